@@ -1,0 +1,1 @@
+"""Python SDK, command line and dashboard. No torch at import."""

@@ -1,0 +1,1 @@
+"""The reconstruction, one stage a module; read in the order of pipeline.py."""
