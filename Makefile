@@ -1,0 +1,60 @@
+# `make help` lists what there is. Needs Python 3.11 or newer, make and pip; everything else goes into .venv.
+#
+#   TORCH_INDEX  package index for torch alone, e.g. https://download.pytorch.org/whl/cpu (small, no GPU);
+#                empty: pip's own index, which on Linux is usually a CUDA build of several GB
+#   PYTHON       the interpreter that makes .venv (default: the first of python3, python3.13, 3.12, 3.11 that is new enough)
+
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+
+TORCH_INDEX ?=
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+# -qq: errors only; pip warns once per package for every local index it is configured with
+NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
+PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do \
+	"$$each" -c '$(NEW_ENOUGH)' 2>/dev/null && { echo "$$each"; break; }; done)
+
+.PHONY: help setup demo test check bench clean
+
+help: ## this list
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+
+setup: $(STAMP) ## make .venv and install everything into it (TORCH_INDEX=URL chooses the torch build)
+	@$(BIN)/python -c 'import torch; print(f"torch {torch.__version__}:", f"CUDA {torch.version.cuda} build" if torch.version.cuda else "CPU build")'
+
+$(STAMP): pyproject.toml constraints.txt
+	@if [ -z "$(PYTHON)" ] || ! "$(PYTHON)" -c '$(NEW_ENOUGH)'; then \
+		echo "setup: Python 3.11 or newer is needed; found: $$(python3 --version 2>&1). Install one, or name it: make setup PYTHON=/path/to/python3.12" >&2; exit 1; fi
+	@if ! $(BIN)/python -c '$(NEW_ENOUGH)' 2>/dev/null; then \
+		echo "setup: making $(VENV) with $$("$(PYTHON)" --version)"; \
+		"$(PYTHON)" -m venv --clear $(VENV) || { echo "setup: the venv module is incomplete; on Debian or Ubuntu: apt-get install python3-venv" >&2; exit 1; }; fi
+	@if [ -n "$(TORCH_INDEX)" ]; then \
+		echo "setup: installing torch from $(TORCH_INDEX)"; \
+		$(PIP) install -qq --constraint constraints.txt --index-url "$(TORCH_INDEX)" torch; fi
+	@echo "setup: installing intrasplat and what it needs (download sizes are in README.md; minutes on a slow line)"
+	@$(PIP) install -qq --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: setup ## reconstruct a synthetic clip of tissue and render it without the instrument
+	@$(BIN)/python -m client.demo
+
+test: setup ## the whole test suite; ARGS="tests/test_layers.py -k law" narrows it
+	@$(BIN)/python -m pytest $(ARGS)
+
+check: setup ## style, types and the import rules
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/python -m pytest tests/test_layers.py
+
+bench: setup ## every benchmarks/bm_*.py, one after the other
+	@set -e; for each in benchmarks/bm_*.py; do \
+		[ -e "$$each" ] || { echo "bench: benchmarks/ holds no bm_*.py" >&2; exit 1; }; \
+		echo "== $$each"; $(BIN)/python "$$each"; done
+
+clean: ## remove .venv, caches and build leftovers; scenes and the demo's pictures stay
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find contract worker service client tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
