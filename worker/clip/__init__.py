@@ -1,5 +1,8 @@
 """Decode and validate what the user gave: a stereo clip, or frames whose depth is already known."""
 
+from worker.clip.limits import ClipLimits
+from worker.clip.opening import find_calibration, open_clip
+from worker.clip.split import FrameSplit, split_frames
 from worker.clip.types import DepthClip, StereoClip
 
-__all__ = ["DepthClip", "StereoClip"]
+__all__ = ["ClipLimits", "DepthClip", "FrameSplit", "StereoClip", "find_calibration", "open_clip", "split_frames"]

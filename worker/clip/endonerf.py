@@ -1,0 +1,137 @@
+"""The EndoNeRF layout: images/ depth/ masks/ poses_bounds.npy, decoded at once.
+
+Symbols: T frames, H W pixels.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.camera import Intrinsics
+from contract.errors import InputError
+from worker.clip.files import FileTree
+from worker.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
+from worker.clip.masks import MaskPolarity, TissueMasks, read_masks, tissue_from_masks
+from worker.clip.naming import check_aligned
+from worker.clip.poses import POSES_FILE, PoseConvention, Poses, parse_poses
+from worker.clip.types import DepthClip
+from worker.clip.video import FALLBACK_RATE_HZ
+
+LAYOUT = "EndoNeRF"
+CONFIDENT = 255  # depth_confidence of every valid depth: the layout carries none of its own
+_BYTES_PER_PIXEL = 3 + 4 + 1 + 1  # rgb, depth_mm, depth_confidence, tissue
+_MOST_THREADS = 4  # decoding PNG releases the interpreter; more threads than this wait for the disk
+
+
+def is_endonerf(tree: FileTree) -> bool:
+    """Whether a tree means to be in this layout; what is missing is then an error."""
+    has_poses = any(name.endswith(POSES_FILE) for name in tree.names)
+    return has_poses or bool(tree.images("images") and tree.images("depth"))
+
+
+def read_endonerf(
+    tree: FileTree, masks_white: NDArray[np.bool_] | None, mask_polarity: MaskPolarity, convention: PoseConvention
+) -> DepthClip:
+    """Decodes the whole clip. masks_white [T, H, W], when given, replaces the folder's own masks.
+
+    Depth images hold millimetres in 8 or 16 bit, 0 = invalid. Intrinsics are f, cx = W / 2, cy = H / 2:
+    all the layout knows.
+    Raises InputError for everything that does not fit together and LimitError when it is too large.
+    """
+    for folder, names in (("images", tree.images("images")), ("depth", tree.images("depth"))):
+        if not names:
+            raise InputError(
+                tree.field, f"{tree.label} has no images in {folder}/.", f"Put the frames' {folder} there."
+            )
+    if POSES_FILE not in tree.names:
+        raise InputError(tree.field, f"{tree.label} has no {POSES_FILE}.", "Put it beside images/.")
+    images = open_images(tree, tree.images("images"), _BYTES_PER_PIXEL)
+    poses = parse_poses(tree.read(POSES_FILE), images.frame_count, convention)
+    _check_size(images, poses)
+    rgb = _decode_all(images, np.uint8, (3,), lambda name: as_rgb(images.decode(name), tree.field, name))
+    depth_mm = _read_depth(tree, images)
+    masks = _masks(tree, images, masks_white, mask_polarity)
+    if not (depth_mm[masks.tissue] > 0).any():
+        where = "on tissue" if (depth_mm > 0).any() else "anywhere"
+        raise InputError(
+            tree.field, f"depth/ has no valid depth {where}.", "Give millimetres as grey PNG, 0 = invalid."
+        )
+    moves = not np.allclose(poses.world_from_camera, np.eye(4), atol=1e-6)
+    return DepthClip(
+        rgb=rgb,
+        tissue=masks.tissue,
+        depth_mm=depth_mm,
+        depth_confidence=np.where(depth_mm > 0, np.uint8(CONFIDENT), np.uint8(0)),
+        intrinsics=Intrinsics(
+            width=images.width,
+            height=images.height,
+            fx=poses.focal_px,
+            fy=poses.focal_px,
+            cx=images.width / 2,
+            cy=images.height / 2,
+        ),
+        world_from_camera=poses.world_from_camera,
+        frame_times_s=np.arange(images.frame_count) / FALLBACK_RATE_HZ,
+        assumptions=(
+            f"layout: {LAYOUT}",
+            masks.assumption,
+            f"poses: {convention} camera-to-world, " + ("moving camera" if moves else "fixed camera"),
+            "intrinsics: principal point at the image centre",
+            "depth: millimetres",
+            f"time: {FALLBACK_RATE_HZ:g} frames a second, images carry none",
+        ),
+        warnings=masks.warnings,
+    )
+
+
+def _check_size(images: ImageSequence, poses: Poses) -> None:
+    if (poses.height, poses.width) != (images.height, images.width):
+        raise InputError(
+            images.tree.field,
+            f"{POSES_FILE} says {poses.width}x{poses.height} pixels, the images are {images.width}x{images.height}.",
+            f"Write the images' size into {POSES_FILE}, and scale f with it.",
+        )
+
+
+def _read_depth(tree: FileTree, images: ImageSequence) -> NDArray[np.float32]:
+    """Depth [T, H, W] float32 in mm, 0 = invalid."""
+    names = tree.images("depth")
+    check_aligned(tree.field, images.names, names)
+    depth = open_images(tree, names)
+    if (depth.height, depth.width) != (images.height, images.width):
+        raise InputError(
+            tree.field,
+            f"depth is {depth.width}x{depth.height} pixels, the images are {images.width}x{images.height}.",
+            "Give depth in the images' size.",
+        )
+    return _decode_all(depth, np.float32, (), lambda name: as_depth_mm(depth.decode(name), tree.field, name))
+
+
+def _masks(
+    tree: FileTree, images: ImageSequence, masks_white: NDArray[np.bool_] | None, told: MaskPolarity
+) -> TissueMasks:
+    shape = (images.frame_count, images.height, images.width)
+    if masks_white is None:
+        names = tree.images("masks")
+        if not names:
+            return TissueMasks(np.ones(shape, dtype=np.bool_), "masks: none given, every pixel is tissue")
+        check_aligned("masks", images.names, names)
+        masks_white = read_masks(tree, names)
+    return tissue_from_masks(masks_white, shape, told, by_layout=(LAYOUT, "tool"))
+
+
+def _decode_all(
+    images: ImageSequence, dtype: type, channels: tuple[int, ...], decode: Callable[[str], NDArray[Any]]
+) -> NDArray[Any]:
+    """All frames of a sequence [T, H, W, ...], decoded by a few threads."""
+    result: NDArray[Any] = np.empty((images.frame_count, images.height, images.width, *channels), dtype=dtype)
+    with ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1)) as threads:
+        for index, frame in enumerate(threads.map(decode, images.names)):
+            result[index] = frame
+    return result

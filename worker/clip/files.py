@@ -1,0 +1,243 @@
+"""A folder, a zip or a single image as one flat list of named files, read in memory.
+
+Archives come from strangers: members are never written under their own names, and everything that could reach outside
+(absolute paths, "..", links), hide its content (encryption, nested archives, duplicates, overlaps) or outgrow the limits
+is refused.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import tempfile
+import zipfile
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO, TypeVar
+
+from contract.errors import InputError, LimitError
+from worker.clip.limits import ClipLimits
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm"})
+ARCHIVE_SUFFIXES = frozenset({".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar", ".jar"})
+
+MOST_MEMBERS = 20_000  # images, depth, masks and right frames of 1000 frames are 4000
+DEEPEST_FOLDER = 6  # levels below the given folder; also what ends a loop of linked folders
+_CHUNK_BYTES = 1 << 20
+_LAYOUT_FOLDERS = frozenset({"images", "depth", "masks", "mask", "left", "right"})  # never stripped as mere wrapping
+
+_Item = TypeVar("_Item")
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key by which frame9 comes before frame10."""
+    parts = re.split(r"(\d+)", name.lower())
+    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)
+
+
+@dataclass(frozen=True)
+class FileTree(ABC):
+    """Files by relative name ("images/000001.png"), in natural order, without wrapping folders.
+
+    field is the input at fault in errors ("clip", "masks", "right"); label names the tree in messages.
+    """
+
+    field: str
+    label: str
+    names: tuple[str, ...]
+    limits: ClipLimits
+
+    @abstractmethod
+    def open(self, name: str) -> IO[bytes]:
+        """The file for reading; may raise what zipfile and the operating system raise."""
+
+    def path(self, name: str) -> Path | None:
+        """Where the file lies on disk; None inside an archive."""
+        return None
+
+    def read(self, name: str, at_most: int | None = None) -> bytes:
+        """Content of a file, or its first at_most bytes. InputError when unreadable, LimitError when too large."""
+        if at_most is None:
+            return b"".join(self._chunks(name))
+        return next(self._chunks(name, at_most), b"")
+
+    def copy_to(self, name: str, target: Path) -> None:
+        """Writes a file under a name of ours, for readers that need a path. target must not exist."""
+        with target.open("xb") as stream:
+            for chunk in self._chunks(name):
+                stream.write(chunk)
+
+    def _chunks(self, name: str, size: int = _CHUNK_BYTES) -> Iterator[bytes]:
+        """Content piece by piece, counted while it is inflated: what an archive declares may be a lie."""
+        total = 0
+        try:
+            with self.open(name) as stream:
+                while chunk := stream.read(size):
+                    total += len(chunk)
+                    if total > self.limits.decoded_bytes:
+                        raise LimitError(
+                            self.field,
+                            f"{name} is larger than {self.limits.decoded_bytes} bytes.",
+                            "Give a smaller file.",
+                        )
+                    yield chunk
+        except (OSError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+            raise InputError(
+                self.field, f"{name} in {self.label} cannot be read ({error}).", "Write the file again."
+            ) from error
+
+    def images(self, folder: str | None = None) -> tuple[str, ...]:
+        """Image files of the tree, or those right inside `folder`."""
+        return tuple(
+            name
+            for name in self.names
+            if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
+            and (folder is None or str(PurePosixPath(name).parent).lower() == folder)
+        )
+
+    def videos(self) -> tuple[str, ...]:
+        return tuple(name for name in self.names if PurePosixPath(name).suffix.lower() in VIDEO_SUFFIXES)
+
+
+@dataclass(frozen=True)
+class _Folder(FileTree):
+    paths: dict[str, Path]
+
+    def path(self, name: str) -> Path | None:
+        return self.paths[name]
+
+    def open(self, name: str) -> IO[bytes]:
+        return self.paths[name].open("rb")
+
+
+@dataclass(frozen=True)
+class _Zip(FileTree):
+    archive: zipfile.ZipFile
+    members: dict[str, zipfile.ZipInfo]
+
+    def open(self, name: str) -> IO[bytes]:
+        return self.archive.open(self.members[name])
+
+
+def open_tree(path: Path, field: str, limits: ClipLimits) -> FileTree | None:
+    """The files behind a folder, a zip (told by its content) or a single image; None when path is none of these."""
+    if path.is_dir():
+        return _open_folder(path, field, limits)
+    if zipfile.is_zipfile(path):
+        return _open_zip(path, field, limits)
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        return _Folder(field, path.name, (path.name,), limits, {path.name: path})
+    return None
+
+
+def check_exists(path: Path, field: str) -> None:
+    """InputError unless path is a folder or a file with content."""
+    if not path.exists():
+        raise InputError(field, f"{path} does not exist.", "Check the path.")
+    if path.is_file() and path.stat().st_size == 0:
+        raise InputError(field, f"{path.name} is empty (0 bytes).", "Copy or upload the file again.")
+
+
+def scratch_folder() -> Path:
+    """A new private folder for files that must have a path; the caller removes it."""
+    return Path(tempfile.mkdtemp(prefix="intrasplat-"))
+
+
+def _open_folder(root: Path, field: str, limits: ClipLimits) -> FileTree:
+    paths: dict[str, Path] = {}
+    for folder, subfolders, files in os.walk(root, followlinks=True):
+        relative = Path(folder).relative_to(root)
+        if len(relative.parts) >= DEEPEST_FOLDER:
+            subfolders.clear()
+        for file in files:
+            paths[(relative / file).as_posix()] = Path(folder) / file
+        _check_member_count(len(paths), field, root.name)
+    named = _without_wrapping(paths)
+    return _Folder(field, root.name, tuple(sorted(named, key=natural_key)), limits, named)
+
+
+def _open_zip(path: Path, field: str, limits: ClipLimits) -> FileTree:
+    try:
+        archive = zipfile.ZipFile(path)
+    except (zipfile.BadZipFile, OSError, ValueError) as error:
+        raise InputError(field, f"{path.name} is not a readable zip ({error}).", "Zip the files again.") from error
+    entries = archive.infolist()
+    _check_member_count(len(entries), field, path.name)
+    members: dict[str, zipfile.ZipInfo] = {}
+    for entry in entries:
+        _check_member(entry, field, path.name)
+        if entry.filename in members:
+            raise InputError(field, f"{path.name} holds {entry.filename!r} twice.", "Zip the files again.")
+        if not entry.is_dir():
+            members[entry.filename] = entry
+    _check_inflated(list(members.values()), field, path, limits)
+    named = _without_wrapping(members)
+    return _Zip(field, path.name, tuple(sorted(named, key=natural_key)), limits, archive, named)
+
+
+def _check_member_count(count: int, field: str, label: str) -> None:
+    if count > MOST_MEMBERS:
+        raise LimitError(
+            field, f"{label} holds {count} files or more; the limit is {MOST_MEMBERS}.", "Keep the clip's own."
+        )
+
+
+def _check_member(entry: zipfile.ZipInfo, field: str, label: str) -> None:
+    """InputError for a member that could reach outside the archive or hide what it holds."""
+    name = entry.filename
+    problem = None
+    kind = stat.S_IFMT(entry.external_attr >> 16)
+    # zipfile cuts names at NUL, so the name as stored is asked too
+    if any(ord(letter) < 32 for letter in entry.orig_filename) or "\\" in entry.orig_filename:
+        problem = "has a name with a backslash or a control character"
+    elif name.startswith("/") or re.match(r"[A-Za-z]:", name):
+        problem = "has an absolute path"
+    elif ".." in name.split("/"):
+        problem = 'has ".." in its path'
+    elif kind == stat.S_IFLNK:
+        problem = "is a symbolic link"
+    elif kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+        problem = "is not a plain file"
+    elif entry.flag_bits & 0x1:
+        problem = "is encrypted"
+    elif PurePosixPath(name).suffix.lower() in ARCHIVE_SUFFIXES:
+        problem = "is an archive inside the archive"
+    if problem is not None:
+        raise InputError(field, f"{name!r} in {label} {problem}.", "Zip plain files only, without links or passwords.")
+
+
+def _check_inflated(entries: list[zipfile.ZipInfo], field: str, path: Path, limits: ClipLimits) -> None:
+    """LimitError when the declared sizes add up to too much; InputError when members share compressed bytes."""
+    total = sum(entry.file_size for entry in entries)
+    if total > limits.decoded_bytes:
+        raise LimitError(
+            field,
+            f"{path.name} inflates to {total} bytes; the limit is {limits.decoded_bytes}.",
+            "Give a shorter clip.",
+        )
+    ordered = sorted(entries, key=lambda entry: entry.header_offset)
+    ends = [entry.header_offset + entry.compress_size for entry in ordered]
+    starts = [entry.header_offset for entry in ordered[1:]] + [path.stat().st_size]
+    if any(end > start for end, start in zip(ends, starts, strict=True)):
+        raise InputError(field, f"members of {path.name} overlap.", "Zip the files again.")
+
+
+def _without_wrapping(items: dict[str, _Item]) -> dict[str, _Item]:
+    """Drops what file managers leave behind, and folders that hold everything ("clip/images/..." -> "images/...")."""
+    kept = {name: item for name, item in items.items() if not _is_litter(name)}
+    while kept:
+        first = {name.split("/", 1)[0] for name in kept}
+        if len(first) > 1 or any("/" not in name for name in kept) or first & _LAYOUT_FOLDERS:
+            break
+        kept = {name.split("/", 1)[1]: item for name, item in kept.items()}
+    return kept
+
+
+def _is_litter(name: str) -> bool:
+    parts = name.split("/")
+    return "__MACOSX" in parts or parts[-1] == "Thumbs.db" or any(part.startswith(".") for part in parts)

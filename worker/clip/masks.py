@@ -1,0 +1,166 @@
+"""Instrument masks: which pixels are tissue, and how that was known.
+
+Symbols: T frames, H W pixels of the left eye.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.errors import InputError
+from worker.clip.files import FileTree, check_exists, open_tree
+from worker.clip.images import MASK_THRESHOLD, as_mask, open_images
+from worker.clip.limits import ClipLimits
+from worker.clip.naming import left_eye_only
+from worker.clip.video import VideoFile, open_video, open_video_in
+
+MaskPolarity = Literal["auto", "tool", "tissue"]
+BrightClass = Literal["tool", "tissue"]  # what a white pixel means
+
+MOST_TOOL_SHARE = 0.4  # of the area: a class larger than this is not taken for the instrument unasked
+_FIELD = "masks"
+_POLARITY_REMEDY = 'Say mask_polarity "tool" if white marks instruments, "tissue" if white marks tissue.'
+
+
+@dataclass(frozen=True)
+class TissueMasks:
+    """tissue [T, H, W] bool, True = tissue, with what was assumed and what looks odd."""
+
+    tissue: NDArray[np.bool_]
+    assumption: str
+    warnings: tuple[str, ...] = ()
+
+
+def open_masks(path: Path, limits: ClipLimits) -> NDArray[np.bool_]:
+    """White pixels [T, H, W] of masks given as a zip or folder of images, or as a video. InputError, LimitError."""
+    check_exists(path, _FIELD)
+    tree = open_tree(path, _FIELD, limits)
+    if tree is None:
+        return _video_masks(open_video(path, _FIELD, limits))
+    names = mask_names(tree) or tree.images()
+    if not names and len(tree.videos()) == 1:
+        return _video_masks(open_video_in(tree, tree.videos()[0]))
+    return read_masks(tree, left_eye_only(names))
+
+
+def mask_names(tree: FileTree) -> tuple[str, ...]:
+    """Images that lie in a folder called masks or mask; of both eyes only the left."""
+    names = (name for name in tree.images() if {"masks", "mask"} & {p.lower() for p in PurePosixPath(name).parts[:-1]})
+    return left_eye_only(tuple(names))
+
+
+def read_masks(tree: FileTree, names: tuple[str, ...]) -> NDArray[np.bool_]:
+    """White pixels [T, H, W] of mask images. InputError when none has a pixel that is white."""
+    images = open_images(tree, names, bytes_per_pixel=1)
+    white = np.empty((images.frame_count, images.height, images.width), dtype=np.bool_)
+    largest = 0
+    for index, name in enumerate(names):
+        image = images.decode(name)
+        white[index] = as_mask(image)
+        largest = max(largest, int(image.max()) if image.dtype == np.uint8 else int(image.max()) // 257)
+    if 0 < largest < MASK_THRESHOLD:
+        raise InputError(
+            _FIELD, f"the largest value in the masks is {largest} of 255.", "Write masks with the values 0 and 255."
+        )
+    return white
+
+
+def tissue_from_masks(
+    white: NDArray[np.bool_],
+    shape: tuple[int, int, int],
+    told: MaskPolarity,
+    by_layout: tuple[str, BrightClass] | None = None,
+) -> TissueMasks:
+    """Tissue pixels of white pixels [T, H, W].
+
+    What the user told wins; then the layout (its name, what white means there), unless the masks' own look contradicts
+    it; then the look: the class that touches the border in most frames with less than 40 % of the area is the tool.
+    InputError when count or size differ from the clip's `shape` (T, H, W), when the tool's class cannot be told, when
+    the masks mark nothing, and when they leave no tissue.
+    """
+    _check_shape(white, shape)
+    bright, reason = _bright_class(white, told, by_layout)
+    tissue = white if bright == "tissue" else ~white
+    if not tissue.any():
+        raise InputError(_FIELD, "every pixel of every mask is tool.", _POLARITY_REMEDY)
+    warnings = []
+    if tissue.all():
+        warnings.append("the masks mark no instrument in any frame")
+    covered = int((~tissue.any(axis=(1, 2))).sum())
+    if covered:
+        warnings.append(f"{covered} frames are all tool in their masks and teach nothing")
+    return TissueMasks(tissue, f"masks: white is {bright} ({reason})", tuple(warnings))
+
+
+def _bright_class(
+    white: NDArray[np.bool_], told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
+) -> tuple[BrightClass, str]:
+    """What white means, and why we think so."""
+    if told != "auto":
+        return told, "as told"
+    if white.all() or not white.any():
+        colour = "white" if white.any() else "black"
+        raise InputError(
+            _FIELD,
+            f"every mask is {colour} all over, so nothing is marked.",
+            "Leave the masks out if no instrument shows. " + _POLARITY_REMEDY,
+        )
+    look = _bright_class_by_look(white)
+    share = f"white covers {100 * white.mean():.0f} % of the area"
+    if by_layout is not None:
+        layout, bright = by_layout
+        if look in (None, bright):
+            return bright, f"the {layout} layout's rule"
+        raise InputError(
+            _FIELD, f"the {layout} layout says white is {bright}, the masks look inverted ({share}).", _POLARITY_REMEDY
+        )
+    if look is None:
+        raise InputError(
+            _FIELD, f"cannot tell whether white or black marks the instrument ({share}).", _POLARITY_REMEDY
+        )
+    return look, f"the instrument enters from the border and covers less than {100 * MOST_TOOL_SHARE:.0f} %; {share}"
+
+
+def _bright_class_by_look(white: NDArray[np.bool_]) -> BrightClass | None:
+    if white.mean() < MOST_TOOL_SHARE:
+        return "tool" if _touches_border(white) else None
+    if 1.0 - white.mean() < MOST_TOOL_SHARE:
+        return "tissue" if _touches_border(~white) else None
+    return None
+
+
+def _touches_border(marked: NDArray[np.bool_]) -> bool:
+    """Whether a class reaches the image border in most of the frames it appears in."""
+    on_border = (
+        marked[:, 0].any(axis=1)
+        | marked[:, -1].any(axis=1)
+        | marked[:, :, 0].any(axis=1)
+        | marked[:, :, -1].any(axis=1)
+    )
+    return bool(2 * on_border.sum() > marked.any(axis=(1, 2)).sum())
+
+
+def _check_shape(white: NDArray[np.bool_], shape: tuple[int, int, int]) -> None:
+    frames, height, width = shape
+    if white.shape[0] != frames:
+        raise InputError(
+            _FIELD, f"there are {white.shape[0]} masks for {frames} frames.", "Give one mask for each frame."
+        )
+    if white.shape[1:] != (height, width):
+        raise InputError(
+            _FIELD,
+            f"the masks are {white.shape[2]}x{white.shape[1]} pixels, the left eye is {width}x{height}.",
+            "Give masks in the size of the left eye.",
+        )
+
+
+def _video_masks(video: VideoFile) -> NDArray[np.bool_]:
+    white = np.empty((video.frame_count, video.height, video.width), dtype=np.bool_)
+    for index, frame in enumerate(video.frames()):
+        white[index] = as_mask(frame)
+    return white

@@ -1,0 +1,158 @@
+"""Stereo clips of every layout but EndoNeRF's, opened and checked, decoded when asked for.
+
+Symbols: T frames, H W pixels of one eye.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.errors import InputError
+from worker.clip.files import FileTree, open_tree
+from worker.clip.images import ImageSequence, open_images
+from worker.clip.limits import SMALLEST_SIDE_PX, ClipLimits
+from worker.clip.masks import BrightClass, MaskPolarity, mask_names, read_masks, tissue_from_masks
+from worker.clip.naming import eye_of, left_eye_only, pair_names
+from worker.clip.packing import (
+    PACKING_WORDS,
+    FrameSequence,
+    PackedPairs,
+    Packing,
+    TwoSequences,
+    detect_packing,
+    pair_sequences,
+)
+from worker.clip.types import StereoClip
+from worker.clip.video import FALLBACK_RATE_HZ, open_video, open_video_in
+
+STEREOMIS = "StereoMIS"
+STEREOMIS_CALIBRATION = "StereoCalibration.ini"
+
+StereoLayout = Literal["auto", "stereomis", "sbs", "tb", "frames"]
+_Pairs = PackedPairs | TwoSequences
+
+
+def open_two_files(left: Path, right: Path, limits: ClipLimits) -> StereoClip:
+    """Left and right eye as two videos, two folders or zips of frames, or two images."""
+    pairs = pair_sequences(_open_eye(left, "clip", limits), _open_eye(right, "right", limits))
+    return _stereo_clip(pairs, ("layout: two files, left eye first",))
+
+
+def open_video_clip(path: Path, layout: StereoLayout, limits: ClipLimits) -> StereoClip:
+    """Both eyes in one video, side by side or top-bottom."""
+    if layout in ("frames", "stereomis"):
+        raise InputError(
+            "options.layout", f'layout "{layout}" needs a folder or zip, {path.name} is a file.', "Leave it out."
+        )
+    return _packed_clip(open_video(path, "clip", limits), layout)
+
+
+def open_tree_clip(tree: FileTree, layout: StereoLayout) -> StereoClip:
+    """A folder or zip with one or two videos, or with left and right frames; StereoMIS if its calibration is there."""
+    if layout == "auto" and is_stereomis(tree):
+        layout = "stereomis"
+    videos = _outside_masks(tree, tree.videos())
+    if videos and layout != "frames":
+        return _open_tree_videos(tree, videos, layout)
+    if layout in ("sbs", "tb"):
+        return _packed_clip(open_images(tree, _outside_masks(tree, tree.images())), layout)
+    left, right = pair_names(_outside_masks(tree, tree.images()))
+    if not left:
+        raise InputError(
+            "clip",
+            f"{tree.label} holds neither a video nor frames (PNG or JPEG).",
+            "Give a stereo video, left and right frames, or the EndoNeRF or StereoMIS layout.",
+        )
+    pairs = pair_sequences(open_images(tree, left), open_images(tree, right))
+    word = STEREOMIS if layout == "stereomis" else "left and right frames"
+    return _stereo_clip(pairs, (f"layout: {word}, {left[0]} is the left eye",))
+
+
+def is_stereomis(tree: FileTree) -> bool:
+    return any(PurePosixPath(name).name.lower() == STEREOMIS_CALIBRATION.lower() for name in tree.names)
+
+
+def own_masks(tree: FileTree) -> NDArray[np.bool_] | None:
+    """White pixels [T, H, W] of the masks that lie in the clip's own folder, if any."""
+    names = mask_names(tree)
+    return read_masks(tree, names) if names else None
+
+
+def with_masks(
+    clip: StereoClip, white: NDArray[np.bool_], told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
+) -> StereoClip:
+    """The clip with its tissue pixels; see tissue_from_masks for how white is read."""
+    masks = tissue_from_masks(white, (clip.frame_count, clip.height, clip.width), told, by_layout)
+    return StereoClip(
+        frame_count=clip.frame_count,
+        height=clip.height,
+        width=clip.width,
+        pairs=clip.pairs,
+        tissue=masks.tissue,
+        frame_times_s=clip.frame_times_s,
+        assumptions=(*clip.assumptions, masks.assumption),
+        warnings=(*clip.warnings, *masks.warnings),
+    )
+
+
+def _open_tree_videos(tree: FileTree, videos: tuple[str, ...], layout: StereoLayout) -> StereoClip:
+    if len(videos) == 1:
+        video = open_video_in(tree, videos[0])
+        if layout == "stereomis":
+            return _packed_clip(video, "tb", f"{STEREOMIS}, ")
+        return _packed_clip(video, layout)
+    eyes = {found[0] for name in videos if (found := eye_of(name))}
+    if len(videos) != 2 or eyes != {"left", "right"}:
+        raise InputError(
+            "clip",
+            f"{tree.label} holds {len(videos)} videos ({', '.join(videos[:4])}).",
+            "Keep one stereo video, or two named left and right.",
+        )
+    left, right = left_eye_only(videos)[0], next(name for name in videos if name not in left_eye_only(videos))
+    pairs = pair_sequences(open_video_in(tree, left), open_video_in(tree, right))
+    return _stereo_clip(pairs, (f"layout: two files, {left} is the left eye",))
+
+
+def _packed_clip(sequence: FrameSequence, layout: StereoLayout, known: str = "") -> StereoClip:
+    packing: Packing = layout if layout in ("sbs", "tb") else detect_packing(sequence)
+    reason = f"layout: {known}{PACKING_WORDS[packing]}" + (
+        " (found by likeness of the halves)" if layout == "auto" else ""
+    )
+    assumptions = [reason]
+    odd = sequence.width % 2 if packing == "sbs" else sequence.height % 2
+    if odd:
+        assumptions.append(f"layout: the odd middle {'column' if packing == 'sbs' else 'row'} belongs to neither eye")
+    return _stereo_clip(PackedPairs(sequence, packing), tuple(assumptions))
+
+
+def _stereo_clip(pairs: _Pairs, assumptions: tuple[str, ...]) -> StereoClip:
+    first = pairs.sequence if isinstance(pairs, PackedPairs) else pairs.left
+    height, width = pairs.eye_size if isinstance(pairs, PackedPairs) else (first.height, first.width)
+    if min(height, width) < SMALLEST_SIDE_PX:
+        raise InputError("clip", f"one eye is {width}x{height} pixels.", f"Give at least {SMALLEST_SIDE_PX} a side.")
+    frame_times_s = first.frame_times_s
+    if frame_times_s is None:
+        frame_times_s = np.arange(first.frame_count) / FALLBACK_RATE_HZ
+        assumptions = (*assumptions, f"time: {FALLBACK_RATE_HZ:g} frames a second, the clip carries none")
+    return StereoClip(first.frame_count, height, width, pairs, None, frame_times_s, assumptions)
+
+
+def _open_eye(path: Path, field: str, limits: ClipLimits) -> FrameSequence:
+    tree = open_tree(path, field, limits)
+    if tree is None:
+        return open_video(path, field, limits)
+    videos = _outside_masks(tree, tree.videos())
+    return open_video_in(tree, videos[0]) if len(videos) == 1 else _eye_images(tree)
+
+
+def _eye_images(tree: FileTree) -> ImageSequence:
+    return open_images(tree, _outside_masks(tree, tree.images()))
+
+
+def _outside_masks(tree: FileTree, names: tuple[str, ...]) -> tuple[str, ...]:
+    masks = {"masks", "mask"}
+    return tuple(name for name in names if not masks & {part.lower() for part in PurePosixPath(name).parts[:-1]})

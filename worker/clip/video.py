@@ -1,0 +1,192 @@
+"""Video files through one of three decoders and nothing else.
+
+The decoders bundled with OpenCV are many and some had holes; a whitelist of codecs reaches only FFmpeg's probe. What
+does hold is to force the decoder by name, so each allowed one is tried in turn.
+
+Symbols: T frames, H W pixels.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.errors import InputError
+from worker.clip.files import FileTree, scratch_folder
+from worker.clip.limits import ClipLimits
+from worker.clip.types import RgbFrame
+
+DECODERS = ("h264", "hevc", "vp9")
+MISSING_FRAMES_ALLOWED = 1  # containers that store a duration instead of a count round it
+FALLBACK_RATE_HZ = 30.0
+
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm"
+_REMEDY = "Give H.264, HEVC or VP9 video in mp4, mov, mkv or webm."
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
+_QUIET = "-8"  # AV_LOG_QUIET: what a refused decoder says is not for the user
+_environment_lock = threading.Lock()  # OpenCV takes these options from the environment only, which the process shares
+
+_OTHER_CODECS = {  # how containers name the codecs people are likely to bring
+    b"av01": "AV1",
+    b"V_AV1": "AV1",
+    b"V_VP8": "VP8",
+    b"mp4v": "MPEG-4 part 2",
+    b"jpeg": "Motion JPEG",
+    b"mjpg": "Motion JPEG",
+    b"V_MJPEG": "Motion JPEG",
+    b"apch": "ProRes",
+    b"apcn": "ProRes",
+    b"V_FFV1": "FFV1",
+    b"V_MPEG4/ISO/ASP": "MPEG-4 part 2",
+}
+_CODEC_SCAN_BYTES = 1 << 18  # the track description stands at the head or, in streamed mp4, at the tail
+
+
+@dataclass(frozen=True)
+class VideoFile:
+    """A video that was opened once, counted and timed: a restartable sequence of T RGB frames."""
+
+    path: Path
+    field: str
+    label: str
+    decoder: str
+    frame_count: int
+    height: int
+    width: int
+    frame_times_s: NDArray[np.float64] | None  # None: the container has no usable times
+
+    def frames(self) -> Iterator[RgbFrame]:
+        """RGB uint8 [H, W, 3], from the first frame on. InputError when frames change size or stop early."""
+        with _capture(self.path, self.decoder) as capture:
+            for index in range(self.frame_count):
+                good, frame = capture.read() if capture is not None else (False, None)
+                if not good or frame is None:
+                    raise _cut_short(self.field, self.label, index, self.frame_count)
+                if frame.shape[:2] != (self.height, self.width):
+                    raise InputError(
+                        self.field,
+                        f"frame {index} of {self.label} is {frame.shape[1]}x{frame.shape[0]} pixels, "
+                        f"the first is {self.width}x{self.height}.",
+                        "Encode the clip in one size.",
+                    )
+                yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+
+
+def open_video(path: Path, field: str, limits: ClipLimits, label: str | None = None) -> VideoFile:
+    """Opens, counts and times a video; frames are decoded later.
+
+    Raises InputError when it is no video, its codec is not allowed, or it ends early; LimitError when it is too large.
+    """
+    label = label or path.name
+    if not _has_container_magic(path):
+        raise InputError(field, f"{label} is not an mp4, mov, mkv or webm file.", _REMEDY)
+    for decoder in DECODERS:
+        with _capture(path, decoder) as capture:
+            if capture is not None:
+                return _survey(capture, path, field, limits, label, decoder)
+    codec = _other_codec(path)
+    if codec is not None:
+        raise InputError(field, f"{label} is encoded as {codec}, which is not accepted.", _REMEDY)
+    raise InputError(
+        field, f"{label} cannot be decoded: it is damaged, or its codec is none of {', '.join(DECODERS)}.", _REMEDY
+    )
+
+
+def open_video_in(tree: FileTree, name: str) -> VideoFile:
+    """Opens a video inside a folder or zip; what is copied out of a zip goes when the VideoFile does."""
+    path = tree.path(name)
+    if path is not None:
+        return open_video(path, tree.field, tree.limits, label=name)
+    folder = scratch_folder()
+    try:
+        path = folder / f"video{Path(name).suffix.lower()}"
+        tree.copy_to(name, path)
+        video = open_video(path, tree.field, tree.limits, label=name)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    weakref.finalize(video, shutil.rmtree, folder, ignore_errors=True)
+    return video
+
+
+def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str, decoder: str) -> VideoFile:
+    """Checks the header, then walks all frames once: only that gives their number and times for certain."""
+    width, height = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    declared = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))  # nonsense below zero when the container has no duration
+    limits.check_frame(field, label, width, height)
+    limits.check_clip(field, label, max(declared, 0), width * height * 3)
+    times_ms: list[float] = []
+    while capture.grab():
+        times_ms.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)))
+        if len(times_ms) == 1:
+            good, frame = capture.retrieve()  # turned clips have another size than their header
+            height, width = frame.shape[:2] if good else (height, width)
+        limits.check_clip(field, label, len(times_ms), width * height * 3)
+    if not times_ms or len(times_ms) + MISSING_FRAMES_ALLOWED < declared:
+        raise _cut_short(field, label, len(times_ms), declared)
+    rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
+    return VideoFile(path, field, label, decoder, len(times_ms), height, width, _times_s(times_ms, rate_hz))
+
+
+def _times_s(times_ms: list[float], rate_hz: float) -> NDArray[np.float64] | None:
+    """Seconds from frame 0: the container's time stamps when they rise, else its frame rate, else None."""
+    times_s = (np.asarray(times_ms, dtype=np.float64) - times_ms[0]) / 1000.0
+    if len(times_s) > 1 and np.isfinite(times_s).all() and (np.diff(times_s) > 0).all():
+        return times_s
+    if np.isfinite(rate_hz) and 0 < rate_hz <= 1000:
+        return np.arange(len(times_ms)) / rate_hz
+    return None
+
+
+@contextmanager
+def _capture(path: Path, decoder: str) -> Iterator[Any | None]:
+    """An OpenCV capture bound to one decoder and to local files, or None when that decoder refuses the file."""
+    options = f"protocol_whitelist;file|format_whitelist;{_CONTAINERS}|codec_whitelist;{decoder}|video_codec;{decoder}"
+    with _environment_lock:
+        before = {name: os.environ.get(name) for name in (_OPTIONS, _LOG_LEVEL)}
+        os.environ.update({_OPTIONS: options, _LOG_LEVEL: before[_LOG_LEVEL] or _QUIET})
+        try:
+            capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    os.environ.pop(name, None)
+                else:
+                    os.environ[name] = value
+    try:
+        yield capture if capture.isOpened() else None
+    finally:
+        capture.release()
+
+
+def _has_container_magic(path: Path) -> bool:
+    """ISO base media files (mp4, mov) name a box at byte 4; Matroska and WebM open with the EBML sign."""
+    with path.open("rb") as stream:
+        head = stream.read(12)
+    return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip") or head.startswith(b"\x1aE\xdf\xa3")
+
+
+def _other_codec(path: Path) -> str | None:
+    """Name of a codec we do not decode, when the container mentions one."""
+    with path.open("rb") as stream:
+        text = stream.read(_CODEC_SCAN_BYTES)
+        stream.seek(max(0, path.stat().st_size - _CODEC_SCAN_BYTES))
+        text += stream.read(_CODEC_SCAN_BYTES)
+    return next((name for sign, name in _OTHER_CODECS.items() if sign in text), None)
+
+
+def _cut_short(field: str, label: str, found: int, declared: int) -> InputError:
+    problem = f"{label} ends after {found} frames; its header says {declared}."
+    return InputError(field, problem, "The file is cut short or damaged: copy or export it again.")
