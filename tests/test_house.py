@@ -1,0 +1,103 @@
+"""The front door keeps its word: links lead somewhere, commands exist, versions agree, files stay readable."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("docker/*.md")])
+TARGETS = ("help", "setup", "demo", "test", "check", "bench", "clean")
+MAX_LINES = 400
+LINK = re.compile(r"\[(?:[^\[\]]|\\.)*\]\(([^)\s]+)\)")
+
+
+def project() -> dict[str, Any]:
+    document = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))
+    table: dict[str, Any] = document["project"]
+    return table
+
+
+def relative_links(page: Path) -> list[str]:
+    targets = LINK.findall(page.read_text(encoding="utf-8"))
+    return [unquote(each.split("#")[0]) for each in targets if not re.match(r"[a-z]+:|#", each)]
+
+
+def requirement_name(requirement: str) -> str:
+    return re.split(r"[<>=!~;\[ ]", requirement, maxsplit=1)[0].lower()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_links_between_pages_and_files_lead_somewhere(page: Path) -> None:
+    assert [each for each in relative_links(page) if not (page.parent / each).exists()] == []
+
+
+def test_the_tree_in_the_readme_names_only_what_exists() -> None:
+    readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```\w*\n(.*?)^```", readme, re.DOTALL | re.MULTILINE)
+    tree = next(each for each in blocks if each.startswith("contract/"))
+    missing, folder = [], ""
+    for line in tree.splitlines():
+        # Names end where the description begins: after two spaces, or at the end of the line.
+        names = re.split(r"\s{2,}", line.strip())
+        candidates = [each for each in names if re.fullmatch(r"[a-z0-9_]+(/|\.py)", each)]
+        if not line.startswith(" "):
+            folder = candidates[0]
+            candidates = [""]
+        missing += [folder + each for each in candidates if not (REPOSITORY / folder / each).exists()]
+    assert missing == []
+
+
+def test_the_readme_says_it_is_no_medical_device() -> None:
+    readme = " ".join((REPOSITORY / "README.md").read_text(encoding="utf-8").split())
+    assert "Research use only" in readme
+    assert "not a medical device" in readme
+
+
+def test_the_console_script_leads_to_a_function() -> None:
+    module, _, function = project()["scripts"]["intrasplat"].partition(":")
+    assert callable(getattr(importlib.import_module(module), function))
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_make_knows_the_target(target: str) -> None:
+    listed = subprocess.run(["make", "help"], cwd=REPOSITORY, capture_output=True, text=True, timeout=30, check=True)
+    assert re.search(rf"^  make {target}\s+\S", listed.stdout, re.MULTILINE), listed.stdout
+
+
+def test_versions_agree() -> None:
+    version = project()["version"]
+    citation = (REPOSITORY / "CITATION.cff").read_text(encoding="utf-8")
+    changelog = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.findall(r"^version: (\S+)$", citation, re.MULTILINE) == [version]
+    assert re.findall(r"^## (\S+)", changelog, re.MULTILINE)[0] == version
+
+
+def test_every_direct_dependency_has_a_constraint_and_no_other_has() -> None:
+    lines = (REPOSITORY / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    constrained = {requirement_name(each) for each in lines if each and not each.startswith("#")}
+    extras = project()["optional-dependencies"]
+    direct = {requirement_name(each) for each in [*project()["dependencies"], *extras["dev"]]}
+    assert constrained == direct
+
+
+def test_the_constraint_on_torch_is_the_projects_range() -> None:
+    torch = [each for each in project()["dependencies"] if requirement_name(each) == "torch"]
+    assert torch[0] in (REPOSITORY / "constraints.txt").read_text(encoding="utf-8").splitlines()
+
+
+def test_long_files_say_why_they_are_long() -> None:
+    silent = []
+    for package in ("contract", "worker", "service", "client", "tests", "benchmarks"):
+        for path in sorted((REPOSITORY / package).rglob("*.py")):
+            lines = path.read_text(encoding="utf-8").splitlines()
+            if len(lines) > MAX_LINES and not any(re.match(r"# long: \S", each) for each in lines):
+                silent.append(f"{path.relative_to(REPOSITORY)} has {len(lines)} lines")
+    assert silent == [], "split them, or say why not in a line that begins '# long: '"
