@@ -1,0 +1,98 @@
+"""Spherical harmonics to colour and back, for scenes whose camera moves (worker/gaussians.py has the same in torch).
+
+N Gaussians, K = (degree + 1)^2 coefficients a channel; sh [K, 3, N], colour [3, N], mean in state[0:3].
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+_C3 = (
+    -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
+    -0.4570457994644658, 1.445305721320277, -0.5900435899266435,
+)  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _terms(degree, x, y, z, value, slope):  # type: ignore[no-untyped-def]
+    """Real harmonics at the unit direction (x, y, z) into value [K]; their gradients, as polynomials, into slope [K, 3]."""
+    value[0] = C0
+    slope[:, :] = 0.0
+    if degree >= 1:
+        value[1], value[2], value[3] = -C1 * y, C1 * z, -C1 * x
+        slope[1, 1], slope[2, 2], slope[3, 0] = -C1, C1, -C1
+    if degree >= 2:
+        a, b, c, d, e = _C2
+        value[4], value[5], value[6] = a * x * y, b * y * z, c * (2 * z * z - x * x - y * y)
+        value[7], value[8] = d * x * z, e * (x * x - y * y)
+        slope[4, 0], slope[4, 1] = a * y, a * x
+        slope[5, 1], slope[5, 2] = b * z, b * y
+        slope[6, 0], slope[6, 1], slope[6, 2] = -2 * c * x, -2 * c * y, 4 * c * z
+        slope[7, 0], slope[7, 2] = d * z, d * x
+        slope[8, 0], slope[8, 1] = 2 * e * x, -2 * e * y
+    if degree >= 3:
+        a, b, c, d, e, f, h = _C3
+        value[9] = a * y * (3 * x * x - y * y)
+        slope[9, 0], slope[9, 1] = 6 * a * x * y, a * (3 * x * x - 3 * y * y)
+        value[10] = b * x * y * z
+        slope[10, 0], slope[10, 1], slope[10, 2] = b * y * z, b * x * z, b * x * y
+        value[11] = c * y * (4 * z * z - x * x - y * y)
+        slope[11, 0], slope[11, 1], slope[11, 2] = -2 * c * x * y, c * (4 * z * z - x * x - 3 * y * y), 8 * c * y * z
+        value[12] = d * z * (2 * z * z - 3 * x * x - 3 * y * y)
+        slope[12, 0], slope[12, 1] = -6 * d * x * z, -6 * d * y * z
+        slope[12, 2] = d * (6 * z * z - 3 * x * x - 3 * y * y)
+        value[13] = e * x * (4 * z * z - x * x - y * y)
+        slope[13, 0], slope[13, 1], slope[13, 2] = e * (4 * z * z - 3 * x * x - y * y), -2 * e * x * y, 8 * e * x * z
+        value[14] = f * z * (x * x - y * y)
+        slope[14, 0], slope[14, 1], slope[14, 2] = 2 * f * x * z, -2 * f * y * z, f * (x * x - y * y)
+        value[15] = h * x * (x * x - 3 * y * y)
+        slope[15, 0], slope[15, 1] = h * (3 * x * x - 3 * y * y), -6 * h * x * y
+
+
+@njit(cache=True, nogil=True)
+def colour_from_sh(thread, threads, degree, centre, state, sh, colour):  # type: ignore[no-untyped-def]
+    """colour = max(0, 0.5 + sum_k sh_k Y_k(direction from the camera centre to the mean))."""
+    terms = (degree + 1) * (degree + 1)
+    value, slope = np.empty(terms), np.empty((terms, 3))
+    count = state.shape[1]
+    for g in range(count * thread // threads, count * (thread + 1) // threads):
+        x, y, z = state[0, g] - centre[0], state[1, g] - centre[1], state[2, g] - centre[2]
+        n = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
+        _terms(degree, x * n, y * n, z * n, value, slope)
+        for channel in range(3):
+            total = 0.5
+            for k in range(terms):
+                total += sh[k, channel, g] * value[k]
+            colour[channel, g] = max(total, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def colour_from_sh_backward(  # type: ignore[no-untyped-def]
+    thread, threads, degree, centre, state, sh, colour, v_colour, v_sh, v_state
+):
+    """Write v_sh [K, 3, N]; add the direction's share to v_state[0:3]."""
+    terms = (degree + 1) * (degree + 1)
+    value, slope, v_direction = np.empty(terms), np.empty((terms, 3)), np.empty(3)
+    count = state.shape[1]
+    for g in range(count * thread // threads, count * (thread + 1) // threads):
+        x, y, z = state[0, g] - centre[0], state[1, g] - centre[1], state[2, g] - centre[2]
+        n = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
+        x, y, z = x * n, y * n, z * n
+        _terms(degree, x, y, z, value, slope)
+        v_direction[:] = 0.0
+        for channel in range(3):
+            gradient = v_colour[channel, g] if colour[channel, g] > 0.0 else np.float32(0.0)
+            for k in range(terms):
+                v_sh[k, channel, g] = gradient * value[k]
+                for axis in range(3):
+                    v_direction[axis] += gradient * sh[k, channel, g] * slope[k, axis]
+        along = v_direction[0] * x + v_direction[1] * y + v_direction[2] * z
+        v_state[0, g] += n * (v_direction[0] - along * x)
+        v_state[1, g] += n * (v_direction[1] - along * y)
+        v_state[2, g] += n * (v_direction[2] - along * z)

@@ -1,0 +1,168 @@
+"""The fused training step: deform, project, bin, blend with loss and gradients, then Adam on every parameter.
+
+N Gaussians (padded to whole vectors), K spherical-harmonic coefficients, rows of N floats.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from worker.deformation import FlexibleDeformation, SharedBasis
+from worker.gaussians import Gaussians
+from worker.optimize import StepRates, adam_step_size
+from worker.raster.cpu import harmonics, update
+from worker.raster.cpu.motion import motion_of
+from worker.raster.cpu.rasterizer import Floats, Rasterizer, Target, padded
+from worker.raster.cpu.threads import run
+
+PAD_LOGIT = -30.0
+"""Opacity logit of the columns that only fill the last vector: never drawn."""
+C0 = harmonics.C0
+
+
+@dataclass(frozen=True)
+class StepSums:
+    """Sums over the tissue pixels of one step, before its update."""
+
+    colour_l1: float
+    depth_l1: float
+    squared_error: float
+    holes: float
+
+
+class FusedModel:
+    """Canonical Gaussians, their deformation and Adam's moments, trained a frame at a time on the CPU."""
+
+    def __init__(self, gaussians: Gaussians, deformation: SharedBasis | FlexibleDeformation, width: int, height: int):
+        self.count = len(gaussians)
+        columns = padded(self.count)
+        canonical = torch.cat([gaussians.mean, gaussians.quaternion, gaussians.log_scale], 1).numpy()
+        self.canonical = np.zeros((10, columns), np.float32)
+        self.canonical[3] = 1.0
+        self.canonical[:, : self.count] = canonical.T
+        self.opacity_logit = np.full(columns, PAD_LOGIT, np.float32)
+        self.opacity_logit[: self.count] = gaussians.opacity_logit.numpy()
+        self.sh = np.zeros((gaussians.sh.shape[1], 3, columns), np.float32)
+        self.sh[:, :, : self.count] = gaussians.sh.permute(1, 2, 0).numpy()
+        self.sh_degree = gaussians.sh_degree  # of those stored; a schedule may use fewer
+        self.motion = motion_of(deformation, columns)
+        self.rasterizer = Rasterizer(width, height)
+        self._moments = {name: np.zeros((2, *a.shape), np.float32) for name, a in self._parameters().items()}
+        self._allocate()
+
+    def _parameters(self) -> dict[str, Floats]:
+        return {"canonical": self.canonical, "opacity_logit": self.opacity_logit, "sh": self.sh}
+
+    def _allocate(self) -> None:
+        columns = self.canonical.shape[1]
+        self.state = np.zeros((10, columns), np.float32)
+        self.colour = np.zeros((3, columns), np.float32)
+        self._v_sh = np.zeros_like(self.sh)
+
+    def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
+        """The Gaussians at time t on this camera's image."""
+        self.motion.deform(self.canonical, t, self.state)
+        if sh_degree == 0:
+            np.multiply(self.sh[0], np.float32(C0), out=self.colour)
+            self.colour += np.float32(0.5)
+            np.maximum(self.colour, 0, out=self.colour)
+        else:
+            run(harmonics.colour_from_sh, sh_degree, _centre(camera), self.state, self.sh, self.colour)
+        self.rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
+
+    def render(self, camera: NDArray[np.float64], t: float) -> Floats:
+        """R G B Z A, [5, H, W]; a view that the next render overwrites."""
+        self.project(camera, t, self.sh_degree)
+        return self.rasterizer.render()
+
+    def step(
+        self,
+        camera: NDArray[np.float64],
+        t: float,
+        target: Target,
+        loss_settings: Floats,
+        rates: StepRates,
+        iteration: int,
+        sh_degree: int = 0,
+    ) -> StepSums:
+        """One iteration (counted from 1) on one frame; sh_degree: the harmonics in use at this iteration."""
+        self.project(camera, t, sh_degree)
+        gradients = self.rasterizer.loss_backward(target, loss_settings)
+        if sh_degree == 0:
+            np.multiply(gradients.colour, np.float32(C0), out=self._v_sh[0])
+            self._v_sh[0] *= self.colour > 0
+        else:
+            run(
+                harmonics.colour_from_sh_backward, sh_degree, _centre(camera), self.state, self.sh, self.colour,
+                gradients.colour, self._v_sh, gradients.state,
+            )  # fmt: skip
+        self.motion.update(gradients.state, t, rates, iteration)
+        canonical, moments = self.canonical, self._moments["canonical"]
+        for rows, rate in ((slice(0, 3), rates.mean), (slice(3, 7), rates.quaternion), (slice(7, 10), rates.log_scale)):
+            _adam(canonical[rows], gradients.state[rows], moments[:, rows], rate, rates.eps, iteration)
+        opacity_moments = self._moments["opacity_logit"]
+        _adam(self.opacity_logit, gradients.opacity_logit, opacity_moments, rates.opacity, rates.eps, iteration)
+        sh_moments, terms = self._moments["sh"], (sh_degree + 1) ** 2
+        _adam(self.sh[0], self._v_sh[0], sh_moments[:, 0], rates.colour, rates.eps, iteration)
+        if terms > 1:
+            rest = slice(1, terms)
+            _adam(self.sh[rest], self._v_sh[rest], sh_moments[:, rest], rates.sh_rest, rates.eps, iteration)
+        colour_l1, depth_l1, squared_error, holes = self.rasterizer.statistics.sum(0, dtype=np.float64).tolist()
+        return StepSums(colour_l1, depth_l1, squared_error, holes)
+
+    def take(self, columns: NDArray[np.int64], fresh: NDArray[np.bool_]) -> None:
+        """Keep these Gaussians, in this order (repeats are copies); Adam's moments start at 0 where fresh."""
+        count = len(columns)
+        fill = padded(count) - count
+        columns = np.concatenate([columns, np.zeros(fill, np.int64)])
+        fresh = np.concatenate([fresh, np.ones(fill, np.bool_)])
+        for name, values in self._parameters().items():
+            setattr(self, name, np.ascontiguousarray(values[..., columns]))
+            self._moments[name] = np.where(fresh, np.float32(0), self._moments[name][..., columns])
+        self.motion.take(columns, fresh)
+        self.opacity_logit[count:] = PAD_LOGIT
+        self.count = count
+        self._allocate()
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything a resumed run needs, by name; views of the live arrays."""
+        moments = {f"moments.{name}": values for name, values in self._moments.items()}
+        return {**self._parameters(), **moments, **self.motion.arrays()}
+
+    def load_arrays(self, stored: dict[str, np.ndarray]) -> None:
+        """Put back what arrays() gave, into a model of the same size."""
+        for name, values in self.arrays().items():
+            if stored[name].shape != values.shape:
+                raise ValueError(f"{name} has shape {stored[name].shape}, this model needs {values.shape}")
+            values[...] = stored[name]
+
+    def export(self) -> tuple[Gaussians, SharedBasis | FlexibleDeformation]:
+        """The Gaussians and their deformation as torch tensors (copies)."""
+        canonical = torch.from_numpy(np.ascontiguousarray(self.canonical[:, : self.count].T))
+        gaussians = Gaussians(
+            canonical[:, 0:3].contiguous(),
+            canonical[:, 3:7].contiguous(),
+            canonical[:, 7:10].contiguous(),
+            torch.from_numpy(self.opacity_logit[: self.count].copy()),
+            torch.from_numpy(np.ascontiguousarray(self.sh[:, :, : self.count].transpose(2, 0, 1))),
+        )
+        return gaussians, self.motion.export(self.count)
+
+
+def _centre(camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    pose = camera[6:].reshape(3, 4)
+    return np.asarray(-pose[:, :3].T @ pose[:, 3])
+
+
+def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, eps: float, iteration: int) -> None:
+    if rate == 0.0:
+        return
+    size, floor = adam_step_size(rate, eps, iteration)
+    run(
+        update.adam, value.reshape(-1), gradient.reshape(-1), moments[0].reshape(-1), moments[1].reshape(-1),
+        np.float32(size), np.float32(floor),
+    )  # fmt: skip

@@ -1,0 +1,149 @@
+"""The deformation of the fused step: shared bases or FDM, with Adam's moments beside the weights.
+
+N Gaussians (padded), B bases, C = 10 channels, rows of N floats.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from worker.deformation import FlexibleDeformation, SharedBasis
+from worker.optimize import StepRates, adam_step_size
+from worker.raster.cpu import update
+from worker.raster.cpu.rasterizer import Floats
+from worker.raster.cpu.threads import run
+
+CHANNELS = update.CHANNELS
+NEGLIGIBLE = 1e-3
+"""A shared basis below this at t is neither evaluated nor trained in that step."""
+
+
+class Motion(Protocol):
+    """A deformation the fused step can evaluate and train."""
+
+    def deform(self, canonical: Floats, t: float, state: Floats) -> None:
+        """state [10, N] = canonical + psi(t)."""
+
+    def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
+        """One Adam step of the weights that reach t, given dL/dstate at t. iteration counts from 1."""
+
+    def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
+        """Keep these columns, in this order; moments start at 0 where fresh."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything that must be stored to resume, by name; views."""
+
+    def export(self, count: int) -> SharedBasis | FlexibleDeformation:
+        """The first count Gaussians' deformation as torch tensors (copies)."""
+
+
+def _channel_rates(rates: StepRates) -> Floats:
+    return np.repeat(
+        np.array([rates.motion_mean, rates.motion_quaternion, rates.motion_log_scale], np.float32), [3, 4, 3]
+    )
+
+
+class SharedMotion:
+    """Fixed bases common to all Gaussians; only the weights of those alive at t are read or written in a step.
+
+    Adam's moments of a weight advance only in steps that use it, with its own count of them.
+    """
+
+    def __init__(self, deformation: SharedBasis, columns: int) -> None:
+        count, _, bases = deformation.weight.shape
+        self.centre = deformation.centre.numpy().astype(np.float64)
+        self.width = deformation.width.numpy().astype(np.float64)
+        self.weight = np.zeros((bases, CHANNELS, columns), np.float32)
+        self.weight[:, :, :count] = deformation.weight.permute(2, 1, 0).numpy()
+        self.first, self.second = np.zeros_like(self.weight), np.zeros_like(self.weight)
+        self.steps = np.zeros(bases, np.int64)
+
+    def _alive(self, t: float) -> tuple[Floats, int, int]:
+        values = np.exp(-((t - self.centre) ** 2) / (2 * self.width**2)).astype(np.float32)
+        alive = np.flatnonzero(values >= NEGLIGIBLE)
+        return (values, int(alive[0]), int(alive[-1]) + 1) if alive.size else (values, 0, 0)
+
+    def deform(self, canonical: Floats, t: float, state: Floats) -> None:
+        values, first, last = self._alive(t)
+        run(update.deform_shared, canonical, self.weight, values, first, last, state)
+
+    def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
+        values, first, last = self._alive(t)
+        self.steps[first:last] += 1
+        channel_rates = _channel_rates(rates)
+        rate, eps = np.zeros((2, len(self.centre), CHANNELS), np.float32)
+        for j in range(first, last):
+            size, floor = adam_step_size(1.0, rates.eps, int(self.steps[j]))
+            rate[j], eps[j] = channel_rates * size, floor
+        run(update.update_shared, self.weight, self.first, self.second, v_state, values, first, last, rate, eps)
+
+    def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
+        self.weight = np.ascontiguousarray(self.weight[:, :, columns])
+        self.first = np.where(fresh, np.float32(0), self.first[:, :, columns])
+        self.second = np.where(fresh, np.float32(0), self.second[:, :, columns])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        names = ("centre", "width", "weight", "first", "second", "steps")
+        return {f"motion.{name}": getattr(self, name) for name in names}
+
+    def export(self, count: int) -> SharedBasis:
+        weight = torch.from_numpy(np.ascontiguousarray(self.weight[:, :, :count].transpose(2, 1, 0)))
+        centre, width = (torch.from_numpy(a.astype(np.float32)) for a in (self.centre, self.width))
+        return SharedBasis(weight, centre, width)
+
+
+class FdmMotion:
+    """The paper's FDM: weight, centre and width of every basis learnable a Gaussian and channel; dense Adam."""
+
+    def __init__(self, deformation: FlexibleDeformation, columns: int) -> None:
+        self.form = deformation.form
+        self.weight, self.centre, self.width = (
+            _columns_last(tensor, columns, fill)
+            for tensor, fill in ((deformation.weight, 0.0), (deformation.centre, 0.5), (deformation.width, 1.0))
+        )
+        self.first = np.zeros((3, *self.weight.shape), np.float32)
+        self.second = np.zeros_like(self.first)
+
+    def deform(self, canonical: Floats, t: float, state: Floats) -> None:
+        quartic = self.form == "quartic"
+        run(update.deform_fdm, canonical, self.weight, self.centre, self.width, np.float32(t), quartic, state)
+
+    def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
+        size, floor = adam_step_size(rates.motion_mean, rates.eps, iteration)
+        run(
+            update.update_fdm, self.weight, self.centre, self.width, self.first, self.second, v_state,
+            np.float32(t), self.form == "quartic", np.float32(size), np.float32(floor),
+        )  # fmt: skip
+
+    def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
+        for name in ("weight", "centre", "width"):
+            setattr(self, name, np.ascontiguousarray(getattr(self, name)[..., columns]))
+        self.first = np.where(fresh, np.float32(0), self.first[..., columns])
+        self.second = np.where(fresh, np.float32(0), self.second[..., columns])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {f"motion.{name}": getattr(self, name) for name in ("weight", "centre", "width", "first", "second")}
+
+    def export(self, count: int) -> FlexibleDeformation:
+        tensors = (
+            torch.from_numpy(np.ascontiguousarray(a[..., :count].transpose(2, 0, 1)))
+            for a in (self.weight, self.centre, self.width)
+        )
+        return FlexibleDeformation(*tensors, form=self.form)
+
+
+def _columns_last(tensor: torch.Tensor, columns: int, fill: float) -> Floats:
+    """[N, 10, B] tensor as [10, B, columns] rows."""
+    rows = np.full((*tensor.shape[1:], columns), fill, np.float32)
+    rows[..., : tensor.shape[0]] = tensor.permute(1, 2, 0).numpy()
+    return rows
+
+
+def motion_of(deformation: SharedBasis | FlexibleDeformation, columns: int) -> SharedMotion | FdmMotion:
+    """The trainable form of a deformation, padded to columns Gaussians."""
+    if isinstance(deformation, SharedBasis):
+        return SharedMotion(deformation, columns)
+    return FdmMotion(deformation, columns)

@@ -1,0 +1,163 @@
+"""One image size, one set of buffers: project, bin, blend and their gradients by the kernels of this folder.
+
+N Gaussians (a multiple of LANES, see padded), M slots, H W pixels. All arrays are NumPy, rows of N (project.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from worker.raster import Camera
+from worker.raster.cpu import bins, project
+from worker.raster.cpu.blend import COTANGENT, LOSS, PLANE, PLANES, RENDER, STATISTICS, blend
+from worker.raster.cpu.simd import LANES
+from worker.raster.cpu.threads import THREADS, run
+
+Floats = NDArray[np.float32]
+
+
+def padded(count: int) -> int:
+    """The next multiple of LANES: rows of N are processed LANES at a time."""
+    return -(-count // LANES) * LANES
+
+
+def camera_vector(camera: Camera) -> NDArray[np.float64]:
+    """fx, fy, cx, cy, W, H and camera_from_world [3, 4] row-major, as the kernels read a camera."""
+    given = camera.camera_from_world
+    matrix = given.detach().double().numpy() if isinstance(given, torch.Tensor) else given
+    pose = np.asarray(matrix, np.float64)[:3].ravel()
+    return np.concatenate([[camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], pose])
+
+
+@dataclass
+class Target:
+    """What a rendered frame is compared with, padded to whole tiles; one row of TrainingTargets."""
+
+    rgb: NDArray[np.uint8]  # [3 * H * stride]
+    weight: NDArray[np.uint8]  # [H * stride], 255 = tissue
+    inverse_depth: Floats  # [H * stride], 1 / units, 0 = none
+
+
+@dataclass
+class Gradients:
+    """dL/d of every Gaussian's deformed state, opacity logit and colour; |dL/dmean2d| in NDC; dL/d camera_from_world."""
+
+    state: Floats  # [10, N]
+    opacity_logit: Floats  # [N]
+    colour: Floats  # [3, N]
+    mean2d_norm: Floats  # [N]
+    pose: NDArray[np.float64]  # [THREADS, 12], to be summed
+
+
+class Rasterizer:
+    """Buffers for one image size; they grow with the scene and are reused from step to step. Not thread-safe."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.width, self.height = width, height
+        self.tiles_x, tiles_y = -(-width // LANES), -(-height // bins.TILE_ROWS)
+        self.tiles = self.tiles_x * tiles_y
+        self.stride = self.tiles_x * LANES
+        self.image = np.zeros(5 * height * self.stride, np.float32)
+        self.statistics = np.zeros((self.tiles, STATISTICS), np.float32)
+        self._planes = np.zeros((THREADS, PLANES * PLANE), np.float32)
+        self._trail = np.zeros((THREADS, 0), np.float32)
+        self._tile_start = np.zeros(self.tiles + 1, np.int64)
+        self._no_target = Target(np.zeros(1, np.uint8), np.zeros(1, np.uint8), np.zeros(1, np.float32))
+        self._allocate_gaussians(0)
+        self._allocate_slots(0)
+
+    def _allocate_gaussians(self, count: int) -> None:
+        self.splats = np.zeros((count, project.SPLAT), np.float32)
+        self.radius2 = np.full(count, -1.0, np.float32)
+        self.slot_start = np.zeros(count + 1, np.int64)
+        self._slot_count = np.zeros(count, np.int32)
+        self._order = np.zeros((2, count), np.int32)
+        self._keys = np.zeros((2, count), np.uint32)
+        self.gradients = Gradients(
+            np.zeros((10, count), np.float32),
+            np.zeros(count, np.float32),
+            np.zeros((3, count), np.float32),
+            np.zeros(count, np.float32),
+            np.zeros((THREADS, 12)),
+        )
+
+    def _allocate_slots(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._slot_splat = np.zeros(capacity, np.int32)
+        self._slot_tile = np.zeros(capacity, np.int32)
+        self._slot_rows = np.zeros((capacity, 2), np.int16)
+        self._tile_slots = np.zeros(capacity, np.int32)
+        self._slots = np.zeros((capacity, project.GRADIENT), np.float32)
+
+    def project(
+        self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats
+    ) -> None:
+        """Splats of this camera, their tiles and depth order. camera: camera_vector; state [10, N], colour [3, N]."""
+        count = state.shape[1]
+        if self.splats.shape[0] != count:
+            self._allocate_gaussians(count)
+        self._camera, self._state, self._opacity_logit = camera, state, opacity_logit
+        run(project.project, camera, state, opacity_logit, colour, self.splats, self.radius2)
+        run(bins.count_slots, self.splats, self.radius2, self.height, self.tiles_x, self._slot_count)
+        np.cumsum(self._slot_count, out=self.slot_start[1:])
+        self.slot_total = int(self.slot_start[-1])
+        if self.slot_total > self._capacity:
+            self._allocate_slots(self.slot_total + self.slot_total // 4)
+        m = self.slot_total
+        run(
+            bins.fill_slots, self.splats, self.radius2, self.height, self.tiles_x,
+            self.slot_start, self._slot_splat, self._slot_tile, self._slot_rows,
+        )  # fmt: skip
+        visible = bins.depth_order(
+            self.splats, self.radius2, self._order[0], self._keys[0], self._order[1], self._keys[1]
+        )
+        bins.sort_into_tiles(
+            self._order[1], visible, self.slot_start, self._slot_tile[:m], self._tile_start, self._tile_slots
+        )
+
+    def _reserve_trail(self) -> None:
+        """Room for the alphas and weights of the fullest tile, one such room a thread."""
+        rows = bins.most_rows(self._slot_rows, self._tile_start, self._tile_slots)
+        if self._trail.shape[1] < rows * 2 * LANES:
+            self._trail = np.zeros((THREADS, rows * 2 * LANES * 5 // 4), np.float32)
+
+    def _blend(self, mode: int, target: Target, loss_settings: Floats, image: Floats) -> None:
+        run(
+            blend, mode, self.width, self.height, self.tiles_x, self.splats, self._slot_splat, self._slot_rows,
+            self._tile_start, self._tile_slots, self._trail, self._planes, self._slots, self.statistics,
+            target.rgb, target.weight, target.inverse_depth, loss_settings, image,
+        )  # fmt: skip
+
+    def render(self) -> Floats:
+        """R G B Z A of the projected splats, [5, H, W]; a view of a buffer the next render overwrites."""
+        self._blend(RENDER, self._no_target, _NO_LOSS, self.image)
+        return self.image.reshape(5, self.height, self.stride)[:, :, : self.width]
+
+    def loss_backward(self, target: Target, loss_settings: Floats) -> Gradients:
+        """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums a tile."""
+        self._reserve_trail()
+        self._blend(LOSS, target, loss_settings, self.image)
+        return self._parameters_backward()
+
+    def cotangent_backward(self, cotangents: Floats) -> Gradients:
+        """Gradients of sum(cotangents * image), cotangents [5, H, W]."""
+        self._reserve_trail()
+        padded_cotangents = np.zeros((5, self.height, self.stride), np.float32)
+        padded_cotangents[:, :, : self.width] = cotangents
+        self._blend(COTANGENT, self._no_target, _NO_LOSS, padded_cotangents.ravel())
+        return self._parameters_backward()
+
+    def _parameters_backward(self) -> Gradients:
+        out = self.gradients
+        run(
+            project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,
+            self.slot_start, self._slots, out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
+        )  # fmt: skip
+        return out
+
+
+_NO_LOSS = np.zeros(5, np.float32)

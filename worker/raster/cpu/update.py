@@ -1,0 +1,132 @@
+"""Deformation and Adam: the per-parameter half of a training step.
+
+N Gaussians padded to a multiple of LANES, B bases, C = 10 channels (mean 0:3, quaternion 3:7, log-scale 7:10). Rows of N
+floats everywhere, so that a vector is LANES Gaussians. Adam (Kingma and Ba 2015) with bias correction folded into the
+step: rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and eps scaled alike.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from worker.raster.cpu.simd import LANES, exp2, fma, load, splat, sqrt, store, where_less
+
+CHANNELS = 10
+BETA1, BETA2 = np.float32(0.9), np.float32(0.999)
+_REST1, _REST2 = np.float32(0.1), np.float32(0.001)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_HALF_LOG2E = np.float32(0.5 * 1.4426950408889634)
+_LOG2E = np.float32(1.4426950408889634)
+MIN_WIDTH = np.float32(1e-3)
+"""Smallest |sigma| of a basis, in model time."""
+QUARTIC_FLOOR = np.float32(1e-4)
+"""Added to sigma^2 in the released form of the basis."""
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _adam(value, first, second, i, gradient, rate, eps):  # type: ignore[no-untyped-def]
+    """One Adam step on LANES parameters at value[i]; first and second are the moments."""
+    m = fma(splat(BETA1), load(first, i), splat(_REST1) * gradient)
+    v = fma(splat(BETA2), load(second, i), splat(_REST2) * gradient * gradient)
+    store(first, i, m)
+    store(second, i, v)
+    store(value, i, load(value, i) - rate * m / (sqrt(v) + eps))
+
+
+@njit(cache=True, nogil=True)
+def adam(thread, threads, value, gradient, first, second, rate, eps):  # type: ignore[no-untyped-def]
+    """Adam on flat arrays whose length is a multiple of LANES."""
+    vectors = value.shape[0] // LANES
+    for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
+        _adam(value, first, second, k * LANES, load(gradient, k * LANES), splat(rate), splat(eps))
+
+
+@njit(cache=True, nogil=True)
+def deform_shared(thread, threads, canonical, weight, basis, first, last, state):  # type: ignore[no-untyped-def]
+    """state [10, N] = canonical + sum over j in [first, last) of basis[j] weight[j]; weight [B, 10, N]."""
+    vectors = canonical.shape[1] // LANES
+    for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
+        i = k * LANES
+        for c in range(CHANNELS):
+            total = load(canonical[c], i)
+            for j in range(first, last):
+                total = fma(splat(basis[j]), load(weight[j, c], i), total)
+            store(state[c], i, total)
+
+
+@njit(cache=True, nogil=True)
+def update_shared(  # type: ignore[no-untyped-def]
+    thread, threads, weight, first_moment, second_moment, v_state, basis, first, last, rate, eps
+):
+    """Adam on the weights of the bases [first, last); rate, eps [B, 10]. dL/dw_j = dL/dpsi basis_j."""
+    vectors = v_state.shape[1] // LANES
+    for j in range(first, last):
+        for c in range(CHANNELS):
+            if rate[j, c] == _ZERO:
+                continue
+            step, floor, value = splat(rate[j, c]), splat(eps[j, c]), splat(basis[j])
+            for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
+                i = k * LANES
+                gradient = value * load(v_state[c], i)
+                _adam(weight[j, c], first_moment[j, c], second_moment[j, c], i, gradient, step, floor)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _basis(t, centre, width, quartic):  # type: ignore[no-untyped-def]
+    """Value of a basis at t, and its logarithmic derivatives to centre and width.
+
+    gaussian: exp(-d^2 / (2 s^2)), d = t - centre;  quartic: exp(-(d^2 / (s^2 + QUARTIC_FLOOR))^2).
+    """
+    zero = splat(_ZERO)
+    d = t - centre
+    if quartic:
+        spread = fma(width, width, splat(QUARTIC_FLOOR))
+        ratio = d * d / spread
+        value = exp2(zero - splat(_LOG2E) * ratio * ratio)
+        slope = splat(np.float32(4.0)) * ratio / spread
+        return value, slope * d, slope * ratio * width
+    size = where_less(width, zero, zero - width, width)
+    low = splat(MIN_WIDTH)
+    bounded = where_less(size, low, low, size)
+    inverse = splat(_ONE) / bounded
+    along = d * inverse
+    value = exp2(zero - splat(_HALF_LOG2E) * along * along)
+    sign = where_less(width, zero, splat(-_ONE), splat(_ONE))
+    free = where_less(size, low, zero, sign)  # no gradient through the floor
+    return value, along * inverse, along * along * inverse * free
+
+
+@njit(cache=True, nogil=True)
+def deform_fdm(thread, threads, canonical, weight, centre, width, t, quartic, state):  # type: ignore[no-untyped-def]
+    """state [10, N] = canonical + FDM at t; weight, centre, width [10, B, N] (Deform3DGS, equations 3 and 4)."""
+    vectors = canonical.shape[1] // LANES
+    time = splat(t)
+    for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
+        i = k * LANES
+        for c in range(CHANNELS):
+            total = load(canonical[c], i)
+            for j in range(weight.shape[1]):
+                value, _, _ = _basis(time, load(centre[c, j], i), load(width[c, j], i), quartic)
+                total = fma(load(weight[c, j], i), value, total)
+            store(state[c], i, total)
+
+
+@njit(cache=True, nogil=True)
+def update_fdm(  # type: ignore[no-untyped-def]
+    thread, threads, weight, centre, width, first_moment, second_moment, v_state, t, quartic, rate, eps
+):
+    """Adam on weight, centre and width of every basis; moments [3, 10, B, N]."""
+    vectors = v_state.shape[1] // LANES
+    time, step, floor = splat(t), splat(rate), splat(eps)
+    for c in range(CHANNELS):
+        for j in range(weight.shape[1]):
+            for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
+                i = k * LANES
+                gradient = load(v_state[c], i)
+                value, by_centre, by_width = _basis(time, load(centre[c, j], i), load(width[c, j], i), quartic)
+                gradient = gradient * value
+                scaled = gradient * load(weight[c, j], i)
+                _adam(weight[c, j], first_moment[0, c, j], second_moment[0, c, j], i, gradient, step, floor)
+                _adam(centre[c, j], first_moment[1, c, j], second_moment[1, c, j], i, scaled * by_centre, step, floor)
+                _adam(width[c, j], first_moment[2, c, j], second_moment[2, c, j], i, scaled * by_width, step, floor)
