@@ -1,0 +1,141 @@
+"""Scenes for rasteriser tests, the backends under test, and the pixels no float32 backend can be held to.
+
+Symbols: N Gaussians, H W pixels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera, Rendered, reference
+
+Rasterize = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Camera], Rendered]
+
+BACKENDS: dict[str, Rasterize] = {"reference": reference.rasterize}
+"""Every backend by name; each computes in the dtype it is given, and all are tested in float32."""
+
+NAMES = ("mean", "quaternion", "scale", "opacity", "colour")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The arguments of rasterize."""
+
+    mean: Tensor
+    quaternion: Tensor
+    scale: Tensor
+    opacity: Tensor
+    colour: Tensor
+    camera: Camera
+
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        return self.mean, self.quaternion, self.scale, self.opacity, self.colour
+
+    def render(self, rasterize: Rasterize = reference.rasterize) -> Rendered:
+        return rasterize(*self.tensors(), self.camera)
+
+    def to(self, dtype: torch.dtype) -> Scene:
+        """In another precision; the camera stays float64."""
+        return dataclasses.replace(self, **{name: getattr(self, name).to(dtype) for name in NAMES})
+
+    def rows(self, index: Tensor) -> Scene:
+        """The Gaussians index, in that order."""
+        return dataclasses.replace(self, **{name: getattr(self, name)[index] for name in NAMES})
+
+    def differentiable(self) -> Scene:
+        """Copies that ask for gradients, the camera's pose among them."""
+        leaves = {name: getattr(self, name).detach().clone().requires_grad_() for name in NAMES}
+        pose = torch.tensor(np.asarray(self.camera.camera_from_world)).requires_grad_()
+        return dataclasses.replace(self, camera=dataclasses.replace(self.camera, camera_from_world=pose), **leaves)
+
+    def leaves(self) -> dict[str, Tensor]:
+        """What can be differentiated, by name."""
+        pose = self.camera.camera_from_world
+        assert isinstance(pose, Tensor)
+        return {**{name: getattr(self, name) for name in NAMES}, "camera_from_world": pose}
+
+
+def tilted_pose() -> NDArray[np.float64]:
+    """A rigid camera_from_world that is nothing special: every entry matters."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", [0.2, -0.15, 0.3]).as_matrix()
+    pose[:3, 3] = [1.5, -2.0, 3.0]
+    return pose
+
+
+def camera(width: int, height: int, pose: NDArray[np.float64] | None = None) -> Camera:
+    """About 65 degrees wide, unequal focal lengths, the principal point off the middle."""
+    return Camera(
+        fx=0.80 * width,
+        fy=0.84 * width,
+        cx=0.48 * width,
+        cy=0.53 * height,
+        width=width,
+        height=height,
+        camera_from_world=tilted_pose() if pose is None else pose,
+    )
+
+
+def random_scene(count: int, *, width: int, height: int, seed: int = 0, pixels: float = 2.0) -> Scene:
+    """Gaussians in and around the image at distinct depths, float64: faint and opaque, thin and wide, any orientation.
+
+    Args:
+        pixels: standard deviation on the image of an average Gaussian.
+    """
+    random = np.random.default_rng(seed)
+    view = camera(width, height)
+    depth = random.permutation(np.linspace(40.0, 80.0, count))
+    column = random.uniform(-0.25 * width, 1.25 * width, count)
+    row = random.uniform(-0.25 * height, 1.25 * height, count)
+    scale = random.lognormal(0.0, 0.5, (count, 3)) * (pixels * depth / view.fx)[:, None]
+    return Scene(
+        mean=torch.tensor(unproject(view, column, row, depth)),
+        quaternion=torch.tensor(random.normal(size=(count, 4))),
+        scale=torch.tensor(scale),
+        opacity=torch.tensor(random.choice([0.05, 0.4, 0.999], count) * random.uniform(0.9, 1.0, count)),
+        colour=torch.tensor(random.uniform(-0.2, 1.4, (count, 3))),
+        camera=view,
+    )
+
+
+def unproject(
+    view: Camera, column: NDArray[np.float64], row: NDArray[np.float64], depth: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """World points [N, 3] seen at continuous image positions (column, row) and camera z depth."""
+    in_camera = np.stack([(column - view.cx) / view.fx * depth, (row - view.cy) / view.fy * depth, depth], axis=1)
+    pose = np.asarray(view.camera_from_world)
+    return np.asarray((in_camera - pose[:3, 3]) @ pose[:3, :3])
+
+
+def pixels_near_a_cut(scene: Scene, *, alpha_margin: float = 1e-5, stop_margin: float = 1e-6) -> NDArray[np.bool_]:
+    """[H, W] bool: pixels where a Gaussian comes so near a threshold that rounding decides on which side it falls.
+
+    Thresholds: alpha at MIN_ALPHA and at MAX_ALPHA (within alpha_margin), transmittance at MIN_TRANSMITTANCE (within
+    stop_margin).
+    """
+    exact = scene.to(torch.float64)
+    projected = reference.project(*exact.tensors()[:4], scene.camera)
+    i, j = np.mgrid[0.5 : scene.camera.height, 0.5 : scene.camera.width]
+    near = np.zeros(i.shape, bool)
+    transmittance = np.ones(i.shape)
+    mean2d, conic = projected.mean2d.detach().numpy(), projected.conic.detach().numpy()
+    opacity = projected.opacity.detach().numpy()
+    for g in np.argsort(projected.depth.detach().numpy(), kind="stable"):
+        if not projected.visible[g]:
+            continue
+        dx, dy = j - mean2d[g, 0], i - mean2d[g, 1]
+        a, b, c = conic[g]
+        raw = opacity[g] * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+        near |= (abs(raw - MIN_ALPHA) < alpha_margin) | (abs(raw - MAX_ALPHA) < alpha_margin)
+        alpha = np.where(raw >= MIN_ALPHA, np.minimum(raw, MAX_ALPHA), 0.0)
+        near |= (alpha > 0) & (abs(transmittance - MIN_TRANSMITTANCE) < stop_margin)
+        transmittance *= np.where(transmittance >= MIN_TRANSMITTANCE, 1 - alpha, 1.0)
+    return near
