@@ -1,0 +1,167 @@
+"""What a clip's pairs share, measured on a few of them: the shift between the eyes' rows and the disparities in use.
+
+Symbols: H W pixels of one eye; d disparity, x_left - x_right in px; dy = y_right - y_left of matching points in px.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.errors import InputError
+from worker.stereo.matching import DISPARITY_STEPS, Grey, padded, semi_global_matcher, shift_rows
+
+FEATURE_WIDTH = 700  # features are found on images at most this wide: larger ones cost time and place them no better
+FEATURES = 1500
+RATIO = 0.8  # Lowe's ratio test
+MAX_SEARCHED_SHIFT_PX = 48.0  # matches farther apart in y are wrong
+MIN_MATCHES = 20
+WORTH_CORRECTING_PX = 0.2  # resampling for less blurs more than it mends
+MAX_CORRECTION_PX = 8.0  # beyond it the calibration belongs to other frames
+SWAPPED_SHARE = 0.8
+COARSE_WIDTH = 176  # px; wide enough for tissue, and a search of every disparity costs milliseconds
+NEAREST_MM = 12.0  # an endoscope that close sees nothing sharp
+WIDEST_DISPARITY = 0.6  # of the width: less overlap than that gives no depth worth having
+RANGE_PERCENTILES = (0.5, 99.5)
+RANGE_MARGIN_PX, RANGE_MARGIN = 3.0, 0.1  # the sampled frames do not show every disparity of the clip
+
+
+@dataclass(frozen=True)
+class RowShift:
+    """Median dy of inlier matches, what is left of |dy| after removing it, and how many matches say so."""
+
+    shift_px: float
+    residual_px: float
+    matches: int
+
+    @property
+    def correction_px(self) -> float:
+        """How far the right eye's rows are moved; 0 where it is not worth it or not known."""
+        worth_it = self.matches >= MIN_MATCHES and abs(self.shift_px) >= WORTH_CORRECTING_PX
+        return self.shift_px if worth_it else 0.0
+
+
+def feature_matches(left: Grey, right: Grey) -> NDArray[np.float64]:
+    """[M, 4] x_left, y_left, x_right, y_right of SIFT matches that pass the ratio test and lie on similar rows."""
+    scale = min(1.0, FEATURE_WIDTH / left.shape[1])
+    finder = cv2.SIFT.create(nfeatures=FEATURES)
+    found = []
+    for image in (left, right):
+        small = image if scale == 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        found.append(finder.detectAndCompute(small, None))
+    (left_points, left_features), (right_points, right_features) = found
+    if left_features is None or right_features is None or len(right_points) < 2:
+        return np.zeros((0, 4))
+    rows = [
+        (*left_points[best.queryIdx].pt, *right_points[best.trainIdx].pt)
+        for best, second in cv2.BFMatcher(cv2.NORM_L2).knnMatch(left_features, right_features, k=2)
+        if best.distance < RATIO * second.distance
+    ]
+    matches: NDArray[np.float64] = np.array(rows, dtype=np.float64).reshape(-1, 4) / scale
+    near: NDArray[np.float64] = matches[np.abs(matches[:, 3] - matches[:, 1]) <= MAX_SEARCHED_SHIFT_PX]
+    return near
+
+
+def measure_row_shift(matches: NDArray[np.float64], infinity_px: float) -> RowShift:
+    """The shift between the eyes' rows from matches [M, 4] of several frames.
+
+    infinity_px is the disparity of a point infinitely far away; real points lie above it.
+
+    Raises:
+        InputError: the eyes look swapped, or their rows differ by more than this project corrects.
+    """
+    dy = matches[:, 3] - matches[:, 1]
+    disparity_px = matches[:, 0] - matches[:, 2]
+    if len(dy) < MIN_MATCHES:
+        return RowShift(0.0, 0.0, 0)
+    centre = _densest(dy)
+    spread = np.median(np.abs(dy[np.abs(dy - centre) < 3.0] - centre))
+    inliers = np.abs(dy - centre) < max(1.5, 4 * float(spread))
+    shift = RowShift(
+        shift_px=float(np.median(dy[inliers])),
+        residual_px=float(np.median(np.abs(dy[inliers] - np.median(dy[inliers])))),
+        matches=int(inliers.sum()),
+    )
+    if shift.matches < max(MIN_MATCHES, len(dy) // 4):
+        return RowShift(0.0, 0.0, 0)
+    _check_eyes(disparity_px[inliers] - infinity_px)
+    if abs(shift.shift_px) > MAX_CORRECTION_PX:
+        raise InputError(
+            "calibration",
+            f"after rectification the rows of left and right differ by {shift.shift_px:.1f} px; "
+            f"at most {MAX_CORRECTION_PX:.0f} can be corrected.",
+            "Give the calibration that was made for this recording, and frames that were not cropped.",
+        )
+    return shift
+
+
+def choose_range(
+    pairs: Sequence[tuple[Grey, Grey]], row_shift_px: float, infinity_px: float, focal_baseline_px_mm: float
+) -> tuple[float, float]:
+    """The disparities (low, high) in px that the clip needs, from a coarse search of all of them on a few pairs.
+
+    Raises:
+        InputError: no pair has matching points.
+    """
+    height, width = pairs[0][0].shape
+    scale = min(1.0, COARSE_WIDTH / width)
+    size = (round(width * scale), round(height * scale))
+    widest = min(focal_baseline_px_mm / NEAREST_MM, WIDEST_DISPARITY * width)
+    low = int(np.floor(infinity_px * scale))
+    count = 16 * max(1, int(np.ceil(widest * scale / 16)))
+    found = []
+    for left, right in pairs:
+        small = [
+            cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, shift_rows(right, row_shift_px))
+        ]
+        found.append(_consistent_disparities(small[0], small[1], low, count) / scale)
+    disparities = np.concatenate(found)
+    if disparities.size < 0.02 * size[0] * size[1] * len(pairs):
+        raise InputError(
+            "clip",
+            "left and right have hardly a matching point.",
+            "Check that both eyes show the same scene at the same time, in focus, and that the layout is right.",
+        )
+    near_low, near_high = np.percentile(disparities, RANGE_PERCENTILES)
+    margin = RANGE_MARGIN_PX + RANGE_MARGIN * (near_high - near_low)
+    return max(float(near_low - margin), infinity_px), float(near_high + margin)
+
+
+def _densest(values: NDArray[np.float64]) -> float:
+    """Centre of the fullest 2 px window: a robust start when most matches are wrong."""
+    ordered = np.sort(values)
+    counts = np.searchsorted(ordered, ordered + 2.0, side="right") - np.arange(len(ordered))
+    first = int(np.argmax(counts))
+    return float(np.median(ordered[first : first + counts[first]]))
+
+
+def _check_eyes(beyond_infinity_px: NDArray[np.float64]) -> None:
+    """Refuse pairs whose points lie behind the cameras: swapped eyes, or one eye shown twice."""
+    if float(np.mean(beyond_infinity_px <= 0)) < SWAPPED_SHARE:
+        return
+    raise InputError(
+        "clip",
+        f"matching points have a median disparity of {float(np.median(beyond_infinity_px)):.1f} px relative to "
+        "infinity, which places them behind the cameras.",
+        "Left and right are probably swapped, or both eyes show the same picture: swap them or check the layout.",
+    )
+
+
+def _consistent_disparities(left: Grey, right: Grey, low: int, count: int) -> NDArray[np.float64]:
+    """Disparities (px of these images) on which both matching directions agree, at textured, lit pixels."""
+    wide_left, wide_right, pad = padded(left, right, low, count)
+    matcher = semi_global_matcher(low, count)
+    columns = slice(pad, pad + left.shape[1])
+    one = matcher.compute(wide_left, wide_right)[:, columns] / DISPARITY_STEPS
+    other = cv2.ximgproc.createRightMatcher(matcher).compute(wide_right, wide_left)[:, columns]
+    other = -other / DISPARITY_STEPS
+    x_right = np.rint(np.arange(left.shape[1]) - one).astype(np.int64)
+    seen = (x_right >= 0) & (x_right < left.shape[1])
+    back = np.take_along_axis(other, np.clip(x_right, 0, left.shape[1] - 1), axis=1)
+    textured = cv2.boxFilter(np.abs(cv2.Sobel(left, cv2.CV_32F, 1, 0)), -1, (5, 5)) > 8.0
+    agreed: NDArray[np.float64] = one[seen & textured & (np.abs(one - back) <= 1.0)]
+    return agreed

@@ -1,0 +1,175 @@
+"""Depth of every frame of a rectified clip.
+
+Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. depth_mm = fx baseline_mm / (d - offset).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.errors import Cancelled, InputError
+from worker.calibration import RectifiedClip
+from worker.clip.types import DepthClip
+from worker.hooks import Hooks, Progress
+from worker.stereo.alignment import RowShift, choose_range, feature_matches, measure_row_shift
+from worker.stereo.matching import Grey, MatchPlan, match
+
+STAGE = "stereo"
+DECODING_SHARE, MEASURING_SHARE = 0.15, 0.05  # of the stage's progress
+SAMPLED_PAIRS = 5
+MIN_CONFIDENCE = 16  # of 255: below it a depth is a guess
+MAX_DEPTH_MM = 400.0  # beyond it an endoscope's disparity is a fraction of a pixel
+WARN_SHIFT_PX = 0.5
+WARN_VALID_SHARE = 0.5
+
+
+def estimate_depth(clip: RectifiedClip, hooks: Hooks | None = None) -> DepthClip:
+    """Depth and confidence of every frame; the eyes' row shift is measured, corrected up to 8 px, and reported.
+
+    `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| left after the correction),
+    min_disparity_px and max_disparity_px (the range searched) and depth_valid_share (of tissue pixels).
+
+    Raises:
+        InputError: no depth anywhere, the eyes look swapped, or their rows differ by more than 8 px.
+        Cancelled: hooks.should_stop said so.
+    """
+    hooks = Hooks() if hooks is None else hooks
+    rgb, right = _decode(clip, hooks)
+    focal_baseline = clip.intrinsics.fx * clip.baseline_mm
+    depth_mm = np.zeros(rgb.shape[:3], np.float32)
+    confidence = np.zeros(rgb.shape[:3], np.uint8)
+    with _worker_threads() as run:
+        shift, plan = _plan(clip, rgb, right, run)
+        hooks.on_progress(Progress(STAGE, DECODING_SHARE + MEASURING_SHARE))
+
+        def work(i: int) -> None:
+            disparity, trust = match(_grey(rgb[i]), right[i], plan)
+            depth_mm[i], confidence[i] = _to_depth(disparity, trust, focal_baseline, clip.disparity_offset_px)
+
+        for done, _ in enumerate(run(work, range(clip.frame_count)), start=1):
+            _check_stop(hooks)
+            start = DECODING_SHARE + MEASURING_SHARE
+            hooks.on_progress(Progress(STAGE, start + (1 - start) * done / clip.frame_count))
+    valid_share = _valid_share(depth_mm, clip.tissue)
+    return DepthClip(
+        rgb=rgb,
+        tissue=np.ascontiguousarray(clip.tissue),
+        depth_mm=depth_mm,
+        depth_confidence=confidence,
+        intrinsics=clip.intrinsics,
+        world_from_camera=np.tile(np.eye(4), (clip.frame_count, 1, 1)),
+        frame_times_s=clip.frame_times_s,
+        assumptions=clip.assumptions,
+        warnings=clip.warnings + _warnings(shift, valid_share),
+        measurements={
+            "vertical_misalignment_px": shift.shift_px,
+            "vertical_residual_px": shift.residual_px,
+            "vertical_matches": float(shift.matches),
+            "min_disparity_px": plan.min_disparity_px,
+            "max_disparity_px": plan.max_disparity_px,
+            "depth_valid_share": valid_share,
+        },
+    )
+
+
+def _decode(clip: RectifiedClip, hooks: Hooks) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Left frames [T, H, W, 3] and right frames in grey [T, H, W]: one pass over the source, all that is kept of it."""
+    shape = (clip.frame_count, clip.intrinsics.height, clip.intrinsics.width)
+    rgb = np.empty((*shape, 3), np.uint8)
+    right = np.empty(shape, np.uint8)
+    decoded = 0
+    for i, (left_frame, right_frame) in enumerate(clip.pairs()):
+        if i >= clip.frame_count:
+            break
+        _check_stop(hooks)
+        rgb[i], right[i] = left_frame, _grey(right_frame)
+        decoded = i + 1
+        hooks.on_progress(Progress(STAGE, DECODING_SHARE * decoded / clip.frame_count))
+    if decoded < clip.frame_count:
+        raise InputError("clip", f"it ended after {decoded} of {clip.frame_count} frames.", "Give the whole recording.")
+    return rgb, right
+
+
+def _plan(
+    clip: RectifiedClip, rgb: NDArray[np.uint8], right: NDArray[np.uint8], run: Callable[..., Iterator[object]]
+) -> tuple[RowShift, MatchPlan]:
+    """Row shift and disparity range, from a few pairs spread over the clip."""
+    sampled = np.unique(np.linspace(0, clip.frame_count - 1, SAMPLED_PAIRS).round().astype(int))
+    pairs = [(_grey(rgb[i]), right[i]) for i in sampled]
+    matches = np.concatenate([np.asarray(found) for found in run(lambda pair: feature_matches(*pair), pairs)])
+    shift = measure_row_shift(matches, clip.disparity_offset_px)
+    low, high = choose_range(
+        pairs, shift.correction_px, clip.disparity_offset_px, clip.intrinsics.fx * clip.baseline_mm
+    )
+    return shift, MatchPlan(low, high, shift.correction_px)
+
+
+def _to_depth(
+    disparity_px: NDArray[np.float32], confidence: NDArray[np.uint8], focal_baseline: float, offset_px: float
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Depth in mm, 0 where it is invalid, and the confidence, 0 at the same pixels."""
+    beyond_infinity_px = disparity_px - np.float32(offset_px)
+    valid = (confidence >= MIN_CONFIDENCE) & (beyond_infinity_px > focal_baseline / MAX_DEPTH_MM)
+    depth_mm = np.where(valid, focal_baseline / np.where(valid, beyond_infinity_px, 1.0), 0.0)
+    return depth_mm.astype(np.float32), np.where(valid, confidence, 0).astype(np.uint8)
+
+
+def _valid_share(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) -> float:
+    """Share of tissue pixels with depth.
+
+    Raises:
+        InputError: there is none.
+    """
+    valid = sum(int(np.count_nonzero(depth[mask])) for depth, mask in zip(depth_mm, tissue, strict=True))
+    if valid == 0:
+        raise InputError(
+            "clip",
+            "no pixel of tissue has a valid depth.",
+            "Check focus, that left and right belong together, and that the calibration and masks fit the frames.",
+        )
+    return valid / int(np.count_nonzero(tissue))
+
+
+def _warnings(shift: RowShift, valid_share: float) -> tuple[str, ...]:
+    found = []
+    if shift.matches == 0:
+        found.append("too few matching features to measure the vertical misalignment of the eyes: taken as 0")
+    elif abs(shift.shift_px) >= WARN_SHIFT_PX:
+        found.append(
+            f"rows of left and right differed by {shift.shift_px:+.2f} px (corrected, {shift.residual_px:.2f} px "
+            "remain): the calibration does not fit this recording exactly"
+        )
+    if valid_share < WARN_VALID_SHARE:
+        found.append(f"only {valid_share:.0%} of tissue has stereo depth")
+    return tuple(found)
+
+
+def _check_stop(hooks: Hooks) -> None:
+    if hooks.should_stop():
+        raise Cancelled("stopped while estimating depth")
+
+
+def _grey(rgb: NDArray[np.uint8]) -> Grey:
+    grey: Grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    return grey
+
+
+@contextmanager
+def _worker_threads() -> Iterator[Callable[..., Iterator[object]]]:
+    """A map over one thread a core, in order; OpenCV's own threads rest meanwhile (a pair a thread measured faster)."""
+    before = cv2.getNumThreads()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    pool = ThreadPoolExecutor(cores, thread_name_prefix=STAGE)
+    cv2.setNumThreads(1)
+    try:
+        yield pool.map
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        cv2.setNumThreads(before)
