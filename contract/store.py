@@ -84,7 +84,8 @@ class Store:
         return folder
 
     def publish_scene(self, job_id: str, attempt: int) -> Path:
-        """Make the attempt's folder the job's scene."""
+        """Make the attempt's folder the job's scene, in place of one that an attempt published and could not report."""
+        shutil.rmtree(self._folder("scenes", job_id), ignore_errors=True)
         return _publish(self._folder("work", job_id, suffix=f".{attempt}"), self._folder("scenes", job_id))
 
     def scene_folder(self, job_id: str) -> Path:
@@ -103,15 +104,15 @@ class Store:
         folders = [entry for entry in (self.data_dir / "scenes").iterdir() if (entry / MANIFEST).is_file()]
         return [entry.name for entry in sorted(folders, key=lambda entry: entry.stat().st_mtime, reverse=True)]
 
-    def remove_work(self, job_id: str) -> None:
-        """Remove what attempts have written and not published."""
-        for folder in (self.data_dir / "work").glob(f"{self._checked(job_id)}.*"):
-            shutil.rmtree(folder, ignore_errors=True)
+    def remove_attempt(self, job_id: str, attempt: int) -> None:
+        """Remove what one attempt has written and not published."""
+        shutil.rmtree(self._folder("work", job_id, suffix=f".{attempt}"), ignore_errors=True)
 
     def remove_clip(self, job_id: str) -> None:
         """Remove the job's clip and all unpublished work on it."""
         shutil.rmtree(self._folder("spool", job_id), ignore_errors=True)
-        self.remove_work(job_id)
+        for folder in (self.data_dir / "work").glob(f"{job_id}.*"):
+            shutil.rmtree(folder, ignore_errors=True)
 
     def remove(self, job_id: str) -> None:
         """Remove clip, work and scene."""

@@ -1,0 +1,51 @@
+"""create_app: the HTTP face. Routes parse, make one call and return; nothing here computes an image."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI
+from fastapi.staticfiles import StaticFiles
+
+from contract.queue import Queue
+from contract.settings import Settings
+from contract.store import Store
+from service import jobs, renders, scenes, system
+from service.deps import Deps
+from service.guard import LOOPBACK_NAMES, Guard
+from service.problems import install_handlers
+from service.renderer import Renderer
+from service.version import version
+
+DESCRIPTION = (
+    "A stereo endoscope clip goes in, a dynamic model of the tissue answers renders at any time and pose. "
+    "Research use only; not a medical device."
+)
+
+
+def create_app(settings: Settings, queue: Queue, store: Store, renderer: Renderer) -> FastAPI:
+    """The application; it takes over `queue` and `renderer` and closes them when it ends."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        yield
+        await renderer.close()
+        queue.close()
+
+    app = FastAPI(
+        title="intrasplat",
+        version=version(),
+        description=DESCRIPTION,
+        docs_url=None,  # they would load scripts from a CDN
+        redoc_url=None,
+        lifespan=lifespan,
+    )
+    app.state.deps = Deps(settings, queue, store, renderer)
+    app.add_middleware(Guard, hosts=LOOPBACK_NAMES | {settings.host})
+    install_handlers(app)
+    for router in (jobs.router, renders.router, scenes.router, system.router):
+        app.include_router(router)
+    if settings.dashboard_dir is not None:
+        app.mount("/", StaticFiles(directory=settings.dashboard_dir, html=True), name="dashboard")
+    return app

@@ -1,0 +1,83 @@
+"""Whether the service lives, whether it can work, and what it is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter
+from pydantic import BaseModel
+from starlette.responses import JSONResponse
+
+from contract import CONTRACT_VERSION
+from contract.errors import UnavailableError
+from contract.rendering import ImageFormat, Layer
+from service.deps import Deps, Services
+from service.problems import Problem
+from service.renderer import WORKER_REMEDY
+from service.upload import SUFFIXES
+from service.version import version
+
+router = APIRouter(tags=["system"])
+
+
+class Readiness(BaseModel):
+    """What a ready service has."""
+
+    ready: bool = True
+    workers: list[str]
+    devices: list[str]
+    free_bytes: int
+
+
+@router.get("/healthz", operation_id="healthz")
+def healthz() -> dict[str, bool]:
+    """The process answers; nothing more."""
+    return {"alive": True}
+
+
+@router.get("/readyz", operation_id="readyz", response_model=Readiness)
+def readyz(services: Services) -> Readiness | JSONResponse:
+    """200 if a clip sent now would be trained: the queue answers, a worker is ready, the disk has room."""
+    trouble = _trouble(services)
+    if trouble is not None:
+        return trouble.response()
+    workers = services.queue.workers()
+    return Readiness(
+        workers=[worker.name for worker in workers],
+        devices=[worker.device for worker in workers],
+        free_bytes=services.store.free_bytes(),
+    )
+
+
+@router.get("/info", operation_id="info")
+def info(services: Services) -> dict[str, Any]:
+    """Version, limits and accepted formats."""
+    settings = services.settings
+    return {
+        "name": "intrasplat",
+        "version": version(),
+        "contract_version": CONTRACT_VERSION,
+        "notice": "Research use only. Not a medical device.",
+        "limits": {
+            "max_upload_bytes": settings.max_upload_bytes,
+            "max_render_pixels": settings.max_render_pixels,
+            "min_free_bytes": settings.min_free_bytes,
+        },
+        "accepts": {part: list(suffixes) for part, suffixes in SUFFIXES.items()},
+        "layers": [layer.value for layer in Layer],
+        "formats": [format.value for format in ImageFormat],
+    }
+
+
+def _trouble(services: Deps) -> Problem | None:
+    """The first reason why work would not get done now."""
+    try:
+        services.queue.ping()
+        workers = services.queue.workers()
+    except UnavailableError as error:
+        return Problem(503, error.problem, field="queue", remedy=error.remedy)
+    if not workers:
+        return Problem(503, "No worker is ready yet.", field="worker", remedy=f"Wait for it. {WORKER_REMEDY}")
+    if services.store.free_bytes() < services.settings.min_free_bytes:
+        return Problem(503, "The disk is nearly full.", field="disk", remedy="Delete scenes or give it more room.")
+    return None

@@ -1,0 +1,215 @@
+"""A multipart upload, streamed to disk part by part while it is counted and hashed; never held in memory."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import BinaryIO
+
+from python_multipart.exceptions import MultipartParseError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.concurrency import run_in_threadpool
+
+from contract.errors import InputError, LimitError
+from contract.job import JobFiles
+from service.problems import Problem
+
+CLIP_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".zip")
+SUFFIXES = {
+    "clip": CLIP_SUFFIXES,
+    "left": CLIP_SUFFIXES,
+    "right": CLIP_SUFFIXES,
+    "calibration": (".json", ".yaml", ".yml", ".xml", ".ini"),
+    "masks": CLIP_SUFFIXES,
+}
+"""File parts and the endings they may have; the ending is all that is kept of the caller's file name."""
+
+OPTIONS = "options"
+MAX_OPTIONS_BYTES = 64 * 1024
+MAX_CALIBRATION_BYTES = 16 * 2**20
+MAX_HEADER_BYTES = 8 * 1024
+FORM_REMEDY = "Send multipart/form-data with clip, or left and right, and optionally calibration, masks and options."
+
+
+@dataclass
+class Received:
+    """What arrived: stored names by part, digests by part, and the options as text."""
+
+    names: dict[str, str] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)
+    options: str = "{}"
+    total_bytes: int = 0
+
+    def files(self) -> JobFiles:
+        """The parts by their role.
+
+        Raises:
+            InputError: there is no clip, or both ways of giving one, or one eye only.
+        """
+        given = set(self.names)
+        if "clip" in given and given & {"left", "right"}:
+            raise InputError("clip", "it came together with left or right.", "Send either clip, or left and right.")
+        if "clip" not in given:
+            for eye, other in (("left", "right"), ("right", "left")):
+                if eye not in given:
+                    problem = f"there is {other} but no {eye}." if other in given else "there is no clip."
+                    raise InputError(eye if other in given else "clip", problem, FORM_REMEDY)
+        return JobFiles(
+            clip=self.names.get("clip") or self.names["left"],
+            right=self.names.get("right"),
+            calibration=self.names.get("calibration"),
+            masks=self.names.get("masks"),
+        )
+
+    def sha256(self) -> str:
+        """Of the clip; of the two digests in hexadecimal, left first, when there are two files."""
+        if "clip" in self.digests:
+            return self.digests["clip"]
+        return hashlib.sha256((self.digests["left"] + self.digests["right"]).encode()).hexdigest()
+
+
+async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: Path, limit_bytes: int) -> Received:
+    """Write the parts of a multipart body into folder.
+
+    Raises:
+        Problem: 400, the body is not the multipart form it should be.
+        InputError: an unknown, repeated or empty part, or an ending that is not accepted.
+        LimitError: more than limit_bytes, counted as they come.
+    """
+    kind, parameters = parse_options_header(content_type)
+    if kind != b"multipart/form-data" or not parameters.get(b"boundary"):
+        raise Problem(400, f"The content type is {content_type[:80]!r}.", field="Content-Type", remedy=FORM_REMEDY)
+    receiver = _Receiver(parameters[b"boundary"], folder, limit_bytes)
+    try:
+        async for chunk in body:
+            await run_in_threadpool(receiver.write, chunk)
+        return receiver.finish()
+    except MultipartParseError as error:
+        raise Problem(400, f"The multipart body is malformed: {error}", remedy=FORM_REMEDY) from error
+    finally:
+        receiver.close()
+
+
+class _Receiver:
+    """The parser's callbacks, and the one part that is being received."""
+
+    def __init__(self, boundary: bytes, folder: Path, limit_bytes: int) -> None:
+        self._folder = folder
+        self._limit_bytes = limit_bytes
+        self._received = Received()
+        self._ended = False
+        self._header_name = b""
+        self._header_value = b""
+        self._headers: dict[bytes, bytes] = {}
+        self._part = ""
+        self._part_bytes = 0
+        self._file: BinaryIO | None = None
+        self._digest = hashlib.sha256()
+        self._options = b""
+        self._parser = MultipartParser(
+            boundary,
+            {
+                "on_part_begin": self._on_part_begin,
+                "on_header_field": self._on_header_field,
+                "on_header_value": self._on_header_value,
+                "on_header_end": self._on_header_end,
+                "on_headers_finished": self._on_headers_finished,
+                "on_part_data": self._on_part_data,
+                "on_part_end": self._on_part_end,
+                "on_end": self._on_end,
+            },
+        )
+
+    def write(self, chunk: bytes) -> None:
+        """Take the next piece of the body."""
+        self._received.total_bytes += len(chunk)
+        if self._received.total_bytes > self._limit_bytes:
+            problem = f"the upload is larger than {self._limit_bytes} bytes."
+            raise LimitError("clip", problem, "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES.")
+        self._parser.write(chunk)
+
+    def finish(self) -> Received:
+        """What was received, once the body has ended as it should."""
+        self._parser.finalize()
+        if not self._ended:
+            raise Problem(400, "The body ended before its last boundary.", remedy="Send the upload again.")
+        return self._received
+
+    def close(self) -> None:
+        """Let go of a file that was cut short."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _on_part_begin(self) -> None:
+        self._headers = {}
+        self._part_bytes = 0
+
+    def _on_header_field(self, data: bytes, start: int, end: int) -> None:
+        self._header_name += data[start:end]
+        self._check_header()
+
+    def _on_header_value(self, data: bytes, start: int, end: int) -> None:
+        self._header_value += data[start:end]
+        self._check_header()
+
+    def _on_header_end(self) -> None:
+        self._headers[self._header_name.lower()] = self._header_value
+        self._header_name = self._header_value = b""
+
+    def _check_header(self) -> None:
+        if len(self._header_name) + len(self._header_value) > MAX_HEADER_BYTES:
+            raise Problem(400, "A part's header is too long.", remedy=FORM_REMEDY)
+
+    def _on_headers_finished(self) -> None:
+        _, parameters = parse_options_header(self._headers.get(b"content-disposition", b""))
+        part = parameters.get(b"name", b"").decode("utf-8", "replace")
+        if part != OPTIONS and part not in SUFFIXES:
+            raise InputError(part[:40] or "clip", "there is no such part.", FORM_REMEDY)
+        if part in self._received.names or (part == OPTIONS and self._options):
+            raise InputError(part, "it came twice.", "Send each part once.")
+        self._part = part
+        if part != OPTIONS:
+            self._open_file(part, parameters.get(b"filename", b"").decode("utf-8", "replace"))
+
+    def _open_file(self, part: str, filename: str) -> None:
+        suffix = PurePosixPath(filename).suffix.lower()
+        if suffix not in SUFFIXES[part]:
+            accepted = ", ".join(SUFFIXES[part])
+            raise InputError(part, f"a file that ends in {suffix[:20]!r} is not accepted.", f"Send {accepted}.")
+        name = part + suffix
+        self._file = (self._folder / name).open("xb")
+        self._digest = hashlib.sha256()
+        self._received.names[part] = name
+
+    def _on_part_data(self, data: bytes, start: int, end: int) -> None:
+        self._part_bytes += end - start
+        limit_bytes = {OPTIONS: MAX_OPTIONS_BYTES, "calibration": MAX_CALIBRATION_BYTES}.get(self._part)
+        if limit_bytes is not None and self._part_bytes > limit_bytes:
+            raise LimitError(self._part, f"it is larger than {limit_bytes} bytes.", "Send a smaller one.")
+        piece = data[start:end]
+        if self._file is None:
+            self._options += piece
+        else:
+            self._file.write(piece)
+            self._digest.update(piece)
+
+    def _on_part_end(self) -> None:
+        if self._file is None:
+            try:
+                self._received.options = self._options.decode()
+            except UnicodeDecodeError:
+                raise InputError(OPTIONS, "it is not UTF-8 text.", "Send a JSON object.") from None
+            return
+        if self._part_bytes == 0:
+            raise InputError(self._part, "the file is empty.", "Send a file with content.")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self.close()
+        self._received.digests[self._part] = self._digest.hexdigest()
+
+    def _on_end(self) -> None:
+        self._ended = True

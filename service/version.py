@@ -1,0 +1,14 @@
+"""The installed version of intrasplat."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as installed_version
+
+
+def version() -> str:
+    """Of the installed distribution; "0+unknown" in a tree that was not installed."""
+    try:
+        return installed_version("intrasplat")
+    except PackageNotFoundError:
+        return "0+unknown"
