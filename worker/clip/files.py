@@ -1,8 +1,8 @@
 """A folder, a zip or a single image as one flat list of named files, read in memory.
 
 Archives come from strangers: members are never written under their own names, and everything that could reach outside
-(absolute paths, "..", links), hide its content (encryption, nested archives, duplicates, overlaps) or outgrow the limits
-is refused.
+(absolute paths, "..", links), hide its content (encryption, nested archives, duplicates, overlaps) or outgrow the
+limits is refused.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ Side = Literal["left", "right"]
 
 _SIDES: dict[str, Side] = {"l": "left", "left": "left", "r": "right", "right": "right"}
 _FOLDER = re.compile(r"(left|right)", re.IGNORECASE)
+_WORD_ALONE = re.compile(r"(?P<side>left|right)(?P<frame>)", re.IGNORECASE)
 _WORD_AT_END = re.compile(r"(?P<frame>.+?)[_\-. ](?P<side>left|right|l|r)", re.IGNORECASE)
 _LETTER_AFTER_DIGIT = re.compile(r"(?P<frame>.*\d)(?P<side>left|right|l|r)", re.IGNORECASE)
 _WORD_AT_START = re.compile(r"(?P<side>left|right|l|r)[_\-. ]?(?P<frame>\d.*|(?<=[_\-. ]).+)", re.IGNORECASE)
@@ -88,7 +89,7 @@ def check_aligned(field: str, names: tuple[str, ...], others: tuple[str, ...]) -
 
 
 def _by_stem(stem: str) -> tuple[Side, str] | None:
-    for pattern in (_WORD_AT_END, _LETTER_AFTER_DIGIT, _WORD_AT_START):
+    for pattern in (_WORD_ALONE, _WORD_AT_END, _LETTER_AFTER_DIGIT, _WORD_AT_START):
         if found := pattern.fullmatch(stem):
             return _SIDES[found["side"].lower()], found["frame"]
     return None

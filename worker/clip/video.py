@@ -27,7 +27,11 @@ from worker.clip.files import FileTree, scratch_folder
 from worker.clip.limits import ClipLimits
 from worker.clip.types import RgbFrame
 
-DECODERS = ("h264", "hevc", "vp9")
+DECODERS: dict[str, tuple[bytes, ...]] = {  # decoder: how containers name its codec
+    "h264": (b"avc1", b"avc3", b"V_MPEG4/ISO/AVC"),
+    "hevc": (b"hvc1", b"hev1", b"V_MPEGH/ISO/HEVC"),
+    "vp9": (b"vp09", b"V_VP9"),
+}
 MISSING_FRAMES_ALLOWED = 1  # containers that store a duration instead of a count round it
 FALLBACK_RATE_HZ = 30.0
 
@@ -35,6 +39,7 @@ _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm"
 _REMEDY = "Give H.264, HEVC or VP9 video in mp4, mov, mkv or webm."
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
+_SILENT = 0  # OpenCV's own messages
 _QUIET = "-8"  # AV_LOG_QUIET: what a refused decoder says is not for the user
 _environment_lock = threading.Lock()  # OpenCV takes these options from the environment only, which the process shares
 
@@ -92,11 +97,13 @@ def open_video(path: Path, field: str, limits: ClipLimits, label: str | None = N
     label = label or path.name
     if not _has_container_magic(path):
         raise InputError(field, f"{label} is not an mp4, mov, mkv or webm file.", _REMEDY)
-    for decoder in DECODERS:
+    names = _codec_names(path)
+    # the order only saves failed attempts: what a file says of itself does not choose the decoder
+    for decoder in sorted(DECODERS, key=lambda decoder: not any(sign in names for sign in DECODERS[decoder])):
         with _capture(path, decoder) as capture:
             if capture is not None:
                 return _survey(capture, path, field, limits, label, decoder)
-    codec = _other_codec(path)
+    codec = next((codec for sign, codec in _OTHER_CODECS.items() if sign in names), None)
     if codec is not None:
         raise InputError(field, f"{label} is encoded as {codec}, which is not accepted.", _REMEDY)
     raise InputError(
@@ -156,10 +163,13 @@ def _capture(path: Path, decoder: str) -> Iterator[Any | None]:
     options = f"protocol_whitelist;file|format_whitelist;{_CONTAINERS}|codec_whitelist;{decoder}|video_codec;{decoder}"
     with _environment_lock:
         before = {name: os.environ.get(name) for name in (_OPTIONS, _LOG_LEVEL)}
+        log_level = cv2.utils.logging.getLogLevel()
         os.environ.update({_OPTIONS: options, _LOG_LEVEL: before[_LOG_LEVEL] or _QUIET})
+        cv2.utils.logging.setLogLevel(_SILENT)
         try:
             capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         finally:
+            cv2.utils.logging.setLogLevel(log_level)
             for name, value in before.items():
                 if value is None:
                     os.environ.pop(name, None)
@@ -178,13 +188,12 @@ def _has_container_magic(path: Path) -> bool:
     return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip") or head.startswith(b"\x1aE\xdf\xa3")
 
 
-def _other_codec(path: Path) -> str | None:
-    """Name of a codec we do not decode, when the container mentions one."""
+def _codec_names(path: Path) -> bytes:
+    """The parts of the file in which containers name their codecs."""
     with path.open("rb") as stream:
-        text = stream.read(_CODEC_SCAN_BYTES)
+        head = stream.read(_CODEC_SCAN_BYTES)
         stream.seek(max(0, path.stat().st_size - _CODEC_SCAN_BYTES))
-        text += stream.read(_CODEC_SCAN_BYTES)
-    return next((name for sign, name in _OTHER_CODECS.items() if sign in text), None)
+        return head + stream.read(_CODEC_SCAN_BYTES)
 
 
 def _cut_short(field: str, label: str, found: int, declared: int) -> InputError:
