@@ -1,7 +1,8 @@
 # `make help` lists what there is. Needs Python 3.11 or newer, make and pip; everything else goes into .venv.
 #
 #   TORCH_INDEX  package index for torch alone, e.g. https://download.pytorch.org/whl/cpu (small, no GPU);
-#                empty: pip's own index, which on Linux is usually a CUDA build of several GB
+#                empty: pip's own index, which on Linux is usually a CUDA build of several GB;
+#                to change the build later, `make clean` first
 #   PYTHON       the interpreter that makes .venv (default: the first of python3, python3.13, 3.12, 3.11 that is new enough)
 
 SHELL := /bin/bash
@@ -27,7 +28,8 @@ setup: $(STAMP) ## make .venv and install everything into it (TORCH_INDEX=URL ch
 
 $(STAMP): pyproject.toml constraints.txt
 	@if [ -z "$(PYTHON)" ] || ! "$(PYTHON)" -c '$(NEW_ENOUGH)'; then \
-		echo "setup: Python 3.11 or newer is needed; found: $$(python3 --version 2>&1). Install one, or name it: make setup PYTHON=/path/to/python3.12" >&2; exit 1; fi
+		echo "setup: Python 3.11 or newer is needed; $(or $(PYTHON),python3) is: $$("$(or $(PYTHON),python3)" --version 2>&1)" >&2; \
+		echo "setup: install one, or name it: make setup PYTHON=/path/to/python3.12" >&2; exit 1; fi
 	@if ! $(BIN)/python -c '$(NEW_ENOUGH)' 2>/dev/null; then \
 		echo "setup: making $(VENV) with $$("$(PYTHON)" --version)"; \
 		"$(PYTHON)" -m venv --clear $(VENV) || { echo "setup: the venv module is incomplete; on Debian or Ubuntu: apt-get install python3-venv" >&2; exit 1; }; fi

@@ -18,7 +18,7 @@ USER intrasplat
 VOLUME /data
 # Compiled kernels are kept on the volume, so that a new container does not compile them again.
 ENV INTRASPLAT_DATA_DIR=/data \
-    NUMBA_CACHE_DIR=/data/numba \
+    INTRASPLAT_CACHE=/data/cache \
     PYTHONUNBUFFERED=1
 
-CMD ["python", "-m", "worker"]
+CMD ["python", "-m", "worker", "consume"]
