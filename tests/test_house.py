@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import re
 import subprocess
@@ -53,6 +54,19 @@ def test_the_tree_in_the_readme_names_only_what_exists() -> None:
             candidates = [""]
         missing += [folder + each for each in candidates if not (REPOSITORY / folder / each).exists()]
     assert missing == []
+
+
+def test_the_python_example_calls_only_what_the_client_offers() -> None:
+    readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"^```python\n(.*?)^```", readme, re.DOTALL | re.MULTILINE)
+    assert len(example.splitlines()) <= 20
+    offered = importlib.import_module("client").Client
+    called = {
+        node.attr
+        for node in ast.walk(ast.parse(example))
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "client"
+    }
+    assert [each for each in sorted(called) if not hasattr(offered, each)] == []
 
 
 def test_the_readme_says_it_is_no_medical_device() -> None:
