@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera, Rendered, reference
+from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera, Rendered, cpu, reference
 
 Rasterize = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Camera], Rendered]
 
-BACKENDS: dict[str, Rasterize] = {"reference": reference.rasterize}
-"""Every backend by name; each computes in the dtype it is given, and all are tested in float32."""
+BACKENDS: dict[str, Rasterize] = {"reference": reference.rasterize, "cpu": cpu.rasterize}
+"""Every backend by name, all tested in float32 (the reference too: it shows what float32 alone costs)."""
 
 NAMES = ("mean", "quaternion", "scale", "opacity", "colour")
 

@@ -1,0 +1,331 @@
+"""What the CPU backend has beyond the contract: reused buffers, the built-in loss, the fused training step, Adam.
+
+The gradients of a step are read from Adam's first moments, which after one step from zero are 0.1 of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tests.helpers import assert_close
+from tests.worker.raster.scenes import Scene, pixels_near_a_cut, random_scene
+from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
+from worker.gaussians import Gaussians
+from worker.optimize import StepRates
+from worker.raster import Camera
+from worker.raster.cpu import Rasterizer, Target, camera_vector, padded
+from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, SharedMotion, motion_of
+
+COLOUR_WEIGHT, DEPTH_WEIGHT = 0.7, 40.0
+COLOUR_ZONE, DEPTH_ZONE = 0.05, 1e-3
+"""Half-widths of the loss's quadratic zone: channels in [0, 1], and 1 / units."""
+RATES = StepRates(
+    mean=1e-3,
+    quaternion=2e-3,
+    log_scale=3e-3,
+    opacity=4e-3,
+    colour=5e-3,
+    sh_rest=6e-3,
+    motion_mean=7e-3,
+    motion_quaternion=8e-3,
+    motion_log_scale=9e-3,
+    eps=1e-15,
+)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One training frame, unpadded: rgb [H, W, 3] uint8, tissue [H, W] bool, inverse depth [H, W] with holes."""
+
+    rgb: NDArray[np.uint8]
+    tissue: NDArray[np.bool_]
+    inverse_depth: NDArray[np.float32]
+
+    def target(self, rasterizer: Rasterizer) -> Target:
+        """Padded to whole tiles; the padding holds values that would show if they were read."""
+        height, width = self.tissue.shape
+        shape = (height, rasterizer.stride)
+        rgb = np.full((3, *shape), 255, np.uint8)
+        weight = np.full(shape, 255, np.uint8)
+        inverse_depth = np.full(shape, 0.5, np.float32)
+        rgb[:, :, :width] = self.rgb.transpose(2, 0, 1)
+        weight[:, :width] = self.tissue * 255
+        weight[:, width:] = 0
+        inverse_depth[:, :width] = self.inverse_depth
+        return Target(rgb.ravel(), weight.ravel(), inverse_depth.ravel())
+
+
+def random_frame(camera: Camera, left_out: NDArray[np.bool_]) -> Frame:
+    random = np.random.default_rng(21)
+    shape = (camera.height, camera.width)
+    inverse_depth = random.uniform(1 / 90, 1 / 40, shape) * (random.uniform(size=shape) > 0.2)
+    return Frame(
+        rgb=random.integers(0, 256, (*shape, 3), dtype=np.uint8),
+        tissue=(random.uniform(size=shape) > 0.15) & ~left_out,
+        inverse_depth=inverse_depth.astype(np.float32),
+    )
+
+
+def loss_settings(normalised: bool) -> NDArray[np.float32]:
+    return np.array([COLOUR_WEIGHT, DEPTH_WEIGHT, 1 / COLOUR_ZONE, 1 / DEPTH_ZONE, normalised], np.float32)
+
+
+def torch_loss(scene: Scene, frame: Frame, normalised: bool) -> Tensor:
+    """The kernel's loss from its equation: Huber's on colour and on inverse depth, summed over tissue."""
+    rendered = scene.render()
+    tissue = torch.from_numpy(frame.tissue)
+    wanted = torch.from_numpy(frame.inverse_depth).double()
+    usable = tissue & (wanted > 0) & (rendered.alpha > 1e-2)
+    depth = torch.where(usable, rendered.depth, torch.ones_like(wanted))
+    inverse = (torch.where(usable, rendered.alpha, torch.ones_like(wanted)) if normalised else 1) / depth
+    colour = _huber(rendered.rgb - torch.from_numpy(frame.rgb).double() / 255, COLOUR_ZONE)
+    depth_loss = _huber(inverse - wanted, DEPTH_ZONE)
+    return COLOUR_WEIGHT * (colour * tissue[..., None]).sum() + DEPTH_WEIGHT * (depth_loss * usable).sum()
+
+
+def _huber(error: Tensor, zone: float) -> Tensor:
+    return torch.where(error.abs() < zone, error**2 / (2 * zone), error.abs() - zone / 2)
+
+
+def project_with(rasterizer: Rasterizer, scene: Scene) -> None:
+    """The scene's Gaussians onto its camera, as rows of padded columns."""
+    count = padded(len(scene.mean))
+
+    def rows(values: Tensor, fill: float) -> NDArray[np.float32]:
+        filled = np.full((values.shape[1], count), fill, np.float32)
+        filled[:, : len(values)] = values.T.numpy()
+        return filled
+
+    state = np.concatenate([rows(scene.mean, 0.0), rows(scene.quaternion, 1.0), rows(scene.scale.log(), 0.0)])
+    logit = rows(torch.logit(scene.opacity)[:, None], -30.0)[0]
+    rasterizer.project(camera_vector(scene.camera), state, logit, rows(scene.colour, 0.0))
+
+
+def outcome(rasterizer: Rasterizer, scene: Scene, frame: Frame) -> list[NDArray[np.float32]]:
+    """Copies of everything a render and a loss leave behind for the caller."""
+    project_with(rasterizer, scene)
+    image = rasterizer.render().copy()
+    gradients = rasterizer.loss_backward(frame.target(rasterizer), loss_settings(True))
+    parts = [getattr(gradients, field.name).copy() for field in dataclasses.fields(gradients)]
+    return [image, rasterizer.statistics.copy(), *parts]
+
+
+def assert_same_bits(actual: list[NDArray[np.float32]], expected: list[NDArray[np.float32]]) -> None:
+    for got, wanted in zip(actual, expected, strict=True):
+        assert got.shape == wanted.shape
+        assert bool((got == wanted).all()), f"{int((got != wanted).sum())} of {got.size} differ"
+
+
+def poison(rasterizer: Rasterizer) -> None:
+    """Fills every buffer with what no computation may read: NaN, and the largest integer."""
+    buffers = [each for each in vars(rasterizer).values() if isinstance(each, np.ndarray)]
+    buffers += [getattr(rasterizer.gradients, field.name) for field in dataclasses.fields(rasterizer.gradients)]
+    for each in buffers:
+        each.fill(np.nan if each.dtype.kind == "f" else np.iinfo(each.dtype).max)
+    rasterizer.slot_start[0] = 0  # the one entry that is set when it is made: nothing lies before the first slot
+
+
+def test_what_the_buffers_held_before_changes_nothing() -> None:
+    scene = random_scene(180, width=45, height=37, seed=30)
+    frame = random_frame(scene.camera, np.zeros((37, 45), bool))
+    expected = outcome(Rasterizer(45, 37), scene, frame)
+    used = Rasterizer(45, 37)
+    outcome(used, scene, frame)
+    poison(used)
+    assert_same_bits(outcome(used, scene, frame), expected)
+
+
+def test_a_rasterizer_that_saw_other_scenes_gives_the_same_bits() -> None:
+    scene = random_scene(60, width=45, height=37, seed=31)
+    larger = random_scene(500, width=45, height=37, seed=32, pixels=3.0)
+    frame = random_frame(scene.camera, np.zeros((37, 45), bool))
+    used = Rasterizer(45, 37)
+    outcome(used, larger, frame)
+    assert_same_bits(outcome(used, scene, frame), outcome(Rasterizer(45, 37), scene, frame))
+
+
+@pytest.mark.parametrize("normalised", [False, True], ids=["summed depth", "normalised depth"])
+def test_the_built_in_loss_has_the_gradients_of_its_equation(normalised: bool) -> None:
+    scene = random_scene(220, width=45, height=37, seed=33).to(torch.float32)
+    left_out = pixels_near_a_cut(scene)
+    frame = random_frame(scene.camera, left_out)
+    rasterizer = Rasterizer(45, 37)
+    project_with(rasterizer, scene)
+    got = rasterizer.loss_backward(frame.target(rasterizer), loss_settings(normalised))
+
+    live = scene.to(torch.float64).differentiable()
+    leaves = live.leaves()
+    gradients = torch.autograd.grad(torch_loss(live, frame, normalised), list(leaves.values()))
+    wanted = dict(zip(leaves, gradients, strict=True))
+    opacity, scale = live.opacity.detach(), live.scale.detach()
+    assert_close(got.state[0:3, :220].T, wanted["mean"], name="mean")
+    assert_close(got.state[3:7, :220].T, wanted["quaternion"], name="quaternion")
+    assert_close(got.state[7:10, :220].T, wanted["scale"] * scale, name="log_scale")
+    assert_close(got.opacity_logit[:220], wanted["opacity"] * opacity * (1 - opacity), name="opacity_logit")
+    assert_close(got.colour[:, :220].T, wanted["colour"], name="colour")
+    assert_close(got.pose.sum(0).reshape(3, 4), wanted["camera_from_world"][:3], name="camera_from_world")
+
+
+def test_the_loss_reports_its_sums_over_tissue() -> None:
+    scene = random_scene(220, width=45, height=37, seed=33).to(torch.float32)
+    frame = random_frame(scene.camera, pixels_near_a_cut(scene))
+    rasterizer = Rasterizer(45, 37)
+    project_with(rasterizer, scene)
+    rasterizer.loss_backward(frame.target(rasterizer), loss_settings(False))
+    rendered = scene.to(torch.float64).render()
+    error = (rendered.rgb.numpy() - frame.rgb / 255.0) * frame.tissue[..., None]
+    holes = (1 - rendered.alpha.numpy()) * frame.tissue
+    sums = rasterizer.statistics.sum(0, dtype=np.float64)
+    assert_close(sums[[0, 2, 3]], np.array([np.abs(error).sum(), (error**2).sum(), holes.sum()]), relative=1e-5)
+
+
+def moving_gaussians(kind: str, sh_degree: int) -> tuple[Gaussians, Deformation, Camera]:
+    """A scene of 90 Gaussians as the optimiser holds it, float32, every basis well alive at t = 0.4."""
+    scene = random_scene(90, width=37, height=33, seed=35)
+    random = torch.Generator().manual_seed(5)
+    sh = 0.1 * torch.randn(90, (sh_degree + 1) ** 2, 3, generator=random)
+    sh[:, 0] += 0.8
+    gaussians = Gaussians(
+        mean=scene.mean.float(),
+        quaternion=scene.quaternion.float(),
+        log_scale=scene.scale.log().float(),
+        opacity_logit=torch.logit(scene.opacity).float(),
+        sh=sh,
+    )
+    if kind == "shared":
+        shared = SharedBasis.initial(90, bases=5, width=0.3)
+        return gaussians, dataclasses.replace(shared, weight=_stirred(shared.weight, 0.05, random)), scene.camera
+    fdm = FlexibleDeformation.initial(90, bases=5, width=0.2, form="quartic" if kind == "fdm-quartic" else "gaussian")
+    moved = {name: _stirred(each, 0.05, random) for name, each in fdm.parameters().items()}
+    moved["width"][0, 0, 2] = 1e-4  # under the floor: no gradient in the paper's form
+    moved["width"][1, 0, 2] *= -1
+    return gaussians, dataclasses.replace(fdm, **moved), scene.camera  # type: ignore[arg-type]
+
+
+def _stirred(tensor: Tensor, amount: float, random: torch.Generator) -> Tensor:
+    return tensor + amount * torch.randn(tensor.shape, generator=random)
+
+
+@pytest.mark.parametrize(("kind", "sh_degree"), [("shared", 0), ("shared", 3), ("fdm-gaussian", 0), ("fdm-quartic", 1)])
+def test_a_fused_step_has_the_gradients_of_the_stages_one_by_one(kind: str, sh_degree: int) -> None:
+    t = 0.4
+    gaussians, deformation, camera = moving_gaussians(kind, sh_degree)
+    leaves = {name: each.double().requires_grad_() for name, each in gaussians.tensors().items()}
+    motion = {name: each.double().requires_grad_() for name, each in deformation.parameters().items()}
+    constants = {name: each.double() for name, each in deformation.constants().items()}
+    moved = dataclasses.replace(deformation, **motion, **constants).deform(Gaussians(**leaves), t)  # type: ignore[type-var]
+    scene = _scene_of(moved, camera)
+    frame = random_frame(camera, pixels_near_a_cut(scene))
+    everything = [*leaves.values(), *motion.values()]
+    gradients = torch.autograd.grad(torch_loss(scene, frame, True), everything)
+    wanted = dict(zip([*leaves, *motion], gradients, strict=True))
+
+    assert isinstance(deformation, SharedBasis | FlexibleDeformation)
+    model = FusedModel(gaussians, deformation, camera.width, camera.height)
+    target = frame.target(model.rasterizer)
+    model.step(camera_vector(camera), t, target, loss_settings(True), RATES, 1, sh_degree)
+    stored = {name: 10 * np.asarray(each) for name, each in model.arrays().items()}
+
+    canonical = torch.cat([wanted["mean"], wanted["quaternion"], wanted["log_scale"]], dim=1)
+    assert_close(stored["moments.canonical"][0, :, :90].T, canonical, name="canonical")
+    assert_close(stored["moments.opacity_logit"][0, :90], wanted["opacity_logit"], name="opacity_logit")
+    assert_close(stored["moments.sh"][0, :, :, :90], wanted["sh"].permute(1, 2, 0), name="sh")
+    if kind == "shared":
+        assert_close(stored["motion.first"][:, :, :90], wanted["weight"].permute(2, 1, 0), name="weight")
+    else:
+        for row, name in enumerate(("weight", "centre", "width")):
+            assert_close(stored["motion.first"][row, ..., :90], wanted[name].permute(1, 2, 0), name=name)
+
+
+def _scene_of(gaussians: Gaussians, camera: Camera) -> Scene:
+    return Scene(
+        mean=gaussians.mean,
+        quaternion=gaussians.quaternion,
+        scale=gaussians.scale,
+        opacity=gaussians.opacity,
+        colour=gaussians.colour(camera.centre(gaussians.mean)),
+        camera=camera,
+    )
+
+
+@pytest.mark.parametrize("kind", ["shared", "fdm-gaussian", "fdm-quartic"])
+def test_a_fused_render_is_the_reference_of_the_deformed_gaussians(kind: str) -> None:
+    gaussians, deformation, camera = moving_gaussians(kind, 1)
+    assert isinstance(deformation, SharedBasis | FlexibleDeformation)
+    scene = _scene_of(deformation.deform(gaussians, 0.4), camera)
+    kept = ~pixels_near_a_cut(scene)
+    wanted = scene.to(torch.float64).render()
+    red, green, blue, depth, alpha = FusedModel(gaussians, deformation, camera.width, camera.height).render(
+        camera_vector(camera), 0.4
+    )
+    assert_close(np.stack([red, green, blue], axis=-1), wanted.rgb, where=kept, name="rgb")
+    assert_close(depth, wanted.depth, where=kept, name="depth")
+    assert_close(alpha, wanted.alpha, where=kept, name="alpha")
+
+
+@pytest.mark.parametrize("kind", ["shared", "fdm-gaussian", "fdm-quartic"])
+def test_a_model_exports_what_it_was_made_of(kind: str) -> None:
+    gaussians, deformation, camera = moving_gaussians(kind, 2)
+    assert isinstance(deformation, SharedBasis | FlexibleDeformation)
+    exported, motion = FusedModel(gaussians, deformation, camera.width, camera.height).export()
+    assert motion.kind == kind
+    given = gaussians.tensors() | deformation.parameters() | deformation.constants()
+    for name, each in (exported.tensors() | motion.parameters() | motion.constants()).items():
+        assert bool((each == given[name]).all()), name
+
+
+@pytest.mark.parametrize("kind", ["shared", "fdm-gaussian", "fdm-quartic"])
+def test_motion_takes_the_steps_of_torchs_adam(kind: str) -> None:
+    gaussians, deformation, _ = moving_gaussians(kind, 0)
+    assert isinstance(deformation, SharedBasis | FlexibleDeformation)
+    count, columns = 90, padded(90)
+    motion = motion_of(deformation, columns)
+    leaves = {name: each.double().requires_grad_() for name, each in deformation.parameters().items()}
+    constants = {name: each.double() for name, each in deformation.constants().items()}
+    canonical = Gaussians(**{name: each.double() for name, each in gaussians.tensors().items()})
+    optimiser = torch.optim.Adam(leaves.values(), lr=RATES.motion_mean, eps=RATES.eps)
+    rates = dataclasses.replace(RATES, motion_quaternion=RATES.motion_mean, motion_log_scale=RATES.motion_mean)
+    random = np.random.default_rng(6)
+    for iteration, t in enumerate([0.4, 0.45, 0.35], start=1):
+        cotangent = random.normal(size=(10, columns)).astype(np.float32)
+        motion.update(cotangent, t, rates, iteration)
+        moved = dataclasses.replace(deformation, **leaves, **constants).deform(canonical, t)  # type: ignore[arg-type]
+        channels = torch.cat([moved.mean, moved.quaternion, moved.log_scale], dim=1)
+        optimiser.zero_grad()
+        (channels * torch.from_numpy(cotangent[:, :count].T).double()).sum().backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+    for name, each in motion.export(count).parameters().items():
+        assert_close(each, leaves[name], name=name)
+
+
+def test_bases_that_are_negligible_are_left_out_of_deformation_and_training() -> None:
+    narrow = SharedBasis.initial(8, bases=9, width=0.02)
+    weight = torch.randn(narrow.weight.shape, generator=torch.Generator().manual_seed(8))
+    deformation = dataclasses.replace(narrow, weight=weight)
+    motion = SharedMotion(deformation, 8)
+    state = np.empty((10, 8), np.float32)
+    motion.deform(np.zeros((10, 8), np.float32), 0.26, state)
+    bound = NEGLIGIBLE * float(weight.abs().sum(-1).max())
+    assert_close(state.T, weight @ deformation.basis(0.26), relative=0.0, absolute=bound)
+    motion.update(np.ones((10, 8), np.float32), 0.26, RATES, 1)
+    changed = (motion.export(8).weight != weight).any(dim=0).any(dim=0)
+    assert changed.tolist() == (deformation.basis(0.26) >= NEGLIGIBLE).tolist()
+
+
+def test_beyond_six_widths_the_kernels_give_the_canonical_state() -> None:
+    fdm = FlexibleDeformation.initial(8, bases=3, width=0.01)
+    fdm = dataclasses.replace(fdm, weight=torch.ones_like(fdm.weight))
+    shared = dataclasses.replace(SharedBasis.initial(8, bases=3, width=0.01), weight=torch.ones(8, 10, 3))
+    canonical = np.random.default_rng(0).normal(size=(10, 8)).astype(np.float32)
+    for motion in (FdmMotion(fdm, 8), SharedMotion(shared, 8)):
+        state = np.full((10, 8), np.nan, np.float32)
+        motion.deform(canonical, 0.25, state)  # 25 widths from the nearest centre
+        assert bool((state == canonical).all())
