@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from contract.errors import InputError, SceneError
 from contract.rendering import ExportRequest, RenderRequest, ReplyError, WorkerReply, WorkerRequest
 
-POLL_MS = 200
+POLL_MS = 50
 """How soon the thread notices that it should end."""
 
 logger = logging.getLogger("intrasplat.worker")
