@@ -17,7 +17,7 @@ from contract.camera import Intrinsics
 from contract.errors import InputError
 from worker.clip.files import FileTree
 from worker.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
-from worker.clip.masks import MaskPolarity, TissueMasks, read_masks, tissue_from_masks
+from worker.clip.masks import NO_MASKS, MaskPolarity, TissueMasks, read_masks, tissue_from_masks
 from worker.clip.naming import check_aligned
 from worker.clip.poses import POSES_FILE, PoseConvention, Poses, parse_poses
 from worker.clip.types import DepthClip
@@ -44,13 +44,7 @@ def read_endonerf(
     all the layout knows.
     Raises InputError for everything that does not fit together and LimitError when it is too large.
     """
-    for folder, names in (("images", tree.images("images")), ("depth", tree.images("depth"))):
-        if not names:
-            raise InputError(
-                tree.field, f"{tree.label} has no images in {folder}/.", f"Put the frames' {folder} there."
-            )
-    if POSES_FILE not in tree.names:
-        raise InputError(tree.field, f"{tree.label} has no {POSES_FILE}.", "Put it beside images/.")
+    _check_files(tree)
     images = open_images(tree, tree.images("images"), _BYTES_PER_PIXEL)
     poses = parse_poses(tree.read(POSES_FILE), images.frame_count, convention)
     _check_size(images, poses)
@@ -62,7 +56,6 @@ def read_endonerf(
         raise InputError(
             tree.field, f"depth/ has no valid depth {where}.", "Give millimetres as grey PNG, 0 = invalid."
         )
-    moves = not np.allclose(poses.world_from_camera, np.eye(4), atol=1e-6)
     return DepthClip(
         rgb=rgb,
         tissue=masks.tissue,
@@ -78,16 +71,31 @@ def read_endonerf(
         ),
         world_from_camera=poses.world_from_camera,
         frame_times_s=np.arange(images.frame_count) / FALLBACK_RATE_HZ,
-        assumptions=(
-            f"layout: {LAYOUT}",
-            masks.assumption,
-            f"poses: {convention} camera-to-world, " + ("moving camera" if moves else "fixed camera"),
-            "intrinsics: principal point at the image centre",
-            "depth: millimetres",
-            f"time: {FALLBACK_RATE_HZ:g} frames a second, images carry none",
-        ),
+        assumptions=_assumptions(masks, poses, convention),
         warnings=masks.warnings,
     )
+
+
+def _assumptions(masks: TissueMasks, poses: Poses, convention: PoseConvention) -> tuple[str, ...]:
+    moves = not np.allclose(poses.world_from_camera, np.eye(4), atol=1e-6)
+    return (
+        f"layout: {LAYOUT}",
+        masks.assumption,
+        f"poses: {convention} camera-to-world, " + ("moving camera" if moves else "fixed camera"),
+        "intrinsics: principal point at the image centre",
+        "depth: millimetres",
+        f"time: {FALLBACK_RATE_HZ:g} frames a second, images carry none",
+    )
+
+
+def _check_files(tree: FileTree) -> None:
+    for folder, names in (("images", tree.images("images")), ("depth", tree.images("depth"))):
+        if not names:
+            raise InputError(
+                tree.field, f"{tree.label} has no images in {folder}/.", f"Put the frames' {folder} there."
+            )
+    if POSES_FILE not in tree.names:
+        raise InputError(tree.field, f"{tree.label} has no {POSES_FILE}.", "Put it beside images/.")
 
 
 def _check_size(images: ImageSequence, poses: Poses) -> None:
@@ -120,7 +128,7 @@ def _masks(
     if masks_white is None:
         names = tree.images("masks")
         if not names:
-            return TissueMasks(np.ones(shape, dtype=np.bool_), "masks: none given, every pixel is tissue")
+            return TissueMasks(np.ones(shape, dtype=np.bool_), NO_MASKS)
         check_aligned("masks", images.names, names)
         masks_white = read_masks(tree, names)
     return tissue_from_masks(masks_white, shape, told, by_layout=(LAYOUT, "tool"))

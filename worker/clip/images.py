@@ -34,6 +34,7 @@ class ImageSequence:
     height: int
     width: int
     frame_times_s: NDArray[np.float64] | None = None  # images carry no time
+    warnings: tuple[str, ...] = ()
 
     @property
     def frame_count(self) -> int:

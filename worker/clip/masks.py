@@ -23,6 +23,7 @@ MaskPolarity = Literal["auto", "tool", "tissue"]
 BrightClass = Literal["tool", "tissue"]  # what a white pixel means
 
 MOST_TOOL_SHARE = 0.4  # of the area: a class larger than this is not taken for the instrument unasked
+NO_MASKS = "masks: none given, every pixel is tissue"  # the assumption recorded then
 _FIELD = "masks"
 _POLARITY_REMEDY = 'Say mask_polarity "tool" if white marks instruments, "tissue" if white marks tissue.'
 
@@ -93,7 +94,7 @@ def tissue_from_masks(
         warnings.append("the masks mark no instrument in any frame")
     covered = int((~tissue.any(axis=(1, 2))).sum())
     if covered:
-        warnings.append(f"{covered} frames are all tool in their masks and teach nothing")
+        warnings.append(f"{covered} of {len(tissue)} frames are all tool in their masks and cannot be learnt from")
     return TissueMasks(tissue, f"masks: white is {bright} ({reason})", tuple(warnings))
 
 
@@ -127,22 +128,15 @@ def _bright_class(
 
 
 def _bright_class_by_look(white: NDArray[np.bool_]) -> BrightClass | None:
+    """The class that reaches the border in most of the frames it appears in, with little enough area to be the tool."""
+    border = np.concatenate([white[:, 0], white[:, -1], white[:, :, 0], white[:, :, -1]], axis=1)
     if white.mean() < MOST_TOOL_SHARE:
-        return "tool" if _touches_border(white) else None
+        touches = 2 * border.any(axis=1).sum() > white.any(axis=(1, 2)).sum()
+        return "tool" if touches else None
     if 1.0 - white.mean() < MOST_TOOL_SHARE:
-        return "tissue" if _touches_border(~white) else None
+        touches = 2 * (~border).any(axis=1).sum() > (~white.all(axis=(1, 2))).sum()
+        return "tissue" if touches else None
     return None
-
-
-def _touches_border(marked: NDArray[np.bool_]) -> bool:
-    """Whether a class reaches the image border in most of the frames it appears in."""
-    on_border = (
-        marked[:, 0].any(axis=1)
-        | marked[:, -1].any(axis=1)
-        | marked[:, :, 0].any(axis=1)
-        | marked[:, :, -1].any(axis=1)
-    )
-    return bool(2 * on_border.sum() > marked.any(axis=(1, 2)).sum())
 
 
 def _check_shape(white: NDArray[np.bool_], shape: tuple[int, int, int]) -> None:

@@ -8,16 +8,18 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Literal, get_args
 
+import numpy as np
+from numpy.typing import NDArray
+
 from contract.errors import InputError
 from worker.clip.endonerf import is_endonerf, read_endonerf
 from worker.clip.files import FileTree, check_exists, open_tree, scratch_folder
 from worker.clip.limits import ClipLimits
-from worker.clip.masks import BrightClass, MaskPolarity, open_masks
+from worker.clip.masks import NO_MASKS, BrightClass, MaskPolarity, open_masks
 from worker.clip.poses import PoseConvention
 from worker.clip.stereo_source import (
     STEREOMIS,
     STEREOMIS_CALIBRATION,
-    StereoLayout,
     is_stereomis,
     open_tree_clip,
     open_two_files,
@@ -61,21 +63,14 @@ def open_clip(
     check_exists(path, "clip")
     white = open_masks(Path(masks), limits) if masks is not None else None
     if right is not None:
-        if layout != "auto":
-            raise InputError("options.layout", f'layout "{layout}" does not go with a second file.', "Leave it out.")
-        check_exists(Path(right), "right")
-        clip, tree = open_two_files(path, Path(right), limits), None
-    else:
-        tree = open_tree(path, "clip", limits)
-        if layout == "endonerf" or (layout == "auto" and tree is not None and is_endonerf(tree)):
-            return read_endonerf(_needs_tree(tree, path), white, mask_polarity, pose_convention)
-        clip = _open_stereo(path, tree, layout, limits)
-    by_layout = _mask_rule(tree, layout)
+        return _finish(_open_two(path, Path(right), layout, limits), white, mask_polarity, None)
+    tree = open_tree(path, "clip", limits)
+    if layout == "endonerf" or (layout == "auto" and tree is not None and is_endonerf(tree)):
+        return read_endonerf(_needs_tree(tree, path), white, mask_polarity, pose_convention)
+    clip = open_video_clip(path, layout, limits) if tree is None else open_tree_clip(tree, layout)
     if white is None and tree is not None:
         white = own_masks(tree)
-    if white is None:
-        return replace(clip, assumptions=(*clip.assumptions, "masks: none given, every pixel is tissue"))
-    return with_masks(clip, white, mask_polarity, by_layout)
+    return _finish(clip, white, mask_polarity, _mask_rule(tree, layout))
 
 
 def find_calibration(path: Path | str, scratch: Path | None = None, limits: ClipLimits | None = None) -> Path | None:
@@ -103,10 +98,22 @@ def find_calibration(path: Path | str, scratch: Path | None = None, limits: Clip
     return _as_path(tree, found[0], scratch) if found else None
 
 
-def _open_stereo(path: Path, tree: FileTree | None, layout: StereoLayout, limits: ClipLimits) -> StereoClip:
-    if tree is None:
-        return open_video_clip(path, layout, limits)
-    return open_tree_clip(tree, layout)
+def _open_two(left: Path, right: Path, layout: Layout, limits: ClipLimits) -> StereoClip:
+    if layout != "auto":
+        raise InputError("options.layout", f'layout "{layout}" does not go with a second file.', "Leave it out.")
+    check_exists(right, "right")
+    return open_two_files(left, right, limits)
+
+
+def _finish(
+    clip: StereoClip,
+    white: NDArray[np.bool_] | None,
+    told: MaskPolarity,
+    by_layout: tuple[str, BrightClass] | None,
+) -> StereoClip:
+    if white is None:
+        return replace(clip, assumptions=(*clip.assumptions, NO_MASKS))
+    return with_masks(clip, white, told, by_layout)
 
 
 def _mask_rule(tree: FileTree | None, layout: Layout) -> tuple[str, BrightClass] | None:

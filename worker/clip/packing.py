@@ -42,6 +42,8 @@ class FrameSequence(Protocol):
     def label(self) -> str: ...
     @property
     def frame_times_s(self) -> NDArray[np.float64] | None: ...
+    @property
+    def warnings(self) -> tuple[str, ...]: ...
     def frames(self) -> Iterator[RgbFrame]: ...
 
 
@@ -51,6 +53,10 @@ class PackedPairs:
 
     sequence: FrameSequence
     packing: Packing
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        return self.sequence.warnings
 
     @property
     def eye_size(self) -> tuple[int, int]:
@@ -69,6 +75,10 @@ class TwoSequences:
 
     left: FrameSequence
     right: FrameSequence
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        return self.left.warnings + self.right.warnings
 
     def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]:
         return zip(self.left.frames(), self.right.frames(), strict=True)

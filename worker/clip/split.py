@@ -55,7 +55,7 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     repeated = find_repeats(clip.rgb, train, held_out)
     if len(repeated) == len(train):
         return _nothing_held_out(count, "every training frame repeats a held-out one: the picture does not change")
-    warnings = (f"{len(repeated)} frames repeat a held-out frame and are not used",) if repeated else ()
+    warnings = (f"frames that repeat a held-out frame are not used: {len(repeated)}",) if repeated else ()
     gone = set(repeated)
     return FrameSplit([index for index in train if index not in gone], held_out, repeated, warnings)
 

@@ -138,7 +138,7 @@ def _stereo_clip(pairs: _Pairs, assumptions: tuple[str, ...]) -> StereoClip:
     if frame_times_s is None:
         frame_times_s = np.arange(first.frame_count) / FALLBACK_RATE_HZ
         assumptions = (*assumptions, f"time: {FALLBACK_RATE_HZ:g} frames a second, the clip carries none")
-    return StereoClip(first.frame_count, height, width, pairs, None, frame_times_s, assumptions)
+    return StereoClip(first.frame_count, height, width, pairs, None, frame_times_s, assumptions, pairs.warnings)
 
 
 def _open_eye(path: Path, field: str, limits: ClipLimits) -> FrameSequence:

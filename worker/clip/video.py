@@ -39,6 +39,7 @@ _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm"
 _REMEDY = "Give H.264, HEVC or VP9 video in mp4, mov, mkv or webm."
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
+_EBML = b"\x1aE\xdf\xa3"  # first bytes of Matroska and WebM
 _SILENT = 0  # OpenCV's own messages
 _QUIET = "-8"  # AV_LOG_QUIET: what a refused decoder says is not for the user
 _environment_lock = threading.Lock()  # OpenCV takes these options from the environment only, which the process shares
@@ -71,6 +72,7 @@ class VideoFile:
     height: int
     width: int
     frame_times_s: NDArray[np.float64] | None  # None: the container has no usable times
+    warnings: tuple[str, ...] = ()
 
     def frames(self) -> Iterator[RgbFrame]:
         """RGB uint8 [H, W, 3], from the first frame on. InputError when frames change size or stop early."""
@@ -131,9 +133,10 @@ def open_video_in(tree: FileTree, name: str) -> VideoFile:
 def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str, decoder: str) -> VideoFile:
     """Checks the header, then walks all frames once: only that gives their number and times for certain."""
     width, height = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-    declared = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))  # nonsense below zero when the container has no duration
+    declared = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))  # negative when the container has no duration
+    rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
     limits.check_frame(field, label, width, height)
-    limits.check_clip(field, label, max(declared, 0), width * height * 3)
+    limits.check_clip(field, label, declared, width * height * 3)
     times_ms: list[float] = []
     while capture.grab():
         times_ms.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)))
@@ -141,15 +144,36 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
             good, frame = capture.retrieve()  # turned clips have another size than their header
             height, width = frame.shape[:2] if good else (height, width)
         limits.check_clip(field, label, len(times_ms), width * height * 3)
-    if not times_ms or len(times_ms) + MISSING_FRAMES_ALLOWED < declared:
+    times_s = _times_s(times_ms, rate_hz)
+    whole = len(times_ms) + MISSING_FRAMES_ALLOWED >= declared
+    if not times_ms or not (whole or _whole_despite_count(path, decoder, declared, times_s, rate_hz)):
         raise _cut_short(field, label, len(times_ms), declared)
-    rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
-    return VideoFile(path, field, label, decoder, len(times_ms), height, width, _times_s(times_ms, rate_hz))
+    warnings = () if declared else (f"{label} does not say how many frames it has: a missing end would not be noticed",)
+    return VideoFile(path, field, label, decoder, len(times_ms), height, width, times_s, warnings)
+
+
+def _whole_despite_count(
+    path: Path, decoder: str, declared: int, times_s: NDArray[np.float64] | None, rate_hz: float
+) -> bool:
+    """Whether a video that shows fewer frames than `declared` is whole all the same.
+
+    Matroska stores a duration, and declared is that times the nominal rate: frames of varying length may be fewer, as
+    long as they last to the end. An mp4 cut without re-encoding keeps frames that its edit list hides: these count.
+    """
+    if _is_matroska(path):
+        if times_s is None or len(times_s) < 2:
+            return False
+        return bool(declared / rate_hz - times_s[-1] <= (1 + MISSING_FRAMES_ALLOWED) * np.diff(times_s).max())
+    with _capture(path, decoder, "|advanced_editlist;0") as capture:
+        found = 0
+        while capture is not None and found < declared and capture.grab():
+            found += 1
+    return found + MISSING_FRAMES_ALLOWED >= declared
 
 
 def _times_s(times_ms: list[float], rate_hz: float) -> NDArray[np.float64] | None:
     """Seconds from frame 0: the container's time stamps when they rise, else its frame rate, else None."""
-    times_s = (np.asarray(times_ms, dtype=np.float64) - times_ms[0]) / 1000.0
+    times_s = (np.asarray(times_ms, dtype=np.float64) - (times_ms[0] if times_ms else 0.0)) / 1000.0
     if len(times_s) > 1 and np.isfinite(times_s).all() and (np.diff(times_s) > 0).all():
         return times_s
     if np.isfinite(rate_hz) and 0 < rate_hz <= 1000:
@@ -158,13 +182,13 @@ def _times_s(times_ms: list[float], rate_hz: float) -> NDArray[np.float64] | Non
 
 
 @contextmanager
-def _capture(path: Path, decoder: str) -> Iterator[Any | None]:
+def _capture(path: Path, decoder: str, more_options: str = "") -> Iterator[Any | None]:
     """An OpenCV capture bound to one decoder and to local files, or None when that decoder refuses the file."""
     options = f"protocol_whitelist;file|format_whitelist;{_CONTAINERS}|codec_whitelist;{decoder}|video_codec;{decoder}"
     with _environment_lock:
         before = {name: os.environ.get(name) for name in (_OPTIONS, _LOG_LEVEL)}
         log_level = cv2.utils.logging.getLogLevel()
-        os.environ.update({_OPTIONS: options, _LOG_LEVEL: before[_LOG_LEVEL] or _QUIET})
+        os.environ.update({_OPTIONS: options + more_options, _LOG_LEVEL: before[_LOG_LEVEL] or _QUIET})
         cv2.utils.logging.setLogLevel(_SILENT)
         try:
             capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
@@ -185,7 +209,12 @@ def _has_container_magic(path: Path) -> bool:
     """ISO base media files (mp4, mov) name a box at byte 4; Matroska and WebM open with the EBML sign."""
     with path.open("rb") as stream:
         head = stream.read(12)
-    return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip") or head.startswith(b"\x1aE\xdf\xa3")
+    return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip") or head.startswith(_EBML)
+
+
+def _is_matroska(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(4) == _EBML
 
 
 def _codec_names(path: Path) -> bytes:

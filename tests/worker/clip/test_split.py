@@ -51,11 +51,9 @@ def test_blocks8_hides_every_third_block_of_eight_between_the_first_and_the_last
     assert split_frames(distinct(20), "blocks8").held_out == [8, 9, 10, 11]
 
 
-@pytest.mark.parametrize("holdout", ["every8", "blocks8", "none", "1,9,17", " 3 , 0 "])
+@pytest.mark.parametrize("holdout", ["every8", "blocks8", "none", "1,7,8", " 3 , 0 "])
 @pytest.mark.parametrize("count", [9, 17, 40])
 def test_every_frame_is_in_exactly_one_list(holdout: str, count: int) -> None:
-    if holdout == "1,9,17" and count < 18:
-        pytest.skip("the list names a frame the clip lacks")
     split = split_frames(distinct(count), holdout)
     assert sorted(split.train + split.held_out + split.repeated) == list(range(count))
     assert split.train == sorted(split.train)
@@ -107,7 +105,7 @@ def test_a_training_frame_that_repeats_a_held_out_one_is_in_neither_list() -> No
     assert split.repeated == [2, 14]
     assert split.held_out == [1, 9, 17]
     assert split.train == [0, 3, 4, 5, 6, 7, 8, 10, 11, 12, 13, 15, 16]
-    assert split.warnings == ("2 frames repeat a held-out frame and are not used",)
+    assert split.warnings == ("frames that repeat a held-out frame are not used: 2",)
 
 
 def test_the_quick_bound_never_changes_the_answer() -> None:

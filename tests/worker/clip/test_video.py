@@ -15,6 +15,7 @@ from worker.clip import ClipLimits, StereoClip, open_clip
 DATA = Path(__file__).parents[2] / "data"
 SBS_H264 = DATA / "stereo_sbs_h264.mp4"
 TB_HEVC = DATA / "stereo_tb_hevc.mov"
+REAL_DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).parents[3].parent / "shared/data"))
 LOSSY_LEVELS = 8.0  # mean error of strongly compressed 8-bit frames
 
 
@@ -40,6 +41,33 @@ def test_h264_and_hevc_clips_open_with_their_packing_found(path: Path, words: st
 
 def test_times_come_from_the_container() -> None:
     np.testing.assert_allclose(stereo(SBS_H264).frame_times_s, np.arange(12) / 25, atol=1e-6)
+
+
+def test_frames_of_varying_length_keep_their_times() -> None:
+    """Matroska promises 12 frames by duration and nominal rate; 8 of varying length are all there are."""
+    clip = stereo(DATA / "stereo_sbs_varying.mkv")
+    assert clip.frame_count == 8
+    np.testing.assert_allclose(clip.frame_times_s, [0, 0.04, 0.12, 0.16, 0.24, 0.28, 0.36, 0.40], atol=1e-6)
+
+
+def test_frames_hidden_by_an_edit_list_are_not_missing() -> None:
+    clip = stereo(DATA / "stereo_sbs_trimmed.mp4")
+    assert clip.frame_count == 7
+    whole = list(stereo(SBS_H264).pairs())
+    np.testing.assert_array_equal(next(clip.pairs())[0], whole[5][0])
+
+
+def test_a_stream_that_declares_no_length_warns() -> None:
+    clip = stereo(DATA / "stereo_sbs_live.webm")
+    assert clip.frame_count == 12
+    assert "a missing end would not be noticed" in clip.warnings[0]
+
+
+def test_a_cut_clip_of_varying_frames_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cut.mkv"
+    path.write_bytes((DATA / "stereo_sbs_varying.mkv").read_bytes()[:2600])
+    with pytest.raises(InputError, match="ends after"):
+        open_clip(path)
 
 
 def test_pairs_start_again_from_the_first_frame() -> None:
@@ -226,3 +254,14 @@ def test_layouts_that_do_not_fit_a_video_are_refused() -> None:
         open_clip(SBS_H264, layout="mono")
     with pytest.raises(InputError, match="does not go with a second file"):
         open_clip(SBS_H264, SBS_H264, layout="sbs")
+
+
+@pytest.mark.skipif(not REAL_DATA.is_dir(), reason="needs INTRASPLAT_DATA")
+def test_real_stereo_clips_open_without_being_told_anything() -> None:
+    clip = stereo(REAL_DATA / "d4d_stereo/stereo_sbs.mp4", masks=REAL_DATA / "d4d_stereo/tool_masks.zip")
+    assert (clip.frame_count, clip.height, clip.width) == (96, 540, 674)
+    assert clip.tissue is not None
+    assert 0.85 < clip.tissue.mean() < 0.95
+    raw = stereo(REAL_DATA / "surgt_raw/video.mp4")
+    assert (raw.frame_count, raw.height, raw.width) == (10, 1024, 1280)
+    assert "side by side" in raw.assumptions[0]
