@@ -19,6 +19,7 @@ from worker.calibration.check import FIELD, check_calibration
 from worker.clip.types import PairSource, RgbFrame, StereoClip
 
 OPENCV_PIXEL_CENTRE = 0.5  # OpenCV puts pixel centres at whole numbers, this project at +0.5 (docs/conventions.md)
+WARN_ZOOM, MAX_ZOOM = 1.2, 2.0  # of the focal length; a sound endoscope calibration stays below 1.1
 
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]  # OpenCV's fixed-point maps: source pixel, index of its fraction
 
@@ -85,16 +86,13 @@ class _RemappedPairs:
 
 def _pass_through(clip: StereoClip, calibration: RectifiedCalibration) -> RectifiedClip:
     c = calibration
-    tissue = clip.tissue
-    if tissue is None:
-        tissue = np.broadcast_to(np.True_, (clip.frame_count, clip.height, clip.width))
     return RectifiedClip(
         frame_count=clip.frame_count,
         intrinsics=Intrinsics(width=c.width, height=c.height, fx=c.fx_px, fy=c.fy_px, cx=c.cx_px, cy=c.cy_px),
         baseline_mm=c.baseline_mm,
         disparity_offset_px=c.disparity_offset_px,
         pairs=clip.pairs,
-        tissue=tissue,
+        tissue=_all_tissue(clip) if clip.tissue is None else clip.tissue,
         frame_times_s=clip.frame_times_s,
         assumptions=clip.assumptions + c.assumptions,
         warnings=clip.warnings,
@@ -128,7 +126,7 @@ def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
         tissue=_warp_tissue(clip, left_maps),
         frame_times_s=clip.frame_times_s,
         assumptions=clip.assumptions + calibration.assumptions,
-        warnings=clip.warnings,
+        warnings=clip.warnings + _zoom_warning(float(left_p[0, 0]) / calibration.left.fx_px),
     )
 
 
@@ -138,11 +136,29 @@ def _matrix(eye: RawEye) -> NDArray[np.float64]:
 
 def _warp_tissue(clip: StereoClip, maps: Maps) -> NDArray[np.bool_]:
     """Tissue in rectified pixels, nearest neighbour; beyond the recorded image there is none."""
-    shape = (clip.height, clip.width)
-    inside = cv2.remap(np.full(shape, 255, np.uint8), *maps, cv2.INTER_LINEAR, borderValue=0) == 255
     if clip.tissue is None:
-        return np.broadcast_to(inside, (clip.frame_count, *shape))
-    warped = np.empty((clip.frame_count, *shape), dtype=np.bool_)
+        return _all_tissue(clip)
+    warped = np.empty(clip.tissue.shape, dtype=np.bool_)
     for i, mask in enumerate(clip.tissue):
-        warped[i] = inside & (cv2.remap(mask.view(np.uint8), *maps, cv2.INTER_NEAREST) > 0)
+        warped[i] = cv2.remap(mask.astype(np.uint8), *maps, cv2.INTER_NEAREST, borderValue=0) > 0
     return warped
+
+
+def _all_tissue(clip: StereoClip) -> NDArray[np.bool_]:
+    """[T, H, W] True that takes no memory: alpha 0 leaves no pixel beyond the recording."""
+    return np.broadcast_to(np.True_, (clip.frame_count, clip.height, clip.width))
+
+
+def _zoom_warning(zoom: float) -> tuple[str, ...]:
+    """What to say of a rectification that magnifies, as it must cut away what only one eye recorded.
+
+    Raises:
+        InputError: so little is left that the calibration cannot be this recording's.
+    """
+    if zoom > MAX_ZOOM:
+        raise InputError(
+            FIELD,
+            f"rectifying with it magnifies {zoom:.1f} times and cuts most of the view away.",
+            "Give the calibration of this recording; check R, T and the distortion's order k1 k2 p1 p2 k3.",
+        )
+    return (f"rectification magnifies {zoom:.2f} times and cuts the margins away",) if zoom > WARN_ZOOM else ()

@@ -6,9 +6,7 @@ Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. d
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -45,18 +43,23 @@ def estimate_depth(clip: RectifiedClip, hooks: Hooks | None = None) -> DepthClip
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
     depth_mm = np.zeros(rgb.shape[:3], np.float32)
     confidence = np.zeros(rgb.shape[:3], np.uint8)
-    with _worker_threads() as run:
-        shift, plan = _plan(clip, rgb, right, run)
+    with _pool() as pool:
+        shift, plan = _plan(clip, rgb, right, pool)
         hooks.on_progress(Progress(STAGE, DECODING_SHARE + MEASURING_SHARE))
 
         def work(i: int) -> None:
             disparity, trust = match(_grey(rgb[i]), right[i], plan)
             depth_mm[i], confidence[i] = _to_depth(disparity, trust, focal_baseline, clip.disparity_offset_px)
 
-        for done, _ in enumerate(run(work, range(clip.frame_count)), start=1):
-            _check_stop(hooks)
-            start = DECODING_SHARE + MEASURING_SHARE
-            hooks.on_progress(Progress(STAGE, start + (1 - start) * done / clip.frame_count))
+        start = DECODING_SHARE + MEASURING_SHARE
+        jobs = [pool.submit(work, i) for i in range(clip.frame_count)]
+        try:
+            for done, job in enumerate(jobs, start=1):
+                _check_stop(hooks)
+                job.result()
+                hooks.on_progress(Progress(STAGE, start + (1 - start) * done / clip.frame_count))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
     valid_share = _valid_share(depth_mm, clip.tissue)
     return DepthClip(
         rgb=rgb,
@@ -98,12 +101,12 @@ def _decode(clip: RectifiedClip, hooks: Hooks) -> tuple[NDArray[np.uint8], NDArr
 
 
 def _plan(
-    clip: RectifiedClip, rgb: NDArray[np.uint8], right: NDArray[np.uint8], run: Callable[..., Iterator[object]]
+    clip: RectifiedClip, rgb: NDArray[np.uint8], right: NDArray[np.uint8], pool: ThreadPoolExecutor
 ) -> tuple[RowShift, MatchPlan]:
     """Row shift and disparity range, from a few pairs spread over the clip."""
     sampled = np.unique(np.linspace(0, clip.frame_count - 1, SAMPLED_PAIRS).round().astype(int))
     pairs = [(_grey(rgb[i]), right[i]) for i in sampled]
-    matches = np.concatenate([np.asarray(found) for found in run(lambda pair: feature_matches(*pair), pairs)])
+    matches = np.concatenate(list(pool.map(lambda pair: feature_matches(*pair), pairs)))
     shift = measure_row_shift(matches, clip.disparity_offset_px)
     low, high = choose_range(
         pairs, shift.correction_px, clip.disparity_offset_px, clip.intrinsics.fx * clip.baseline_mm
@@ -161,15 +164,7 @@ def _grey(rgb: NDArray[np.uint8]) -> Grey:
     return grey
 
 
-@contextmanager
-def _worker_threads() -> Iterator[Callable[..., Iterator[object]]]:
-    """A map over one thread a core, in order; OpenCV's own threads rest meanwhile (a pair a thread measured faster)."""
-    before = cv2.getNumThreads()
+def _pool() -> ThreadPoolExecutor:
+    """One pair a thread and core: OpenCV lets go of the interpreter, and one pair in two threads measured slower."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    pool = ThreadPoolExecutor(cores, thread_name_prefix=STAGE)
-    cv2.setNumThreads(1)
-    try:
-        yield pool.map
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        cv2.setNumThreads(before)
+    return ThreadPoolExecutor(cores, thread_name_prefix=STAGE)

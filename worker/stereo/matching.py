@@ -25,6 +25,7 @@ DISPARITY_STEPS = 16  # per px, in which OpenCV's matchers count
 SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 8, 32  # SGBM's P1, P2 per block pixel, OpenCV's own advice
 PREFILTER_CAP = 31
 SMOOTHNESS, COLOUR_SIGMA = 8000.0, 1.0  # of the edge-aware filter
+REFERENCE_WIDTH = 640  # px for which windows and gradients are stated: wider images have wider, flatter edges
 REFINE_WINDOW_PX, HIGH_PASS_PX = 11, 15
 REFINE_DAMPING = 20.0  # grey levels squared: below this mean squared gradient the matcher's own value wins
 MAX_REFINEMENT_PX = 1.0  # farther away the linearisation of one step does not hold
@@ -138,18 +139,26 @@ def _refine(disparity: Image, left: Grey, right: Grey) -> tuple[Image, Image, Im
     height, width = left.shape
     x = np.arange(width, dtype=np.float32) - disparity
     y = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, axis=1)
-    reference = _high_pass(left)
-    warped = cv2.remap(_high_pass(right), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    fineness = max(1.0, width / REFERENCE_WIDTH)
+    reference = _high_pass(left, fineness)
+    warped = cv2.remap(_high_pass(right, fineness), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     difference = warped - reference
     gradient = cv2.filter2D((warped + reference) * np.float32(0.5), -1, np.array([[-0.5, 0.0, 0.5]], np.float32))
-    window = (REFINE_WINDOW_PX, REFINE_WINDOW_PX)
-    texture = cv2.boxFilter(gradient * gradient, -1, window)
-    step = cv2.boxFilter(gradient * difference, -1, window) / (texture + REFINE_DAMPING)
+    window = _window(REFINE_WINDOW_PX, fineness)
+    texture = cv2.boxFilter(gradient * gradient, -1, window) * np.float32(fineness**2)
+    pull = cv2.boxFilter(gradient * difference, -1, window) * np.float32(fineness**2)
+    step = pull / (texture + REFINE_DAMPING)
     residual = cv2.boxFilter(np.abs(difference), -1, window)
     return disparity + np.clip(step, -MAX_REFINEMENT_PX, MAX_REFINEMENT_PX), texture, residual
 
 
-def _high_pass(image: Grey) -> Image:
+def _high_pass(image: Grey, fineness: float) -> Image:
     values = image.astype(np.float32)
-    values -= cv2.boxFilter(values, -1, (HIGH_PASS_PX, HIGH_PASS_PX))
+    values -= cv2.boxFilter(values, -1, _window(HIGH_PASS_PX, fineness))
     return values
+
+
+def _window(size_px: int, fineness: float) -> tuple[int, int]:
+    """A square window of odd size, size_px at the reference width."""
+    size = 2 * round(size_px * fineness / 2 - 0.5) + 1
+    return size, size
