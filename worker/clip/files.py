@@ -136,10 +136,14 @@ def open_tree(path: Path, field: str, limits: ClipLimits) -> FileTree | None:
 
 
 def check_exists(path: Path, field: str) -> None:
-    """InputError unless path is a folder or a file with content."""
+    """InputError unless path is a folder or a readable file with content."""
     if not path.exists():
         raise InputError(field, f"{path} does not exist.", "Check the path.")
-    if path.is_file() and path.stat().st_size == 0:
+    if path.is_dir():
+        return
+    if not path.is_file() or not os.access(path, os.R_OK):
+        raise InputError(field, f"{path.name} is no readable file or folder.", "Check its kind and permissions.")
+    if path.stat().st_size == 0:
         raise InputError(field, f"{path.name} is empty (0 bytes).", "Copy or upload the file again.")
 
 

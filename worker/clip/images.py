@@ -93,9 +93,8 @@ def as_rgb(image: NDArray[Any], field: str, name: str) -> RgbFrame:
                 field, f"{name} stores 8-bit values in 16 bits (largest {image.max()}).", "Write it as 8-bit."
             )
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    if image.ndim == 2:
-        return np.repeat(image[:, :, None], 3, axis=2)
-    return np.ascontiguousarray(image[:, :, 2::-1])
+    to_rgb = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
+    return np.asarray(cv2.cvtColor(image, to_rgb[1 if image.ndim == 2 else image.shape[2]]))
 
 
 def as_mask(image: NDArray[Any]) -> NDArray[np.bool_]:

@@ -5,6 +5,7 @@ Symbols: T frames, H W pixels of one eye.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -53,14 +54,14 @@ def open_video_clip(path: Path, layout: StereoLayout, limits: ClipLimits) -> Ste
 
 def open_tree_clip(tree: FileTree, layout: StereoLayout) -> StereoClip:
     """A folder or zip with one or two videos, or with left and right frames; StereoMIS if its calibration is there."""
-    if layout == "auto" and is_stereomis(tree):
-        layout = "stereomis"
     videos = _outside_masks(tree, tree.videos())
     if videos and layout != "frames":
         return _open_tree_videos(tree, videos, layout)
-    if layout in ("sbs", "tb"):
-        return _packed_clip(open_images(tree, _outside_masks(tree, tree.images())), layout)
-    left, right = pair_names(_outside_masks(tree, tree.images()))
+    images = _outside_masks(tree, tree.images())
+    nameless = bool(images) and not any(eye_of(name) for name in images)
+    if layout in ("sbs", "tb") or (layout == "auto" and nameless):
+        return _packed_clip(open_images(tree, images), layout)
+    left, right = pair_names(images)
     if not left:
         raise InputError(
             "clip",
@@ -68,7 +69,7 @@ def open_tree_clip(tree: FileTree, layout: StereoLayout) -> StereoClip:
             "Give a stereo video, left and right frames, or the EndoNeRF or StereoMIS layout.",
         )
     pairs = pair_sequences(open_images(tree, left), open_images(tree, right))
-    word = STEREOMIS if layout == "stereomis" else "left and right frames"
+    word = STEREOMIS if layout == "stereomis" or is_stereomis(tree) else "left and right frames"
     return _stereo_clip(pairs, (f"layout: {word}, {left[0]} is the left eye",))
 
 
@@ -87,13 +88,9 @@ def with_masks(
 ) -> StereoClip:
     """The clip with its tissue pixels; see tissue_from_masks for how white is read."""
     masks = tissue_from_masks(white, (clip.frame_count, clip.height, clip.width), told, by_layout)
-    return StereoClip(
-        frame_count=clip.frame_count,
-        height=clip.height,
-        width=clip.width,
-        pairs=clip.pairs,
+    return replace(
+        clip,
         tissue=masks.tissue,
-        frame_times_s=clip.frame_times_s,
         assumptions=(*clip.assumptions, masks.assumption),
         warnings=(*clip.warnings, *masks.warnings),
     )
@@ -102,9 +99,8 @@ def with_masks(
 def _open_tree_videos(tree: FileTree, videos: tuple[str, ...], layout: StereoLayout) -> StereoClip:
     if len(videos) == 1:
         video = open_video_in(tree, videos[0])
-        if layout == "stereomis":
-            return _packed_clip(video, "tb", f"{STEREOMIS}, ")
-        return _packed_clip(video, layout)
+        known = f"{STEREOMIS}, " if layout == "stereomis" or is_stereomis(tree) else ""
+        return _packed_clip(video, "tb" if layout == "stereomis" else layout, known)
     eyes = {found[0] for name in videos if (found := eye_of(name))}
     if len(videos) != 2 or eyes != {"left", "right"}:
         raise InputError(
@@ -119,10 +115,8 @@ def _open_tree_videos(tree: FileTree, videos: tuple[str, ...], layout: StereoLay
 
 def _packed_clip(sequence: FrameSequence, layout: StereoLayout, known: str = "") -> StereoClip:
     packing: Packing = layout if layout in ("sbs", "tb") else detect_packing(sequence)
-    reason = f"layout: {known}{PACKING_WORDS[packing]}" + (
-        " (found by likeness of the halves)" if layout == "auto" else ""
-    )
-    assumptions = [reason]
+    how = " (found by likeness of the halves)" if layout == "auto" else ""
+    assumptions = [f"layout: {known}{PACKING_WORDS[packing]}{how}"]
     odd = sequence.width % 2 if packing == "sbs" else sequence.height % 2
     if odd:
         assumptions.append(f"layout: the odd middle {'column' if packing == 'sbs' else 'row'} belongs to neither eye")

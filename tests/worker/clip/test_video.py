@@ -109,6 +109,13 @@ def test_a_told_packing_wins_over_what_the_frames_look_like() -> None:
     assert (clip.height, clip.width) == (40, 192)
 
 
+def test_content_tells_the_packing_where_the_shape_misleads(studio) -> None:
+    """144x80 in all: side by side would give well-shaped eyes of 72x80, but it holds 144x40 top-bottom."""
+    left, right = studio.eyes(height=40, width=144)
+    clip = stereo(studio.video("squeezed.webm", np.concatenate([left, right], axis=1)))
+    assert (clip.height, clip.width) == (40, 144)
+
+
 def test_two_files_are_the_two_eyes(studio) -> None:
     left, right = studio.eyes()
     clip = stereo(studio.video("a.webm", left), studio.video("b.webm", right))
@@ -218,6 +225,9 @@ def test_an_empty_file_and_a_missing_file_are_refused(tmp_path: Path) -> None:
         open_clip(tmp_path / "clip.mp4")
     with pytest.raises(InputError, match="does not exist"):
         open_clip(tmp_path / "nowhere.mp4")
+    os.mkfifo(tmp_path / "pipe.mp4")
+    with pytest.raises(InputError, match="no readable file"):
+        open_clip(tmp_path / "pipe.mp4")
 
 
 def test_eyes_of_different_length_are_refused(studio) -> None:
