@@ -1,0 +1,118 @@
+"""How near a render is to the recorded frame (docs/conventions.md, "Scores").
+
+Symbols: H W pixels. Colours are RGB: float in [0, 1], or uint8; tissue [H, W] bool, True = tissue.
+Each function judges one frame, except depth_agreement_mm; what has no pixel to be judged on is NaN.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.floating] | NDArray[np.uint8]
+
+BEST_PSNR_DB = 100.0
+"""Stands for equality, whose PSNR is infinite and which no mean over frames and no JSON survives."""
+SSIM_SIGMA_PX = 1.5
+SSIM_WINDOW_PX = 11
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+"""Stabilisers for a data range of 1 (Wang et al., 2004)."""
+COVERED_ALPHA = 0.5
+"""Least sum of blending weights at which a pixel counts as covered and its depth as valid."""
+
+
+def psnr_tissue(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> float:
+    """-10 log10 of the mean squared error over tissue pixels and RGB, in dB; the render is clamped to [0, 1] first.
+
+    Tissue without depth is included. This is the score we go by.
+    """
+    _check_shapes(rendered, truth, tissue)
+    difference = _unit(rendered) - _unit(truth)
+    return _decibel(difference[tissue])
+
+
+def psnr_paper(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> float:
+    """What the papers print, in dB: both images rounded to 8 bit, the instrument 0 in both, all H W 3 values counted.
+
+    It exceeds psnr_tissue by -10 log10(share of tissue), since the zeroed pixels are all right.
+    """
+    _check_shapes(rendered, truth, tissue)
+    if not tissue.any():
+        return math.nan
+    difference = np.rint(_unit(rendered) * 255) - np.rint(_unit(truth) * 255)
+    return _decibel(np.where(tissue[..., None], difference, 0) / 255)
+
+
+def ssim(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> float:
+    """Structural similarity (Wang et al., 2004), 11 x 11 Gaussian, sigma 1.5, its map averaged over tissue and RGB.
+
+    The instrument is 0 in both images, so that a window which reaches over it compares tissue alone.
+    """
+    _check_shapes(rendered, truth, tissue)
+    if not tissue.any():
+        return math.nan
+    kept = tissue[..., None]
+    similarity = ssim_map(np.where(kept, _unit(rendered), 0), np.where(kept, _unit(truth), 0))
+    return float(similarity[tissue].mean(dtype=np.float64))
+
+
+def ssim_map(first: NDArray[np.floating], second: NDArray[np.floating]) -> NDArray[np.float64]:
+    """SSIM at every pixel and channel of two images [H, W, 3] in [0, 1]; borders are mirrored."""
+    x, y = first.astype(np.float64), second.astype(np.float64)
+    mean_x, mean_y = _windowed(x), _windowed(y)
+    variance_x = _windowed(x * x) - mean_x**2
+    variance_y = _windowed(y * y) - mean_y**2
+    covariance = _windowed(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
+    structure = (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
+    return np.asarray(luminance * structure)
+
+
+def depth_errors_mm(
+    rendered_mm: NDArray[np.floating], stereo_mm: NDArray[np.floating], tissue: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """|rendered - stereo| in mm at the tissue pixels where both depths are valid (above 0), [M]."""
+    if not rendered_mm.shape == stereo_mm.shape == tissue.shape:
+        raise ValueError(f"shapes differ: {rendered_mm.shape}, {stereo_mm.shape}, tissue {tissue.shape}")
+    both = tissue & (rendered_mm > 0) & (stereo_mm > 0)
+    return np.abs(rendered_mm[both] - stereo_mm[both]).astype(np.float32)
+
+
+def depth_agreement_mm(errors_mm: list[NDArray[np.float32]]) -> float:
+    """Median of the depth errors of all frames together, in mm; NaN if there is none."""
+    together = np.concatenate(errors_mm) if errors_mm else np.empty(0)
+    return float(np.median(together)) if together.size else math.nan
+
+
+def coverage(alpha: NDArray[np.floating], tissue: NDArray[np.bool_]) -> float:
+    """Share of tissue pixels with a sum of blending weights of at least 0.5."""
+    if alpha.shape != tissue.shape:
+        raise ValueError(f"shapes differ: {alpha.shape}, tissue {tissue.shape}")
+    return float((alpha[tissue] >= COVERED_ALPHA).mean()) if tissue.any() else math.nan
+
+
+def _unit(image: Image) -> NDArray[np.float32]:
+    """float32 in [0, 1]."""
+    if image.dtype == np.uint8:
+        return image.astype(np.float32) / np.float32(255)
+    return np.clip(image, 0, 1).astype(np.float32)
+
+
+def _decibel(difference: NDArray[np.floating]) -> float:
+    if not difference.size:
+        return math.nan
+    squared = float(np.mean(np.square(difference, dtype=np.float64)))
+    return min(BEST_PSNR_DB, -10 * math.log10(squared)) if squared > 0 else BEST_PSNR_DB
+
+
+def _windowed(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    window = (SSIM_WINDOW_PX, SSIM_WINDOW_PX)
+    return np.asarray(cv2.GaussianBlur(image, window, SSIM_SIGMA_PX, borderType=cv2.BORDER_REFLECT))
+
+
+def _check_shapes(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> None:
+    if rendered.shape != truth.shape or rendered.shape != (*tissue.shape, 3):
+        raise ValueError(f"shapes do not fit: {rendered.shape}, {truth.shape}, tissue {tissue.shape}")
