@@ -6,7 +6,6 @@ Order of search: REDIS_URL (then nothing is started), a valkey-server or redis-s
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import importlib
 import os
@@ -20,6 +19,7 @@ from pathlib import Path
 import redis
 
 from contract.errors import UnavailableError
+from contract.locks import FolderLock
 from contract.queue_redis import RedisQueue
 
 SOCKET_PATH_LIMIT = 107
@@ -86,7 +86,7 @@ class EmbeddedServer:
         self._socket = short_socket_path(self._folder, "queue.sock")
         self._process: subprocess.Popen[bytes] | None = None
         self._adopted = False
-        self._lock: int | None = None
+        self._lock = FolderLock(self._folder / "lock")
 
     @property
     def url(self) -> str:
@@ -104,7 +104,7 @@ class EmbeddedServer:
         Raises:
             UnavailableError: no server program, or it does not come up.
         """
-        owner = self._owns_folder()
+        owner = self._lock.take()
         self._adopted = owner and self._answers()
         if owner and not self._adopted:
             binary = find_server()
@@ -143,21 +143,7 @@ class EmbeddedServer:
         elif self._adopted:
             redis.Redis.from_url(self.url, socket_timeout=STOP_TIMEOUT_S).shutdown()
             self._adopted = False
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
-
-    def _owns_folder(self) -> bool:
-        if self._lock is not None:
-            return True
-        descriptor = os.open(self._folder / "lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(descriptor)
-            return False
-        self._lock = descriptor
-        return True
+        self._lock.release()
 
     def _answers(self) -> bool:
         if not self._socket.exists():

@@ -1,0 +1,174 @@
+"""`intrasplat up`: a queue, the service and one worker on this machine, watched until the caller ends them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from client.api import Client
+from contract.embedded import EmbeddedServer
+from contract.errors import UnavailableError
+from contract.locks import FolderLock
+from contract.settings import Settings
+from contract.store import Store
+
+DASHBOARD = Path(__file__).resolve().parent / "dashboard"
+WATCH_PERIOD_S = 0.2
+FIRST_PAUSE_S = 0.5
+LONGEST_PAUSE_S = 30.0
+STEADY_S = 60.0
+"""A process that lived this long was sound: its next crash is the first again."""
+
+STOP_TIMEOUT_S = 15.0
+
+
+class WatchedProcess:
+    """A child that is started again when it ends by itself, after pauses that double."""
+
+    def __init__(self, name: str, command: list[str], environment: dict[str, str]) -> None:
+        self._name = name
+        self._command = command
+        self._environment = environment
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pause_s = FIRST_PAUSE_S
+        self._started_s = 0.0
+        self._start_at_s = 0.0
+
+    @property
+    def process_id(self) -> int | None:
+        """Of the running child."""
+        return self._process.pid if self._process else None
+
+    def watch(self) -> None:
+        """Start the child if it is not there and its pause is over."""
+        now_s = time.monotonic()
+        if self._process is not None:
+            status = self._process.poll()
+            if status is None:
+                return
+            self._pause_s = FIRST_PAUSE_S if now_s - self._started_s > STEADY_S else self._pause_s
+            self._start_at_s = now_s + self._pause_s
+            say(f"the {self._name} ended with status {status}; starting it again in {self._pause_s:g} s")
+            self._pause_s = min(LONGEST_PAUSE_S, 2 * self._pause_s)
+            self._process = None
+        if now_s >= self._start_at_s:
+            # A session of its own: Ctrl-C reaches the launcher alone, which ends the others in order.
+            self._process = subprocess.Popen(
+                self._command, env=self._environment, stdin=subprocess.DEVNULL, start_new_session=True
+            )
+            self._started_s = now_s
+
+    def stop(self) -> None:
+        """Ask the child to end, and insist after STOP_TIMEOUT_S."""
+        if self._process is None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process = None
+
+
+class Installation:
+    """Queue, service and worker of one data directory; a context manager that starts and ends them."""
+
+    def __init__(self, settings: Settings) -> None:
+        Store(settings.data_dir)  # makes the folders, readable by their owner only
+        data_dir = settings.data_dir.expanduser().resolve()
+        self._lock = FolderLock(data_dir / "run" / "up.lock")
+        self._queue = EmbeddedServer(data_dir) if settings.redis_url is None else None
+        redis_url = settings.redis_url if self._queue is None else self._queue.url
+        self.settings = settings.model_copy(
+            update={"data_dir": data_dir, "redis_url": redis_url, "dashboard_dir": DASHBOARD}
+        )
+        environment = {**os.environ, **self.settings.to_environment()}
+        self.service = WatchedProcess("service", [sys.executable, "-m", "service"], environment)
+        self.worker = WatchedProcess("worker", [sys.executable, "-m", "worker", "consume"], environment)
+
+    @property
+    def url(self) -> str:
+        """Where the service answers."""
+        return f"http://{self.settings.host}:{self.settings.port}"
+
+    def __enter__(self) -> Installation:
+        if not self._lock.take():
+            problem = f"Another `intrasplat up` uses {self.settings.data_dir}."
+            raise UnavailableError(problem, "Use that one, end it, or choose another --data-dir.")
+        if self._queue is not None:
+            self._queue.start()
+        self.watch()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.service.stop()
+        self.worker.stop()
+        if self._queue is not None:
+            self._queue.stop()
+        self._lock.release()
+
+    def watch(self) -> None:
+        """Start again what has died; call it often."""
+        if self._queue is not None and self._queue.ensure_running():
+            say("the queue's server had died and was started again; nothing it had accepted is lost")
+        self.service.watch()
+        self.worker.watch()
+
+    def wait_until_ready(self, is_ended: Callable[[], bool], timeout_s: float) -> bool:
+        """Watch until a clip would be trained; False if that takes too long or the caller ends."""
+        deadline_s = time.monotonic() + timeout_s
+        with Client(self.url) as client:
+            while time.monotonic() < deadline_s and not is_ended():
+                self.watch()
+                if client.is_ready():
+                    return True
+                time.sleep(WATCH_PERIOD_S)
+        return False
+
+
+def say(text: str) -> None:
+    """A line for whoever watches the launcher."""
+    print(f"intrasplat: {text}", file=sys.stderr, flush=True)
+
+
+def run(settings: Settings, ready_timeout_s: float = 300.0) -> None:
+    """Start everything, say where it is, and watch until SIGINT or SIGTERM.
+
+    Raises:
+        UnavailableError: the port is taken, there is no queue, or nothing becomes ready.
+    """
+    end = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: end.set())
+    check_port(settings.host, settings.port)
+    with Installation(settings) as installation:
+        say("starting; the first time, the kernels are compiled, which takes up to a minute")
+        if not installation.wait_until_ready(end.is_set, ready_timeout_s):
+            if end.is_set():
+                return
+            raise UnavailableError(
+                "The worker did not become ready.", "Its messages are above; try `intrasplat doctor`."
+            )
+        say(f"ready: {installation.url}/   data: {installation.settings.data_dir}   end with Ctrl-C")
+        while not end.wait(WATCH_PERIOD_S):
+            installation.watch()
+        say("ending")
+
+
+def check_port(host: str, port: int) -> None:
+    """Raise UnavailableError if somebody else listens there."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            problem = f"Port {port} is not free ({error.strerror})."
+            raise UnavailableError(problem, f"Choose another: --port {port + 1}.") from error
