@@ -26,6 +26,8 @@ from worker.clip.video import FALLBACK_RATE_HZ
 LAYOUT = "EndoNeRF"
 CONFIDENT = 255  # depth_confidence of every valid depth: the layout carries none of its own
 _BYTES_PER_PIXEL = 3 + 4 + 1 + 1  # rgb, depth_mm, depth_confidence, tissue
+_USUAL_DEPTH_MM = (5.0, 500.0)  # working distances of endoscopes with ample room; other units fall outside
+_LEAST_DEPTH_SHARE = 0.5  # of tissue pixels with depth, below which the user should know
 _MOST_THREADS = 4  # decoding PNG releases the interpreter; more threads than this wait for the disk
 
 
@@ -51,7 +53,7 @@ def read_endonerf(
     rgb = _decode_all(images, np.uint8, (3,), lambda name: as_rgb(images.decode(name), tree.field, name))
     depth_mm = _read_depth(tree, images)
     masks = _masks(tree, images, masks_white, mask_polarity)
-    if not (depth_mm[masks.tissue] > 0).any():
+    if not ((depth_mm > 0) & masks.tissue).any():
         where = "on tissue" if (depth_mm > 0).any() else "anywhere"
         raise InputError(
             tree.field, f"depth/ has no valid depth {where}.", "Give millimetres as grey PNG, 0 = invalid."
@@ -72,7 +74,7 @@ def read_endonerf(
         world_from_camera=poses.world_from_camera,
         frame_times_s=np.arange(images.frame_count) / FALLBACK_RATE_HZ,
         assumptions=_assumptions(masks, poses, convention),
-        warnings=masks.warnings,
+        warnings=(*masks.warnings, *_depth_warnings(depth_mm, masks.tissue)),
     )
 
 
@@ -139,7 +141,25 @@ def _decode_all(
 ) -> NDArray[Any]:
     """All frames of a sequence [T, H, W, ...], decoded by a few threads."""
     result: NDArray[Any] = np.empty((images.frame_count, images.height, images.width, *channels), dtype=dtype)
+
+    def fill(index: int) -> None:
+        result[index] = decode(images.names[index])
+
     with ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1)) as threads:
-        for index, frame in enumerate(threads.map(decode, images.names)):
-            result[index] = frame
+        for _ in threads.map(fill, range(images.frame_count)):
+            pass
     return result
+
+
+def _depth_warnings(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) -> tuple[str, ...]:
+    """What looks odd about depth that has some valid pixel on tissue; judged on every 4th row and column."""
+    depth_mm, tissue = depth_mm[:, ::4, ::4], tissue[:, ::4, ::4]
+    valid = (depth_mm > 0) & tissue
+    warnings = []
+    low, high = _USUAL_DEPTH_MM
+    if valid.any() and not low <= (median := float(np.median(depth_mm[valid]))) <= high:
+        warnings.append(f"depth: its median is {median:.1f} mm, unusual for an endoscope; is it in millimetres?")
+    share = np.count_nonzero(valid) / max(1, int(np.count_nonzero(tissue)))
+    if share < _LEAST_DEPTH_SHARE:
+        warnings.append(f"depth: only {100 * share:.0f} % of the tissue pixels have one")
+    return tuple(warnings)

@@ -101,6 +101,19 @@ def test_a_member_whose_content_is_damaged_is_named(studio) -> None:
         next(open_clip(path).pairs())
 
 
+def test_a_member_that_is_larger_than_it_declares_is_refused(studio) -> None:
+    left, right = studio.eyes(1)
+    studio.images("clip/left/{}.png", left)
+    studio.images("clip/right/{}.png", right)
+    path = studio.zip(studio.root / "clip")
+    data = bytearray(path.read_bytes())
+    directory = data.index(b"PK\x01\x02")
+    data[directory + 24 : directory + 28] = (2000).to_bytes(4, "little")  # uncompressed size of the first member
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"left/000000.png"):
+        next(open_clip(path).pairs())
+
+
 def test_a_cut_zip_is_refused(studio) -> None:
     folder = studio.endonerf()
     path = studio.zip(folder)

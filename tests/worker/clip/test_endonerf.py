@@ -44,6 +44,7 @@ def test_a_folder_and_its_zip_give_the_same_clip(studio, zipped: bool) -> None:
     np.testing.assert_array_equal(clip.world_from_camera, np.tile(np.eye(4), (3, 1, 1)))
     np.testing.assert_allclose(clip.frame_times_s, np.arange(3) / 30)
     assert any("white is tool" in assumption for assumption in clip.assumptions)
+    assert clip.warnings == ()
 
 
 def test_16_bit_depth_is_millimetres(studio) -> None:
@@ -221,6 +222,21 @@ def test_no_valid_depth_is_refused(studio) -> None:
     studio.images("endonerf/depth/frame-{}.depth.png", on_tool)
     with pytest.raises(InputError, match="no valid depth on tissue"):
         open_clip(folder)
+
+
+@pytest.mark.parametrize(("depth_mm", "warning"), [(2, "median is 2.0 mm"), (2000, "median is 2000.0 mm")])
+def test_depth_in_other_units_is_warned_about(studio, depth_mm: int, warning: str) -> None:
+    folder = studio.endonerf()
+    studio.images("endonerf/depth/frame-{}.depth.png", np.full((3, 64, 80), depth_mm, dtype=np.uint16))
+    assert warning in depth_clip(folder).warnings[0]
+
+
+def test_mostly_missing_depth_is_warned_about(studio) -> None:
+    folder = studio.endonerf()
+    depth = np.zeros((3, 64, 80), dtype=np.uint8)
+    depth[:, :, :20] = 60
+    studio.images("endonerf/depth/frame-{}.depth.png", depth)
+    assert any("of the tissue pixels have one" in warning for warning in depth_clip(folder).warnings)
 
 
 def test_a_damaged_image_is_named(studio) -> None:

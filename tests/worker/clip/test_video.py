@@ -256,6 +256,12 @@ def test_clips_over_a_limit_are_refused(limits: ClipLimits, problem: str) -> Non
         open_clip(SBS_H264, limits=limits)
 
 
+@pytest.mark.parametrize("limits", [ClipLimits(frames=11), ClipLimits(decoded_bytes=12 * 192 * 80 * 3 - 1)])
+def test_limits_hold_while_decoding_where_the_header_says_nothing(limits: ClipLimits) -> None:
+    with pytest.raises(LimitError):
+        open_clip(DATA / "stereo_sbs_live.webm", limits=limits)
+
+
 def test_layouts_that_do_not_fit_a_video_are_refused() -> None:
     for layout in ("endonerf", "stereomis", "frames"):
         with pytest.raises(InputError, match="folder or zip"):
