@@ -1,0 +1,307 @@
+"""A finished scene on disk, and a training state to go on from.
+
+Symbols: N Gaussians, T frames, C = 10 channels, B bases. Gaussians are in optimiser units (mm * units_per_mm),
+poses in mm.
+
+    directory/
+    ├── scene.safetensors   every tensor: gaussians.*, deformation.*, seen
+    └── manifest.json       format, camera, poses, times, settings; shape and type of each tensor, SHA-256 of each file
+    resume.safetensors      one file: tensors, and in its header the loop's state as JSON and a SHA-256 over both
+
+Files are written aside, made durable and renamed; the manifest last, so a folder without one holds no scene.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load, save
+from torch import Tensor
+
+from contract.camera import Intrinsics
+from contract.errors import SceneError
+from worker.deformation import Deformation, restore
+from worker.gaussians import Gaussians
+
+FORMAT = "intrasplat-scene"
+FORMAT_VERSION = 1
+"""Raised when an older reader would misread what is written."""
+SCENE_FILE = "scene.safetensors"
+MANIFEST_FILE = "manifest.json"
+RESUME_FILE = "resume.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """All that rendering needs.
+
+    gaussians, deformation  the model, optimiser units
+    intrinsics              of the clip's left eye
+    world_from_camera       [T, 4, 4] float64, mm: the endoscope's own poses
+    frame_times_s           [T] seconds from frame 0
+    units_per_mm            optimiser units = mm * units_per_mm
+    preset, seed, settings  how it was trained; settings is JSON
+    trained_t               model times of the training frames
+    seen                    [N] float32 in [0, 1]: share of training frames that saw each Gaussian x stereo confidence
+    """
+
+    gaussians: Gaussians
+    deformation: Deformation
+    intrinsics: Intrinsics
+    world_from_camera: NDArray[np.float64]
+    frame_times_s: NDArray[np.float64]
+    units_per_mm: float
+    preset: str
+    trained_t: tuple[float, ...]
+    seen: Tensor
+    seed: int = 0
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def frame_count(self) -> int:
+        return int(self.world_from_camera.shape[0])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Every stored tensor by its name in the file, on the CPU."""
+        named = {f"gaussians.{name}": each for name, each in self.gaussians.tensors().items()}
+        moving = self.deformation.parameters() | self.deformation.constants()
+        named |= {f"deformation.{name}": each for name, each in moving.items()}
+        named["seen"] = self.seen
+        return {name: each.detach().cpu().contiguous() for name, each in named.items()}
+
+    @property
+    def byte_count(self) -> int:
+        """Bytes of all tensors: the scene's size on disk but for a header of some kB."""
+        return sum(each.numel() * each.element_size() for each in self.tensors().values())
+
+
+def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> None:
+    """Writes the scene into a directory, which is made if need be; one that is there is replaced.
+
+    Args:
+        beside: names of files already in the directory (report.json, curve.csv) whose hashes the manifest shall hold.
+
+    Raises:
+        SceneError: a tensor is not finite, or the tensors do not belong together; nothing is written.
+    """
+    tensors = scene.tensors()
+    _check_finite(tensors)
+    _check_counts(scene)
+    directory.mkdir(parents=True, exist_ok=True)
+    data = save(tensors)
+    files = {SCENE_FILE: data} | {name: (directory / _plain(name)).read_bytes() for name in beside}
+    manifest = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "deformation": scene.deformation.kind,
+        "gaussians": len(scene.gaussians),
+        "intrinsics": scene.intrinsics.model_dump(),
+        "world_from_camera": scene.world_from_camera.tolist(),
+        "frame_times_s": scene.frame_times_s.tolist(),
+        "units_per_mm": scene.units_per_mm,
+        "preset": scene.preset,
+        "seed": scene.seed,
+        "settings": scene.settings,
+        "trained_t": list(scene.trained_t),
+        "tensors": {name: {"shape": list(each.shape), "dtype": _dtype(each)} for name, each in tensors.items()},
+        "files": {
+            name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            for name, content in files.items()
+        },
+    }
+    text = json.dumps(manifest, indent=1, allow_nan=False)
+    _write(directory / SCENE_FILE, data)
+    _write(directory / MANIFEST_FILE, text.encode())
+
+
+def load_scene(directory: Path) -> Scene:
+    """The scene of a directory, on the CPU, every file checked against its hash.
+
+    Raises:
+        SceneError: missing, damaged, of another version, or with tensors of another shape, type or not finite.
+    """
+    manifest = _read_manifest(directory / MANIFEST_FILE)
+    try:
+        data = {name: _read_checked(directory / _plain(name), expected) for name, expected in manifest["files"].items()}
+        tensors = _parse(data[SCENE_FILE], directory / SCENE_FILE)
+        _check_declared(tensors, manifest["tensors"])
+        _check_finite(tensors)
+        scene = _scene_of(manifest, tensors)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise SceneError(f"The scene in {directory} does not fit its manifest: {error!r}.") from error
+    _check_counts(scene)
+    return scene
+
+
+def save_resume(directory: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
+    """Writes a training state to directory/resume.safetensors, in place of the one before; at no time is there none.
+
+    Args:
+        tensors: of any type, for example parameters, Adam's moments and a generator's state.
+        state: what JSON can hold: iteration, seconds, settings.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    named = {name: each.detach().cpu().contiguous() for name, each in tensors.items()}
+    text = json.dumps(dict(state), sort_keys=True)
+    header = {"state": text, "version": str(FORMAT_VERSION), "sha256": _digest(named, text)}
+    _write(directory / RESUME_FILE, save(named, metadata=header))
+
+
+def load_resume(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors and the state that save_resume wrote, on the CPU.
+
+    Raises:
+        SceneError: there is none, it is damaged, or another version wrote it.
+    """
+    path = directory / RESUME_FILE
+    data = _read(path)
+    tensors = _parse(data, path)
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__", {})
+    if header.get("version") != str(FORMAT_VERSION):
+        raise SceneError(f"{path} is of version {header.get('version')}, this program reads {FORMAT_VERSION}.")
+    if header.get("sha256") != _digest(tensors, header.get("state", "")):
+        raise SceneError(f"{path} is damaged: its contents do not match their hash.")
+    state: dict[str, Any] = json.loads(header["state"])
+    return tensors, state
+
+
+def _scene_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> Scene:
+    def under(prefix: str) -> dict[str, Tensor]:
+        return {name.removeprefix(prefix): each for name, each in tensors.items() if name.startswith(prefix)}
+
+    poses = np.array(manifest["world_from_camera"], dtype=np.float64)
+    times_s = np.array(manifest["frame_times_s"], dtype=np.float64)
+    if poses.shape != (len(times_s), 4, 4) or not np.isfinite(poses).all():
+        raise ValueError(f"world_from_camera has shape {poses.shape} for {len(times_s)} frames")
+    return Scene(
+        gaussians=Gaussians(**under("gaussians.")),
+        deformation=restore(manifest["deformation"], under("deformation.")),
+        intrinsics=Intrinsics.model_validate(manifest["intrinsics"]),
+        world_from_camera=poses,
+        frame_times_s=times_s,
+        units_per_mm=float(manifest["units_per_mm"]),
+        preset=str(manifest["preset"]),
+        trained_t=tuple(float(t) for t in manifest["trained_t"]),
+        seen=tensors["seen"],
+        seed=int(manifest["seed"]),
+        settings=dict(manifest["settings"]),
+    )
+
+
+def _check_counts(scene: Scene) -> None:
+    """N is the same everywhere, and the deformation is one of these Gaussians."""
+    count = len(scene.gaussians)
+    shapes = {
+        "quaternion": ((count, 4), scene.gaussians.quaternion),
+        "mean": ((count, 3), scene.gaussians.mean),
+        "log_scale": ((count, 3), scene.gaussians.log_scale),
+        "opacity_logit": ((count,), scene.gaussians.opacity_logit),
+        "seen": ((count,), scene.seen),
+        "sh": ((count, (scene.gaussians.sh_degree + 1) ** 2, 3), scene.gaussians.sh),
+    }
+    for name, (expected, tensor) in shapes.items():
+        if tuple(tensor.shape) != expected or tensor.dtype != torch.float32:
+            found = f"{_dtype(tensor)} {list(tensor.shape)}"
+            raise SceneError(f"The scene's {name} is {found}, {count} Gaussians need float32 {list(expected)}.")
+    weight = scene.deformation.parameters().get("weight")
+    if weight is not None and weight.shape[0] != count:
+        raise SceneError(f"The scene's deformation moves {weight.shape[0]} Gaussians, there are {count}.")
+    if not scene.units_per_mm > 0:
+        raise SceneError(f"The scene's units_per_mm is {scene.units_per_mm}, it must be above 0.")
+
+
+def _check_declared(tensors: dict[str, Tensor], declared: dict[str, Any]) -> None:
+    found = {name: {"shape": list(each.shape), "dtype": _dtype(each)} for name, each in tensors.items()}
+    if found != declared:
+        names = sorted(name for name in found | declared if found.get(name) != declared.get(name))
+        raise SceneError(f"The scene's tensors are not those its manifest lists: {', '.join(names)}.")
+
+
+def _check_finite(tensors: dict[str, Tensor]) -> None:
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            broken = int((~torch.isfinite(tensor)).sum())
+            raise SceneError(f"The scene's {name} holds {broken} values that are NaN or infinite.")
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    try:
+        manifest = json.loads(_read(path))
+    except ValueError as error:
+        raise SceneError(f"{path} is damaged: {error}.") from error
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise SceneError(f"{path} is not the manifest of a scene.")
+    if manifest.get("version") != FORMAT_VERSION:
+        raise SceneError(
+            f"{path} is of version {manifest.get('version')}, this program reads version {FORMAT_VERSION}."
+        )
+    return manifest
+
+
+def _read_checked(path: Path, expected: dict[str, Any]) -> bytes:
+    data = _read(path)
+    if len(data) != expected["bytes"] or hashlib.sha256(data).hexdigest() != expected["sha256"]:
+        raise SceneError(f"{path} is damaged: {len(data)} bytes that do not match the hash in the manifest.")
+    return data
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def _parse(data: bytes, path: Path) -> dict[str, Tensor]:
+    try:
+        return dict(load(data))
+    except (safetensors.SafetensorError, ValueError, KeyError) as error:
+        raise SceneError(f"{path} is damaged: {error}.") from error
+
+
+def _digest(tensors: Mapping[str, Tensor], state: str) -> str:
+    """SHA-256 over the state and every tensor's name, type, shape and bytes, by name."""
+    digest = hashlib.sha256(state.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"\n{name} {_dtype(tensor)} {list(tensor.shape)}\n".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _dtype(tensor: Tensor) -> str:
+    return str(tensor.dtype).removeprefix("torch.")
+
+
+def _plain(name: str) -> str:
+    if name in ("", ".", "..") or Path(name).name != name:
+        raise SceneError(f"{name!r} is not the name of a file in a scene's folder.")
+    return name
+
+
+def _write(path: Path, data: bytes) -> None:
+    """The whole file or none of it, also when the power fails."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with aside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
