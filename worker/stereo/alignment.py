@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from contract.errors import InputError
 from worker.stereo.matching import DISPARITY_STEPS, Grey, padded, semi_global_matcher, shift_rows
 
-FEATURE_WIDTH = 700  # features are found on images at most this wide: larger ones cost time and place them no better
+FEATURE_WIDTH = (
+    400  # features are found on images at most this wide: the median over pairs is as good, in a third of the time
+)
 FEATURES = 1500
 RATIO = 0.8  # Lowe's ratio test
 MAX_SEARCHED_SHIFT_PX = 48.0  # matches farther apart in y are wrong

@@ -21,6 +21,7 @@ Image = NDArray[np.float32]  # [H, W]
 
 HALF_RESOLUTION_FROM_WIDTH = 480  # narrower images keep their resolution: disparities are few and detail is scarce
 BLOCK_PX = 5
+SPARE_STEPS = 1.5  # of the range's margin, given up where they would cost sixteen more disparities
 DISPARITY_STEPS = 16  # per px, in which OpenCV's matchers count
 SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 8, 32  # SGBM's P1, P2 per block pixel, OpenCV's own advice
 PREFILTER_CAP = 31
@@ -59,7 +60,7 @@ def match(left: Grey, right: Grey, plan: MatchPlan) -> tuple[Image, NDArray[np.u
     size = (round(width / factor), round(height / factor))
     scale = size[0] / width
     low = int(np.floor(plan.min_disparity_px * scale))
-    count = 16 * int(np.ceil((plan.max_disparity_px * scale - low) / 16))
+    count = 16 * max(1, int(np.ceil((plan.max_disparity_px * scale - low - SPARE_STEPS) / 16)))
     coarse, consistency = _semi_global(_resized(left, size), _resized(right, size), low, count)
     disparity = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR) / np.float32(scale)
     disparity, texture, residual = _refine(disparity, left, right)
