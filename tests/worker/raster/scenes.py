@@ -84,11 +84,20 @@ def camera(width: int, height: int, pose: NDArray[np.float64] | None = None) -> 
     )
 
 
-def random_scene(count: int, *, width: int, height: int, seed: int = 0, pixels: float = 2.0) -> Scene:
+def random_scene(
+    count: int,
+    *,
+    width: int,
+    height: int,
+    seed: int = 0,
+    pixels: float = 2.0,
+    opacities: tuple[float, ...] = (0.05, 0.4, 0.999),
+) -> Scene:
     """Gaussians in and around the image at distinct depths, float64: faint and opaque, thin and wide, any orientation.
 
     Args:
         pixels: standard deviation on the image of an average Gaussian.
+        opacities: each Gaussian has one of them, less up to a tenth.
     """
     random = np.random.default_rng(seed)
     view = camera(width, height)
@@ -100,10 +109,15 @@ def random_scene(count: int, *, width: int, height: int, seed: int = 0, pixels: 
         mean=torch.tensor(unproject(view, column, row, depth)),
         quaternion=torch.tensor(random.normal(size=(count, 4))),
         scale=torch.tensor(scale),
-        opacity=torch.tensor(random.choice([0.05, 0.4, 0.999], count) * random.uniform(0.9, 1.0, count)),
+        opacity=torch.tensor(random.choice(opacities, count) * random.uniform(0.9, 1.0, count)),
         colour=torch.tensor(random.uniform(-0.2, 1.4, (count, 3))),
         camera=view,
     )
+
+
+def opaque_wall() -> Scene:
+    """Every pixel is full long before its last Gaussian: most are hidden everywhere."""
+    return random_scene(400, width=37, height=35, seed=40, pixels=9.0, opacities=(0.9,))
 
 
 def unproject(
@@ -134,7 +148,8 @@ def pixels_near_a_cut(scene: Scene, *, alpha_margin: float = 1e-5, stop_margin: 
         dx, dy = j - mean2d[g, 0], i - mean2d[g, 1]
         a, b, c = conic[g]
         raw = opacity[g] * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
-        near |= (abs(raw - MIN_ALPHA) < alpha_margin) | (abs(raw - MAX_ALPHA) < alpha_margin)
+        open_still = transmittance >= MIN_TRANSMITTANCE - stop_margin
+        near |= open_still & ((abs(raw - MIN_ALPHA) < alpha_margin) | (abs(raw - MAX_ALPHA) < alpha_margin))
         alpha = np.where(raw >= MIN_ALPHA, np.minimum(raw, MAX_ALPHA), 0.0)
         near |= (alpha > 0) & (abs(transmittance - MIN_TRANSMITTANCE) < stop_margin)
         transmittance *= np.where(transmittance >= MIN_TRANSMITTANCE, 1 - alpha, 1.0)

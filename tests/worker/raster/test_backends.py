@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.helpers import assert_close
-from tests.worker.raster.scenes import BACKENDS, Rasterize, Scene, pixels_near_a_cut, random_scene
-from worker.raster import Rendered, reference
+from tests.worker.raster.scenes import BACKENDS, Rasterize, Scene, opaque_wall, pixels_near_a_cut, random_scene
+from worker.raster import MIN_TRANSMITTANCE, Rendered, reference
 
 MOST_LEFT_OUT = 0.05
 """Share of an image's pixels that may lie near a cut before a comparison says too little."""
@@ -29,9 +29,18 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "one row": lambda: random_scene(60, width=70, height=1, seed=5),
     "past a tile": lambda: random_scene(200, width=33, height=65, seed=6),
     "wide": lambda: random_scene(50, width=40, height=40, seed=7, pixels=7.0),
+    "opaque": opaque_wall,
     "thinner than a pixel": lambda: random_scene(600, width=56, height=40, seed=8, pixels=0.15),
     "a small frame": lambda: random_scene(1500, width=96, height=80, seed=9),
 }
+
+
+def test_the_opaque_scene_hides_most_of_its_gaussians() -> None:
+    wall = opaque_wall()
+    assert float(wall.render().alpha.min()) > 1 - MIN_TRANSMITTANCE
+    live = wall.differentiable()
+    (gradient,) = torch.autograd.grad(live.render().rgb.sum(), [live.colour])
+    assert float((gradient == 0).all(dim=1).double().mean()) > 0.5
 
 
 @pytest.fixture(params=sorted(BACKENDS))

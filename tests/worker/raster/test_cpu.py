@@ -6,6 +6,7 @@ The gradients of a step are read from Adam's first moments, which after one step
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,18 +16,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.helpers import assert_close
-from tests.worker.raster.scenes import Scene, pixels_near_a_cut, random_scene
+from tests.worker.raster.scenes import Scene, opaque_wall, pixels_near_a_cut, random_scene
 from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
 from worker.gaussians import Gaussians
+from worker.loss import LossSettings, training_loss
 from worker.optimize import StepRates
 from worker.raster import Camera
 from worker.raster.cpu import Rasterizer, Target, camera_vector, padded
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, SharedMotion, motion_of
 
-COLOUR_WEIGHT, DEPTH_WEIGHT = 0.7, 40.0
-COLOUR_ZONE, DEPTH_ZONE = 0.05, 1e-3
-"""Half-widths of the loss's quadratic zone: channels in [0, 1], and 1 / units."""
+LOSSES = {
+    "summed depth": LossSettings(2e3, 4e4, normalised_depth=False, colour_zone=0.05, depth_zone=1e-3),
+    "normalised depth": LossSettings(2e3, 4e4, normalised_depth=True, colour_zone=0.05, depth_zone=1e-3),
+}
+"""Weights near the number of pixels, so that gradients are near 1 and the absolute tolerance plays no part."""
+NORMALISED = LOSSES["normalised depth"]
 RATES = StepRates(
     mean=1e-3,
     quaternion=2e-3,
@@ -43,11 +48,11 @@ RATES = StepRates(
 
 @dataclass(frozen=True)
 class Frame:
-    """One training frame, unpadded: rgb [H, W, 3] uint8, tissue [H, W] bool, inverse depth [H, W] with holes."""
+    """One training frame, unpadded: rgb [H, W, 3] uint8, tissue [H, W] bool, depth [H, W] in units, 0 = invalid."""
 
     rgb: NDArray[np.uint8]
     tissue: NDArray[np.bool_]
-    inverse_depth: NDArray[np.float32]
+    depth: NDArray[np.float32]
 
     def target(self, rasterizer: Rasterizer) -> Target:
         """Padded to whole tiles; the padding holds values that would show if they were read."""
@@ -59,40 +64,40 @@ class Frame:
         rgb[:, :, :width] = self.rgb.transpose(2, 0, 1)
         weight[:, :width] = self.tissue * 255
         weight[:, width:] = 0
-        inverse_depth[:, :width] = self.inverse_depth
+        inverse_depth[:, :width] = np.where(self.depth > 0, 1 / np.where(self.depth > 0, self.depth, 1), 0)
         return Target(rgb.ravel(), weight.ravel(), inverse_depth.ravel())
+
+    def kernel_settings(self, settings: LossSettings) -> NDArray[np.float32]:
+        """The kernel's loss is a sum over pixels: worker.loss's means need this frame's counts."""
+        with_depth = int((self.tissue & (self.depth > 0)).sum())
+        return np.array(
+            [
+                settings.colour_weight / (3 * int(self.tissue.sum())),
+                settings.depth_weight / with_depth,
+                1 / settings.colour_zone,
+                1 / settings.depth_zone,
+                settings.normalised_depth,
+            ],
+            np.float32,
+        )
+
+    def loss(self, scene: Scene, settings: LossSettings) -> Tensor:
+        """worker.loss on the reference's render."""
+        rendered = scene.render()
+        true_rgb = torch.from_numpy(self.rgb).double() / 255
+        true_depth, tissue = torch.from_numpy(self.depth).double(), torch.from_numpy(self.tissue)
+        return training_loss(rendered.rgb, rendered.depth, rendered.alpha, true_rgb, true_depth, tissue, settings).total
 
 
 def random_frame(camera: Camera, left_out: NDArray[np.bool_]) -> Frame:
     random = np.random.default_rng(21)
     shape = (camera.height, camera.width)
-    inverse_depth = random.uniform(1 / 90, 1 / 40, shape) * (random.uniform(size=shape) > 0.2)
+    depth = random.uniform(40, 90, shape) * (random.uniform(size=shape) > 0.2)
     return Frame(
         rgb=random.integers(0, 256, (*shape, 3), dtype=np.uint8),
         tissue=(random.uniform(size=shape) > 0.15) & ~left_out,
-        inverse_depth=inverse_depth.astype(np.float32),
+        depth=depth.astype(np.float32),
     )
-
-
-def loss_settings(normalised: bool) -> NDArray[np.float32]:
-    return np.array([COLOUR_WEIGHT, DEPTH_WEIGHT, 1 / COLOUR_ZONE, 1 / DEPTH_ZONE, normalised], np.float32)
-
-
-def torch_loss(scene: Scene, frame: Frame, normalised: bool) -> Tensor:
-    """The kernel's loss from its equation: Huber's on colour and on inverse depth, summed over tissue."""
-    rendered = scene.render()
-    tissue = torch.from_numpy(frame.tissue)
-    wanted = torch.from_numpy(frame.inverse_depth).double()
-    usable = tissue & (wanted > 0) & (rendered.alpha > 1e-2)
-    depth = torch.where(usable, rendered.depth, torch.ones_like(wanted))
-    inverse = (torch.where(usable, rendered.alpha, torch.ones_like(wanted)) if normalised else 1) / depth
-    colour = _huber(rendered.rgb - torch.from_numpy(frame.rgb).double() / 255, COLOUR_ZONE)
-    depth_loss = _huber(inverse - wanted, DEPTH_ZONE)
-    return COLOUR_WEIGHT * (colour * tissue[..., None]).sum() + DEPTH_WEIGHT * (depth_loss * usable).sum()
-
-
-def _huber(error: Tensor, zone: float) -> Tensor:
-    return torch.where(error.abs() < zone, error**2 / (2 * zone), error.abs() - zone / 2)
 
 
 def project_with(rasterizer: Rasterizer, scene: Scene) -> None:
@@ -113,7 +118,7 @@ def outcome(rasterizer: Rasterizer, scene: Scene, frame: Frame) -> list[NDArray[
     """Copies of everything a render and a loss leave behind for the caller."""
     project_with(rasterizer, scene)
     image = rasterizer.render().copy()
-    gradients = rasterizer.loss_backward(frame.target(rasterizer), loss_settings(True))
+    gradients = rasterizer.loss_backward(frame.target(rasterizer), frame.kernel_settings(NORMALISED))
     parts = [getattr(gradients, field.name).copy() for field in dataclasses.fields(gradients)]
     return [image, rasterizer.statistics.copy(), *parts]
 
@@ -133,11 +138,15 @@ def poison(rasterizer: Rasterizer) -> None:
     rasterizer.slot_start[0] = 0  # the one entry that is set when it is made: nothing lies before the first slot
 
 
-def test_what_the_buffers_held_before_changes_nothing() -> None:
-    scene = random_scene(180, width=45, height=37, seed=30)
-    frame = random_frame(scene.camera, np.zeros((37, 45), bool))
-    expected = outcome(Rasterizer(45, 37), scene, frame)
-    used = Rasterizer(45, 37)
+@pytest.mark.parametrize(
+    "make_scene", [lambda: random_scene(180, width=45, height=37, seed=30), opaque_wall], ids=["open", "opaque"]
+)
+def test_what_the_buffers_held_before_changes_nothing(make_scene: Callable[[], Scene]) -> None:
+    scene = make_scene()
+    width, height = scene.camera.width, scene.camera.height
+    frame = random_frame(scene.camera, np.zeros((height, width), bool))
+    expected = outcome(Rasterizer(width, height), scene, frame)
+    used = Rasterizer(width, height)
     outcome(used, scene, frame)
     poison(used)
     assert_same_bits(outcome(used, scene, frame), expected)
@@ -152,18 +161,18 @@ def test_a_rasterizer_that_saw_other_scenes_gives_the_same_bits() -> None:
     assert_same_bits(outcome(used, scene, frame), outcome(Rasterizer(45, 37), scene, frame))
 
 
-@pytest.mark.parametrize("normalised", [False, True], ids=["summed depth", "normalised depth"])
-def test_the_built_in_loss_has_the_gradients_of_its_equation(normalised: bool) -> None:
+@pytest.mark.parametrize("settings", LOSSES.values(), ids=LOSSES.keys())
+def test_the_built_in_loss_has_the_gradients_of_the_loss(settings: LossSettings) -> None:
     scene = random_scene(220, width=45, height=37, seed=33).to(torch.float32)
     left_out = pixels_near_a_cut(scene)
     frame = random_frame(scene.camera, left_out)
     rasterizer = Rasterizer(45, 37)
     project_with(rasterizer, scene)
-    got = rasterizer.loss_backward(frame.target(rasterizer), loss_settings(normalised))
+    got = rasterizer.loss_backward(frame.target(rasterizer), frame.kernel_settings(settings))
 
     live = scene.to(torch.float64).differentiable()
     leaves = live.leaves()
-    gradients = torch.autograd.grad(torch_loss(live, frame, normalised), list(leaves.values()))
+    gradients = torch.autograd.grad(frame.loss(live, settings), list(leaves.values()))
     wanted = dict(zip(leaves, gradients, strict=True))
     opacity, scale = live.opacity.detach(), live.scale.detach()
     assert_close(got.state[0:3, :220].T, wanted["mean"], name="mean")
@@ -179,7 +188,7 @@ def test_the_loss_reports_its_sums_over_tissue() -> None:
     frame = random_frame(scene.camera, pixels_near_a_cut(scene))
     rasterizer = Rasterizer(45, 37)
     project_with(rasterizer, scene)
-    rasterizer.loss_backward(frame.target(rasterizer), loss_settings(False))
+    rasterizer.loss_backward(frame.target(rasterizer), frame.kernel_settings(NORMALISED))
     rendered = scene.to(torch.float64).render()
     error = (rendered.rgb.numpy() - frame.rgb / 255.0) * frame.tissue[..., None]
     holes = (1 - rendered.alpha.numpy()) * frame.tissue
@@ -205,7 +214,8 @@ def moving_gaussians(kind: str, sh_degree: int) -> tuple[Gaussians, Deformation,
         return gaussians, dataclasses.replace(shared, weight=_stirred(shared.weight, 0.05, random)), scene.camera
     fdm = FlexibleDeformation.initial(90, bases=5, width=0.2, form="quartic" if kind == "fdm-quartic" else "gaussian")
     moved = {name: _stirred(each, 0.05, random) for name, each in fdm.parameters().items()}
-    moved["width"][0, 0, 2] = 1e-4  # under the floor: no gradient in the paper's form
+    # Alive at t = 0.4 and narrower than the floor: no gradient to the width in the paper's form.
+    moved["width"][0, 0, 2], moved["centre"][0, 0, 2] = 1e-4, 0.4005
     moved["width"][1, 0, 2] *= -1
     return gaussians, dataclasses.replace(fdm, **moved), scene.camera  # type: ignore[arg-type]
 
@@ -225,13 +235,13 @@ def test_a_fused_step_has_the_gradients_of_the_stages_one_by_one(kind: str, sh_d
     scene = _scene_of(moved, camera)
     frame = random_frame(camera, pixels_near_a_cut(scene))
     everything = [*leaves.values(), *motion.values()]
-    gradients = torch.autograd.grad(torch_loss(scene, frame, True), everything)
+    gradients = torch.autograd.grad(frame.loss(scene, NORMALISED), everything)
     wanted = dict(zip([*leaves, *motion], gradients, strict=True))
 
     assert isinstance(deformation, SharedBasis | FlexibleDeformation)
     model = FusedModel(gaussians, deformation, camera.width, camera.height)
     target = frame.target(model.rasterizer)
-    model.step(camera_vector(camera), t, target, loss_settings(True), RATES, 1, sh_degree)
+    model.step(camera_vector(camera), t, target, frame.kernel_settings(NORMALISED), RATES, 1, sh_degree)
     stored = {name: 10 * np.asarray(each) for name, each in model.arrays().items()}
 
     canonical = torch.cat([wanted["mean"], wanted["quaternion"], wanted["log_scale"]], dim=1)
