@@ -5,7 +5,11 @@ Pairs are drawn from one smooth random texture: the right eye sees it as it is, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,8 +18,8 @@ from numpy.typing import NDArray
 
 from contract.camera import Intrinsics
 from contract.errors import Cancelled, InputError
-from worker.calibration import RectifiedClip
-from worker.clip.types import DepthClip
+from worker.calibration import RectifiedClip, load_calibration, rectify
+from worker.clip import DepthClip, StereoClip, open_clip
 from worker.hooks import Hooks, Progress
 from worker.stereo import estimate_depth
 
@@ -265,3 +269,47 @@ def test_a_stop_is_obeyed_in_every_part(asked: int) -> None:
 
     with pytest.raises(Cancelled):
         estimate_depth(clip_of([draw_pair(slanted(), seed=i) for i in range(4)]), Hooks(should_stop=should_stop))
+
+
+DATA = Path(os.environ.get("INTRASPLAT_DATA", "../shared/data"))
+REAL_FRAMES = 4
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="INTRASPLAT_DATA names no folder with the recordings")
+
+
+def first_frames(clip: StereoClip, calibration: Path) -> RectifiedClip:
+    def pairs() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+        return islice(clip.pairs(), REAL_FRAMES)
+
+    tissue = None if clip.tissue is None else clip.tissue[:REAL_FRAMES]
+    times_s = clip.frame_times_s[:REAL_FRAMES]
+    short = replace(clip, frame_count=REAL_FRAMES, pairs=pairs, tissue=tissue, frame_times_s=times_s)
+    return rectify(short, load_calibration(calibration, eye_width=clip.width, eye_height=clip.height))
+
+
+@needs_data
+def test_a_real_recording_agrees_with_another_groups_stereo_depth() -> None:
+    folder = DATA / "d4d_stereo"
+    masks = folder / "tool_masks.zip"
+    clip = open_clip(folder / "stereo_sbs.mp4", layout="sbs", masks=masks, mask_polarity="tool")
+    assert isinstance(clip, StereoClip)
+    depth = estimate_depth(first_frames(clip, folder / "calibration.json"))
+    differences: list[NDArray[np.float32]] = []
+    for i, (ours, tissue) in enumerate(zip(depth.depth_mm, depth.tissue, strict=True)):
+        reference = cv2.imread(str(DATA / f"d4d_endonerf/depth/frame-{i:06d}.depth.png"), cv2.IMREAD_UNCHANGED)
+        assert reference is not None
+        size = reference.shape[::-1]
+        resized = cv2.resize(ours * tissue, size, interpolation=cv2.INTER_NEAREST)
+        differences.append(np.abs(resized - reference)[(resized > 0) & (reference > 0)])
+    assert np.median(np.concatenate(differences)) < 1.5
+    assert np.percentile(np.concatenate(differences), 90) < 5.0
+    assert depth.measurements["depth_valid_share"] > 0.9
+
+
+@needs_data
+def test_a_raw_recording_lands_on_equal_rows() -> None:
+    clip = open_clip(DATA / "surgt_raw/video.mp4", layout="sbs")
+    assert isinstance(clip, StereoClip)
+    depth = estimate_depth(first_frames(clip, DATA / "surgt_raw/calibration.yaml"))
+    assert depth.measurements["vertical_residual_px"] < 0.5
+    assert abs(depth.measurements["vertical_misalignment_px"]) < 1.0
+    assert depth.measurements["depth_valid_share"] > 0.8

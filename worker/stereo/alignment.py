@@ -47,9 +47,12 @@ class RowShift:
         return self.shift_px if worth_it else 0.0
 
 
-def feature_matches(left: Grey, right: Grey) -> NDArray[np.float64]:
-    """[M, 4] x_left, y_left, x_right, y_right of SIFT matches that pass the ratio test and lie on similar rows."""
-    scale = min(1.0, FEATURE_WIDTH / left.shape[1])
+def feature_matches(left: Grey, right: Grey, at_most_px: int = FEATURE_WIDTH) -> NDArray[np.float64]:
+    """[M, 4] x_left, y_left, x_right, y_right of SIFT matches that pass the ratio test and lie on similar rows.
+
+    Features are found on images made at_most_px wide; the coordinates are the full images'.
+    """
+    scale = min(1.0, at_most_px / left.shape[1])
     finder = cv2.SIFT.create(nfeatures=FEATURES)
     found = []
     for image in (left, right):

@@ -1,0 +1,108 @@
+"""Depth from stereo on real clips: agreement with a reference, rows after rectification, and seconds a frame.
+
+    python benchmarks/bm_stereo.py [--data FOLDER] [--repeats 3]
+
+FOLDER (INTRASPLAT_DATA, else ../shared/data) holds `d4d_stereo` and `d4d_endonerf` (one recording, as stereo video and
+as frames with another group's stereo depth, 1 mm steps) and `surgt_raw` (unrectified, with an OpenCV YAML).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.calibration import RectifiedClip, load_calibration, rectify
+from worker.clip import DepthClip, StereoClip, open_clip
+from worker.stereo import estimate_depth
+from worker.stereo.alignment import RowShift, feature_matches, measure_row_shift
+from worker.stereo.matching import shift_rows
+
+ROW_CHECKED_PAIRS = 5
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("INTRASPLAT_DATA", "../shared/data")))
+    parser.add_argument("--repeats", type=int, default=3, help="timed runs a clip; the fastest is printed")
+    arguments = parser.parse_args()
+    print(f"machine {platform.processor() or platform.machine()}, {os.cpu_count()} cores; commit {_commit()}")
+    d4d = arguments.data / "d4d_stereo"
+    clip = _rectified(d4d / "stereo_sbs.mp4", d4d / "calibration.json", d4d / "tool_masks.zip")
+    depth = _timed("d4d_stereo", clip, arguments.repeats)
+    reference = open_clip(arguments.data / "d4d_endonerf")
+    assert isinstance(reference, DepthClip)
+    _print_agreement(depth, reference)
+    surgt = arguments.data / "surgt_raw"
+    clip = _rectified(surgt / "video.mp4", surgt / "calibration.yaml", None)
+    depth = _timed("surgt_raw", clip, arguments.repeats)
+    _print_rows(clip, depth.measurements["vertical_misalignment_px"])
+
+
+def _rectified(video: Path, calibration: Path, masks: Path | None) -> RectifiedClip:
+    clip = open_clip(video, layout="sbs", masks=masks, mask_polarity="tool" if masks else "auto")
+    assert isinstance(clip, StereoClip)
+    return rectify(clip, load_calibration(calibration, eye_width=clip.width, eye_height=clip.height))
+
+
+def _timed(name: str, clip: RectifiedClip, repeats: int) -> DepthClip:
+    """Estimate depth and print the fastest run's seconds a frame, decoding and rectification included."""
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter(), time.process_time()
+        depth = estimate_depth(clip)
+        seconds.append((time.perf_counter() - start[0], time.process_time() - start[1]))
+    size = f"{clip.intrinsics.width}x{clip.intrinsics.height}"
+    wall_s, cpu_s = min(seconds)
+    print(f"{name}: {clip.frame_count} frames of {size} in {wall_s:.2f} s, {wall_s / clip.frame_count:.4f} s a frame")
+    print(f"  {cpu_s / clip.frame_count:.4f} CPU seconds a frame, the figure to compare on a busy machine")
+    print("  " + ", ".join(f"{key} {value:.3f}" for key, value in depth.measurements.items()))
+    for warning in depth.warnings:
+        print(f"  warning: {warning}")
+    return depth
+
+
+def _print_agreement(depth: DepthClip, reference: DepthClip) -> None:
+    """|difference| to the reference in mm over tissue where both are valid, at the reference's size."""
+    height, width = reference.depth_mm.shape[1:]
+    differences, valid = [], []
+    for ours, theirs, tissue in zip(depth.depth_mm, reference.depth_mm, reference.tissue, strict=True):
+        resized = cv2.resize(ours, (width, height), interpolation=cv2.INTER_NEAREST)
+        differences.append(np.abs(resized - theirs)[(resized > 0) & (theirs > 0) & tissue])
+        valid.append((resized > 0)[tissue].mean())
+    all_mm: NDArray[np.float32] = np.concatenate(differences)
+    median_mm, high_mm = np.percentile(all_mm, [50, 90])
+    print(f"  |depth - reference|: median {median_mm:.2f} mm (target 1.5), 90th percentile {high_mm:.2f} mm (target 5)")
+    print(f"  valid on {np.mean(valid):.1%} of tissue (target 90 %)")
+
+
+def _print_rows(clip: RectifiedClip, correction_px: float) -> None:
+    """Median |dy| of inlier matches after rectification, before and after the correction that the stage applies."""
+    step = max(1, clip.frame_count // ROW_CHECKED_PAIRS)
+    pairs = [pair for i, pair in enumerate(clip.pairs()) if i % step == 0]
+    for label, shift_px in (("rectified", 0.0), ("corrected", correction_px)):
+        found = []
+        for left, right in pairs:
+            greys = [cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in (left, right)]
+            found.append(feature_matches(greys[0], shift_rows(greys[1], shift_px), at_most_px=left.shape[1]))
+        matches = np.concatenate(found)
+        shift: RowShift = measure_row_shift(matches, clip.disparity_offset_px)
+        dy = np.abs(matches[:, 3] - matches[:, 1])
+        inliers = np.abs(matches[:, 3] - matches[:, 1] - shift.shift_px) < 2.0
+        print(f"  median |dy| {label}: {np.median(dy[inliers]):.3f} px (target 0.5) over {inliers.sum()} matches")
+
+
+def _commit() -> str:
+    answer = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    return answer.stdout.strip() or "unknown"
+
+
+if __name__ == "__main__":
+    main()
