@@ -1,0 +1,256 @@
+"""`python -m worker COMMAND`: everything that happens on this machine, without a service, and the service's worker.
+
+`intrasplat reconstruct|render|phantom|doctor` end here with the same arguments. Modules that bring torch along are
+imported by the command that needs them, so that --help and doctor answer at once, and doctor even without torch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from pydantic import ValidationError
+
+from contract.errors import InputError, IntrasplatError, UnavailableError
+from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
+from contract.progress_bar import ProgressBar
+from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
+from contract.settings import Settings
+from contract.store import REPORT
+
+SUFFIX_FORMATS = {".png": ImageFormat.PNG, ".jpg": ImageFormat.JPEG, ".jpeg": ImageFormat.JPEG, ".npy": ImageFormat.NPY}
+MAX_RENDER_PIXELS = 8192 * 8192
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    options = _parser(sys.argv[1:] if argv is None else argv).parse_args(argv)
+    command: Callable[[argparse.Namespace], int] = options.command
+    try:
+        return command(options)
+    except IntrasplatError as error:
+        print(f"intrasplat: {error}", file=sys.stderr)
+        return exit_code_of(error)
+    except ModuleNotFoundError as error:
+        print(f"intrasplat: {error.name} is not installed; `intrasplat doctor` tells the remedy", file=sys.stderr)
+        return ExitCode.UNAVAILABLE
+    except KeyboardInterrupt:
+        return ExitCode.INTERRUPTED
+
+
+def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="intrasplat", epilog=EXIT_CODES_HELP)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    _add_reconstruct(commands)
+    _add_render(commands)
+    _add_phantom(commands, wanted="phantom" in argv[:1])
+    _add(commands, "consume", "claim jobs from the queue and serve renders, until a signal ends it", _consume)
+    _add(commands, "doctor", "say what is installed, what would be used, what is missing", _doctor)
+    return parser
+
+
+def _add(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    summary: str,
+    command: Callable[[argparse.Namespace], int],
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
+    parser.epilog = EXIT_CODES_HELP
+    parser.set_defaults(command=command)
+    return parser
+
+
+def _add_reconstruct(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _add(commands, "reconstruct", "train a scene from a clip", _reconstruct)
+    parser.add_argument(
+        "clip", type=Path, metavar="INPUT", help="a video, a folder or a zip: both eyes, or the left one"
+    )
+    parser.add_argument(
+        "right", type=Path, metavar="RIGHT", nargs="?", help="the right eye, if it is a file of its own"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="folder for the scene; new or empty")
+    layouts = ("auto", "endonerf", "stereomis", "sbs", "tb", "frames")
+    parser.add_argument("--layout", choices=layouts, default="auto", help="how the eyes are laid out (default: guess)")
+    parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini; for stereo")
+    parser.add_argument("--masks", type=Path, metavar="F", help="zip or folder of PNGs, or a video: the instruments")
+    parser.add_argument(
+        "--mask-polarity", choices=("auto", "tool", "tissue"), default="auto", help="what is bright in the masks"
+    )
+    parser.add_argument(
+        "--holdout",
+        default="every8",
+        metavar="every8|blocks8|none|LIST",
+        help="frames kept from training to measure quality on (default: every8); LIST such as 1,9,17",
+    )
+    parser.add_argument("--preset", default="fast", help="fast (default), or paper and its kin for comparison")
+    limit = parser.add_mutually_exclusive_group()
+    limit.add_argument("--budget-s", type=_positive, metavar="S", help="seconds of training (default: the preset's)")
+    limit.add_argument("--iterations", type=int, metavar="N", help="steps of training; the same N gives the same bits")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
+
+
+def _add_render(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _add(commands, "render", "render images of a scene", _render)
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="the folder that reconstruct wrote")
+    when = parser.add_mutually_exclusive_group(required=True)
+    when.add_argument("--t", type=float, help="time: 0 is the first frame, 1 the end of the clip")
+    when.add_argument("--frames", type=_frames, metavar="LIST", help="frame numbers such as 1,9,17; writes a folder")
+    parser.add_argument("--pose", help="12 or 16 numbers, or orbit:yaw,pitch,zoom (default: the endoscope's own)")
+    parser.add_argument("--width", type=int)
+    parser.add_argument("--height", type=int)
+    for name in ("fx", "fy", "cx", "cy"):
+        parser.add_argument(f"--{name}", type=float, metavar="PX")
+    parser.add_argument("--layer", choices=[layer.value for layer in Layer], default=Layer.RGB.value)
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="PATH", help="a .png, .jpg or .npy file; with --frames a folder"
+    )
+
+
+def _add_phantom(commands: argparse._SubParsersAction[argparse.ArgumentParser], wanted: bool) -> None:
+    parser = _add(commands, "phantom", "make a synthetic stereo clip of tissue, with its truth", _phantom)
+    if wanted:
+        from worker.phantom import add_cli_arguments
+
+        add_cli_arguments(parser)
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not above 0")
+    return value
+
+
+def _frames(text: str) -> list[int]:
+    try:
+        frames = [int(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list such as 1,9,17") from None
+    if min(frames) < 0:
+        raise argparse.ArgumentTypeError("frames count from 0")
+    return frames
+
+
+def _reconstruct(options: argparse.Namespace) -> int:
+    from worker.hooks import Hooks
+    from worker.pipeline import ReconstructionRequest, reconstruct
+
+    out: Path = options.out
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError("--out", f"{out} is there already and is not an empty folder.", "Name a new folder.")
+    names = ("clip", "right", "layout", "calibration", "masks", "mask_polarity", "holdout", "preset", "budget_s")
+    chosen = {name: getattr(options, name) for name in (*names, "iterations", "device", "seed")}
+    interrupted = threading.Event()
+    signal.signal(signal.SIGINT, _once(interrupted))
+    with ProgressBar(sys.stderr) as bar:
+        from worker.consume import job_progress
+
+        hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
+        out.mkdir(parents=True, exist_ok=True)
+        reconstruct(ReconstructionRequest(**chosen), out, hooks)
+    _print_report(json.loads((out / REPORT).read_text()), out)
+    return ExitCode.OK
+
+
+def _once(event: threading.Event) -> Callable[[int, FrameType | None], None]:
+    """A handler that asks politely the first time; the second interrupt is Python's own."""
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        event.set()
+        signal.signal(number, signal.default_int_handler)
+
+    return handle
+
+
+def _print_report(report: dict[str, Any], out: Path) -> None:
+    quality = report.get("psnr_tissue")
+    shown = "not measured (no frames were held out)" if quality is None else f"{quality:.2f} dB on held-out frames"
+    print(f"scene: {out}\npsnr_tissue: {shown}")
+    for warning in report.get("warnings", []):
+        print(f"warning: {warning}")
+
+
+def _render(options: argparse.Namespace) -> int:
+    from contract.pose import parse_pose
+    from worker.checkpoint import load_scene
+    from worker.encode import encode_layer
+    from worker.render import render_frame
+    from worker.views import camera_of, pose_of
+
+    scene = load_scene(options.scene)
+    wanted = _camera(options)
+    camera = camera_of(scene.intrinsics, wanted, MAX_RENDER_PIXELS)
+    pose = pose_of(scene, None if options.pose is None else parse_pose(options.pose))
+    for t, path in _targets(options, scene.frame_count):
+        image_format = SUFFIX_FORMATS.get(path.suffix.lower())
+        if image_format is None:
+            raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
+        frame = render_frame(scene, t, pose, camera)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(encode_layer(frame, Layer(options.layer), image_format))
+        print(path)
+        for warning in frame.warnings:
+            print(f"warning: {warning}", file=sys.stderr)
+    return ExitCode.OK
+
+
+def _camera(options: argparse.Namespace) -> IntrinsicsOverride:
+    """The parts of the camera that the caller gave."""
+    try:
+        return IntrinsicsOverride(**{name: getattr(options, name) for name in IntrinsicsOverride.model_fields})
+    except ValidationError as error:
+        first = error.errors()[0]
+        problem = f"{first['input']} is not accepted: {first['msg']}."
+        raise InputError(f"--{first['loc'][0]}", problem, "Give pixels of a usual size.") from error
+
+
+def _targets(options: argparse.Namespace, frame_count: int) -> list[tuple[float, Path]]:
+    """Times and files to write; frame i is shown at t = i / T and written as 00000i.png."""
+    if options.frames is None:
+        return [(options.t, options.out)]
+    beyond = [frame for frame in options.frames if frame >= frame_count]
+    if beyond:
+        raise InputError("--frames", f"{beyond[0]} is not there.", f"The clip has frames 0 to {frame_count - 1}.")
+    return [(frame / frame_count, options.out / f"{frame:06d}.png") for frame in options.frames]
+
+
+def _phantom(options: argparse.Namespace) -> int:
+    from worker.phantom import run_cli
+
+    return run_cli(options)
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from worker.doctor import run_doctor
+
+    return ExitCode.UNAVAILABLE if run_doctor() else ExitCode.OK
+
+
+def _consume(options: argparse.Namespace) -> int:
+    from worker.process import run_worker
+
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    settings = Settings.from_environment()
+    if settings.redis_url is None:
+        raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
+    end = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: end.set())
+    run_worker(settings, end)
+    return ExitCode.OK
+
+
+if __name__ == "__main__":
+    sys.exit(main())

