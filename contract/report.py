@@ -1,0 +1,70 @@
+"""The quality report of a finished scene (report.json): what was measured, what was assumed, what to distrust."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+REPORT_VERSION = 1
+"""Raised when a field changes its meaning; new fields do not raise it."""
+RESEARCH_USE = "Research use only. Not a medical device; it must not guide treatment."
+
+
+class FrameScore(BaseModel):
+    """One held-out frame: the model's scores beside those of copying its neighbours. None: no tissue to judge."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    frame: int = Field(ge=0)
+    psnr_tissue_db: float | None
+    psnr_paper_db: float | None
+    ssim: float | None
+    coverage: float | None
+    baseline_blend_db: float | None
+    baseline_flow_db: float | None
+
+
+class Report(BaseModel):
+    """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why.
+
+    Scores are means over the held-out frames, which took no part in training (docs/conventions.md, "Scores").
+    psnr_tissue_db is the one to go by; psnr_paper_db is what papers print, and higher. When psnr_tissue_db does not
+    exceed the two baselines, copying the neighbouring frames would have served as well.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    report_version: int = REPORT_VERSION
+    notice: str = RESEARCH_USE
+    versions: dict[str, str] = Field(default={}, description="of intrasplat and what it computes with")
+
+    psnr_tissue_db: float | None
+    psnr_paper_db: float | None
+    ssim: float | None
+    baseline_blend_db: float | None = Field(description="psnr_tissue_db of blending the nearest training frames")
+    baseline_flow_db: float | None = Field(description="the same, each warped half-way by optical flow first")
+    depth_agreement_mm: float | None = Field(description="median |rendered - stereo depth| on held-out tissue")
+    coverage: float | None = Field(description="share of tissue pixels the model covers")
+    train_psnr_tissue_db: float | None = Field(description="psnr_tissue_db over some training frames, to compare")
+    frames: tuple[FrameScore, ...] = ()
+
+    warnings: tuple[str, ...] = Field(description="what to distrust, in plain words; empty if nothing was found")
+    assumptions: tuple[str, ...] = Field(description="what was taken for granted about the input")
+    measurements: dict[str, float] = Field(default={}, description="of the input, such as its misalignment in px")
+
+    preset: str
+    seed: int
+    device: str
+    iterations: int = Field(ge=0)
+    seconds: dict[str, float] = Field(description="by stage; t_train_s and t_post_s as docs/conventions.md has them")
+    gaussians: int = Field(ge=0)
+    bases: int = Field(ge=0, description="of a channel's motion; 0 if the model has no such number")
+    scene_bytes: int = Field(ge=0)
+    units_per_mm: float = Field(gt=0)
+
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    frame_count: int = Field(gt=0)
+    train_count: int = Field(ge=0)
+    held_out: tuple[int, ...]
+    repeated: tuple[int, ...] = Field(description="frames in neither set, because they repeat a held-out one")
+    frame_times_s: tuple[float, ...]
