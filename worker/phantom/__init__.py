@@ -1,0 +1,23 @@
+"""Synthetic tissue under a stereo endoscope, with everything a real clip cannot tell: depth, motion, what is hidden."""
+
+from worker.phantom.camera import orbit_pose
+from worker.phantom.command import add_cli_arguments, run_cli
+from worker.phantom.scene import Phantom, PhantomFrame, Trajectories, make_phantom
+from worker.phantom.settings import MOTIONS, Motion, PhantomSettings
+from worker.phantom.writers import write_endonerf, write_stereo_video, write_stereomis
+
+__all__ = [
+    "MOTIONS",
+    "Motion",
+    "Phantom",
+    "PhantomFrame",
+    "PhantomSettings",
+    "Trajectories",
+    "add_cli_arguments",
+    "make_phantom",
+    "orbit_pose",
+    "run_cli",
+    "write_endonerf",
+    "write_stereo_video",
+    "write_stereomis",
+]

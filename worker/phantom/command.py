@@ -1,0 +1,65 @@
+"""`intrasplat phantom`: writes a synthetic clip."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from contract.errors import InputError
+from worker.phantom.scene import make_phantom
+from worker.phantom.settings import MOTIONS, PhantomSettings
+from worker.phantom.writers import write_endonerf, write_stereo_video, write_stereomis
+
+WRITERS = {"video": write_stereo_video, "stereomis": write_stereomis, "endonerf": write_endonerf}
+
+
+def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of `phantom`; run_cli reads them."""
+    default = PhantomSettings()
+    parser.add_argument("--motion", choices=MOTIONS, default=default.motion, help="how the tissue moves (%(default)s)")
+    parser.add_argument("--frames", type=int, default=default.frames, help="length of the clip (%(default)s)")
+    parser.add_argument("--width", type=int, default=default.width, help="pixels of one eye across (%(default)s)")
+    parser.add_argument("--height", type=int, default=default.height, help="pixels of one eye down (%(default)s)")
+    parser.add_argument("--seed", type=int, default=default.seed, help="same seed, same tissue (%(default)s)")
+    parser.add_argument("--no-tools", action="store_true", help="leave the instrument out")
+    parser.add_argument("--no-noise", action="store_true", help="leave the sensor's noise out")
+    parser.add_argument(
+        "--moving-camera", action="store_true", help="let the endoscope swing; only endonerf tells poses"
+    )
+    parser.add_argument(
+        "--format",
+        choices=sorted(WRITERS),
+        default="video",
+        help="video: VP9 side by side, calibration, masks; stereomis: frames as PNG; "
+        "endonerf: frames, depth, poses and the exact truth (%(default)s)",
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder to write into; new or empty")
+
+
+def run_cli(args: argparse.Namespace) -> int:
+    """Writes the clip that args ask for; returns the exit code. Raises InputError for what cannot be drawn."""
+    out: Path = args.out
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError("out", f"{out} is there already and is not an empty folder.", "Name a new folder.")
+    settings = PhantomSettings(
+        width=args.width,
+        height=args.height,
+        frames=args.frames,
+        motion=args.motion,
+        seed=args.seed,
+        tools=not args.no_tools,
+        noise=not args.no_noise,
+        moving_camera=args.moving_camera,
+    )
+    WRITERS[args.format](make_phantom(settings), out, _show_progress if sys.stderr.isatty() else _show_nothing)
+    print(f"{settings.frames} frames of {settings.width}x{settings.height} ({settings.motion}) are in {out}")
+    return 0
+
+
+def _show_progress(done: int, frames: int) -> None:
+    print(f"\rframe {done}/{frames}", end="\n" if done == frames else "", file=sys.stderr, flush=True)
+
+
+def _show_nothing(done: int, frames: int) -> None:
+    del done, frames

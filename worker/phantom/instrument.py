@@ -1,0 +1,159 @@
+"""A laparoscopic grasper: shaft, wrist and two jaws of metal, and how it moves over the tissue.
+
+The instrument's own frame has its tip at the origin and its shaft along +z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.phantom.fields import smoothstep
+from worker.phantom.mesh import grid_normals, grid_triangles
+from worker.phantom.motion import CUT_SLANT, GRIP_MM, Cut, Pull
+from worker.phantom.surface import Surface
+
+SIDES = 32  # of a round part
+JAW_MM, WRIST_MM, SHAFT_MM = 11.0, 22.0, 150.0  # from the tip, where each part ends
+JAW_HALF_MM = (1.7, 0.9)  # half width and half thickness at the jaw's root
+WRIST_RADIUS_MM, SHAFT_RADIUS_MM = 2.7, 4.0
+PORT_MM = np.array([70.0, 62.0, 6.0])  # the shaft points at its port in the abdominal wall, below right of the camera
+HOVER_MM = 3.0  # the tip keeps this far above the tissue it does not hold
+RETREAT_MM = 16.0  # after the release
+JAW_OPEN_RAD = 0.30
+STEEL = np.array([0.42, 0.43, 0.44])
+SHAFT_GREY = np.array([0.075, 0.078, 0.082])
+BRASS = np.array([0.40, 0.33, 0.20])
+
+Vertices = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class InstrumentMesh:
+    """vertices_mm [V, 3] world, normals [V, 3], albedo [V, 3] linear, glint [V], triangles [F, 3]."""
+
+    vertices_mm: Vertices
+    normals: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+    glint: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+
+
+def instrument_at(surface: Surface, frame: float, period_frames: float) -> InstrumentMesh:
+    """The instrument at a frame, placed on or above the tissue as the motion asks."""
+    tip, opening = _tip_and_opening(surface, frame, period_frames)
+    parts = [*_jaws(opening), _wrist(), _shaft()]
+    rotation = _rotation_along(PORT_MM - tip)
+    vertices, normals, albedo, glint, triangles = [], [], [], [], []
+    first = 0
+    for grid, colour, shine in parts:
+        placed = grid @ rotation.T + tip
+        vertices.append(placed.reshape(-1, 3))
+        normals.append(_outward(grid_normals(placed), placed).reshape(-1, 3))
+        albedo.append(colour.reshape(-1, 3))
+        glint.append(np.full(grid.shape[0] * grid.shape[1], shine))
+        triangles.append(grid_triangles(grid.shape[0], grid.shape[1], first))
+        first += grid.shape[0] * grid.shape[1]
+    return InstrumentMesh(
+        np.concatenate(vertices),
+        np.concatenate(normals).astype(np.float32),
+        np.concatenate(albedo).astype(np.float32),
+        np.concatenate(glint).astype(np.float32),
+        np.concatenate(triangles),
+    )
+
+
+def _tip_and_opening(surface: Surface, frame: float, period_frames: float) -> tuple[NDArray[np.float64], float]:
+    """World position of the tip, and the jaws' opening angle in rad."""
+    motion = surface.motion
+    if isinstance(motion, Pull):
+        tip = surface.point_mm(*GRIP_MM, frame)
+        p = (frame / period_frames) % 1.0
+        away = float(smoothstep(np.array(p), 0.70, 0.80) * (1 - smoothstep(np.array(p), 0.90, 1.0)))
+        direction = (PORT_MM - tip) / np.linalg.norm(PORT_MM - tip)
+        return tip + RETREAT_MM * away * direction, 0.06 + JAW_OPEN_RAD * away
+    if isinstance(motion, Cut):
+        v = motion.blade_mm(frame) + 1.5
+        snip = 0.5 + 0.5 * np.sin(2 * np.pi * frame / 7)
+        return surface.point_mm(CUT_SLANT * v + 0.4, v, frame) - (0.0, 0.0, 0.3), 0.05 + JAW_OPEN_RAD * snip
+    angle = 2 * np.pi * frame / period_frames
+    reach_u, reach_v = (0.42 * half for half in surface.half_extent_mm)
+    u = 0.1 * reach_u + 0.55 * reach_u * np.sin(angle / 1.7 + 0.6)
+    v = 0.25 * reach_v + 0.45 * reach_v * np.sin(angle / 1.13 + 0.2)
+    hover = HOVER_MM + 1.5 * np.sin(angle / 0.8)
+    opening = 0.08 + JAW_OPEN_RAD * (0.5 + 0.5 * np.sin(angle / 0.6))
+    return surface.point_mm(u, v, frame) - (0.0, 0.0, hover), float(opening)
+
+
+def _jaws(opening_rad: float) -> list[tuple[Vertices, Vertices, float]]:
+    """Two tapered jaws that turn about their root."""
+    jaws = []
+    along = np.linspace(0, 1, 48)
+    for side in (-1.0, 1.0):
+        taper = 0.45 + 0.55 * along
+        rounded = np.sqrt(np.clip(1 - (1 - np.minimum(along / 0.12, 1)) ** 2, 0, 1))
+        grid = _lathe(along * JAW_MM, JAW_HALF_MM[0] * taper * rounded, JAW_HALF_MM[1] * taper * rounded)
+        grid[..., 1] += side * 0.75 * JAW_HALF_MM[1]
+        turn = side * opening_rad / 2
+        y, z = grid[..., 1].copy(), grid[..., 2] - JAW_MM
+        grid[..., 1] = np.cos(turn) * y - np.sin(turn) * z
+        grid[..., 2] = np.sin(turn) * y + np.cos(turn) * z + JAW_MM
+        teeth = np.where((np.sin(along * JAW_MM * 2 * np.pi / 0.9) > 0.4) & (along < 0.85), 0.65, 1.0)
+        jaws.append((grid, _rings(STEEL, teeth), 0.9))
+    return jaws
+
+
+def _wrist() -> tuple[Vertices, Vertices, float]:
+    z = np.linspace(JAW_MM - 1.5, WRIST_MM, 90)
+    along = (z - z[0]) / np.ptp(z)
+    clevis = np.where(along < 0.45, 0.72 + 0.2 * np.sin(along / 0.45 * np.pi), 1.0)
+    groove = 1 - 0.08 * (np.sin(along * 34) > 0.75)
+    radius = WRIST_RADIUS_MM * clevis * groove * np.minimum(1, 0.4 + along * 14)
+    shade = np.where(np.sin(along * 34) > 0.75, 0.35, 1.0)
+    colour = _rings(STEEL, shade)
+    colour[np.abs(along - 0.62) < 0.07] = BRASS
+    return _lathe(z, radius, radius * np.where(along < 0.45, 0.75, 1.0)), colour, 0.8
+
+
+def _shaft() -> tuple[Vertices, Vertices, float]:
+    z = np.concatenate([[WRIST_MM - 0.8], np.linspace(WRIST_MM, SHAFT_MM, 120)])
+    radius = np.full(z.size, SHAFT_RADIUS_MM)
+    radius[0] = WRIST_RADIUS_MM
+    brushed = 1 + 0.10 * np.sin(np.arange(z.size) * 2.4) * np.sin(np.arange(z.size) * 0.9)
+    colour = _rings(SHAFT_GREY, brushed)
+    colour[z < WRIST_MM + 4] = 0.7 * STEEL
+    return _lathe(z, radius, radius), colour, 0.12
+
+
+def _lathe(z: NDArray[np.float64], half_x: NDArray[np.float64], half_y: NDArray[np.float64]) -> Vertices:
+    """A tube about the z axis [len(z), SIDES + 1, 3] with elliptic sections."""
+    angle = np.linspace(0, 2 * np.pi, SIDES + 1)
+    x, y = half_x[:, None] * np.cos(angle), half_y[:, None] * np.sin(angle)
+    return np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], axis=-1)
+
+
+def _rings(colour: NDArray[np.float64], shade: NDArray[np.float64]) -> Vertices:
+    """One shade of a colour for each ring of a tube: [rings, SIDES + 1, 3]."""
+    return np.repeat((shade[:, None] * colour)[:, None], SIDES + 1, axis=1)
+
+
+def _outward(normals: Vertices, tube: Vertices) -> Vertices:
+    """Normals [rings, SIDES + 1, 3] turned away from the tube's axis; the seam's two ends agree."""
+    normals = normals.copy()
+    seam = normals[:, 0] + normals[:, -1]
+    seam /= np.linalg.norm(seam, axis=-1, keepdims=True) + 1e-9
+    normals[:, 0] = normals[:, -1] = seam
+    from_axis = tube - tube.mean(axis=1, keepdims=True)
+    inward = np.einsum("rsc,rsc->rs", normals, from_axis) < 0
+    normals[inward] *= -1
+    return normals
+
+
+def _rotation_along(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """World from instrument [3, 3]: z along direction, y as far down as that allows."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross((0.0, 1.0, 0.3), z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)

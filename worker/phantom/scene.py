@@ -1,0 +1,259 @@
+"""The phantom itself: frames with exact truth, free viewpoints and trajectories.
+
+Symbols: T frames, H W pixels of one eye, M tracked material points.
+
+Truth comes from the geometry, never from the picture: depth and tracks are those of the mesh that is drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.camera import Intrinsics
+from worker.clip.types import DepthClip
+from worker.phantom.camera import endoscope_pose, right_eye
+from worker.phantom.fields import Image32
+from worker.phantom.instrument import InstrumentMesh, instrument_at
+from worker.phantom.mesh import Fragments, interpolate, rasterize_mesh
+from worker.phantom.motion import Still
+from worker.phantom.settings import PhantomSettings
+from worker.phantom.shading import (
+    Lamp,
+    add_noise,
+    endoscope_lamp,
+    metal_finish,
+    shade,
+    tissue_finish,
+    to_srgb,
+)
+from worker.phantom.surface import Surface, make_surface
+from worker.phantom.tissue import Paint, paint_tissue
+
+BLUR_PX = 3  # the lens spreads a pixel over its neighbours: a kernel of 3x3 with this sigma
+BLUR_SIGMA_PX = 0.45
+FILM_DRIFT_MM = (0.05, 0.09)  # of the wet film over the tissue in one frame, so that glints crawl
+LEFT, RIGHT = 0, 1
+
+
+@dataclass(frozen=True)
+class PhantomFrame:
+    """One frame of both eyes with its truth.
+
+    left, right          [H, W, 3] uint8 RGB, with noise if settings ask for it
+    tissue, tissue_right [H, W] bool: False at every pixel that the instrument's light touches
+    depth_mm             [H, W] float32, camera z of what the left eye sees, instrument included; 0 beyond the tissue
+    hidden_depth_mm      [H, W] float32, the same with the instrument taken away
+    hidden_rgb           [H, W, 3] float32 in [0, 1], the left eye's picture without instrument and noise
+    world_from_camera    [4, 4] float64 of the left eye
+    """
+
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+    tissue: NDArray[np.bool_]
+    tissue_right: NDArray[np.bool_]
+    depth_mm: NDArray[np.float32]
+    hidden_depth_mm: NDArray[np.float32]
+    hidden_rgb: Image32
+    world_from_camera: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Material points seen in frame 0, without the instrument, and where they go.
+
+    pixels    [M, 2] int32, (row, column) in frame 0 of the left eye
+    points_mm [T, M, 3] float64, world
+    """
+
+    pixels: NDArray[np.int32]
+    points_mm: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _EyeView:
+    rgb: Image32  # noise-free, instrument included
+    tissue: NDArray[np.bool_]
+    depth_mm: NDArray[np.float32]
+    hidden_rgb: Image32
+    hidden_depth_mm: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Phantom:
+    """Synthetic tissue under a stereo endoscope. Frames are drawn when asked for and not kept."""
+
+    settings: PhantomSettings
+    surface: Surface
+    paint: Paint
+
+    def frame(self, index: int) -> PhantomFrame:
+        """Frame 0 <= index < T of both eyes."""
+        self._check_frame(index)
+        left, right = self._view(index, LEFT), self._view(index, RIGHT)
+        return PhantomFrame(
+            left=self._recorded(left.rgb, index, LEFT),
+            right=self._recorded(right.rgb, index, RIGHT),
+            tissue=left.tissue,
+            tissue_right=right.tissue,
+            depth_mm=left.depth_mm,
+            hidden_depth_mm=left.hidden_depth_mm,
+            hidden_rgb=left.hidden_rgb,
+            world_from_camera=self.world_from_camera(index),
+        )
+
+    def render(
+        self,
+        frame: float,
+        world_from_camera: NDArray[np.float64] | None = None,
+        intrinsics: Intrinsics | None = None,
+    ) -> tuple[Image32, NDArray[np.float32]]:
+        """The tissue without instrument and noise from any viewpoint, best within 15 degrees of the endoscope's.
+
+        Args:
+            frame: any real number in [0, T); model time t is frame / T.
+            world_from_camera: [4, 4] mm; the endoscope's left eye when left out. The lamp stays in the endoscope.
+
+        Returns:
+            rgb [H, W, 3] float32 in [0, 1] and depth_mm [H, W] float32, both 0 where no tissue is modelled.
+        """
+        pose = self.world_from_camera(frame) if world_from_camera is None else world_from_camera
+        linear, fragments = self._draw_tissue(frame, pose, intrinsics or self.settings.intrinsics)
+        return to_srgb(_through_lens(linear)), fragments.depth_mm
+
+    def world_from_camera(self, frame: float) -> NDArray[np.float64]:
+        """Pose [4, 4] of the endoscope's left eye, mm; the identity at frame 0."""
+        return endoscope_pose(frame, self.settings.period_frames, self.settings.moving_camera)
+
+    def trajectories(self, stride_px: int = 8) -> Trajectories:
+        """Follows the material points that every stride_px-th pixel of frame 0 shows through all frames."""
+        seen = rasterize_mesh(
+            self.surface.vertices_mm(0),
+            self.surface.triangles,
+            self.world_from_camera(0),
+            self.settings.intrinsics,
+        )
+        rows, columns = np.nonzero(seen.triangle >= 0)
+        chosen = (rows % stride_px == stride_px // 2) & (columns % stride_px == stride_px // 2)
+        rows, columns = rows[chosen], columns[chosen]
+        corners = self.surface.triangles[seen.triangle[rows, columns]]
+        weights = seen.weights[rows, columns].astype(np.float64)
+        weights /= weights.sum(axis=1, keepdims=True)
+        points = [
+            np.einsum("mk,mkc->mc", weights, self.surface.vertices_mm(frame)[corners])
+            for frame in range(self.settings.frames)
+        ]
+        return Trajectories(np.stack([rows, columns], -1).astype(np.int32), np.stack(points))
+
+    def depth_clip(self) -> DepthClip:
+        """All frames of the left eye with true depth: what training reads, without stereo matching's errors."""
+        settings = self.settings
+        views = []
+        for index in range(settings.frames):
+            view = self._view(index, LEFT)
+            views.append((self._recorded(view.rgb, index, LEFT), view.tissue, view.depth_mm))
+        rgb, tissue, depth_mm = (np.stack(layer) for layer in zip(*views, strict=True))
+        return DepthClip(
+            rgb=rgb,
+            tissue=tissue,
+            depth_mm=depth_mm,
+            depth_confidence=np.where(depth_mm > 0, np.uint8(255), np.uint8(0)),
+            intrinsics=settings.intrinsics,
+            world_from_camera=np.stack([self.world_from_camera(index) for index in range(settings.frames)]),
+            frame_times_s=np.arange(settings.frames) / settings.frame_rate_hz,
+            assumptions=(f"synthetic tissue: {settings.motion}, seed {settings.seed}, true depth",),
+        )
+
+    def _view(self, index: int, eye: int) -> _EyeView:
+        """One eye at a frame, with and without instrument."""
+        pose = self.world_from_camera(index)
+        if eye == RIGHT:
+            pose = right_eye(pose, self.settings.baseline_mm)
+        hidden, fragments = self._draw_tissue(index, pose, self.settings.intrinsics)
+        hidden_rgb = to_srgb(_through_lens(hidden))
+        depth_mm = fragments.depth_mm
+        if not self.settings.tools:
+            return _EyeView(hidden_rgb, np.ones(depth_mm.shape, np.bool_), depth_mm, hidden_rgb, depth_mm)
+        tool = instrument_at(self.surface, index, self.settings.period_frames)
+        linear, tool_fragments = self._draw_instrument(tool, index, pose)
+        behind_tissue = (depth_mm > 0) & (depth_mm < tool_fragments.depth_mm)
+        shows_tool = (tool_fragments.triangle >= 0) & ~behind_tissue
+        both = np.where(shows_tool[..., None], linear, hidden)
+        # the lens smears the instrument into its neighbours: they are no clean tissue
+        touched = cv2.dilate(shows_tool.astype(np.uint8), np.ones((BLUR_PX, BLUR_PX), np.uint8)) > 0
+        return _EyeView(
+            rgb=np.where(touched[..., None], to_srgb(_through_lens(both)), hidden_rgb),
+            tissue=~touched,
+            depth_mm=np.where(shows_tool, tool_fragments.depth_mm, depth_mm),
+            hidden_rgb=hidden_rgb,
+            hidden_depth_mm=depth_mm,
+        )
+
+    def _draw_tissue(
+        self, frame: float, pose: NDArray[np.float64], intrinsics: Intrinsics
+    ) -> tuple[Image32, Fragments]:
+        vertices, normals = self.surface.vertices_and_normals(frame)
+        triangles = self.surface.triangles
+        fragments = rasterize_mesh(vertices, triangles, pose, intrinsics)
+        attributes = np.concatenate([vertices.astype(np.float32), normals, self.surface.atlas_xy], axis=1)
+        pixels = interpolate(fragments, triangles, attributes)
+        atlas_x, atlas_y = np.ascontiguousarray(pixels[..., 6]), np.ascontiguousarray(pixels[..., 7])
+        albedo = cv2.remap(self.paint.albedo, atlas_x, atlas_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        drift = np.zeros(2) if isinstance(self.surface.motion, Still) else np.array(FILM_DRIFT_MM) * frame
+        drift = (drift / self.surface.atlas.texel_mm).astype(np.float32)
+        film = cv2.remap(
+            self.paint.film, atlas_x + drift[0], atlas_y + drift[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+        )
+        hit = fragments.triangle >= 0
+        normals = pixels[..., 3:6][hit]
+        normals[:, :2] += film[..., :2][hit]  # the sheet's right and down are nearly the world's
+        lit = np.zeros((*hit.shape, 3), dtype=np.float32)
+        lit[hit] = shade(
+            pixels[..., :3][hit],
+            normals,
+            albedo[hit],
+            film[..., 2][hit],
+            tissue_finish(),
+            self._lamp(frame),
+            pose[:3, 3],
+        )
+        return lit, fragments
+
+    def _draw_instrument(
+        self, tool: InstrumentMesh, frame: float, pose: NDArray[np.float64]
+    ) -> tuple[Image32, Fragments]:
+        fragments = rasterize_mesh(tool.vertices_mm, tool.triangles, pose, self.settings.intrinsics)
+        attributes = [tool.vertices_mm.astype(np.float32), tool.normals, tool.albedo, tool.glint[:, None]]
+        pixels = interpolate(fragments, tool.triangles, np.concatenate(attributes, axis=1))
+        hit = fragments.triangle >= 0
+        shown = pixels[hit]
+        points_mm, normals, albedo, glint = shown[:, :3], shown[:, 3:6], shown[:, 6:9], shown[:, 9]
+        lit = np.zeros((*hit.shape, 3), dtype=np.float32)
+        lit[hit] = shade(points_mm, normals, albedo, glint, metal_finish(), self._lamp(frame), pose[:3, 3])
+        return lit, fragments
+
+    def _lamp(self, frame: float) -> Lamp:
+        return endoscope_lamp(self.world_from_camera(frame), self.settings.baseline_mm)
+
+    def _recorded(self, rgb: Image32, index: int, eye: int) -> NDArray[np.uint8]:
+        if self.settings.noise:
+            rgb = add_noise(rgb, np.random.default_rng((self.settings.seed, index, eye)))
+        return np.asarray(np.clip(rgb * 255 + 0.5, 0, 255), dtype=np.uint8)
+
+    def _check_frame(self, index: int) -> None:
+        if not 0 <= index < self.settings.frames:
+            raise IndexError(f"frame {index} of a clip of {self.settings.frames}")
+
+
+def make_phantom(settings: PhantomSettings) -> Phantom:
+    """Draws the tissue that settings ask for: shape, colours, motion. Frames follow when asked for."""
+    shape_rng, paint_rng = (np.random.default_rng((settings.seed, part)) for part in (101, 102))
+    surface = make_surface(settings, shape_rng)
+    return Phantom(settings, surface, paint_tissue(surface, paint_rng))
+
+
+def _through_lens(linear: Image32) -> Image32:
+    return np.asarray(cv2.GaussianBlur(linear, (BLUR_PX, BLUR_PX), BLUR_SIGMA_PX), dtype=np.float32)

@@ -1,0 +1,79 @@
+"""What a phantom is made of. T frames, H W pixels of one eye."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from contract.camera import Intrinsics
+from contract.errors import InputError
+
+Motion = Literal["still", "breathing", "pull", "cut"]
+MOTIONS: tuple[Motion, ...] = get_args(Motion)
+
+FOCAL_PER_WIDTH = 0.89  # a da Vinci endoscope's field of view, about 59 degrees across
+SMALLEST_WIDTH, SMALLEST_HEIGHT = 64, 48  # px; below this vessels and instrument are a pixel wide
+LARGEST_SIDE = 4096  # px; the tissue's texture is about twice as wide and must stay within OpenCV's 32767
+LARGEST_ASPECT = 4  # beyond this a pinhole sees nothing like an endoscope's view
+MOST_FRAMES = 100_000
+
+
+@dataclass(frozen=True)
+class PhantomSettings:
+    """A synthetic clip. The same settings give the same bits on the same machine.
+
+    Attributes:
+        width, height: pixels of one eye, at least 64x48.
+        frames: length of the clip, T.
+        motion: still | breathing (periodic heave and sway) | pull (a grasper lifts a fold, which falls back) |
+            cut (the surface splits along a line and opens).
+        tools: whether an instrument moves in front of the tissue.
+        noise: whether frames carry sensor noise; depth, hidden surface and free viewpoints never do.
+        moving_camera: whether the endoscope swings slowly about the tissue; its pose is known.
+        period_frames: frames of one breath, of one pull, or of half a cut.
+
+    Raises InputError (field options.<name>) for what cannot be drawn.
+    """
+
+    width: int = 640
+    height: int = 512
+    frames: int = 64
+    motion: Motion = "breathing"
+    seed: int = 0
+    tools: bool = True
+    noise: bool = True
+    moving_camera: bool = False
+    baseline_mm: float = 4.3
+    period_frames: float = 36.0
+    frame_rate_hz: float = 25.0
+
+    def __post_init__(self) -> None:
+        _require_range("width", self.width, SMALLEST_WIDTH, LARGEST_SIDE)
+        _require_range("height", self.height, SMALLEST_HEIGHT, LARGEST_SIDE)
+        _require_range("frames", self.frames, 1, MOST_FRAMES)
+        _require_range("seed", self.seed, 0, 2**63 - 1)
+        _require_range("baseline_mm", self.baseline_mm, 0.1, 50)
+        _require_range("period_frames", self.period_frames, 2, 1e6)
+        _require_range("frame_rate_hz", self.frame_rate_hz, 0.1, 1000)
+        if max(self.width, self.height) > LARGEST_ASPECT * min(self.width, self.height):
+            raise InputError(
+                "options.height",
+                f"{self.width}x{self.height} is more than {LARGEST_ASPECT} times as long as wide.",
+                "Give a less extreme shape.",
+            )
+        if self.motion not in MOTIONS:
+            raise InputError("options.motion", f'"{self.motion}" is no motion.', f"Give one of {', '.join(MOTIONS)}.")
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The pinhole camera of either eye; the eyes are rectified, so they share it."""
+        focal = FOCAL_PER_WIDTH * self.width
+        return Intrinsics(
+            width=self.width, height=self.height, fx=focal, fy=focal, cx=self.width / 2, cy=self.height / 2
+        )
+
+
+def _require_range(name: str, value: float, low: float, high: float) -> None:
+    if not (math.isfinite(value) and low <= value <= high):
+        raise InputError(f"options.{name}", f"{value} is out of range.", f"Give {low:g} to {high:g}.")

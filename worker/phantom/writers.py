@@ -1,0 +1,196 @@
+"""Writes a phantom the way real clips arrive: stereo video, StereoMIS layout, EndoNeRF layout with truth beside it.
+
+Symbols: T frames, H W pixels of one eye, M tracked points, K novel views.
+PNG keeps every bit; the video is VP9, which is lossy on fine texture, so truth is measured on the PNG layouts.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.errors import UnavailableError
+from worker.phantom.camera import orbit_pose
+from worker.phantom.scene import Phantom, PhantomFrame
+
+Tick = Callable[[int, int], None]  # called with (frames done, frames) after each frame
+
+VIDEO, CALIBRATION, MASKS = "stereo.webm", "calibration.json", "masks.zip"
+VIDEO_QUALITY = 100.0  # of OpenCV's writer; backends that know no quality ignore it
+BRIGHT = 255
+DEEPEST_8_BIT_MM = 255
+NOVEL_TIMES = (0.0, 0.35, 0.7)  # model times of the novel views
+NOVEL_ANGLES_DEG = ((12.0, 0.0), (-12.0, 0.0), (0.0, 9.0), (8.0, -8.0))  # (yaw, pitch) about frame 0's axis
+BOUNDS_MARGIN = (0.9, 1.1)  # near and far bounds around the depths seen
+
+
+def _ignore(done: int, frames: int) -> None:
+    del done, frames
+
+
+def write_stereo_video(phantom: Phantom, path: Path, tick: Tick = _ignore) -> None:
+    """Folder with stereo.webm (VP9, left | right), calibration.json and masks.zip (tool = 255).
+
+    Raises UnavailableError when this OpenCV cannot write VP9.
+    """
+    settings = phantom.settings
+    path.mkdir(parents=True, exist_ok=True)
+    video = cv2.VideoWriter(
+        str(path / VIDEO),
+        cv2.VideoWriter.fourcc(*"VP90"),
+        settings.frame_rate_hz,
+        (2 * settings.width, settings.height),
+    )
+    if not video.isOpened():
+        raise UnavailableError("OpenCV cannot write VP9 here.", "Write --format stereomis instead.")
+    video.set(cv2.VIDEOWRITER_PROP_QUALITY, VIDEO_QUALITY)
+    try:
+        with zipfile.ZipFile(path / MASKS, "w") as masks:
+            for index in range(settings.frames):
+                frame = phantom.frame(index)
+                both = np.concatenate([frame.left, frame.right], axis=1)
+                video.write(cv2.cvtColor(both, cv2.COLOR_RGB2BGR))
+                masks.writestr(f"{index:06d}.png", _png(_white(~frame.tissue)))
+                tick(index + 1, settings.frames)
+    finally:
+        video.release()
+    _write_calibration(phantom, path)
+
+
+def write_stereomis(phantom: Phantom, path: Path, tick: Tick = _ignore) -> None:
+    """StereoMIS layout: NNNNNNl.png, NNNNNNr.png, StereoCalibration.ini, masks/NNNNNNl.png (tissue = 255)."""
+    (path / "masks").mkdir(parents=True, exist_ok=True)
+    for index in range(phantom.settings.frames):
+        frame = phantom.frame(index)
+        _save(path / f"{index:06d}l.png", frame.left)
+        _save(path / f"{index:06d}r.png", frame.right)
+        _save(path / "masks" / f"{index:06d}l.png", _white(frame.tissue))
+        tick(index + 1, phantom.settings.frames)
+    (path / "StereoCalibration.ini").write_text(_stereomis_calibration(phantom))
+
+
+def write_endonerf(phantom: Phantom, path: Path, tick: Tick = _ignore) -> None:
+    """EndoNeRF layout: images/ depth/ (8-bit mm) masks/ (tool = 255) poses_bounds.npy, and truth/.
+
+    truth/NNNNNN.npz      depth_mm, hidden_depth_mm [H, W] float32; hidden_rgb [H, W, 3] float16 in [0, 1]; tissue
+    truth/trajectories.npz  pixels [M, 2] (row, column) in frame 0, points_mm [T, M, 3] float32 world
+    truth/novel_views.npz   frame [K], world_from_camera [K, 4, 4], rgb [K, H, W, 3] float16, depth_mm [K, H, W] float32
+    truth/camera.json       the exact intrinsics and every frame's world_from_camera
+    """
+    for folder in ("images", "depth", "masks", "truth"):
+        (path / folder).mkdir(parents=True, exist_ok=True)
+    nearest, farthest = np.inf, 0.0
+    for index in range(phantom.settings.frames):
+        frame, name = phantom.frame(index), f"{index:06d}"
+        _save(path / "images" / f"{name}.png", frame.left)
+        _save(path / "depth" / f"{name}.png", np.clip(np.rint(frame.depth_mm), 0, DEEPEST_8_BIT_MM).astype(np.uint8))
+        _save(path / "masks" / f"{name}.png", _white(~frame.tissue))
+        _write_truth(path / "truth" / f"{name}.npz", frame)
+        seen = frame.depth_mm[frame.depth_mm > 0]
+        nearest, farthest = min(nearest, float(seen.min())), max(farthest, float(seen.max()))
+        tick(index + 1, phantom.settings.frames)
+    bounds = (nearest * BOUNDS_MARGIN[0], farthest * BOUNDS_MARGIN[1])
+    np.save(path / "poses_bounds.npy", _poses_bounds(phantom, bounds))
+    tracks = phantom.trajectories()
+    np.savez_compressed(
+        path / "truth" / "trajectories.npz", pixels=tracks.pixels, points_mm=tracks.points_mm.astype(np.float32)
+    )
+    _write_novel_views(phantom, path / "truth" / "novel_views.npz")
+    camera = {
+        "intrinsics": phantom.settings.intrinsics.model_dump(),
+        "world_from_camera": _poses(phantom).tolist(),
+    }
+    (path / "truth" / "camera.json").write_text(json.dumps(camera, indent=1))
+
+
+def _write_calibration(phantom: Phantom, path: Path) -> None:
+    camera = phantom.settings.intrinsics
+    calibration = {
+        "model": "rectified",
+        "width": camera.width,
+        "height": camera.height,
+        "fx_px": camera.fx,
+        "fy_px": camera.fy,
+        "cx_px": camera.cx,
+        "cy_px": camera.cy,
+        "baseline_mm": phantom.settings.baseline_mm,
+        "disparity_offset_px": 0.0,
+    }
+    (path / CALIBRATION).write_text(json.dumps(calibration, indent=1))
+
+
+def _stereomis_calibration(phantom: Phantom) -> str:
+    """Both eyes' intrinsics; right_from_left rotation R and translation T in mm stand with the right eye."""
+    camera = phantom.settings.intrinsics
+    lines = []
+    for section, shift_mm in (("StereoLeft", 0.0), ("StereoRight", -phantom.settings.baseline_mm)):
+        values: dict[str, float] = {"res_x": camera.width, "res_y": camera.height, "fc_x": camera.fx, "fc_y": camera.fy}
+        # this file's principal point counts pixel centres at whole numbers, as OpenCV does
+        values |= {"cc_x": camera.cx - 0.5, "cc_y": camera.cy - 0.5}
+        values |= {f"kc_{i}": 0.0 for i in range(5)}
+        values |= {f"R_{i}": float(i % 4 == 0) for i in range(9)}
+        values |= {"T_0": shift_mm, "T_1": 0.0, "T_2": 0.0}
+        lines += [f"[{section}]", *(f"{key}={value:.9g}" for key, value in values.items()), ""]
+    return "\n".join(lines)
+
+
+def _poses_bounds(phantom: Phantom, bounds_mm: tuple[float, float]) -> NDArray[np.float64]:
+    """[T, 17]: camera-to-world [right, up, back | t | (H, W, f)] of OpenGL row by row, then near and far in mm."""
+    camera = phantom.settings.intrinsics
+    rows = []
+    for pose in _poses(phantom):
+        opengl = pose[:3, :4] * np.array([1.0, -1.0, -1.0, 1.0])
+        size = np.array([[camera.height], [camera.width], [camera.fx]])
+        rows.append(np.concatenate([np.concatenate([opengl, size], axis=1).ravel(), bounds_mm]))
+    return np.stack(rows)
+
+
+def _poses(phantom: Phantom) -> NDArray[np.float64]:
+    return np.stack([phantom.world_from_camera(index) for index in range(phantom.settings.frames)])
+
+
+def _write_truth(path: Path, frame: PhantomFrame) -> None:
+    np.savez_compressed(
+        path,
+        depth_mm=frame.depth_mm,
+        hidden_depth_mm=frame.hidden_depth_mm,
+        hidden_rgb=frame.hidden_rgb.astype(np.float16),
+        tissue=frame.tissue,
+    )
+
+
+def _write_novel_views(phantom: Phantom, path: Path) -> None:
+    """Each novel time from each novel angle."""
+    frames = [int(t * phantom.settings.frames) for t in NOVEL_TIMES for _ in NOVEL_ANGLES_DEG]
+    poses = [orbit_pose(yaw_deg, pitch_deg) for _ in NOVEL_TIMES for yaw_deg, pitch_deg in NOVEL_ANGLES_DEG]
+    views = [phantom.render(frame, pose) for frame, pose in zip(frames, poses, strict=True)]
+    np.savez_compressed(
+        path,
+        frame=np.array(frames, dtype=np.int32),
+        world_from_camera=np.stack(poses),
+        rgb=np.stack([rgb for rgb, _ in views]).astype(np.float16),
+        depth_mm=np.stack([depth_mm for _, depth_mm in views]),
+    )
+
+
+def _white(where: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    return np.where(where, np.uint8(BRIGHT), np.uint8(0))
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    """A PNG file of grey or RGB pixels."""
+    ordered = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    encoded, data = cv2.imencode(".png", ordered)
+    if not encoded:
+        raise UnavailableError("OpenCV cannot write PNG here.", "Install opencv-contrib-python-headless again.")
+    return bytes(data)
+
+
+def _save(path: Path, image: NDArray[np.uint8]) -> None:
+    path.write_bytes(_png(image))
