@@ -5,7 +5,7 @@ Symbols: H W pixels of one eye; d disparity, x_left - x_right in px of the full 
 Semi-global matching (Hirschmueller 2008; OpenCV's 3-way form) runs on half the resolution, where a pixel costs an
 eighth. Both directions feed an edge-aware weighted-least-squares filter (Min et al. 2014, cv2.ximgproc), which fills
 what the left-right check rejects. One Lucas-Kanade step along the row at full resolution then restores the sub-pixel
-part that half resolution lost (docs/decisions/stereo.md has the measurements).
+part that half resolution lost (docs/decisions/001-stereo-at-half-resolution.md has figures).
 """
 
 from __future__ import annotations
