@@ -87,13 +87,14 @@ def fuse(clip: DepthClip, train: Sequence[int], settings: FusionSettings, *, see
         raise InputError(
             "clip", f"has no valid depth on tissue in its {len(train)} training frames.", "Check depth and masks."
         )
+    # Where the very first frame has no depth, the first one that has some takes its part.
+    frames = [first, *(index for index in train if index != first)]
     if settings.mode == "fill":
-        # Without depth in the very first frame the grid starts at the first one that has some.
-        return _fill(clip, [first, *(index for index in train if index != first)], settings)
+        return _fill(clip, frames, settings)
     random = np.random.default_rng(seed)
-    parts = [_points_at(clip, train[0], _measured_pixels(clip, train[0]))]
+    parts = [_points_at(clip, first, _measured_pixels(clip, first))]
     if settings.mode == "paper":
-        parts += _published_fusion(clip, train, settings, random)
+        parts += _published_fusion(clip, frames, settings, random)
     cloud = _concatenated(parts)
     return _taken(cloud, _sample(len(cloud), settings.total_share, random))
 
@@ -120,13 +121,13 @@ def motion_mask(clip: DepthClip, train: Sequence[int], percentile: float) -> NDA
 
 
 def _published_fusion(
-    clip: DepthClip, train: Sequence[int], settings: FusionSettings, random: np.random.Generator
+    clip: DepthClip, frames: Sequence[int], settings: FusionSettings, random: np.random.Generator
 ) -> Iterator[PointCloud]:
     """A sample of the points of every later training frame whose projection into the first one falls into F."""
-    wanted = motion_mask(clip, train, settings.motion_percentile)
-    for index in train[1:]:
+    wanted = motion_mask(clip, frames, settings.motion_percentile)
+    for index in frames[1:]:
         pixels = _measured_pixels(clip, index)
-        pixels = pixels[_lands_in(wanted, clip, index, train[0], pixels)]
+        pixels = pixels[_lands_in(wanted, clip, index, frames[0], pixels)]
         if pixels.size:
             yield _points_at(clip, index, pixels[_sample(pixels.size, settings.frame_share, random)])
 
@@ -160,7 +161,8 @@ def _fill(clip: DepthClip, frames: Sequence[int], settings: FusionSettings) -> P
     for usable in (_is_clear, _is_measured, _is_tissue):
         for index in later:
             pixels = coverage.open_pixels(clip.world_from_camera[index])
-            pixels = pixels[usable(clip, index).reshape(-1)[pixels]]
+            if pixels.size:
+                pixels = pixels[usable(clip, index).reshape(-1)[pixels]]
             if pixels.size:
                 parts.append(coverage.add(clip, index, pixels))
     return _concatenated(parts)

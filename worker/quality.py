@@ -240,7 +240,8 @@ def _worse_than_copying(model_db: float | None, baselines: CopyBaselines) -> lis
     named = " and ".join(f"{name} at {score:.1f} dB" for name, score in better.items())
     return [
         f"On held-out frames the model scores {model_db:.1f} dB; copying the neighbouring frames scores more: {named}. "
-        "At the endoscope's own pose it shows nothing that the clip does not show better."
+        "Seen from the endoscope itself, the recorded frames are the better picture; the model adds other views, "
+        "depth and what the instrument hides."
     ]
 
 
