@@ -19,6 +19,7 @@ from contract.report import FrameScore, Report
 from worker.baselines import CopyBaselines
 from worker.clip import FrameSplit
 from worker.clip.types import DepthClip
+from worker.fusion import CLEAR_CONFIDENCE
 from worker.metrics import coverage, depth_agreement_mm, depth_errors_mm, psnr_paper, psnr_tissue, ssim
 
 SAMPLED_FRAMES = 8
@@ -34,8 +35,6 @@ LARGEST_DEPTH_SHARE = 0.03
 """Of the depth: beyond it model and stereo disagree by more than the stereo's own noise."""
 FEW_FRAMES = 16
 LEAST_CONFIDENT_SHARE = 0.8
-CONFIDENT = 128
-"""Of 255, as in fusion."""
 SMOOTH_LEVELS = 2.0
 """Standard deviation in 9 x 9 pixels, of 255: below it there is only noise to match."""
 LARGEST_SMOOTH_SHARE = 0.4
@@ -180,7 +179,7 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[str]:
         )
     if all(clip.tissue[index].all() for index in train):
         found.append("No instrument is masked anywhere: an instrument in the clip is modelled as if it were tissue.")
-    confident = _share_of_tissue(clip, sampled, lambda index: clip.depth_confidence[index] >= CONFIDENT)
+    confident = _share_of_tissue(clip, sampled, lambda index: clip.depth_confidence[index] >= CLEAR_CONFIDENCE)
     if confident < LEAST_CONFIDENT_SHARE:
         found.append(
             f"Stereo depth is missing or unsure on {1 - confident:.0%} of the tissue; the shape there is interpolated."
