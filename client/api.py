@@ -18,7 +18,6 @@ from contract.errors import InputError, UnavailableError
 from contract.job import TERMINAL_STATES, JobOptions, JobState, JobView
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
 DEFAULT_URL = "http://127.0.0.1:8765"
@@ -38,13 +37,13 @@ class Image:
     t: float
     warning: str | None
 
-    def array(self) -> NDArray[np.generic]:
+    def array(self) -> NDArray[Any]:
         """The values of a render asked for with format="npy"; needs numpy."""
         if self.media_type != "application/x-npy":
             raise InputError("format", f"this render is {self.media_type}.", 'Ask for it with format="npy".')
         import numpy as np  # here, so that a client without numpy can do everything else
 
-        values: NDArray[np.generic] = np.load(io.BytesIO(self.content), allow_pickle=False)
+        values: NDArray[Any] = np.load(io.BytesIO(self.content), allow_pickle=False)
         return values
 
 

@@ -24,7 +24,7 @@ class SceneSummary(BaseModel):
     """A scene in the list."""
 
     id: str
-    psnr_tissue: float | None
+    psnr_tissue_db: float | None
     links: dict[str, str]
 
 
@@ -34,7 +34,7 @@ def list_scenes(services: Services) -> list[SceneSummary]:
     return [
         SceneSummary(
             id=scene_id,
-            psnr_tissue=_report(services, scene_id).get("psnr_tissue"),
+            psnr_tissue_db=_report(services, scene_id).get("psnr_tissue_db"),
             links={"report": f"/scenes/{scene_id}", "render": f"/render?scene={scene_id}"},
         )
         for scene_id in services.store.scene_ids()

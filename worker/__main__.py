@@ -175,10 +175,10 @@ def _once(event: threading.Event) -> Callable[[int, FrameType | None], None]:
 
 
 def _print_report(report: dict[str, Any], out: Path) -> None:
-    quality = report.get("psnr_tissue")
+    quality = report["psnr_tissue_db"]
     shown = "not measured (no frames were held out)" if quality is None else f"{quality:.2f} dB on held-out frames"
     print(f"scene: {out}\npsnr_tissue: {shown}")
-    for warning in report.get("warnings", []):
+    for warning in report["warnings"]:
         print(f"warning: {warning}")
 
 

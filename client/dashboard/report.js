@@ -4,23 +4,22 @@ const number = (value, digits, unit) => (Number.isFinite(value) ? `${value.toFix
 const share = (value) => (Number.isFinite(value) ? `${Math.round(value * 100)} %` : null);
 
 function quality(report) {
-  const model = number(report.psnr_tissue, 2, "dB");
+  const model = number(report.psnr_tissue_db, 2, "dB");
   if (model === null) return "Not measured: no frames were held out.";
-  const copies = Object.values(report.baselines ?? {}).map(Number).filter(Number.isFinite);
+  const copies = [report.baseline_blend_db, report.baseline_flow_db].filter(Number.isFinite);
   if (copies.length === 0) return `${model} on frames it never saw.`;
   const best = Math.max(...copies);
-  const verdict = report.psnr_tissue >= best ? "better than" : "worse than";
-  return `${model} on frames it never saw; ${verdict} copying neighbouring frames (${best.toFixed(2)} dB).`;
+  const verdict = report.psnr_tissue_db > best ? "better" : "no better";
+  return `${model} on frames it never saw; ${verdict} than copying neighbouring frames (${best.toFixed(2)} dB).`;
 }
 
 function rows(report) {
-  const depth = report.depth_agreement_mm ?? report.depth_agreement;
   return [
     ["Likeness", quality(report)],
     ["Tissue covered", share(report.coverage)],
-    ["Depth against the measured depth", number(depth, 2, "mm (median difference)")],
+    ["Depth against stereo", number(report.depth_agreement_mm, 2, "mm (median difference)")],
     ["Size", Number.isFinite(report.gaussians) ? `${report.gaussians.toLocaleString()} Gaussians` : null],
-    ["Training", number(report.t_train_s, 1, "s")],
+    ["Training", number(report.seconds?.t_train_s, 1, "s")],
   ].filter(([, text]) => text !== null);
 }
 
@@ -39,9 +38,6 @@ function list(title, texts, className) {
   return [heading, body];
 }
 
-const textsOf = (value) =>
-  Array.isArray(value) ? value.map(String) : Object.entries(value ?? {}).map(([name, text]) => `${name}: ${text}`);
-
 export function showReport(target, id, report) {
   const lines = document.createElement("dl");
   for (const [title, text] of rows(report)) {
@@ -51,9 +47,9 @@ export function showReport(target, id, report) {
     body.textContent = text;
     lines.append(heading, body);
   }
-  const warnings = textsOf(report.warnings);
+  const warnings = report.warnings ?? [];
   if (warnings.length > 0) lines.append(...list("Warnings", warnings, "warning"));
-  const assumptions = textsOf(report.assumptions);
+  const assumptions = report.assumptions ?? [];
   if (assumptions.length > 0) lines.append(...list("Assumed", assumptions, ""));
   const download = document.createElement("a");
   download.href = `/scenes/${id}/export?format=ply&t=0`;

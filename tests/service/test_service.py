@@ -70,8 +70,8 @@ class House:
         record, claim = self.claimed()
         folder = self.store.work_folder(record.job_id, record.attempt)
         (folder / MANIFEST).write_text("{}")
-        (folder / REPORT).write_text('{"psnr_tissue": 36.2, "warnings": []}')
-        (folder / CURVE).write_text("t_train_s,psnr_tissue\n1,30\n")
+        (folder / REPORT).write_text('{"psnr_tissue_db": 36.2, "warnings": []}')
+        (folder / CURVE).write_text("t_train_s,psnr_tissue_db\n1,30\n")
         self.store.publish_scene(record.job_id, record.attempt)
         self.queue.finish(claim)
         return record.job_id
@@ -332,7 +332,7 @@ def test_a_worker_that_does_not_answer_is_given_up_in_time(tmp_path: Path) -> No
 
 def test_scenes_have_report_curve_and_export_until_they_are_deleted(house: House) -> None:
     scene = house.finished_scene()
-    assert house.http.get("/scenes").json()[0]["psnr_tissue"] == 36.2
+    assert house.http.get("/scenes").json()[0]["psnr_tissue_db"] == 36.2
     assert house.http.get(f"/scenes/{scene}").json()["warnings"] == []
     assert house.http.get(f"/scenes/{scene}/curve").text.startswith("t_train_s")
     exported = house.http.get(f"/scenes/{scene}/export", params={"format": "ply", "t": 0.5})

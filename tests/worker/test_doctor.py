@@ -1,0 +1,55 @@
+"""The doctor sees what is there, and says in one line how to mend what is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from contract.settings import Settings
+from worker.doctor import FIXED_FFMPEG, PACKAGES, Finding, bundled_ffmpeg, examine, format_findings
+
+
+def found(settings: Settings) -> dict[str, Finding]:
+    return {finding.topic: finding for finding in examine(settings)}
+
+
+def test_this_installation_is_complete_and_its_decoder_is_not_the_vulnerable_one(tmp_path: Path) -> None:
+    findings = found(Settings(data_dir=tmp_path))
+    assert set(PACKAGES) <= set(findings)
+    assert [finding for finding in findings.values() if finding.blocks] == []
+    assert findings["video decoder"].remedy is None
+    assert "up` starts" in findings["queue"].found
+
+
+def test_a_queue_that_does_not_answer_has_a_remedy(tmp_path: Path) -> None:
+    finding = found(Settings(data_dir=tmp_path, redis_url=f"unix://{tmp_path}/nobody.sock"))["queue"]
+    assert finding.remedy == "start that server, or unset REDIS_URL"
+
+
+def test_a_full_disk_has_a_remedy(tmp_path: Path) -> None:
+    assert found(Settings(data_dir=tmp_path / "new", min_free_bytes=2**62))["data directory"].remedy
+
+
+def test_the_version_of_a_bundled_ffmpeg_is_read_from_its_library(tmp_path: Path) -> None:
+    assert bundled_ffmpeg(tmp_path) is None
+    folder = tmp_path / "opencv_python.libs"
+    folder.mkdir()
+    (folder / "libavutil-0.so").write_bytes(b"\0ELF..FFmpeg version 8.1.1\0")
+    version = bundled_ffmpeg(tmp_path)
+    assert version == (8, 1, 1)
+    assert version < FIXED_FFMPEG
+
+
+@pytest.mark.parametrize(
+    ("finding", "mark"),
+    [
+        (Finding("a", "fine"), "ok"),
+        (Finding("a", "old", "update it"), "look"),
+        (Finding("a", "gone", "install it", blocks=True), "missing"),
+    ],
+)
+def test_each_line_begins_with_how_it_stands_and_the_remedy_follows(finding: Finding, mark: str) -> None:
+    lines = format_findings([finding]).splitlines()
+    assert lines[0].split()[0] == mark
+    assert len(lines) == (1 if finding.remedy is None else 2)
