@@ -94,7 +94,7 @@ def _parse(text: str, eye_width: int, eye_height: int) -> tuple[dict[str, Any], 
 def _parse_json(text: str) -> dict[str, Any]:
     try:
         value = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(FIELD, f"it is not valid JSON: {error}.", FORMATS_REMEDY) from None
     assert isinstance(value, dict)  # it starts with a brace
     return value

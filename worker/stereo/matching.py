@@ -2,10 +2,10 @@
 
 Symbols: H W pixels of one eye; d disparity, x_left - x_right in px of the full image; h w pixels the matcher works on.
 
-Semi-global matching (Hirschmueller 2008; OpenCV's 3-way form) runs on half the resolution, where a pixel costs an
+Semi-global matching (Hirschmueller 2008; OpenCV's 3-way form) runs on half the resolution or less, where it costs an
 eighth. Both directions feed an edge-aware weighted-least-squares filter (Min et al. 2014, cv2.ximgproc), which fills
 what the left-right check rejects. One Lucas-Kanade step along the row at full resolution then restores the sub-pixel
-part that half resolution lost (docs/decisions/001-stereo-at-half-resolution.md has figures).
+part that the reduction lost (docs/decisions/001-stereo-at-half-resolution.md has figures).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 Grey = NDArray[np.uint8]  # [H, W]
 Image = NDArray[np.float32]  # [H, W]
 
-HALF_RESOLUTION_FROM_WIDTH = 480  # narrower images keep their resolution: disparities are few and detail is scarce
+MATCHING_WIDTH = 480  # px; wider images are matched smaller by a whole factor: 2 for 640, 3 for 1280
 BLOCK_PX = 5
 SPARE_STEPS = 1.5  # of the range's margin, given up where they would cost sixteen more disparities
 DISPARITY_STEPS = 16  # per px, in which OpenCV's matchers count
@@ -56,7 +56,7 @@ def match(left: Grey, right: Grey, plan: MatchPlan) -> tuple[Image, NDArray[np.u
     """
     right = shift_rows(right, plan.row_shift_px)
     height, width = left.shape
-    factor = 2 if width >= HALF_RESOLUTION_FROM_WIDTH else 1
+    factor = -(-width // MATCHING_WIDTH)
     size = (round(width / factor), round(height / factor))
     scale = size[0] / width
     low = int(np.floor(plan.min_disparity_px * scale))
