@@ -41,26 +41,9 @@ def estimate_depth(clip: RectifiedClip, hooks: Hooks | None = None) -> DepthClip
     """
     hooks = Hooks() if hooks is None else hooks
     rgb, right = _decode(clip, hooks)
-    focal_baseline = clip.intrinsics.fx * clip.baseline_mm
-    depth_mm = np.zeros(rgb.shape[:3], np.float32)
-    confidence = np.zeros(rgb.shape[:3], np.uint8)
     with _pool() as pool:
         shift, plan = _plan(clip, rgb, right, pool)
-        hooks.on_progress(Progress(STAGE, DECODING_SHARE + MEASURING_SHARE))
-
-        def work(i: int) -> None:
-            disparity, trust = match(_grey(rgb[i]), right[i], plan)
-            depth_mm[i], confidence[i] = _to_depth(disparity, trust, focal_baseline, clip.disparity_offset_px)
-
-        start = DECODING_SHARE + MEASURING_SHARE
-        jobs = [pool.submit(work, i) for i in range(clip.frame_count)]
-        try:
-            for done, job in enumerate(jobs, start=1):
-                _check_stop(hooks)
-                job.result()
-                hooks.on_progress(Progress(STAGE, 1 - (1 - start) * (1 - done / clip.frame_count)))
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        depth_mm, confidence = _match_all(clip, rgb, right, plan, pool, hooks)
     valid_share = _valid_share(depth_mm, clip.tissue)
     return DepthClip(
         rgb=rgb,
@@ -116,6 +99,35 @@ def _plan(
         spread(RANGE_PAIRS), shift.correction_px, clip.disparity_offset_px, clip.intrinsics.fx * clip.baseline_mm
     )
     return shift, MatchPlan(low, high, shift.correction_px)
+
+
+def _match_all(
+    clip: RectifiedClip,
+    rgb: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    plan: MatchPlan,
+    pool: ThreadPoolExecutor,
+    hooks: Hooks,
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Depth in mm and confidence [T, H, W] of all pairs, matched side by side."""
+    focal_baseline = clip.intrinsics.fx * clip.baseline_mm
+    depth_mm = np.zeros(right.shape, np.float32)
+    confidence = np.zeros(right.shape, np.uint8)
+
+    def work(i: int) -> None:
+        disparity, trust = match(_grey(rgb[i]), right[i], plan)
+        depth_mm[i], confidence[i] = _to_depth(disparity, trust, focal_baseline, clip.disparity_offset_px)
+
+    share = 1 - DECODING_SHARE - MEASURING_SHARE
+    jobs = [pool.submit(work, i) for i in range(clip.frame_count)]
+    try:
+        for left_over, job in zip(reversed(range(len(jobs))), jobs, strict=True):
+            _check_stop(hooks)
+            job.result()
+            hooks.on_progress(Progress(STAGE, 1 - share * left_over / len(jobs)))
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    return depth_mm, confidence
 
 
 def _to_depth(
