@@ -26,7 +26,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Rates:
-    """One rate a parameter group. motion_* are those of the deformation's weights for its three kinds of channel."""
+    """One rate a parameter group. motion_* are those of the deformation's weights for its four kinds of channel."""
 
     mean: Rate
     quaternion: Rate
@@ -37,6 +37,7 @@ class Rates:
     motion_mean: Rate
     motion_quaternion: Rate
     motion_log_scale: Rate
+    motion_colour: Rate
     eps: float = 1e-15
 
 
@@ -53,6 +54,7 @@ class StepRates:
     motion_mean: float
     motion_quaternion: float
     motion_log_scale: float
+    motion_colour: float
     eps: float
 
 

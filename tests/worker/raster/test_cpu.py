@@ -24,7 +24,7 @@ from worker.optimize import StepRates
 from worker.raster import Camera
 from worker.raster.cpu import Rasterizer, Target, camera_vector, padded
 from worker.raster.cpu.model import FusedModel
-from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, SharedMotion, motion_of
+from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion, motion_of
 
 LOSSES = {
     "summed depth": LossSettings(2e3, 4e4, normalised_depth=False, colour_zone=0.05, depth_zone=1e-3),
@@ -320,7 +320,7 @@ def test_bases_that_are_negligible_are_left_out_of_deformation_and_training() ->
     narrow = SharedBasis.initial(8, bases=9, width=0.02)
     weight = torch.randn(narrow.weight.shape, generator=torch.Generator().manual_seed(8))
     deformation = dataclasses.replace(narrow, weight=weight)
-    motion = SharedMotion(deformation, 8)
+    motion = LinearMotion(deformation, 8)
     state = np.empty((10, 8), np.float32)
     motion.deform(np.zeros((10, 8), np.float32), 0.26, state)
     bound = NEGLIGIBLE * float(weight.abs().sum(-1).max())
@@ -335,7 +335,7 @@ def test_beyond_six_widths_the_kernels_give_the_canonical_state() -> None:
     fdm = dataclasses.replace(fdm, weight=torch.ones_like(fdm.weight))
     shared = dataclasses.replace(SharedBasis.initial(8, bases=3, width=0.01), weight=torch.ones(8, 10, 3))
     canonical = np.random.default_rng(0).normal(size=(10, 8)).astype(np.float32)
-    for motion in (FdmMotion(fdm, 8), SharedMotion(shared, 8)):
+    for motion in (FdmMotion(fdm, 8), LinearMotion(shared, 8)):
         state = np.full((10, 8), np.nan, np.float32)
         motion.deform(canonical, 0.25, state)  # 25 widths from the nearest centre
         assert bool((state == canonical).all())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ _PAD_LOGIT = -30.0  # opacity of the columns that only fill the last vector: cul
 
 def _rows(tensor: Tensor, count: int, fill: float = 0.0) -> Floats:
     """[N, k] tensor as [k, padded N] float32 rows."""
-    values = tensor.detach().reshape(tensor.shape[0], -1).numpy()
+    values = tensor.detach().reshape(tensor.shape[0], math.prod(tensor.shape[1:])).numpy()
     rows = np.full((values.shape[1], count), fill, np.float32)
     rows[:, : values.shape[0]] = values.T
     return rows
@@ -73,6 +74,6 @@ def rasterize(
     mean: Tensor, quaternion: Tensor, scale: Tensor, opacity: Tensor, colour: Tensor, camera: Camera
 ) -> Rendered:
     """See worker/raster/__init__.py. float32 on the CPU; gradients by torch.autograd."""
-    pose = torch.as_tensor(camera.camera_from_world)
+    pose = camera.pose(mean)
     rgb, depth, alpha = _Rasterize.apply(mean, quaternion, scale, opacity, colour, pose, camera)
     return Rendered(rgb, depth, alpha)

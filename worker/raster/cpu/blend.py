@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from worker.raster import MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE
+from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from worker.raster.cpu.bins import TILE_ROWS
 from worker.raster.cpu.simd import (
     LANES,

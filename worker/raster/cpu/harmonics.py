@@ -1,6 +1,7 @@
 """Spherical harmonics to colour and back, for scenes whose camera moves (worker/gaussians.py has the same in torch).
 
-N Gaussians, K = (degree + 1)^2 coefficients a channel; sh [K, 3, N], colour [3, N], mean in state[0:3].
+N Gaussians, K = (degree + 1)^2 coefficients a channel: the constant one in state[10:13], the others in rest [K - 1, 3, N];
+colour [3, N], mean in state[0:3].
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ def _terms(degree, x, y, z, value, slope):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def colour_from_sh(thread, threads, degree, centre, state, sh, colour):  # type: ignore[no-untyped-def]
-    """colour = max(0, 0.5 + sum_k sh_k Y_k(direction from the camera centre to the mean))."""
+def colour_from_sh(thread, threads, degree, centre, state, rest, colour):  # type: ignore[no-untyped-def]
+    """colour = max(0, 0.5 + sum_k c_k Y_k(direction from the camera centre to the mean))."""
     terms = (degree + 1) * (degree + 1)
     value, slope = np.empty(terms), np.empty((terms, 3))
     count = state.shape[1]
@@ -66,17 +67,17 @@ def colour_from_sh(thread, threads, degree, centre, state, sh, colour):  # type:
         n = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
         _terms(degree, x * n, y * n, z * n, value, slope)
         for channel in range(3):
-            total = 0.5
-            for k in range(terms):
-                total += sh[k, channel, g] * value[k]
+            total = 0.5 + C0 * state[10 + channel, g]
+            for k in range(1, terms):
+                total += rest[k - 1, channel, g] * value[k]
             colour[channel, g] = max(total, 0.0)
 
 
 @njit(cache=True, nogil=True)
 def colour_from_sh_backward(  # type: ignore[no-untyped-def]
-    thread, threads, degree, centre, state, sh, colour, v_colour, v_sh, v_state
+    thread, threads, degree, centre, state, rest, colour, v_colour, v_rest, v_state
 ):
-    """Write v_sh [K, 3, N]; add the direction's share to v_state[0:3]."""
+    """Write v_rest [K - 1, 3, N] and v_state[10:13]; add the direction's share to v_state[0:3]."""
     terms = (degree + 1) * (degree + 1)
     value, slope, v_direction = np.empty(terms), np.empty((terms, 3)), np.empty(3)
     count = state.shape[1]
@@ -88,10 +89,11 @@ def colour_from_sh_backward(  # type: ignore[no-untyped-def]
         v_direction[:] = 0.0
         for channel in range(3):
             gradient = v_colour[channel, g] if colour[channel, g] > 0.0 else np.float32(0.0)
-            for k in range(terms):
-                v_sh[k, channel, g] = gradient * value[k]
+            v_state[10 + channel, g] = gradient * C0
+            for k in range(1, terms):
+                v_rest[k - 1, channel, g] = gradient * value[k]
                 for axis in range(3):
-                    v_direction[axis] += gradient * sh[k, channel, g] * slope[k, axis]
+                    v_direction[axis] += gradient * rest[k - 1, channel, g] * slope[k, axis]
         along = v_direction[0] * x + v_direction[1] * y + v_direction[2] * z
         v_state[0, g] += n * (v_direction[0] - along * x)
         v_state[1, g] += n * (v_direction[1] - along * y)

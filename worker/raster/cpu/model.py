@@ -1,6 +1,6 @@
 """The fused training step: deform, project, bin, blend with loss and gradients, then Adam on every parameter.
 
-N Gaussians (padded to whole vectors), K spherical-harmonic coefficients, rows of N floats.
+N Gaussians (padded to whole vectors), rows of N floats; canonical and state [13, N] as in update.py.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worker.deformation import FlexibleDeformation, SharedBasis
+from worker.deformation import FlexibleDeformation
 from worker.gaussians import Gaussians
 from worker.optimize import StepRates, adam_step_size
 from worker.raster.cpu import harmonics, update
-from worker.raster.cpu.motion import motion_of
+from worker.raster.cpu.motion import LinearDeformation, motion_of
 from worker.raster.cpu.rasterizer import Floats, Rasterizer, Target, padded
 from worker.raster.cpu.threads import run
 
@@ -37,17 +37,20 @@ class StepSums:
 class FusedModel:
     """Canonical Gaussians, their deformation and Adam's moments, trained a frame at a time on the CPU."""
 
-    def __init__(self, gaussians: Gaussians, deformation: SharedBasis | FlexibleDeformation, width: int, height: int):
+    def __init__(
+        self, gaussians: Gaussians, deformation: LinearDeformation | FlexibleDeformation, width: int, height: int
+    ):
         self.count = len(gaussians)
         columns = padded(self.count)
         canonical = torch.cat([gaussians.mean, gaussians.quaternion, gaussians.log_scale], 1).numpy()
-        self.canonical = np.zeros((10, columns), np.float32)
+        self.canonical = np.zeros((update.ROWS, columns), np.float32)
         self.canonical[3] = 1.0
-        self.canonical[:, : self.count] = canonical.T
+        self.canonical[:10, : self.count] = canonical.T
+        self.canonical[10:13, : self.count] = gaussians.sh[:, 0].T.numpy()
         self.opacity_logit = np.full(columns, PAD_LOGIT, np.float32)
         self.opacity_logit[: self.count] = gaussians.opacity_logit.numpy()
-        self.sh = np.zeros((gaussians.sh.shape[1], 3, columns), np.float32)
-        self.sh[:, :, : self.count] = gaussians.sh.permute(1, 2, 0).numpy()
+        self.sh_rest = np.zeros((gaussians.sh.shape[1] - 1, 3, columns), np.float32)
+        self.sh_rest[:, :, : self.count] = gaussians.sh[:, 1:].permute(1, 2, 0).numpy()
         self.sh_degree = gaussians.sh_degree  # of those stored; a schedule may use fewer
         self.motion = motion_of(deformation, columns)
         self.rasterizer = Rasterizer(width, height)
@@ -55,23 +58,23 @@ class FusedModel:
         self._allocate()
 
     def _parameters(self) -> dict[str, Floats]:
-        return {"canonical": self.canonical, "opacity_logit": self.opacity_logit, "sh": self.sh}
+        return {"canonical": self.canonical, "opacity_logit": self.opacity_logit, "sh_rest": self.sh_rest}
 
     def _allocate(self) -> None:
         columns = self.canonical.shape[1]
-        self.state = np.zeros((10, columns), np.float32)
+        self.state = np.zeros((update.ROWS, columns), np.float32)
         self.colour = np.zeros((3, columns), np.float32)
-        self._v_sh = np.zeros_like(self.sh)
+        self._v_rest = np.zeros_like(self.sh_rest)
 
     def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
         """The Gaussians at time t on this camera's image."""
         self.motion.deform(self.canonical, t, self.state)
         if sh_degree == 0:
-            np.multiply(self.sh[0], np.float32(C0), out=self.colour)
+            np.multiply(self.state[10:13], np.float32(C0), out=self.colour)
             self.colour += np.float32(0.5)
             np.maximum(self.colour, 0, out=self.colour)
         else:
-            run(harmonics.colour_from_sh, sh_degree, _centre(camera), self.state, self.sh, self.colour)
+            run(harmonics.colour_from_sh, sh_degree, _centre(camera), self.state, self.sh_rest, self.colour)
         self.rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
 
     def render(self, camera: NDArray[np.float64], t: float) -> Floats:
@@ -93,24 +96,24 @@ class FusedModel:
         self.project(camera, t, sh_degree)
         gradients = self.rasterizer.loss_backward(target, loss_settings)
         if sh_degree == 0:
-            np.multiply(gradients.colour, np.float32(C0), out=self._v_sh[0])
-            self._v_sh[0] *= self.colour > 0
+            np.multiply(gradients.colour, np.float32(C0), out=gradients.state[10:13])
+            gradients.state[10:13] *= self.colour > 0
         else:
             run(
-                harmonics.colour_from_sh_backward, sh_degree, _centre(camera), self.state, self.sh, self.colour,
-                gradients.colour, self._v_sh, gradients.state,
+                harmonics.colour_from_sh_backward, sh_degree, _centre(camera), self.state, self.sh_rest, self.colour,
+                gradients.colour, self._v_rest, gradients.state,
             )  # fmt: skip
         self.motion.update(gradients.state, t, rates, iteration)
         canonical, moments = self.canonical, self._moments["canonical"]
-        for rows, rate in ((slice(0, 3), rates.mean), (slice(3, 7), rates.quaternion), (slice(7, 10), rates.log_scale)):
+        groups = ((0, 3, rates.mean), (3, 7, rates.quaternion), (7, 10, rates.log_scale), (10, 13, rates.colour))
+        for first, last, rate in groups:
+            rows = slice(first, last)
             _adam(canonical[rows], gradients.state[rows], moments[:, rows], rate, rates.eps, iteration)
         opacity_moments = self._moments["opacity_logit"]
         _adam(self.opacity_logit, gradients.opacity_logit, opacity_moments, rates.opacity, rates.eps, iteration)
-        sh_moments, terms = self._moments["sh"], (sh_degree + 1) ** 2
-        _adam(self.sh[0], self._v_sh[0], sh_moments[:, 0], rates.colour, rates.eps, iteration)
-        if terms > 1:
-            rest = slice(1, terms)
-            _adam(self.sh[rest], self._v_sh[rest], sh_moments[:, rest], rates.sh_rest, rates.eps, iteration)
+        if sh_degree > 0:
+            rest, used = self._moments["sh_rest"], slice(0, (sh_degree + 1) ** 2 - 1)
+            _adam(self.sh_rest[used], self._v_rest[used], rest[:, used], rates.sh_rest, rates.eps, iteration)
         colour_l1, depth_l1, squared_error, holes = self.rasterizer.statistics.sum(0, dtype=np.float64).tolist()
         return StepSums(colour_l1, depth_l1, squared_error, holes)
 
@@ -140,15 +143,16 @@ class FusedModel:
                 raise ValueError(f"{name} has shape {stored[name].shape}, this model needs {values.shape}")
             values[...] = stored[name]
 
-    def export(self) -> tuple[Gaussians, SharedBasis | FlexibleDeformation]:
+    def export(self) -> tuple[Gaussians, LinearDeformation | FlexibleDeformation]:
         """The Gaussians and their deformation as torch tensors (copies)."""
-        canonical = torch.from_numpy(np.ascontiguousarray(self.canonical[:, : self.count].T))
+        canonical = torch.from_numpy(np.ascontiguousarray(self.canonical[:10, : self.count].T))
+        sh = np.concatenate([self.canonical[None, 10:13], self.sh_rest])[:, :, : self.count]
         gaussians = Gaussians(
             canonical[:, 0:3].contiguous(),
             canonical[:, 3:7].contiguous(),
             canonical[:, 7:10].contiguous(),
             torch.from_numpy(self.opacity_logit[: self.count].copy()),
-            torch.from_numpy(np.ascontiguousarray(self.sh[:, :, : self.count].transpose(2, 0, 1))),
+            torch.from_numpy(np.ascontiguousarray(sh.transpose(2, 0, 1))),
         )
         return gaussians, self.motion.export(self.count)
 

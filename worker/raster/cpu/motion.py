@@ -1,31 +1,35 @@
 """The deformation of the fused step: shared bases or FDM, with Adam's moments beside the weights.
 
-N Gaussians (padded), B bases, C = 10 channels, rows of N floats.
+N Gaussians (padded), B bases, C channels (10, or 13 where colour moves too), rows of N floats.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Protocol
 
 import numpy as np
 import torch
 
-from worker.deformation import FlexibleDeformation, SharedBasis
+from worker.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis
 from worker.optimize import StepRates, adam_step_size
 from worker.raster.cpu import update
 from worker.raster.cpu.rasterizer import Floats
 from worker.raster.cpu.threads import run
 
-CHANNELS = update.CHANNELS
 NEGLIGIBLE = 1e-3
 """A shared basis below this at t is neither evaluated nor trained in that step."""
+
+
+LinearDeformation = SharedBasis | PolynomialFourier
+"""Deformations that are a matrix of weights times bases common to all Gaussians."""
 
 
 class Motion(Protocol):
     """A deformation the fused step can evaluate and train."""
 
     def deform(self, canonical: Floats, t: float, state: Floats) -> None:
-        """state [10, N] = canonical + psi(t)."""
+        """state [13, N] = canonical + psi(t)."""
 
     def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
         """One Adam step of the weights that reach t, given dL/dstate at t. iteration counts from 1."""
@@ -36,34 +40,32 @@ class Motion(Protocol):
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything that must be stored to resume, by name; views."""
 
-    def export(self, count: int) -> SharedBasis | FlexibleDeformation:
+    def export(self, count: int) -> LinearDeformation | FlexibleDeformation:
         """The first count Gaussians' deformation as torch tensors (copies)."""
 
 
 def _channel_rates(rates: StepRates) -> Floats:
-    return np.repeat(
-        np.array([rates.motion_mean, rates.motion_quaternion, rates.motion_log_scale], np.float32), [3, 4, 3]
-    )
+    groups = [rates.motion_mean, rates.motion_quaternion, rates.motion_log_scale, rates.motion_colour]
+    return np.repeat(np.array(groups, np.float32), [3, 4, 3, 3])
 
 
-class SharedMotion:
-    """Fixed bases common to all Gaussians; only the weights of those alive at t are read or written in a step.
+class LinearMotion:
+    """Bases of t common to all Gaussians; only the weights of those alive at t are read or written in a step.
 
     Adam's moments of a weight advance only in steps that use it, with its own count of them.
     """
 
-    def __init__(self, deformation: SharedBasis, columns: int) -> None:
-        count, _, bases = deformation.weight.shape
-        self.centre = deformation.centre.numpy().astype(np.float64)
-        self.width = deformation.width.numpy().astype(np.float64)
-        self.weight = np.zeros((bases, CHANNELS, columns), np.float32)
+    def __init__(self, deformation: LinearDeformation, columns: int) -> None:
+        count, channels, bases = deformation.weight.shape
+        self._deformation = deformation
+        self.weight = np.zeros((bases, channels, columns), np.float32)
         self.weight[:, :, :count] = deformation.weight.permute(2, 1, 0).numpy()
         self.first, self.second = np.zeros_like(self.weight), np.zeros_like(self.weight)
         self.steps = np.zeros(bases, np.int64)
 
     def _alive(self, t: float) -> tuple[Floats, int, int]:
-        values = np.exp(-((t - self.centre) ** 2) / (2 * self.width**2)).astype(np.float32)
-        alive = np.flatnonzero(values >= NEGLIGIBLE)
+        values = self._deformation.basis(t).numpy()
+        alive = np.flatnonzero(np.abs(values) >= NEGLIGIBLE)
         return (values, int(alive[0]), int(alive[-1]) + 1) if alive.size else (values, 0, 0)
 
     def deform(self, canonical: Floats, t: float, state: Floats) -> None:
@@ -74,10 +76,11 @@ class SharedMotion:
         values, first, last = self._alive(t)
         self.steps[first:last] += 1
         channel_rates = _channel_rates(rates)
-        rate, eps = np.zeros((2, len(self.centre), CHANNELS), np.float32)
+        bases, channels, _ = self.weight.shape
+        rate, eps = np.zeros((2, bases, channels), np.float32)
         for j in range(first, last):
             size, floor = adam_step_size(1.0, rates.eps, int(self.steps[j]))
-            rate[j], eps[j] = channel_rates * size, floor
+            rate[j], eps[j] = channel_rates[:channels] * size, floor
         run(update.update_shared, self.weight, self.first, self.second, v_state, values, first, last, rate, eps)
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
@@ -86,13 +89,12 @@ class SharedMotion:
         self.second = np.where(fresh, np.float32(0), self.second[:, :, columns])
 
     def arrays(self) -> dict[str, np.ndarray]:
-        names = ("centre", "width", "weight", "first", "second", "steps")
+        names = ("weight", "first", "second", "steps")
         return {f"motion.{name}": getattr(self, name) for name in names}
 
-    def export(self, count: int) -> SharedBasis:
+    def export(self, count: int) -> LinearDeformation:
         weight = torch.from_numpy(np.ascontiguousarray(self.weight[:, :, :count].transpose(2, 1, 0)))
-        centre, width = (torch.from_numpy(a.astype(np.float32)) for a in (self.centre, self.width))
-        return SharedBasis(weight, centre, width)
+        return dataclasses.replace(self._deformation, weight=weight)
 
 
 class FdmMotion:
@@ -128,11 +130,11 @@ class FdmMotion:
         return {f"motion.{name}": getattr(self, name) for name in ("weight", "centre", "width", "first", "second")}
 
     def export(self, count: int) -> FlexibleDeformation:
-        tensors = (
+        weight, centre, width = (
             torch.from_numpy(np.ascontiguousarray(a[..., :count].transpose(2, 0, 1)))
             for a in (self.weight, self.centre, self.width)
         )
-        return FlexibleDeformation(*tensors, form=self.form)
+        return FlexibleDeformation(weight, centre, width, form=self.form)
 
 
 def _columns_last(tensor: torch.Tensor, columns: int, fill: float) -> Floats:
@@ -142,8 +144,8 @@ def _columns_last(tensor: torch.Tensor, columns: int, fill: float) -> Floats:
     return rows
 
 
-def motion_of(deformation: SharedBasis | FlexibleDeformation, columns: int) -> SharedMotion | FdmMotion:
+def motion_of(deformation: LinearDeformation | FlexibleDeformation, columns: int) -> LinearMotion | FdmMotion:
     """The trainable form of a deformation, padded to columns Gaussians."""
-    if isinstance(deformation, SharedBasis):
-        return SharedMotion(deformation, columns)
-    return FdmMotion(deformation, columns)
+    if isinstance(deformation, FlexibleDeformation):
+        return FdmMotion(deformation, columns)
+    return LinearMotion(deformation, columns)

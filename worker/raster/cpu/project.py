@@ -162,8 +162,16 @@ def project_backward(  # type: ignore[no-untyped-def]
         a00, a01, a02 = j0 * (w00 - u * w20), j0 * (w01 - u * w21), j0 * (w02 - u * w22)
         a10, a11, a12 = j1 * (w10 - v * w20), j1 * (w11 - v * w21), j1 * (w12 - v * w22)
         # B = A R: cov2d = B S^2 B^T.
-        b00, b01, b02 = a00 * r00 + a01 * r10 + a02 * r20, a00 * r01 + a01 * r11 + a02 * r21, a00 * r02 + a01 * r12 + a02 * r22
-        b10, b11, b12 = a10 * r00 + a11 * r10 + a12 * r20, a10 * r01 + a11 * r11 + a12 * r21, a10 * r02 + a11 * r12 + a12 * r22
+        b00, b01, b02 = (
+            a00 * r00 + a01 * r10 + a02 * r20,
+            a00 * r01 + a01 * r11 + a02 * r21,
+            a00 * r02 + a01 * r12 + a02 * r22,
+        )
+        b10, b11, b12 = (
+            a10 * r00 + a11 * r10 + a12 * r20,
+            a10 * r01 + a11 * r11 + a12 * r21,
+            a10 * r02 + a11 * r12 + a12 * r22,
+        )
         t0, t1, t2 = s0 * s0, s1 * s1, s2 * s2
         cxx = b00 * b00 * t0 + b01 * b01 * t1 + b02 * b02 * t2 + EPS2D
         cxy = b00 * b10 * t0 + b01 * b11 * t1 + b02 * b12 * t2
@@ -184,7 +192,14 @@ def project_backward(  # type: ignore[no-untyped-def]
         v_state[7, g] = 2.0 * t0 * (b00 * e00 + b10 * e10)
         v_state[8, g] = 2.0 * t1 * (b01 * e01 + b11 * e11)
         v_state[9, g] = 2.0 * t2 * (b02 * e02 + b12 * e12)
-        e00, e10, e01, e11, e02, e12 = 2 * e00 * t0, 2 * e10 * t0, 2 * e01 * t1, 2 * e11 * t1, 2 * e02 * t2, 2 * e12 * t2
+        e00, e10, e01, e11, e02, e12 = (
+            2 * e00 * t0,
+            2 * e10 * t0,
+            2 * e01 * t1,
+            2 * e11 * t1,
+            2 * e02 * t2,
+            2 * e12 * t2,
+        )
 
         # dL/dR = A^T dL/dB, then through R(q / |q|).
         p00, p01, p02 = a00 * e00 + a10 * e10, a00 * e01 + a10 * e11, a00 * e02 + a10 * e12
@@ -199,8 +214,16 @@ def project_backward(  # type: ignore[no-untyped-def]
         v_state[5, g], v_state[6, g] = n * (d2 - along * q2), n * (d3 - along * q3)
 
         # dL/dA = dL/dB R^T, then to the camera point through A = diag(j) (W_xy - (u, v) W_z).
-        f00, f01, f02 = e00 * r00 + e01 * r01 + e02 * r02, e00 * r10 + e01 * r11 + e02 * r12, e00 * r20 + e01 * r21 + e02 * r22
-        f10, f11, f12 = e10 * r00 + e11 * r01 + e12 * r02, e10 * r10 + e11 * r11 + e12 * r12, e10 * r20 + e11 * r21 + e12 * r22
+        f00, f01, f02 = (
+            e00 * r00 + e01 * r01 + e02 * r02,
+            e00 * r10 + e01 * r11 + e02 * r12,
+            e00 * r20 + e01 * r21 + e02 * r22,
+        )
+        f10, f11, f12 = (
+            e10 * r00 + e11 * r01 + e12 * r02,
+            e10 * r10 + e11 * r11 + e12 * r12,
+            e10 * r20 + e11 * r21 + e12 * r22,
+        )
         v_u = -j0 * (f00 * w20 + f01 * w21 + f02 * w22)
         v_v = -j1 * (f10 * w20 + f11 * w21 + f12 * w22)
         v_x, v_y = j0 * v_mx, j1 * v_my

@@ -46,7 +46,7 @@ class Target:
 class Gradients:
     """dL/d of every Gaussian's deformed state, opacity logit and colour; |dL/dmean2d| in NDC; dL/d camera_from_world."""
 
-    state: Floats  # [10, N]
+    state: Floats  # [13, N]; rows 10:13, the constant harmonic, are the caller's to fill
     opacity_logit: Floats  # [N]
     colour: Floats  # [3, N]
     mean2d_norm: Floats  # [N]
@@ -78,7 +78,7 @@ class Rasterizer:
         self._order = np.zeros((2, count), np.int32)
         self._keys = np.zeros((2, count), np.uint32)
         self.gradients = Gradients(
-            np.zeros((10, count), np.float32),
+            np.zeros((13, count), np.float32),
             np.zeros(count, np.float32),
             np.zeros((3, count), np.float32),
             np.zeros(count, np.float32),
@@ -93,10 +93,8 @@ class Rasterizer:
         self._tile_slots = np.zeros(capacity, np.int32)
         self._slots = np.zeros((capacity, project.GRADIENT), np.float32)
 
-    def project(
-        self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats
-    ) -> None:
-        """Splats of this camera, their tiles and depth order. camera: camera_vector; state [10, N], colour [3, N]."""
+    def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
+        """Splats of this camera, their tiles and depth order. camera: camera_vector; state [>= 10, N], colour [3, N]."""
         count = state.shape[1]
         if self.splats.shape[0] != count:
             self._allocate_gaussians(count)

@@ -1,7 +1,8 @@
 """Deformation and Adam: the per-parameter half of a training step.
 
-N Gaussians padded to a multiple of LANES, B bases, C = 10 channels (mean 0:3, quaternion 3:7, log-scale 7:10). Rows of N
-floats everywhere, so that a vector is LANES Gaussians. Adam (Kingma and Ba 2015) with bias correction folded into the
+N Gaussians padded to a multiple of LANES, B bases. The canonical state has ROWS = 13 rows: mean 0:3, quaternion 3:7,
+log-scale 7:10 and the constant harmonic of the colour 10:13; FDM moves the first CHANNELS = 10, shared bases the first
+10 or all. Rows of N floats everywhere, so that a vector is LANES Gaussians. Adam (Kingma and Ba 2015) with bias correction folded into the
 step: rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and eps scaled alike.
 """
 
@@ -12,7 +13,7 @@ from numba import njit
 
 from worker.raster.cpu.simd import LANES, exp2, fma, load, splat, sqrt, store, where_less
 
-CHANNELS = 10
+CHANNELS, ROWS = 10, 13
 BETA1, BETA2 = np.float32(0.9), np.float32(0.999)
 _REST1, _REST2 = np.float32(0.1), np.float32(0.001)
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
@@ -44,14 +45,15 @@ def adam(thread, threads, value, gradient, first, second, rate, eps):  # type: i
 
 @njit(cache=True, nogil=True)
 def deform_shared(thread, threads, canonical, weight, basis, first, last, state):  # type: ignore[no-untyped-def]
-    """state [10, N] = canonical + sum over j in [first, last) of basis[j] weight[j]; weight [B, 10, N]."""
+    """state [ROWS, N] = canonical + sum over j in [first, last) of basis[j] weight[j]; weight [B, C, N], C <= ROWS."""
     vectors = canonical.shape[1] // LANES
     for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
         i = k * LANES
-        for c in range(CHANNELS):
+        for c in range(ROWS):
             total = load(canonical[c], i)
-            for j in range(first, last):
-                total = fma(splat(basis[j]), load(weight[j, c], i), total)
+            if c < weight.shape[1]:
+                for j in range(first, last):
+                    total = fma(splat(basis[j]), load(weight[j, c], i), total)
             store(state[c], i, total)
 
 
@@ -59,10 +61,10 @@ def deform_shared(thread, threads, canonical, weight, basis, first, last, state)
 def update_shared(  # type: ignore[no-untyped-def]
     thread, threads, weight, first_moment, second_moment, v_state, basis, first, last, rate, eps
 ):
-    """Adam on the weights of the bases [first, last); rate, eps [B, 10]. dL/dw_j = dL/dpsi basis_j."""
+    """Adam on the weights of the bases [first, last); rate, eps [B, C]. dL/dw_j = dL/dpsi basis_j."""
     vectors = v_state.shape[1] // LANES
     for j in range(first, last):
-        for c in range(CHANNELS):
+        for c in range(weight.shape[1]):
             if rate[j, c] == _ZERO:
                 continue
             step, floor, value = splat(rate[j, c]), splat(eps[j, c]), splat(basis[j])
@@ -99,11 +101,13 @@ def _basis(t, centre, width, quartic):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def deform_fdm(thread, threads, canonical, weight, centre, width, t, quartic, state):  # type: ignore[no-untyped-def]
-    """state [10, N] = canonical + FDM at t; weight, centre, width [10, B, N] (Deform3DGS, equations 3 and 4)."""
+    """state [ROWS, N] = canonical + FDM at t; weight, centre, width [10, B, N] (Deform3DGS, equations 3 and 4)."""
     vectors = canonical.shape[1] // LANES
     time = splat(t)
     for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
         i = k * LANES
+        for c in range(CHANNELS, ROWS):
+            store(state[c], i, load(canonical[c], i))
         for c in range(CHANNELS):
             total = load(canonical[c], i)
             for j in range(weight.shape[1]):
