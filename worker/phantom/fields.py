@@ -35,7 +35,8 @@ def smooth_field(
 
 def fine_field(rng: np.random.Generator, shape: tuple[int, int], blur_texels: float) -> Image32:
     """Noise as fine as the texture itself: white, blurred by blur_texels, deviation 1. The detail stereo lives on."""
-    field = cv2.GaussianBlur(rng.standard_normal(shape, dtype=np.float32), (0, 0), blur_texels)
+    own_rng = rng.spawn(1)[0]  # how much is drawn depends on shape; what is drawn next from rng must not
+    field = cv2.GaussianBlur(own_rng.standard_normal(shape, dtype=np.float32), (0, 0), blur_texels)
     return np.asarray(field / field.std(), dtype=np.float32)
 
 

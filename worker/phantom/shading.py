@@ -27,7 +27,7 @@ BACKLIT = 0.15  # a normal that turns away by more than this gets no glint
 
 TISSUE_WRAP = (0.40, 0.22, 0.20)  # light bleeds round edges inside tissue, red the farthest
 
-NOISE_FLOOR, NOISE_GAIN = 0.0035, 0.00012  # deviation of sRGB in the dark; variance per unit of brightness
+NOISE_FLOOR, NOISE_GAIN = 0.003, 0.00004  # deviation of sRGB in the dark; variance per unit of brightness
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,6 @@ from worker.phantom.scene import Phantom, PhantomFrame
 Tick = Callable[[int, int], None]  # called with (frames done, frames) after each frame
 
 VIDEO, CALIBRATION, MASKS = "stereo.webm", "calibration.json", "masks.zip"
-VIDEO_QUALITY = 100.0  # of OpenCV's writer; backends that know no quality ignore it
 BRIGHT = 255
 DEEPEST_8_BIT_MM = 255
 NOVEL_TIMES = (0.0, 0.35, 0.7)  # model times of the novel views
@@ -49,7 +48,6 @@ def write_stereo_video(phantom: Phantom, path: Path, tick: Tick = _ignore) -> No
     )
     if not video.isOpened():
         raise UnavailableError("OpenCV cannot write VP9 here.", "Write --format stereomis instead.")
-    video.set(cv2.VIDEOWRITER_PROP_QUALITY, VIDEO_QUALITY)
     try:
         with zipfile.ZipFile(path / MASKS, "w") as masks:
             for index in range(settings.frames):
