@@ -1,0 +1,91 @@
+"""The local commands, from the command line to the files they write."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from contract.exits import ExitCode
+from worker.__main__ import main
+
+WIDTH, HEIGHT, FRAMES = 96, 80, 10
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("phantom") / "clip"
+    size = ["--width", str(WIDTH), "--height", str(HEIGHT), "--frames", str(FRAMES)]
+    assert main(["phantom", *size, "--format", "endonerf", "--out", str(folder)]) == ExitCode.OK
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("scenes") / "scene"
+    assert main(["reconstruct", str(clip), "--iterations", "10", "--out", str(out)]) == ExitCode.OK
+    return out
+
+
+def test_reconstruct_writes_a_scene_with_its_report_and_curve(scene: Path) -> None:
+    assert {"manifest.json", "scene.safetensors", "report.json", "curve.csv"} <= {path.name for path in scene.iterdir()}
+    assert json.loads((scene / "report.json").read_text())["iterations"] == 10
+
+
+def test_render_writes_one_picture_a_frame(scene: Path, tmp_path: Path) -> None:
+    assert main(["render", str(scene), "--frames", "1,9", "--out", str(tmp_path / "frames")]) == ExitCode.OK
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["000001.png", "000009.png"]
+    picture = cv2.imread(str(tmp_path / "frames" / "000001.png"))
+    assert picture is not None
+    assert picture.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_render_writes_any_layer_from_any_pose(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "depth.npy"
+    view = ["--t", "0.4", "--pose", "orbit:5,0,1", "--width", "48", "--layer", "depth", "--out", str(out)]
+    assert main(["render", str(scene), *view]) == ExitCode.OK
+    assert np.load(out).shape == (HEIGHT // 2, WIDTH // 2)
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        ["--t", "0", "--out", "view.gif"],
+        ["--t", "0", "--pose", "1,2,3", "--out", "view.png"],
+        ["--t", "0", "--width", "1", "--out", "view.png"],
+        ["--frames", "99", "--out", "frames"],
+    ],
+)
+def test_a_view_that_cannot_be_meant_is_a_bad_input(
+    scene: Path, view: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["render", str(scene), *view]) == ExitCode.BAD_INPUT
+    assert "intrasplat: " in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_clip_that_is_not_there_is_a_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reconstruct", str(tmp_path / "no.mp4"), "--out", str(tmp_path / "scene")]) == ExitCode.BAD_INPUT
+    assert "clip" in capsys.readouterr().err
+
+
+def test_a_folder_with_something_in_it_is_not_written_over(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reconstruct", str(clip), "--out", str(clip)]) == ExitCode.BAD_INPUT
+    assert "--out" in capsys.readouterr().err
+
+
+def test_a_scene_that_is_not_there_is_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", str(tmp_path), "--t", "0", "--out", str(tmp_path / "a.png")]) == ExitCode.FAILED
+    assert capsys.readouterr().err
+
+
+def test_consume_without_a_queue_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("REDIS_URL", raising=False)
+    assert main(["consume"]) == ExitCode.UNAVAILABLE
+    assert "intrasplat up" in capsys.readouterr().err
