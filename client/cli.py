@@ -12,13 +12,14 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import get_args
 
 from pydantic import ValidationError
 
 from client.api import DEFAULT_URL, Client
 from contract.errors import InputError, IntrasplatError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.job import JobOptions, JobProgress, JobView
+from contract.job import JobOptions, JobProgress, JobView, PresetName
 from contract.progress_bar import ProgressBar
 from contract.settings import Settings, default_data_dir
 
@@ -118,7 +119,9 @@ def _add_submit(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     parser.add_argument(
         "--holdout", metavar="every8|blocks8|none|LIST", help="frames kept from training, to measure on"
     )
-    parser.add_argument("--preset", help="fast (default), paper, and others")
+    parser.add_argument(
+        "--preset", choices=get_args(PresetName), help="fast, ours, is the default; paper, as published"
+    )
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-s", type=float, metavar="S", help="seconds of training")
     limit.add_argument("--iterations", type=int, metavar="N", help="steps of training")

@@ -12,6 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
 """Job ids are made by the service, never by a caller, so they are safe as file names and key parts."""
 
+PresetName = Literal["fast", "paper", "paper-released", "paper-wide", "pfs", "hexplane", "without_mapf"]
+"""fast is ours; paper is the published method as published; the others are compared with it (worker/presets.py)."""
+
 
 class JobState(StrEnum):
     """Where a job stands."""
@@ -48,7 +51,7 @@ class JobOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    preset: str = Field(default="fast", pattern=r"^[a-z][a-z0-9_-]{0,39}$")
+    preset: PresetName = "fast"
     budget_s: float | None = Field(default=None, gt=0, le=7200, description="seconds of training; not with iterations")
     iterations: int | None = Field(default=None, ge=1, le=1_000_000, description="fixed schedule; not with budget_s")
     mask_polarity: Literal["auto", "tool", "tissue"] = "auto"

@@ -15,12 +15,13 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import ValidationError
 
 from contract.errors import InputError, IntrasplatError, UnavailableError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
+from contract.job import PresetName
 from contract.progress_bar import ProgressBar
 from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
 from contract.settings import Settings
@@ -93,7 +94,9 @@ def _add_reconstruct(commands: argparse._SubParsersAction[argparse.ArgumentParse
         metavar="every8|blocks8|none|LIST",
         help="frames kept from training to measure quality on (default: every8); LIST such as 1,9,17",
     )
-    parser.add_argument("--preset", default="fast", help="fast (default), or paper and its kin for comparison")
+    parser.add_argument(
+        "--preset", choices=get_args(PresetName), default="fast", help="fast, ours, is the default; paper, as published"
+    )
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-s", type=_positive, metavar="S", help="seconds of training (default: the preset's)")
     limit.add_argument("--iterations", type=int, metavar="N", help="steps of training; the same N gives the same bits")

@@ -56,6 +56,7 @@ def test_a_list_of_held_out_frames_is_kept_as_text() -> None:
         '{"mask_polarity": "inside"}',
         '{"layout": "top"}',
         '{"presett": "fast"}',
+        '{"preset": "slow"}',
         '{"seed": -1}',
         '{"budget_s": NaN}',
     ],

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
 
 from contract.exits import ExitCode
+from contract.job import PresetName
 from worker.__main__ import main
+from worker.presets import PRESETS
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 10
 
@@ -89,3 +92,7 @@ def test_consume_without_a_queue_says_what_to_do(
     monkeypatch.delenv("REDIS_URL", raising=False)
     assert main(["consume"]) == ExitCode.UNAVAILABLE
     assert "intrasplat up" in capsys.readouterr().err
+
+
+def test_the_contract_names_the_presets_that_there_are() -> None:
+    assert set(get_args(PresetName)) == set(PRESETS)
