@@ -147,6 +147,7 @@ def _frames(text: str) -> list[int]:
 
 
 def _reconstruct(options: argparse.Namespace) -> int:
+    from worker.consume import job_progress
     from worker.hooks import Hooks
     from worker.pipeline import ReconstructionRequest, reconstruct
 
@@ -156,13 +157,14 @@ def _reconstruct(options: argparse.Namespace) -> int:
     names = ("clip", "right", "layout", "calibration", "masks", "mask_polarity", "holdout", "preset", "budget_s")
     chosen = {name: getattr(options, name) for name in (*names, "iterations", "device", "seed")}
     interrupted = threading.Event()
-    signal.signal(signal.SIGINT, _once(interrupted))
-    with ProgressBar(sys.stderr) as bar:
-        from worker.consume import job_progress
-
-        hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
-        out.mkdir(parents=True, exist_ok=True)
-        reconstruct(ReconstructionRequest(**chosen), out, hooks)
+    out.mkdir(parents=True, exist_ok=True)
+    before = signal.signal(signal.SIGINT, _once(interrupted))
+    try:
+        with ProgressBar(sys.stderr) as bar:
+            hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
+            reconstruct(ReconstructionRequest(**chosen), out, hooks)
+    finally:
+        signal.signal(signal.SIGINT, before)
     _print_report(json.loads((out / REPORT).read_text()), out)
     return ExitCode.OK
 
