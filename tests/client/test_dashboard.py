@@ -1,0 +1,76 @@
+"""The page: everything it needs lies beside it, nothing in it would be stopped by its own security policy."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from client.up import DASHBOARD
+
+SCRIPTS = sorted(DASHBOARD.glob("*.js"))
+
+
+class Page(HTMLParser):
+    """Ids, references and inline code of the page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.references: list[str] = []
+        self.inline: list[str] = []
+        self._tag = ""
+        self.feed((DASHBOARD / "index.html").read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._tag = tag
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            if name in ("src", "href"):
+                self.references.append(value or "")
+            if name == "style" or name.startswith("on"):
+                self.inline.append(f"{tag} {name}")
+
+    def handle_data(self, data: str) -> None:
+        if self._tag in ("script", "style") and data.strip():
+            self.inline.append(data)
+
+
+def imports_of(script: Path) -> list[str]:
+    return re.findall(r'from "([^"]+)"', script.read_text())
+
+
+def test_the_page_refers_only_to_files_beside_it() -> None:
+    assert [each for each in Page().references if not (DASHBOARD / each).is_file()] == []
+
+
+def test_the_page_holds_no_inline_code_that_its_policy_would_stop() -> None:
+    assert Page().inline == []
+
+
+def test_the_page_says_that_it_is_no_medical_device() -> None:
+    assert "Not a medical device" in (DASHBOARD / "index.html").read_text()
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
+def test_a_script_imports_only_scripts_beside_it_and_names_that_they_export(script: Path) -> None:
+    for names, module in re.findall(r'import \{([^}]+)\} from "\./([^"]+)"', script.read_text()):
+        source = (DASHBOARD / module).read_text()
+        for name in (each.strip() for each in names.split(",")):
+            assert re.search(rf"export (async )?(const|function|class) {name}\b", source), f"{module} exports no {name}"
+    assert [module for module in imports_of(script) if not module.startswith("./")] == []
+
+
+def test_every_element_that_a_script_asks_for_is_on_the_page() -> None:
+    page = Page()
+    asked = {each for script in SCRIPTS for each in re.findall(r'\bget\("([^"]+)"\)', script.read_text())}
+    assert asked <= set(page.ids)
+    assert len(page.ids) == len(set(page.ids))
+
+
+def test_nothing_is_fetched_from_elsewhere() -> None:
+    for path in (*SCRIPTS, DASHBOARD / "style.css", DASHBOARD / "index.html"):
+        assert not re.search(r"(https?:)?//[a-z0-9.-]+\.[a-z]{2,}/", path.read_text()), path.name
