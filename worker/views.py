@@ -20,9 +20,7 @@ from worker.encode import encode_layer
 from worker.export import export_ply
 from worker.render import render_frame
 from worker.serve import View
-
-MEDIAN_DEPTH_UNITS = 60.0
-"""Median depth of the training frames in optimiser units, by their definition; orbits turn about it."""
+from worker.targets import MEDIAN_DEPTH_UNITS
 
 LOADED_SCENES = 4
 """Scenes kept in memory; a scene of a hundred thousand Gaussians is some tens of MB."""
