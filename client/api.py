@@ -15,7 +15,7 @@ import httpx
 
 from client.errors import JobCancelled, JobFailed, JobRejected, RequestRefused, ServiceFault
 from contract.errors import InputError, UnavailableError
-from contract.job import TERMINAL_STATES, JobOptions, JobState, JobView
+from contract.job import TERMINAL_STATES, JobState, JobView, parse_options
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,7 +68,7 @@ class Client:
 
         `options` are the fields of JobOptions: preset, budget_s or iterations, mask_polarity, layout, holdout, seed.
         """
-        document = JobOptions.model_validate(options).model_dump_json(exclude_unset=True)
+        document = parse_options(options).model_dump_json(exclude_unset=True)
         paths = {"clip": clip} if right is None else {"left": clip, "right": right}
         paths |= {name: path for name, path in (("calibration", calibration), ("masks", masks)) if path is not None}
         with contextlib.ExitStack() as stack:

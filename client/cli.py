@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from client.api import DEFAULT_URL, Client
 from contract.errors import InputError, IntrasplatError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.job import JobOptions, JobProgress, JobView, PresetName
+from contract.job import JobProgress, JobView, PresetName
 from contract.progress_bar import ProgressBar
 from contract.settings import Settings, default_data_dir
 
@@ -167,12 +167,6 @@ def _up(options: argparse.Namespace) -> int:
 def _submit(options: argparse.Namespace) -> int:
     names = ("mask_polarity", "layout", "holdout", "preset", "budget_s", "iterations", "seed")
     chosen = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    try:
-        JobOptions.model_validate(chosen)
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = "--" + str(first["loc"][0] if first["loc"] else "options").replace("_", "-")
-        raise InputError(name, f"{first['input']!r} is not accepted: {first['msg']}.", "See --help.") from error
     with Client(options.url) as client:
         paths = {"calibration": options.calibration, "masks": options.masks}
         job = client.reconstruct(options.clip, options.right, **paths, **chosen)

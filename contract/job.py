@@ -7,7 +7,9 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from contract.errors import InputError
 
 JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
 """Job ids are made by the service, never by a caller, so they are safe as file names and key parts."""
@@ -74,6 +76,22 @@ class JobOptions(BaseModel):
         if self.budget_s is not None and self.iterations is not None:
             raise ValueError("budget_s and iterations exclude each other; give one of them")
         return self
+
+
+def parse_options(given: str | Mapping[str, object]) -> JobOptions:
+    """Options from JSON text or from values by name.
+
+    Raises:
+        InputError: names the option at fault, as options.NAME.
+    """
+    try:
+        return JobOptions.model_validate_json(given) if isinstance(given, str) else JobOptions.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(["options", *(str(part) for part in first["loc"])])
+        problem = f"{first['msg']} (given: {str(first['input'])[:80]!r})."
+        known = ", ".join(JobOptions.model_fields)
+        raise InputError(field, problem, f"The options are {known}; /openapi.json describes them.") from error
 
 
 class JobFiles(BaseModel):

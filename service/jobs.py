@@ -8,12 +8,11 @@ import time
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from contract.errors import InputError, UnavailableError
-from contract.job import TERMINAL_STATES, JobOptions, JobRecord, JobState, JobView
+from contract.errors import UnavailableError
+from contract.job import TERMINAL_STATES, JobOptions, JobRecord, JobState, JobView, parse_options
 from contract.store import is_job_id, new_job_id
 from service.deps import Deps, Services
 from service.problems import RETRY_AFTER_S, Problem
@@ -129,14 +128,3 @@ def _accept(services: Deps, job_id: str, received: Received) -> JobRecord:
             shutil.rmtree(spooled)  # nothing was promised: the caller hears 503
         raise
     return record
-
-
-def parse_options(document: str) -> JobOptions:
-    """The options field; InputError names the option at fault."""
-    try:
-        return JobOptions.model_validate_json(document)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(["options", *(str(part) for part in first["loc"])])
-        problem = f"{first['msg']} (given: {str(first['input'])[:80]!r})."
-        raise InputError(field, problem, "The options are described at /openapi.json, POST /reconstruct.") from error
