@@ -34,6 +34,8 @@ STAGES = (
     "loss",
     "optimize",
     "raster",
+    "model",
+    "unfused",
     "metrics",
     "baselines",
     "densify",

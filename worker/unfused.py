@@ -1,0 +1,114 @@
+"""Training with a deformation that has no kernels of its own (`hexplane`): torch moves the Gaussians, autograd answers.
+
+The blend, its loss and the canonical parameters' Adam are those of the fused step, so that two deformations compared
+with each other differ in nothing else. Only the time a step takes is not comparable: tables of speed must say so.
+
+Symbols: N Gaussians (padded to whole vectors), rows of N floats; canonical and state [13, N] as in
+raster/cpu/update.py.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from worker.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation, restore
+from worker.gaussians import Gaussians
+from worker.optimize import BETA1, BETA2, StepRates, adam_step_size
+from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.motion import Motion
+from worker.raster.cpu.rasterizer import Floats
+
+COLOUR = slice(10, 13)
+"""Rows of the constant harmonic."""
+
+
+class UnfusedModel(FusedModel):
+    """A model of any deformation, with the surface of FusedModel."""
+
+    def _motion_of(self, deformation: Deformation, columns: int) -> Motion:
+        return AutogradMotion(deformation, self.count, columns)
+
+
+class AutogradMotion:
+    """Any deformation as a Motion: its offsets by torch, its gradients by autograd, dense Adam on all its parameters.
+
+    Every parameter has the rate motion_mean: a network's weights belong to no kind of channel.
+    """
+
+    def __init__(self, deformation: Deformation, count: int, columns: int) -> None:
+        padding = torch.zeros(columns - count, dtype=torch.int64)  # whose motion it is does not matter: never drawn
+        self._adopt(deformation.select(torch.cat([torch.arange(count), padding])))
+        self._moments = {name: torch.zeros(2, *each.shape) for name, each in self._parameters.items()}
+
+    def _adopt(self, deformation: Deformation) -> None:
+        """Train copies of this deformation's parameters from here on."""
+        self._parameters = {name: each.detach().clone() for name, each in deformation.parameters().items()}
+        for each in self._parameters.values():
+            each.requires_grad_()
+        self._deformation = restore(deformation.kind, self._parameters | deformation.constants())
+
+    def deform(self, canonical: Floats, t: float, state: Floats) -> None:
+        """state = canonical + offsets at t; keeps the graph for update."""
+        self._canonical = torch.from_numpy(canonical.T.copy()).requires_grad_()
+        self._moved = _deformed(self._deformation, self._canonical, t)
+        state[:] = self._moved.detach().T.numpy()
+
+    def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
+        """One Adam step, given dL/dstate at the t last deformed to; turns v_state into dL/dcanonical.
+
+        The two differ where offsets depend on the canonical state: a field of offsets is sampled at the mean.
+        """
+        inputs = [self._canonical, *self._parameters.values()]
+        cotangent = torch.from_numpy(v_state.T.copy())
+        v_canonical, *gradients = torch.autograd.grad(self._moved, inputs, cotangent)
+        v_state[:] = v_canonical.T.numpy()
+        if rates.motion_mean == 0.0:
+            return
+        size, floor = adam_step_size(rates.motion_mean, rates.eps, iteration)
+        for name, gradient in zip(self._parameters, gradients, strict=True):
+            _adam(self._parameters[name].detach(), gradient, self._moments[name], size, floor)
+
+    def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
+        """Keep these columns, in this order; moments start at 0 where fresh. Shared parameters keep theirs."""
+        rows = torch.from_numpy(columns)
+        self._adopt(self._deformation.select(rows))
+        if self._deformation.floats_per_gaussian == 0:
+            return
+        for name, moments in self._moments.items():
+            taken = moments[:, rows]
+            taken[:, torch.from_numpy(fresh)] = 0.0
+            self._moments[name] = taken
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Parameters and moments by name; views."""
+        parameters = {f"motion.{name}": each.detach().numpy() for name, each in self._parameters.items()}
+        return parameters | {f"motion.moments.{name}": each.numpy() for name, each in self._moments.items()}
+
+    def export(self, count: int) -> Deformation:
+        """The first count Gaussians' deformation as torch tensors (copies)."""
+        copies = {name: each.detach().clone() for name, each in self._parameters.items()}
+        deformation = restore(self._deformation.kind, copies | self._deformation.constants())
+        return deformation.select(torch.arange(count))
+
+
+def _deformed(deformation: Deformation, canonical: Tensor, t: float) -> Tensor:
+    """Canonical rows [N, 13] at time t. Opacity and the other harmonics do not move and are not asked for."""
+    gaussians = Gaussians(
+        mean=canonical[:, MEAN],
+        quaternion=canonical[:, QUATERNION],
+        log_scale=canonical[:, LOG_SCALE],
+        opacity_logit=canonical.new_zeros(len(canonical)),
+        sh=canonical[:, None, COLOUR],
+    )
+    moved = deformation.deform(gaussians, t)
+    return torch.cat([moved.mean, moved.quaternion, moved.log_scale, moved.sh[:, 0]], dim=1)
+
+
+def _adam(value: Tensor, gradient: Tensor, moments: Tensor, size: float, floor: float) -> None:
+    """One step of Adam in place; size and floor as adam_step_size gives them. moments [2, ...]."""
+    first, second = moments
+    first.lerp_(gradient, 1 - BETA1)
+    second.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
+    value.addcdiv_(first, second.sqrt().add_(floor), value=-size)
