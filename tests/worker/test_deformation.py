@@ -48,6 +48,7 @@ def moving(kind: str) -> Deformation:
         "fdm-gaussian": FlexibleDeformation.initial(COUNT, bases=5, width=0.1, form="gaussian"),
         "fdm-quartic": FlexibleDeformation.initial(COUNT, bases=5, width=0.1, form="quartic"),
         "shared": SharedBasis.initial(COUNT, bases=5),
+        "shared with colour": SharedBasis.initial(COUNT, bases=5, colour=True),
         "pfs": PolynomialFourier.initial(COUNT, weights=8),
         "hexplane": HexPlane.initial(
             torch.tensor([[-2.0, -2.0, -2.0], [2.0, 2.0, 2.0]]), space_cells=(4, 7), time_cells=5, features=3
@@ -55,14 +56,15 @@ def moving(kind: str) -> Deformation:
     }
     model = start[kind]
     tensors = {name: stir(each, 0.02, seed) for seed, (name, each) in enumerate(model.parameters().items())}
-    return restore(kind, tensors | {name: each.double() for name, each in model.constants().items()})
+    return restore(model.kind, tensors | {name: each.double() for name, each in model.constants().items()})
 
 
-KINDS = ["fdm-gaussian", "fdm-quartic", "shared", "pfs", "hexplane"]
+KINDS = ["fdm-gaussian", "fdm-quartic", "shared", "shared with colour", "pfs", "hexplane"]
 STARTS: list[Deformation] = [
     FlexibleDeformation.initial(COUNT),
     FlexibleDeformation.initial(COUNT, form="quartic"),
     SharedBasis.initial(COUNT),
+    SharedBasis.initial(COUNT, colour=True),
     PolynomialFourier.initial(COUNT),
     HexPlane.initial(torch.tensor([[-2.0, -2.0, -2.0], [2.0, 2.0, 2.0]])),
 ]
@@ -146,28 +148,73 @@ def test_beyond_six_widths_of_every_centre_is_the_canonical_state(form: Form) ->
     assert_close(deformed_channels(model, canonical(), t), np.zeros((COUNT, CHANNELS)), absolute=bound)
 
 
-def test_shared_beyond_six_widths_is_the_canonical_state() -> None:
-    model = moving("shared")
-    assert isinstance(model, SharedBasis)
-    t = 1 + 6 * float(model.width.max())
-    bound = float(model.weight.abs().sum(-1).max()) * math.exp(-18)
-    assert_close(deformed_channels(model, canonical(), t), np.zeros((COUNT, CHANNELS)), absolute=bound)
+TIMES_OUTSIDE_TOO = [-0.5, *TIMES, 1.0, 3.0]
 
 
 @pytest.mark.parametrize("t", TIMES)
-def test_shared_is_fdm_with_equal_bases(t: float) -> None:
-    shared = moving("shared")
-    assert isinstance(shared, SharedBasis)
-    own = FlexibleDeformation(
-        shared.weight, shared.centre.expand(COUNT, CHANNELS, -1), shared.width.expand(COUNT, CHANNELS, -1)
-    )
-    assert_close(deformed_channels(shared, canonical(), t), deformed_channels(own, canonical(), t), relative=1e-12)
+def test_shared_is_the_quotient_its_equation_says(t: float) -> None:
+    model = moving("shared")
+    assert isinstance(model, SharedBasis)
+    bumps = [
+        math.exp(-((t - float(theta)) ** 2) / (2 * float(sigma) ** 2))
+        for theta, sigma in zip(model.centre, model.width, strict=True)
+    ]
+    phi = np.array(bumps) / sum(bumps)
+    assert_close(deformed_channels(model, canonical(), t), model.weight.numpy() @ phi, relative=1e-12)
 
 
-@pytest.mark.parametrize("bases", [1, 2, 5, 9, 17])
-def test_the_default_shared_bases_leave_no_time_uncovered(bases: int) -> None:
-    model = SharedBasis.initial(1, bases=bases)
-    assert min(float(model.basis(t).max()) for t in np.linspace(0, 1, 201)) > (0.2 if bases == 1 else 0.69)
+@pytest.mark.parametrize("bases", [1, 2, 5, 17, 33])
+@pytest.mark.parametrize("t", TIMES_OUTSIDE_TOO)
+def test_shared_bases_are_a_partition_of_unity_at_any_time(bases: int, t: float) -> None:
+    phi = SharedBasis.initial(1, bases=bases).basis(t)
+    assert bool((phi >= 0).all())
+    assert float(phi.sum()) == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("t", TIMES_OUTSIDE_TOO)
+def test_equal_shared_weights_are_one_constant_offset(t: float) -> None:
+    model = SharedBasis.initial(COUNT, bases=7)
+    still = SharedBasis(torch.full_like(model.weight, 0.3).double(), model.centre.double(), model.width.double())
+    assert_close(deformed_channels(still, canonical(), t), np.full((COUNT, CHANNELS), 0.3), relative=1e-12)
+
+
+def test_shared_motion_carries_across_a_stretch_without_frames_from_both_its_ends() -> None:
+    times = [*np.linspace(0, 0.4, 21), *np.linspace(0.7, 1, 16)]
+    model = SharedBasis.initial(1, bases=8, times=times)
+    weight = torch.where(model.centre <= 0.55, 1.0, 2.0).expand(1, CHANNELS, -1)
+    moving_on = dataclasses.replace(model, weight=weight)
+    path = np.array([float((moving_on.weight @ moving_on.basis(t))[0, 0]) for t in np.linspace(0.4, 0.7, 61)])
+    assert bool((np.diff(path) >= -1e-6).all())  # from the one end to the other without a way back to 0
+    assert 1 <= path[0] < 1.5 < path[-1] <= 2
+
+
+def test_shared_bases_lie_where_the_training_frames_do() -> None:
+    times = [0.0, 0.1, 0.2, 0.3, 0.4, 0.9]
+    model = SharedBasis.initial(1, bases=6, times=times)
+    assert_close(model.centre, np.array(times))
+    assert_close(model.width, 0.6 * np.array([0.1, 0.1, 0.1, 0.1, 0.5, 0.5]), relative=1e-5)
+    repeated = SharedBasis.initial(1, bases=5, times=[0.2, 0.2, 0.2])
+    assert bool((repeated.width > 0).all())
+    assert float(repeated.basis(0.9).sum()) == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("t", TIMES)
+def test_shared_channels_ten_to_thirteen_move_the_constant_colour_alone(t: float) -> None:
+    model = moving("shared with colour")
+    assert isinstance(model, SharedBasis)
+    assert model.weight.shape[1] == 13
+    gaussians = canonical()
+    moved = model.deform(gaussians, t)
+    assert_close(moved.sh[:, 0] - gaussians.sh[:, 0], model.weight[:, 10:] @ model.basis(t), relative=1e-12)
+    assert bool((moved.sh[:, 1:] == gaussians.sh[:, 1:]).all())
+    assert moved.opacity_logit is gaussians.opacity_logit
+    without = SharedBasis(model.weight[:, :CHANNELS], model.centre, model.width)
+    assert_close(deformed_channels(model, gaussians, t), deformed_channels(without, gaussians, t), relative=1e-12)
+
+
+def test_shared_without_bases_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least 1, not 0"):
+        SharedBasis.initial(3, bases=0)
 
 
 def test_pfs_spans_its_polynomials_and_harmonics() -> None:
@@ -215,16 +262,16 @@ def test_gradients_are_those_of_finite_differences(kind: str) -> None:
     names = list(model.parameters())
 
     def channels(mean: Tensor, *parameters: Tensor) -> Tensor:
-        moved = restore(kind, dict(zip(names, parameters, strict=True)) | model.constants())
+        moved = restore(model.kind, dict(zip(names, parameters, strict=True)) | model.constants())
         at = moved.deform(dataclasses.replace(gaussians, mean=mean), 0.37)
-        return torch.cat([at.mean, at.quaternion, at.log_scale], dim=1)
+        return torch.cat([at.mean, at.quaternion, at.log_scale, at.sh[:, 0]], dim=1)
 
     leaves = [gaussians.mean, *model.parameters().values()]
     leaves = [each.clone().requires_grad_() for each in leaves]
     assert torch.autograd.gradcheck(channels, leaves, fast_mode=kind == "hexplane")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "shared with colour"])
 def test_deform_leaves_its_inputs_opacity_and_colour_alone(kind: str) -> None:
     model, gaussians = moving(kind), canonical()
     before = {name: each.clone() for name, each in (gaussians.tensors() | model.parameters()).items()}
@@ -249,7 +296,7 @@ def test_select_keeps_the_motion_of_the_rows_it_takes(kind: str) -> None:
 def test_a_model_comes_back_from_its_tensors(kind: str) -> None:
     model = moving(kind)
     again = restore(model.kind, model.parameters() | model.constants())
-    assert again.kind == kind
+    assert again.kind == model.kind
     assert list(again.parameters()) == list(model.parameters())
     assert bool((deformed_channels(again, canonical(), 0.2) == deformed_channels(model, canonical(), 0.2)).all())
 

@@ -26,13 +26,14 @@ MIN_WIDTH = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class SharedBasis:
-    """psi(t) = sum_j w_j phi_j(t), phi_j = b_j / sum_k b_k, b_j(t) = exp(-(t - theta_j)^2 / (2 sigma_j^2)), theta and sigma
-    common to all and fixed.
+    """psi(t) = sum_j w_j phi_j(t), phi_j = b_j / sum_k b_k, b_j(t) = exp(-(t - theta_j)^2 / (2 sigma_j^2)).
+
+    theta and sigma are common to all and fixed.
 
     Divided by their sum, the bases carry motion across a stretch without frames (an instrument in the way) from both of
     its ends; undivided ones fall back to the canonical state there.
 
-    weight [N, C, B]  trained, in the channel's unit; channels 10:13, where there are any, add to the colour's harmonic 0
+    weight [N, C, B]  trained, in the channel's unit; channels 10:13, if there are any, add to the colour's harmonic 0
     centre [B]        theta, model time
     width  [B]        sigma > 0, model time
     """
@@ -56,8 +57,11 @@ class SharedBasis:
     def initial(
         cls, count: int, *, bases: int = DEFAULT_BASES, colour: bool = False, times: Sequence[float] | None = None
     ) -> SharedBasis:
-        """No motion yet: weights 0. Centres at even quantiles of the training times (even over [0, 1] without them), each
-        as wide as 0.6 of the larger gap beside it.
+        """No motion yet: weights 0. Each basis is as wide as 0.6 of the larger gap beside it.
+
+        Args:
+            colour: whether the colour's constant harmonic moves too: 13 channels instead of 10.
+            times: of the training frames; centres lie at their even quantiles, without them evenly over [0, 1].
 
         Raises:
             ValueError: bases < 1.

@@ -1,13 +1,16 @@
-"""The CPU backend: Numba kernels on explicit vectors, one thread a core. Obeys the contract of worker/raster/__init__.py.
+"""The CPU backend: Numba kernels on explicit vectors, one thread a core; obeys the contract of worker/raster.
 
-simd -> project -> bins -> blend -> rasterizer (buffers and calls) -> rasterize (autograd) ; update (deformation, Adam).
+simd -> project -> bins -> blend -> rasterizer (buffers and calls) -> autograd (rasterize);
+update, harmonics -> motion -> model (the fused training step) -> compilation.
 """
 
 from worker.raster.cpu.cache import use_kernel_cache
 
 use_kernel_cache()
 
-from worker.raster.cpu.autograd import rasterize  # noqa: E402  the cache folder must be set before a kernel is declared
+# The cache folder must be set before a kernel is declared.
+from worker.raster.cpu.autograd import rasterize  # noqa: E402
+from worker.raster.cpu.compilation import compile_kernels  # noqa: E402
 from worker.raster.cpu.rasterizer import Gradients, Rasterizer, Target, camera_vector, padded  # noqa: E402
 
-__all__ = ["Gradients", "Rasterizer", "Target", "camera_vector", "padded", "rasterize"]
+__all__ = ["Gradients", "Rasterizer", "Target", "camera_vector", "compile_kernels", "padded", "rasterize"]

@@ -6,7 +6,7 @@ blend writes a slot are summed without atomics and in a fixed order.
 
     slot_start [N + 1]  slots of splat g are slot_start[g] : slot_start[g + 1]
     slot_splat [M]      the splat of a slot
-    slot_rows  [M, 2]   first row and end row inside the tile; bounds are exact for the ellipse within the tile's columns
+    slot_rows  [M, 2]   first and end row inside the tile, exact for the ellipse within the tile's columns
     tile_start [tiles + 1], tile_slots [M]   the slots of a tile, nearest splat first
 """
 
@@ -49,7 +49,7 @@ def _rows(splats, g, extent2, first_x, last_x):  # type: ignore[no-untyped-def]
     bottom = (-b * at + math.sqrt(max(0.0, extent2 * c - det * at * at))) / c
     at = min(max(-extreme, low), high)
     top = (-b * at - math.sqrt(max(0.0, extent2 * c - det * at * at))) / c
-    return int(math.ceil(my + top - 0.5 - ROUNDING)), int(math.floor(my + bottom - 0.5 + ROUNDING)) + 1
+    return math.ceil(my + top - 0.5 - ROUNDING), math.floor(my + bottom - 0.5 + ROUNDING) + 1
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -59,8 +59,8 @@ def _columns(splats, g, extent2, tiles_x):  # type: ignore[no-untyped-def]
     b = -1.0 / LOG2E * splats[g, 3]
     c = -2.0 / LOG2E * splats[g, 4]
     reach = math.sqrt(extent2 * c / max(a * c - b * b, 1e-30))
-    first = int(math.floor((splats[g, 0] - reach - 0.5) / LANES))
-    last = int(math.floor((splats[g, 0] + reach - 0.5) / LANES))
+    first = math.floor((splats[g, 0] - reach - 0.5) / LANES)
+    last = math.floor((splats[g, 0] + reach - 0.5) / LANES)
     return max(first, 0), min(last, tiles_x - 1)
 
 

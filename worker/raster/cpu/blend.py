@@ -6,8 +6,8 @@ Symbols, for one pixel and its splats i = 0, 1, ... nearest first:
     C       = sum w_i c_i,  Z = sum w_i z_i,  A = sum w_i = 1 - T_end
     s_i     = g_C . c_i + g_Z z_i + g_A, with g the loss gradient at this pixel
     dL/dalpha_i = T_i (s_i - B_i),  B_{i-1} = alpha_i s_i + (1 - alpha_i) B_i,  B_last = 0
-so going back to front needs no division, and dL/dpower_i = w_i (s_i - B_i). The forward pass leaves alpha and w of every
-row it visited in ``trail``; the loss needs only the pixel's own colour, so no gradient image ever exists.
+so going back to front needs no division, and dL/dpower_i = w_i (s_i - B_i). The forward pass leaves alpha and w of
+every row it visited in ``trail``; the loss needs only the pixel's own colour, so no gradient image ever exists.
 Derivation: docs/rasterizer.md.
 
 A tile's planes lie in ``planes``, PLANE floats apart: T (later B and g_A), then R G B Z (later g_R g_G g_B g_Z).
@@ -61,11 +61,12 @@ def blend(  # type: ignore[no-untyped-def]
     trail [threads, 2 * rows * LANES] and planes [threads, PLANES * PLANE]: scratch.
     slots [M, 10]: written in modes LOSS and COTANGENT (GRADIENT of project.py). statistics [tiles, STATISTICS]: LOSS.
     target [3, H, stride] uint8, weight [H, stride] uint8 (255 = tissue), inverse_depth [H, stride] float32 (0 = none):
-    LOSS, flattened, stride = tiles_x * LANES. loss_settings float32 [5]: colour weight a channel, depth weight, 1 / width
-    of the quadratic zone of the colour and of the depth loss, 1 for normalised depth else 0.
+    LOSS, flattened, stride = tiles_x * LANES. loss_settings float32 [5]: colour weight a channel, depth weight,
+    1 / width of the quadratic zone of the colour and of the depth loss, 1 for normalised depth else 0.
     image [5, H, stride] flattened: R G B Z A, written in RENDER, read as cotangents in COTANGENT.
     """
     tiles = tile_start.shape[0] - 1
+    size = height * tiles_x * LANES
     for tile in range(thread, tiles, threads):
         row0, column0 = tile // tiles_x * TILE_ROWS, tile % tiles_x * LANES
         rows = min(TILE_ROWS, height - row0)
@@ -76,18 +77,20 @@ def blend(  # type: ignore[no-untyped-def]
         )  # fmt: skip
         origin, stride = row0 * tiles_x * LANES + column0, tiles_x * LANES
         if mode == RENDER:
-            _write(planes[thread], image, origin, stride, height, rows)
+            _write(planes[thread], image, origin, stride, size, rows)
             continue
         if mode == LOSS:
             _loss(
-                planes[thread], statistics[tile], target, weight, inverse_depth, loss_settings, origin, stride, height, rows
+                planes[thread], statistics[tile], target, weight, inverse_depth, loss_settings,
+                origin, stride, size, rows,
             )  # fmt: skip
         else:
-            _read_cotangents(planes[thread], image, origin, stride, height, rows)
+            _read_cotangents(planes[thread], image, origin, stride, size, rows)
         for i in range(visited, end):  # behind the opaque front: no gradient
             slots[tile_slots[i], :] = _ZERO
         _backward(
-            first, visited, row0, column0, splats, slot_splat, slot_rows, tile_slots, trail[thread], planes[thread], slots
+            first, visited, row0, column0,
+            splats, slot_splat, slot_rows, tile_slots, trail[thread], planes[thread], slots,
         )  # fmt: skip
 
 
@@ -188,10 +191,9 @@ def _backward(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _write(planes, image, origin, stride, height, rows):  # type: ignore[no-untyped-def]
+def _write(planes, image, origin, stride, size, rows):  # type: ignore[no-untyped-def]
     """R G B Z A of the tile into the image."""
     one = splat(_ONE)
-    size = height * stride
     for row in range(rows):
         p, q = row * LANES, origin + row * stride
         for k in range(4):
@@ -200,9 +202,8 @@ def _write(planes, image, origin, stride, height, rows):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
-def _read_cotangents(planes, image, origin, stride, height, rows):  # type: ignore[no-untyped-def]
+def _read_cotangents(planes, image, origin, stride, size, rows):  # type: ignore[no-untyped-def]
     """The image's cotangents into the planes' places for g; B starts at 0."""
-    size = height * stride
     for row in range(rows):
         p, q = row * LANES, origin + row * stride
         for k in range(5):
@@ -220,7 +221,7 @@ def _clip_unit(x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _loss(  # type: ignore[no-untyped-def]
-    planes, statistics, target, weight, inverse_depth, loss_settings, origin, stride, height, rows
+    planes, statistics, target, weight, inverse_depth, loss_settings, origin, stride, size, rows
 ):
     """Loss of the tile into statistics, its gradient into the planes (worker/loss.py has the same in plain torch)."""
     zero, one = splat(_ZERO), splat(_ONE)
@@ -228,7 +229,6 @@ def _loss(  # type: ignore[no-untyped-def]
     colour_weight, depth_weight = splat(loss_settings[0]), splat(loss_settings[1])
     colour_sharpness, depth_sharpness = splat(loss_settings[2]), splat(loss_settings[3])
     normalised = loss_settings[4] > _ZERO
-    size = height * stride
     l1, depth_l1, squared, holes = zero, zero, zero, zero
     for row in range(rows):
         p, q = row * LANES, origin + row * stride

@@ -7,8 +7,12 @@ therefore live in a folder named after a hash of every source file of this packa
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
+import shutil
+import tempfile
+import warnings
 from pathlib import Path
 
 import numba
@@ -28,5 +32,18 @@ def kernel_cache_directory() -> Path:
 
 
 def use_kernel_cache() -> None:
-    """Point Numba at that folder; must run before the first kernel is declared."""
-    numba.config.CACHE_DIR = str(kernel_cache_directory())
+    """Point Numba at that folder; must run before the first kernel is declared.
+
+    Where nothing can be written there, a temporary folder takes its place until the process ends, with a warning.
+    """
+    folder = kernel_cache_directory()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        temporary = tempfile.mkdtemp(prefix="intrasplat-kernels-")
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        problem = f"compiled kernels cannot be kept in {folder} ({error.strerror}), so every start compiles them anew"
+        warnings.warn(f"{problem}; set INTRASPLAT_CACHE to a folder that can be written.", RuntimeWarning, stacklevel=2)
+        folder = Path(temporary)
+    numba.config.CACHE_DIR = str(folder)

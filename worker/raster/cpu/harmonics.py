@@ -1,7 +1,7 @@
 """Spherical harmonics to colour and back, for scenes whose camera moves (worker/gaussians.py has the same in torch).
 
-N Gaussians, K = (degree + 1)^2 coefficients a channel: the constant one in state[10:13], the others in rest [K - 1, 3, N];
-colour [3, N], mean in state[0:3].
+N Gaussians, K = (degree + 1)^2 coefficients a channel: the constant one in state[10:13], the others in
+rest [K - 1, 3, N]; colour [3, N], mean in state[0:3].
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _C3 = (
 
 @njit(cache=True, nogil=True)
 def _terms(degree, x, y, z, value, slope):  # type: ignore[no-untyped-def]
-    """Real harmonics at the unit direction (x, y, z) into value [K]; their gradients, as polynomials, into slope [K, 3]."""
+    """Real harmonics at the unit direction (x, y, z) into value [K]; as polynomials, their slopes into [K, 3]."""
     value[0] = C0
     slope[:, :] = 0.0
     if degree >= 1:

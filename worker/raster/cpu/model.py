@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worker.deformation import FlexibleDeformation
+from worker.deformation import Deformation
 from worker.gaussians import Gaussians
 from worker.optimize import StepRates, adam_step_size
 from worker.raster.cpu import harmonics, update
-from worker.raster.cpu.motion import LinearDeformation, motion_of
+from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
 from worker.raster.cpu.rasterizer import Floats, Rasterizer, Target, padded
 from worker.raster.cpu.threads import run
 
@@ -37,9 +37,7 @@ class StepSums:
 class FusedModel:
     """Canonical Gaussians, their deformation and Adam's moments, trained a frame at a time on the CPU."""
 
-    def __init__(
-        self, gaussians: Gaussians, deformation: LinearDeformation | FlexibleDeformation, width: int, height: int
-    ):
+    def __init__(self, gaussians: Gaussians, deformation: Deformation, width: int, height: int):
         self.count = len(gaussians)
         columns = padded(self.count)
         canonical = torch.cat([gaussians.mean, gaussians.quaternion, gaussians.log_scale], 1).numpy()
@@ -52,10 +50,13 @@ class FusedModel:
         self.sh_rest = np.zeros((gaussians.sh.shape[1] - 1, 3, columns), np.float32)
         self.sh_rest[:, :, : self.count] = gaussians.sh[:, 1:].permute(1, 2, 0).numpy()
         self.sh_degree = gaussians.sh_degree  # of those stored; a schedule may use fewer
-        self.motion = motion_of(deformation, columns)
+        self.motion = self._motion_of(deformation, columns)
         self.rasterizer = Rasterizer(width, height)
         self._moments = {name: np.zeros((2, *a.shape), np.float32) for name, a in self._parameters().items()}
         self._allocate()
+
+    def _motion_of(self, deformation: Deformation, columns: int) -> Motion:
+        return motion_of(deformation, columns)
 
     def _parameters(self) -> dict[str, Floats]:
         return {"canonical": self.canonical, "opacity_logit": self.opacity_logit, "sh_rest": self.sh_rest}
@@ -65,6 +66,16 @@ class FusedModel:
         self.state = np.zeros((update.ROWS, columns), np.float32)
         self.colour = np.zeros((3, columns), np.float32)
         self._v_rest = np.zeros_like(self.sh_rest)
+
+    @property
+    def gradient_norm(self) -> Floats:
+        """[N] |dL/dmean2d| of the last step in NDC; a view."""
+        return self.rasterizer.gradients.mean2d_norm[: self.count]
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        """[N] whether the last frame could see each Gaussian."""
+        return self.rasterizer.radius2[: self.count] >= 0
 
     def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
         """The Gaussians at time t on this camera's image."""
@@ -81,6 +92,15 @@ class FusedModel:
         """R G B Z A, [5, H, W]; a view that the next render overwrites."""
         self.project(camera, t, self.sh_degree)
         return self.rasterizer.render()
+
+    def deformed_mean(self, t: float) -> Floats:
+        """Centres at time t, [3, N] in units, as a copy."""
+        self.motion.deform(self.canonical, t, self.state)
+        return self.state[:3, : self.count].copy()
+
+    def blend_values(self, values: Floats) -> Floats:
+        """A number a Gaussian [N], blended as colour was in the last render: [H, W]; a view."""
+        return self.rasterizer.blend_values(values)
 
     def step(
         self,
@@ -125,7 +145,7 @@ class FusedModel:
         fresh = np.concatenate([fresh, np.ones(fill, np.bool_)])
         for name, values in self._parameters().items():
             setattr(self, name, np.ascontiguousarray(values[..., columns]))
-            self._moments[name] = np.where(fresh, np.float32(0), self._moments[name][..., columns])
+            self._moments[name] = kept_where_old(self._moments[name], columns, fresh)
         self.motion.take(columns, fresh)
         self.opacity_logit[count:] = PAD_LOGIT
         self.count = count
@@ -143,7 +163,7 @@ class FusedModel:
                 raise ValueError(f"{name} has shape {stored[name].shape}, this model needs {values.shape}")
             values[...] = stored[name]
 
-    def export(self) -> tuple[Gaussians, LinearDeformation | FlexibleDeformation]:
+    def export(self) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as torch tensors (copies)."""
         canonical = torch.from_numpy(np.ascontiguousarray(self.canonical[:10, : self.count].T))
         sh = np.concatenate([self.canonical[None, 10:13], self.sh_rest])[:, :, : self.count]
@@ -166,7 +186,12 @@ def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, eps: fl
     if rate == 0.0:
         return
     size, floor = adam_step_size(rate, eps, iteration)
-    run(
-        update.adam, value.reshape(-1), gradient.reshape(-1), moments[0].reshape(-1), moments[1].reshape(-1),
-        np.float32(size), np.float32(floor),
-    )  # fmt: skip
+    flat = [_flat(each) for each in (value, gradient, moments[0], moments[1])]
+    run(update.adam, *flat, np.float32(size), np.float32(floor))
+
+
+def _flat(array: Floats) -> Floats:
+    """A view; reshape alone would hand the kernel a copy of a strided array, and its update would be lost."""
+    if not array.flags.c_contiguous:
+        raise ValueError(f"an array of shape {array.shape} and strides {array.strides} has no flat view")
+    return array.reshape(-1)

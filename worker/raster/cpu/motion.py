@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from worker.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
 from worker.optimize import StepRates, adam_step_size
 from worker.raster.cpu import update
 from worker.raster.cpu.rasterizer import Floats
@@ -32,7 +32,10 @@ class Motion(Protocol):
         """state [13, N] = canonical + psi(t)."""
 
     def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
-        """One Adam step of the weights that reach t, given dL/dstate at t. iteration counts from 1."""
+        """One Adam step of the weights that reach t, given dL/dstate at t; turns it into dL/dcanonical.
+
+        iteration counts from 1.
+        """
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         """Keep these columns, in this order; moments start at 0 where fresh."""
@@ -40,8 +43,13 @@ class Motion(Protocol):
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything that must be stored to resume, by name; views."""
 
-    def export(self, count: int) -> LinearDeformation | FlexibleDeformation:
+    def export(self, count: int) -> Deformation:
         """The first count Gaussians' deformation as torch tensors (copies)."""
+
+
+def kept_where_old(moments: Floats, columns: np.ndarray, fresh: np.ndarray) -> Floats:
+    """These columns of Adam's moments, 0 where fresh. A copy by rows: indexing the last axis alone turns it about."""
+    return np.ascontiguousarray(np.where(fresh, np.float32(0), moments[..., columns]))
 
 
 def _channel_rates(rates: StepRates) -> Floats:
@@ -85,8 +93,7 @@ class LinearMotion:
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         self.weight = np.ascontiguousarray(self.weight[:, :, columns])
-        self.first = np.where(fresh, np.float32(0), self.first[:, :, columns])
-        self.second = np.where(fresh, np.float32(0), self.second[:, :, columns])
+        self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
 
     def arrays(self) -> dict[str, np.ndarray]:
         names = ("weight", "first", "second", "steps")
@@ -123,8 +130,7 @@ class FdmMotion:
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         for name in ("weight", "centre", "width"):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[..., columns]))
-        self.first = np.where(fresh, np.float32(0), self.first[..., columns])
-        self.second = np.where(fresh, np.float32(0), self.second[..., columns])
+        self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
 
     def arrays(self) -> dict[str, np.ndarray]:
         return {f"motion.{name}": getattr(self, name) for name in ("weight", "centre", "width", "first", "second")}
@@ -144,8 +150,10 @@ def _columns_last(tensor: torch.Tensor, columns: int, fill: float) -> Floats:
     return rows
 
 
-def motion_of(deformation: LinearDeformation | FlexibleDeformation, columns: int) -> LinearMotion | FdmMotion:
-    """The trainable form of a deformation, padded to columns Gaussians."""
+def motion_of(deformation: Deformation, columns: int) -> LinearMotion | FdmMotion:
+    """The trainable form of a deformation, padded to columns Gaussians; ValueError if it has none."""
     if isinstance(deformation, FlexibleDeformation):
         return FdmMotion(deformation, columns)
-    return LinearMotion(deformation, columns)
+    if isinstance(deformation, LinearDeformation):
+        return LinearMotion(deformation, columns)
+    raise ValueError(f"deformation {deformation.kind!r} has no kernels of its own: worker/unfused.py trains it")

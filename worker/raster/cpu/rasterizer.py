@@ -18,6 +18,7 @@ from worker.raster.cpu.simd import LANES
 from worker.raster.cpu.threads import THREADS, run
 
 Floats = NDArray[np.float32]
+_NO_LOSS = np.zeros(5, np.float32)
 
 
 def padded(count: int) -> int:
@@ -44,12 +45,12 @@ class Target:
 
 @dataclass
 class Gradients:
-    """dL/d of every Gaussian's deformed state, opacity logit and colour; |dL/dmean2d| in NDC; dL/d camera_from_world."""
+    """dL/d of every Gaussian's deformed state, opacity logit and colour, and of camera_from_world; |dL/dmean2d|."""
 
     state: Floats  # [13, N]; rows 10:13, the constant harmonic, are the caller's to fill
     opacity_logit: Floats  # [N]
     colour: Floats  # [3, N]
-    mean2d_norm: Floats  # [N]
+    mean2d_norm: Floats  # [N], in normalised device coordinates
     pose: NDArray[np.float64]  # [THREADS, 12], to be summed
 
 
@@ -94,28 +95,37 @@ class Rasterizer:
         self._slots = np.zeros((capacity, project.GRADIENT), np.float32)
 
     def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
-        """Splats of this camera, their tiles and depth order. camera: camera_vector; state [>= 10, N], colour [3, N]."""
+        """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N]."""
+        self.place(camera, state, opacity_logit, colour)
+        self.bin()
+        self.sort()
+
+    def place(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
+        """First third of project: the splats on the image."""
         count = state.shape[1]
         if self.splats.shape[0] != count:
             self._allocate_gaussians(count)
         self._camera, self._state, self._opacity_logit = camera, state, opacity_logit
         run(project.project, camera, state, opacity_logit, colour, self.splats, self.radius2)
+
+    def bin(self) -> None:
+        """Second third: the slots of every splat."""
         run(bins.count_slots, self.splats, self.radius2, self.height, self.tiles_x, self._slot_count)
         np.cumsum(self._slot_count, out=self.slot_start[1:])
         self.slot_total = int(self.slot_start[-1])
         if self.slot_total > self._capacity:
             self._allocate_slots(self.slot_total + self.slot_total // 4)
-        m = self.slot_total
         run(
             bins.fill_slots, self.splats, self.radius2, self.height, self.tiles_x,
             self.slot_start, self._slot_splat, self._slot_tile, self._slot_rows,
         )  # fmt: skip
-        visible = bins.depth_order(
-            self.splats, self.radius2, self._order[0], self._keys[0], self._order[1], self._keys[1]
-        )
-        bins.sort_into_tiles(
-            self._order[1], visible, self.slot_start, self._slot_tile[:m], self._tile_start, self._tile_slots
-        )
+
+    def sort(self) -> None:
+        """Last third: the slots of every tile, nearest first."""
+        order, keys = self._order, self._keys
+        visible = bins.depth_order(self.splats, self.radius2, order[0], keys[0], order[1], keys[1])
+        tiles = self._slot_tile[: self.slot_total]
+        bins.sort_into_tiles(order[1], visible, self.slot_start, tiles, self._tile_start, self._tile_slots)
 
     def _reserve_trail(self) -> None:
         """Room for the alphas and weights of the fullest tile, one such room a thread."""
@@ -123,7 +133,8 @@ class Rasterizer:
         if self._trail.shape[1] < rows * 2 * LANES:
             self._trail = np.zeros((THREADS, rows * 2 * LANES * 5 // 4), np.float32)
 
-    def _blend(self, mode: int, target: Target, loss_settings: Floats, image: Floats) -> None:
+    def blend(self, mode: int, target: Target, loss_settings: Floats, image: Floats) -> None:
+        """The kernel in one of its modes (blend.py)."""
         run(
             blend, mode, self.width, self.height, self.tiles_x, self.splats, self._slot_splat, self._slot_rows,
             self._tile_start, self._tile_slots, self._trail, self._planes, self._slots, self.statistics,
@@ -132,30 +143,34 @@ class Rasterizer:
 
     def render(self) -> Floats:
         """R G B Z A of the projected splats, [5, H, W]; a view of a buffer the next render overwrites."""
-        self._blend(RENDER, self._no_target, _NO_LOSS, self.image)
+        self.blend(RENDER, self._no_target, _NO_LOSS, self.image)
         return self.image.reshape(5, self.height, self.stride)[:, :, : self.width]
+
+    def blend_values(self, values: Floats) -> Floats:
+        """A number a Gaussian, blended as colour is, [H, W], for the splats last projected; overwrites their red."""
+        self.splats[: len(values), 6] = values
+        blended: Floats = self.render()[0]
+        return blended
 
     def loss_backward(self, target: Target, loss_settings: Floats) -> Gradients:
         """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums a tile."""
         self._reserve_trail()
-        self._blend(LOSS, target, loss_settings, self.image)
-        return self._parameters_backward()
+        self.blend(LOSS, target, loss_settings, self.image)
+        return self.carry_back()
 
     def cotangent_backward(self, cotangents: Floats) -> Gradients:
         """Gradients of sum(cotangents * image), cotangents [5, H, W]."""
         self._reserve_trail()
         padded_cotangents = np.zeros((5, self.height, self.stride), np.float32)
         padded_cotangents[:, :, : self.width] = cotangents
-        self._blend(COTANGENT, self._no_target, _NO_LOSS, padded_cotangents.ravel())
-        return self._parameters_backward()
+        self.blend(COTANGENT, self._no_target, _NO_LOSS, padded_cotangents.ravel())
+        return self.carry_back()
 
-    def _parameters_backward(self) -> Gradients:
+    def carry_back(self) -> Gradients:
+        """The slots' gradients, left by blend, to the parameters of their Gaussians."""
         out = self.gradients
         run(
             project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,
             self.slot_start, self._slots, out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
         )  # fmt: skip
         return out
-
-
-_NO_LOSS = np.zeros(5, np.float32)

@@ -21,6 +21,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import types
+from numba.core.errors import TypingError
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
@@ -36,7 +37,7 @@ _INTS = ir.VectorType(_INT32, LANES)
 _EXP2 = (1.000000071655, 0.693146967064, 0.240221197239, 0.055507132750, 0.009675541331, 0.001327647152)
 
 
-class VectorType(types.Type):  # type: ignore[misc]
+class VectorType(types.Type):
     """The Numba type of LANES float32."""
 
     def __init__(self) -> None:
@@ -62,6 +63,12 @@ def _call(builder: Any, name: str, *args: Any) -> Any:
     return builder.call(builder.module.declare_intrinsic(f"llvm.{name}.v{LANES}f32", fnty=kind), args)
 
 
+def _check_dense(array: Any) -> None:
+    """Addresses are computed from the first element alone: a strided array would be read at the wrong place."""
+    if not isinstance(array, types.Array) or array.ndim != 1 or array.layout != "C":
+        raise TypingError(f"a vector is loaded from and stored to 1-D C-contiguous arrays, not {array}")
+
+
 def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
@@ -70,6 +77,7 @@ def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any
 @intrinsic
 def load(typing: Any, array: Any, index: Any) -> Any:
     """LANES consecutive float32 of a 1-D C-contiguous array, from array[index]."""
+    _check_dense(array)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         loaded = builder.load(_pointer(context, builder, signature.args[0], args[0], args[1]))
@@ -82,6 +90,7 @@ def load(typing: Any, array: Any, index: Any) -> Any:
 @intrinsic
 def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """Write LANES consecutive float32 into a 1-D C-contiguous array at array[index]."""
+    _check_dense(array)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         stored = builder.store(args[2], _pointer(context, builder, signature.args[0], args[0], args[1]))
@@ -94,6 +103,7 @@ def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
 @intrinsic
 def load_bytes(typing: Any, array: Any, index: Any) -> Any:
     """LANES consecutive uint8 of a 1-D C-contiguous array, as floats 0..255."""
+    _check_dense(array)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         small = ir.VectorType(ir.IntType(8), LANES)
@@ -227,7 +237,7 @@ def _arithmetic(symbol: Callable[[Any, Any], Any], instruction: str) -> None:
                 return signature(vector, vector, vector)
             return None
 
-    @lower_builtin(symbol, VectorType, VectorType)  # type: ignore[untyped-decorator]
+    @lower_builtin(symbol, VectorType, VectorType)
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return getattr(builder, instruction)(*args)
 

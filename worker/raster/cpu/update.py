@@ -2,8 +2,8 @@
 
 N Gaussians padded to a multiple of LANES, B bases. The canonical state has ROWS = 13 rows: mean 0:3, quaternion 3:7,
 log-scale 7:10 and the constant harmonic of the colour 10:13; FDM moves the first CHANNELS = 10, shared bases the first
-10 or all. Rows of N floats everywhere, so that a vector is LANES Gaussians. Adam (Kingma and Ba 2015) with bias correction folded into the
-step: rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and eps scaled alike.
+10 or all. Rows of N floats everywhere, so that a vector is LANES Gaussians. Adam (Kingma and Ba 2015) with bias
+correction folded into the step: rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and eps scaled by the same square root.
 """
 
 from __future__ import annotations
