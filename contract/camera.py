@@ -20,4 +20,6 @@ class Intrinsics(BaseModel):
     def resized(self, width: int, height: int) -> Intrinsics:
         """The same camera with another pixel grid over the same field of view."""
         sx, sy = width / self.width, height / self.height
-        return Intrinsics(width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy)
+        return Intrinsics(
+            width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )

@@ -1,0 +1,141 @@
+"""Motion known before training: optical flow from the first training frame, lifted to 3D by stereo depth.
+
+Dense flow (DIS) from the reference to every training frame, checked forward against backward, gives each reference
+pixel a track; the tracks' displacements are smoothed where they are trusted and fitted by a deformation's bases.
+Held-out frames are never read.
+
+Symbols: K training frames, h w pixels of the coarse grid on which flow is computed, N points, B bases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.clip import DepthClip
+from worker.fusion import unproject
+
+Floats = NDArray[np.float32]
+
+FLOW_WIDTH = 320
+"""Flow is computed at the clip's size over the least whole factor that brings its width to this or less, in px."""
+ROUND_TRIP_PX = 1.0
+"""Forward and backward flow disagreeing by this much, in px of the coarse grid, halve a track's confidence or worse."""
+SMOOTH_PX = 4.0
+"""Standard deviation, in px of the coarse grid, over which trusted displacements are averaged: depth is noisy."""
+STEADINESS = 0.02
+"""Weight of a difference between neighbouring bases against one fully trusted frame; it carries motion across gaps."""
+RIDGE = 1e-3
+"""Weight of the basis weights themselves, only to keep the system solvable."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Displacement of reference pixels to every training frame.
+
+    displacement_mm [K, h, w, 3]  camera frame of the reference (world), mm; smoothed
+    confidence      [K, h, w]     in [0, 1]; 0 where the track is lost, hidden or without depth
+    step_px                       clip pixels between neighbouring cells of the grid
+    """
+
+    displacement_mm: Floats
+    confidence: Floats
+    step_px: int
+
+
+def track(clip: DepthClip, train: Sequence[int]) -> Tracks:
+    """Follow the first training frame's tissue through the others."""
+    step = -(-clip.intrinsics.width // FLOW_WIDTH)
+    reference = _Coarse(clip, train[0], step)
+    lost = np.zeros(reference.grey.shape, np.float32)
+
+    def follow(frames: Sequence[int]) -> list[tuple[Floats, Floats]]:
+        flow_solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        forward: Floats | None = None
+        found = []
+        for index in frames:  # in order of time: the last flow starts the next
+            if index == train[0]:
+                found.append((np.zeros((*lost.shape, 3), np.float32), reference.trust))
+                continue
+            target = _Coarse(clip, index, step)
+            forward = flow_solver.calc(reference.grey, target.grey, None if forward is None else forward.copy())
+            backward = flow_solver.calc(target.grey, reference.grey, -forward)
+            found.append(_lift(reference, target, forward, backward))
+        return found
+
+    halves = (train[: len(train) // 2], train[len(train) // 2 :])
+    with ThreadPoolExecutor(2) as pool:
+        tracks = [pair for half in pool.map(follow, halves) for pair in half]
+    return Tracks(np.stack([d for d, _ in tracks]), np.stack([c for _, c in tracks]), step)
+
+
+class _Coarse:
+    """A frame on the coarse grid: grey, camera points (world, mm), and how far depth and mask can be trusted."""
+
+    def __init__(self, clip: DepthClip, index: int, step: int) -> None:
+        height, width = clip.tissue.shape[1:]
+        size = (width // step, height // step)
+        grey = cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY)
+        self.grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        rows, columns = np.mgrid[0 : size[1], 0 : size[0]] * step + step // 2
+        pixels = (rows * width + columns).ravel()
+        depth_mm = clip.depth_mm[index].ravel()[pixels]
+        usable = clip.tissue[index].ravel()[pixels] & (depth_mm > 0)
+        points = unproject(pixels, np.where(usable, depth_mm, 1.0), clip.intrinsics, clip.world_from_camera[index])
+        self.points_mm = points.reshape(*rows.shape, 3).astype(np.float32)
+        confidence = clip.depth_confidence[index].ravel()[pixels] / np.float32(255)
+        self.trust = np.where(usable, confidence, 0).reshape(rows.shape).astype(np.float32)
+
+
+def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
+    """Displacement (mm) and confidence of every reference cell, given the flows there and back."""
+    rows, columns = np.mgrid[0 : forward.shape[0], 0 : forward.shape[1]].astype(np.float32)
+    x, y = columns + forward[..., 0], rows + forward[..., 1]
+
+    def at_target(values: Floats) -> Floats:
+        moved: Floats = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        return moved
+
+    round_trip = forward + at_target(backward)
+    trust = at_target(target.trust)
+    agree = 1 / (1 + (np.square(round_trip).sum(-1) / ROUND_TRIP_PX**2) ** 2)
+    confidence = reference.trust * trust * (trust > 0.5) * agree
+    weighted = at_target(target.points_mm * target.trust[..., None]) / np.maximum(trust, 1e-3)[..., None]
+    displacement = (weighted - reference.points_mm) * confidence[..., None]
+    # Normalised convolution: only trusted neighbours are averaged.
+    weight = cv2.GaussianBlur(confidence, (0, 0), SMOOTH_PX)
+    smooth = cv2.GaussianBlur(displacement, (0, 0), SMOOTH_PX) / np.maximum(weight, 1e-4)[..., None]
+    return smooth.astype(np.float32), np.minimum(confidence, 1).astype(np.float32)
+
+
+def fit_tracks(
+    tracks: Tracks, basis: NDArray[np.float64], pixels: NDArray[np.intp], width: int
+) -> tuple[Floats, Floats]:
+    """Weights of the bases for points of the reference frame, by weighted least squares over the training frames.
+
+    Minimises sum_k c_k |basis_k . w - d_k|^2 + STEADINESS sum_j |w_{j+1} - w_j|^2 + RIDGE |w|^2 for each point.
+
+    Args:
+        basis: [K, B] value of every basis at every training time.
+        pixels: [N] flat pixel indices (row * width + column) of the points in the reference frame.
+        width: of the clip, px.
+
+    Returns:
+        weights [N, B, 3] in mm; support [N], the mean confidence of the point's track.
+    """
+    row = np.minimum(pixels // width // tracks.step_px, tracks.confidence.shape[1] - 1)
+    column = np.minimum(pixels % width // tracks.step_px, tracks.confidence.shape[2] - 1)
+    confidence = tracks.confidence[:, row, column].astype(np.float64)  # [K, N]
+    displacement = tracks.displacement_mm[:, row, column].astype(np.float64)  # [K, N, 3]
+    bases = basis.shape[1]
+    difference = np.diff(np.eye(bases), axis=0)
+    prior = STEADINESS * difference.T @ difference + RIDGE * np.eye(bases)
+    outer = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
+    normal = (confidence.T @ outer).reshape(-1, bases, bases) + prior
+    right = np.einsum("kb,kn,knc->nbc", basis, confidence, displacement, optimize=True)
+    return np.linalg.solve(normal, right).astype(np.float32), confidence.mean(0).astype(np.float32)

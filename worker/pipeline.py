@@ -1,0 +1,272 @@
+"""The table of contents: a clip becomes a scene, one stage a line. Read the modules in the order of the calls."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TypeVar
+
+import numba
+import numpy as np
+import torch
+
+from contract.errors import Cancelled, InputError, UnavailableError
+from contract.report import Report
+from contract.store import CURVE, REPORT
+from worker.baselines import copy_baselines
+from worker.calibration import load_calibration, rectify
+from worker.checkpoint import RESUME_FILE, Scene, save_scene
+from worker.clip import (
+    DepthClip,
+    FrameSplit,
+    Layout,
+    MaskPolarity,
+    PoseConvention,
+    StereoClip,
+    find_calibration,
+    open_clip,
+    split_frames,
+)
+from worker.densify import Densifier
+from worker.fusion import fuse
+from worker.hooks import Hooks, Progress
+from worker.metrics import psnr_tissue
+from worker.presets import Preset, preset_named
+from worker.quality import Training, View, build_report, measure, sample_frames
+from worker.raster.cpu import compile_kernels
+from worker.start import bases_of, fusion_for, start_model
+from worker.stereo import estimate_depth
+from worker.targets import TrainingFrames, units_per_mm
+from worker.train import Run, Stopwatch, iterations_within, load_run, save_run, train
+from worker.visibility import seen_share
+
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class ReconstructionRequest:
+    """What to reconstruct and how; the fields are those of `intrasplat reconstruct --help`.
+
+    budget_s and iterations exclude each other; without either the preset decides.
+    """
+
+    clip: Path
+    right: Path | None = None
+    layout: Layout = "auto"
+    calibration: Path | None = None
+    masks: Path | None = None
+    mask_polarity: MaskPolarity = "auto"
+    pose_convention: PoseConvention = "opengl"
+    holdout: str = "every8"
+    preset: str = "fast"
+    budget_s: float | None = None
+    iterations: int | None = None
+    device: str = "auto"
+    seed: int = 0
+
+
+def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> Report:
+    """Clip in; manifest.json, scene.safetensors, report.json and curve.csv out, in out_dir.
+
+    A stopped run leaves its state in out_dir; the same request on the same folder goes on from there.
+
+    Raises:
+        InputError: the clip, its calibration, masks or an option cannot be used.
+        UnavailableError: the device is not there.
+        TrainingDiverged: training left the finite numbers; nothing is written.
+        Cancelled: hooks.should_stop said so.
+    """
+    accepted = time.perf_counter()
+    preset = preset_named(request.preset)
+    check_device(request.device)
+    seconds: dict[str, float] = {}
+
+    clip = timed(seconds, "depth_s", lambda: depth_clip_of(request, hooks))
+    split = split_frames(clip, request.holdout)
+    compile_s = compile_kernels(lambda share: hooks.on_progress(Progress("compile", share)))
+    clock = Stopwatch()
+    run, scale = prepare(clip, split, preset, request, clock)
+    resumed_s = resume(out_dir, run)
+    clock = Stopwatch(resumed_s) if resumed_s is not None else clock
+    view_of = view_function(run, scale)
+    try:
+        train(run, clock, lambda: held_out_psnr(clip, split, view_of), hooks)
+    except Cancelled:
+        save_run(out_dir, run, clock.elapsed_s)
+        raise
+    t_train_s = clock.elapsed_s
+    hooks.on_progress(Progress("publish", 0.0, run.iteration, run.iterations))
+    scene = scene_of(run, clip, split, scale, request.seed)
+    seconds |= {
+        "compile_s": compile_s,
+        "t_train_s": t_train_s,
+        "t_post_s": time.perf_counter() - accepted,
+    }
+    report = report_of(run, clip, split, scene, request, seconds, view_of)
+    (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
+    write_curve(out_dir / CURVE, run)
+    save_scene(out_dir, scene, beside=(REPORT, CURVE))
+    (out_dir / RESUME_FILE).unlink(missing_ok=True)
+    return report
+
+
+def check_device(device: str) -> None:
+    """Refuse a device this build cannot train on."""
+    if device not in ("auto", "cpu"):
+        problem = f"device {device!r} was asked for, but this version trains on the CPU only."
+        raise UnavailableError(problem, "Use --device auto or --device cpu.")
+
+
+def timed(seconds: dict[str, float], name: str, work: Callable[[], _Result]) -> _Result:
+    """work(), its duration stored under name."""
+    start = time.perf_counter()
+    result = work()
+    seconds[name] = time.perf_counter() - start
+    return result
+
+
+def depth_clip_of(request: ReconstructionRequest, hooks: Hooks) -> DepthClip:
+    """Decode, and for stereo input rectify and match: the left frames with depth."""
+    hooks.on_progress(Progress("decode", 0.0))
+    clip = open_clip(
+        request.clip,
+        request.right,
+        layout=request.layout,
+        masks=request.masks,
+        mask_polarity=request.mask_polarity,
+        pose_convention=request.pose_convention,
+    )
+    if isinstance(clip, DepthClip):
+        return clip
+    with tempfile.TemporaryDirectory(prefix="intrasplat-") as scratch:
+        calibration = load_calibration(
+            calibration_path(request, clip, Path(scratch)), eye_width=clip.width, eye_height=clip.height
+        )
+    return estimate_depth(rectify(clip, calibration), hooks)
+
+
+def calibration_path(request: ReconstructionRequest, clip: StereoClip, scratch: Path) -> Path:
+    """The given calibration, or the one that lies in the clip's folder or zip."""
+    path = request.calibration or find_calibration(request.clip, scratch)
+    if path is None:
+        problem = f"a stereo clip of {clip.width} x {clip.height} px an eye came without one."
+        remedy = "Give a calibration: our JSON (docs/conventions.md), OpenCV YAML or XML, or StereoMIS ini."
+        raise InputError("calibration", problem, remedy)
+    return path
+
+
+def prepare(
+    clip: DepthClip, split: FrameSplit, preset: Preset, request: ReconstructionRequest, clock: Stopwatch
+) -> tuple[Run, float]:
+    """Fuse points, start the model, and settle how many iterations are made."""
+    scale = units_per_mm(clip, split.train)
+    cloud = fuse(clip, split.train, fusion_for(preset, clip.intrinsics), seed=request.seed)
+    model = start_model(cloud, clip, split.train, preset, scale, request.seed)
+    frames = TrainingFrames(clip, split.train, scale)
+    densifier = Densifier(preset.densify, model.count) if preset.densify else None
+    fixed = request.iterations or (None if request.budget_s else preset.iterations)
+    run = Run(model, frames, preset, fixed or 1, request.seed, densifier=densifier)
+    if fixed is None:
+        budget_s = request.budget_s or preset.budget_s
+        assert budget_s is not None
+        run.iterations = 1000  # any length: calibration needs a place in the schedule, not its end
+        run.iterations = iterations_within(run, budget_s, clock.elapsed_s)
+    return run, scale
+
+
+def resume(out_dir: Path, run: Run) -> float | None:
+    """Go on with the run stored in out_dir, if there is one; its t_train_s.
+
+    Raises:
+        InputError: it is of another preset, seed or clip.
+    """
+    if not (out_dir / RESUME_FILE).exists():
+        return None
+    try:
+        return load_run(out_dir, run)
+    except (ValueError, KeyError) as error:
+        problem = f"{out_dir / RESUME_FILE} does not continue this request: {error}."
+        raise InputError("--out", problem, "Give the options it was started with, or name a new folder.") from error
+
+
+def view_function(run: Run, scale: float) -> Callable[[int], View]:
+    """Renders frame i from the endoscope's pose, in mm."""
+
+    def view_of(index: int) -> View:
+        image = run.model.render(run.frames.cameras[index], float(run.frames.t[index])).copy()
+        solid = image[4] >= 0.5
+        depth_mm = np.where(solid, image[3] / np.where(solid, image[4], 1) / scale, 0)
+        return View(image[:3].transpose(1, 2, 0), depth_mm.astype(np.float32), image[4])
+
+    return view_of
+
+
+def held_out_psnr(clip: DepthClip, split: FrameSplit, view_of: Callable[[int], View]) -> float:
+    """Mean psnr_tissue over at most sixteen held-out frames, evenly spread; NaN without any."""
+    scores = [psnr_tissue(view_of(i).rgb, clip.rgb[i], clip.tissue[i]) for i in sample_frames(split.held_out, 16)]
+    return float(np.nanmean(scores)) if scores else float("nan")
+
+
+def scene_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: int) -> Scene:
+    """What is kept of a finished run."""
+    gaussians, deformation = run.model.export()
+    return Scene(
+        gaussians=gaussians,
+        deformation=deformation,
+        intrinsics=clip.intrinsics,
+        world_from_camera=clip.world_from_camera,
+        frame_times_s=clip.frame_times_s,
+        units_per_mm=scale,
+        preset=run.preset.name,
+        trained_t=tuple(float(clip.t[i]) for i in split.train),
+        seen=torch.from_numpy(seen_share(run.model, clip, run.frames)),
+        seed=seed,
+        settings={"iterations": run.iterations, **json.loads(json.dumps(asdict(run.preset), default=str))},
+    )
+
+
+def report_of(
+    run: Run,
+    clip: DepthClip,
+    split: FrameSplit,
+    scene: Scene,
+    request: ReconstructionRequest,
+    seconds: dict[str, float],
+    view_of: Callable[[int], View],
+) -> Report:
+    """Score the held-out frames beside the copy baselines and say what to distrust."""
+    held_out = measure(clip, split.held_out, view_of)
+    trained = measure(clip, sample_frames(split.train), view_of)
+    training = Training(
+        preset=run.preset.name,
+        seed=request.seed,
+        device="cpu",
+        iterations=run.iteration,
+        gaussians=len(scene.gaussians),
+        bases=bases_of(scene.deformation),
+        scene_bytes=scene.byte_count,
+        units_per_mm=scene.units_per_mm,
+        seconds=seconds,
+        versions={
+            "intrasplat": version("intrasplat"),
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numba": numba.__version__,
+        },
+    )
+    return build_report(clip, split, held_out, trained, copy_baselines(clip, split.train, split.held_out), training)
+
+
+def write_curve(path: Path, run: Run) -> None:
+    """curve.csv: t_train_s, iteration, psnr_tissue_db of the held-out frames."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t_train_s", "iteration", "psnr_tissue_db"])
+        writer.writerows([f"{p.t_train_s:.3f}", p.iteration, f"{p.psnr_tissue_db:.4f}"] for p in run.curve)

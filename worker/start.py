@@ -1,0 +1,100 @@
+"""The model before its first step: points become Gaussians, motion starts at rest."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from contract.camera import Intrinsics
+from worker.clip import DepthClip
+from worker.deformation import FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
+from worker.fusion import FusionSettings, PointCloud
+from worker.gaussians import Gaussians, initial_gaussians
+from worker.model import Model
+from worker.motion import fit_tracks, track
+from worker.presets import Preset
+from worker.raster.cpu.model import FusedModel
+from worker.unfused import UnfusedModel
+
+FRAMES_A_BASIS, MIN_BASES = 5, 3
+"""Training frames a shared basis stands for: denser ones fit noise, sparser ones miss motion (docs/decisions)."""
+MIN_STRIDE = 2
+"""Pixels between the points of a grid at the least: a Gaussian a pixel is noise, not surface."""
+
+
+def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
+    """The preset's fusion; "fill" with the finest stride whose grid has at most points_per_image points."""
+    if preset.points_per_image is None or preset.fusion.mode != "fill":
+        return preset.fusion
+    stride = math.ceil(math.sqrt(intrinsics.width * intrinsics.height / preset.points_per_image))
+    return dataclasses.replace(preset.fusion, stride=max(MIN_STRIDE, stride))
+
+
+def start_model(
+    cloud: PointCloud, clip: DepthClip, train: Sequence[int], preset: Preset, scale: float, seed: int
+) -> Model:
+    """Gaussians at the cloud's points (mm, scaled to optimiser units) with the preset's motion, at rest."""
+    gaussians = initial_gaussians(
+        cloud.points_mm * np.float32(scale),
+        cloud.rgb,
+        sh_degree=preset.sh_degree,
+        opacity=preset.opacity,
+    )
+    gaussians = dataclasses.replace(gaussians, log_scale=gaussians.log_scale + math.log(preset.spread))
+    width, height = clip.intrinsics.width, clip.intrinsics.height
+    count = len(gaussians)
+    if preset.deformation == "hexplane":
+        bounds = torch.stack([gaussians.mean.amin(0), gaussians.mean.amax(0)])
+        return UnfusedModel(gaussians, HexPlane.initial(bounds, seed=seed), width, height)
+    if preset.deformation == "pfs":
+        return FusedModel(gaussians, PolynomialFourier.initial(count, weights=preset.bases), width, height)
+    if preset.deformation == "shared":
+        bases = min(len(train), max(MIN_BASES, min(preset.bases, math.ceil(len(train) / FRAMES_A_BASIS))))
+        shared = SharedBasis.initial(count, bases=bases, colour=True, times=[float(clip.t[i]) for i in train])
+        if preset.tracks and len(train) > 1:
+            gaussians = _follow_tracks(gaussians, shared, cloud, clip, train, scale)
+        return FusedModel(gaussians, shared, width, height)
+    assert preset.start_width is not None
+    fdm = FlexibleDeformation.initial(
+        count,
+        bases=preset.bases,
+        width=preset.start_width,
+        form="gaussian" if preset.deformation == "fdm" else "quartic",
+    )
+    return FusedModel(gaussians, fdm, width, height)
+
+
+def _follow_tracks(
+    gaussians: Gaussians, motion: SharedBasis, cloud: PointCloud, clip: DepthClip, train: Sequence[int], scale: float
+) -> Gaussians:
+    """Fill motion's weights from optical-flow tracks; returns the Gaussians with each canonical mean moved so that it
+    passes through its point at the time of the frame it was taken from."""
+    basis = np.stack([motion.basis(float(clip.t[i])).double().numpy() for i in range(clip.frame_count)])
+    pixels = _reference_pixels(cloud, clip, train[0])
+    weights, _ = fit_tracks(track(clip, train), basis[list(train)], pixels, clip.intrinsics.width)
+    weights *= scale
+    motion.weight[:, :3] = torch.from_numpy(weights).permute(0, 2, 1)
+    moved = np.einsum("nbc,nb->nc", weights, basis[cloud.frame])
+    return dataclasses.replace(gaussians, mean=gaussians.mean - torch.from_numpy(moved.astype(np.float32)))
+
+
+def _reference_pixels(cloud: PointCloud, clip: DepthClip, reference: int) -> NDArray[np.intp]:
+    """[N] flat index of the pixel of the reference frame each point projects into, the nearest one if outside."""
+    pose, k = clip.world_from_camera[reference], clip.intrinsics
+    x, y, z = ((cloud.points_mm - pose[:3, 3]) @ pose[:3, :3]).T
+    z = np.maximum(z, 1e-6)
+    column = np.clip(np.floor(k.fx * x / z + k.cx), 0, k.width - 1)
+    row = np.clip(np.floor(k.fy * y / z + k.cy), 0, k.height - 1)
+    pixels: NDArray[np.intp] = (row * k.width + column).astype(np.intp)
+    return pixels
+
+
+def bases_of(model_deformation: object) -> int:
+    """B of a deformation's channels; 0 where there is no such number."""
+    weight = getattr(model_deformation, "weight", None)
+    return 0 if weight is None else int(weight.shape[-1])

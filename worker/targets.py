@@ -1,0 +1,96 @@
+"""The training frames as the rasteriser compares with them: padded to whole tiles, in optimiser units.
+
+Symbols: T frames, H W pixels; stride = W rounded up to whole vectors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.camera import Intrinsics
+from contract.errors import InputError
+from worker.clip import DepthClip
+from worker.loss import LossSettings
+from worker.raster import Camera
+from worker.raster.cpu import Target, camera_vector, padded
+
+MEDIAN_DEPTH_UNITS = 60.0
+"""The median valid depth of the training frames in optimiser units; Adam's rates are stated in this unit."""
+
+
+def units_per_mm(clip: DepthClip, train: Sequence[int]) -> float:
+    """Optimiser units a millimetre, from the training frames' valid tissue depths.
+
+    Raises:
+        InputError: no training frame has valid depth on tissue.
+    """
+    sampled = [clip.depth_mm[i][::4, ::4][clip.tissue[i][::4, ::4]] for i in train]
+    depths = np.concatenate([values[values > 0] for values in sampled])
+    if depths.size == 0:
+        depths = np.concatenate([clip.depth_mm[i][clip.tissue[i] & (clip.depth_mm[i] > 0)] for i in train])
+    if depths.size == 0:
+        problem = "no training frame has a valid depth on tissue."
+        raise InputError("clip", problem, "Check the calibration and the mask polarity, or hold out fewer frames.")
+    return MEDIAN_DEPTH_UNITS / float(np.median(depths))
+
+
+def camera_in_units(intrinsics: Intrinsics, world_from_camera: NDArray[np.float64], scale: float) -> Camera:
+    """The rasteriser's camera: the pose inverted and its translation in optimiser units."""
+    camera_from_world: NDArray[np.float64] = np.linalg.inv(world_from_camera).astype(np.float64)
+    camera_from_world[:3, 3] *= scale
+    k = intrinsics
+    return Camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, camera_from_world)
+
+
+class TrainingFrames:
+    """Colour, tissue, inverse depth and camera of every training frame."""
+
+    def __init__(self, clip: DepthClip, train: Sequence[int], scale: float) -> None:
+        self.indices = list(train)
+        self.scale = scale
+        self._row = {index: row for row, index in enumerate(self.indices)}
+        height, width = clip.rgb.shape[1:3]
+        stride = padded(width)
+        count = len(self.indices)
+        self._rgb = np.zeros((count, 3, height, stride), np.uint8)
+        self._weight = np.zeros((count, height, stride), np.uint8)
+        self._inverse_depth = np.zeros((count, height, stride), np.float32)
+        self._pixels = np.zeros((count, 2), np.int64)  # of tissue; of tissue with depth
+        for row, index in enumerate(self.indices):
+            tissue, depth_mm = clip.tissue[index], clip.depth_mm[index]
+            measured = tissue & (depth_mm > 0)
+            self._rgb[row, :, :, :width] = clip.rgb[index].transpose(2, 0, 1)
+            self._weight[row, :, :width] = np.where(tissue, np.uint8(255), np.uint8(0))
+            np.divide(1 / scale, depth_mm, out=self._inverse_depth[row, :, :width], where=measured)
+            self._pixels[row] = tissue.sum(), measured.sum()
+        self.cameras = {
+            index: camera_vector(camera_in_units(clip.intrinsics, clip.world_from_camera[index], scale))
+            for index in range(clip.frame_count)
+        }
+        self.t = clip.t
+
+    def target(self, index: int) -> Target:
+        """What frame `index` is compared with; views."""
+        row = self._row[index]
+        return Target(self._rgb[row].ravel(), self._weight[row].ravel(), self._inverse_depth[row].ravel())
+
+    def loss_settings(self, index: int, loss: LossSettings) -> NDArray[np.float32]:
+        """The weights the blend applies a pixel (blend.py): each loss is a mean over its valid pixels."""
+        tissue, measured = self._pixels[self._row[index]]
+        return np.array(
+            [
+                loss.colour_weight / (3 * max(tissue, 1)),
+                loss.depth_weight / max(measured, 1),
+                1 / max(loss.colour_zone, 1e-30),
+                1 / max(loss.depth_zone, 1e-30),
+                float(loss.normalised_depth),
+            ],
+            np.float32,
+        )
+
+    def tissue_channels(self, index: int) -> int:
+        """Tissue pixels times colour channels: what a squared error is divided by."""
+        return 3 * int(self._pixels[self._row[index], 0])

@@ -1,0 +1,213 @@
+"""The one training loop. Everything it is given is built before; everything it decides is in Run.
+
+Symbols: p = iteration / iterations, the progress of the schedule. Nothing in a schedule reads the clock, so the same
+seed and iterations give the same bits, and a resumed run gives those of an uninterrupted one.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from contract.errors import Cancelled, TrainingDiverged
+from worker.checkpoint import load_resume, save_resume
+from worker.densify import Densifier
+from worker.hooks import Hooks, Progress
+from worker.model import Model
+from worker.optimize import rates_at
+from worker.presets import Preset
+from worker.targets import TrainingFrames
+
+CURVE_SECONDS = (1, 2, 5, 10, 20, 40, 60, 90, 120, 180, 300, 600)
+"""Training times at which held-out frames are scored; the clock stands still meanwhile."""
+CALIBRATION_STEPS = (2, 8)
+"""Untimed and timed steps that tell how many fit into a budget; they are taken back."""
+LATER_STEPS = 1.15
+"""How much slower steps become while Gaussians grow and sharpen; measured over a run of `fast`."""
+REPORT_EVERY_S = 0.25
+
+
+class Stopwatch:
+    """Seconds of work, not counting what happens while it is paused."""
+
+    def __init__(self, elapsed_s: float = 0.0) -> None:
+        self._start, self._paused = time.perf_counter() - elapsed_s, 0.0
+
+    @property
+    def elapsed_s(self) -> float:
+        return time.perf_counter() - self._start - self._paused
+
+    def pause(self, work: Callable[[], float]) -> float:
+        """work(), uncounted."""
+        before = time.perf_counter()
+        result = work()
+        self._paused += time.perf_counter() - before
+        return result
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """One row of curve.csv; t_train_s as docs/conventions.md defines it."""
+
+    t_train_s: float
+    iteration: int
+    psnr_tissue_db: float
+
+
+@dataclass
+class Run:
+    """A training run: what is trained, on what, how far it has come.
+
+    model        Gaussians, deformation, Adam's moments
+    frames       targets and cameras
+    preset       rates, loss, order, densification
+    iterations   of the whole schedule; iteration: those done
+    densifier    its statistics; None where the preset has no densification
+    """
+
+    model: Model
+    frames: TrainingFrames
+    preset: Preset
+    iterations: int
+    seed: int
+    iteration: int = 0
+    densifier: Densifier | None = None
+    curve: list[CurvePoint] = field(default_factory=list)
+
+
+def frame_at(run: Run, iteration: int) -> int:
+    """The training frame of an iteration (from 1): a function of seed and iteration alone, so a run can resume."""
+    indices = run.frames.indices
+    if run.preset.order == "random":
+        return indices[int(np.random.default_rng([run.seed, iteration]).integers(len(indices)))]
+    epoch, place = divmod(iteration - 1, len(indices))
+    return indices[int(np.random.default_rng([run.seed, epoch]).permutation(len(indices))[place])]
+
+
+def step(run: Run, iteration: int) -> float:
+    """One iteration; returns its psnr_tissue before the update, in dB."""
+    preset, index = run.preset, frame_at(run, iteration)
+    sh_degree = min(preset.sh_degree, iteration // preset.sh_every) if preset.sh_degree else 0
+    sums = run.model.step(
+        run.frames.cameras[index],
+        float(run.frames.t[index]),
+        run.frames.target(index),
+        run.frames.loss_settings(index, preset.loss),
+        rates_at(preset.rates, iteration / run.iterations),
+        iteration,
+        sh_degree,
+    )
+    if not math.isfinite(sums.colour_l1 + sums.depth_l1):
+        raise TrainingDiverged(f"The loss is no longer a number at iteration {iteration} (frame {index}).")
+    return -10 * math.log10(max(sums.squared_error / max(run.frames.tissue_channels(index), 1), 1e-10))
+
+
+def iterations_within(run: Run, budget_s: float, elapsed_s: float) -> int:
+    """How many iterations fit into what is left of budget_s, by timing a few steps and taking them back."""
+    stored = {name: values.copy() for name, values in run.model.arrays().items()}
+    untimed, timed = CALIBRATION_STEPS
+    start = time.perf_counter()
+    before = start
+    for iteration in range(1, untimed + timed + 1):
+        if iteration == untimed + 1:
+            before = time.perf_counter()
+        step(run, iteration)
+    after = time.perf_counter()
+    run.model.load_arrays(stored)
+    step_s = (after - before) / timed * LATER_STEPS
+    left_s = budget_s - elapsed_s - (time.perf_counter() - start)
+    return max(len(run.frames.indices), int(left_s / step_s))
+
+
+def train(run: Run, clock: Stopwatch, evaluate: Callable[[], float], hooks: Hooks) -> None:
+    """Take run from its iteration to its last.
+
+    Args:
+        clock: t_train_s so far; paused while held-out frames are scored.
+        evaluate: mean psnr_tissue over the held-out frames, NaN without any.
+
+    Raises:
+        Cancelled: hooks.should_stop said so; run is as it was after its last full iteration and can be resumed.
+        TrainingDiverged: the loss is not finite, or no Gaussian is left.
+    """
+    marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s]
+    scored: float | None = run.curve[-1].psnr_tissue_db if run.curve else None
+    reported, began, begun_at = -math.inf, clock.elapsed_s, run.iteration
+    while run.iteration < run.iterations:
+        if hooks.should_stop():
+            raise Cancelled(f"Stopped after iteration {run.iteration} of {run.iterations}.")
+
+        # the step
+        iteration = run.iteration + 1
+        step(run, iteration)
+        run.iteration = iteration
+        if run.densifier is not None:
+            run.densifier.observe(run.model)
+            run.densifier.apply(run.model, iteration, np.random.default_rng([run.seed, iteration, 1]))
+
+        # the curve
+        if marks and clock.elapsed_s >= marks[0] and iteration < run.iterations:
+            marks = [mark for mark in marks if mark > clock.elapsed_s]
+            scored = _score(run, clock, evaluate)
+
+        # the report
+        now = clock.elapsed_s
+        if now - reported >= REPORT_EVERY_S:
+            reported = now
+            left_s = (now - began) / (iteration - begun_at) * (run.iterations - iteration)
+            share = iteration / run.iterations
+            hooks.on_progress(Progress("train", share, iteration, run.iterations, scored, left_s))
+    _score(run, clock, evaluate)
+
+
+def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], float]) -> float | None:
+    t_train_s = clock.elapsed_s
+    psnr = clock.pause(evaluate)
+    if math.isnan(psnr):
+        return None
+    run.curve.append(CurvePoint(t_train_s, run.iteration, psnr))
+    return psnr
+
+
+def save_run(directory: Path, run: Run, t_train_s: float) -> None:
+    """Write what load_run needs to go on: parameters, moments, densification statistics, curve."""
+    arrays = {**run.model.arrays(), **(run.densifier.arrays() if run.densifier else {})}
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}
+    state = {
+        "preset": run.preset.name,
+        "seed": run.seed,
+        "iteration": run.iteration,
+        "iterations": run.iterations,
+        "count": run.model.count,
+        "t_train_s": t_train_s,
+        "curve": [[point.t_train_s, point.iteration, point.psnr_tissue_db] for point in run.curve],
+    }
+    save_resume(directory, tensors, state)
+
+
+def load_run(directory: Path, run: Run) -> float:
+    """Put a freshly built run where a stored one was; returns its t_train_s.
+
+    Raises:
+        SceneError: nothing usable is stored there.
+        ValueError: it belongs to another preset, seed or clip.
+    """
+    tensors, state = load_resume(directory)
+    if (state["preset"], state["seed"]) != (run.preset.name, run.seed):
+        raise ValueError(f"the stored run is of preset {state['preset']}, seed {state['seed']}")
+    arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+    if state["count"] != run.model.count:  # densified since the start
+        columns = np.zeros(state["count"], np.int64)
+        run.model.take(columns, np.ones(len(columns), np.bool_))
+    run.model.load_arrays(arrays)
+    if run.densifier is not None:
+        run.densifier.load_arrays(arrays)
+    run.iteration, run.iterations = state["iteration"], state["iterations"]
+    run.curve = [CurvePoint(*row) for row in state["curve"]]
+    return float(state["t_train_s"])
