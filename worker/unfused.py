@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from worker.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation, restore
@@ -29,6 +30,16 @@ class UnfusedModel(FusedModel):
 
     def _motion_of(self, deformation: Deformation, columns: int) -> Motion:
         return AutogradMotion(deformation, self.count, columns)
+
+    def render(self, camera: NDArray[np.float64], t: float) -> Floats:
+        """R G B Z A, [5, H, W]; a view that the next render overwrites."""
+        with torch.no_grad():  # no step follows: keep no graph
+            return super().render(camera, t)
+
+    def deformed_mean(self, t: float) -> Floats:
+        """Centres at time t, [3, N] in units, as a copy."""
+        with torch.no_grad():
+            return super().deformed_mean(t)
 
 
 class AutogradMotion:
@@ -50,7 +61,7 @@ class AutogradMotion:
         self._deformation = restore(deformation.kind, self._parameters | deformation.constants())
 
     def deform(self, canonical: Floats, t: float, state: Floats) -> None:
-        """state = canonical + offsets at t; keeps the graph for update."""
+        """state = canonical + offsets at t; keeps the graph for update unless gradients are switched off."""
         self._canonical = torch.from_numpy(canonical.T.copy()).requires_grad_()
         self._moved = _deformed(self._deformation, self._canonical, t)
         state[:] = self._moved.detach().T.numpy()
