@@ -120,6 +120,14 @@ def opaque_wall() -> Scene:
     return random_scene(400, width=37, height=35, seed=40, pixels=9.0, opacities=(0.9,))
 
 
+def opacities_at_both_ends() -> Scene:
+    """A third of the Gaussians at opacity 1, a third at 0: neither has a finite logit."""
+    scene = random_scene(150, width=41, height=34, seed=41)
+    opacity = scene.opacity.clone()
+    opacity[0::3], opacity[1::3] = 1.0, 0.0
+    return dataclasses.replace(scene, opacity=opacity)
+
+
 def unproject(
     view: Camera, column: NDArray[np.float64], row: NDArray[np.float64], depth: NDArray[np.float64]
 ) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ float32 rounding may choose the other side, and both answers are right.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -15,7 +16,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.helpers import assert_close
-from tests.worker.raster.scenes import BACKENDS, Rasterize, Scene, opaque_wall, pixels_near_a_cut, random_scene
+from tests.worker.raster.scenes import (
+    BACKENDS,
+    Rasterize,
+    Scene,
+    opacities_at_both_ends,
+    opaque_wall,
+    pixels_near_a_cut,
+    random_scene,
+)
 from worker.raster import MIN_TRANSMITTANCE, Rendered, reference
 
 MOST_LEFT_OUT = 0.05
@@ -30,6 +39,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "past a tile": lambda: random_scene(200, width=33, height=65, seed=6),
     "wide": lambda: random_scene(50, width=40, height=40, seed=7, pixels=7.0),
     "opaque": opaque_wall,
+    "opacity 0 and 1": opacities_at_both_ends,
     "thinner than a pixel": lambda: random_scene(600, width=56, height=40, seed=8, pixels=0.15),
     "a small frame": lambda: random_scene(1500, width=96, height=80, seed=9),
 }
@@ -67,6 +77,19 @@ def test_values_and_gradients_are_the_references(
         assert_close(getattr(got, layer), getattr(wanted, layer), where=~left_out, name=layer)
     for leaf, gradient in wanted_gradients.items():
         assert_close(got_gradients[leaf], gradient, name=f"gradient of {leaf}")
+
+
+def test_an_opacity_of_one_gets_its_gradient(rasterize: Rasterize) -> None:
+    scene = opacities_at_both_ends().to(torch.float32).differentiable()
+    (gradient,) = torch.autograd.grad(scene.render(rasterize).alpha.sum(), [scene.opacity])
+    assert float((gradient[0::3] != 0).double().mean()) > 0.3
+    assert not gradient[1::3].any()
+
+
+def test_shapes_that_do_not_belong_together_are_refused(rasterize: Rasterize) -> None:
+    scene = random_scene(5, width=19, height=11).to(torch.float32)
+    with pytest.raises(ValueError, match="shapes"):
+        dataclasses.replace(scene, colour=scene.colour[:4]).render(rasterize)
 
 
 def test_no_gaussians_are_black_with_gradients_of_their_shape(rasterize: Rasterize) -> None:

@@ -103,6 +103,13 @@ def test_a_camera_given_as_a_tensor_sees_the_same(rasterize: Rasterize, scene: S
     assert_same(scene.differentiable().render(rasterize), scene.render(rasterize), scene)
 
 
+def test_a_pose_that_cannot_be_written_sees_the_same(rasterize: Rasterize, scene: Scene) -> None:
+    pose = np.array(scene.camera.camera_from_world)
+    pose.setflags(write=False)
+    fixed = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, camera_from_world=pose))
+    assert bool((fixed.render(rasterize).rgb == scene.render(rasterize).rgb).all())
+
+
 def test_project_undoes_unproject() -> None:
     view = camera(31, 24)
     i, j = np.mgrid[:24, :31]

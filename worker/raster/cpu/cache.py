@@ -19,15 +19,18 @@ import numba
 
 
 def kernel_cache_directory() -> Path:
-    """The folder of compiled kernels: $INTRASPLAT_CACHE, else $XDG_CACHE_HOME/intrasplat, else ~/.cache/intrasplat."""
+    """The folder of compiled kernels: $INTRASPLAT_CACHE, else $XDG_CACHE_HOME/intrasplat, else ~/.cache/intrasplat.
+
+    Raises:
+        RuntimeError: none of them is set and this user has no home.
+    """
     digest = hashlib.sha256(numba.__version__.encode())
     folder = Path(__file__).parent
     for source in [*sorted(folder.glob("*.py")), folder.parent / "__init__.py"]:
         digest.update(source.read_bytes())
     base = os.environ.get("INTRASPLAT_CACHE")
-    if base is None:
-        home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-        base = os.path.join(home, "intrasplat")
+    if not base:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "intrasplat"
     return Path(base) / "kernels" / digest.hexdigest()[:16]
 
 
@@ -36,14 +39,14 @@ def use_kernel_cache() -> None:
 
     Where nothing can be written there, a temporary folder takes its place until the process ends, with a warning.
     """
-    folder = kernel_cache_directory()
     try:
+        folder = kernel_cache_directory()
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         temporary = tempfile.mkdtemp(prefix="intrasplat-kernels-")
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-        problem = f"compiled kernels cannot be kept in {folder} ({error.strerror}), so every start compiles them anew"
+        problem = f"compiled kernels cannot be kept, so every start compiles them anew: {error}"
         warnings.warn(f"{problem}; set INTRASPLAT_CACHE to a folder that can be written.", RuntimeWarning, stacklevel=2)
         folder = Path(temporary)
     numba.config.CACHE_DIR = str(folder)

@@ -1,0 +1,87 @@
+"""Run as a program: compile, then train and render in every way, and say whether that compiled anything more.
+
+Prints the seconds that compile_kernels took, the kernels that were compiled only later, and a hash of the results.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+
+import numpy as np
+import torch
+from numba.core.dispatcher import Dispatcher
+
+from worker.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.gaussians import Gaussians
+from worker.optimize import StepRates
+from worker.raster import Camera
+from worker.raster.cpu import Target, camera_vector, compile_kernels, rasterize
+from worker.raster.cpu.model import FusedModel
+
+COUNT, WIDTH, HEIGHT = 50, 37, 35
+
+
+def compiled() -> dict[str, int]:
+    """How many forms of each kernel there are in this process."""
+    modules = [importlib.import_module(f"worker.raster.cpu.{name}") for name in ("project", "bins", "blend", "update")]
+    modules.append(importlib.import_module("worker.raster.cpu.harmonics"))
+    found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
+    return {name: len(kernel.overloads) for name, kernel in found.items()}
+
+
+def gaussians(sh_degree: int) -> Gaussians:
+    random = torch.Generator().manual_seed(1)
+    spread = torch.tensor([20.0, 20.0, 5.0])
+    return Gaussians(
+        mean=(torch.rand(COUNT, 3, generator=random) - 0.5) * spread + torch.tensor([0.0, 0.0, 60.0]),
+        quaternion=torch.randn(COUNT, 4, generator=random),
+        log_scale=torch.zeros(COUNT, 3),
+        opacity_logit=torch.zeros(COUNT),
+        sh=torch.randn(COUNT, (sh_degree + 1) ** 2, 3, generator=random),
+    )
+
+
+def use_everything(digest: hashlib._Hash) -> None:
+    """What the presets call: fused steps and renders of every motion, densification's take, the rivals' autograd."""
+    view = Camera(80.0, 80.0, 18.0, 17.0, WIDTH, HEIGHT, np.eye(4))
+    camera = camera_vector(view)
+    motions: list[tuple[Deformation, int]] = [
+        (SharedBasis.initial(COUNT, bases=3), 0),
+        (SharedBasis.initial(COUNT, bases=3, colour=True), 0),
+        (PolynomialFourier.initial(COUNT), 3),
+        (FlexibleDeformation.initial(COUNT), 3),
+        (FlexibleDeformation.initial(COUNT, form="quartic"), 2),
+    ]
+    for motion, degree in motions:
+        model = FusedModel(gaussians(degree), motion, WIDTH, HEIGHT)
+        pixels = HEIGHT * model.rasterizer.stride
+        target = Target(*(np.full(size, 100, np.uint8) for size in (3 * pixels, pixels)), np.ones(pixels, np.float32))
+        for iteration in range(1, 5):
+            settings = np.array([1e-3, 1e-3, 1e30, 1e30, iteration % 2], np.float32)
+            used = min(degree, iteration - 1)
+            model.step(camera, 0.3 * iteration % 1, target, settings, StepRates(*[1e-3] * 11), iteration, used)
+            model.take(np.arange(model.count)[::-1].copy(), np.zeros(model.count, np.bool_))
+        digest.update(model.render(camera, 0.4).tobytes())
+    one = gaussians(0)
+    mean = one.mean.requires_grad_()
+    rendered = rasterize(mean, one.quaternion, one.scale, one.opacity, one.sh[:, 0], view)
+    (gradient,) = torch.autograd.grad((rendered.rgb.sum() + rendered.depth.sum()), [mean])
+    digest.update(gradient.numpy().tobytes())
+
+
+def main() -> None:
+    shares: list[float] = []
+    seconds = compile_kernels(shares.append)
+    before = compiled()
+    digest = hashlib.sha256()
+    use_everything(digest)
+    later = [name for name, forms in compiled().items() if forms != before[name]]
+    again = compile_kernels()
+    answer = {"seconds": seconds, "again": again, "shares": shares, "later": later, "results": digest.hexdigest()}
+    print(json.dumps(answer))
+
+
+if __name__ == "__main__":
+    main()

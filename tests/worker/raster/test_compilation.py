@@ -1,0 +1,69 @@
+"""Kernels are compiled ahead, once, by any number of processes, and with no folder to keep them in."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from tests.conftest import REPOSITORY
+
+
+def start(*arguments: str, cache: Path) -> subprocess.Popen[str]:
+    """A fresh interpreter whose kernels are kept in the folder cache."""
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        cwd=REPOSITORY,
+        env={**os.environ, "INTRASPLAT_CACHE": str(cache)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[str, str]:
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    return out, err
+
+
+def probe(cache: Path) -> subprocess.Popen[str]:
+    return start("-m", "tests.worker.raster.compile_probe", cache=cache)
+
+
+def test_two_processes_that_compile_at_once_leave_a_cache_that_serves_a_third(tmp_path: Path) -> None:
+    both = [probe(tmp_path) for _ in range(2)]
+    answers: list[dict[str, Any]] = [json.loads(finish(process)[0]) for process in both]
+    answers.append(json.loads(finish(probe(tmp_path))[0]))
+    assert len({answer["results"] for answer in answers}) == 1
+    for answer in answers:
+        assert answer["later"] == [], "compile_kernels left these for the first clip"
+        assert answer["shares"] == sorted(answer["shares"])
+        assert answer["shares"][-1] == 1
+    assert answers[2]["seconds"] < 0.5 * min(answer["seconds"] for answer in answers[:2])
+    assert answers[0]["again"] < answers[0]["seconds"]
+
+
+def test_without_a_folder_to_keep_them_in_kernels_are_compiled_into_a_temporary_one(tmp_path: Path) -> None:
+    in_the_way = tmp_path / "file"
+    in_the_way.touch()
+    out, err = finish(start("-c", WHERE, cache=in_the_way))
+    temporary, total = out.split()
+    assert str(in_the_way) in err
+    assert "set INTRASPLAT_CACHE to a folder that can be written" in err
+    assert total == "0.0"
+    assert "intrasplat-kernels-" in temporary
+    assert not Path(temporary).exists(), "the temporary folder is left behind"
+
+
+WHERE = """
+import numba, numpy
+from worker.raster.cpu.harmonics import C0
+from worker.raster.cpu import bins, Rasterizer
+print(numba.config.CACHE_DIR, Rasterizer(8, 8).statistics.sum())
+assert bins.most_rows(numpy.zeros((1, 2), numpy.int16), numpy.zeros(2, numpy.int64), numpy.zeros(1, numpy.int32)) == 0
+"""
+"""Compiles one small kernel, so that the folder is really used."""

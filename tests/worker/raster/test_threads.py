@@ -1,0 +1,128 @@
+"""Kernels of several callers at once: right results, and nobody waits for ever."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.worker.raster.test_cpu import NORMALISED, RATES, moving_gaussians, random_frame
+from worker.raster.cpu import camera_vector
+from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.threads import THREADS, run
+
+PATIENCE_S = 120.0
+"""Longer than any of this takes on a busy machine: only a deadlock lasts so long."""
+
+
+def all_at_once(*works: Callable[[], None]) -> None:
+    """Runs each in a thread of its own; fails where one fails or does not end."""
+    errors: list[BaseException] = []
+
+    def guarded(work: Callable[[], None]) -> None:
+        try:
+            work()
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=guarded, args=(work,), daemon=True) for work in works]
+    for each in threads:
+        each.start()
+    deadline = time.monotonic() + PATIENCE_S
+    for each in threads:
+        each.join(max(0.0, deadline - time.monotonic()))
+    assert not any(each.is_alive() for each in threads), "a caller waits for ever"
+    if errors:
+        raise errors[0]
+
+
+def train(kind: str, steps: int) -> list[NDArray[np.float32]]:
+    """Everything a model holds after some steps."""
+    gaussians, deformation, camera = moving_gaussians(kind, 0)
+    frame = random_frame(camera, np.zeros((camera.height, camera.width), bool))
+    model = FusedModel(gaussians, deformation, camera.width, camera.height)
+    target, settings = frame.target(model.rasterizer), frame.kernel_settings(NORMALISED)
+    for iteration in range(1, steps + 1):
+        model.step(camera_vector(camera), 0.4, target, settings, RATES, iteration)
+    return [np.array(each) for each in model.arrays().values()]
+
+
+def render(kind: str, frames: int) -> list[NDArray[np.float32]]:
+    gaussians, deformation, camera = moving_gaussians(kind, 0)
+    model = FusedModel(gaussians, deformation, camera.width, camera.height)
+    return [model.render(camera_vector(camera), t).copy() for t in np.linspace(0, 1, frames)]
+
+
+def test_training_and_rendering_at_once_give_what_each_gives_alone() -> None:
+    steps, frames = 40, 60
+    works: list[tuple[Callable[[str, int], list[NDArray[np.float32]]], str, int]] = [
+        (train, "shared with colour", steps),
+        (train, "fdm-gaussian", steps),
+        (render, "shared with colour", frames),
+        (render, "fdm-gaussian", frames),
+    ]
+    alone = [work(kind, count) for work, kind, count in works]
+    together: dict[int, list[NDArray[np.float32]]] = {}
+
+    def caller(place: int) -> Callable[[], None]:
+        work, kind, count = works[place]
+        return lambda: together.__setitem__(place, work(kind, count))
+
+    all_at_once(*(caller(place) for place in range(len(works))))
+    for place, expected in enumerate(alone):
+        for got, wanted in zip(together[place], expected, strict=True):
+            assert np.array_equal(got, wanted)
+
+
+def test_more_callers_than_threads_all_come_to_an_end() -> None:
+    counts = np.zeros((16, THREADS), np.int64)
+
+    def kernel(thread: int, threads: int, row: NDArray[np.int64]) -> None:
+        assert threads == THREADS
+        time.sleep(1e-4)
+        row[thread] += 1
+
+    def caller(row: NDArray[np.int64]) -> Callable[[], None]:
+        return lambda: [run(kernel, row) for _ in range(50)].clear()
+
+    all_at_once(*(caller(row) for row in counts))
+    assert bool((counts == 50).all())
+
+
+@pytest.mark.parametrize("failing", [0, THREADS - 1])
+def test_an_error_in_one_share_is_raised_when_all_shares_are_done(failing: int) -> None:
+    done = np.zeros(THREADS, np.int64)
+
+    def kernel(thread: int, threads: int) -> None:
+        if thread == failing:
+            raise ZeroDivisionError(f"share {thread}")
+        time.sleep(0.02)
+        done[thread] = 1
+
+    with pytest.raises(ZeroDivisionError, match=f"share {failing}"):
+        run(kernel)
+    assert done.sum() == THREADS - 1
+    run(lambda thread, threads: None)  # and the pool works on
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes are forked on this system")
+def test_a_forked_process_has_threads_of_its_own() -> None:
+    run(lambda thread, threads: None)  # the parent's pool is there before the fork
+    child = os.fork()
+    if child == 0:
+        done = np.zeros(THREADS, np.int64)
+        run(lambda thread, threads: done.__setitem__(thread, 1))
+        os._exit(0 if done.all() else 1)
+    deadline = time.monotonic() + PATIENCE_S
+    while (ended := os.waitpid(child, os.WNOHANG)) == (0, 0) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    if ended == (0, 0):
+        os.kill(child, 9)
+        os.waitpid(child, 0)
+        pytest.fail("the forked process waits for threads that only its parent has")
+    assert os.waitstatus_to_exitcode(ended[1]) == 0
