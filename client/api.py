@@ -66,7 +66,8 @@ class Client:
     ) -> JobView:
         """Upload a clip (`right`: the right eye's file, if there are two) and get its queued job.
 
-        `options` are the fields of JobOptions: preset, budget_s or iterations, mask_polarity, layout, holdout, seed.
+        `options` are the fields of JobOptions: preset, budget_s or iterations, mask_polarity, layout,
+        pose_convention, holdout, seed.
         """
         document = parse_options(options).model_dump_json(exclude_unset=True)
         paths = {"clip": clip} if right is None else {"left": clip, "right": right}

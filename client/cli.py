@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from client.api import DEFAULT_URL, Client
 from contract.errors import InputError, IntrasplatError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.job import JobProgress, JobView, PresetName
+from contract.job import JobProgress, JobView, PoseConvention, PresetName
 from contract.progress_bar import ProgressBar
 from contract.settings import Settings, default_data_dir
 
@@ -116,6 +116,7 @@ def _add_submit(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     parser.add_argument("--masks", type=Path, metavar="F", help="zip of PNGs or a video that shows the instruments")
     parser.add_argument("--mask-polarity", choices=("auto", "tool", "tissue"), help="what is bright in the masks")
     parser.add_argument("--layout", choices=("auto", "endonerf", "stereomis", "sbs", "tb", "frames"))
+    parser.add_argument("--pose-convention", choices=get_args(PoseConvention), help="axes of poses_bounds.npy")
     parser.add_argument(
         "--holdout", metavar="every8|blocks8|none|LIST", help="frames kept from training, to measure on"
     )
@@ -165,7 +166,7 @@ def _up(options: argparse.Namespace) -> int:
 
 
 def _submit(options: argparse.Namespace) -> int:
-    names = ("mask_polarity", "layout", "holdout", "preset", "budget_s", "iterations", "seed")
+    names = ("mask_polarity", "layout", "pose_convention", "holdout", "preset", "budget_s", "iterations", "seed")
     chosen = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     with Client(options.url) as client:
         paths = {"calibration": options.calibration, "masks": options.masks}

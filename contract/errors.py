@@ -47,7 +47,7 @@ class SceneError(IntrasplatError):
 
 
 class Cancelled(IntrasplatError):
-    """The caller asked to stop; what was done so far is discarded."""
+    """The caller asked to stop; nothing is published."""
 
 
 class UnavailableError(IntrasplatError):

@@ -18,6 +18,10 @@ PresetName = Literal["fast", "paper", "paper-released", "paper-wide", "pfs", "he
 """fast is ours; paper is the published method as published; the others are compared with it (worker/presets.py)."""
 
 
+PoseConvention = Literal["opengl", "llff"]
+"""Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
+
+
 class JobState(StrEnum):
     """Where a job stands."""
 
@@ -58,6 +62,7 @@ class JobOptions(BaseModel):
     iterations: int | None = Field(default=None, ge=1, le=1_000_000, description="fixed schedule; not with budget_s")
     mask_polarity: Literal["auto", "tool", "tissue"] = "auto"
     layout: Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"] = "auto"
+    pose_convention: PoseConvention = Field(default="opengl", description="axes of poses_bounds.npy")
     holdout: str = Field(
         default="every8",
         pattern=r"^(every8|blocks8|none|\d{1,6}(,\d{1,6})*)$",

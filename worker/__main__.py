@@ -7,8 +7,10 @@ imported by the command that needs them, so that --help and doctor answer at onc
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import logging
+import math
 import signal
 import sys
 import threading
@@ -19,9 +21,9 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from contract.errors import InputError, IntrasplatError, UnavailableError
+from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.job import PresetName
+from contract.job import PoseConvention, PresetName
 from contract.progress_bar import ProgressBar
 from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
 from contract.settings import Settings
@@ -80,13 +82,18 @@ def _add_reconstruct(commands: argparse._SubParsersAction[argparse.ArgumentParse
     parser.add_argument(
         "right", type=Path, metavar="RIGHT", nargs="?", help="the right eye, if it is a file of its own"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="folder for the scene; new or empty")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="SCENE", help="folder for the scene: new, empty, or of a stopped run"
+    )
     layouts = ("auto", "endonerf", "stereomis", "sbs", "tb", "frames")
     parser.add_argument("--layout", choices=layouts, default="auto", help="how the eyes are laid out (default: guess)")
     parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini; for stereo")
     parser.add_argument("--masks", type=Path, metavar="F", help="zip or folder of PNGs, or a video: the instruments")
     parser.add_argument(
         "--mask-polarity", choices=("auto", "tool", "tissue"), default="auto", help="what is bright in the masks"
+    )
+    parser.add_argument(
+        "--pose-convention", choices=get_args(PoseConvention), default="opengl", help="axes of poses_bounds.npy"
     )
     parser.add_argument(
         "--holdout",
@@ -108,7 +115,7 @@ def _add_render(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     parser = _add(commands, "render", "render images of a scene", _render)
     parser.add_argument("scene", type=Path, metavar="SCENE", help="the folder that reconstruct wrote")
     when = parser.add_mutually_exclusive_group(required=True)
-    when.add_argument("--t", type=float, help="time: 0 is the first frame, 1 the end of the clip")
+    when.add_argument("--t", type=_finite, help="time: 0 is the first frame, 1 the end of the clip")
     when.add_argument("--frames", type=_frames, metavar="LIST", help="frame numbers such as 1,9,17; writes a folder")
     parser.add_argument("--pose", help="12 or 16 numbers, or orbit:yaw,pitch,zoom (default: the endoscope's own)")
     parser.add_argument("--width", type=int)
@@ -136,6 +143,13 @@ def _positive(text: str) -> float:
     return value
 
 
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text} is not a time")
+    return value
+
+
 def _frames(text: str) -> list[int]:
     try:
         frames = [int(part) for part in text.split(",")]
@@ -147,15 +161,16 @@ def _frames(text: str) -> list[int]:
 
 
 def _reconstruct(options: argparse.Namespace) -> int:
+    from worker.checkpoint import RESUME_FILE
     from worker.consume import job_progress
     from worker.hooks import Hooks
     from worker.pipeline import ReconstructionRequest, reconstruct
 
     out: Path = options.out
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError("--out", f"{out} is there already and is not an empty folder.", "Name a new folder.")
-    names = ("clip", "right", "layout", "calibration", "masks", "mask_polarity", "holdout", "preset", "budget_s")
-    chosen = {name: getattr(options, name) for name in (*names, "iterations", "device", "seed")}
+    if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= {RESUME_FILE}):
+        problem = f"{out} is there already and is neither an empty folder nor that of a stopped run."
+        raise InputError("--out", problem, "Name a new folder.")
+    chosen = {field.name: getattr(options, field.name) for field in dataclasses.fields(ReconstructionRequest)}
     interrupted = threading.Event()
     out.mkdir(parents=True, exist_ok=True)
     before = signal.signal(signal.SIGINT, _once(interrupted))
@@ -163,6 +178,9 @@ def _reconstruct(options: argparse.Namespace) -> int:
         with ProgressBar(sys.stderr) as bar:
             hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
             reconstruct(ReconstructionRequest(**chosen), out, hooks)
+    except Cancelled as error:
+        again = " The same command goes on from there." if (out / RESUME_FILE).exists() else ""
+        raise Cancelled(f"{error}{again}") from error
     finally:
         signal.signal(signal.SIGINT, before)
     _print_report(json.loads((out / REPORT).read_text()), out)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import platform
 import tempfile
 import time
@@ -17,7 +18,7 @@ import numba
 import numpy as np
 import torch
 
-from contract.errors import Cancelled, InputError, UnavailableError
+from contract.errors import Cancelled, InputError, SceneError, UnavailableError
 from contract.report import Report
 from contract.store import CURVE, REPORT
 from worker.baselines import copy_baselines
@@ -54,7 +55,8 @@ _Result = TypeVar("_Result")
 class ReconstructionRequest:
     """What to reconstruct and how; the fields are those of `intrasplat reconstruct --help`.
 
-    budget_s and iterations exclude each other; without either the preset decides.
+    preset is a name, or a preset of the caller's own. budget_s and iterations exclude each other; without either the
+    preset decides.
     """
 
     clip: Path
@@ -65,7 +67,7 @@ class ReconstructionRequest:
     mask_polarity: MaskPolarity = "auto"
     pose_convention: PoseConvention = "opengl"
     holdout: str = "every8"
-    preset: str = "fast"
+    preset: str | Preset = "fast"
     budget_s: float | None = None
     iterations: int | None = None
     device: str = "auto"
@@ -84,8 +86,10 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
         Cancelled: hooks.should_stop said so.
     """
     accepted = time.perf_counter()
-    preset = preset_named(request.preset)
+    preset = request.preset if isinstance(request.preset, Preset) else preset_named(request.preset)
+    check_options(request)
     check_device(request.device)
+    out_dir.mkdir(parents=True, exist_ok=True)
     seconds: dict[str, float] = {}
 
     clip = timed(seconds, "depth_s", lambda: depth_clip_of(request, hooks))
@@ -115,6 +119,20 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
     save_scene(out_dir, scene, beside=(REPORT, CURVE))
     (out_dir / RESUME_FILE).unlink(missing_ok=True)
     return report
+
+
+def check_options(request: ReconstructionRequest) -> None:
+    """Refuse a length or seed that cannot be meant; InputError names it."""
+    budget_s, iterations = request.budget_s, request.iterations
+    if budget_s is not None and iterations is not None:
+        problem = f"{budget_s:g} s came together with {iterations} iterations."
+        raise InputError("options.budget_s", problem, "Give one of them.")
+    if budget_s is not None and not (math.isfinite(budget_s) and budget_s > 0):
+        raise InputError("options.budget_s", f"{budget_s:g} s is no time to train in.", "Give seconds above 0.")
+    if iterations is not None and iterations < 1:
+        raise InputError("options.iterations", f"{iterations} is less than one step.", "Give 1 or more.")
+    if request.seed < 0:
+        raise InputError("options.seed", f"{request.seed} is negative.", "Give 0 or more.")
 
 
 def check_device(device: str) -> None:
@@ -172,9 +190,10 @@ def prepare(
     frames = TrainingFrames(clip, split.train, scale)
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
     fixed = request.iterations or (None if request.budget_s else preset.iterations)
-    run = Run(model, frames, preset, fixed or 1, request.seed, densifier=densifier)
+    budget_s = request.budget_s or preset.budget_s
+    asked = f"{fixed} iterations" if fixed else f"{budget_s} s"
+    run = Run(model, frames, preset, fixed or 1, request.seed, asked, densifier=densifier)
     if fixed is None:
-        budget_s = request.budget_s or preset.budget_s
         assert budget_s is not None
         run.iterations = 1000  # any length: calibration needs a place in the schedule, not its end
         run.iterations = iterations_within(run, budget_s, clock.elapsed_s)
@@ -185,14 +204,14 @@ def resume(out_dir: Path, run: Run) -> float | None:
     """Go on with the run stored in out_dir, if there is one; its t_train_s.
 
     Raises:
-        InputError: it is of another preset, seed or clip.
+        InputError: it was started with another preset, seed, length or clip, or cannot be read.
     """
     if not (out_dir / RESUME_FILE).exists():
         return None
     try:
         return load_run(out_dir, run)
-    except (ValueError, KeyError) as error:
-        problem = f"{out_dir / RESUME_FILE} does not continue this request: {error}."
+    except (ValueError, KeyError, SceneError) as error:
+        problem = f"{out_dir / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
         raise InputError("--out", problem, "Give the options it was started with, or name a new folder.") from error
 
 
@@ -211,7 +230,8 @@ def view_function(run: Run, scale: float) -> Callable[[int], View]:
 def held_out_psnr(clip: DepthClip, split: FrameSplit, view_of: Callable[[int], View]) -> float:
     """Mean psnr_tissue over at most sixteen held-out frames, evenly spread; NaN without any."""
     scores = [psnr_tissue(view_of(i).rgb, clip.rgb[i], clip.tissue[i]) for i in sample_frames(split.held_out, 16)]
-    return float(np.nanmean(scores)) if scores else float("nan")
+    known = [score for score in scores if not math.isnan(score)]  # a frame without tissue has no score
+    return float(np.mean(known)) if known else math.nan
 
 
 def scene_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: int) -> Scene:

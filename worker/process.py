@@ -69,6 +69,7 @@ def request_of(record: JobRecord, spool: Path, device: str) -> ReconstructionReq
         calibration=spool / files.calibration if files.calibration else None,
         masks=spool / files.masks if files.masks else None,
         mask_polarity=options.mask_polarity,
+        pose_convention=options.pose_convention,
         holdout=options.holdout,
         preset=options.preset,
         budget_s=options.budget_s,

@@ -5,6 +5,7 @@ Symbols: T frames, H W pixels; stride = W rounded up to whole vectors.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -90,6 +91,14 @@ class TrainingFrames:
             ],
             np.float32,
         )
+
+    def digest(self) -> str:
+        """SHA-256 over all that training reads of the clip: two runs on the same frames have the same."""
+        found = hashlib.sha256(f"{self.indices} {self.scale!r} {self._rgb.shape}".encode())
+        cameras = np.stack([self.cameras[index] for index in self.indices])
+        for values in (self._rgb, self._weight, self._inverse_depth, cameras):
+            found.update(np.ascontiguousarray(values).data)
+        return found.hexdigest()
 
     def tissue_channels(self, index: int) -> int:
         """Tissue pixels times colour channels: what a squared error is divided by."""

@@ -6,6 +6,7 @@ seed and iterations give the same bits, and a resumed run gives those of an unin
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
 from collections.abc import Callable
@@ -68,6 +69,7 @@ class Run:
     frames       targets and cameras
     preset       rates, loss, order, densification
     iterations   of the whole schedule; iteration: those done
+    asked        the length that was asked for, in words; a stored run goes on only with its own
     densifier    its statistics; None where the preset has no densification
     """
 
@@ -76,6 +78,7 @@ class Run:
     preset: Preset
     iterations: int
     seed: int
+    asked: str = ""
     iteration: int = 0
     densifier: Densifier | None = None
     curve: list[CurvePoint] = field(default_factory=list)
@@ -134,7 +137,7 @@ def train(run: Run, clock: Stopwatch, evaluate: Callable[[], float], hooks: Hook
 
     Raises:
         Cancelled: hooks.should_stop said so; run is as it was after its last full iteration and can be resumed.
-        TrainingDiverged: the loss is not finite, or no Gaussian is left.
+        TrainingDiverged: the loss or a parameter is not finite, or no Gaussian is left.
     """
     marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s]
     scored: float | None = run.curve[-1].psnr_tissue_db if run.curve else None
@@ -163,7 +166,15 @@ def train(run: Run, clock: Stopwatch, evaluate: Callable[[], float], hooks: Hook
             left_s = (now - began) / (iteration - begun_at) * (run.iterations - iteration)
             share = iteration / run.iterations
             hooks.on_progress(Progress("train", share, iteration, run.iterations, scored, left_s))
+    _check_finite(run)
     _score(run, clock, evaluate)
+
+
+def _check_finite(run: Run) -> None:
+    """A Gaussian that is not a number is not drawn either, so the loss alone does not show it."""
+    broken = [name for name, values in run.model.arrays().items() if not np.isfinite(values).all()]
+    if broken:
+        raise TrainingDiverged(f"After {run.iteration} iterations {', '.join(broken)} hold values that are no numbers.")
 
 
 def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], float]) -> float | None:
@@ -180,8 +191,7 @@ def save_run(directory: Path, run: Run, t_train_s: float) -> None:
     arrays = {**run.model.arrays(), **(run.densifier.arrays() if run.densifier else {})}
     tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}
     state = {
-        "preset": run.preset.name,
-        "seed": run.seed,
+        "identity": _identity(run),
         "iteration": run.iteration,
         "iterations": run.iterations,
         "count": run.model.count,
@@ -191,16 +201,29 @@ def save_run(directory: Path, run: Run, t_train_s: float) -> None:
     save_resume(directory, tensors, state)
 
 
+def _identity(run: Run) -> dict[str, str]:
+    """By the words for it, what a stored run must share with the one that goes on from it."""
+    return {
+        "preset": run.preset.name,
+        "settings of the preset": hashlib.sha256(repr(run.preset).encode()).hexdigest(),
+        "seed": str(run.seed),
+        "length": run.asked,
+        "clip, or other frames of it": run.frames.digest(),
+    }
+
+
 def load_run(directory: Path, run: Run) -> float:
     """Put a freshly built run where a stored one was; returns its t_train_s.
 
     Raises:
         SceneError: nothing usable is stored there.
-        ValueError: it belongs to another preset, seed or clip.
+        ValueError: it was started with another preset, seed, length or clip.
     """
     tensors, state = load_resume(directory)
-    if (state["preset"], state["seed"]) != (run.preset.name, run.seed):
-        raise ValueError(f"the stored run is of preset {state['preset']}, seed {state['seed']}")
+    stored = state.get("identity", {})
+    differing = [f"another {name}" for name, own in _identity(run).items() if stored.get(name) != own]
+    if differing:
+        raise ValueError(f"the stored run was started with {', '.join(differing)}")
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
     if state["count"] != run.model.count:  # densified since the start
         columns = np.zeros(state["count"], np.int64)
