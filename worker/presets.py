@@ -22,7 +22,7 @@ class Preset:
     """One way of training.
 
     fusion           which points become Gaussians
-    points_per_image "fill" fusion takes the finest grid stride that stays below this many points a frame
+    points_per_image "fill" fusion takes the grid stride that comes nearest to this many points a frame
     deformation      "shared", "fdm", "fdm-quartic", "pfs", "hexplane"
     bases            B of the deformation; the most of it for "shared", which takes one for every few frames
     tracks           whether optical-flow tracks start the motion ("shared" only)

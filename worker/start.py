@@ -28,10 +28,10 @@ MIN_STRIDE = 2
 
 
 def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
-    """The preset's fusion; "fill" with the finest stride whose grid has at most points_per_image points."""
+    """The preset's fusion; "fill" with the stride whose grid comes nearest to points_per_image points."""
     if preset.points_per_image is None or preset.fusion.mode != "fill":
         return preset.fusion
-    stride = math.ceil(math.sqrt(intrinsics.width * intrinsics.height / preset.points_per_image))
+    stride = round(math.sqrt(intrinsics.width * intrinsics.height / preset.points_per_image))
     return dataclasses.replace(preset.fusion, stride=max(MIN_STRIDE, stride))
 
 

@@ -152,7 +152,8 @@ def train(run: Run, clock: Stopwatch, evaluate: Callable[[], float], hooks: Hook
         run.iteration = iteration
         if run.densifier is not None:
             run.densifier.observe(run.model)
-            run.densifier.apply(run.model, iteration, np.random.default_rng([run.seed, iteration, 1]))
+            if iteration < run.iterations:  # what is split then would get no step any more
+                run.densifier.apply(run.model, iteration, np.random.default_rng([run.seed, iteration, 1]))
 
         # the curve
         if marks and clock.elapsed_s >= marks[0] and iteration < run.iterations:

@@ -4,10 +4,12 @@ A tile is LANES pixels wide and TILE_ROWS tall: as narrow as a vector, tall to k
 low. A slot is one (splat, tile) pair with its range of rows; the slots of a splat are consecutive, so the gradients the
 blend writes a slot are summed without atomics and in a fixed order.
 
-    slot_start [N + 1]  slots of splat g are slot_start[g] : slot_start[g + 1]
-    slot_splat [M]      the splat of a slot
-    slot_rows  [M, 2]   first and end row inside the tile, exact for the ellipse within the tile's columns
+    slot_start, slot_count [N]   slots of splat g: slot_count[g] of them from slot_start[g]
+    slot_splat, slot_tile  [M]   the splat and the tile of a slot
+    slot_rows              [M, 2] first and end row inside the tile, exact for the ellipse within the tile's columns
     tile_start [tiles + 1], tile_slots [M]   the slots of a tile, nearest splat first
+
+Each thread has a region of the M places for the slots of its splats, so one pass over the splats is enough.
 """
 
 from __future__ import annotations
@@ -65,43 +67,36 @@ def _columns(splats, g, extent2, tiles_x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def count_slots(thread, threads, splats, radius2, height, tiles_x, slot_count):  # type: ignore[no-untyped-def]
-    """slot_count [N]: tiles each splat touches."""
+def fill_slots(  # type: ignore[no-untyped-def]
+    thread, threads, splats, radius2, height, tiles_x,
+    slot_start, slot_count, slot_splat, slot_tile, slot_rows, region_end,
+):  # fmt: skip
+    """Write the slots of the thread's share of splats into its region, an equal share of the slot arrays.
+
+    region_end [threads]: where they end, or would: beyond the region nothing is written, and the caller makes room.
+    """
+    region = slot_splat.shape[0] // threads
+    slot, full = thread * region, (thread + 1) * region
     count = splats.shape[0]
     for g in range(count * thread // threads, count * (thread + 1) // threads):
-        slots = 0
+        slot_start[g] = slot
+        first, last = 0, -1
         if radius2[g] >= 0.0:
             first, last = _columns(splats, g, radius2[g], tiles_x)
-            for column in range(first, last + 1):
-                top, end = _rows(splats, g, radius2[g], column * LANES + 0.5, column * LANES + LANES - 0.5)
-                top, end = max(top, 0), min(end, height)
-                if top < end:
-                    slots += (end - 1) // TILE_ROWS - top // TILE_ROWS + 1
-        slot_count[g] = slots
-
-
-@njit(cache=True, nogil=True)
-def fill_slots(  # type: ignore[no-untyped-def]
-    thread, threads, splats, radius2, height, tiles_x, slot_start, slot_splat, slot_tile, slot_rows
-):
-    """Write the slots of every splat at slot_start[g]; the same walk as count_slots."""
-    count = splats.shape[0]
-    for g in range(count * thread // threads, count * (thread + 1) // threads):
-        slot = slot_start[g]
-        if slot == slot_start[g + 1]:
-            continue
-        first, last = _columns(splats, g, radius2[g], tiles_x)
         for column in range(first, last + 1):
             top, end = _rows(splats, g, radius2[g], column * LANES + 0.5, column * LANES + LANES - 0.5)
             top, end = max(top, 0), min(end, height)
             if top >= end:
                 continue
             for band in range(top // TILE_ROWS, (end - 1) // TILE_ROWS + 1):
-                slot_splat[slot] = g
-                slot_tile[slot] = band * tiles_x + column
-                slot_rows[slot, 0] = max(top - band * TILE_ROWS, 0)
-                slot_rows[slot, 1] = min(end - band * TILE_ROWS, TILE_ROWS)
+                if slot < full:
+                    slot_splat[slot] = g
+                    slot_tile[slot] = band * tiles_x + column
+                    slot_rows[slot, 0] = max(top - band * TILE_ROWS, 0)
+                    slot_rows[slot, 1] = min(end - band * TILE_ROWS, TILE_ROWS)
                 slot += 1
+        slot_count[g] = slot - slot_start[g]
+    region_end[thread] = slot
 
 
 @njit(cache=True, nogil=True)
@@ -138,17 +133,21 @@ def depth_order(splats, radius2, order, keys, other_order, other_keys):  # type:
 
 
 @njit(cache=True, nogil=True)
-def sort_into_tiles(order, visible, slot_start, slot_tile, tile_start, tile_slots):  # type: ignore[no-untyped-def]
+def sort_into_tiles(  # type: ignore[no-untyped-def]
+    order, visible, slot_start, slot_count, slot_tile, region_end, tile_start, tile_slots
+):
     """Counting sort of the slots by tile, splats taken in depth order."""
     tile_start[:] = 0
-    for slot in range(slot_tile.shape[0]):
-        tile_start[slot_tile[slot] + 1] += 1
+    region = slot_tile.shape[0] // region_end.shape[0]
+    for thread in range(region_end.shape[0]):
+        for slot in range(thread * region, region_end[thread]):
+            tile_start[slot_tile[slot] + 1] += 1
     for tile in range(tile_start.shape[0] - 1):
         tile_start[tile + 1] += tile_start[tile]
     cursor = tile_start[:-1].copy()
     for i in range(visible):
         g = order[i]
-        for slot in range(slot_start[g], slot_start[g + 1]):
+        for slot in range(slot_start[g], slot_start[g] + slot_count[g]):
             tile = slot_tile[slot]
             tile_slots[cursor[tile]] = slot
             cursor[tile] += 1

@@ -28,10 +28,9 @@ def kernel_cache_directory() -> Path:
     folder = Path(__file__).parent
     for source in [*sorted(folder.glob("*.py")), folder.parent / "__init__.py"]:
         digest.update(source.read_bytes())
-    base = os.environ.get("INTRASPLAT_CACHE")
-    if not base:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "intrasplat"
-    return Path(base) / "kernels" / digest.hexdigest()[:16]
+    chosen = os.environ.get("INTRASPLAT_CACHE")
+    base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "intrasplat"
+    return base / "kernels" / digest.hexdigest()[:16]
 
 
 def use_kernel_cache() -> None:

@@ -16,7 +16,7 @@ from worker.gaussians import Gaussians
 from worker.optimize import StepRates, adam_step_size
 from worker.raster.cpu import harmonics, update
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
-from worker.raster.cpu.rasterizer import Floats, Rasterizer, Target, padded
+from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, Target, padded
 from worker.raster.cpu.threads import run
 
 PAD_LOGIT = -30.0
@@ -124,6 +124,12 @@ class FusedModel:
                 gradients.colour, self._v_rest, gradients.state,
             )  # fmt: skip
         self.motion.update(gradients.state, t, rates, iteration)
+        self.update_canonical(gradients, rates, iteration, sh_degree)
+        colour_l1, depth_l1, squared_error, holes = self.rasterizer.statistics.sum(0, dtype=np.float64).tolist()
+        return StepSums(colour_l1, depth_l1, squared_error, holes)
+
+    def update_canonical(self, gradients: Gradients, rates: StepRates, iteration: int, sh_degree: int) -> None:
+        """One Adam step of everything but the motion, given dL/dcanonical."""
         canonical, moments = self.canonical, self._moments["canonical"]
         groups = ((0, 3, rates.mean), (3, 7, rates.quaternion), (7, 10, rates.log_scale), (10, 13, rates.colour))
         for first, last, rate in groups:
@@ -134,8 +140,6 @@ class FusedModel:
         if sh_degree > 0:
             rest, used = self._moments["sh_rest"], slice(0, (sh_degree + 1) ** 2 - 1)
             _adam(self.sh_rest[used], self._v_rest[used], rest[:, used], rates.sh_rest, rates.eps, iteration)
-        colour_l1, depth_l1, squared_error, holes = self.rasterizer.statistics.sum(0, dtype=np.float64).tolist()
-        return StepSums(colour_l1, depth_l1, squared_error, holes)
 
     def take(self, columns: NDArray[np.int64], fresh: NDArray[np.bool_]) -> None:
         """Keep these Gaussians, in this order (repeats are copies); Adam's moments start at 0 where fresh."""

@@ -171,12 +171,12 @@ def project(thread, threads, camera, state, opacity_logit, colour, splats, radiu
 
 @njit(cache=True, nogil=True)
 def project_backward(  # type: ignore[no-untyped-def]
-    thread, threads, camera, state, opacity_logit, radius2, slot_start, slots,
+    thread, threads, camera, state, opacity_logit, radius2, slot_start, slot_count, slots,
     v_state, v_opacity_logit, v_colour, v_mean2d_norm, v_pose,
 ):  # fmt: skip
     """Sum the blend's gradients of each Gaussian over its tiles and carry them back to its parameters.
 
-    slots [M, GRADIENT], those of Gaussian g at slot_start[g] : slot_start[g + 1]. Every v_* row is written (zeros for
+    slots [M, GRADIENT], those of Gaussian g the slot_count[g] from slot_start[g]. Every v_* row is written (zeros for
     culled Gaussians). v_mean2d_norm [N]: |dL/dmean2d| in normalised device coordinates (x times W / 2, y times H / 2),
     the unit in which densification thresholds are published. v_pose [threads, 12]: the thread's share of
     dL/d camera_from_world. With G = dL/dconic: dL/dcov2d = -conic G conic; dL/dSigma = A^T dL/dcov2d A.
@@ -189,14 +189,14 @@ def project_backward(  # type: ignore[no-untyped-def]
     total = np.zeros(GRADIENT)
     count = state.shape[1]
     for g in range(count * thread // threads, count * (thread + 1) // threads):
-        if radius2[g] < 0.0 or slot_start[g] == slot_start[g + 1]:
+        if radius2[g] < 0.0 or slot_count[g] == 0:
             v_state[:, g] = 0.0
             v_colour[:, g] = 0.0
             v_opacity_logit[g] = 0.0
             v_mean2d_norm[g] = 0.0
             continue
         total[:] = 0.0
-        for slot in range(slot_start[g], slot_start[g + 1]):
+        for slot in range(slot_start[g], slot_start[g] + slot_count[g]):
             for k in range(GRADIENT):
                 total[k] += slots[slot, k]
         v_colour[0, g], v_colour[1, g], v_colour[2, g] = total[0], total[1], total[2]

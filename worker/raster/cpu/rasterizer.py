@@ -67,6 +67,7 @@ class Rasterizer:
         self._planes = np.zeros((THREADS, PLANES * PLANE), np.float32)
         self._trail = np.zeros((THREADS, 0), np.float32)
         self._tile_start = np.zeros(self.tiles + 1, np.int64)
+        self._region_end = np.zeros(THREADS, np.int64)
         self._no_target = Target(np.zeros(1, np.uint8), np.zeros(1, np.uint8), np.zeros(1, np.float32))
         self._allocate_gaussians(0)
         self._allocate_slots(0)
@@ -74,7 +75,7 @@ class Rasterizer:
     def _allocate_gaussians(self, count: int) -> None:
         self.splats = np.zeros((count, project.SPLAT), np.float32)
         self.radius2 = np.full(count, -1.0, np.float32)
-        self.slot_start = np.zeros(count + 1, np.int64)
+        self.slot_start = np.zeros(count, np.int64)
         self._slot_count = np.zeros(count, np.int32)
         self._order = np.zeros((2, count), np.int32)
         self._keys = np.zeros((2, count), np.uint32)
@@ -87,7 +88,6 @@ class Rasterizer:
         )
 
     def _allocate_slots(self, capacity: int) -> None:
-        self._capacity = capacity
         self._slot_splat = np.zeros(capacity, np.int32)
         self._slot_tile = np.zeros(capacity, np.int32)
         self._slot_rows = np.zeros((capacity, 2), np.int16)
@@ -110,22 +110,33 @@ class Rasterizer:
 
     def bin(self) -> None:
         """Second third: the slots of every splat."""
-        run(bins.count_slots, self.splats, self.radius2, self.height, self.tiles_x, self._slot_count)
-        np.cumsum(self._slot_count, out=self.slot_start[1:])
-        self.slot_total = int(self.slot_start[-1])
-        if self.slot_total > self._capacity:
-            self._allocate_slots(self.slot_total + self.slot_total // 4)
+        if not self._filled():
+            most = int(self._region_slots.max())
+            self._allocate_slots(THREADS * (most + most // 4))
+            self._filled()
+
+    def _filled(self) -> bool:
+        """Write the slots; False where a thread's region is too small for its own."""
         run(
-            bins.fill_slots, self.splats, self.radius2, self.height, self.tiles_x,
-            self.slot_start, self._slot_splat, self._slot_tile, self._slot_rows,
+            bins.fill_slots, self.splats, self.radius2, self.height, self.tiles_x, self.slot_start, self._slot_count,
+            self._slot_splat, self._slot_tile, self._slot_rows, self._region_end,
         )  # fmt: skip
+        return int(self._region_slots.max()) <= len(self._slot_splat) // THREADS
+
+    @property
+    def _region_slots(self) -> NDArray[np.int64]:
+        """[THREADS] slots of each thread's splats."""
+        region = len(self._slot_splat) // THREADS
+        return np.asarray(self._region_end - region * np.arange(THREADS))
 
     def sort(self) -> None:
         """Last third: the slots of every tile, nearest first."""
         order, keys = self._order, self._keys
         visible = bins.depth_order(self.splats, self.radius2, order[0], keys[0], order[1], keys[1])
-        tiles = self._slot_tile[: self.slot_total]
-        bins.sort_into_tiles(order[1], visible, self.slot_start, tiles, self._tile_start, self._tile_slots)
+        bins.sort_into_tiles(
+            order[1], visible, self.slot_start, self._slot_count, self._slot_tile, self._region_end,
+            self._tile_start, self._tile_slots,
+        )  # fmt: skip
 
     def _reserve_trail(self) -> None:
         """Room for the alphas and weights of the fullest tile, one such room a thread."""
@@ -171,6 +182,6 @@ class Rasterizer:
         out = self.gradients
         run(
             project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,
-            self.slot_start, self._slots, out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
+            self.slot_start, self._slot_count, self._slots, out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
         )  # fmt: skip
         return out
