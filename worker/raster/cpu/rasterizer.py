@@ -182,6 +182,7 @@ class Rasterizer:
         out = self.gradients
         run(
             project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,
-            self.slot_start, self._slot_count, self._slots, out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
+            self.slot_start, self._slot_count, self._slots,
+            out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
         )  # fmt: skip
         return out
