@@ -1,0 +1,69 @@
+"""Presets say what they claim: the published numbers, and variants of the published method that differ in one thing."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from contract.errors import InputError
+from worker.presets import PRESETS, Preset, preset_named
+
+VARIANTS = {
+    "paper-released": {"deformation"},
+    "paper-wide": {"start_width"},
+    "pfs": {"deformation", "start_width"},
+    "hexplane": {"deformation", "bases", "start_width"},
+    "without_mapf": {"fusion"},
+}
+
+
+def differing(one: Preset, other: Preset) -> set[str]:
+    names = {field.name for field in dataclasses.fields(Preset)} - {"name"}
+    return {name for name in names if getattr(one, name) != getattr(other, name)}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_is_found_under_its_own_name(name: str) -> None:
+    assert preset_named(name).name == name
+
+
+def test_an_unknown_preset_is_refused_with_those_there_are() -> None:
+    with pytest.raises(InputError) as refused:
+        preset_named("quality")
+    assert refused.value.field == "options.preset"
+    assert "'quality'" in refused.value.problem
+    assert all(name in refused.value.remedy for name in PRESETS)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_has_a_length_of_its_own(name: str) -> None:
+    preset = PRESETS[name]
+    assert (preset.iterations is None) != (preset.budget_s is None)
+
+
+@pytest.mark.parametrize(("name", "fields"), VARIANTS.items())
+def test_a_rival_differs_from_the_paper_in_what_it_is_named_for_alone(name: str, fields: set[str]) -> None:
+    assert differing(PRESETS[name], PRESETS["paper"]) == fields
+
+
+def test_the_paper_is_trained_as_published() -> None:
+    paper = PRESETS["paper"]
+    assert (paper.deformation, paper.bases, paper.start_width) == ("fdm", 17, 0.01)
+    assert (paper.iterations, paper.order, paper.sh_degree) == (3000, "random", 3)
+    assert paper.fusion.mode == "paper"
+    assert paper.densify is not None
+    assert paper.densify.from_iteration == 600
+    assert (paper.loss.colour_weight, paper.loss.depth_weight) == (1, 1)
+    assert not paper.loss.normalised_depth
+    assert paper.rates.motion_mean == paper.rates.mean
+    # 1.6e-3 falls log-linearly to a hundredth of itself over 4000 steps, of which 3000 are made
+    for progress in (0.0, 0.3, 1.0):
+        assert paper.rates.mean.at(progress) == pytest.approx(1.6e-3 * 0.01 ** (progress * 3000 / 4000), rel=1e-3)
+
+
+def test_presets_cannot_be_changed_by_accident() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        PRESETS["fast"].bases = 3  # type: ignore[misc]
+    with pytest.raises(TypeError):
+        PRESETS["mine"] = PRESETS["fast"]  # type: ignore[index]

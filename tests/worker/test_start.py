@@ -1,0 +1,89 @@
+"""A model before its first step stands where its points are, and moves as the tracks say or not at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from contract.camera import Intrinsics
+from tests.helpers import assert_close
+from tests.worker.phantoms import phantom_clip
+from worker.clip import DepthClip
+from worker.fusion import PointCloud, fuse
+from worker.model import Model
+from worker.presets import PRESETS, Preset
+from worker.start import MIN_STRIDE, bases_of, fusion_for, start_model
+from worker.targets import units_per_mm
+
+TIMES = (0.0, 0.31, 11 / 12)
+
+
+def camera(width: int, height: int) -> Intrinsics:
+    return Intrinsics(width=width, height=height, fx=width, fy=width, cx=width / 2, cy=height / 2)
+
+
+def started(clip: DepthClip, preset: Preset, train: list[int] | None = None) -> tuple[Model, PointCloud, float]:
+    frames = train or list(range(clip.frame_count))
+    scale = units_per_mm(clip, frames)
+    cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0)
+    return start_model(cloud, clip, frames, preset, scale, seed=0), cloud, scale
+
+
+@pytest.mark.parametrize("size", [(640, 512), (1280, 1024), (333, 777), (64, 48)])
+def test_the_grid_of_points_is_the_finest_that_keeps_to_the_limit(size: tuple[int, int]) -> None:
+    preset = PRESETS["fast"]
+    assert preset.points_per_image is not None
+    stride = fusion_for(preset, camera(*size)).stride
+    assert size[0] * size[1] / stride**2 <= preset.points_per_image
+    assert stride == MIN_STRIDE or size[0] * size[1] / (stride - 1) ** 2 > preset.points_per_image
+
+
+def test_the_published_fusion_is_left_as_it_is() -> None:
+    assert fusion_for(PRESETS["paper"], camera(640, 512)) == PRESETS["paper"].fusion
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_without_tracks_the_model_is_at_rest_on_its_points(name: str) -> None:
+    preset = dataclasses.replace(PRESETS[name], tracks=False)
+    model, cloud, scale = started(phantom_clip(), preset)
+    assert model.count == len(cloud.points_mm)
+    for t in TIMES:
+        assert_close(model.deformed_mean(t).T, cloud.points_mm * scale, relative=1e-5, name=f"means at {t}")
+
+
+@pytest.mark.parametrize("name", ["fast", "paper"])
+def test_gaussians_start_as_the_preset_says(name: str) -> None:
+    preset = PRESETS[name]
+    gaussians, _ = started(phantom_clip(), preset)[0].export()
+    assert gaussians.sh_degree == preset.sh_degree
+    assert gaussians.opacity_logit.sigmoid().median().item() == pytest.approx(preset.opacity, rel=1e-4)
+    wider, _ = started(phantom_clip(), dataclasses.replace(preset, spread=2 * preset.spread))[0].export()
+    assert_close(wider.log_scale - gaussians.log_scale, np.full(gaussians.log_scale.shape, math.log(2)))
+
+
+def test_with_tracks_each_gaussian_passes_through_its_point_at_the_time_it_was_seen() -> None:
+    clip = phantom_clip()
+    model, cloud, scale = started(clip, PRESETS["fast"])
+    moved = np.zeros(model.count)
+    for index in np.unique(cloud.frame):
+        chosen = cloud.frame == index
+        placed = model.deformed_mean(float(clip.t[index])).T
+        assert_close(placed[chosen], cloud.points_mm[chosen] * scale, relative=1e-5, name=f"points of frame {index}")
+        moved = np.maximum(moved, np.linalg.norm(placed - model.deformed_mean(0.0).T, axis=1))
+    assert len(np.unique(cloud.frame)) > 1
+    assert np.linalg.norm(model.deformed_mean(0.4) - model.deformed_mean(0.0), axis=0).mean() / scale > 0.2  # mm
+
+
+@pytest.mark.parametrize("frames", [1, 2, 4, 12])
+def test_a_short_clip_has_no_more_bases_than_frames(frames: int) -> None:
+    model, _, _ = started(phantom_clip(frames=frames), PRESETS["fast"])
+    _, deformation = model.export()
+    assert 1 <= bases_of(deformation) <= frames
+
+
+def test_a_deformation_without_bases_has_zero() -> None:
+    assert bases_of(started(phantom_clip(), PRESETS["paper"])[0].export()[1]) == PRESETS["paper"].bases
+    assert bases_of(started(phantom_clip(), PRESETS["hexplane"])[0].export()[1]) == 0
