@@ -1,0 +1,101 @@
+"""A running service for the tests: real queue, store and ZeroMQ connection; only the image is painted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from contract.embedded import short_socket_path
+from contract.errors import InputError, SceneError
+from contract.job import JobRecord
+from contract.queue import Claim
+from contract.queue_memory import MemoryQueue
+from contract.rendering import ExportRequest, RenderRequest, WorkerAddress
+from contract.settings import Settings
+from contract.store import CURVE, MANIFEST, REPORT, Store
+from service.app import create_app
+from service.renderer import ZmqRenderer
+from tests.service.asgi import AsgiClient, serving
+from worker.serve import RequestServer, View
+
+CLIP = b"not a video, but the service does not look inside" * 100
+IDENTITY = "1,0,0,0,0,1,0,0,0,0,1,0"
+
+
+class Painter:
+    """Answers like a worker and remembers what it was asked."""
+
+    def __init__(self) -> None:
+        self.requests: list[RenderRequest | ExportRequest] = []
+
+    def answer(self, request: RenderRequest | ExportRequest) -> View:
+        self.requests.append(request)
+        if isinstance(request, ExportRequest):
+            return View(b"ply\n", "application/octet-stream", request.t)
+        if request.camera.width == 8:
+            raise InputError("width", "8 is too narrow.", "Use more.")
+        if request.camera.width == 9:
+            raise SceneError("The scene is damaged.")
+        if request.camera.width == 10:
+            raise RuntimeError("patient Smith")
+        warnings = ("t is after the last frame", "ansicht – geschätzt") if request.t > 1 else ()
+        return View(request.format.value.encode(), f"image/{request.format.value}", min(request.t, 1.0), warnings)
+
+
+@dataclass
+class House:
+    """A running service and what it stands on."""
+
+    http: AsgiClient
+    queue: MemoryQueue
+    store: Store
+    painter: Painter
+
+    def upload(self, options: str = "{}", parts: Mapping[str, tuple[str, bytes]] | None = None) -> httpx.Response:
+        return self.http.post("/reconstruct", files=parts or {"clip": ("a.mp4", CLIP)}, data={"options": options})
+
+    def claimed(self) -> tuple[JobRecord, Claim]:
+        record = self.queue.claim("worker-1", 0.0)
+        assert record is not None
+        return record, Claim(record.job_id, record.attempt, "worker-1")
+
+    def finished_scene(self) -> str:
+        self.upload()
+        record, claim = self.claimed()
+        folder = self.store.work_folder(record.job_id, record.attempt)
+        (folder / MANIFEST).write_text("{}")
+        (folder / REPORT).write_text('{"psnr_tissue_db": 36.2, "warnings": []}')
+        (folder / CURVE).write_text("t_train_s,psnr_tissue_db\n1,30\n")
+        self.store.publish_scene(record.job_id, record.attempt)
+        self.queue.finish(claim)
+        return record.job_id
+
+    def spooled(self) -> list[Path]:
+        return [path for area in ("incoming", "spool") for path in (self.store.data_dir / area).iterdir()]
+
+
+def make_house(data_dir: Path, **changes: Any) -> Iterator[House]:
+    queue, store, painter = MemoryQueue(), Store(data_dir), Painter()
+    settings = Settings(data_dir=data_dir, render_timeout_s=5.0, min_free_bytes=0).model_copy(update=changes)
+    app = create_app(settings, queue, store, ZmqRenderer(queue, settings.render_timeout_s))
+    endpoint = f"ipc://{short_socket_path(store.run_dir, 'worker-1.sock')}"
+    with (
+        RequestServer(endpoint, painter.answer),
+        serving(app, "http://127.0.0.1:8765") as http,
+    ):
+        queue.announce(WorkerAddress(name="worker-1", endpoint=endpoint, device="cpu"))
+        yield House(http, queue, store, painter)
+
+
+def assert_problem(response: httpx.Response, status: int, field: str | None = None) -> dict[str, Any]:
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    problem: dict[str, Any] = response.json()
+    assert problem["status"] == status
+    assert problem["detail"]
+    assert problem.get("field") == field
+    return problem

@@ -1,0 +1,115 @@
+"""Pictures and scenes: asked of the worker, described truthfully, gone when deleted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from contract.embedded import short_socket_path
+from contract.job import JobState
+from contract.rendering import RenderRequest, WorkerAddress
+from tests.service.house import IDENTITY, House, assert_problem, make_house
+
+
+def test_a_render_carries_scene_state_and_time_and_its_request_reaches_the_worker(house: House) -> None:
+    scene = house.finished_scene()
+    query = {"t": "0.4", "pose": "orbit:10,-5,1.5", "scene": scene, "width": "64", "layer": "depth", "format": "npy"}
+    response = house.http.get("/render", params=query)
+    assert response.status_code == 200, response.text
+    assert response.content == b"npy"
+    assert response.headers["x-intrasplat-scene"] == scene
+    assert response.headers["x-intrasplat-state"] == "done"
+    assert response.headers["x-intrasplat-t"] == "0.4"
+    assert "x-intrasplat-warning" not in response.headers
+    (request,) = house.painter.requests
+    assert isinstance(request, RenderRequest)
+    assert request.model_dump(include={"t", "layer", "scene_id"}) == {"t": 0.4, "layer": "depth", "scene_id": scene}
+    assert request.pose is not None
+    assert request.pose.kind == "orbit"
+    assert request.camera.width == 64
+
+
+def test_warnings_of_a_render_come_as_a_header(house: House) -> None:
+    house.finished_scene()
+    response = house.http.get("/render", params={"t": 2, "pose": IDENTITY})
+    assert response.headers["x-intrasplat-t"] == "1"
+    assert response.headers["x-intrasplat-warning"].startswith("t is after the last frame; ansicht")
+
+
+def test_the_scene_may_be_left_out_only_while_there_is_exactly_one(house: House) -> None:
+    assert_problem(house.http.get("/render"), 400, "scene")
+    first = house.finished_scene()
+    assert house.http.get("/render").headers["x-intrasplat-scene"] == first
+    house.finished_scene()
+    assert "2 scenes" in assert_problem(house.http.get("/render"), 400, "scene")["detail"]
+
+
+@pytest.mark.parametrize(
+    ("query", "status", "field"),
+    [
+        ({"t": "-0.1"}, 422, "t"),
+        ({"t": "nan"}, 422, "t"),
+        ({"t": "soon"}, 422, "t"),
+        ({"pose": "1,2,3"}, 422, "pose"),
+        ({"pose": IDENTITY.replace("1,", "3,", 1)}, 422, "pose"),
+        ({"layer": "xray"}, 422, "layer"),
+        ({"format": "gif"}, 422, "format"),
+        ({"width": "100000"}, 422, "width"),
+        ({"fx": "inf"}, 422, "fx"),
+        ({"scene": "../../etc/passwd"}, 404, "scene"),
+        ({"scene": "0" * 32}, 404, "scene"),
+        ({"width": "8"}, 422, "width"),
+        ({"width": "9"}, 404, "scene"),
+        ({"width": "10"}, 500, None),
+    ],
+)
+def test_a_render_that_cannot_be_made_is_a_problem(
+    house: House, query: dict[str, str], status: int, field: str | None
+) -> None:
+    house.finished_scene()
+    response = house.http.get("/render", params=query)
+    assert_problem(response, status, field)
+    assert "Smith" not in response.text
+
+
+def test_without_a_worker_renders_are_unavailable_and_the_service_is_not_ready(house: House) -> None:
+    house.finished_scene()
+    assert house.http.get("/readyz").json()["workers"] == ["worker-1"]
+    house.queue.withdraw("worker-1")
+    response = house.http.get("/render")
+    assert "intrasplat up" in assert_problem(response, 503)["remedy"]
+    assert response.headers["retry-after"]
+    assert_problem(house.http.get("/readyz"), 503, "worker")
+    assert house.http.get("/healthz").status_code == 200
+
+
+def test_a_worker_that_does_not_answer_is_given_up_in_time(tmp_path: Path) -> None:
+    for house in make_house(tmp_path, render_timeout_s=0.1):
+        house.finished_scene()
+        nobody = f"ipc://{short_socket_path(house.store.run_dir, 'nobody.sock')}"
+        house.queue.withdraw("worker-1")
+        house.queue.announce(WorkerAddress(name="worker-2", endpoint=nobody, device="cpu"))
+        assert_problem(house.http.get("/render"), 503)
+
+
+def test_scenes_have_report_curve_and_export_until_they_are_deleted(house: House) -> None:
+    scene = house.finished_scene()
+    assert house.http.get("/scenes").json()[0]["psnr_tissue_db"] == 36.2
+    assert house.http.get(f"/scenes/{scene}").json()["warnings"] == []
+    assert house.http.get(f"/scenes/{scene}/curve").text.startswith("t_train_s")
+    exported = house.http.get(f"/scenes/{scene}/export", params={"format": "ply", "t": 0.5})
+    assert exported.content == b"ply\n"
+    assert f'filename="{scene}.ply"' in exported.headers["content-disposition"]
+    assert house.http.delete(f"/scenes/{scene}").status_code == 204
+    for path in (f"/scenes/{scene}", f"/scenes/{scene}/curve", f"/jobs/{scene}", f"/scenes/{scene}/export"):
+        assert house.http.get(path).status_code == 404
+    assert [path for path in house.store.data_dir.rglob("*") if scene in path.name] == []
+
+
+def test_a_live_job_is_not_deleted_as_a_scene(house: House) -> None:
+    job_id = house.upload().json()["id"]
+    assert_problem(house.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
+    record = house.queue.get(job_id)
+    assert record is not None
+    assert record.state is JobState.QUEUED

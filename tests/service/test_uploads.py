@@ -1,0 +1,116 @@
+"""What a client sends: kept whole before the answer, or refused with the part named and nothing left behind."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from contract.job import JobRecord
+from contract.store import SUBMISSION
+from tests.service.house import CLIP, House, assert_problem, make_house
+
+
+def test_an_accepted_clip_is_on_disk_and_queued_before_the_answer(house: House) -> None:
+    response = house.upload('{"preset": "fast", "iterations": 30, "holdout": [1, 9]}')
+    assert response.status_code == 202
+    job = response.json()
+    assert response.headers["location"] == f"/jobs/{job['id']}"
+    assert job["state"] == "queued"
+    record = house.queue.get(job["id"])
+    assert record is not None
+    assert record.options.holdout == "1,9"
+    assert record.input_sha256 == hashlib.sha256(CLIP).hexdigest()
+    folder = house.store.spool_folder(job["id"])
+    assert (folder / "clip.mp4").read_bytes() == CLIP
+    assert JobRecord.model_validate_json((folder / SUBMISSION).read_text()) == record
+    assert list((house.store.data_dir / "incoming").iterdir()) == []
+
+
+def test_two_eyes_calibration_and_masks_are_kept_under_our_names(house: House) -> None:
+    eyes = {"left": ("Smith_L.MOV", b"left"), "right": ("Smith_R.mov", b"right")}
+    response = house.upload(parts={**eyes, "calibration": ("stereo.yaml", b"K: 1"), "masks": ("m.zip", b"zip")})
+    record = house.queue.get(response.json()["id"])
+    assert record is not None
+    assert record.files.model_dump() == {
+        "clip": "left.mov",
+        "right": "right.mov",
+        "calibration": "calibration.yaml",
+        "masks": "masks.zip",
+    }
+    assert "Smith" not in "".join(path.read_text() for path in house.store.data_dir.rglob("*.json"))
+
+
+@pytest.mark.parametrize(
+    ("parts", "field"),
+    [
+        ({"left": ("l.mp4", b"x")}, "right"),
+        ({"right": ("r.mp4", b"x")}, "left"),
+        ({"masks": ("m.zip", b"x")}, "clip"),
+        ({"clip": ("c.mp4", b"x"), "right": ("r.mp4", b"x")}, "clip"),
+        ({"clip": ("c.exe", b"x")}, "clip"),
+        ({"clip": ("c", b"x")}, "clip"),
+        ({"clip": ("c.mp4", b"")}, "clip"),
+        ({"clip": ("c.mp4", b"x"), "calibration": ("k.pkl", b"x")}, "calibration"),
+        ({"clip": ("c.mp4", b"x"), "passwd": ("k.json", b"x")}, "passwd"),
+    ],
+)
+def test_an_upload_that_cannot_be_used_names_the_part_and_leaves_nothing(
+    house: House, parts: dict[str, tuple[str, bytes]], field: str
+) -> None:
+    assert assert_problem(house.upload(parts=parts), 422, field)["remedy"]
+    assert house.spooled() == []
+    assert house.queue.records() == []
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ('{"budget_s": 0}', "options.budget_s"),
+        ('{"budget_s": 1, "iterations": 1}', "options"),
+        ('{"layout": "diagonal"}', "options.layout"),
+        ('{"colour": 1}', "options.colour"),
+        ("[1]", "options"),
+        ("{", "options"),
+    ],
+)
+def test_an_option_that_cannot_be_meant_is_named(house: House, options: str, field: str) -> None:
+    assert_problem(house.upload(options), 422, field)
+    assert house.spooled() == []
+
+
+def test_a_part_that_comes_twice_is_refused(house: House) -> None:
+    twice = [("clip", ("a.mp4", b"x")), ("clip", ("b.mp4", b"y"))]
+    assert_problem(house.http.post("/reconstruct", files=twice), 422, "clip")
+
+
+@pytest.mark.parametrize(
+    ("content_type", "body"),
+    [
+        ("application/json", b"{}"),
+        ("multipart/form-data", b"--x"),
+        ("multipart/form-data; boundary=x", b"this is no multipart body"),
+        (
+            "multipart/form-data; boundary=x",
+            b'--x\r\nContent-Disposition: form-data; name="clip"; filename="a.mp4"\r\n\r\nab',
+        ),
+    ],
+)
+def test_a_body_that_is_no_complete_form_is_a_bad_request(house: House, content_type: str, body: bytes) -> None:
+    response = house.http.post("/reconstruct", content=body, headers={"content-type": content_type})
+    assert response.status_code == 400
+    assert response.json()["remedy"]
+    assert house.spooled() == []
+
+
+def test_an_upload_over_the_limit_is_cut_off_while_it_is_counted(tmp_path: Path) -> None:
+    for house in make_house(tmp_path, max_upload_bytes=1000):
+        assert "INTRASPLAT_MAX_UPLOAD_BYTES" in assert_problem(house.upload(), 413, "clip")["remedy"]
+        assert house.spooled() == []
+
+
+def test_nothing_is_accepted_on_a_full_disk(tmp_path: Path) -> None:
+    for house in make_house(tmp_path, min_free_bytes=2**62):
+        assert_problem(house.upload(), 507)
+        assert_problem(house.http.get("/readyz"), 503, "disk")
