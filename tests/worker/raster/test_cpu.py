@@ -330,27 +330,27 @@ def test_motion_takes_the_steps_of_torchs_adam(kind: str) -> None:
 
 
 def test_bases_that_are_negligible_are_left_out_of_deformation_and_training() -> None:
-    shared = SharedBasis.initial(8, bases=9, colour=True)
+    shared = SharedBasis.initial(16, bases=9, colour=True)
     weight = torch.randn(shared.weight.shape, generator=torch.Generator().manual_seed(8))
     deformation = dataclasses.replace(shared, weight=weight)
-    motion = LinearMotion(deformation, 8)
-    state = np.empty((13, 8), np.float32)
-    motion.deform(np.zeros((13, 8), np.float32), 0.26, state)
+    motion = LinearMotion(deformation, 16)
+    state = np.empty((13, 16), np.float32)
+    motion.deform(np.zeros((13, 16), np.float32), 0.26, state)
     bound = NEGLIGIBLE * float(weight.abs().sum(-1).max())
     assert_close(state.T, weight @ deformation.basis(0.26), relative=0.0, absolute=bound)
-    motion.update(np.ones((13, 8), np.float32), 0.26, RATES, 1)
-    changed = (motion.export(8).weight != weight).any(dim=0).any(dim=0)
+    motion.update(np.ones((13, 16), np.float32), 0.26, RATES, 1)
+    changed = (motion.export(16).weight != weight).any(dim=0).any(dim=0)
     alive = deformation.basis(0.26) >= NEGLIGIBLE
     assert 0 < int(alive.sum()) < 9
     assert changed.tolist() == alive.tolist()
 
 
 def test_beyond_six_widths_the_kernels_of_fdm_give_the_canonical_state() -> None:
-    fdm = FlexibleDeformation.initial(8, bases=3, width=0.01)
+    fdm = FlexibleDeformation.initial(16, bases=3, width=0.01)
     fdm = dataclasses.replace(fdm, weight=torch.ones_like(fdm.weight))
-    canonical = np.random.default_rng(0).normal(size=(13, 8)).astype(np.float32)
-    state = np.full((13, 8), np.nan, np.float32)
-    FdmMotion(fdm, 8).deform(canonical, 0.25, state)  # 25 widths from the nearest centre
+    canonical = np.random.default_rng(0).normal(size=(13, 16)).astype(np.float32)
+    state = np.full((13, 16), np.nan, np.float32)
+    FdmMotion(fdm, 16).deform(canonical, 0.25, state)  # 25 widths from the nearest centre
     assert bool((state == canonical).all())
 
 
