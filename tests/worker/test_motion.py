@@ -1,0 +1,153 @@
+"""Tracks follow the tissue: true trajectories of synthetic clips, nothing where nothing moves, bridges over gaps."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.helpers import assert_close
+from worker.clip import DepthClip
+from worker.deformation import SharedBasis
+from worker.motion import Tracks, fit_tracks, track
+from worker.phantom import Motion, PhantomSettings, Trajectories, make_phantom
+
+WIDTH, HEIGHT, FRAMES = 160, 128, 24
+HELD_OUT = range(1, FRAMES, 8)
+TRAIN = [index for index in range(FRAMES) if index not in HELD_OUT]
+TRUSTED = 0.5
+
+
+def phantom(motion: Motion, *, moving_camera: bool = False, noise: bool = True) -> tuple[DepthClip, Trajectories]:
+    settings = PhantomSettings(
+        width=WIDTH, height=HEIGHT, frames=FRAMES, motion=motion, moving_camera=moving_camera, noise=noise,
+    )  # fmt: skip
+    made = make_phantom(settings)
+    return made.depth_clip(), made.trajectories(stride_px=4)
+
+
+def on_tissue(clip: DepthClip, truth: Trajectories) -> NDArray[np.bool_]:
+    """[M] whether the point shows in frame 0, not hidden by the instrument."""
+    rows, columns = truth.pixels.T
+    return np.asarray(clip.tissue[0, rows, columns])
+
+
+def basis_of(clip: DepthClip, bases: int) -> NDArray[np.float64]:
+    """[T, B]"""
+    shared = SharedBasis.initial(1, bases=bases, times=[float(clip.t[i]) for i in TRAIN])
+    return np.stack([shared.basis(float(t)).double().numpy() for t in clip.t])
+
+
+def bare(displacement_mm: NDArray[np.floating], confidence: NDArray[np.floating]) -> Tracks:
+    """Tracks of one row of pixels: displacement [K, N, 3], confidence [K, N]."""
+    return Tracks(displacement_mm[:, None].astype(np.float32), confidence[:, None].astype(np.float32), 1)
+
+
+@pytest.mark.parametrize(
+    ("motion", "moving_camera"), [("breathing", False), ("pull", False), ("breathing", True), ("still", True)]
+)
+def test_trusted_tracks_follow_the_true_points(motion: Motion, moving_camera: bool) -> None:
+    clip, truth = phantom(motion, moving_camera=moving_camera)
+    tracks = track(clip, TRAIN)
+    assert tracks.step_px == 1
+    rows, columns = truth.pixels.T
+    moved = truth.points_mm[TRAIN] - truth.points_mm[0]
+    trusted = (tracks.confidence[:, rows, columns] > TRUSTED) & on_tissue(clip, truth)
+    error_mm = np.linalg.norm(tracks.displacement_mm[:, rows, columns] - moved, axis=-1)
+    assert trusted.mean() > 0.5
+    assert np.median(error_mm[trusted]) < 0.5
+    if motion != "still":
+        assert np.linalg.norm(moved, axis=-1)[trusted].max() > 3  # mm: there was something to follow
+
+
+@pytest.mark.parametrize("motion", ["breathing", "pull"])
+def test_fitted_tracks_also_hold_at_frames_they_never_saw(motion: Motion) -> None:
+    clip, truth = phantom(motion)
+    basis = basis_of(clip, 9)
+    pixels = cast(NDArray[np.intp], truth.pixels[:, 0] * WIDTH + truth.pixels[:, 1])
+    weights, support = fit_tracks(track(clip, TRAIN), basis[TRAIN], pixels, WIDTH)
+    fitted = np.einsum("tb,nbc->tnc", basis, weights)
+    moved = truth.points_mm - truth.points_mm[0]
+    # where the instrument never passes and the flow never fails
+    followed = (support > TRUSTED) & on_tissue(clip, truth)
+    error_mm = np.linalg.norm(fitted - moved, axis=-1)[:, followed]
+    assert followed.mean() > 0.4
+    assert np.median(error_mm[TRAIN]) < 0.5
+    assert np.median(error_mm[list(HELD_OUT)]) < 0.5
+
+
+def test_held_out_frames_are_never_looked_at() -> None:
+    clip, _ = phantom("breathing")
+    expected = track(clip, TRAIN)
+    for layer in (clip.rgb, clip.tissue, clip.depth_mm, clip.depth_confidence):
+        layer[list(HELD_OUT)] = 0
+    found = track(clip, TRAIN)
+    np.testing.assert_array_equal(found.displacement_mm, expected.displacement_mm)
+    np.testing.assert_array_equal(found.confidence, expected.confidence)
+
+
+def test_a_still_clip_does_not_move() -> None:
+    clip, _ = phantom("still")
+    tracks = track(clip, TRAIN)
+    length_mm = np.linalg.norm(tracks.displacement_mm, axis=-1)
+    assert np.median(length_mm[tracks.confidence > TRUSTED]) < 0.05
+    assert np.quantile(length_mm[tracks.confidence > TRUSTED], 0.99) < 0.5
+
+
+def test_nothing_is_trusted_under_the_instrument_or_without_depth() -> None:
+    clip, _ = phantom("breathing")
+    clip.depth_mm[:, :32] = 0
+    tracks = track(clip, TRAIN)
+    assert not tracks.confidence[:, :32].any()
+    assert not tracks.confidence[:, ~clip.tissue[0]].any()
+    assert np.isfinite(tracks.displacement_mm).all()
+    assert tracks.confidence.min() >= 0
+    assert tracks.confidence.max() <= 1
+
+
+@pytest.mark.parametrize(("width", "step"), [(320, 1), (321, 2), (641, 3)])
+def test_a_large_clip_is_followed_on_a_coarser_grid(width: int, step: int) -> None:
+    height = width // 4 + 1
+    clip = make_phantom(PhantomSettings(width=width, height=height, frames=3, motion="breathing")).depth_clip()
+    tracks = track(clip, [0, 2])
+    assert tracks.step_px == step
+    assert tracks.confidence.shape == (2, height // step, width // step)
+    every_pixel = np.arange(width * height)
+    weights, support = fit_tracks(tracks, np.eye(2), every_pixel, width)
+    assert weights.shape == (width * height, 2, 3)
+    assert support[0] == pytest.approx(tracks.confidence[:, 0, 0].mean())
+    assert support[-1] == pytest.approx(tracks.confidence[:, -1, -1].mean())
+
+
+def test_tracks_nobody_trusts_move_nothing(rng: np.random.Generator) -> None:
+    basis = rng.random((6, 4))
+    weights, support = fit_tracks(bare(rng.normal(0, 5, (6, 3, 3)), np.zeros((6, 3))), basis, np.arange(3), 3)
+    assert_close(weights, np.zeros((3, 4, 3)))
+    assert not support.any()
+
+
+def test_motion_the_bases_can_show_is_found_again(rng: np.random.Generator) -> None:
+    times = np.linspace(0, 1, 40, endpoint=False)
+    shared = SharedBasis.initial(1, bases=5)
+    basis = np.stack([shared.basis(float(t)).double().numpy() for t in times])
+    steady = np.linspace(0, 4, 5)[:, None, None] * rng.normal(0, 1, (1, 7, 3))  # [B, N, 3], drifts evenly
+    displacement = np.einsum("kb,bnc->knc", basis, steady)
+    weights, _ = fit_tracks(bare(displacement, np.ones((40, 7))), basis, np.arange(7), 7)
+    fitted = np.einsum("kb,nbc->knc", basis, weights)
+    assert_close(fitted, displacement, relative=0.02)
+
+
+def test_a_gap_of_untrusted_frames_is_bridged() -> None:
+    times = np.linspace(0, 1, 40, endpoint=False)
+    shared = SharedBasis.initial(1, bases=9)
+    basis = np.stack([shared.basis(float(t)).double().numpy() for t in times])
+    drift = np.zeros((40, 1, 3))
+    drift[:, 0, 0] = 8 * times
+    hidden = (times > 0.3) & (times < 0.6)
+    drift[hidden] = 500.0  # what a lost track may say
+    weights, support = fit_tracks(bare(drift, np.where(hidden, 0.0, 1.0)[:, None]), basis, np.arange(1), 1)
+    fitted = basis @ weights[0, :, 0]
+    assert np.abs(fitted - 8 * times)[hidden].max() < 1.0
+    assert support[0] == pytest.approx(1 - hidden.mean())
