@@ -7,8 +7,8 @@ opacity 0.88, on a curved surface at depth 60: every pixel is covered, as after 
 projection, binning, sorting, blend with loss and gradients, their way back to the parameters, and Adam; with shared
 bases (17, colour moving) and with the paper's FDM (17 bases a Gaussian and channel). Then the same against the number
 of pixels, Gaussians held, and against the number of Gaussians, pixels held. Figures are medians in ms, the least beside
-them for busy machines; parts are timed inside whole runs. --scene measures a stored scene instead. The machine's peak is that of two small kernels on the same
-vectors.
+them for busy machines; parts are timed inside whole runs. --scene measures a stored scene instead. The machine's peak
+is that of two small kernels on the same vectors.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def measure(
     settings = np.array([1 / (3 * pixels), 1 / pixels, 1e30, 1e30, 1.0], np.float32)
     works: dict[str, Callable[[], object]] = {
         "render": lambda: model.render(view, TIME),
-        "step": lambda: model.step(view, TIME, target, settings, RATES, 1),
+        "step": lambda: model.step(view, TIME, target, settings, RATES, 1, model.sh_degree),
     }
     blended = blended_per_pixel(model, view)
     rows = []
@@ -145,10 +145,8 @@ def measure(
         call()
         total_ms, least_ms, part_ms = _timed(model, call, repeats)
         aim = f" (target {TARGET_MS[work]:.0f})" if name.startswith("standard: shared") else ""
-        print(
-            f"  {work:6} {total_ms:7.2f} ms{aim}, least {least_ms:.2f}"
-            + (": " + _listed(part_ms, total_ms) if parts else "")
-        )
+        shares = f": {_listed(part_ms, total_ms)}" if parts else ""
+        print(f"  {work:6} {total_ms:7.2f} ms{aim}, least {least_ms:.2f}{shares}")
         row = {"name": name, "work": work, "gaussians": len(gaussians), "blended": round(blended, 1)}
         row |= {"width": camera.width, "height": camera.height, "ms": round(total_ms, 2)}
         row["least_ms"] = round(least_ms, 2)
@@ -157,7 +155,7 @@ def measure(
 
 
 def _timed(model: FusedModel, call: Callable[[], object], repeats: int) -> tuple[float, float, dict[str, float]]:
-    """Median and least ms of call, and median of the parts inside it, by wrapping the model's own methods while it runs."""
+    """Median and least ms of call, median ms of its parts, by wrapping the model's own methods while it runs."""
     spent: dict[str, float] = {}
 
     def wrapped(part: str, method: Callable[..., Any]) -> Callable[..., Any]:
