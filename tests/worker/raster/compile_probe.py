@@ -57,7 +57,8 @@ def use_everything(digest: hashlib._Hash) -> None:
     for motion, degree in motions:
         model = FusedModel(gaussians(degree), motion, WIDTH, HEIGHT)
         pixels = HEIGHT * model.rasterizer.stride
-        target = Target(*(np.full(size, 100, np.uint8) for size in (3 * pixels, pixels)), np.ones(pixels, np.float32))
+        rgb, weight = np.full(3 * pixels, 100, np.uint8), np.full(pixels, 255, np.uint8)
+        target = Target(rgb, weight, np.ones(pixels, np.float32))
         for iteration in range(1, 5):
             settings = np.array([1e-3, 1e-3, 1e30, 1e30, iteration % 2], np.float32)
             used = min(degree, iteration - 1)
