@@ -108,6 +108,8 @@ def step(run: Run, iteration: int) -> float:
     )
     if not math.isfinite(sums.colour_l1 + sums.depth_l1):
         raise TrainingDiverged(f"The loss is no longer a number at iteration {iteration} (frame {index}).")
+    if not run.model.visible.any():
+        raise TrainingDiverged(f"No Gaussian is left in view at iteration {iteration} (frame {index}).")
     return -10 * math.log10(max(sums.squared_error / max(run.frames.tissue_channels(index), 1), 1e-10))
 
 

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from contract.errors import TrainingDiverged
 from worker.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation, restore
 from worker.gaussians import Gaussians
 from worker.optimize import BETA1, BETA2, StepRates, adam_step_size
@@ -61,7 +62,13 @@ class AutogradMotion:
         self._deformation = restore(deformation.kind, self._parameters | deformation.constants())
 
     def deform(self, canonical: Floats, t: float, state: Floats) -> None:
-        """state = canonical + offsets at t; keeps the graph for update unless gradients are switched off."""
+        """state = canonical + offsets at t; keeps the graph for update unless gradients are switched off.
+
+        Raises:
+            TrainingDiverged: a mean is not finite. Torch would look it up outside the planes' memory and crash.
+        """
+        if not np.isfinite(canonical[MEAN]).all():
+            raise TrainingDiverged("A Gaussian's place is no longer a number.")
         self._canonical = torch.from_numpy(canonical.T.copy()).requires_grad_()
         self._moved = _deformed(self._deformation, self._canonical, t)
         state[:] = self._moved.detach().T.numpy()
