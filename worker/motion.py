@@ -32,6 +32,8 @@ STEADINESS = 0.02
 """Weight of a difference between neighbouring bases against one fully trusted frame; it carries motion across gaps."""
 RIDGE = 1e-3
 """Weight of the basis weights themselves, only to keep the system solvable."""
+POINTS_AT_ONCE = 4096
+"""Points fitted together: bounds the memory of their normal equations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +132,18 @@ def fit_tracks(
     """
     row = np.minimum(pixels // width // tracks.step_px, tracks.confidence.shape[1] - 1)
     column = np.minimum(pixels % width // tracks.step_px, tracks.confidence.shape[2] - 1)
-    confidence = tracks.confidence[:, row, column].astype(np.float64)  # [K, N]
-    displacement = tracks.displacement_mm[:, row, column].astype(np.float64)  # [K, N, 3]
     bases = basis.shape[1]
     difference = np.diff(np.eye(bases), axis=0)
     prior = STEADINESS * difference.T @ difference + RIDGE * np.eye(bases)
     outer = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    normal = (confidence.T @ outer).reshape(-1, bases, bases) + prior
-    right = np.einsum("kb,kn,knc->nbc", basis, confidence, displacement, optimize=True)
-    return np.linalg.solve(normal, right).astype(np.float32), confidence.mean(0).astype(np.float32)
+    weights = np.zeros((len(pixels), bases, 3), np.float32)
+    support = np.zeros(len(pixels), np.float32)
+    for first in range(0, len(pixels), POINTS_AT_ONCE):
+        some = slice(first, first + POINTS_AT_ONCE)
+        confidence = tracks.confidence[:, row[some], column[some]].astype(np.float64)  # [K, points]
+        displacement = tracks.displacement_mm[:, row[some], column[some]] * confidence[..., None]
+        normal = (confidence.T @ outer).reshape(-1, bases, bases) + prior
+        right = np.tensordot(displacement, basis, (0, 0)).transpose(0, 2, 1)
+        weights[some] = np.linalg.solve(normal, right)
+        support[some] = confidence.mean(0)
+    return weights, support

@@ -1,0 +1,116 @@
+"""What each part of `fast` is worth: the same fixed number of iterations with one part changed at a time.
+
+    python benchmarks/bm_ablation.py [--iterations 400] [--seeds 1] [--csv docs/results/ablation.csv] [--only NAME ...]
+
+Iterations are fixed, so the decibels do not depend on how busy the machine is. Clips: the real recording (named
+`d4d-a`, left out where it is absent) and two synthetic motions with true depth, 320 x 256, 64 frames; both ways of holding out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from bm_train import append, commit, machine
+
+from worker.clip import DepthClip, open_clip, split_frames
+from worker.hooks import Hooks
+from worker.metrics import psnr_tissue
+from worker.optimize import Rate
+from worker.phantom import PhantomSettings, make_phantom
+from worker.pipeline import ReconstructionRequest, held_out_psnr, prepare, view_function
+from worker.presets import PRESETS, Preset
+from worker.quality import sample_frames
+from worker.train import Stopwatch, train
+
+FIELDS = (
+    "change", "clip", "holdout", "iterations", "seed", "start_db", "psnr_tissue_db", "train_db", "gaussians", "bases",
+    "machine", "commit",
+)  # fmt: skip
+_FAST, _PAPER = PRESETS["fast"], PRESETS["paper"]
+
+
+def _rates(**rates: Rate) -> Preset:
+    return dataclasses.replace(_FAST, rates=dataclasses.replace(_FAST.rates, **rates))
+
+
+_PUBLISHED_MOTION = _PAPER.rates.motion_mean
+CHANGES: dict[str, Preset] = {
+    "fast": _FAST,
+    "without tracks": dataclasses.replace(_FAST, tracks=False),
+    "colour at rest": _rates(motion_colour=Rate(0.0)),
+    "published rates of motion": _rates(
+        motion_mean=_PUBLISHED_MOTION, motion_quaternion=_PUBLISHED_MOTION, motion_log_scale=_PUBLISHED_MOTION
+    ),
+    "published rates of colour and shape": _rates(
+        colour=_PAPER.rates.colour, log_scale=_PAPER.rates.log_scale, quaternion=_PAPER.rates.quaternion
+    ),
+    "9 bases at most": dataclasses.replace(_FAST, bases=9),
+    "20 k points": dataclasses.replace(_FAST, points_per_image=20_000),
+    "80 k points": dataclasses.replace(_FAST, points_per_image=80_000),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--iterations", type=int, default=400)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--only", nargs="*", choices=list(CHANGES), help="these changes alone")
+    parser.add_argument("--csv", type=Path, help="append the rows here")
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("INTRASPLAT_DATA", "../shared/data")))
+    arguments = parser.parse_args()
+    for clip_name, opened in clips(arguments.data).items():
+        clip = opened()
+        for holdout in ("every8", "blocks8"):
+            for change in arguments.only or CHANGES:
+                for seed in range(arguments.seeds):
+                    row = measure(change, clip_name, clip, holdout, arguments.iterations, seed)
+                    print("  ".join(str(row[name]) for name in FIELDS[:-2]), flush=True)
+                    if arguments.csv:
+                        append(arguments.csv, row, FIELDS)
+
+
+def clips(data: Path) -> dict[str, Callable[[], DepthClip]]:
+    """The clips by name, opened when they are needed."""
+
+    def real() -> DepthClip:
+        clip = open_clip(data / "d4d_endonerf")
+        assert isinstance(clip, DepthClip)
+        return clip
+
+    def synthetic(motion: str) -> Callable[[], DepthClip]:
+        settings = PhantomSettings(width=320, height=256, frames=64, motion=motion, seed=3)
+        return lambda: make_phantom(settings).depth_clip()
+
+    found = {f"phantom-{motion}": synthetic(motion) for motion in ("pull", "breathing")}
+    return {"d4d-a": real, **found} if (data / "d4d_endonerf").exists() else found
+
+
+def measure(
+    change: str, clip_name: str, clip: DepthClip, holdout: str, iterations: int, seed: int
+) -> dict[str, object]:
+    """Train and score one cell; its row."""
+    split = split_frames(clip, holdout)
+    request = ReconstructionRequest(Path(clip_name), iterations=iterations, seed=seed)
+    clock = Stopwatch()
+    run, scale = prepare(clip, split, CHANGES[change], request, clock)
+    view_of = view_function(run, scale)
+    start = held_out_psnr(clip, split, view_of)
+    train(run, clock, lambda: held_out_psnr(clip, split, view_of), Hooks())
+    trained = [psnr_tissue(view_of(i).rgb, clip.rgb[i], clip.tissue[i]) for i in sample_frames(split.train)]
+    _, deformation = run.model.export()
+    row: dict[str, object] = {
+        "change": change, "clip": clip_name, "holdout": holdout, "iterations": iterations, "seed": seed,
+        "start_db": start, "psnr_tissue_db": run.curve[-1].psnr_tissue_db, "train_db": float(np.mean(trained)),
+        "gaussians": run.model.count, "bases": deformation.parameters()["weight"].shape[-1],
+        "machine": machine(), "commit": commit(),
+    }  # fmt: skip
+    return {name: round(value, 2) if isinstance(value, float) else value for name, value in row.items()}
+
+
+if __name__ == "__main__":
+    main()
