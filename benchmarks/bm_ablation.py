@@ -3,7 +3,8 @@
     python benchmarks/bm_ablation.py [--iterations 400] [--seeds 1] [--csv docs/results/ablation.csv] [--only NAME ...]
 
 Iterations are fixed, so the decibels do not depend on how busy the machine is. Clips: the real recording (named
-`d4d-a`, left out where it is absent) and two synthetic motions with true depth, 320 x 256, 64 frames; both ways of holding out.
+`d4d-a`, left out where it is absent) and two synthetic motions with true depth, 320 x 256, 64 frames. Both ways of
+holding out.
 """
 
 from __future__ import annotations
