@@ -1,0 +1,291 @@
+"""A clip on disk becomes a scene: every preset, every length of clip, stereo and depth; or an error that names why."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from contract.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
+from contract.report import Report
+from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, bits, phantom_clip, prepared_on, trained, view
+from worker.checkpoint import RESUME_FILE, load_scene
+from worker.clip import DepthClip, open_clip, split_frames
+from worker.hooks import Hooks, Progress
+from worker.metrics import coverage
+from worker.optimize import Rate
+from worker.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
+from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.presets import PRESETS
+from worker.render import render_frame
+
+SCENE_FILES = {"manifest.json", "scene.safetensors", "report.json", "curve.csv"}
+ITERATIONS = 20
+STEREO = PhantomSettings(width=192, height=160, frames=10, period_frames=12)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return endonerf(tmp_path_factory.mktemp("clip"), FRAMES)
+
+
+def endonerf(folder: Path, frames: int, width: int = WIDTH, height: int = HEIGHT, **settings: Any) -> Path:
+    made = make_phantom(PhantomSettings(width=width, height=height, frames=frames, period_frames=12, **settings))
+    write_endonerf(made, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def stereo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a stereo video, its calibration and masks."""
+    folder = tmp_path_factory.mktemp("stereo")
+    write_stereo_video(make_phantom(STEREO), folder)
+    return folder
+
+
+def run(clip: Path, out: Path, hooks: Hooks | None = None, **options: Any) -> Report:
+    options = {"iterations": ITERATIONS, **options}
+    return reconstruct(ReconstructionRequest(clip, **options), out, hooks or Hooks())
+
+
+def files(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()} if folder.exists() else set()
+
+
+def tensor_bits(folder: Path) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in load_scene(folder).tensors().items()}
+
+
+def stopping_after(iterations: int) -> Hooks:
+    asked = 0
+
+    def should_stop() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > iterations
+
+    return Hooks(should_stop=should_stop)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_makes_a_scene_that_renders(name: str, clip: Path, tmp_path: Path) -> None:
+    report = run(clip, tmp_path, preset=name)
+    assert files(tmp_path) == SCENE_FILES
+    scene = load_scene(tmp_path)
+    assert (scene.preset, report.preset) == (name, name)
+    assert report.gaussians == len(scene.gaussians)
+    assert report.iterations == ITERATIONS
+    assert report.psnr_tissue_db is not None
+    frame = render_frame(scene, 0.4)
+    assert frame.rgb.shape == (HEIGHT, WIDTH, 3)
+    assert frame.rgb.std() > 10
+
+
+def test_the_report_tells_what_was_done(clip: Path, tmp_path: Path) -> None:
+    told: list[Progress] = []
+    report = run(clip, tmp_path, Hooks(on_progress=told.append), seed=5)
+    assert Report.model_validate_json((tmp_path / "report.json").read_text()) == report
+    assert (report.seed, report.held_out, report.train_count) == (5, (1, 9), FRAMES - 2)
+    assert {"depth_s", "compile_s", "t_train_s", "t_post_s"} <= report.seconds.keys()
+    assert 0 < report.seconds["t_train_s"] <= report.seconds["t_post_s"]
+    assert report.depth_agreement_mm is not None
+    assert report.depth_agreement_mm < 3
+    assert report.assumptions
+    with (tmp_path / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert int(rows[-1]["iteration"]) == ITERATIONS
+    assert float(rows[-1]["psnr_tissue_db"]) == pytest.approx(report.psnr_tissue_db, abs=1e-3)
+    assert [stage for i, stage in enumerate(each.stage for each in told) if i == 0 or told[i - 1].stage != stage] == [
+        "decode",
+        "compile",
+        "train",
+        "publish",
+    ]
+
+
+def test_the_same_request_gives_the_same_scene(clip: Path, tmp_path: Path) -> None:
+    reports = [run(clip, tmp_path / name) for name in "ab"]
+    assert tensor_bits(tmp_path / "a") == tensor_bits(tmp_path / "b")
+    assert reports[0].frames == reports[1].frames
+
+
+@pytest.mark.parametrize("name", ["fast", "paper"])
+def test_a_stopped_run_goes_on_in_its_folder(name: str, clip: Path, tmp_path: Path) -> None:
+    whole = run(clip, tmp_path / "whole", preset=name)
+    with pytest.raises(Cancelled):
+        run(clip, tmp_path / "stopped", stopping_after(7), preset=name)
+    assert files(tmp_path / "stopped") == {RESUME_FILE}
+    resumed = run(clip, tmp_path / "stopped", preset=name)
+    assert files(tmp_path / "stopped") == SCENE_FILES
+    assert tensor_bits(tmp_path / "stopped") == tensor_bits(tmp_path / "whole")
+    assert (resumed.frames, resumed.iterations) == (whole.frames, whole.iterations)
+
+
+def test_a_stopped_run_with_a_budget_keeps_its_schedule(clip: Path, tmp_path: Path) -> None:
+    with pytest.raises(Cancelled) as stopped:
+        run(clip, tmp_path, stopping_after(3), iterations=None, budget_s=0.5)
+    planned = int(str(stopped.value).rstrip(".").rsplit(" ", 1)[1])
+    assert run(clip, tmp_path, iterations=None, budget_s=0.5).iterations == planned
+
+
+@pytest.mark.parametrize(
+    "change", [{"preset": "paper"}, {"seed": 1}, {"iterations": ITERATIONS + 1}, {"holdout": "2"}, {"clip": "another"}]
+)
+def test_a_stopped_run_does_not_go_on_as_something_else(change: dict[str, Any], clip: Path, tmp_path: Path) -> None:
+    with pytest.raises(Cancelled):
+        run(clip, tmp_path / "out", stopping_after(2))
+    stored = (tmp_path / "out" / RESUME_FILE).read_bytes()
+    if "clip" in change:
+        change = {"clip": endonerf(tmp_path / "another", FRAMES, seed=1)}
+    with pytest.raises(InputError, match="was started with another") as refused:
+        run(**{"clip": clip, "out": tmp_path / "out", **change})
+    assert refused.value.field == "--out"
+    assert (tmp_path / "out" / RESUME_FILE).read_bytes() == stored
+
+
+def test_a_damaged_stopped_run_is_refused(clip: Path, tmp_path: Path) -> None:
+    (tmp_path / RESUME_FILE).write_bytes(b"half a file")
+    with pytest.raises(InputError, match="new folder"):
+        run(clip, tmp_path)
+
+
+def test_a_stop_before_training_publishes_nothing(clip: Path, tmp_path: Path) -> None:
+    with pytest.raises(Cancelled):
+        run(clip, tmp_path, Hooks(should_stop=lambda: True))
+    assert files(tmp_path) <= {RESUME_FILE}
+
+
+def test_training_that_diverges_publishes_nothing(clip: Path, tmp_path: Path) -> None:
+    fast = PRESETS["fast"]
+    wild = dataclasses.replace(fast, rates=dataclasses.replace(fast.rates, mean=Rate(1e30)))
+    with np.errstate(all="ignore"), pytest.raises(TrainingDiverged):
+        run(clip, tmp_path, preset=wild)
+    assert files(tmp_path) == set()
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"iterations": 0}, "options.iterations"),
+        ({"iterations": -4}, "options.iterations"),
+        ({"iterations": None, "budget_s": 0.0}, "options.budget_s"),
+        ({"iterations": None, "budget_s": float("nan")}, "options.budget_s"),
+        ({"iterations": 5, "budget_s": 5.0}, "options.budget_s"),
+        ({"seed": -1}, "options.seed"),
+        ({"preset": "best"}, "options.preset"),
+        ({"holdout": "99"}, "options.holdout"),
+        ({"pose_convention": "blender"}, "options.pose_convention"),
+    ],
+)
+def test_options_that_cannot_be_meant_are_refused(
+    options: dict[str, Any], field: str, clip: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError) as refused:
+        run(clip, tmp_path, **options)
+    assert refused.value.field == field
+    assert files(tmp_path) == set()
+
+
+@pytest.mark.parametrize("device", ["cuda", "tpu"])
+def test_a_device_that_is_not_there_is_refused(device: str, clip: Path, tmp_path: Path) -> None:
+    with pytest.raises(UnavailableError, match=device):
+        run(clip, tmp_path, device=device)
+
+
+@pytest.mark.parametrize("name", ["fast", "paper", "hexplane"])
+@pytest.mark.parametrize("frames", [1, 2, 4, 8])
+def test_a_short_clip_trains_without_a_measured_quality(frames: int, name: str, tmp_path: Path) -> None:
+    report = run(endonerf(tmp_path / "clip", frames), tmp_path / "out", preset=name, iterations=3)
+    assert (report.held_out, report.train_count) == ((), frames)
+    assert report.psnr_tissue_db is None
+    assert report.depth_agreement_mm is None
+    assert any("held out" in warning for warning in report.warnings)
+    assert "t_train_s" in report.seconds
+    assert render_frame(load_scene(tmp_path / "out"), 0.9).rgb.any()
+
+
+@pytest.mark.parametrize("name", ["fast", "paper"])
+def test_odd_sizes_are_no_trouble(name: str, tmp_path: Path) -> None:
+    report = run(endonerf(tmp_path / "clip", 10, 97, 81), tmp_path / "out", preset=name)
+    assert (report.width, report.height) == (97, 81)
+    assert report.train_psnr_tissue_db is not None
+    assert render_frame(load_scene(tmp_path / "out"), 0.0).rgb.shape == (81, 97, 3)
+
+
+def test_a_moving_camera_is_read_from_its_poses(tmp_path: Path) -> None:
+    clip = endonerf(tmp_path / "clip", 10, moving_camera=True)
+    opengl = run(clip, tmp_path / "opengl", iterations=60)
+    scene = load_scene(tmp_path / "opengl")
+    truth = make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=10, period_frames=12, moving_camera=True))
+    np.testing.assert_allclose(scene.world_from_camera[7], truth.world_from_camera(7), atol=1e-6)
+    llff = run(clip, tmp_path / "llff", iterations=60, pose_convention="llff")
+    assert opengl.psnr_tissue_db is not None
+    assert llff.psnr_tissue_db is not None
+    assert opengl.psnr_tissue_db > llff.psnr_tissue_db  # the wrong axes put the frames where they were not
+
+
+def test_tissue_whose_depth_is_never_known_is_covered_all_the_same() -> None:
+    whole = phantom_clip(tools=False)
+    depth_mm = whole.depth_mm.copy()
+    depth_mm[:, 25:50, 30:60] = 0
+    holed = dataclasses.replace(whole, depth_mm=depth_mm)
+    split = split_frames(holed)
+    made = trained(prepared_on(holed, split, "fast", iterations=30))
+    where = np.zeros_like(whole.tissue[0])
+    where[25:50, 30:60] = True
+    assert min(coverage(view(made, index).alpha, where) for index in range(FRAMES)) >= 0.98
+
+
+def test_a_clip_without_any_depth_is_refused(clip: Path, tmp_path: Path) -> None:
+    broken = shutil.copytree(clip, tmp_path / "clip")
+    for path in (broken / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(InputError, match="depth"):
+        run(broken, tmp_path / "out")
+    assert files(tmp_path / "out") == set()
+
+
+def test_a_stereo_clip_without_calibration_is_refused(stereo: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as refused:
+        run(stereo / "stereo.webm", tmp_path, masks=stereo / "masks.zip")
+    assert refused.value.field == "calibration"
+    assert f"{STEREO.width} x {STEREO.height}" in refused.value.problem
+
+
+def test_a_stereo_video_becomes_a_scene_of_the_right_size_in_mm(stereo: Path, tmp_path: Path) -> None:
+    beside: dict[str, Any] = {"calibration": stereo / "calibration.json", "masks": stereo / "masks.zip"}
+    report = run(stereo / "stereo.webm", tmp_path, **beside, iterations=60)
+    assert report.psnr_tissue_db is not None
+    assert report.psnr_tissue_db > 20
+    assert report.depth_agreement_mm is not None
+    assert report.depth_agreement_mm < 2
+    truth = make_phantom(STEREO).frame(5)
+    frame = render_frame(load_scene(tmp_path), 0.5)
+    both = truth.tissue & (frame.depth_mm > 0)
+    assert np.median(np.abs(frame.depth_mm - truth.depth_mm)[both]) < 2
+
+
+def test_a_stopped_run_on_a_stereo_clip_goes_on_with_the_same_depth(stereo: Path, tmp_path: Path) -> None:
+    beside: dict[str, Any] = {"calibration": stereo / "calibration.json", "masks": stereo / "masks.zip"}
+    stages: set[str] = set()
+    in_training = Hooks(lambda progress: stages.add(progress.stage), lambda: "train" in stages)
+    with pytest.raises(Cancelled):
+        run(stereo / "stereo.webm", tmp_path / "stopped", in_training, **beside)
+    run(stereo / "stereo.webm", tmp_path / "stopped", **beside)
+    run(stereo / "stereo.webm", tmp_path / "whole", **beside)
+    assert tensor_bits(tmp_path / "stopped") == tensor_bits(tmp_path / "whole")
+
+
+def test_the_pipeline_and_the_loop_make_the_same_model(clip: Path, tmp_path: Path) -> None:
+    opened = open_clip(clip)
+    assert isinstance(opened, DepthClip)
+    split = split_frames(opened)
+    run(clip, tmp_path)
+    loop = trained(prepared_on(opened, split, "fast", iterations=ITERATIONS))
+    assert tensor_bits(tmp_path) == bits(loop, opened, split)
