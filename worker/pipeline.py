@@ -46,7 +46,7 @@ from worker.start import bases_of, fusion_for, start_model
 from worker.stereo import estimate_depth
 from worker.targets import TrainingFrames, units_per_mm
 from worker.train import Run, Stopwatch, iterations_within, load_run, save_run, train
-from worker.visibility import seen_share
+from worker.visibility import drop_strays, seen_share
 
 _Result = TypeVar("_Result")
 
@@ -235,7 +235,8 @@ def held_out_psnr(clip: DepthClip, split: FrameSplit, view_of: Callable[[int], V
 
 
 def scene_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: int) -> Scene:
-    """What is kept of a finished run."""
+    """What is kept of a finished run; strays are taken out of its model first."""
+    drop_strays(run.model, clip, run.frames)
     gaussians, deformation = run.model.export()
     return Scene(
         gaussians=gaussians,

@@ -1,16 +1,19 @@
-"""Which Gaussians the clip really saw: what the confidence layer blends.
+"""Which Gaussians the clip really saw: what the confidence layer blends, and which of the others must go.
 
 Symbols: N Gaussians, H W pixels.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from worker.clip import DepthClip
+from worker.gaussians import Gaussians
 from worker.model import Model
 from worker.targets import TrainingFrames
 
@@ -18,6 +21,39 @@ SAMPLED_FRAMES = 24
 """Training frames looked at, evenly spread: the share is known to a few per cent."""
 BEHIND = 0.03
 """A Gaussian farther than the rendered surface by this share of its depth is hidden there."""
+
+WIDEST_UNSEEN = 3.0
+"""Units, a twentieth of the median depth: a Gaussian that nothing saw may be no wider at any time of the clip."""
+
+
+def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
+    """Take Gaussians out of model that no training frame saw and that grew wide; returns how many.
+
+    Where an instrument never leaves, nothing holds a Gaussian in place but its tail on the tissue beside it. A few are
+    pulled wide at the times nobody sees them, and from another pose they hang over the tissue like a veil.
+    """
+    unseen = np.flatnonzero(seen_share(model, clip, frames) == 0)
+    widest = _widest(model, unseen, [float(frames.t[index]) for index in _spread(frames.indices, SAMPLED_FRAMES)])
+    kept = np.ones(model.count, np.bool_)
+    kept[unseen] = widest <= WIDEST_UNSEEN
+    if kept.all() or not kept.any():
+        return 0
+    model.take(np.flatnonzero(kept).astype(np.int64), np.zeros(int(kept.sum()), np.bool_))
+    return int((~kept).sum())
+
+
+def _widest(model: Model, chosen: NDArray[np.intp], times: Sequence[float]) -> NDArray[np.float32]:
+    """The largest scale of each chosen Gaussian at any of the times, in units."""
+    everything, deformation = model.export()
+    rows = torch.from_numpy(chosen)
+    gaussians = Gaussians(*(getattr(everything, each.name)[rows] for each in dataclasses.fields(Gaussians)))
+    motion = deformation.select(rows)
+    widest = np.zeros(len(chosen), np.float32)
+    with torch.no_grad():
+        for t in times:
+            scale = motion.deform(gaussians, t).log_scale.exp()
+            widest = np.maximum(widest, scale.numpy().max(axis=1, initial=0.0))
+    return widest
 
 
 def seen_share(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.float32]:
