@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import get_args
 
@@ -13,6 +16,7 @@ import pytest
 from contract.exits import ExitCode
 from contract.job import PresetName
 from worker.__main__ import main
+from worker.checkpoint import RESUME_FILE, load_resume
 from worker.presets import PRESETS
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 10
@@ -69,6 +73,54 @@ def test_a_view_that_cannot_be_meant_is_a_bad_input(
     assert main(["render", str(scene), *view]) == ExitCode.BAD_INPUT
     assert "intrasplat: " in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def interrupt_in_training(clip: Path, out: Path) -> str:
+    """Start a run that would take long, press Ctrl-C once it trains; what it said at its end."""
+    command = [sys.executable, "-m", "worker", "reconstruct", str(clip), "--iterations", "100000", "--out", str(out)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert any(line.startswith("train") for line in process.stderr)
+        process.send_signal(signal.SIGINT)
+        said = process.stderr.read()
+        assert process.wait(timeout=60) == ExitCode.INTERRUPTED
+    return said
+
+
+def test_an_interrupted_run_goes_on_with_the_same_command(clip: Path, tmp_path: Path) -> None:
+    out = tmp_path / "scene"
+    assert "same command goes on" in interrupt_in_training(clip, out)
+    assert [path.name for path in out.iterdir()] == [RESUME_FILE]
+    first = load_resume(out)[1]["iteration"]
+    interrupt_in_training(clip, out)
+    assert load_resume(out)[1]["iteration"] > first > 0
+
+
+def test_an_interrupted_run_does_not_go_on_as_another(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / RESUME_FILE).write_bytes(b"of something else")
+    assert main(["reconstruct", str(clip), "--iterations", "5", "--out", str(tmp_path)]) == ExitCode.BAD_INPUT
+    assert "new folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "wrong", [["--iterations", "0"], ["--seed", "-1"], ["--holdout", "99"], ["--holdout", "third"]]
+)
+def test_an_option_that_cannot_be_meant_is_a_bad_input(
+    wrong: list[str], clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "scene"
+    assert main(["reconstruct", str(clip), "--out", str(out), *wrong]) == ExitCode.BAD_INPUT
+    assert "options." in capsys.readouterr().err
+    assert list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize("t", ["nan", "inf", "now"])
+def test_a_time_that_is_none_is_wrong_usage(t: str, scene: Path) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["render", str(scene), "--t", t, "--out", "view.png"])
+    assert ended.value.code == ExitCode.USAGE
 
 
 def test_a_clip_that_is_not_there_is_a_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
