@@ -1,0 +1,126 @@
+"""docs/results/index.md from the CSV files beside it, so that no figure there is typed by hand.
+
+    python benchmarks/write_results.py
+
+Reads docs/results/{train,ablation,raster}.csv and stereo.txt (the output of bm_stereo.py); what is missing is left out.
+"""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from statistics import median
+
+RESULTS = Path(__file__).parent.parent / "docs" / "results"
+Row = dict[str, str]
+
+_INTRODUCTION = """# Results
+
+Every figure here was printed by a command in this repository and stands in the CSV file named beside it; this page is
+written by `python benchmarks/write_results.py`. `d4d-a` is a real da Vinci recording (96 frames, 640x512, camera at
+rest) that is not part of the project; the other clips are synthetic. `psnr_tissue` is the honest score, `psnr_paper`
+what papers print ([conventions](../conventions.md)). The machines are shared and noisy: the load stands beside each run.
+"""
+_TRAIN = """
+## Whole reconstructions
+
+`python benchmarks/bm_train.py --csv docs/results/train.csv` ([train.csv](train.csv)). Copying is the better of blending
+the neighbouring frames and warping them half-way by optical flow, with the masks respected: a picture without a model.
+With a camera at rest and frames held out one by one (`every8`) copying is hard to beat, and no 3D method does on this
+clip; where eight frames in a row are hidden (`blocks8`) the model passes blending. Copying cannot show another pose,
+depth, or what the instrument hides.
+"""
+_ABLATION = """
+## What each part of fast is worth
+
+`python benchmarks/bm_ablation.py --iterations 300 --csv docs/results/ablation.csv` ([ablation.csv](ablation.csv)):
+held-out psnr_tissue in dB after the same number of iterations, one part changed at a time. The synthetic clips are
+320x256, where the finest grid has 20 k points, so the last two rows equal the first there. More points gain where
+the picture is larger, and cost time and bytes in proportion.
+"""
+_RASTER = """
+## Splatting on the CPU
+
+`python benchmarks/bm_raster.py --csv docs/results/raster.csv` ([raster.csv](raster.csv)): 640x512, 36,423 Gaussians on
+a 3-pixel grid, medians in ms.
+"""
+_STEREO = """
+## Depth from stereo
+
+`python benchmarks/bm_stereo.py | tee docs/results/stereo.txt`:
+"""
+
+
+def main() -> None:
+    parts = [_INTRODUCTION]
+    if rows := _read("train.csv"):
+        parts += [_TRAIN, _train_table(rows)]
+    if rows := _read("ablation.csv"):
+        parts += [_ABLATION, _ablation_table(rows), _origin(rows)]
+    if rows := _read("raster.csv"):
+        parts += [_RASTER, _raster_table(rows)]
+    if (RESULTS / "stereo.txt").exists():
+        parts += [_STEREO, f"\n```\n{(RESULTS / 'stereo.txt').read_text().strip()}\n```\n"]
+    (RESULTS / "index.md").write_text("".join(parts))
+
+
+def _read(name: str) -> list[Row]:
+    path = RESULTS / name
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _table(header: list[str], rows: list[list[str]]) -> str:
+    lines = ["", "| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows]) + "\n"
+
+
+def _origin(rows: list[Row]) -> str:
+    machines = sorted({f"{row['machine']}, commit {row['commit']}" for row in rows})
+    return f"\nMeasured on {'; '.join(machines)} (+: with changes not yet committed).\n"
+
+
+def _number(text: str, digits: int) -> str:
+    return f"{float(text):.{digits}f}" if text not in ("", "None") else "–"
+
+
+def _train_table(rows: list[Row]) -> str:
+    header = ["run", "clip", "limit", "psnr_tissue", "psnr_paper", "copying", "depth, mm", "iterations", "Gaussians",
+              "MB", "t_train_s", "t_post_s", "MiB", "load", "commit"]  # fmt: skip
+    cells = []
+    for row in rows:
+        copying = max((float(row[name]) for name in ("copy_blend_db", "copy_flow_db") if row[name]), default=None)
+        cells.append([
+            row["run"], row["clip"], row["limit"], _number(row["psnr_tissue_db"], 2), _number(row["psnr_paper_db"], 2),
+            "–" if copying is None else f"{copying:.1f}", _number(row["depth_agreement_mm"], 2), row["iterations"],
+            row["gaussians"], f"{int(row['scene_bytes']) / 1e6:.1f}", _number(row["t_train_s"], 1),
+            _number(row["t_post_s"], 1), row["peak_rss_mib"], _number(row["load_1min"], 1), row["commit"],
+        ])  # fmt: skip
+    return _table(header, cells) + f"\nMeasured on {'; '.join(sorted({row['machine'] for row in rows}))}.\n"
+
+
+def _ablation_table(rows: list[Row]) -> str:
+    columns = list(dict.fromkeys((row["clip"], row["holdout"]) for row in rows))
+    cells = []
+    for change in dict.fromkeys(row["change"] for row in rows):
+        scores = []
+        for clip, holdout in columns:
+            found = [
+                float(row["psnr_tissue_db"])
+                for row in rows
+                if (row["change"], row["clip"], row["holdout"]) == (change, clip, holdout)
+            ]
+            scores.append(f"{median(found):.2f}" if found else "–")
+        cells.append([change, *scores])
+    return _table(["", *(f"{clip}, {holdout}" for clip, holdout in columns)], cells)
+
+
+def _raster_table(rows: list[Row]) -> str:
+    names = list(rows[0])
+    return _table(names, [[row[name] for name in names] for row in rows])
+
+
+if __name__ == "__main__":
+    main()
