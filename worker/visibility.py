@@ -32,7 +32,8 @@ def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
     Where an instrument never leaves, nothing holds a Gaussian in place but its tail on the tissue beside it. A few are
     pulled wide at the times nobody sees them, and from another pose they hang over the tissue like a veil.
     """
-    unseen = np.flatnonzero(seen_share(model, clip, frames) == 0)
+    shown, _ = _sightings(model, clip, frames)  # tissue without depth is seen, however unsure its place
+    unseen = np.flatnonzero(shown == 0)
     widest = _widest(model, unseen, [float(frames.t[index]) for index in _spread(frames.indices, SAMPLED_FRAMES)])
     kept = np.ones(model.count, np.bool_)
     kept[unseen] = widest <= WIDEST_UNSEEN
@@ -59,7 +60,14 @@ def _widest(model: Model, chosen: NDArray[np.intp], times: Sequence[float]) -> N
 def seen_share(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.float32]:
     """[N] in [0, 1]: share of training frames in which a Gaussian's centre lay on visible tissue, times the stereo
     confidence of that pixel."""
-    total = np.zeros(model.count, np.float64)
+    return _sightings(model, clip, frames)[1]
+
+
+def _sightings(
+    model: Model, clip: DepthClip, frames: TrainingFrames
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Share of training frames that show each Gaussian's centre on tissue, [N]; the same times stereo confidence."""
+    shown, trusted = np.zeros((2, model.count), np.float64)
     sampled = _spread(frames.indices, SAMPLED_FRAMES)
     for index in sampled:
         camera = frames.cameras[index]
@@ -71,8 +79,9 @@ def seen_share(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray
         inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         i, j = row[inside].astype(int), column[inside].astype(int)
         visible = clip.tissue[index][i, j] & (z[inside] <= surface[i, j] * (1 + BEHIND))
-        total[inside] += visible * (clip.depth_confidence[index][i, j] / 255.0)
-    return (total / len(sampled)).astype(np.float32)
+        shown[inside] += visible
+        trusted[inside] += visible * (clip.depth_confidence[index][i, j] / 255.0)
+    return (shown / len(sampled)).astype(np.float32), (trusted / len(sampled)).astype(np.float32)
 
 
 def _spread(indices: Sequence[int], count: int) -> list[int]:

@@ -13,7 +13,7 @@ from tests.worker.clips import WIDTH, plane_clip
 from tests.worker.phantoms import prepared
 from worker.clip import DepthClip
 from worker.train import Run
-from worker.visibility import SAMPLED_FRAMES, seen_share
+from worker.visibility import SAMPLED_FRAMES, WIDEST_UNSEEN, drop_strays, seen_share
 
 
 @pytest.fixture
@@ -61,6 +61,14 @@ def test_behind_the_surface_behind_the_camera_and_outside_the_image_nothing_is_s
     assert not seen[chosen].any()
     others = np.setdiff1d(np.arange(run.model.count), chosen)
     assert seen[others].mean() > 0.95 * before[others].mean()
+
+
+def test_a_wide_gaussian_on_tissue_without_depth_is_no_stray(clip: DepthClip) -> None:
+    run = start(clip)
+    run.model.canonical[7:10] = np.log(2 * WIDEST_UNSEEN)
+    unsure = dataclasses.replace(clip, depth_confidence=np.zeros_like(clip.depth_confidence))
+    assert not seen_share(run.model, unsure, run.frames).any()
+    assert drop_strays(run.model, unsure, run.frames) == 0
 
 
 def test_a_long_clip_is_sampled_evenly() -> None:
