@@ -61,6 +61,7 @@ async function poll() {
 
 startUploading(get("upload"), get("upload-message"), (job) => {
   awaited = job.id;
+  if (!viewer.scene) get("stage-message").textContent = "The scene opens here when it is done.";
   poll();
 });
 setInterval(poll, POLL_MS);

@@ -64,7 +64,7 @@ export class Viewer {
       frame.alt = `${this.layer} at t ${this.t.toFixed(3)}`;
       stage.classList.remove("stale");
       message.hidden = true;
-      warning.textContent = answer.warning;
+      warning.textContent = answer.warning.replaceAll(".; ", ". ");
       latency.textContent = `${Math.round(performance.now() - started)} ms`;
     } catch (error) {
       stage.classList.add("stale"); // a frozen frame must not look live

@@ -1,6 +1,6 @@
-"""Draws docs/pictures/phantom.jpg: synthetic tissue, what its instrument hides, and its depth.
+"""Draws docs/images/phantom.jpg: synthetic tissue, what its instrument hides, and its depth.
 
-python docs/pictures/draw_phantom.py
+python docs/images/draw_phantom.py
 """
 
 from __future__ import annotations
