@@ -54,7 +54,7 @@ def assert_renders(client: Client, scene: str) -> None:
 
 
 def test_a_clip_sent_over_http_comes_back_as_renders_of_any_time_and_pose(tmp_path: Path, clip: Path) -> None:
-    with started_service(tmp_path / "data") as client:
+    with started_service(tmp_path / "data", tmp_path / "service.log") as client:
         files = {"calibration": clip / "calibration.json", "masks": clip / "masks.zip"}
         job = client.reconstruct(clip / "stereo.webm", **files, iterations=30)
         assert client.wait(job.id).state is JobState.DONE
