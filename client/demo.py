@@ -73,6 +73,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _interrupt(*_: object) -> NoReturn:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not keep the service from being ended in order
     raise KeyboardInterrupt
 
 
