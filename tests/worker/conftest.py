@@ -10,7 +10,7 @@ import torch
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_torch_thread() -> Iterator[None]:
-    """Torch's threads spin while they wait for each other: on a busy machine and tensors this small, most of the time."""
+    """Torch's threads spin while they wait for each other: with tensors this small, most of the time."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
