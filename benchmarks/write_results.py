@@ -19,7 +19,7 @@ _INTRODUCTION = """# Results
 Every figure here was printed by a command in this repository and stands in the CSV file named beside it; this page is
 written by `python benchmarks/write_results.py`. `d4d-a` is a real da Vinci recording (96 frames, 640x512, camera at
 rest) that is not part of the project; the other clips are synthetic. `psnr_tissue` is the honest score, `psnr_paper`
-what papers print ([conventions](../conventions.md)). The machines are shared and noisy: the load stands beside each run.
+what papers print ([conventions](../conventions.md)). The machines are shared and noisy: each run has its load.
 """
 _TRAIN = """
 ## Whole reconstructions
