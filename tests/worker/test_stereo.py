@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from contract.camera import Intrinsics
 from contract.errors import Cancelled, InputError
 from worker.calibration import RectifiedClip, load_calibration, rectify
-from worker.clip import DepthClip, StereoClip, open_clip
+from worker.clip import DepthClip, StereoClip, held_out_frames, open_clip
 from worker.hooks import Hooks, Progress
 from worker.stereo import estimate_depth
 
@@ -202,6 +202,31 @@ def test_the_same_clip_gives_the_same_bits() -> None:
     first, second = estimate_depth(clip_of(pairs)), estimate_depth(clip_of(pairs))
     assert first.depth_mm.tobytes() == second.depth_mm.tobytes()
     assert first.depth_confidence.tobytes() == second.depth_confidence.tobytes()
+
+
+@pytest.mark.parametrize("holdout", ["every8", "0,4,9"])
+def test_held_out_frames_change_no_bit_of_another_frames_depth(holdout: str) -> None:
+    """The held-out pairs become another scene: nearer, misaligned, and other pictures."""
+    count = 10
+    held_out = held_out_frames(count, holdout)
+    train = [i for i in range(count) if i not in held_out]
+    pairs = [draw_pair(slanted(10.0 + i, 6.0 + i), seed=i) for i in range(count)]
+    poisoned = [
+        draw_pair(slanted(60.0, 40.0), seed=90 + i, row_shift_px=5.0) if i in held_out else pair
+        for i, pair in enumerate(pairs)
+    ]
+    clean, dirty = (estimate_depth(clip_of(each), measured_frames=train) for each in (pairs, poisoned))
+    assert np.array_equal(clean.depth_mm[train], dirty.depth_mm[train])
+    assert np.array_equal(clean.depth_confidence[train], dirty.depth_confidence[train])
+    for name in ("vertical_misalignment_px", "vertical_residual_px", "min_disparity_px", "max_disparity_px"):
+        assert clean.measurements[name] == dirty.measurements[name]
+    assert not np.array_equal(clean.depth_mm[held_out], dirty.depth_mm[held_out])
+
+
+@pytest.mark.parametrize("measured", [[], [3], [-1, 0]])
+def test_measuring_on_frames_that_do_not_exist_is_an_error_of_the_caller(measured: list[int]) -> None:
+    with pytest.raises(ValueError, match="measured_frames"):
+        estimate_depth(clip_of([draw_pair(slanted())] * 2), measured_frames=measured)
 
 
 def test_swapped_eyes_are_refused_with_the_remedy() -> None:

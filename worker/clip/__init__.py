@@ -4,7 +4,7 @@ from worker.clip.limits import ClipLimits
 from worker.clip.masks import MaskPolarity
 from worker.clip.opening import Layout, find_calibration, open_clip
 from worker.clip.poses import PoseConvention
-from worker.clip.split import FrameSplit, split_frames
+from worker.clip.split import FrameSplit, held_out_frames, split_frames
 from worker.clip.types import DepthClip, StereoClip
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "PoseConvention",
     "StereoClip",
     "find_calibration",
+    "held_out_frames",
     "open_clip",
     "split_frames",
 ]

@@ -42,22 +42,29 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     Clips under 9 frames hold out none, with a warning. InputError for an unknown rule and for frames that do not exist.
     """
     count = clip.frame_count
-    wanted = _held_out_by_rule(holdout, count)
-    everything = list(range(count))
+    held_out = held_out_frames(count, holdout)
     if holdout == "none":
-        return FrameSplit(everything, [], [])
+        return FrameSplit(list(range(count)), [], [])
     if count < FEWEST_FRAMES:
         return _nothing_held_out(count, f"the clip has {count} frames, fewer than {FEWEST_FRAMES}")
-    if not wanted:
+    if not held_out:
         return _nothing_held_out(count, f"{holdout} finds no frame to hold out in {count}")
-    held_out = sorted(wanted)
-    train = [index for index in everything if index not in wanted]
+    train = sorted(set(range(count)) - set(held_out))
     repeated = find_repeats(clip.rgb, train, held_out)
     if len(repeated) == len(train):
         return _nothing_held_out(count, "every training frame repeats a held-out one: the picture does not change")
     warnings = (f"frames that repeat a held-out frame are not used: {len(repeated)}",) if repeated else ()
     gone = set(repeated)
     return FrameSplit([index for index in train if index not in gone], held_out, repeated, warnings)
+
+
+def held_out_frames(frame_count: int, holdout: str) -> list[int]:
+    """The frames that the rule of split_frames holds out of a clip, rising; it needs no picture.
+
+    So stages before the split can leave them alone. InputError as in split_frames.
+    """
+    wanted = _held_out_by_rule(holdout, frame_count)
+    return sorted(wanted) if frame_count >= FEWEST_FRAMES else []
 
 
 def find_repeats(rgb: NDArray[np.uint8], train: list[int], held_out: list[int]) -> list[int]:

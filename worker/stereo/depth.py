@@ -6,6 +6,7 @@ Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. d
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -21,7 +22,10 @@ from worker.stereo.matching import Grey, MatchPlan, match
 
 STAGE = "stereo"
 DECODING_SHARE, MEASURING_SHARE = 0.15, 0.05  # of the stage's progress
-RANGE_PAIRS, ALIGNMENT_PAIRS = 7, 3  # spread over the clip; a pair costs 10 ms for the range, 100 for the alignment
+RANGE_PAIRS, ALIGNMENT_PAIRS = (
+    7,
+    3,
+)  # spread over the measured frames; a pair costs 10 ms for the range, 100 for the alignment
 MIN_CONFIDENCE = 16  # of 255: below it a depth is a guess
 MAX_DEPTH_MM = 400.0  # beyond it an endoscope's disparity is a fraction of a pixel
 WARN_SHIFT_PX = 0.5
@@ -29,20 +33,29 @@ WARN_VALID_SHARE = 0.5
 MIN_VALID_SHARE = 0.02  # unrelated images match by chance at 0.2 to 0.4 % of their pixels
 
 
-def estimate_depth(clip: RectifiedClip, hooks: Hooks | None = None) -> DepthClip:
+def estimate_depth(
+    clip: RectifiedClip, hooks: Hooks | None = None, *, measured_frames: Sequence[int] | None = None
+) -> DepthClip:
     """Depth and confidence of every frame; the eyes' row shift is measured, corrected up to 8 px, and reported.
+
+    What all frames share, row shift and disparity range, is measured on measured_frames alone (None: on all); beyond
+    that a frame's depth depends on its own pair only. So frames left out of measured_frames change no other's depth.
 
     `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| left after the correction),
     min_disparity_px and max_disparity_px (the range searched) and depth_valid_share (of tissue pixels).
 
     Raises:
+        ValueError: measured_frames is empty or names a frame that does not exist.
         InputError: no depth anywhere, the eyes look swapped, or their rows differ by more than 8 px.
         Cancelled: hooks.should_stop said so.
     """
     hooks = Hooks() if hooks is None else hooks
+    measured = sorted(set(range(clip.frame_count) if measured_frames is None else measured_frames))
+    if not measured or measured[0] < 0 or measured[-1] >= clip.frame_count:
+        raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
     rgb, right = _decode(clip, hooks)
     with _pool() as pool:
-        shift, plan = _plan(clip, rgb, right, pool)
+        shift, plan = _plan(clip, rgb, right, measured, pool)
         depth_mm, confidence = _match_all(clip, rgb, right, plan, pool, hooks)
     valid_share = _valid_share(depth_mm, clip.tissue)
     return DepthClip(
@@ -85,13 +98,17 @@ def _decode(clip: RectifiedClip, hooks: Hooks) -> tuple[NDArray[np.uint8], NDArr
 
 
 def _plan(
-    clip: RectifiedClip, rgb: NDArray[np.uint8], right: NDArray[np.uint8], pool: ThreadPoolExecutor
+    clip: RectifiedClip,
+    rgb: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    measured: Sequence[int],
+    pool: ThreadPoolExecutor,
 ) -> tuple[RowShift, MatchPlan]:
-    """Row shift and disparity range, from a few pairs spread over the clip."""
+    """Row shift and disparity range, from a few pairs spread over the measured frames."""
 
     def spread(count: int) -> list[tuple[Grey, Grey]]:
-        chosen = np.unique(np.linspace(0, clip.frame_count - 1, count).round().astype(int))
-        return [(_grey(rgb[i]), right[i]) for i in chosen]
+        chosen = np.unique(np.linspace(0, len(measured) - 1, count).round().astype(int))
+        return [(_grey(rgb[measured[k]]), right[measured[k]]) for k in chosen]
 
     matches = np.concatenate(list(pool.map(lambda pair: feature_matches(*pair), spread(ALIGNMENT_PAIRS))))
     shift = measure_row_shift(matches, clip.disparity_offset_px)

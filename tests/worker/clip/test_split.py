@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from contract.camera import Intrinsics
 from contract.errors import InputError
-from worker.clip import DepthClip, open_clip, split_frames
+from worker.clip import DepthClip, held_out_frames, open_clip, split_frames
 from worker.clip.split import REPEAT_LEVELS, find_repeats
 
 REAL_DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).parents[3].parent / "shared/data"))
@@ -52,6 +52,12 @@ def test_blocks8_hides_every_third_block_of_eight_between_the_first_and_the_last
 
 
 @pytest.mark.parametrize("holdout", ["every8", "blocks8", "none", "1,7,8", " 3 , 0 "])
+@pytest.mark.parametrize("count", [9, 16, 17, 40])
+def test_the_rule_alone_names_the_frames_that_the_split_holds_out(holdout: str, count: int) -> None:
+    assert held_out_frames(count, holdout) == split_frames(distinct(count), holdout).held_out
+
+
+@pytest.mark.parametrize("holdout", ["every8", "blocks8", "none", "1,7,8", " 3 , 0 "])
 @pytest.mark.parametrize("count", [9, 17, 40])
 def test_every_frame_is_in_exactly_one_list(holdout: str, count: int) -> None:
     split = split_frames(distinct(count), holdout)
@@ -67,6 +73,7 @@ def test_none_holds_out_none_without_a_warning() -> None:
 @pytest.mark.parametrize("holdout", ["every8", "blocks8", "1"])
 def test_short_clips_hold_out_none_and_warn(holdout: str) -> None:
     split = split_frames(distinct(8), holdout)
+    assert held_out_frames(8, holdout) == []
     assert split.train == list(range(8))
     assert split.held_out == []
     assert "fewer than 9" in split.warnings[0]
