@@ -150,6 +150,8 @@ class JobRecord(BaseModel):
     finished_at_s: float | None = None
     attempt: int = 0
     """Counts claims; a worker's report is accepted only for the attempt it holds."""
+    released: int = 0
+    """How many of the attempts ended because their worker was told to end; the others, but the last, died."""
     owner: str | None = None
     """Name of the worker that holds, or last held, the job."""
     cancel_requested: bool = False

@@ -46,8 +46,8 @@ class Queue(Protocol):
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
         """The next job, now running and owned; None after timeout_s.
 
-        A job that an earlier process of the same name left running is handed out first, as a new attempt; after
-        MAX_ATTEMPTS it fails instead.
+        A job that an earlier process of the same name left running or released is handed out first, as a new attempt;
+        after MAX_ATTEMPTS deaths it fails instead. One with cancel_requested is handed out to be cleared away.
         """
         ...
 
@@ -60,11 +60,18 @@ class Queue(Protocol):
         ...
 
     def fail(self, claim: Claim, error: JobError) -> bool:
-        """running -> failed; False if the claim no longer stands."""
+        """running -> failed; False if the claim no longer stands or a cancel was asked for."""
         ...
 
     def confirm_cancel(self, claim: Claim) -> bool:
-        """running -> cancelled, by the worker that has stopped."""
+        """running -> cancelled, by the worker that has stopped; False if nobody asked for it."""
+        ...
+
+    def release(self, claim: Claim) -> bool:
+        """running -> queued, by a worker that is to end; the attempt is not held against the job.
+
+        False if the claim no longer stands or a cancel was asked for.
+        """
         ...
 
     def cancel(self, job_id: str) -> JobRecord | None:

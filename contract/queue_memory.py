@@ -57,16 +57,28 @@ class MemoryQueue:
     def fail(self, claim: Claim, error: JobError) -> bool:
         with self._changed:
             record = self._held(claim)
-            if record is not None:
-                self._change(record, JobState.FAILED, error=error)
-            return record is not None
+            if record is None or record.cancel_requested:
+                return False
+            self._change(record, JobState.FAILED, error=error)
+            return True
 
     def confirm_cancel(self, claim: Claim) -> bool:
         with self._changed:
             record = self._held(claim)
-            if record is not None:
-                self._change(record, JobState.CANCELLED)
-            return record is not None
+            if record is None or not record.cancel_requested:
+                return False
+            self._change(record, JobState.CANCELLED)
+            return True
+
+    def release(self, claim: Claim) -> bool:
+        with self._changed:
+            record = self._held(claim)
+            if record is None or record.cancel_requested:
+                return False
+            self._change(record, JobState.QUEUED, released=record.released + 1, progress=None)
+            self._waiting.appendleft(record.job_id)
+            self._changed.notify()
+            return True
 
     def cancel(self, job_id: str) -> JobRecord | None:
         with self._changed:
@@ -128,9 +140,7 @@ class MemoryQueue:
         for record in list(self._records.values()):
             if record.state is not JobState.RUNNING or record.owner != owner:
                 continue
-            if record.cancel_requested:
-                self._change(record, JobState.CANCELLED)
-            elif record.attempt >= MAX_ATTEMPTS:
+            if not record.cancel_requested and record.attempt - record.released >= MAX_ATTEMPTS:
                 self._change(record, JobState.FAILED, error=worker_died())
             else:
                 self._change(record, JobState.QUEUED)

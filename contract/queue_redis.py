@@ -6,6 +6,7 @@ Keys (the braces put all of them in one cluster slot, so that a script may touch
         document               the JobRecord as submitted, JSON; never changes
         state                  a JobState; changes only by the scripts below, along TRANSITIONS
         attempt                how often it was claimed; with `owner` it is what a worker's report must match
+        released               how many of those attempts were given back by a worker that was told to end
         owner                  name of the worker that holds, or last held, it
         entry                  id of its stream entry
         cancel                 "1" once a cancel was asked for
@@ -61,21 +62,19 @@ return 1
 """
 
 CLAIM = """
--- KEYS jobs, job; ARGV group, entry, owner, max attempts, error, sources of running, of cancelled, of failed
+-- KEYS jobs, job; ARGV group, entry, owner, max attempts, error, sources of running, of failed
 -- 1: claimed. 0: the entry is of no use, and is gone.
 local function among(state, list) return string.find(list, ',' .. state .. ',', 1, true) end
 local function drop() redis.call('XACK', KEYS[1], ARGV[1], ARGV[2]); redis.call('XDEL', KEYS[1], ARGV[2]) end
-local record = redis.call('HMGET', KEYS[2], 'state', 'owner', 'attempt', 'cancel')
+local record = redis.call('HMGET', KEYS[2], 'state', 'owner', 'attempt', 'cancel', 'released')
 local state, attempt = record[1], tonumber(record[3] or 0)
+local deaths = attempt - tonumber(record[5] or 0)
 local clock = redis.call('TIME')
 local now = clock[1] .. '.' .. string.format('%06d', clock[2])
 if state == 'running' and record[2] == ARGV[3] then
   -- Left by an earlier process of this name: it goes back to the queue, and from there as any other.
-  local ended = nil
-  if record[4] then ended = 'cancelled' elseif attempt >= tonumber(ARGV[4]) then ended = 'failed' end
-  if ended and among(state, ended == 'cancelled' and ARGV[7] or ARGV[8]) then
-    redis.call('HSET', KEYS[2], 'state', ended, 'finished', now)
-    if ended == 'failed' then redis.call('HSET', KEYS[2], 'error', ARGV[5]) end
+  if not record[4] and deaths >= tonumber(ARGV[4]) and among(state, ARGV[7]) then
+    redis.call('HSET', KEYS[2], 'state', 'failed', 'finished', now, 'error', ARGV[5])
     drop()
     return 0
   end
@@ -97,17 +96,31 @@ return 1
 """
 
 SETTLE = """
--- KEYS jobs, job; ARGV group, owner, attempt, target, sources of target, error or '', '1' if a cancel forbids it
+-- KEYS jobs, job; ARGV group, owner, attempt, target, sources of target, error or ''
+-- A job whose cancellation was asked for ends as cancelled, and no other does.
 local record = redis.call('HMGET', KEYS[2], 'state', 'owner', 'attempt', 'cancel', 'entry')
 if record[2] ~= ARGV[2] or record[3] ~= ARGV[3] then return 0 end
 if record[1] == ARGV[4] then return 1 end
 if not string.find(ARGV[5], ',' .. record[1] .. ',', 1, true) then return 0 end
-if ARGV[7] == '1' and record[4] then return 0 end
+if (ARGV[4] == 'cancelled') ~= (record[4] == '1') then return 0 end
 local clock = redis.call('TIME')
 redis.call('HSET', KEYS[2], 'state', ARGV[4], 'finished', clock[1] .. '.' .. string.format('%06d', clock[2]))
 if ARGV[6] ~= '' then redis.call('HSET', KEYS[2], 'error', ARGV[6]) end
 redis.call('XACK', KEYS[1], ARGV[1], record[5])
 redis.call('XDEL', KEYS[1], record[5])
+return 1
+"""
+
+RELEASE = """
+-- KEYS job; ARGV owner, attempt, sources of queued. The stream's entry stays pending for the owner, whose next claim
+-- finds it before all others.
+local record = redis.call('HMGET', KEYS[1], 'state', 'owner', 'attempt', 'cancel')
+if record[2] ~= ARGV[1] or record[3] ~= ARGV[2] then return 0 end
+if record[1] == 'queued' then return 1 end
+if record[4] or not string.find(ARGV[3], ',' .. record[1] .. ',', 1, true) then return 0 end
+redis.call('HSET', KEYS[1], 'state', 'queued')
+redis.call('HINCRBY', KEYS[1], 'released', 1)
+redis.call('HDEL', KEYS[1], 'progress')
 return 1
 """
 
@@ -145,7 +158,8 @@ class RedisQueue:
         self._reader: Any = _connect(url, Retry(NoBackoff(), 0))
         script: Callable[[str], Any] = self._control.register_script
         self._submit, self._claim, self._progress = script(SUBMIT), script(CLAIM), script(PROGRESS)
-        self._settle_script, self._cancel, self._forget = script(SETTLE), script(CANCEL), script(FORGET)
+        self._settle_script, self._release = script(SETTLE), script(RELEASE)
+        self._cancel, self._forget = script(CANCEL), script(FORGET)
 
     def submit(self, record: JobRecord) -> bool:
         keys = [JOBS, _job_key(record.job_id), INDEX]
@@ -173,13 +187,18 @@ class RedisQueue:
             return bool(self._progress(keys=[_job_key(claim.job_id)], args=arguments))
 
     def finish(self, claim: Claim) -> bool:
-        return self._settle(claim, JobState.DONE, unless_cancelled=True)
+        return self._settle(claim, JobState.DONE)
 
     def fail(self, claim: Claim, error: JobError) -> bool:
         return self._settle(claim, JobState.FAILED, error.model_dump_json())
 
     def confirm_cancel(self, claim: Claim) -> bool:
         return self._settle(claim, JobState.CANCELLED)
+
+    def release(self, claim: Claim) -> bool:
+        arguments = [claim.owner, claim.attempt, _sources(JobState.QUEUED)]
+        with _reachable():
+            return bool(self._release(keys=[_job_key(claim.job_id)], args=arguments))
 
     def cancel(self, job_id: str) -> JobRecord | None:
         with _reachable():
@@ -258,13 +277,12 @@ class RedisQueue:
             self._control.xack(JOBS, GROUP, entry_id)
             return None
         arguments = [GROUP, entry_id, owner, MAX_ATTEMPTS, worker_died().model_dump_json()]
-        arguments += [_sources(state) for state in (JobState.RUNNING, JobState.CANCELLED, JobState.FAILED)]
+        arguments += [_sources(state) for state in (JobState.RUNNING, JobState.FAILED)]
         claimed = self._claim(keys=[JOBS, _job_key(job_id)], args=arguments)
         return self.get(job_id) if claimed else None
 
-    def _settle(self, claim: Claim, target: JobState, error: str = "", *, unless_cancelled: bool = False) -> bool:
+    def _settle(self, claim: Claim, target: JobState, error: str = "") -> bool:
         arguments = [GROUP, claim.owner, claim.attempt, target.value, _sources(target), error]
-        arguments.append("1" if unless_cancelled else "0")
         with _reachable():
             return bool(self._settle_script(keys=[JOBS, _job_key(claim.job_id)], args=arguments))
 
@@ -315,6 +333,7 @@ def _record(fields: dict[str, str]) -> JobRecord | None:
         update={
             "state": JobState(fields["state"]),
             "attempt": int(fields["attempt"]),
+            "released": int(fields.get("released", 0)),
             "owner": fields.get("owner"),
             "cancel_requested": "cancel" in fields,
             "progress": _parsed(JobProgress, fields.get("progress")),

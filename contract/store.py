@@ -4,6 +4,7 @@
     ├── incoming/<job>/   an upload in progress; removed when it fails
     ├── spool/<job>/      accepted clips: clip.mp4, calibration.json, ..., submission.json (the JobRecord as submitted)
     ├── work/<job>.<n>/   what attempt n has written so far
+    ├── work/tmp-<name>/  what worker <name> has unpacked; emptied whenever it starts
     ├── scenes/<job>/     finished scenes: manifest.json, scene.safetensors, report.json, curve.csv
     ├── run/              sockets of live workers
     └── valkey/           the embedded queue's log
@@ -13,9 +14,11 @@ A folder in spool/ or scenes/ is complete by its mere presence. The data directo
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
+import time
 import uuid
 from pathlib import Path
 
@@ -26,6 +29,9 @@ SUBMISSION = "submission.json"
 MANIFEST = "manifest.json"
 REPORT = "report.json"
 CURVE = "curve.csv"
+
+ABANDONED_AFTER_S = 24 * 3600.0
+"""An upload that has received nothing for this long was cut off by the end of its service."""
 
 
 def new_job_id() -> str:
@@ -64,7 +70,7 @@ class Store:
 
     def discard_incoming(self, job_id: str) -> None:
         """Remove an upload that will not become a job."""
-        shutil.rmtree(self._folder("incoming", job_id), ignore_errors=True)
+        _remove(self._folder("incoming", job_id))
 
     def accept(self, record: JobRecord) -> Path:
         """Make an upload a spooled clip: submission written, all of it on disk, then renamed into place."""
@@ -76,17 +82,27 @@ class Store:
         """Where the job's clip lies, or lay."""
         return self._folder("spool", job_id)
 
-    def work_folder(self, job_id: str, attempt: int) -> Path:
-        """A new empty folder for one attempt; a left-over of the same attempt is removed first."""
+    def work_folder(self, job_id: str, attempt: int, keep: str | None = None) -> Path:
+        """The folder for one attempt, empty but for the file `keep` if the attempt before left one to go on from.
+
+        The folders of earlier attempts are removed.
+        """
         folder = self._folder("work", job_id, suffix=f".{attempt}")
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(mode=0o700)
+        earlier = self._attempts(job_id)
+        if earlier:
+            earlier.pop().rename(folder)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        for path in (*earlier, *(entry for entry in folder.iterdir() if entry.name != keep)):
+            _remove(path)
         return folder
 
     def publish_scene(self, job_id: str, attempt: int) -> Path:
         """Make the attempt's folder the job's scene, in place of one that an attempt published and could not report."""
-        shutil.rmtree(self._folder("scenes", job_id), ignore_errors=True)
-        return _publish(self._folder("work", job_id, suffix=f".{attempt}"), self._folder("scenes", job_id))
+        _remove(self._folder("scenes", job_id))
+        scene = _publish(self._folder("work", job_id, suffix=f".{attempt}"), self._folder("scenes", job_id))
+        for folder in self._attempts(job_id):
+            _remove(folder)
+        return scene
 
     def scene_folder(self, job_id: str) -> Path:
         """The finished scene's folder.
@@ -101,23 +117,46 @@ class Store:
 
     def scene_ids(self) -> list[str]:
         """Ids of all finished scenes, newest first."""
-        folders = [entry for entry in (self.data_dir / "scenes").iterdir() if (entry / MANIFEST).is_file()]
-        return [entry.name for entry in sorted(folders, key=lambda entry: entry.stat().st_mtime, reverse=True)]
+        born_s = {}
+        for entry in (self.data_dir / "scenes").iterdir():
+            with contextlib.suppress(FileNotFoundError):  # deleted since it was listed
+                if (entry / MANIFEST).is_file():
+                    born_s[entry.name] = entry.stat().st_mtime
+        return sorted(born_s, key=lambda name: born_s[name], reverse=True)
 
     def remove_attempt(self, job_id: str, attempt: int) -> None:
         """Remove what one attempt has written and not published."""
-        shutil.rmtree(self._folder("work", job_id, suffix=f".{attempt}"), ignore_errors=True)
+        _remove(self._folder("work", job_id, suffix=f".{attempt}"))
 
     def remove_clip(self, job_id: str) -> None:
         """Remove the job's clip and all unpublished work on it."""
-        shutil.rmtree(self._folder("spool", job_id), ignore_errors=True)
-        for folder in (self.data_dir / "work").glob(f"{job_id}.*"):
-            shutil.rmtree(folder, ignore_errors=True)
+        for folder in (self._folder("spool", job_id), *self._attempts(job_id)):
+            _remove(folder)
 
     def remove(self, job_id: str) -> None:
         """Remove clip, work and scene."""
         self.remove_clip(job_id)
-        shutil.rmtree(self._folder("scenes", job_id), ignore_errors=True)
+        _remove(self._folder("scenes", job_id))
+
+    def scratch_folder(self, worker_name: str) -> Path:
+        """Where one worker unpacks clips, emptied of what an earlier process of that name left."""
+        folder = self.data_dir / "work" / f"tmp-{worker_name}"
+        _remove(folder)
+        folder.mkdir(mode=0o700)
+        return folder
+
+    def remove_abandoned_uploads(self) -> None:
+        """Remove what is left of uploads that have received nothing for ABANDONED_AFTER_S."""
+        for folder in (self.data_dir / "incoming").iterdir():
+            with contextlib.suppress(FileNotFoundError):  # its upload has just ended
+                touched_s = max(path.stat().st_mtime for path in (folder, *folder.iterdir()))
+                if touched_s < time.time() - ABANDONED_AFTER_S:
+                    _remove(folder)
+
+    def _attempts(self, job_id: str) -> list[Path]:
+        """The folders of the job's attempts, the last attempt's last."""
+        folders = (self.data_dir / "work").glob(f"{self._checked(job_id)}.*")
+        return sorted(folders, key=lambda folder: int(folder.suffix[1:]))
 
     def _folder(self, area: str, job_id: str, suffix: str = "") -> Path:
         return self.data_dir / area / (self._checked(job_id) + suffix)
@@ -127,6 +166,14 @@ class Store:
         if not is_job_id(job_id):
             raise ValueError(f"not a job id: {job_id!r}")
         return job_id
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or a folder with all that is in it, as far as it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _publish(source: Path, target: Path) -> Path:

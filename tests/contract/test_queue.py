@@ -136,6 +136,8 @@ def test_a_running_job_learns_of_its_cancellation_and_can_no_longer_become_done(
 def test_a_terminal_state_never_changes(queue: Queue, settle: str) -> None:
     queue.submit(job())
     record, claim = claimed(queue)
+    if settle == "confirm_cancel":
+        queue.cancel(record.job_id)
     {
         "finish": lambda: queue.finish(claim),
         "fail": lambda: queue.fail(claim, JobError(problem="x")),
@@ -175,12 +177,65 @@ def test_a_job_that_kills_its_worker_every_time_fails_after_the_last_attempt(que
     assert "died 3 times" in failed.error.problem
 
 
-def test_a_cancelled_job_whose_worker_died_ends_as_cancelled(queue: Queue) -> None:
+def test_a_cancelled_job_whose_worker_died_is_handed_out_to_be_cleared_away(queue: Queue) -> None:
     queue.submit(job())
-    record, _ = claimed(queue)
-    queue.cancel(record.job_id)
-    assert queue.claim("worker-1", 0.05) is None
+    for _ in range(MAX_ATTEMPTS):
+        first, _ = claimed(queue)
+    queue.cancel(first.job_id)
+    record, claim = claimed(queue)
+    assert (record.job_id, record.cancel_requested) == (first.job_id, True)
+    assert not queue.finish(claim)
+    assert not queue.fail(claim, JobError(problem="x"))
+    assert queue.confirm_cancel(claim)
     assert state_of(queue, record.job_id) is JobState.CANCELLED
+
+
+def test_a_job_that_nobody_cancelled_does_not_end_as_cancelled(queue: Queue) -> None:
+    queue.submit(job())
+    record, claim = claimed(queue)
+    assert not queue.confirm_cancel(claim)
+    assert state_of(queue, record.job_id) is JobState.RUNNING
+
+
+def test_a_released_job_is_queued_again_and_comes_first_to_its_worker_as_a_new_attempt(queue: Queue) -> None:
+    queue.submit(job())
+    first, stale = claimed(queue)
+    queue.submit(job(created_at_s=1001.0))
+    queue.progress(stale, TRAINING)
+    assert queue.release(stale)
+    waiting = queue.get(first.job_id)
+    assert waiting is not None
+    assert (waiting.state, waiting.progress, waiting.released) == (JobState.QUEUED, None, 1)
+    assert not queue.finish(stale)
+    second, current = claimed(queue)
+    assert (second.job_id, second.attempt) == (first.job_id, 2)
+    assert not queue.release(stale)
+    assert queue.finish(current)
+
+
+def test_polite_ends_are_not_held_against_a_job_and_deaths_are(queue: Queue) -> None:
+    queue.submit(job())
+    for _ in range(2 * MAX_ATTEMPTS):
+        record, claim = claimed(queue)
+        assert queue.release(claim)
+    for _ in range(MAX_ATTEMPTS):
+        claimed(queue)
+    assert queue.claim("worker-1", 0.05) is None
+    assert state_of(queue, record.job_id) is JobState.FAILED
+
+
+def test_a_released_job_can_be_cancelled_and_a_cancelled_one_is_not_released(queue: Queue) -> None:
+    queue.submit(job())
+    record, claim = claimed(queue)
+    assert queue.release(claim)
+    queue.cancel(record.job_id)
+    assert state_of(queue, record.job_id) is JobState.CANCELLED
+    assert queue.claim("worker-1", 0.05) is None
+    queue.submit(job())
+    record, claim = claimed(queue)
+    queue.cancel(record.job_id)
+    assert not queue.release(claim)
+    assert queue.confirm_cancel(claim)
 
 
 def test_another_worker_does_not_take_a_running_job(queue: Queue) -> None:
@@ -234,9 +289,13 @@ def test_a_settled_job_leaves_nothing_in_the_stream(server: EmbeddedServer) -> N
     client = redis.Redis.from_url(server.url)
     client.flushall()
     queue = RedisQueue(server.url)
-    for settle in (queue.finish, queue.confirm_cancel, lambda claim: queue.fail(claim, JobError(problem="x"))):
+    for settle in (queue.finish, lambda claim: queue.fail(claim, JobError(problem="x"))):
         queue.submit(job())
-        settle(claimed(queue)[1])
+        assert settle(claimed(queue)[1])
+    queue.submit(job())
+    record, claim = claimed(queue)
+    queue.cancel(record.job_id)
+    assert queue.confirm_cancel(claim)
     cancelled = job()
     queue.submit(cancelled)
     queue.cancel(cancelled.job_id)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import stat
+import time
 from pathlib import Path
 
 import pytest
 
 from contract.errors import SceneError
 from contract.job import JobFiles, JobRecord
-from contract.store import MANIFEST, SUBMISSION, Store, is_job_id, new_job_id
+from contract.store import ABANDONED_AFTER_S, MANIFEST, SUBMISSION, Store, is_job_id, new_job_id
 
 
 @pytest.fixture
@@ -58,6 +60,43 @@ def test_an_attempt_starts_from_an_empty_folder(store: Store) -> None:
     job_id = new_job_id()
     (store.work_folder(job_id, 1) / "left-over").write_text("x")
     assert list(store.work_folder(job_id, 1).iterdir()) == []
+
+
+def test_an_attempt_takes_over_the_one_file_to_go_on_from_and_removes_earlier_folders(store: Store) -> None:
+    job_id = new_job_id()
+    for name in ("kept", "half-written"):
+        (store.work_folder(job_id, 9, keep="kept") / name).write_text(name)
+    folder = store.work_folder(job_id, 10, keep="kept")
+    assert [path.name for path in folder.iterdir()] == ["kept"]
+    assert [path.name for path in (store.data_dir / "work").iterdir()] == [folder.name]
+
+
+def test_publishing_leaves_no_work_of_any_attempt(store: Store) -> None:
+    job_id = published(store)
+    assert list((store.data_dir / "work").iterdir()) == []
+    (store.work_folder(job_id, 2) / MANIFEST).write_text("{}")
+    (store.data_dir / "work" / f"{job_id}.1").mkdir()
+    store.publish_scene(job_id, 2)
+    assert list((store.data_dir / "work").iterdir()) == []
+
+
+def test_scratch_is_emptied_when_its_worker_starts_again_and_is_no_attempt(store: Store) -> None:
+    (store.scratch_folder("worker-1") / "unpacked").write_text("frames")
+    other = store.scratch_folder("worker-2") / "unpacked"
+    other.write_text("frames")
+    assert list(store.scratch_folder("worker-1").iterdir()) == []
+    assert other.exists()
+
+
+def test_uploads_that_stopped_a_day_ago_are_removed_and_younger_ones_are_not(store: Store) -> None:
+    abandoned, paused, going_on = (store.open_incoming(new_job_id()) for _ in range(3))
+    for folder, silent_s in ((abandoned, ABANDONED_AFTER_S + 60), (paused, ABANDONED_AFTER_S / 2), (going_on, 0.0)):
+        (folder / "clip.mp4").write_bytes(b"half")
+        then_s = time.time() - silent_s
+        os.utime(folder / "clip.mp4", (then_s, then_s))
+        os.utime(folder, (time.time() - ABANDONED_AFTER_S - 60,) * 2)
+    store.remove_abandoned_uploads()
+    assert {path.name for path in (store.data_dir / "incoming").iterdir()} == {paused.name, going_on.name}
 
 
 def test_removing_a_job_leaves_no_file_of_it(store: Store) -> None:

@@ -11,10 +11,11 @@ import pytest
 
 from contract.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
 from contract.job import JobError, JobFiles, JobProgress, JobRecord, JobState
-from contract.queue import Claim
+from contract.queue import MAX_ATTEMPTS, Claim
 from contract.queue_memory import MemoryQueue
 from contract.rendering import WorkerAddress
 from contract.store import MANIFEST, Store, new_job_id
+from worker.checkpoint import RESUME_FILE
 from worker.consume import announced, consume, job_progress
 from worker.hooks import Hooks, Progress
 
@@ -173,11 +174,147 @@ def test_a_worker_that_is_told_to_end_leaves_its_job_to_the_next(bench: Bench) -
     bench.start(waits_to_be_stopped)
     bench.wait_for(job_id, JobState.RUNNING)
     bench.stop()
-    assert bench.record(job_id).state is JobState.RUNNING
+    assert bench.record(job_id).state is JobState.QUEUED
     bench.end.clear()
     bench.start(writes_a_scene)
     assert bench.wait_for(job_id, JobState.DONE).attempt == 2
     bench.stop()
+
+
+def test_any_number_of_polite_restarts_ends_in_a_scene_and_each_goes_on_from_the_one_before(bench: Bench) -> None:
+    steps: list[int] = []
+
+    def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
+        state = out / RESUME_FILE
+        steps.append(int(state.read_text()) + 1 if state.exists() else 0)
+        if len(steps) > 2 * MAX_ATTEMPTS:
+            writes_a_scene(record, spool, out, hooks)
+            return
+        state.write_text(str(steps[-1]))
+        (out / "half").write_text("written")
+        bench.end.set()
+        waits_to_be_stopped(record, spool, out, hooks)
+
+    job_id = bench.submit()
+    for _ in range(2 * MAX_ATTEMPTS):
+        bench.end.clear()
+        consume(bench.queue, bench.store, "worker-1", work, bench.end, 0.0)
+        assert bench.record(job_id).state is JobState.QUEUED
+    bench.end.clear()
+    bench.start(work)
+    assert bench.wait_for(job_id, JobState.DONE, JobState.FAILED).state is JobState.DONE
+    bench.stop()
+    assert steps == list(range(2 * MAX_ATTEMPTS + 1))
+    assert not (bench.store.scene_folder(job_id) / "half").exists()
+    assert list((bench.store.data_dir / "work").iterdir()) == []
+
+
+class Lane(MemoryQueue):
+    """A queue whose connection can be cut."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cut = threading.Event()
+        self.reports = 0
+
+    def progress(self, claim: Claim, progress: JobProgress) -> bool:
+        self.reports += 1
+        self._pass()
+        return super().progress(claim, progress)
+
+    def finish(self, claim: Claim) -> bool:
+        self._pass()
+        return super().finish(claim)
+
+    def fail(self, claim: Claim, error: JobError) -> bool:
+        self._pass()
+        return super().fail(claim, error)
+
+    def release(self, claim: Claim) -> bool:
+        self._pass()
+        return super().release(claim)
+
+    def _pass(self) -> None:
+        if self.cut.is_set():
+            raise UnavailableError("The lane is cut.", "Wait.")
+
+
+def finishes(record: JobRecord, out: Path) -> None:
+    (out / MANIFEST).write_text("{}")
+
+
+def breaks(record: JobRecord, out: Path) -> None:
+    raise ValueError
+
+
+def is_stopped(record: JobRecord, out: Path) -> None:
+    raise Cancelled
+
+
+@pytest.mark.parametrize(("ends", "kept"), [(finishes, "scenes"), (breaks, "work"), (is_stopped, "work")])
+def test_a_worker_that_must_end_while_the_queue_is_away_touches_nothing(
+    tmp_path: Path, ends: Callable[[JobRecord, Path], None], kept: str
+) -> None:
+    bench, lane = Bench(tmp_path), Lane()
+    bench.queue = lane
+    job_id = bench.submit()
+
+    def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
+        lane.cut.set()
+        bench.end.set()
+        ends(record, out)
+
+    consume(lane, bench.store, "worker-1", work, bench.end, 0.0)
+    assert bench.record(job_id).state is JobState.RUNNING
+    assert bench.store.spool_folder(job_id).is_dir()
+    assert [path.name.split(".")[0] for path in (bench.store.data_dir / kept).iterdir()] == [job_id]
+
+
+def test_a_queue_that_is_away_is_not_tried_again_at_every_report(tmp_path: Path) -> None:
+    bench, lane = Bench(tmp_path), Lane()
+    bench.queue = lane
+    job_id = bench.submit()
+
+    def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
+        lane.cut.set()
+        for stage in ("decode", "depth", "train"):
+            hooks.on_progress(Progress(stage, 0.5))
+        assert lane.reports == 1
+        lane.cut.clear()
+        (out / MANIFEST).write_text("{}")
+
+    bench.start(work)
+    assert bench.wait_for(job_id, JobState.DONE, JobState.FAILED).state is JobState.DONE
+    bench.stop()
+
+
+def test_a_job_that_was_cancelled_while_its_worker_was_dead_leaves_no_file(bench: Bench) -> None:
+    job_id = bench.submit()
+    died = bench.queue.claim("worker-1", 0.0)
+    assert died is not None
+    (bench.store.work_folder(job_id, died.attempt) / "half").write_text("written")
+    bench.queue.cancel(job_id)
+    bench.start(writes_a_scene)
+    bench.wait_for(job_id, JobState.CANCELLED, JobState.DONE)
+    bench.stop()
+    assert bench.record(job_id).state is JobState.CANCELLED
+    assert bench.files_of(job_id) == []
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("smith.png"),
+        InputError("clip", "smith.png is no picture.", "Send one."),
+        TrainingDiverged("smith.png diverged."),
+    ],
+)
+def test_the_log_names_jobs_by_their_ids_only(bench: Bench, error: Exception, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", logger="intrasplat.worker"):
+        record = run(bench, raises(error))
+    assert record.job_id in caplog.text
+    assert type(error).__name__ in caplog.text
+    assert "smith" not in caplog.text
 
 
 def test_an_attempt_that_lost_its_job_publishes_nothing(bench: Bench) -> None:
