@@ -9,7 +9,7 @@ Symbols: K training frames, h w pixels of the coarse grid on which flow is compu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -24,6 +24,8 @@ Floats = NDArray[np.float32]
 
 FLOW_WIDTH = 320
 """Flow is computed at the clip's size over the least whole factor that brings its width to this or less, in px."""
+LEAST_SIDE_PX = 16
+"""The coarse grid keeps at least this many cells along the shorter side where the clip has them: DIS needs them."""
 ROUND_TRIP_PX = 1.0
 """Forward and backward flow disagreeing by this much, in px of the coarse grid, halve a track's confidence or worse."""
 SMOOTH_PX = 4.0
@@ -50,30 +52,32 @@ class Tracks:
     step_px: int
 
 
-def track(clip: DepthClip, train: Sequence[int]) -> Tracks:
-    """Follow the first training frame's tissue through the others."""
-    step = -(-clip.intrinsics.width // FLOW_WIDTH)
-    reference = _Coarse(clip, train[0], step)
-    lost = np.zeros(reference.grey.shape, np.float32)
+def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None) -> Tracks:
+    """Follow the first training frame's tissue through the others.
 
-    def follow(frames: Sequence[int]) -> list[tuple[Floats, Floats]]:
+    on_progress is called with the share of frames done, now and then, from threads of this function's own; what it
+    raises ends the work and is raised here.
+    """
+    step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // LEAST_SIDE_PX))
+    reference = _Coarse(clip, train[0], step)
+    displacement = np.zeros((len(train), *reference.grey.shape, 3), np.float32)
+    confidence = np.zeros((len(train), *reference.grey.shape), np.float32)
+    confidence[0] = reference.trust
+
+    def follow(places: Sequence[int]) -> None:
         flow_solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         forward: Floats | None = None
-        found = []
-        for index in frames:  # in order of time: the last flow starts the next
-            if index == train[0]:
-                found.append((np.zeros((*lost.shape, 3), np.float32), reference.trust))
-                continue
-            target = _Coarse(clip, index, step)
+        for done, place in enumerate(places):  # in order of time: the last flow starts the next
+            target = _Coarse(clip, train[place], step)
             forward = flow_solver.calc(reference.grey, target.grey, None if forward is None else forward.copy())
             backward = flow_solver.calc(target.grey, reference.grey, -forward)
-            found.append(_lift(reference, target, forward, backward))
-        return found
+            displacement[place], confidence[place] = _lift(reference, target, forward, backward)
+            on_progress((done + 1) / len(places))
 
-    halves = (train[: len(train) // 2], train[len(train) // 2 :])
+    middle = (len(train) + 1) // 2
     with ThreadPoolExecutor(2) as pool:
-        tracks = [pair for half in pool.map(follow, halves) for pair in half]
-    return Tracks(np.stack([d for d, _ in tracks]), np.stack([c for _, c in tracks]), step)
+        list(pool.map(follow, (range(1, middle), range(middle, len(train)))))
+    return Tracks(displacement, confidence, step)
 
 
 class _Coarse:

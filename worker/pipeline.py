@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import math
 import platform
@@ -32,6 +33,7 @@ from worker.clip import (
     PoseConvention,
     StereoClip,
     find_calibration,
+    held_out_frames,
     open_clip,
     split_frames,
 )
@@ -39,10 +41,11 @@ from worker.densify import Densifier
 from worker.fusion import fuse
 from worker.hooks import Hooks, Progress
 from worker.metrics import psnr_tissue
+from worker.motion import track
 from worker.presets import Preset, preset_named
 from worker.quality import Training, View, build_report, measure, sample_frames
 from worker.raster.cpu import compile_kernels
-from worker.start import bases_of, fusion_for, start_model
+from worker.start import FRAMES_A_BASIS, bases_of, fusion_for, start_model
 from worker.stereo import estimate_depth
 from worker.targets import TrainingFrames, units_per_mm
 from worker.train import Run, Stopwatch, iterations_within, load_run, save_run, train
@@ -56,7 +59,7 @@ class ReconstructionRequest:
     """What to reconstruct and how; the fields are those of `intrasplat reconstruct --help`.
 
     preset is a name, or a preset of the caller's own. budget_s and iterations exclude each other; without either the
-    preset decides.
+    preset decides. accepted_at_s is the Unix time at which the clip was accepted, for t_post_s; None means now.
     """
 
     clip: Path
@@ -72,6 +75,7 @@ class ReconstructionRequest:
     iterations: int | None = None
     device: str = "auto"
     seed: int = 0
+    accepted_at_s: float | None = None
 
 
 def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> Report:
@@ -85,35 +89,30 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
         TrainingDiverged: training left the finite numbers; nothing is written.
         Cancelled: hooks.should_stop said so.
     """
-    accepted = time.perf_counter()
+    accepted_at_s = request.accepted_at_s or time.time()
     preset = request.preset if isinstance(request.preset, Preset) else preset_named(request.preset)
     check_options(request)
     check_device(request.device)
     out_dir.mkdir(parents=True, exist_ok=True)
     seconds: dict[str, float] = {}
 
-    clip = timed(seconds, "depth_s", lambda: depth_clip_of(request, hooks))
+    clip = depth_clip_of(request, hooks, seconds)
     split = split_frames(clip, request.holdout)
-    compile_s = compile_kernels(lambda share: hooks.on_progress(Progress("compile", share)))
+    seconds["compile_s"] = compile_kernels(lambda share: report_stage(hooks, "compile", share))
     clock = Stopwatch()
-    run, scale = prepare(clip, split, preset, request, clock)
+    run, scale = prepare(clip, split, preset, request, clock, hooks, seconds)
     resumed_s = resume(out_dir, run)
     clock = Stopwatch(resumed_s) if resumed_s is not None else clock
+    started_s = clock.elapsed_s
     view_of = view_function(run, scale)
     try:
         train(run, clock, lambda: held_out_psnr(clip, split, view_of), hooks)
     except Cancelled:
         save_run(out_dir, run, clock.elapsed_s)
         raise
-    t_train_s = clock.elapsed_s
-    hooks.on_progress(Progress("publish", 0.0, run.iteration, run.iterations))
-    scene = scene_of(run, clip, split, scale, request.seed)
-    seconds |= {
-        "compile_s": compile_s,
-        "t_train_s": t_train_s,
-        "t_post_s": time.perf_counter() - accepted,
-    }
-    report = report_of(run, clip, split, scene, request, seconds, view_of)
+    seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
+    scene = timed(seconds, "finish_s", lambda: scene_of(run, clip, split, scale, request.seed))
+    report = report_of(run, clip, split, scene, request, seconds, reporting(view_of, split, hooks), accepted_at_s)
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)
     save_scene(out_dir, scene, beside=(REPORT, CURVE))
@@ -150,16 +149,31 @@ def timed(seconds: dict[str, float], name: str, work: Callable[[], _Result]) -> 
     return result
 
 
-def depth_clip_of(request: ReconstructionRequest, hooks: Hooks) -> DepthClip:
+def report_stage(hooks: Hooks, stage: str, share: float) -> None:
+    """Say how far a stage has come.
+
+    Raises:
+        Cancelled: the caller wants to stop.
+    """
+    hooks.on_progress(Progress(stage, share))
+    if hooks.should_stop():
+        raise Cancelled(f"Stopped during stage {stage!r}.")
+
+
+def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: dict[str, float]) -> DepthClip:
     """Decode, and for stereo input rectify and match: the left frames with depth."""
-    hooks.on_progress(Progress("decode", 0.0))
-    clip = open_clip(
-        request.clip,
-        request.right,
-        layout=request.layout,
-        masks=request.masks,
-        mask_polarity=request.mask_polarity,
-        pose_convention=request.pose_convention,
+    report_stage(hooks, "decode", 0.0)
+    clip = timed(
+        seconds,
+        "decode_s",
+        lambda: open_clip(
+            request.clip,
+            request.right,
+            layout=request.layout,
+            masks=request.masks,
+            mask_polarity=request.mask_polarity,
+            pose_convention=request.pose_convention,
+        ),
     )
     if isinstance(clip, DepthClip):
         return clip
@@ -167,7 +181,10 @@ def depth_clip_of(request: ReconstructionRequest, hooks: Hooks) -> DepthClip:
         calibration = load_calibration(
             calibration_path(request, clip, Path(scratch)), eye_width=clip.width, eye_height=clip.height
         )
-    return estimate_depth(rectify(clip, calibration), hooks)
+    rectified = rectify(clip, calibration)
+    held_out = set(held_out_frames(clip.frame_count, request.holdout))
+    measured = [i for i in range(clip.frame_count) if i not in held_out]
+    return timed(seconds, "stereo_s", lambda: estimate_depth(rectified, hooks, measured_frames=measured))
 
 
 def calibration_path(request: ReconstructionRequest, clip: StereoClip, scratch: Path) -> Path:
@@ -181,13 +198,29 @@ def calibration_path(request: ReconstructionRequest, clip: StereoClip, scratch: 
 
 
 def prepare(
-    clip: DepthClip, split: FrameSplit, preset: Preset, request: ReconstructionRequest, clock: Stopwatch
+    clip: DepthClip,
+    split: FrameSplit,
+    preset: Preset,
+    request: ReconstructionRequest,
+    clock: Stopwatch,
+    hooks: Hooks | None = None,
+    seconds: dict[str, float] | None = None,
 ) -> tuple[Run, float]:
-    """Fuse points, start the model, and settle how many iterations are made."""
+    """Fuse points, start the model, and settle how many iterations are made; seconds by stage go into `seconds`."""
+    hooks, seconds = hooks or Hooks(), {} if seconds is None else seconds
     scale = units_per_mm(clip, split.train)
-    cloud = fuse(clip, split.train, fusion_for(preset, clip.intrinsics), seed=request.seed)
-    model = start_model(cloud, clip, split.train, preset, scale, request.seed)
-    frames = TrainingFrames(clip, split.train, scale)
+    fusion = fusion_for(preset, clip.intrinsics)
+    report_stage(hooks, "fusion", 0.0)
+    cloud = timed(seconds, "fusion_s", lambda: fuse(clip, split.train, fusion, seed=request.seed))
+    tracks = None
+    if preset.tracks and len(split.train) > 1:
+        tracks = timed(
+            seconds, "motion_s", lambda: track(clip, split.train, lambda share: report_stage(hooks, "motion", share))
+        )
+    model = timed(
+        seconds, "start_s", lambda: start_model(cloud, tracks, clip, split.train, preset, scale, request.seed)
+    )
+    frames = timed(seconds, "targets_s", lambda: TrainingFrames(clip, split.train, scale))
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
     fixed = request.iterations or (None if request.budget_s else preset.iterations)
     budget_s = request.budget_s or preset.budget_s
@@ -196,6 +229,7 @@ def prepare(
     if fixed is None:
         assert budget_s is not None
         run.iterations = 1000  # any length: calibration needs a place in the schedule, not its end
+        report_stage(hooks, "calibrate", 0.0)
         run.iterations = iterations_within(run, budget_s, clock.elapsed_s)
     return run, scale
 
@@ -227,6 +261,19 @@ def view_function(run: Run, scale: float) -> Callable[[int], View]:
     return view_of
 
 
+def reporting(view_of: Callable[[int], View], split: FrameSplit, hooks: Hooks) -> Callable[[int], View]:
+    """view_of that reports the scoring of frames as it goes."""
+    total, done = len(split.held_out) + len(sample_frames(split.train)), 0
+
+    def reported(index: int) -> View:
+        nonlocal done
+        report_stage(hooks, "score", done / total)
+        done += 1
+        return view_of(index)
+
+    return reported
+
+
 def held_out_psnr(clip: DepthClip, split: FrameSplit, view_of: Callable[[int], View]) -> float:
     """Mean psnr_tissue over at most sixteen held-out frames, evenly spread; NaN without any."""
     scores = [psnr_tissue(view_of(i).rgb, clip.rgb[i], clip.tissue[i]) for i in sample_frames(split.held_out, 16)]
@@ -249,7 +296,7 @@ def scene_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: i
         trained_t=tuple(float(clip.t[i]) for i in split.train),
         seen=torch.from_numpy(seen_share(run.model, clip, run.frames)),
         seed=seed,
-        settings={"iterations": run.iterations, **json.loads(json.dumps(asdict(run.preset), default=str))},
+        settings={"made_iterations": run.iteration, "preset": json.loads(json.dumps(asdict(run.preset), default=str))},
     )
 
 
@@ -261,10 +308,21 @@ def report_of(
     request: ReconstructionRequest,
     seconds: dict[str, float],
     view_of: Callable[[int], View],
+    accepted_at_s: float,
 ) -> Report:
-    """Score the held-out frames beside the copy baselines and say what to distrust."""
+    """Score the held-out frames beside the copy baselines and say what to distrust.
+
+    The curve's last point becomes the score over all held-out frames of the model as it is kept; the points before it
+    are over at most sixteen of them.
+    """
+    start = time.perf_counter()
     held_out = measure(clip, split.held_out, view_of)
     trained = measure(clip, sample_frames(split.train), view_of)
+    baselines = copy_baselines(clip, split.train, split.held_out)
+    known = [score for score in held_out.psnr_tissue_db if not math.isnan(score)]
+    if known and run.curve:
+        run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=float(np.mean(known)))
+    seconds |= {"score_s": time.perf_counter() - start, "t_post_s": time.time() - accepted_at_s}
     training = Training(
         preset=run.preset.name,
         seed=request.seed,
@@ -275,6 +333,8 @@ def report_of(
         scene_bytes=scene.byte_count,
         units_per_mm=scene.units_per_mm,
         seconds=seconds,
+        assumptions=chosen(run, clip, bases_of(scene.deformation)),
+        warnings=training_warnings(run, request),
         versions={
             "intrasplat": version("intrasplat"),
             "python": platform.python_version(),
@@ -282,7 +342,26 @@ def report_of(
             "numba": numba.__version__,
         },
     )
-    return build_report(clip, split, held_out, trained, copy_baselines(clip, split.train, split.held_out), training)
+    return build_report(clip, split, held_out, trained, baselines, training)
+
+
+def chosen(run: Run, clip: DepthClip, bases: int) -> tuple[str, ...]:
+    """How large a model was taken, and why, in words."""
+    preset = run.preset
+    if preset.deformation != "shared" or preset.points_per_image is None:
+        return ()
+    stride = fusion_for(preset, clip.intrinsics).stride
+    return (
+        f"A Gaussian was started on every {stride}. pixel each way: nearest to {preset.points_per_image} an image.",
+        f"Motion has {bases} bases: one for about {FRAMES_A_BASIS} training frames.",
+    )
+
+
+def training_warnings(run: Run, request: ReconstructionRequest) -> tuple[str, ...]:
+    """What the run itself has to say."""
+    if request.iterations is None and run.preset.iterations is None and run.iterations == len(run.frames.indices):
+        return ("The time given allowed less than one step a training frame; one a frame was made all the same.",)
+    return ()
 
 
 def write_curve(path: Path, run: Run) -> None:

@@ -76,6 +76,7 @@ def request_of(record: JobRecord, spool: Path, device: str) -> ReconstructionReq
         iterations=options.iterations,
         device=device,
         seed=options.seed,
+        accepted_at_s=record.created_at_s,
     )
 
 

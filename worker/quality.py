@@ -40,7 +40,7 @@ SMOOTH_LEVELS = 2.0
 LARGEST_SMOOTH_SHARE = 0.4
 LEAST_TISSUE_SHARE = 0.3
 LARGEST_BRIGHTNESS_DRIFT = 0.25
-"""Range of the median brightness over its mean; the model's colours do not change with time."""
+"""Range of the median brightness over its mean; beyond it, changing light and moving tissue are hard to tell apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +259,7 @@ def _brightness_warnings(clip: DepthClip, sampled: Iterable[int]) -> list[str]:
         return []
     return [
         f"The tissue's brightness changes from {min(medians):.0f} to {max(medians):.0f} of 255 during the clip; "
-        "the model explains it by motion."
+        "the model may take changing light for motion."
     ]
 
 

@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from contract.camera import Intrinsics
 from worker.checkpoint import Scene
 from worker.deformation import HexPlane
-from worker.model import Model
-from worker.raster.cpu import camera_vector
+from worker.raster.cpu import Rasterizer, camera_vector
 from worker.raster.cpu.model import FusedModel
 from worker.targets import MEDIAN_DEPTH_UNITS, camera_in_units
 from worker.unfused import UnfusedModel
@@ -32,6 +31,8 @@ FAR_POSE = 0.35
 LOW_CONFIDENCE, MANY = 0.3, 0.1
 """A frame warns when this share of its pixels lies below this confidence."""
 SIZES_KEPT = 3
+ROUNDING = 1e-6
+"""Model time by which t may exceed the last frame's without a warning: i / T need not survive a decimal fraction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,21 +57,19 @@ class SceneRenderer:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = weakref.ref(scene)
-        self._models: OrderedDict[tuple[int, int], Model] = OrderedDict()
+        kind = UnfusedModel if isinstance(scene.deformation, HexPlane) else FusedModel
+        self._model = kind(scene.gaussians, scene.deformation, scene.intrinsics.width, scene.intrinsics.height)
+        self._rasterizers: OrderedDict[tuple[int, int], Rasterizer] = OrderedDict()
         self._lock = Lock()
 
-    def _model(self, scene: Scene, width: int, height: int) -> Model:
-        size = (width, height)
-        if size not in self._models:
-            deformation = scene.deformation
-            if isinstance(deformation, HexPlane):
-                self._models[size] = UnfusedModel(scene.gaussians, deformation, width, height)
-            else:
-                self._models[size] = FusedModel(scene.gaussians, deformation, width, height)
-        self._models.move_to_end(size)
-        while len(self._models) > SIZES_KEPT:
-            self._models.popitem(last=False)
-        return self._models[size]
+    def _rasterizer(self, width: int, height: int) -> Rasterizer:
+        """The buffers of an image size; the few sizes used last are kept."""
+        if (width, height) not in self._rasterizers:
+            self._rasterizers[width, height] = Rasterizer(width, height)
+        self._rasterizers.move_to_end((width, height))
+        while len(self._rasterizers) > SIZES_KEPT:
+            self._rasterizers.popitem(last=False)
+        return self._rasterizers[width, height]
 
     def layers(
         self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
@@ -80,9 +79,9 @@ class SceneRenderer:
         assert scene is not None
         camera = camera_vector(camera_in_units(intrinsics, world_from_camera, scene.units_per_mm))
         with self._lock:
-            model = self._model(scene, intrinsics.width, intrinsics.height)
-            image = model.render(camera, t).copy()
-            seen = model.blend_values(scene.seen.numpy()).copy()
+            self._model.rasterizer = self._rasterizer(intrinsics.width, intrinsics.height)
+            image = self._model.render(camera, t).copy()
+            seen = self._model.blend_values(scene.seen.numpy()).copy()
         return image, seen
 
 
@@ -122,7 +121,7 @@ def render_frame(
     last = (scene.frame_count - 1) / scene.frame_count
     shown = min(max(t, 0.0), last)
     warnings = []
-    if not 0.0 <= t < 1.0:
+    if not 0.0 <= t <= last + ROUNDING:
         warnings.append(f"t = {t:g} lies outside the clip; t = {shown:.4g} is shown.")
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
     image, seen = renderer_of(scene).layers(shown, pose, intrinsics or scene.intrinsics)

@@ -16,7 +16,7 @@ from worker.deformation import FlexibleDeformation, HexPlane, PolynomialFourier,
 from worker.fusion import FusionSettings, PointCloud
 from worker.gaussians import Gaussians, initial_gaussians
 from worker.model import Model
-from worker.motion import fit_tracks, track
+from worker.motion import Tracks, fit_tracks
 from worker.presets import Preset
 from worker.raster.cpu.model import FusedModel
 from worker.unfused import UnfusedModel
@@ -36,9 +36,16 @@ def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
 
 
 def start_model(
-    cloud: PointCloud, clip: DepthClip, train: Sequence[int], preset: Preset, scale: float, seed: int
+    cloud: PointCloud,
+    tracks: Tracks | None,
+    clip: DepthClip,
+    train: Sequence[int],
+    preset: Preset,
+    scale: float,
+    seed: int,
 ) -> Model:
-    """Gaussians at the cloud's points (mm, scaled to optimiser units) with the preset's motion, at rest."""
+    """Gaussians at the cloud's points (mm, scaled to optimiser units) with the preset's motion: as the tracks have it
+    where the motion is "shared" and there are tracks, else at rest."""
     gaussians = initial_gaussians(
         cloud.points_mm * np.float32(scale),
         cloud.rgb,
@@ -56,8 +63,8 @@ def start_model(
     if preset.deformation == "shared":
         bases = min(len(train), max(MIN_BASES, min(preset.bases, math.ceil(len(train) / FRAMES_A_BASIS))))
         shared = SharedBasis.initial(count, bases=bases, colour=True, times=[float(clip.t[i]) for i in train])
-        if preset.tracks and len(train) > 1:
-            gaussians = _follow_tracks(gaussians, shared, cloud, clip, train, scale)
+        if tracks is not None:
+            gaussians = _follow_tracks(gaussians, shared, cloud, tracks, clip, train, scale)
         return FusedModel(gaussians, shared, width, height)
     assert preset.start_width is not None
     fdm = FlexibleDeformation.initial(
@@ -70,13 +77,19 @@ def start_model(
 
 
 def _follow_tracks(
-    gaussians: Gaussians, motion: SharedBasis, cloud: PointCloud, clip: DepthClip, train: Sequence[int], scale: float
+    gaussians: Gaussians,
+    motion: SharedBasis,
+    cloud: PointCloud,
+    tracks: Tracks,
+    clip: DepthClip,
+    train: Sequence[int],
+    scale: float,
 ) -> Gaussians:
     """Fill motion's weights from optical-flow tracks; returns the Gaussians with each canonical mean moved so that it
     passes through its point at the time of the frame it was taken from."""
     basis = np.stack([motion.basis(float(clip.t[i])).double().numpy() for i in range(clip.frame_count)])
     pixels = _reference_pixels(cloud, clip, train[0])
-    weights, _ = fit_tracks(track(clip, train), basis[list(train)], pixels, clip.intrinsics.width)
+    weights, _ = fit_tracks(tracks, basis[list(train)], pixels, clip.intrinsics.width)
     weights *= scale
     motion.weight[:, :3] = torch.from_numpy(weights).permute(0, 2, 1)
     moved = np.einsum("nbc,nb->nc", weights, basis[cloud.frame])

@@ -144,6 +144,7 @@ def train(run: Run, clock: Stopwatch, evaluate: Callable[[], float], hooks: Hook
     marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s]
     scored: float | None = run.curve[-1].psnr_tissue_db if run.curve else None
     reported, began, begun_at = -math.inf, clock.elapsed_s, run.iteration
+    hooks.on_progress(Progress("train", run.iteration / run.iterations, run.iteration, run.iterations, scored))
     while run.iteration < run.iterations:
         if hooks.should_stop():
             raise Cancelled(f"Stopped after iteration {run.iteration} of {run.iterations}.")

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from worker.clip import DepthClip
+from worker.fusion import COMPLETED_CONFIDENCE
 from worker.gaussians import Gaussians
 from worker.model import Model
 from worker.targets import TrainingFrames
@@ -27,13 +28,12 @@ WIDEST_UNSEEN = 3.0
 
 
 def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
-    """Take Gaussians out of model that no training frame saw and that grew wide; returns how many.
+    """Take Gaussians out of model that lay on tissue in no training frame and that grew wide; returns how many.
 
     Where an instrument never leaves, nothing holds a Gaussian in place but its tail on the tissue beside it. A few are
     pulled wide at the times nobody sees them, and from another pose they hang over the tissue like a veil.
     """
-    shown, _ = _sightings(model, clip, frames)  # tissue without depth is seen, however unsure its place
-    unseen = np.flatnonzero(shown == 0)
+    unseen = np.flatnonzero(~_ever_on_tissue(model, clip, frames))
     widest = _widest(model, unseen, [float(frames.t[index]) for index in _spread(frames.indices, SAMPLED_FRAMES)])
     kept = np.ones(model.count, np.bool_)
     kept[unseen] = widest <= WIDEST_UNSEEN
@@ -41,6 +41,15 @@ def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
         return 0
     model.take(np.flatnonzero(kept).astype(np.int64), np.zeros(int(kept.sum()), np.bool_))
     return int((~kept).sum())
+
+
+def _ever_on_tissue(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.bool_]:
+    """[N] whether the centre projects onto a tissue pixel in any training frame, hidden or not."""
+    found = np.zeros(model.count, np.bool_)
+    for index in frames.indices:
+        inside, i, j, _ = _pixels(model, clip, frames, index)
+        found[inside] |= clip.tissue[index][i, j]
+    return found
 
 
 def _widest(model: Model, chosen: NDArray[np.intp], times: Sequence[float]) -> NDArray[np.float32]:
@@ -60,28 +69,29 @@ def _widest(model: Model, chosen: NDArray[np.intp], times: Sequence[float]) -> N
 def seen_share(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.float32]:
     """[N] in [0, 1]: share of training frames in which a Gaussian's centre lay on visible tissue, times the stereo
     confidence of that pixel."""
-    return _sightings(model, clip, frames)[1]
-
-
-def _sightings(
-    model: Model, clip: DepthClip, frames: TrainingFrames
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Share of training frames that show each Gaussian's centre on tissue, [N]; the same times stereo confidence."""
-    shown, trusted = np.zeros((2, model.count), np.float64)
+    trusted = np.zeros(model.count, np.float64)
     sampled = _spread(frames.indices, SAMPLED_FRAMES)
     for index in sampled:
-        camera = frames.cameras[index]
-        image = model.render(camera, float(frames.t[index]))
+        image = model.render(frames.cameras[index], float(frames.t[index]))
         surface = image[3] / np.maximum(image[4], 1e-6)
-        x, y, z = _camera_points(model.deformed_mean(float(frames.t[index])), camera)
-        column, row = np.floor(camera[0] * x / z + camera[2]), np.floor(camera[1] * y / z + camera[3])
-        height, width = surface.shape
-        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        i, j = row[inside].astype(int), column[inside].astype(int)
-        visible = clip.tissue[index][i, j] & (z[inside] <= surface[i, j] * (1 + BEHIND))
-        shown[inside] += visible
-        trusted[inside] += visible * (clip.depth_confidence[index][i, j] / 255.0)
-    return (shown / len(sampled)).astype(np.float32), (trusted / len(sampled)).astype(np.float32)
+        inside, i, j, z = _pixels(model, clip, frames, index)
+        visible = clip.tissue[index][i, j] & (z <= surface[i, j] * (1 + BEHIND))
+        # Completed depth is a guess, not nothing: tissue without stereo keeps a little confidence.
+        confidence = np.maximum(clip.depth_confidence[index][i, j] / 255.0, COMPLETED_CONFIDENCE)
+        trusted[inside] += visible * confidence
+    share: NDArray[np.float32] = (trusted / len(sampled)).astype(np.float32)
+    return share
+
+
+def _pixels(
+    model: Model, clip: DepthClip, frames: TrainingFrames, index: int
+) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+    """Which centres [N] lie in frame `index`; row, column and camera z of those."""
+    camera, (height, width) = frames.cameras[index], clip.tissue[index].shape
+    x, y, z = _camera_points(model.deformed_mean(float(frames.t[index])), camera)
+    column, row = np.floor(camera[0] * x / z + camera[2]), np.floor(camera[1] * y / z + camera[3])
+    inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return inside, row[inside].astype(np.intp), column[inside].astype(np.intp), z[inside]
 
 
 def _spread(indices: Sequence[int], count: int) -> list[int]:

@@ -14,6 +14,7 @@ from tests.worker.phantoms import phantom_clip
 from worker.clip import DepthClip
 from worker.fusion import PointCloud, fuse
 from worker.model import Model
+from worker.motion import track
 from worker.presets import PRESETS, Preset
 from worker.start import MIN_STRIDE, bases_of, fusion_for, start_model
 from worker.targets import units_per_mm
@@ -29,7 +30,8 @@ def started(clip: DepthClip, preset: Preset, train: list[int] | None = None) -> 
     frames = train or list(range(clip.frame_count))
     scale = units_per_mm(clip, frames)
     cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0)
-    return start_model(cloud, clip, frames, preset, scale, seed=0), cloud, scale
+    tracks = track(clip, frames) if preset.tracks and len(frames) > 1 else None
+    return start_model(cloud, tracks, clip, frames, preset, scale, seed=0), cloud, scale
 
 
 @pytest.mark.parametrize("size", [(640, 512), (1280, 1024), (333, 777), (64, 48)])

@@ -12,6 +12,7 @@ from tests.helpers import assert_close
 from tests.worker.clips import WIDTH, plane_clip
 from tests.worker.phantoms import prepared
 from worker.clip import DepthClip
+from worker.fusion import COMPLETED_CONFIDENCE
 from worker.train import Run
 from worker.visibility import SAMPLED_FRAMES, WIDEST_UNSEEN, drop_strays, seen_share
 
@@ -67,7 +68,9 @@ def test_a_wide_gaussian_on_tissue_without_depth_is_no_stray(clip: DepthClip) ->
     run = start(clip)
     run.model.canonical[7:10] = np.log(2 * WIDEST_UNSEEN)
     unsure = dataclasses.replace(clip, depth_confidence=np.zeros_like(clip.depth_confidence))
-    assert not seen_share(run.model, unsure, run.frames).any()
+    seen = seen_share(run.model, unsure, run.frames)
+    assert seen.any()
+    assert (seen <= COMPLETED_CONFIDENCE + 1e-6).all()
     assert drop_strays(run.model, unsure, run.frames) == 0
 
 

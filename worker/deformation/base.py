@@ -1,7 +1,8 @@
 """What all deformation models share: the channels they move and the promises they keep.
 
 Symbols: N Gaussians, B bases or weights a channel, C = 10 channels, t model time in [0, 1).
-Channels: mean 0:3, quaternion 3:7, log-scale 7:10. Opacity and colour do not deform.
+Channels: mean 0:3, quaternion 3:7, log-scale 7:10. Opacity never deforms; colour does
+where a model has channels 10:13 for it (shared.py).
 """
 
 from __future__ import annotations
