@@ -62,7 +62,7 @@ def examine(settings: Settings) -> list[Finding]:
     checks: tuple[Callable[[], list[Finding]], ...] = (
         _python,
         _packages,
-        _device,
+        lambda: _device(settings),
         _video,
         lambda: _queue(settings),
         lambda: _disk(settings),
@@ -106,15 +106,18 @@ def _packages() -> list[Finding]:
     return findings
 
 
-def _device() -> list[Finding]:
+def _device(settings: Settings) -> list[Finding]:
     try:
         torch = importlib.import_module("torch")
+        device = importlib.import_module("worker.process").training_device(settings.device)
     except ImportError:
         return []  # said above
-    if torch.cuda.is_available():
-        return [Finding("device", f"cuda: {torch.cuda.get_device_name(0)}")]
+    except UnavailableError as error:
+        return [Finding("device", error.problem, error.remedy, blocks=True)]
     build = f"CUDA {torch.version.cuda} build, no GPU seen" if torch.version.cuda else "CPU build of torch"
-    return [Finding("device", f"cpu, {_cores()} threads ({build})")]
+    if torch.cuda.is_available():
+        build = f"GPU seen, unused in this version: {torch.cuda.get_device_name(0)}"
+    return [Finding("device", f"{device}, {_cores()} threads ({build})")]
 
 
 def _video() -> list[Finding]:

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import logging
+import tempfile
 import threading
 import time
 from pathlib import Path
 
-import torch
-
 from contract.embedded import short_socket_path
-from contract.errors import UnavailableError
+from contract.errors import InputError, UnavailableError
 from contract.job import JobRecord
 from contract.locks import FolderLock
 from contract.queue_redis import RedisQueue
 from contract.rendering import WorkerAddress
 from contract.settings import Settings
 from contract.store import Store
+from worker.checkpoint import RESUME_FILE
 from worker.consume import announced, consume
 from worker.hooks import Hooks
-from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.pipeline import ReconstructionRequest, check_device, reconstruct
 from worker.raster.cpu import compile_kernels
 from worker.serve import RequestServer
 from worker.views import Views
@@ -31,9 +31,11 @@ def run_worker(settings: Settings, end: threading.Event) -> None:
     """Work until `end` is set.
 
     Raises:
-        UnavailableError: the queue does not answer, or a worker of this name works on this data directory already.
+        UnavailableError: the queue does not answer, a worker of this name works on this data directory already, or the
+            device is not one to train on.
     """
     assert settings.redis_url is not None
+    device = training_device(settings.device)
     store = Store(settings.data_dir)
     lock = FolderLock(store.run_dir / f"{settings.worker_name}.lock")
     if not lock.take():
@@ -47,10 +49,12 @@ def run_worker(settings: Settings, end: threading.Event) -> None:
     socket_path = short_socket_path(store.run_dir, f"{settings.worker_name}.sock")
     socket_path.unlink(missing_ok=True)  # of an earlier process of this name
     endpoint = f"ipc://{socket_path}"
-    address = WorkerAddress(name=settings.worker_name, endpoint=endpoint, device=device_name(settings.device))
+    address = WorkerAddress(name=settings.worker_name, endpoint=endpoint, device=device)
+    # What is unpacked of clips stays in the data directory, and does not outlive the next start.
+    tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
 
     def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
-        reconstruct(request_of(record, spool, settings.device), out, hooks)
+        run_or_start_anew(request_of(record, spool, device), out, hooks)
 
     with RequestServer(endpoint, Views(store).answer), announced(queue, address):
         logger.info("worker %s is ready on %s", address.name, address.device)
@@ -80,6 +84,27 @@ def request_of(record: JobRecord, spool: Path, device: str) -> ReconstructionReq
     )
 
 
-def device_name(device: str) -> str:
-    """The device that `auto` means here."""
-    return "cuda" if device == "cuda" or (device == "auto" and torch.cuda.is_available()) else "cpu"
+def run_or_start_anew(request: ReconstructionRequest, out: Path, hooks: Hooks) -> None:
+    """Reconstruct; from the beginning if the state in `out` is damaged, or of an earlier version of this program."""
+    resumes = (out / RESUME_FILE).exists()
+    try:
+        reconstruct(request, out, hooks)
+    except InputError as error:
+        if error.field != "--out" or not resumes:
+            raise
+        logger.warning("the stored state is of no use to this version; training starts anew")
+        (out / RESUME_FILE).unlink()
+        reconstruct(request, out, hooks)
+
+
+def training_device(device: str) -> str:
+    """The device that jobs are trained on, where INTRASPLAT_DEVICE is `device`.
+
+    Raises:
+        UnavailableError: this version cannot train there.
+    """
+    try:
+        check_device(device)
+    except UnavailableError as error:
+        raise UnavailableError(error.problem, "Set INTRASPLAT_DEVICE to auto or cpu.") from error
+    return "cpu"

@@ -22,6 +22,13 @@ def test_this_installation_is_complete_and_its_decoder_is_not_the_vulnerable_one
     assert "up` starts" in findings["queue"].found
 
 
+def test_a_device_that_cannot_be_trained_on_blocks_and_has_a_remedy(tmp_path: Path) -> None:
+    assert found(Settings(data_dir=tmp_path))["device"].found.startswith("cpu, ")
+    finding = found(Settings(data_dir=tmp_path, device="cuda"))["device"]
+    assert finding.blocks
+    assert finding.remedy == "Set INTRASPLAT_DEVICE to auto or cpu."
+
+
 def test_a_queue_that_does_not_answer_has_a_remedy(tmp_path: Path) -> None:
     finding = found(Settings(data_dir=tmp_path, redis_url=f"unix://{tmp_path}/nobody.sock"))["queue"]
     assert finding.remedy == "start that server, or unset REDIS_URL"
