@@ -19,8 +19,8 @@ from pydantic import ValidationError
 from contract.calibration import RectifiedCalibration, StereoCalibration, parse_calibration
 from contract.errors import InputError
 from worker.calibration.check import FIELD, check_calibration
+from worker.clip.limits import MOST_CALIBRATION_BYTES
 
-MAX_FILE_BYTES = 1_000_000  # a calibration has a few kB; anything larger is another file
 MAX_ASPECT_CHANGE = 0.005  # 1348x1080 read as 640x512 is still one scale; a cropped image is not
 
 FORMATS_REMEDY = (
@@ -74,7 +74,7 @@ def load_calibration(path: Path | str, *, eye_width: int, eye_height: int) -> St
 
 def _read_text(path: Path) -> str:
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
+        if path.stat().st_size > MOST_CALIBRATION_BYTES:
             raise InputError(FIELD, f"{path.name} has {path.stat().st_size} bytes.", FORMATS_REMEDY)
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:

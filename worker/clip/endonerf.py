@@ -17,7 +17,8 @@ from contract.camera import Intrinsics
 from contract.errors import InputError
 from worker.clip.files import FileTree
 from worker.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
-from worker.clip.masks import NO_MASKS, MaskPolarity, TissueMasks, read_masks, tissue_from_masks
+from worker.clip.limits import MOST_POSES_BYTES
+from worker.clip.masks import NO_MASKS, MaskFrames, MaskPolarity, TissueMasks, tissue_from_masks
 from worker.clip.naming import check_aligned
 from worker.clip.poses import POSES_FILE, PoseConvention, Poses, parse_poses
 from worker.clip.types import DepthClip
@@ -25,7 +26,6 @@ from worker.clip.video import FALLBACK_RATE_HZ
 
 LAYOUT = "EndoNeRF"
 CONFIDENT = 255  # depth_confidence of every valid depth: the layout carries none of its own
-_BYTES_PER_PIXEL = 3 + 4 + 1 + 1  # rgb, depth_mm, depth_confidence, tissue
 _USUAL_DEPTH_MM = (5.0, 500.0)  # working distances of endoscopes with ample room; other units fall outside
 _LEAST_DEPTH_SHARE = 0.5  # of tissue pixels with depth, below which the user should know
 _MOST_THREADS = 4  # decoding PNG releases the interpreter; more threads than this wait for the disk
@@ -38,21 +38,25 @@ def is_endonerf(tree: FileTree) -> bool:
 
 
 def read_endonerf(
-    tree: FileTree, masks_white: NDArray[np.bool_] | None, mask_polarity: MaskPolarity, convention: PoseConvention
+    tree: FileTree, given: MaskFrames | None, mask_polarity: MaskPolarity, convention: PoseConvention
 ) -> DepthClip:
-    """Decodes the whole clip. masks_white [T, H, W], when given, replaces the folder's own masks.
+    """Decodes the whole clip. The masks given, if any, replace the folder's own.
 
     Depth images hold millimetres in 8 or 16 bit, 0 = invalid. Intrinsics are f, cx = W / 2, cy = H / 2:
     all the layout knows.
     Raises InputError for everything that does not fit together and LimitError when it is too large.
     """
     _check_files(tree)
-    images = open_images(tree, tree.images("images"), _BYTES_PER_PIXEL)
-    poses = parse_poses(tree.read(POSES_FILE), images.frame_count, convention)
+    images = open_images(tree, tree.images("images"))
+    tree.limits.check_clip(tree.field, tree.label, images.frame_count, images.width, images.height, eyes=1)
+    header_bytes, frame_bytes = MOST_POSES_BYTES
+    poses = parse_poses(
+        tree.read(POSES_FILE, header_bytes + frame_bytes * images.frame_count), images.frame_count, convention
+    )
     _check_size(images, poses)
+    masks = _masks(tree, images, given, mask_polarity)
     rgb = _decode_all(images, np.uint8, (3,), lambda name: as_rgb(images.decode(name), tree.field, name))
     depth_mm = _read_depth(tree, images)
-    masks = _masks(tree, images, masks_white, mask_polarity)
     if not ((depth_mm > 0) & masks.tissue).any():
         where = "on tissue" if (depth_mm > 0).any() else "anywhere"
         raise InputError(
@@ -123,17 +127,15 @@ def _read_depth(tree: FileTree, images: ImageSequence) -> NDArray[np.float32]:
     return _decode_all(depth, np.float32, (), lambda name: as_depth_mm(depth.decode(name), tree.field, name))
 
 
-def _masks(
-    tree: FileTree, images: ImageSequence, masks_white: NDArray[np.bool_] | None, told: MaskPolarity
-) -> TissueMasks:
+def _masks(tree: FileTree, images: ImageSequence, given: MaskFrames | None, told: MaskPolarity) -> TissueMasks:
     shape = (images.frame_count, images.height, images.width)
-    if masks_white is None:
+    if given is None:
         names = tree.images("masks")
         if not names:
             return TissueMasks(np.ones(shape, dtype=np.bool_), NO_MASKS)
         check_aligned("masks", images.names, names)
-        masks_white = read_masks(tree, names)
-    return tissue_from_masks(masks_white, shape, told, by_layout=(LAYOUT, "tool"))
+        given = MaskFrames(open_images(tree, names))
+    return tissue_from_masks(given, shape, told, by_layout=(LAYOUT, "tool"))
 
 
 def _decode_all(

@@ -60,30 +60,34 @@ class FileTree(ABC):
         """Where the file lies on disk; None inside an archive."""
         return None
 
-    def read(self, name: str, at_most: int | None = None) -> bytes:
-        """Content of a file, or its first at_most bytes. InputError when unreadable, LimitError when too large."""
-        if at_most is None:
-            return b"".join(self._chunks(name))
-        return next(self._chunks(name, at_most), b"")
+    def read(self, name: str, most_bytes: int) -> bytes:
+        """Content of a file. InputError when it is unreadable, LimitError when it is larger than most_bytes."""
+        return b"".join(self._chunks(name, most_bytes))
 
-    def copy_to(self, name: str, target: Path) -> None:
-        """Writes a file under a name of ours, for readers that need a path. target must not exist."""
+    def head(self, name: str, size: int) -> bytes:
+        """The first `size` bytes of a file, or all of a smaller one. InputError when it is unreadable."""
+        return next(self._chunks(name, size, size), b"")
+
+    def copy_to(self, name: str, target: Path, most_bytes: int | None = None) -> None:
+        """Writes a file under a name of ours, for readers that need a path. target must not exist.
+
+        Raises what `read` does; most_bytes is the limit for everything in an archive unless given.
+        """
         with target.open("xb") as stream:
-            for chunk in self._chunks(name):
+            for chunk in self._chunks(name, self.limits.decoded_bytes if most_bytes is None else most_bytes):
                 stream.write(chunk)
 
-    def _chunks(self, name: str, size: int = _CHUNK_BYTES) -> Iterator[bytes]:
+    def _chunks(self, name: str, most_bytes: int, size: int = _CHUNK_BYTES) -> Iterator[bytes]:
         """Content piece by piece, counted while it is inflated: what an archive declares may be a lie."""
         total = 0
         try:
             with self.open(name) as stream:
                 while chunk := stream.read(size):
                     total += len(chunk)
-                    if total > self.limits.decoded_bytes:
+                    if total > most_bytes:
+                        problem = f"{name} is larger than {most_bytes} bytes."
                         raise LimitError(
-                            self.field,
-                            f"{name} is larger than {self.limits.decoded_bytes} bytes.",
-                            "Give a smaller file.",
+                            self.field, problem, "Write the file again, without what does not belong in it."
                         )
                     yield chunk
         except (OSError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:

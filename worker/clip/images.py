@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from contract.errors import InputError
 from worker.clip.files import FileTree
+from worker.clip.limits import MOST_IMAGE_BYTES
 from worker.clip.types import RgbFrame
 
 MASK_THRESHOLD = 128  # of 255: masks are binary, but lossy video and resizing leave grey edges
@@ -51,19 +52,21 @@ class ImageSequence:
 
     def decode(self, name: str) -> NDArray[Any]:
         """The pixels as stored, size checked: [H, W] or [H, W, channels], uint8 or uint16, colours in BGR order."""
-        image = decode_image(self.tree.read(name), self.tree.field, name)
+        metadata_bytes, pixel_bytes = MOST_IMAGE_BYTES
+        data = self.tree.read(name, metadata_bytes + pixel_bytes * self.width * self.height)
+        image = decode_image(data, self.tree.field, name)
         if image.shape[:2] != (self.height, self.width):
             raise InputError(self.tree.field, f"{name} changed while it was read.", "Do not write to the clip.")
         return image
 
 
-def open_images(tree: FileTree, names: tuple[str, ...], bytes_per_pixel: int = 3) -> ImageSequence:
+def open_images(tree: FileTree, names: tuple[str, ...]) -> ImageSequence:
     """Checks every image's header: all of one size, and within the tree's limits. InputError, LimitError."""
     if not names:
         raise InputError(tree.field, f"{tree.label} holds no PNG or JPEG images.", "Give the frames as PNG files.")
     width, height = _size_of(tree, names[0])
     tree.limits.check_frame(tree.field, names[0], width, height)
-    tree.limits.check_clip(tree.field, tree.label, len(names), width * height * bytes_per_pixel)
+    tree.limits.check_clip(tree.field, tree.label, len(names), width, height)
     for name in names[1:]:
         if (size := _size_of(tree, name)) != (width, height):
             raise InputError(
@@ -117,10 +120,10 @@ def as_depth_mm(image: NDArray[Any], field: str, name: str) -> NDArray[np.float3
 
 def _size_of(tree: FileTree, name: str) -> tuple[int, int]:
     """(width, height) from the header."""
-    header = tree.read(name, at_most=32)
+    header = tree.head(name, 32)
     size = _png_size(header)
     if size is None and header.startswith(_JPEG_MAGIC):
-        size = _jpeg_size(tree.read(name, at_most=4 * _HEADER_BYTES))
+        size = _jpeg_size(tree.head(name, 4 * _HEADER_BYTES))
     if size is None:
         problem = f"{name} is empty (0 bytes)." if not header else f"{name} is not a PNG or JPEG image."
         raise InputError(tree.field, problem, "Write the image again, as PNG.")

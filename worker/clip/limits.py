@@ -5,11 +5,35 @@ A 166 kB file can decode to 18 GB, so sizes are checked in the header and again 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, field
 
 from contract.errors import LimitError
 
 SMALLEST_SIDE_PX = 16  # below this neither stereo matching nor a tile of the rasteriser has anything to work on
+
+HELD_BYTES_PER_PIXEL = 18
+"""Memory that a pixel of one eye takes in every frame while a clip is reconstructed.
+
+9 in the DepthClip (rgb 3, depth_mm 4, depth_confidence 1, tissue 1), 8 in the training frames made from it (rgb 3,
+weight 1, inverse depth 4), and 1 for their padding; before these exist, masks and the grey right eye take less.
+"""
+
+MOST_MEMORY_BYTES = 8 * 1024**3  # a clip may take, however much there is: more frames than this train for too long
+MEMORY_SHARE = 2  # a clip may take one part in this many of the machine's memory; the model and its gradients need room
+
+MOST_POSES_BYTES = 1 << 16, 1024  # of poses_bounds.npy: its header, and a frame's 17 numbers with ample room
+MOST_CALIBRATION_BYTES = 1_000_000  # a calibration has a few kB; anything larger is another file
+MOST_IMAGE_BYTES = 1 << 20, 8  # of a PNG or JPEG: its metadata, and a pixel of 16-bit RGBA stored uncompressed
+
+
+def memory_for_clip_bytes() -> int:
+    """What a clip may take of this machine's memory: half of it, at most 8 GiB."""
+    try:
+        memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):  # not every system tells
+        return MOST_MEMORY_BYTES
+    return min(MOST_MEMORY_BYTES, memory_bytes // MEMORY_SHARE) if memory_bytes > 0 else MOST_MEMORY_BYTES
 
 
 @dataclass(frozen=True)
@@ -18,12 +42,13 @@ class ClipLimits:
 
     frames            frames of a clip
     pixels_per_frame  pixels of one recorded picture (both eyes when they share it); default: two eyes of 3840x2160
-    decoded_bytes     bytes of the whole clip once decoded, and of everything in an archive once inflated
+    decoded_bytes     memory of the whole clip while it is reconstructed (HELD_BYTES_PER_PIXEL), and bytes of everything
+                      in an archive once inflated; default: half of this machine's memory, at most 8 GiB
     """
 
     frames: int = 1000
     pixels_per_frame: int = 2 * 3840 * 2160
-    decoded_bytes: int = 8 * 1024**3
+    decoded_bytes: int = field(default_factory=memory_for_clip_bytes)
 
     def check_frame(self, field: str, label: str, width: int, height: int) -> None:
         """LimitError unless a picture of width x height pixels is acceptable."""
@@ -40,16 +65,26 @@ class ClipLimits:
                 "Scale the clip down.",
             )
 
-    def check_clip(self, field: str, label: str, frames: int, bytes_per_frame: int) -> None:
-        """LimitError unless `frames` decoded frames of bytes_per_frame bytes each are acceptable."""
+    def check_clip(self, field: str, label: str, frames: int, width: int, height: int, eyes: int = 2) -> None:
+        """LimitError unless `frames` pictures of width x height pixels are acceptable.
+
+        eyes is how many share a picture, of which one is held; 2 where that is not known yet.
+        """
         if frames > self.frames:
             raise LimitError(
                 field, f"{label} has {frames} frames or more; the limit is {self.frames}.", "Cut a shorter clip."
             )
+        bytes_per_frame = width * height * HELD_BYTES_PER_PIXEL // eyes
         if frames * bytes_per_frame > self.decoded_bytes:
+            fitting = self.decoded_bytes // bytes_per_frame
             raise LimitError(
                 field,
-                f"{label} decodes to {frames * bytes_per_frame} bytes ({frames} frames); "
-                f"the limit is {self.decoded_bytes}.",
-                "Cut a shorter clip or scale it down.",
+                f"{label} has at least {frames} frames of {width}x{height} pixels; they take "
+                f"{_mebibytes(frames * bytes_per_frame)} of memory, and the limit of "
+                f"{_mebibytes(self.decoded_bytes)} holds {fitting}.",
+                f"Cut it to {fitting} frames, or scale it down." if fitting else "Scale it down.",
             )
+
+
+def _mebibytes(count: int) -> str:
+    return f"{count / 2**20:.1f} MiB"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from contract.errors import InputError
 from worker.clip.files import FileTree, check_exists, open_tree
-from worker.clip.images import MASK_THRESHOLD, as_mask, open_images
+from worker.clip.images import MASK_THRESHOLD, ImageSequence, as_mask, open_images
 from worker.clip.limits import ClipLimits
 from worker.clip.naming import left_eye_only
 from worker.clip.video import VideoFile, open_video, open_video_in
@@ -37,16 +37,45 @@ class TissueMasks:
     warnings: tuple[str, ...] = ()
 
 
-def open_masks(path: Path, limits: ClipLimits) -> NDArray[np.bool_]:
-    """White pixels [T, H, W] of masks given as a zip or folder of images, or as a video. InputError, LimitError."""
+@dataclass(frozen=True)
+class MaskFrames:
+    """Masks whose number and size are known, but not yet their pixels: a small file may decode to gigabytes."""
+
+    frames: ImageSequence | VideoFile
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(T, H, W)."""
+        return self.frames.frame_count, self.frames.height, self.frames.width
+
+    def white(self) -> NDArray[np.bool_]:
+        """White pixels [T, H, W]. InputError when images have values, but none that is white."""
+        if isinstance(self.frames, ImageSequence):
+            decoded = map(self.frames.decode, self.frames.names)
+        else:
+            decoded = self.frames.frames()
+        white = np.empty(self.shape, dtype=np.bool_)
+        largest = 0
+        for index, image in enumerate(decoded):
+            white[index] = as_mask(image)
+            largest = max(largest, int(image.max()) // (257 if image.dtype == np.uint16 else 1))
+        if isinstance(self.frames, ImageSequence) and 0 < largest < MASK_THRESHOLD:
+            raise InputError(
+                _FIELD, f"the largest value in the masks is {largest} of 255.", "Write masks with the values 0 and 255."
+            )
+        return white
+
+
+def open_masks(path: Path, limits: ClipLimits) -> MaskFrames:
+    """Masks given as a zip or folder of images, or as a video. InputError, LimitError."""
     check_exists(path, _FIELD)
     tree = open_tree(path, _FIELD, limits)
     if tree is None:
-        return _video_masks(open_video(path, _FIELD, limits))
+        return MaskFrames(open_video(path, _FIELD, limits))
     names = mask_names(tree) or tree.images()
     if not names and len(tree.videos()) == 1:
-        return _video_masks(open_video_in(tree, tree.videos()[0]))
-    return read_masks(tree, left_eye_only(names))
+        return MaskFrames(open_video_in(tree, tree.videos()[0]))
+    return MaskFrames(open_images(tree, left_eye_only(names)))
 
 
 def mask_names(tree: FileTree) -> tuple[str, ...]:
@@ -55,38 +84,23 @@ def mask_names(tree: FileTree) -> tuple[str, ...]:
     return left_eye_only(tuple(names))
 
 
-def read_masks(tree: FileTree, names: tuple[str, ...]) -> NDArray[np.bool_]:
-    """White pixels [T, H, W] of mask images. InputError when none has a pixel that is white."""
-    images = open_images(tree, names, bytes_per_pixel=1)
-    white = np.empty((images.frame_count, images.height, images.width), dtype=np.bool_)
-    largest = 0
-    for index, name in enumerate(names):
-        image = images.decode(name)
-        white[index] = as_mask(image)
-        largest = max(largest, int(image.max()) if image.dtype == np.uint8 else int(image.max()) // 257)
-    if 0 < largest < MASK_THRESHOLD:
-        raise InputError(
-            _FIELD, f"the largest value in the masks is {largest} of 255.", "Write masks with the values 0 and 255."
-        )
-    return white
-
-
 def tissue_from_masks(
-    white: NDArray[np.bool_],
+    masks: MaskFrames,
     shape: tuple[int, int, int],
     told: MaskPolarity,
     by_layout: tuple[str, BrightClass] | None = None,
 ) -> TissueMasks:
-    """Tissue pixels of white pixels [T, H, W].
+    """Tissue pixels of a clip's masks, which are decoded only when their number and size fit its `shape` (T, H, W).
 
     What the user told wins; then the layout (its name, what white means there), unless the masks' own look contradicts
     it; then the look: the class that touches the border in most frames with less than 40 % of the area is the tool.
-    InputError when count or size differ from the clip's `shape` (T, H, W), when the tool's class cannot be told, when
-    the masks mark nothing, and when they leave no tissue.
+    InputError when they do not fit, when the tool's class cannot be told, when the masks mark nothing, and when they
+    leave no tissue.
     """
-    _check_shape(white, shape)
+    _check_shape(masks.shape, shape)
+    white = masks.white()
     bright, reason = _bright_class(white, told, by_layout)
-    tissue = white if bright == "tissue" else ~white
+    tissue = white if bright == "tissue" else np.logical_not(white, out=white)
     if not tissue.any():
         raise InputError(_FIELD, "every pixel of every mask is tool.", _POLARITY_REMEDY)
     warnings = []
@@ -139,22 +153,13 @@ def _bright_class_by_look(white: NDArray[np.bool_]) -> BrightClass | None:
     return None
 
 
-def _check_shape(white: NDArray[np.bool_], shape: tuple[int, int, int]) -> None:
+def _check_shape(given: tuple[int, int, int], shape: tuple[int, int, int]) -> None:
     frames, height, width = shape
-    if white.shape[0] != frames:
-        raise InputError(
-            _FIELD, f"there are {white.shape[0]} masks for {frames} frames.", "Give one mask for each frame."
-        )
-    if white.shape[1:] != (height, width):
+    if given[0] != frames:
+        raise InputError(_FIELD, f"there are {given[0]} masks for {frames} frames.", "Give one mask for each frame.")
+    if given[1:] != (height, width):
         raise InputError(
             _FIELD,
-            f"the masks are {white.shape[2]}x{white.shape[1]} pixels, the left eye is {width}x{height}.",
+            f"the masks are {given[2]}x{given[1]} pixels, the left eye is {width}x{height}.",
             "Give masks in the size of the left eye.",
         )
-
-
-def _video_masks(video: VideoFile) -> NDArray[np.bool_]:
-    white = np.empty((video.frame_count, video.height, video.width), dtype=np.bool_)
-    for index, frame in enumerate(video.frames()):
-        white[index] = as_mask(frame)
-    return white

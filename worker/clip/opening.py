@@ -8,14 +8,11 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Literal, get_args
 
-import numpy as np
-from numpy.typing import NDArray
-
 from contract.errors import InputError
 from worker.clip.endonerf import is_endonerf, read_endonerf
 from worker.clip.files import FileTree, check_exists, open_tree, scratch_folder
-from worker.clip.limits import ClipLimits
-from worker.clip.masks import NO_MASKS, BrightClass, MaskPolarity, open_masks
+from worker.clip.limits import MOST_CALIBRATION_BYTES, ClipLimits
+from worker.clip.masks import NO_MASKS, BrightClass, MaskFrames, MaskPolarity, open_masks
 from worker.clip.poses import PoseConvention
 from worker.clip.stereo_source import (
     STEREOMIS,
@@ -61,16 +58,16 @@ def open_clip(
     limits = limits or ClipLimits()
     path = Path(path)
     check_exists(path, "clip")
-    white = open_masks(Path(masks), limits) if masks is not None else None
+    given = open_masks(Path(masks), limits) if masks is not None else None
     if right is not None:
-        return _finish(_open_two(path, Path(right), layout, limits), white, mask_polarity, None)
+        return _finish(_open_two(path, Path(right), layout, limits), given, mask_polarity, None)
     tree = open_tree(path, "clip", limits)
     if layout == "endonerf" or (layout == "auto" and tree is not None and is_endonerf(tree)):
-        return read_endonerf(_needs_tree(tree, path), white, mask_polarity, pose_convention)
+        return read_endonerf(_needs_tree(tree, path), given, mask_polarity, pose_convention)
     clip = open_video_clip(path, layout, limits) if tree is None else open_tree_clip(tree, layout)
-    if white is None and tree is not None:
-        white = own_masks(tree)
-    return _finish(clip, white, mask_polarity, _mask_rule(tree, layout))
+    if given is None and tree is not None:
+        given = own_masks(tree)
+    return _finish(clip, given, mask_polarity, _mask_rule(tree, layout))
 
 
 def find_calibration(path: Path | str, scratch: Path | None = None, limits: ClipLimits | None = None) -> Path | None:
@@ -107,13 +104,13 @@ def _open_two(left: Path, right: Path, layout: Layout, limits: ClipLimits) -> St
 
 def _finish(
     clip: StereoClip,
-    white: NDArray[np.bool_] | None,
+    given: MaskFrames | None,
     told: MaskPolarity,
     by_layout: tuple[str, BrightClass] | None,
 ) -> StereoClip:
-    if white is None:
+    if given is None:
         return replace(clip, assumptions=(*clip.assumptions, NO_MASKS))
-    return with_masks(clip, white, told, by_layout)
+    return with_masks(clip, given, told, by_layout)
 
 
 def _mask_rule(tree: FileTree | None, layout: Layout) -> tuple[str, BrightClass] | None:
@@ -138,7 +135,7 @@ def _as_path(tree: FileTree, name: str, scratch: Path | None) -> Path:
         scratch = scratch_folder()
         atexit.register(shutil.rmtree, scratch, ignore_errors=True)
     target = scratch / f"calibration{PurePosixPath(name).suffix.lower()}"
-    tree.copy_to(name, target)
+    tree.copy_to(name, target, MOST_CALIBRATION_BYTES)
     return target
 
 

@@ -10,13 +10,12 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from contract.errors import InputError
 from worker.clip.files import FileTree, open_tree
 from worker.clip.images import ImageSequence, open_images
 from worker.clip.limits import SMALLEST_SIDE_PX, ClipLimits
-from worker.clip.masks import BrightClass, MaskPolarity, mask_names, read_masks, tissue_from_masks
+from worker.clip.masks import BrightClass, MaskFrames, MaskPolarity, mask_names, tissue_from_masks
 from worker.clip.naming import eye_of, left_eye_only, pair_names
 from worker.clip.packing import (
     PACKING_WORDS,
@@ -40,7 +39,7 @@ _Pairs = PackedPairs | TwoSequences
 def open_two_files(left: Path, right: Path, limits: ClipLimits) -> StereoClip:
     """Left and right eye as two videos, two folders or zips of frames, or two images."""
     pairs = pair_sequences(_open_eye(left, "clip", limits), _open_eye(right, "right", limits))
-    return _stereo_clip(pairs, ("layout: two files, left eye first",))
+    return _stereo_clip(pairs, ("layout: two files, left eye first",), limits)
 
 
 def open_video_clip(path: Path, layout: StereoLayout, limits: ClipLimits) -> StereoClip:
@@ -49,7 +48,7 @@ def open_video_clip(path: Path, layout: StereoLayout, limits: ClipLimits) -> Ste
         raise InputError(
             "options.layout", f'layout "{layout}" needs a folder or zip, {path.name} is a file.', "Leave it out."
         )
-    return _packed_clip(open_video(path, "clip", limits), layout)
+    return _packed_clip(open_video(path, "clip", limits), layout, limits)
 
 
 def open_tree_clip(tree: FileTree, layout: StereoLayout) -> StereoClip:
@@ -60,7 +59,7 @@ def open_tree_clip(tree: FileTree, layout: StereoLayout) -> StereoClip:
     images = _outside_masks(tree, tree.images())
     nameless = bool(images) and not any(eye_of(name) for name in images)
     if layout in ("sbs", "tb") or (layout == "auto" and nameless):
-        return _packed_clip(open_images(tree, images), layout)
+        return _packed_clip(open_images(tree, images), layout, tree.limits)
     left, right = pair_names(images)
     if not left:
         raise InputError(
@@ -70,24 +69,24 @@ def open_tree_clip(tree: FileTree, layout: StereoLayout) -> StereoClip:
         )
     pairs = pair_sequences(open_images(tree, left), open_images(tree, right))
     word = STEREOMIS if layout == "stereomis" or is_stereomis(tree) else "left and right frames"
-    return _stereo_clip(pairs, (f"layout: {word}, {left[0]} is the left eye",))
+    return _stereo_clip(pairs, (f"layout: {word}, told apart by their names",), tree.limits)
 
 
 def is_stereomis(tree: FileTree) -> bool:
     return any(PurePosixPath(name).name.lower() == STEREOMIS_CALIBRATION.lower() for name in tree.names)
 
 
-def own_masks(tree: FileTree) -> NDArray[np.bool_] | None:
-    """White pixels [T, H, W] of the masks that lie in the clip's own folder, if any."""
+def own_masks(tree: FileTree) -> MaskFrames | None:
+    """The masks that lie in the clip's own folder, if any."""
     names = mask_names(tree)
-    return read_masks(tree, names) if names else None
+    return MaskFrames(open_images(tree, names)) if names else None
 
 
 def with_masks(
-    clip: StereoClip, white: NDArray[np.bool_], told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
+    clip: StereoClip, given: MaskFrames, told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
 ) -> StereoClip:
     """The clip with its tissue pixels; see tissue_from_masks for how white is read."""
-    masks = tissue_from_masks(white, (clip.frame_count, clip.height, clip.width), told, by_layout)
+    masks = tissue_from_masks(given, (clip.frame_count, clip.height, clip.width), told, by_layout)
     return replace(
         clip,
         tissue=masks.tissue,
@@ -100,7 +99,7 @@ def _open_tree_videos(tree: FileTree, videos: tuple[str, ...], layout: StereoLay
     if len(videos) == 1:
         video = open_video_in(tree, videos[0])
         known = f"{STEREOMIS}, " if layout == "stereomis" or is_stereomis(tree) else ""
-        return _packed_clip(video, "tb" if layout == "stereomis" else layout, known)
+        return _packed_clip(video, "tb" if layout == "stereomis" else layout, tree.limits, known)
     eyes = {found[0] for name in videos if (found := eye_of(name))}
     if len(videos) != 2 or eyes != {"left", "right"}:
         raise InputError(
@@ -110,24 +109,25 @@ def _open_tree_videos(tree: FileTree, videos: tuple[str, ...], layout: StereoLay
         )
     left, right = left_eye_only(videos)[0], next(name for name in videos if name not in left_eye_only(videos))
     pairs = pair_sequences(open_video_in(tree, left), open_video_in(tree, right))
-    return _stereo_clip(pairs, (f"layout: two files, {left} is the left eye",))
+    return _stereo_clip(pairs, ("layout: two files, told apart by their names",), tree.limits)
 
 
-def _packed_clip(sequence: FrameSequence, layout: StereoLayout, known: str = "") -> StereoClip:
+def _packed_clip(sequence: FrameSequence, layout: StereoLayout, limits: ClipLimits, known: str = "") -> StereoClip:
     packing: Packing = layout if layout in ("sbs", "tb") else detect_packing(sequence)
     how = " (found by likeness of the halves)" if layout == "auto" else ""
     assumptions = [f"layout: {known}{PACKING_WORDS[packing]}{how}"]
     odd = sequence.width % 2 if packing == "sbs" else sequence.height % 2
     if odd:
         assumptions.append(f"layout: the odd middle {'column' if packing == 'sbs' else 'row'} belongs to neither eye")
-    return _stereo_clip(PackedPairs(sequence, packing), tuple(assumptions))
+    return _stereo_clip(PackedPairs(sequence, packing), tuple(assumptions), limits)
 
 
-def _stereo_clip(pairs: _Pairs, assumptions: tuple[str, ...]) -> StereoClip:
+def _stereo_clip(pairs: _Pairs, assumptions: tuple[str, ...], limits: ClipLimits) -> StereoClip:
     first = pairs.sequence if isinstance(pairs, PackedPairs) else pairs.left
     height, width = pairs.eye_size if isinstance(pairs, PackedPairs) else (first.height, first.width)
     if min(height, width) < SMALLEST_SIDE_PX:
         raise InputError("clip", f"one eye is {width}x{height} pixels.", f"Give at least {SMALLEST_SIDE_PX} a side.")
+    limits.check_clip("clip", first.label, first.frame_count, width, height, eyes=1)
     frame_times_s = first.frame_times_s
     if frame_times_s is None:
         frame_times_s = np.arange(first.frame_count) / FALLBACK_RATE_HZ

@@ -136,19 +136,19 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
     declared = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))  # negative when the container has no duration
     rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
     limits.check_frame(field, label, width, height)
-    limits.check_clip(field, label, declared, width * height * 3)
+    limits.check_clip(field, label, declared, width, height)
     times_ms: list[float] = []
     while capture.grab():
         times_ms.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)))
         if len(times_ms) == 1:
             good, frame = capture.retrieve()  # turned clips have another size than their header
             height, width = frame.shape[:2] if good else (height, width)
-        limits.check_clip(field, label, len(times_ms), width * height * 3)
+        limits.check_clip(field, label, len(times_ms), width, height)
     times_s = _times_s(times_ms, rate_hz)
     whole = len(times_ms) + MISSING_FRAMES_ALLOWED >= declared
     if not times_ms or not (whole or _whole_despite_count(path, decoder, declared, times_s, rate_hz)):
         raise _cut_short(field, label, len(times_ms), declared)
-    warnings = () if declared else (f"{label} does not say how many frames it has: a missing end would not be noticed",)
+    warnings = () if declared else (f"{field}: the video names no frame count, a missing end would not be noticed",)
     return VideoFile(path, field, label, decoder, len(times_ms), height, width, times_s, warnings)
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import stat
+import tracemalloc
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from contract.errors import InputError, LimitError
-from worker.clip import ClipLimits, open_clip
+from worker.clip import ClipLimits, find_calibration, open_clip
 
 GOOD = "left/000000.png"
 
@@ -85,6 +87,38 @@ def test_what_inflates_to_too_much_is_refused_before_it_is_read(tmp_path: Path) 
     assert path.stat().st_size < 10_000
     with pytest.raises(LimitError, match="inflates to 5000000 bytes"):
         open_clip(path, limits=ClipLimits(decoded_bytes=4_000_000))
+
+
+BOMB_BYTES = 64 << 20  # zeros: 64 kB in a zip
+
+
+def peak_bytes_of_refusing(work: Callable[[], object]) -> int:
+    """Most memory that Python and NumPy held while work() was refused as too large."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(LimitError, match="is larger than"):
+            work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["images/frame-000001.color.png", "depth/frame-000002.depth.png", "poses_bounds.npy"])
+def test_a_member_larger_than_its_kind_can_be_is_refused_before_it_fills_the_memory(studio, name: str) -> None:
+    """The images keep their right header and picture; zeros follow."""
+    folder = studio.endonerf()
+    with (folder / name).open("ab") as file:
+        file.write(bytes(BOMB_BYTES))
+    path = studio.zip(folder)
+    assert path.stat().st_size < 500_000
+    assert peak_bytes_of_refusing(lambda: open_clip(path)) < BOMB_BYTES // 8
+
+
+def test_a_calibration_larger_than_any_is_not_copied_out_of_a_zip(studio, tmp_path: Path) -> None:
+    folder = studio.endonerf()
+    (folder / "calibration.json").write_bytes(bytes(BOMB_BYTES))
+    path = studio.zip(folder)
+    assert peak_bytes_of_refusing(lambda: find_calibration(path, tmp_path)) < BOMB_BYTES // 8
 
 
 def test_a_member_whose_content_is_damaged_is_named(studio) -> None:

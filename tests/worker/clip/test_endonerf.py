@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from contract.errors import InputError, LimitError
 from worker.clip import ClipLimits, DepthClip, open_clip
+from worker.clip.limits import HELD_BYTES_PER_PIXEL
 
 
 def depth_clip(path: Path, **options) -> DepthClip:
@@ -251,8 +252,10 @@ def test_a_clip_over_the_limits_is_refused_before_it_is_decoded(studio) -> None:
     folder = studio.endonerf()
     with pytest.raises(LimitError, match="the limit is 2"):
         open_clip(folder, limits=ClipLimits(frames=2))
-    with pytest.raises(LimitError, match="decodes to"):
-        open_clip(folder, limits=ClipLimits(decoded_bytes=3 * 64 * 80 * 9 - 1))
+    needed = 3 * 64 * 80 * HELD_BYTES_PER_PIXEL
+    with pytest.raises(LimitError, match=r"3 frames of 80x64 pixels.* holds 2\. Cut it to 2 frames"):
+        open_clip(folder, limits=ClipLimits(decoded_bytes=needed - 1))
+    open_clip(folder, limits=ClipLimits(decoded_bytes=needed))
 
 
 def test_unknown_choices_are_refused(studio) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import pytest
 from contract.errors import InputError, LimitError
 from worker.clip import ClipLimits, StereoClip, find_calibration, open_clip
 
+LIVE = Path(__file__).parents[2] / "data/stereo_sbs_live.webm"  # declares no length
 PATTERNS = [
     ("clip/left/{}.png", "clip/right/{}.png"),
     ("clip/{}l.png", "clip/{}r.png"),
@@ -217,6 +219,28 @@ def test_a_calibration_is_found_in_a_folder_and_in_a_zip(studio, tmp_path: Path)
     assert found is not None
     assert found.read_text() == "[StereoLeft]\n"
     assert found.suffix == ".ini"
+
+
+@pytest.mark.parametrize("pattern", ["{eye}/smith_{{}}.png", "{eye}_smith_{{}}.png", "smith_{{}}{eye}.png"])
+@pytest.mark.parametrize("calibration", ["smith.txt", "StereoCalibration.ini"])
+def test_what_is_said_of_a_clip_repeats_no_name_of_its_files(studio, pattern: str, calibration: str) -> None:
+    """They may name a patient, and the report is passed on."""
+    folder = write_pairs(studio, ("clip/" + pattern.format(eye="left"), "clip/" + pattern.format(eye="right")))
+    (folder / calibration).write_text("[StereoLeft]")
+    studio.masks("clip/masks/smith", studio.tool(3))
+    clip = open_clip(studio.zip(folder, prefix="smith/"), mask_polarity="tool")
+    assert clip.assumptions
+    assert not any("smith" in said for said in clip.assumptions + clip.warnings)
+
+
+def test_what_is_said_of_videos_repeats_no_name_of_their_files(studio) -> None:
+    folder = studio.root / "smith"
+    folder.mkdir()
+    for eye in ("left", "right"):
+        shutil.copy(LIVE, folder / f"smith_{eye}.webm")
+    clip = open_clip(studio.zip(folder))
+    assert len(clip.warnings) == 2
+    assert not any("smith" in said for said in clip.assumptions + clip.warnings)
 
 
 def test_no_calibration_is_none_and_two_are_an_error(studio) -> None:

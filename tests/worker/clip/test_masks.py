@@ -145,6 +145,20 @@ def test_masks_of_another_count_or_size_are_refused(studio, frames: Path) -> Non
         open_clip(frames, masks=studio.masks("small", studio.tool(6, 40, 48)))
 
 
+def test_masks_that_do_not_fit_are_refused_before_they_are_decoded(studio, frames: Path) -> None:
+    """Their pixels are cut off, which nobody notices: number and size stand in the headers."""
+    for name, shape in (("few", (5, 80, 96)), ("small", (6, 40, 48))):
+        folder = studio.masks(name, studio.tool(*shape))
+        for path in folder.iterdir():
+            path.write_bytes(path.read_bytes()[:40])
+        with pytest.raises(InputError, match=r"5 masks for 6 frames|48x40 pixels"):
+            open_clip(frames, masks=folder)
+    endonerf = studio.endonerf(frames=3)
+    for masks in (studio.root / "few", studio.root / "small"):
+        with pytest.raises(InputError, match="masks for 3 frames"):
+            open_clip(endonerf, masks=masks)
+
+
 def test_masks_that_are_missing_or_unreadable_are_refused(frames: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist") as caught:
         open_clip(frames, masks=tmp_path / "nowhere")

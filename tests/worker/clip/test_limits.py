@@ -1,0 +1,54 @@
+"""What a clip may take: the limit counts what is really held, and follows the machine's memory."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from contract.errors import LimitError
+from tests.worker.clips import HEIGHT, WIDTH, plane_clip
+from worker.clip import ClipLimits
+from worker.clip.limits import HELD_BYTES_PER_PIXEL, MOST_MEMORY_BYTES, memory_for_clip_bytes
+from worker.targets import TrainingFrames
+
+GIB = 1024**3
+
+
+def arrays_bytes(value: object) -> int:
+    return sum(array.nbytes for array in vars(value).values() if isinstance(array, np.ndarray))
+
+
+def test_a_pixel_takes_what_the_clip_and_its_training_frames_hold_of_it() -> None:
+    clip = plane_clip(12)
+    held = arrays_bytes(clip) + arrays_bytes(TrainingFrames(clip, range(12), 1.0))
+    pixels = 12 * HEIGHT * WIDTH
+    assert HELD_BYTES_PER_PIXEL - 2 < held / pixels <= HELD_BYTES_PER_PIXEL
+
+
+@pytest.mark.parametrize(("memory_bytes", "share_bytes"), [(4 * GIB, 2 * GIB), (64 * GIB, 8 * GIB), (-1, 8 * GIB)])
+def test_a_clip_may_take_half_of_the_memory_and_at_most_eight_gib(
+    monkeypatch: pytest.MonkeyPatch, memory_bytes: int, share_bytes: int
+) -> None:
+    answers = {"SC_PAGE_SIZE": 1, "SC_PHYS_PAGES": memory_bytes}
+    monkeypatch.setattr(os, "sysconf", answers.__getitem__)
+    assert ClipLimits().decoded_bytes == memory_for_clip_bytes() == share_bytes
+
+
+def test_where_the_system_does_not_tell_its_memory_eight_gib_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sysconf")
+    assert memory_for_clip_bytes() == MOST_MEMORY_BYTES
+
+
+def test_a_clip_that_does_not_fit_is_told_how_many_of_its_frames_do() -> None:
+    limits = ClipLimits(decoded_bytes=GIB)
+    fitting = GIB // (1280 * 1024 * HELD_BYTES_PER_PIXEL)
+    limits.check_clip("clip", "it", fitting, 1280, 1024, eyes=1)
+    with pytest.raises(LimitError, match=r"1280x1024 pixels; .* limit of 1024.0 MiB holds 45") as caught:
+        limits.check_clip("clip", "it", fitting + 1, 1280, 1024, eyes=1)
+    assert caught.value.remedy == "Cut it to 45 frames, or scale it down."
+    limits.check_clip("clip", "it", 2 * fitting, 1280, 1024, eyes=2)
+    with pytest.raises(LimitError, match="holds 0") as caught:
+        ClipLimits(decoded_bytes=1000).check_clip("clip", "it", 1, 1280, 1024)
+    assert caught.value.remedy == "Scale it down."
