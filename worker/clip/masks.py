@@ -5,9 +5,10 @@ Symbols: T frames, H W pixels of the left eye.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,7 @@ class MaskFrames:
 
     def white(self) -> NDArray[np.bool_]:
         """White pixels [T, H, W]. InputError when images have values, but none that is white."""
+        decoded: Iterator[NDArray[Any]]
         if isinstance(self.frames, ImageSequence):
             decoded = map(self.frames.decode, self.frames.names)
         else:
