@@ -170,7 +170,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
     if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= {RESUME_FILE}):
         problem = f"{out} is there already and is neither an empty folder nor that of a stopped run."
         raise InputError("--out", problem, "Name a new folder.")
-    chosen = {field.name: getattr(options, field.name) for field in dataclasses.fields(ReconstructionRequest)}
+    fields = [field.name for field in dataclasses.fields(ReconstructionRequest)]
+    chosen = {name: getattr(options, name) for name in fields if hasattr(options, name)}
     interrupted = threading.Event()
     out.mkdir(parents=True, exist_ok=True)
     before = signal.signal(signal.SIGINT, _once(interrupted))
