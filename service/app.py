@@ -29,6 +29,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        store.remove_abandoned_uploads()
         yield
         await renderer.close()
         queue.close()

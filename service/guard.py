@@ -7,7 +7,7 @@ machine could still reach it; it is refused by its Origin, and a name that was r
 from __future__ import annotations
 
 from collections.abc import Collection
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -52,9 +52,17 @@ class Guard:
 
     def _refusal(self, headers: Headers) -> Problem | None:
         host = headers.get("host", "")
-        if urlsplit(f"//{host}").hostname not in self._hosts:
+        if _split(f"//{host}").hostname not in self._hosts:
             return Problem(403, f"This service does not answer to the name {host[:80]!r}.", field="Host")
         origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and _split(origin).netloc != host:
             return Problem(403, f"Pages from {origin[:80]!r} may not use this service.", field="Origin")
         return None
+
+
+def _split(url: str) -> SplitResult:
+    """The parts of a URL; all of them empty, and so allowed nowhere, if it is none."""
+    try:
+        return urlsplit(url)
+    except ValueError:
+        return urlsplit("")

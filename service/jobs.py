@@ -15,8 +15,8 @@ from contract.errors import UnavailableError
 from contract.job import TERMINAL_STATES, JobOptions, JobRecord, JobState, JobView, parse_options
 from contract.store import is_job_id, new_job_id
 from service.deps import Deps, Services
-from service.problems import RETRY_AFTER_S, Problem
-from service.upload import Received, receive_upload
+from service.problems import RETRY_AFTER_S, Problem, no_room
+from service.upload import Received, UploadLimits, receive_upload
 
 router = APIRouter(tags=["jobs"])
 
@@ -50,14 +50,14 @@ async def reconstruct(request: Request, response: Response, services: Services) 
     store, settings = services.store, services.settings
     free_bytes = store.free_bytes()
     if free_bytes < settings.min_free_bytes:
-        detail = f"{free_bytes} bytes are left on the data directory's disk."
-        raise Problem(507, detail, remedy="Delete scenes (DELETE /scenes/{id}) or give it more room.")
+        raise no_room(f"{free_bytes} bytes are left on the data directory's disk.")
     job_id = new_job_id()
     folder = store.open_incoming(job_id)
-    limit_bytes = min(settings.max_upload_bytes, free_bytes)
+    room_bytes = free_bytes - settings.min_free_bytes
     try:
         content_type = request.headers.get("content-type", "")
-        received = await receive_upload(content_type, request.stream(), folder, limit_bytes)
+        limits = UploadLimits(settings.max_upload_bytes, room_bytes)
+        received = await receive_upload(content_type, request.stream(), folder, limits)
         record = await run_in_threadpool(_accept, services, job_id, received)
     except ClientDisconnect:
         raise Problem(400, "The connection was closed before the upload was complete.") from None

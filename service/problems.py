@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Mapping
 
@@ -63,7 +64,13 @@ def install_handlers(app: FastAPI) -> None:
     app.add_exception_handler(UnavailableError, _on_unavailable)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
+    app.add_exception_handler(OSError, _on_os_error)
     app.add_exception_handler(Exception, _on_fault)
+
+
+def no_room(detail: str) -> Problem:
+    """The answer to what the disk has no room for."""
+    return Problem(507, detail, remedy="Delete scenes (DELETE /scenes/{id}) or give it more room.")
 
 
 async def _on_problem(request: Request, error: Exception) -> JSONResponse:
@@ -99,6 +106,12 @@ async def _on_http_exception(request: Request, error: Exception) -> JSONResponse
     assert isinstance(error, HTTPException)
     remedy = "The API is described at /openapi.json." if error.status_code in (404, 405) else None
     return Problem(error.status_code, str(error.detail), remedy=remedy).response(error.headers)
+
+
+async def _on_os_error(request: Request, error: Exception) -> JSONResponse:
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return no_room("The data directory's disk is full.").response()
+    return await _on_fault(request, error)
 
 
 async def _on_fault(request: Request, error: Exception) -> JSONResponse:

@@ -13,6 +13,7 @@ from typing import Protocol
 
 import zmq
 import zmq.asyncio
+from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from contract.errors import UnavailableError
@@ -120,7 +121,16 @@ class _Connection:
 
     async def _read(self) -> None:
         while True:
-            request_id, head, body = await self._socket.recv_multipart()
+            frames = await self._socket.recv_multipart()
+            if len(frames) != 3:
+                logger.warning("an answer of %d parts was ignored", len(frames))
+                continue
+            request_id, head, body = frames
             future = self._waiting.get(request_id)
-            if future is not None and not future.done():  # else its caller has given up
+            if future is None or future.done():  # its caller has given up
+                continue
+            try:
                 future.set_result(Answer(WorkerReply.model_validate_json(head), body))
+            except ValidationError:
+                problem = "The worker's answer cannot be read."
+                future.set_exception(UnavailableError(problem, "Start service and worker from the same version."))

@@ -6,11 +6,12 @@ import json
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Response
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
 from contract.errors import SceneError
+from contract.job import TERMINAL_STATES
 from contract.rendering import ExportRequest
 from contract.store import CURVE, REPORT, is_job_id
 from service.deps import Services
@@ -21,24 +22,18 @@ router = APIRouter(tags=["scenes"])
 
 
 class SceneSummary(BaseModel):
-    """A scene in the list."""
+    """A scene in the list; `error` says why its report, and so its quality, cannot be read."""
 
     id: str
-    psnr_tissue_db: float | None
+    psnr_tissue_db: float | None = None
+    error: str | None = None
     links: dict[str, str]
 
 
 @router.get("/scenes", operation_id="list_scenes")
 def list_scenes(services: Services) -> list[SceneSummary]:
     """All finished scenes, newest first."""
-    return [
-        SceneSummary(
-            id=scene_id,
-            psnr_tissue_db=_report(services, scene_id).get("psnr_tissue_db"),
-            links={"report": f"/scenes/{scene_id}", "render": f"/render?scene={scene_id}"},
-        )
-        for scene_id in services.store.scene_ids()
-    ]
+    return [_summary(services, scene_id) for scene_id in services.store.scene_ids()]
 
 
 @router.get("/scenes/{scene_id}", operation_id="get_scene")
@@ -77,18 +72,35 @@ def delete_scene(scene_id: str, services: Services) -> None:
     record = services.queue.get(scene_id) if is_job_id(scene_id) else None
     if record is None:
         services.store.scene_folder(scene_id)  # raises SceneError unless a scene is there without its record
-    elif not services.queue.forget(scene_id):
+    elif record.state not in TERMINAL_STATES:
         remedy = f"Cancel it first: DELETE /jobs/{scene_id}."
         raise Problem(409, f"The job is still {record.state}.", field="scene_id", remedy=remedy)
-    services.store.remove(scene_id)
+    services.store.remove(scene_id)  # before its record, by which a removal that was cut short can be asked for again
+    services.queue.forget(scene_id)
+
+
+def _summary(services: Services, scene_id: str) -> SceneSummary:
+    """A scene's line in the list; a damaged one hides no other."""
+    links = {"report": f"/scenes/{scene_id}", "render": f"/render?scene={scene_id}"}
+    try:
+        quality_db = _report(services, scene_id).get("psnr_tissue_db")
+        return SceneSummary(id=scene_id, psnr_tissue_db=quality_db, links=links)
+    except SceneError as error:
+        return SceneSummary(id=scene_id, error=str(error), links=links)
+    except ValidationError:
+        return SceneSummary(id=scene_id, error="The report of this scene holds no quality.", links=links)
 
 
 def _report(services: Services, scene_id: str) -> dict[str, Any]:
     path = services.store.scene_folder(scene_id) / REPORT
     try:
-        report = json.loads(path.read_text())
+        report = json.loads(path.read_text(), parse_constant=_refuse)
     except (OSError, ValueError) as error:
         raise SceneError(f"The report of scene {scene_id} cannot be read ({type(error).__name__}).") from error
     if not isinstance(report, dict):
         raise SceneError(f"The report of scene {scene_id} is not a JSON object.")
     return report
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number of JSON's")

@@ -15,7 +15,7 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.errors import InputError, LimitError
 from contract.job import JobFiles
-from service.problems import Problem
+from service.problems import Problem, no_room
 
 CLIP_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".zip")
 SUFFIXES = {
@@ -32,6 +32,14 @@ MAX_OPTIONS_BYTES = 64 * 1024
 MAX_CALIBRATION_BYTES = 16 * 2**20
 MAX_HEADER_BYTES = 8 * 1024
 FORM_REMEDY = "Send multipart/form-data with clip, or left and right, and optionally calibration, masks and options."
+
+
+@dataclass(frozen=True)
+class UploadLimits:
+    """What an upload may take: bytes at all, and bytes before the disk has less left than it must."""
+
+    upload_bytes: int
+    room_bytes: int
 
 
 @dataclass
@@ -71,18 +79,18 @@ class Received:
         return hashlib.sha256((self.digests["left"] + self.digests["right"]).encode()).hexdigest()
 
 
-async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: Path, limit_bytes: int) -> Received:
+async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: Path, limits: UploadLimits) -> Received:
     """Write the parts of a multipart body into folder.
 
     Raises:
-        Problem: 400, the body is not the multipart form it should be.
+        Problem: 400, the body is not the multipart form it should be; 507, the disk has no room for it.
         InputError: an unknown, repeated or empty part, or an ending that is not accepted.
-        LimitError: more than limit_bytes, counted as they come.
+        LimitError: more than limits.upload_bytes, counted as they come.
     """
     kind, parameters = parse_options_header(content_type)
     if kind != b"multipart/form-data" or not parameters.get(b"boundary"):
         raise Problem(400, f"The content type is {content_type[:80]!r}.", field="Content-Type", remedy=FORM_REMEDY)
-    receiver = _Receiver(parameters[b"boundary"], folder, limit_bytes)
+    receiver = _Receiver(parameters[b"boundary"], folder, limits)
     try:
         async for chunk in body:
             await run_in_threadpool(receiver.write, chunk)
@@ -96,9 +104,9 @@ async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: 
 class _Receiver:
     """The parser's callbacks, and the one part that is being received."""
 
-    def __init__(self, boundary: bytes, folder: Path, limit_bytes: int) -> None:
+    def __init__(self, boundary: bytes, folder: Path, limits: UploadLimits) -> None:
         self._folder = folder
-        self._limit_bytes = limit_bytes
+        self._limits = limits
         self._received = Received()
         self._ended = False
         self._header_name = b""
@@ -126,9 +134,11 @@ class _Receiver:
     def write(self, chunk: bytes) -> None:
         """Take the next piece of the body."""
         self._received.total_bytes += len(chunk)
-        if self._received.total_bytes > self._limit_bytes:
-            problem = f"the upload is larger than {self._limit_bytes} bytes."
+        if self._received.total_bytes > self._limits.upload_bytes:
+            problem = f"the upload is larger than {self._limits.upload_bytes} bytes."
             raise LimitError("clip", problem, "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES.")
+        if self._received.total_bytes > self._limits.room_bytes:
+            raise no_room(f"The disk has room for {self._limits.room_bytes} bytes of an upload.")
         self._parser.write(chunk)
 
     def finish(self) -> Received:

@@ -78,8 +78,8 @@ class House:
         return [path for area in ("incoming", "spool") for path in (self.store.data_dir / area).iterdir()]
 
 
-def make_house(data_dir: Path, **changes: Any) -> Iterator[House]:
-    queue, store, painter = MemoryQueue(), Store(data_dir), Painter()
+def make_house(data_dir: Path, queue: MemoryQueue | None = None, **changes: Any) -> Iterator[House]:
+    queue, store, painter = queue or MemoryQueue(), Store(data_dir), Painter()
     settings = Settings(data_dir=data_dir, render_timeout_s=5.0, min_free_bytes=0).model_copy(update=changes)
     app = create_app(settings, queue, store, ZmqRenderer(queue, settings.render_timeout_s))
     endpoint = f"ipc://{short_socket_path(store.run_dir, 'worker-1.sock')}"

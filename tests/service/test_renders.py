@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import pytest
+import zmq
 
 from contract.embedded import short_socket_path
+from contract.errors import UnavailableError
 from contract.job import JobState
-from contract.rendering import RenderRequest, WorkerAddress
+from contract.queue_memory import MemoryQueue
+from contract.rendering import RenderRequest, WorkerAddress, WorkerReply
+from contract.store import REPORT
 from tests.service.house import IDENTITY, House, assert_problem, make_house
 
 
@@ -105,6 +110,66 @@ def test_scenes_have_report_curve_and_export_until_they_are_deleted(house: House
     for path in (f"/scenes/{scene}", f"/scenes/{scene}/curve", f"/jobs/{scene}", f"/scenes/{scene}/export"):
         assert house.http.get(path).status_code == 404
     assert [path for path in house.store.data_dir.rglob("*") if scene in path.name] == []
+
+
+@pytest.mark.parametrize("report", [b"", b"[]", b"\xff", b'{"psnr_tissue_db": NaN}', b'{"psnr_tissue_db": "good"}'])
+def test_a_damaged_report_hides_no_other_scene(house: House, report: bytes) -> None:
+    sound, damaged = house.finished_scene(), house.finished_scene()
+    (house.store.scene_folder(damaged) / REPORT).write_bytes(report)
+    listed = {scene["id"]: scene for scene in house.http.get("/scenes").json()}
+    assert (listed[sound]["psnr_tissue_db"], listed[sound]["error"]) == (36.2, None)
+    assert listed[damaged]["psnr_tissue_db"] is None
+    assert listed[damaged]["error"]
+
+
+class ForgetfulQueue(MemoryQueue):
+    """Goes away just when a record is to be forgotten, once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_away = True
+
+    def forget(self, job_id: str) -> bool:
+        if self.is_away:
+            self.is_away = False
+            raise UnavailableError("The queue does not answer.", "Start it.")
+        return super().forget(job_id)
+
+
+def test_a_deletion_that_the_queue_cut_short_has_removed_the_files_and_can_be_repeated(tmp_path: Path) -> None:
+    for house in make_house(tmp_path, ForgetfulQueue()):
+        scene = house.finished_scene()
+        assert_problem(house.http.delete(f"/scenes/{scene}"), 503)
+        assert [path for path in house.store.data_dir.rglob("*") if scene in path.name] == []
+        assert house.http.delete(f"/scenes/{scene}").status_code == 204
+        assert house.http.get(f"/jobs/{scene}").status_code == 404
+
+
+def answer_badly_then_well(socket: zmq.Socket[bytes]) -> None:
+    """Two answers that cannot be read, one to each of two requests, then a sound one to the third."""
+    good = WorkerReply(media_type="image/png", t=0.5).model_dump_json().encode()
+    for head in (b"{", b'{"error": 5}', good):
+        caller, request_id, _ = socket.recv_multipart()
+        socket.send_multipart([caller, b"one part"])
+        socket.send_multipart([caller, request_id, head, b"picture"])
+    socket.close()
+
+
+def test_an_answer_that_cannot_be_read_spoils_no_later_one(house: House) -> None:
+    scene = house.finished_scene()
+    house.queue.withdraw("worker-1")
+    endpoint = f"ipc://{short_socket_path(house.store.run_dir, 'rude.sock')}"
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    socket = context.socket(zmq.ROUTER)
+    socket.bind(endpoint)
+    rude = threading.Thread(target=answer_badly_then_well, args=(socket,))
+    rude.start()
+    house.queue.announce(WorkerAddress(name="rude", endpoint=endpoint, device="cpu"))
+    for _ in range(2):
+        assert "cannot be read" in assert_problem(house.http.get("/render", params={"scene": scene}), 503)["detail"]
+    assert house.http.get("/render", params={"scene": scene}).content == b"picture"
+    rude.join()
+    context.term()
 
 
 def test_a_live_job_is_not_deleted_as_a_scene(house: House) -> None:

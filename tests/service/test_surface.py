@@ -14,7 +14,10 @@ def test_what_does_not_exist_is_a_problem_too(house: House, method: str, path: s
     assert_problem(house.http.request(method, path), status)
 
 
-@pytest.mark.parametrize("headers", [{"host": "evil.example"}, {"origin": "https://evil.example"}])
+@pytest.mark.parametrize(
+    "headers",
+    [{"host": "evil.example"}, {"host": "["}, {"origin": "https://evil.example"}, {"origin": "http://["}],
+)
 def test_foreign_pages_and_names_are_refused(house: House, headers: dict[str, str]) -> None:
     assert house.http.post("/reconstruct", headers=headers).status_code == 403
     assert house.http.get("/jobs", headers=headers).status_code == 403

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
+import os
+import time
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
+from fastapi import FastAPI
 
 from contract.job import JobRecord
-from contract.store import SUBMISSION
+from contract.store import ABANDONED_AFTER_S, SUBMISSION, Store, new_job_id
+from service.problems import Problem, install_handlers
+from service.upload import UploadLimits, receive_upload
+from tests.service.asgi import serving
 from tests.service.house import CLIP, House, assert_problem, make_house
 
 
@@ -104,10 +112,44 @@ def test_a_body_that_is_no_complete_form_is_a_bad_request(house: House, content_
     assert house.spooled() == []
 
 
+def test_uploads_cut_off_by_the_end_of_an_earlier_service_are_removed_at_the_start_of_the_next(tmp_path: Path) -> None:
+    folder = Store(tmp_path).open_incoming(new_job_id())
+    (folder / "clip.mp4").write_bytes(b"half")
+    long_ago_s = time.time() - ABANDONED_AFTER_S - 60
+    for path in (folder / "clip.mp4", folder):
+        os.utime(path, (long_ago_s, long_ago_s))
+    for house in make_house(tmp_path):
+        assert house.spooled() == []
+
+
 def test_an_upload_over_the_limit_is_cut_off_while_it_is_counted(tmp_path: Path) -> None:
     for house in make_house(tmp_path, max_upload_bytes=1000):
         assert "INTRASPLAT_MAX_UPLOAD_BYTES" in assert_problem(house.upload(), 413, "clip")["remedy"]
         assert house.spooled() == []
+
+
+def test_an_upload_leaves_the_room_on_disk_that_must_stay_free(tmp_path: Path) -> None:
+    limits = UploadLimits(upload_bytes=10**9, room_bytes=1000)
+
+    async def body() -> AsyncIterator[bytes]:
+        yield b'--x\r\nContent-Disposition: form-data; name="clip"; filename="a.mp4"\r\n\r\n' + b"x" * 1000
+
+    with pytest.raises(Problem, match="room for 1000 bytes") as caught:
+        asyncio.run(receive_upload("multipart/form-data; boundary=x", body(), tmp_path, limits))
+    assert caught.value.status == 507
+
+
+def test_a_disk_that_fills_up_is_told_as_such() -> None:
+    app = FastAPI()
+    install_handlers(app)
+
+    @app.get("/{device}")
+    def write(device: str) -> None:
+        Path("/dev", device).write_bytes(b"x")
+
+    with serving(app, "http://127.0.0.1") as http:
+        assert "Delete scenes" in assert_problem(http.get("/full"), 507)["remedy"]
+        assert_problem(http.get("/null/nothing"), 404)
 
 
 def test_nothing_is_accepted_on_a_full_disk(tmp_path: Path) -> None:
