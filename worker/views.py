@@ -18,7 +18,7 @@ from contract.store import Store
 from worker.checkpoint import Scene, load_scene
 from worker.encode import encode_layer
 from worker.export import export_ply
-from worker.render import render_frame
+from worker.render import ROUNDING, render_frame
 from worker.serve import View
 from worker.targets import MEDIAN_DEPTH_UNITS
 
@@ -42,7 +42,10 @@ class Views:
         """
         scene = self._scene(request.scene_id)
         if isinstance(request, ExportRequest):
-            return View(export_ply(scene, shown_time(scene, request.t)), "application/octet-stream", request.t)
+            shown = shown_time(scene, request.t)
+            outside = f"t = {request.t:g} lies outside the clip; t = {shown:.4g} is exported."
+            warnings = (outside,) if request.t > shown + ROUNDING else ()
+            return View(export_ply(scene, shown), "application/octet-stream", shown, warnings)
         intrinsics = camera_of(scene.intrinsics, request.camera, request.max_pixels)
         frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics)
         body = encode_layer(frame, request.layer, request.format)

@@ -90,6 +90,16 @@ def test_a_deleted_scene_is_not_shown_from_memory(store: Store, scene_id: str) -
 def test_an_export_holds_every_gaussian(store: Store, scene_id: str) -> None:
     view = Views(store).answer(ExportRequest(scene_id=scene_id, t=0.5))
     assert b"element vertex 120\n" in view.body
+    assert (view.t, view.warnings) == (0.5, ())
+
+
+def test_an_export_after_the_clip_is_of_its_last_frame_and_says_so(store: Store, scene_id: str) -> None:
+    view = Views(store).answer(ExportRequest(scene_id=scene_id, t=1))
+    last = Views(store).answer(ExportRequest(scene_id=scene_id, t=(FRAMES - 1) / FRAMES))
+    assert view.t == last.t == (FRAMES - 1) / FRAMES
+    assert view.body == last.body
+    assert view.warnings
+    assert not last.warnings
 
 
 def test_an_orbit_turns_about_the_median_depth() -> None:
