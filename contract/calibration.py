@@ -2,10 +2,12 @@
 
 Two kinds share the key `model`: "rectified" (rows already match; one focal length, one baseline) and "raw" (both eyes
 with their distortion and the rigid transform between them). Lengths are mm, image lengths are pixels of one eye.
+docs/conventions.md shows one of each; `python -m contract.calibration` prints their JSON schema.
 """
 
 from __future__ import annotations
 
+import json
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator
@@ -125,3 +127,7 @@ def parse_calibration(value: Any) -> RectifiedCalibration | RawCalibration:
 def calibration_schema() -> dict[str, Any]:
     """JSON schema of a calibration file."""
     return TypeAdapter(StereoCalibration).json_schema()
+
+
+if __name__ == "__main__":
+    print(json.dumps(calibration_schema(), indent=2))

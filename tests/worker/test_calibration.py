@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,7 @@ from contract.errors import InputError
 from worker.calibration import load_calibration, rectify
 from worker.clip.types import StereoClip
 
+CONVENTIONS = Path(__file__).parents[2] / "docs/conventions.md"
 WIDTH, HEIGHT = 160, 128
 RECTIFIED: dict[str, Any] = {
     "model": "rectified",
@@ -112,6 +116,38 @@ def test_the_json_schema_names_both_kinds_and_their_units() -> None:
     text = json.dumps(calibration_schema())
     for name in ("rectified", "raw", "baseline_mm", "fx_px", "right_from_left_translation_mm"):
         assert f'"{name}"' in text
+
+
+def test_the_module_prints_the_schema() -> None:
+    command = [sys.executable, "-m", "contract.calibration"]
+    printed = subprocess.run(command, cwd=CONVENTIONS.parents[1], capture_output=True, text=True, check=True)
+    assert json.loads(printed.stdout) == json.loads(json.dumps(calibration_schema()))
+
+
+def test_the_conventions_page_shows_both_kinds_as_they_are_read(tmp_path: Path) -> None:
+    """Every key, and values that pass all checks up to rectification."""
+    blocks = re.findall(r"^```json\n(.*?)^```", CONVENTIONS.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    examples = [json.loads(block) for block in blocks]
+    parsed = [parse_calibration(example) for example in examples]
+    assert [type(each) for each in parsed] == [RectifiedCalibration, RawCalibration]
+    for block, example, calibration in zip(blocks, examples, parsed, strict=True):
+        assert set(example) == set(type(calibration).model_fields) - {"assumptions"}
+        width, height = calibration.width, calibration.height
+        assert load(write(tmp_path / "c.json", block), width, height) == calibration
+        image = np.zeros((height, width, 3), np.uint8)
+        assert rectify(clip_of(image, image), calibration).warnings == ()
+
+
+def test_a_clip_says_whether_its_calibration_rectified_it() -> None:
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    said = [
+        rectify(clip_of(image, image), each).assumptions[-1]
+        for each in (parse_calibration(RECTIFIED), raw_calibration())
+    ]
+    assert said == [
+        "frames: rectified already, as the calibration says",
+        "frames: as recorded, rectified by the calibration",
+    ]
 
 
 def test_opencv_yaml_xml_and_json_and_the_ini_all_mean_the_same_calibration(tmp_path: Path) -> None:

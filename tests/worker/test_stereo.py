@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from contract.calibration import StereoCalibration, parse_calibration
 from contract.camera import Intrinsics
 from contract.errors import Cancelled, InputError
 from worker.calibration import RectifiedClip, load_calibration, rectify
@@ -131,6 +132,44 @@ def test_a_misalignment_beyond_eight_pixels_is_refused() -> None:
     with pytest.raises(InputError, match=r"differ by 14\.\d px") as error:
         estimate_depth(clip_of([draw_pair(slanted(), row_shift_px=14.0)]))
     assert error.value.field == "calibration"
+
+
+def raw_calibration(right_eye_lower_px: float) -> StereoCalibration:
+    """Two eyes alike but for the right one's principal point, which lies lower: recorded rows differ by as much."""
+    eye = {"fx_px": FX_PX, "fy_px": FX_PX, "cx_px": (WIDTH - 1) / 2, "cy_px": (HEIGHT - 1) / 2}
+    value = {
+        "model": "raw",
+        "width": WIDTH,
+        "height": HEIGHT,
+        "left": eye,
+        "right": eye | {"cy_px": eye["cy_px"] + right_eye_lower_px},
+        "right_from_left_rotation": np.eye(3).tolist(),
+        "right_from_left_translation_mm": [-BASELINE_MM, 0.0, 0.0],
+    }
+    return parse_calibration(value)
+
+
+def recorded(row_shift_px: float) -> StereoClip:
+    pair = draw_pair(slanted(), row_shift_px=row_shift_px)
+    return StereoClip(1, HEIGHT, WIDTH, lambda: iter([pair]), None, np.zeros(1))
+
+
+@pytest.mark.parametrize("lower_px", [-3.0, 5.0, 12.0])
+def test_frames_that_are_rectified_already_are_refused_with_a_raw_calibration(lower_px: float) -> None:
+    calibration = raw_calibration(lower_px)
+    as_recorded = estimate_depth(rectify(recorded(lower_px), calibration))
+    assert abs(as_recorded.measurements["vertical_misalignment_px"]) < 0.2
+    assert "frames: as recorded, rectified by the calibration" in as_recorded.assumptions
+    with pytest.raises(InputError, match="the frames are rectified already") as error:
+        estimate_depth(rectify(recorded(0.0), calibration))
+    assert (error.value.field, "model rectified" in error.value.remedy) == ("calibration", True)
+
+
+def test_a_small_misalignment_is_not_mistaken_for_frames_that_are_rectified_already() -> None:
+    clip = estimate_depth(rectify(recorded(0.0), raw_calibration(1.5)))
+    assert clip.measurements["vertical_misalignment_px"] == pytest.approx(-1.5, abs=0.1)
+    clip = estimate_depth(rectify(recorded(5.0 + 3.0), raw_calibration(5.0)))
+    assert clip.measurements["vertical_misalignment_px"] == pytest.approx(3.0, abs=0.2)  # rectifying magnifies a little
 
 
 def test_noise_costs_accuracy_gently() -> None:

@@ -21,6 +21,8 @@ from worker.clip.types import PairSource, RgbFrame, StereoClip
 OPENCV_PIXEL_CENTRE = 0.5  # OpenCV puts pixel centres at whole numbers, this project at +0.5 (docs/conventions.md)
 WARN_ZOOM, MAX_ZOOM = 1.2, 2.0  # of the focal length; a sound endoscope calibration stays below 1.1
 
+GRID_POINTS = 17  # a side, on which it is asked how far rectification moves rows
+
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]  # OpenCV's fixed-point maps: source pixel, index of its fraction
 
 
@@ -31,6 +33,9 @@ class RectifiedClip:
     pairs yields rectified (left, right) RGB uint8 frames, remapped as they are asked for. tissue is [T, H, W] bool in
     the pixels of the rectified left eye (a read-only view when no masks were given), False where the rectified image
     reaches beyond the recorded one. intrinsics are the left eye's.
+
+    equal_rows_px is y_right - y_left in these frames of points that lay on one row in the recorded ones: about what is
+    measured here when frames that had been rectified were rectified again.
     """
 
     frame_count: int
@@ -42,6 +47,7 @@ class RectifiedClip:
     frame_times_s: NDArray[np.float64]
     assumptions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    equal_rows_px: float = 0.0
 
 
 def rectify(clip: StereoClip, calibration: StereoCalibration) -> RectifiedClip:
@@ -94,7 +100,7 @@ def _pass_through(clip: StereoClip, calibration: RectifiedCalibration) -> Rectif
         pairs=clip.pairs,
         tissue=_all_tissue(clip) if clip.tissue is None else clip.tissue,
         frame_times_s=clip.frame_times_s,
-        assumptions=clip.assumptions + c.assumptions,
+        assumptions=(*clip.assumptions, *c.assumptions, "frames: rectified already, as the calibration says"),
         warnings=clip.warnings,
     )
 
@@ -125,9 +131,26 @@ def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
         pairs=_RemappedPairs(clip.pairs, left_maps, right_maps),
         tissue=_warp_tissue(clip, left_maps),
         frame_times_s=clip.frame_times_s,
-        assumptions=clip.assumptions + calibration.assumptions,
+        assumptions=(*clip.assumptions, *calibration.assumptions, "frames: as recorded, rectified by the calibration"),
         warnings=clip.warnings + _zoom_warning(float(left_p[0, 0]) / calibration.left.fx_px),
+        equal_rows_px=float(
+            np.median(_rows(size, *cameras[1], right_r, right_p) - _rows(size, *cameras[0], left_r, left_p))
+        ),
     )
+
+
+def _rows(
+    size: tuple[int, int],
+    k: NDArray[np.float64],
+    distortion: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    projection: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """The rectified rows of a coarse grid of recorded pixels, [M]."""
+    x, y = np.meshgrid(*(np.linspace(0, side - 1, GRID_POINTS) for side in size))
+    recorded = np.stack([x.ravel(), y.ravel()], axis=1)
+    rows: NDArray[np.float64] = cv2.undistortPoints(recorded, k, distortion, R=rotation, P=projection)[:, 0, 1]
+    return rows
 
 
 def _matrix(eye: RawEye) -> NDArray[np.float64]:

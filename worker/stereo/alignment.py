@@ -24,6 +24,7 @@ MAX_SEARCHED_SHIFT_PX = 48.0  # matches farther apart in y are wrong
 MIN_MATCHES = 20
 WORTH_CORRECTING_PX = 0.2  # resampling for less blurs more than it mends
 MAX_CORRECTION_PX = 8.0  # beyond it the calibration belongs to other frames
+WORST_EQUAL_ROWS_PX = 1.0  # by which the rows of frames that are rectified already may differ
 SWAPPED_SHARE = 0.8
 COARSE_WIDTH = 176  # px; wide enough for tissue, and a search of every disparity costs milliseconds
 NEAREST_MM = 12.0  # an endoscope that close sees nothing sharp
@@ -71,13 +72,15 @@ def feature_matches(left: Grey, right: Grey, at_most_px: int = FEATURE_WIDTH) ->
     return near
 
 
-def measure_row_shift(matches: NDArray[np.float64], infinity_px: float) -> RowShift:
+def measure_row_shift(matches: NDArray[np.float64], infinity_px: float, equal_rows_px: float = 0.0) -> RowShift:
     """The shift between the eyes' rows from matches [M, 4] of several frames.
 
-    infinity_px is the disparity of a point infinitely far away; real points lie above it.
+    infinity_px is the disparity of a point infinitely far away; real points lie above it. equal_rows_px is the shift
+    that rectification gave points that were on one row before it.
 
     Raises:
-        InputError: the eyes look swapped, or their rows differ by more than this project corrects.
+        InputError: the frames were rectified before they were rectified here, the eyes look swapped,
+            or their rows differ by more than this project corrects.
     """
     dy = matches[:, 3] - matches[:, 1]
     disparity_px = matches[:, 0] - matches[:, 2]
@@ -93,6 +96,7 @@ def measure_row_shift(matches: NDArray[np.float64], infinity_px: float) -> RowSh
     )
     if shift.matches < max(MIN_MATCHES, len(dy) // 4):
         return RowShift(0.0, 0.0, 0)
+    _check_recorded(shift.shift_px, equal_rows_px)
     _check_eyes(disparity_px[inliers] - infinity_px)
     if abs(shift.shift_px) > MAX_CORRECTION_PX:
         raise InputError(
@@ -142,6 +146,18 @@ def _densest(values: NDArray[np.float64]) -> float:
     counts = np.searchsorted(ordered, ordered + 2.0, side="right") - np.arange(len(ordered))
     first = int(np.argmax(counts))
     return float(np.median(ordered[first : first + counts[first]]))
+
+
+def _check_recorded(shift_px: float, equal_rows_px: float) -> None:
+    """Refuse frames whose rows matched before rectification and no longer do: they had been rectified already."""
+    if abs(equal_rows_px) <= 2 * WORST_EQUAL_ROWS_PX or abs(shift_px - equal_rows_px) > WORST_EQUAL_ROWS_PX:
+        return
+    raise InputError(
+        "calibration",
+        f"the rows of left and right match in the frames as given, to {abs(shift_px - equal_rows_px):.1f} px, and this "
+        f"calibration moves them {abs(shift_px):.1f} px apart: the frames are rectified already.",
+        "Give the calibration of the rectified pair (our JSON, model rectified), or the frames as recorded.",
+    )
 
 
 def _check_eyes(beyond_infinity_px: NDArray[np.float64]) -> None:

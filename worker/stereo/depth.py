@@ -46,7 +46,8 @@ def estimate_depth(
 
     Raises:
         ValueError: measured_frames is empty or names a frame that does not exist.
-        InputError: no depth anywhere, the eyes look swapped, or their rows differ by more than 8 px.
+        InputError: no depth anywhere, the frames had been rectified before, the eyes look swapped,
+            or their rows differ by more than 8 px.
         Cancelled: hooks.should_stop said so.
     """
     hooks = Hooks() if hooks is None else hooks
@@ -111,7 +112,7 @@ def _plan(
         return [(_grey(rgb[measured[k]]), right[measured[k]]) for k in chosen]
 
     matches = np.concatenate(list(pool.map(lambda pair: feature_matches(*pair), spread(ALIGNMENT_PAIRS))))
-    shift = measure_row_shift(matches, clip.disparity_offset_px)
+    shift = measure_row_shift(matches, clip.disparity_offset_px, clip.equal_rows_px)
     low, high = choose_range(
         spread(RANGE_PAIRS), shift.correction_px, clip.disparity_offset_px, clip.intrinsics.fx * clip.baseline_mm
     )
