@@ -27,8 +27,9 @@ from worker.targets import TrainingFrames
 
 CURVE_SECONDS = (1, 2, 5, 10, 20, 40, 60, 90, 120, 180, 300, 600)
 """Training times at which held-out frames are scored; the clock stands still meanwhile."""
-CALIBRATION_STEPS = (2, 8)
-"""Untimed and timed steps that tell how many fit into a budget; they are taken back."""
+CALIBRATION_STEPS = (3, 12)
+"""Untimed and timed steps that tell how many fit into a budget; they are taken back. Their median counts: the first
+steps fill caches, and other processes come and go."""
 LATER_STEPS = 1.15
 """How much slower steps become while Gaussians grow and sharpen; measured over a run of `fast`."""
 REPORT_EVERY_S = 0.25
@@ -118,14 +119,12 @@ def iterations_within(run: Run, budget_s: float, elapsed_s: float) -> int:
     stored = {name: values.copy() for name, values in run.model.arrays().items()}
     untimed, timed = CALIBRATION_STEPS
     start = time.perf_counter()
-    before = start
+    ends = [start]
     for iteration in range(1, untimed + timed + 1):
-        if iteration == untimed + 1:
-            before = time.perf_counter()
         step(run, iteration)
-    after = time.perf_counter()
+        ends.append(time.perf_counter())
     run.model.load_arrays(stored)
-    step_s = (after - before) / timed * LATER_STEPS
+    step_s = float(np.median(np.diff(ends)[untimed:])) * LATER_STEPS
     left_s = budget_s - elapsed_s - (time.perf_counter() - start)
     return max(len(run.frames.indices), int(left_s / step_s))
 
