@@ -7,7 +7,9 @@ up starts a service; submit, watch and fetch talk to one.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -17,9 +19,10 @@ from typing import get_args
 from pydantic import ValidationError
 
 from client.api import DEFAULT_URL, Client
+from contract.arguments import Commands, add_command, finite, positive
 from contract.errors import InputError, IntrasplatError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.job import JobProgress, JobView, PoseConvention, PresetName
+from contract.job import JobProgress, JobView, Layout, MaskPolarity, PoseConvention, PresetName
 from contract.progress_bar import ProgressBar
 from contract.settings import Settings, default_data_dir
 
@@ -58,15 +61,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run_local(arguments: list[str]) -> int:
-    """Hand the command line to the worker's program unchanged; Ctrl-C reaches both, and the worker decides."""
-    process = subprocess.Popen([sys.executable, "-m", "worker", *arguments])
+    """Become the worker's program, with the command line unchanged: signals and exit status are its own."""
+    command = [sys.executable, "-m", "worker", *arguments]
+    if os.name == "posix":
+        os.execv(sys.executable, command)
+    process = subprocess.Popen(command)  # elsewhere whoever called does not wait for what a process has become
     while True:
-        try:
-            status = process.wait()
-            break
-        except KeyboardInterrupt:
-            continue
-    return ExitCode.INTERRUPTED if status < 0 else status
+        with contextlib.suppress(KeyboardInterrupt):  # it reaches both, and the worker decides
+            return process.wait()
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -86,36 +88,24 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-    name: str,
-    summary: str,
-    command: Callable[[argparse.Namespace], int],
-) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
-    parser.epilog = EXIT_CODES_HELP
-    parser.set_defaults(command=command)
-    return parser
-
-
-def _add_up(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = _add(commands, "up", "start a queue, the service and one worker on this machine", _up)
+def _add_up(commands: Commands) -> None:
+    parser = add_command(commands, "up", "start a queue, the service and one worker on this machine", _up)
     parser.add_argument("--port", type=int, default=None, help="where the service answers (default: 8765)")
     parser.add_argument(
         "--data-dir", type=Path, help=f"where clips and scenes are kept (default: {default_data_dir()})"
     )
 
 
-def _add_submit(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = _add(commands, "submit", "send a clip to a service and print its job's id", _submit)
+def _add_submit(commands: Commands) -> None:
+    parser = add_command(commands, "submit", "send a clip to a service and print its job's id", _submit)
     parser.add_argument("clip", type=Path, metavar="INPUT", help="a video or a zip; both eyes, or the left one")
     parser.add_argument(
         "right", type=Path, metavar="RIGHT", nargs="?", help="the right eye, if it is a file of its own"
     )
     parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini")
     parser.add_argument("--masks", type=Path, metavar="F", help="zip of PNGs or a video that shows the instruments")
-    parser.add_argument("--mask-polarity", choices=("auto", "tool", "tissue"), help="what is bright in the masks")
-    parser.add_argument("--layout", choices=("auto", "endonerf", "stereomis", "sbs", "tb", "frames"))
+    parser.add_argument("--mask-polarity", choices=get_args(MaskPolarity), help="what is bright in the masks")
+    parser.add_argument("--layout", choices=get_args(Layout), help="how the eyes are laid out")
     parser.add_argument("--pose-convention", choices=get_args(PoseConvention), help="axes of poses_bounds.npy")
     parser.add_argument(
         "--holdout", metavar="every8|blocks8|none|LIST", help="frames kept from training, to measure on"
@@ -124,24 +114,24 @@ def _add_submit(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         "--preset", choices=get_args(PresetName), help="fast, ours, is the default; paper, as published"
     )
     limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--budget-s", type=float, metavar="S", help="seconds of training")
+    limit.add_argument("--budget-s", type=positive, metavar="S", help="seconds of training")
     limit.add_argument("--iterations", type=int, metavar="N", help="steps of training")
     parser.add_argument("--seed", type=int)
     parser.add_argument("--watch", action="store_true", help="wait for the scene, with a progress bar")
     _add_url(parser)
 
 
-def _add_watch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = _add(commands, "watch", "wait for a job, with a progress bar", _watch)
+def _add_watch(commands: Commands) -> None:
+    parser = add_command(commands, "watch", "wait for a job, with a progress bar", _watch)
     parser.add_argument("job", metavar="JOB", help="the id that submit printed")
     _add_url(parser)
 
 
-def _add_fetch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = _add(commands, "fetch", "save a finished scene's report, curve, picture and Gaussians", _fetch)
+def _add_fetch(commands: Commands) -> None:
+    parser = add_command(commands, "fetch", "save a finished scene's report, curve, picture and Gaussians", _fetch)
     parser.add_argument("job", metavar="JOB", help="the id that submit printed")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write into; made if need be")
-    parser.add_argument("--t", type=float, default=0.0, help="time of picture and Gaussians, 0 to 1 (default: 0)")
+    parser.add_argument("--t", type=finite, default=0.0, help="time of picture and Gaussians, 0 to 1 (default: 0)")
     parser.add_argument("--pose", help="12 or 16 numbers or orbit:yaw,pitch,zoom (default: the endoscope's own)")
     parser.add_argument("--no-ply", action="store_true", help="leave the Gaussians out")
     _add_url(parser)

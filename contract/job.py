@@ -17,6 +17,11 @@ JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
 PresetName = Literal["fast", "paper", "paper-released", "paper-wide", "pfs", "hexplane", "without_mapf"]
 """fast is ours; paper is the published method as published; the others are compared with it (worker/presets.py)."""
 
+Layout = Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]
+"""How a clip's eyes, depths and masks are laid out (docs/conventions.md); auto looks for itself."""
+
+MaskPolarity = Literal["auto", "tool", "tissue"]
+"""What is bright in the masks."""
 
 PoseConvention = Literal["opengl", "llff"]
 """Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
@@ -60,8 +65,8 @@ class JobOptions(BaseModel):
     preset: PresetName = "fast"
     budget_s: float | None = Field(default=None, gt=0, le=7200, description="seconds of training; not with iterations")
     iterations: int | None = Field(default=None, ge=1, le=1_000_000, description="fixed schedule; not with budget_s")
-    mask_polarity: Literal["auto", "tool", "tissue"] = "auto"
-    layout: Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"] = "auto"
+    mask_polarity: MaskPolarity = "auto"
+    layout: Layout = "auto"
     pose_convention: PoseConvention = Field(default="opengl", description="axes of poses_bounds.npy")
     holdout: str = Field(
         default="every8",

@@ -10,7 +10,6 @@ import argparse
 import dataclasses
 import json
 import logging
-import math
 import signal
 import sys
 import threading
@@ -21,9 +20,10 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
+from contract.arguments import Commands, add_command, finite, positive
 from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.job import PoseConvention, PresetName
+from contract.job import Layout, MaskPolarity, PoseConvention, PresetName
 from contract.progress_bar import ProgressBar
 from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
 from contract.settings import Settings
@@ -57,25 +57,13 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     _add_reconstruct(commands)
     _add_render(commands)
     _add_phantom(commands, wanted="phantom" in argv[:1])
-    _add(commands, "consume", "claim jobs from the queue and serve renders, until a signal ends it", _consume)
-    _add(commands, "doctor", "say what is installed, what would be used, what is missing", _doctor)
+    add_command(commands, "consume", "claim jobs from the queue and serve renders, until a signal ends it", _consume)
+    add_command(commands, "doctor", "say what is installed, what would be used, what is missing", _doctor)
     return parser
 
 
-def _add(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-    name: str,
-    summary: str,
-    command: Callable[[argparse.Namespace], int],
-) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
-    parser.epilog = EXIT_CODES_HELP
-    parser.set_defaults(command=command)
-    return parser
-
-
-def _add_reconstruct(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = _add(commands, "reconstruct", "train a scene from a clip", _reconstruct)
+def _add_reconstruct(commands: Commands) -> None:
+    parser = add_command(commands, "reconstruct", "train a scene from a clip", _reconstruct)
     parser.add_argument(
         "clip", type=Path, metavar="INPUT", help="a video, a folder or a zip: both eyes, or the left one"
     )
@@ -85,12 +73,13 @@ def _add_reconstruct(commands: argparse._SubParsersAction[argparse.ArgumentParse
     parser.add_argument(
         "--out", type=Path, required=True, metavar="SCENE", help="folder for the scene: new, empty, or of a stopped run"
     )
-    layouts = ("auto", "endonerf", "stereomis", "sbs", "tb", "frames")
-    parser.add_argument("--layout", choices=layouts, default="auto", help="how the eyes are laid out (default: guess)")
+    parser.add_argument(
+        "--layout", choices=get_args(Layout), default="auto", help="how the eyes are laid out (default: guess)"
+    )
     parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini; for stereo")
     parser.add_argument("--masks", type=Path, metavar="F", help="zip or folder of PNGs, or a video: the instruments")
     parser.add_argument(
-        "--mask-polarity", choices=("auto", "tool", "tissue"), default="auto", help="what is bright in the masks"
+        "--mask-polarity", choices=get_args(MaskPolarity), default="auto", help="what is bright in the masks"
     )
     parser.add_argument(
         "--pose-convention", choices=get_args(PoseConvention), default="opengl", help="axes of poses_bounds.npy"
@@ -105,17 +94,17 @@ def _add_reconstruct(commands: argparse._SubParsersAction[argparse.ArgumentParse
         "--preset", choices=get_args(PresetName), default="fast", help="fast, ours, is the default; paper, as published"
     )
     limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--budget-s", type=_positive, metavar="S", help="seconds of training (default: the preset's)")
+    limit.add_argument("--budget-s", type=positive, metavar="S", help="seconds of training (default: the preset's)")
     limit.add_argument("--iterations", type=int, metavar="N", help="steps of training; the same N gives the same bits")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
 
 
-def _add_render(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = _add(commands, "render", "render images of a scene", _render)
+def _add_render(commands: Commands) -> None:
+    parser = add_command(commands, "render", "render images of a scene", _render)
     parser.add_argument("scene", type=Path, metavar="SCENE", help="the folder that reconstruct wrote")
     when = parser.add_mutually_exclusive_group(required=True)
-    when.add_argument("--t", type=_finite, help="time: 0 is the first frame, 1 the end of the clip")
+    when.add_argument("--t", type=finite, help="time: 0 is the first frame, 1 the end of the clip")
     when.add_argument("--frames", type=_frames, metavar="LIST", help="frame numbers such as 1,9,17; writes a folder")
     parser.add_argument("--pose", help="12 or 16 numbers, or orbit:yaw,pitch,zoom (default: the endoscope's own)")
     parser.add_argument("--width", type=int)
@@ -128,26 +117,12 @@ def _add_render(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
 
 
-def _add_phantom(commands: argparse._SubParsersAction[argparse.ArgumentParser], wanted: bool) -> None:
-    parser = _add(commands, "phantom", "make a synthetic stereo clip of tissue, with its truth", _phantom)
+def _add_phantom(commands: Commands, wanted: bool) -> None:
+    parser = add_command(commands, "phantom", "make a synthetic stereo clip of tissue, with its truth", _phantom)
     if wanted:
         from worker.phantom import add_cli_arguments
 
         add_cli_arguments(parser)
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not above 0")
-    return value
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text} is not a time")
-    return value
 
 
 def _frames(text: str) -> list[int]:
@@ -174,7 +149,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     chosen = {name: getattr(options, name) for name in fields if hasattr(options, name)}
     interrupted = threading.Event()
     out.mkdir(parents=True, exist_ok=True)
-    before = signal.signal(signal.SIGINT, _once(interrupted))
+    before = {number: signal.signal(number, _once(interrupted)) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with ProgressBar(sys.stderr) as bar:
             hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
@@ -183,13 +158,14 @@ def _reconstruct(options: argparse.Namespace) -> int:
         again = " The same command goes on from there." if (out / RESUME_FILE).exists() else ""
         raise Cancelled(f"{error}{again}") from error
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     _print_report(json.loads((out / REPORT).read_text()), out)
     return ExitCode.OK
 
 
 def _once(event: threading.Event) -> Callable[[int, FrameType | None], None]:
-    """A handler that asks politely the first time; the second interrupt is Python's own."""
+    """A handler that asks politely the first time; at the second signal the run is left as Ctrl-C leaves a program."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         event.set()

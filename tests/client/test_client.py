@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import io
+import os
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -14,6 +18,7 @@ import numpy as np
 import pytest
 import uvicorn
 
+import client as client_package
 from client import Client, JobCancelled, JobFailed, JobRejected, RequestRefused, ServiceFault
 from client.cli import main, progress_of
 from contract.embedded import short_socket_path
@@ -196,7 +201,14 @@ def test_exit_codes_tell_what_went_wrong(
 
 
 @pytest.mark.parametrize(
-    "arguments", [[], ["unknown"], ["submit"], ["submit", "a", "--budget-s", "1", "--iterations", "1"]]
+    "arguments",
+    [
+        [],
+        ["unknown"],
+        ["submit"],
+        ["submit", "a", "--budget-s", "1", "--iterations", "1"],
+        ["fetch", "a", "--out", "b", "--t", "nan"],
+    ],
 )
 def test_wrong_usage_ends_with_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
@@ -213,9 +225,30 @@ def test_every_help_tells_the_exit_codes(command: str, capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "render", "phantom", "doctor"])
-def test_local_commands_have_help_too(command: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--help"]) == ExitCode.OK
-    assert "exit codes" in capfd.readouterr().out
+def test_local_commands_have_help_too(command: str) -> None:
+    assert "exit codes" in run_here(Path.cwd(), command, "--help").stdout
+
+
+def run_here(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command line in a process of its own, started in `folder`, whose `worker` is taken if it has one."""
+    environment = os.environ | {"PYTHONPATH": str(Path(client_package.__file__).parents[1])}
+    command = [sys.executable, "-m", "client.cli", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=60)
+
+
+def test_a_local_command_is_one_process_that_ends_as_the_workers_program_ends(tmp_path: Path) -> None:
+    program = tmp_path / "worker" / "__main__.py"
+    program.parent.mkdir()
+    (program.parent / "__init__.py").touch()
+    for source, status in (
+        ("raise SystemExit(7)", 7),
+        ("import os; os.kill(os.getpid(), 9)", -signal.SIGKILL),
+        ("import os; os.kill(os.getpid(), 15)", -signal.SIGTERM),
+    ):
+        program.write_text(f"import sys; print(*sys.argv[1:], flush=True)\n{source}\n")
+        ended = run_here(tmp_path, "reconstruct", "a b", "--out", "c")
+        assert ended.returncode == status
+        assert ended.stdout == "reconstruct a b --out c\n"
 
 
 def test_a_job_that_has_not_begun_is_shown_by_its_state(client: Client, clip: Path) -> None:

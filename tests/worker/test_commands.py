@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import get_args
 
@@ -20,6 +21,8 @@ from worker.checkpoint import RESUME_FILE, load_resume
 from worker.presets import PRESETS
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 10
+TRAINING_S = 1.0
+"""Hundreds of steps at this size."""
 
 
 @pytest.fixture(scope="module")
@@ -75,13 +78,14 @@ def test_a_view_that_cannot_be_meant_is_a_bad_input(
     assert list(tmp_path.iterdir()) == []
 
 
-def interrupt_in_training(clip: Path, out: Path) -> str:
-    """Start a run that would take long, press Ctrl-C once it trains; what it said at its end."""
+def interrupt_in_training(clip: Path, out: Path, number: signal.Signals) -> str:
+    """Start a run that would take long, send it a signal once it trains; what it said at its end."""
     command = [sys.executable, "-m", "worker", "reconstruct", str(clip), "--iterations", "100000", "--out", str(out)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         assert any(line.startswith("train") for line in process.stderr)
-        process.send_signal(signal.SIGINT)
+        time.sleep(TRAINING_S)
+        process.send_signal(number)
         said = process.stderr.read()
         assert process.wait(timeout=60) == ExitCode.INTERRUPTED
     return said
@@ -89,10 +93,10 @@ def interrupt_in_training(clip: Path, out: Path) -> str:
 
 def test_an_interrupted_run_goes_on_with_the_same_command(clip: Path, tmp_path: Path) -> None:
     out = tmp_path / "scene"
-    assert "same command goes on" in interrupt_in_training(clip, out)
+    assert "same command goes on" in interrupt_in_training(clip, out, signal.SIGINT)
     assert [path.name for path in out.iterdir()] == [RESUME_FILE]
     first = load_resume(out)[1]["iteration"]
-    interrupt_in_training(clip, out)
+    interrupt_in_training(clip, out, signal.SIGTERM)
     assert load_resume(out)[1]["iteration"] > first > 0
 
 
@@ -117,10 +121,11 @@ def test_an_option_that_cannot_be_meant_is_a_bad_input(
 
 
 @pytest.mark.parametrize("t", ["nan", "inf", "now"])
-def test_a_time_that_is_none_is_wrong_usage(t: str, scene: Path) -> None:
+def test_a_time_that_is_none_is_wrong_usage(t: str, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["render", str(scene), "--t", t, "--out", "view.png"])
     assert ended.value.code == ExitCode.USAGE
+    assert f"--t: {t!r} is not a number." in capsys.readouterr().err
 
 
 def test_a_clip_that_is_not_there_is_a_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
