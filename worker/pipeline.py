@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from contract.errors import Cancelled, InputError, SceneError, UnavailableError
+from contract.job import Layout, MaskPolarity, PoseConvention
 from contract.report import Report
 from contract.store import CURVE, REPORT
 from worker.baselines import copy_baselines
@@ -28,9 +29,6 @@ from worker.checkpoint import RESUME_FILE, Scene, save_scene
 from worker.clip import (
     DepthClip,
     FrameSplit,
-    Layout,
-    MaskPolarity,
-    PoseConvention,
     StereoClip,
     find_calibration,
     held_out_frames,

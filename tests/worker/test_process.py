@@ -9,12 +9,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
-import worker.clip as clip_package
-from contract import job
 from contract.embedded import EmbeddedServer
 from contract.errors import InputError, UnavailableError
 from contract.exits import ExitCode
@@ -51,11 +48,6 @@ def test_every_option_of_a_job_is_one_of_the_request(chosen: dict[str, object]) 
     for name, value in JobOptions.model_validate(chosen):
         assert getattr(asked, name) == value, name
     assert asked.device == "cpu"
-
-
-@pytest.mark.parametrize("choice", ["Layout", "MaskPolarity", "PoseConvention"])
-def test_a_job_offers_every_choice_that_a_clip_has(choice: str) -> None:
-    assert get_args(getattr(job, choice)) == get_args(getattr(clip_package, choice)) != ()
 
 
 def test_files_lie_where_the_store_keeps_them() -> None:

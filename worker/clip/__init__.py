@@ -1,9 +1,7 @@
 """Decode and validate what the user gave: a stereo clip, or frames whose depth is already known."""
 
 from worker.clip.limits import ClipLimits
-from worker.clip.masks import MaskPolarity
-from worker.clip.opening import Layout, find_calibration, open_clip
-from worker.clip.poses import PoseConvention
+from worker.clip.opening import find_calibration, open_clip
 from worker.clip.split import FrameSplit, held_out_frames, split_frames
 from worker.clip.types import DepthClip, StereoClip
 
@@ -11,9 +9,6 @@ __all__ = [
     "ClipLimits",
     "DepthClip",
     "FrameSplit",
-    "Layout",
-    "MaskPolarity",
-    "PoseConvention",
     "StereoClip",
     "find_calibration",
     "held_out_frames",

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from contract.camera import Intrinsics
 from contract.errors import InputError
+from contract.job import MaskPolarity, PoseConvention
 from worker.clip.files import FileTree
 from worker.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
 from worker.clip.limits import MOST_POSES_BYTES
-from worker.clip.masks import NO_MASKS, MaskFrames, MaskPolarity, TissueMasks, tissue_from_masks
+from worker.clip.masks import NO_MASKS, MaskFrames, TissueMasks, tissue_from_masks
 from worker.clip.naming import check_aligned
-from worker.clip.poses import POSES_FILE, PoseConvention, Poses, parse_poses
+from worker.clip.poses import POSES_FILE, Poses, parse_poses
 from worker.clip.types import DepthClip
 from worker.clip.video import FALLBACK_RATE_HZ
 

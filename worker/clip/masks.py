@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.errors import InputError
+from contract.job import MaskPolarity
 from worker.clip.files import FileTree, check_exists, open_tree
 from worker.clip.images import MASK_THRESHOLD, ImageSequence, as_mask, open_images
 from worker.clip.limits import ClipLimits
 from worker.clip.naming import left_eye_only
 from worker.clip.video import VideoFile, open_video, open_video_in
 
-MaskPolarity = Literal["auto", "tool", "tissue"]
 BrightClass = Literal["tool", "tissue"]  # what a white pixel means
 
 MOST_TOOL_SHARE = 0.4  # of the area: a class larger than this is not taken for the instrument unasked

@@ -6,14 +6,14 @@ import atexit
 import shutil
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Literal, get_args
+from typing import get_args
 
 from contract.errors import InputError
+from contract.job import Layout, MaskPolarity, PoseConvention
 from worker.clip.endonerf import is_endonerf, read_endonerf
 from worker.clip.files import FileTree, check_exists, open_tree, scratch_folder
 from worker.clip.limits import MOST_CALIBRATION_BYTES, ClipLimits
-from worker.clip.masks import NO_MASKS, BrightClass, MaskFrames, MaskPolarity, open_masks
-from worker.clip.poses import PoseConvention
+from worker.clip.masks import NO_MASKS, BrightClass, MaskFrames, open_masks
 from worker.clip.stereo_source import (
     STEREOMIS,
     STEREOMIS_CALIBRATION,
@@ -25,8 +25,6 @@ from worker.clip.stereo_source import (
     with_masks,
 )
 from worker.clip.types import DepthClip, StereoClip
-
-Layout = Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]
 
 _CALIBRATION_SUFFIXES = frozenset({".json", ".yaml", ".yml", ".xml", ".ini"})
 

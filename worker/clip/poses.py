@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from contract.errors import InputError
+from contract.job import PoseConvention
 
-PoseConvention = Literal["opengl", "llff"]
 POSE_CONVENTIONS: tuple[str, ...] = get_args(PoseConvention)
 
 POSES_FILE = "poses_bounds.npy"
