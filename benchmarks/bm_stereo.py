@@ -34,6 +34,10 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3, help="timed runs a clip; the fastest is printed")
     arguments = parser.parse_args()
     print(f"machine {platform.processor() or platform.machine()}, {os.cpu_count()} cores; commit {_commit()}")
+    missing = [name for name in ("d4d_stereo", "d4d_endonerf", "surgt_raw") if not (arguments.data / name).exists()]
+    if missing:
+        print(f"nothing measured: {arguments.data} lacks {', '.join(missing)}")
+        return
     d4d = arguments.data / "d4d_stereo"
     clip = _rectified(d4d / "stereo_sbs.mp4", d4d / "calibration.json", d4d / "tool_masks.zip")
     depth = _timed("d4d_stereo", clip, arguments.repeats)
