@@ -24,6 +24,7 @@ MAY_IMPORT = {
 }
 STAGES = (
     "hooks",
+    "opencv",
     "clip",
     "calibration",
     "stereo",

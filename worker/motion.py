@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from worker.clip import DepthClip
 from worker.fusion import unproject
+from worker.opencv import one_opencv_thread
 
 Floats = NDArray[np.float32]
 
@@ -75,7 +76,7 @@ def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], 
             on_progress((done + 1) / len(places))
 
     middle = (len(train) + 1) // 2
-    with ThreadPoolExecutor(2) as pool:
+    with one_opencv_thread(), ThreadPoolExecutor(2) as pool:
         list(pool.map(follow, (range(1, middle), range(middle, len(train)))))
     return Tracks(displacement, confidence, step)
 

@@ -110,7 +110,8 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
         raise
     seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
     scene = timed(seconds, "finish_s", lambda: scene_of(run, clip, split, scale, request.seed))
-    report = report_of(run, clip, split, scene, request, seconds, reporting(view_of, split, hooks), accepted_at_s)
+    report = report_of(run, clip, split, scene, request, seconds, reporting(run, view_of, split, hooks), accepted_at_s)
+    hooks.on_progress(Progress("score", 1.0, run.iteration, run.iterations, report.psnr_tissue_db))
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)
     save_scene(out_dir, scene, beside=(REPORT, CURVE))
@@ -259,13 +260,16 @@ def view_function(run: Run, scale: float) -> Callable[[int], View]:
     return view_of
 
 
-def reporting(view_of: Callable[[int], View], split: FrameSplit, hooks: Hooks) -> Callable[[int], View]:
+def reporting(run: Run, view_of: Callable[[int], View], split: FrameSplit, hooks: Hooks) -> Callable[[int], View]:
     """view_of that reports the scoring of frames as it goes."""
     total, done = len(split.held_out) + len(sample_frames(split.train)), 0
 
     def reported(index: int) -> View:
         nonlocal done
-        report_stage(hooks, "score", done / total)
+        latest = run.curve[-1].psnr_tissue_db if run.curve else None
+        hooks.on_progress(Progress("score", done / total, run.iteration, run.iterations, latest))
+        if hooks.should_stop():
+            raise Cancelled("Stopped while scoring.")
         done += 1
         return view_of(index)
 

@@ -17,6 +17,7 @@ from contract.errors import Cancelled, InputError
 from worker.calibration import RectifiedClip
 from worker.clip.types import DepthClip
 from worker.hooks import Hooks, Progress
+from worker.opencv import one_opencv_thread
 from worker.stereo.alignment import RowShift, choose_range, feature_matches, measure_row_shift
 from worker.stereo.matching import Grey, MatchPlan, match
 
@@ -55,7 +56,7 @@ def estimate_depth(
     if not measured or measured[0] < 0 or measured[-1] >= clip.frame_count:
         raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
     rgb, right = _decode(clip, hooks)
-    with _pool() as pool:
+    with one_opencv_thread(), _pool() as pool:
         shift, plan = _plan(clip, rgb, right, measured, pool)
         depth_mm, confidence = _match_all(clip, rgb, right, plan, pool, hooks)
     valid_share = _valid_share(depth_mm, clip.tissue)
