@@ -32,8 +32,8 @@ MAX_OPTIONS_BYTES = 64 * 1024
 MAX_CALIBRATION_BYTES = 16 * 2**20
 MAX_HEADER_BYTES = 8 * 1024
 FORM_REMEDY = (
-    "Send multipart/form-data with clip, or left and right, and optionally calibration, masks and options, which is JSON: "
-    '{"budget_s": 20}.'
+    "Send multipart/form-data with clip, or left and right, and optionally calibration, masks and options; "
+    'options is JSON, such as {"budget_s": 20}.'
 )
 
 
