@@ -373,3 +373,24 @@ def test_a_rectification_that_cuts_the_view_away_warns_and_in_the_extreme_is_ref
     assert "magnifies" in rectify(clip_of(image, image), rolled(0.2)).warnings[0]
     with pytest.raises(InputError, match="magnifies"):
         rectify(clip_of(image, image), rolled(0.5))
+
+
+@pytest.mark.parametrize(
+    ("content", "problem", "remedy"),
+    [
+        (b"\xff\xfe\x00PK\x03\x04", "is not a text file", "StereoLeft"),
+        (b'[project]\nname = "x"\ndependencies = [\n  "a>=1",\n]\n', "neither JSON", "StereoLeft"),
+        (None, "cannot be read: No such file", "exists"),
+    ],
+    ids=["an archive", "another text file", "no file"],
+)
+def test_a_file_that_is_no_calibration_is_named_for_what_it_is(
+    content: bytes | None, problem: str, remedy: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "given.txt"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError) as refused:
+        load_calibration(path, eye_width=640, eye_height=512)
+    assert problem in refused.value.problem
+    assert remedy in refused.value.remedy

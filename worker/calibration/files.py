@@ -77,8 +77,11 @@ def _read_text(path: Path) -> str:
         if path.stat().st_size > MOST_CALIBRATION_BYTES:
             raise InputError(FIELD, f"{path.name} has {path.stat().st_size} bytes.", FORMATS_REMEDY)
         return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(FIELD, f"{path.name} cannot be read: {error}.", FORMATS_REMEDY) from None
+    except UnicodeDecodeError:
+        raise InputError(FIELD, f"{path.name} is not a text file.", FORMATS_REMEDY) from None
+    except OSError as error:
+        problem = f"{path.name} cannot be read: {error.strerror or error}."
+        raise InputError(FIELD, problem, "Name a file that exists and may be read.") from None
 
 
 def _parse(text: str, eye_width: int, eye_height: int) -> tuple[dict[str, Any], bool]:
@@ -170,8 +173,9 @@ def _opencv_values(text: str) -> dict[str, NDArray[np.float64]]:
             if name is not None:
                 values[name] = _node_values(storage.getNode(key))
         storage.release()
-    except (cv2.error, SystemError, UnicodeError) as error:
-        raise InputError(FIELD, f"OpenCV cannot read it: {str(error).splitlines()[0][:120]}.", FORMATS_REMEDY) from None
+    except (cv2.error, SystemError, UnicodeError):
+        problem = "it is neither JSON, nor a stereo ini, nor an OpenCV YAML or XML file."
+        raise InputError(FIELD, problem, FORMATS_REMEDY) from None
     return values
 
 
