@@ -46,7 +46,8 @@ _RASTER = """
 a 3-pixel grid, medians in ms.
 """
 _SCENE = """
-The model that `fast` ends with on `d4d-a` (600 iterations): `python benchmarks/bm_raster.py --scene SCENE`
+The model that `intrasplat reconstruct CLIP --iterations 600 --out s600` ends with on `d4d-a`:
+`python benchmarks/bm_raster.py --scene s600 --quick | tee docs/results/raster-scene.txt`
 """
 _STEREO = """
 ## Depth from stereo

@@ -16,6 +16,7 @@ from client.api import Client
 from contract.embedded import EmbeddedServer
 from contract.errors import UnavailableError
 from contract.locks import FolderLock
+from contract.processes import end_process
 from contract.settings import Settings
 from contract.store import Store
 
@@ -69,12 +70,7 @@ class WatchedProcess:
         """Ask the child to end, and insist after STOP_TIMEOUT_S."""
         if self._process is None:
             return
-        self._process.terminate()
-        try:
-            self._process.wait(STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        end_process(self._process, STOP_TIMEOUT_S)
         self._process = None
 
 

@@ -20,6 +20,7 @@ import redis
 
 from contract.errors import UnavailableError
 from contract.locks import FolderLock
+from contract.processes import end_process
 from contract.queue_redis import RedisQueue
 
 SOCKET_PATH_LIMIT = 107
@@ -133,12 +134,7 @@ class EmbeddedServer:
     def stop(self) -> None:
         """End the server this object started, or whose starter has died; one that was shared is left alone."""
         if self._process is not None:
-            self._process.terminate()  # the server writes its log to disk before it leaves
-            try:
-                self._process.wait(STOP_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+            end_process(self._process, STOP_TIMEOUT_S)  # the server writes its log to disk before it leaves
             self._process = None
         elif self._adopted:
             redis.Redis.from_url(self.url, socket_timeout=STOP_TIMEOUT_S).shutdown()

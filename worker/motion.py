@@ -75,6 +75,7 @@ def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], 
             displacement[place], confidence[place] = _lift(reference, target, forward, backward)
             on_progress((done + 1) / len(places))
 
+    # Two halves on any machine: which flow starts which must not depend on the number of cores.
     middle = (len(train) + 1) // 2
     with one_opencv_thread(), ThreadPoolExecutor(2) as pool:
         list(pool.map(follow, (range(1, middle), range(middle, len(train)))))

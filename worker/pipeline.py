@@ -45,7 +45,7 @@ from worker.quality import Training, View, build_report, measure, sample_frames
 from worker.raster.cpu import compile_kernels
 from worker.start import FRAMES_A_BASIS, bases_of, fusion_for, start_model
 from worker.stereo import estimate_depth
-from worker.targets import TrainingFrames, units_per_mm
+from worker.targets import TrainingFrames, solid_depth_mm, units_per_mm
 from worker.train import Run, Stopwatch, iterations_within, load_run, save_run, train
 from worker.visibility import drop_strays, seen_share
 
@@ -253,9 +253,7 @@ def view_function(run: Run, scale: float) -> Callable[[int], View]:
 
     def view_of(index: int) -> View:
         image = run.model.render(run.frames.cameras[index], float(run.frames.t[index])).copy()
-        solid = image[4] >= 0.5
-        depth_mm = np.where(solid, image[3] / np.where(solid, image[4], 1) / scale, 0)
-        return View(image[:3].transpose(1, 2, 0), depth_mm.astype(np.float32), image[4])
+        return View(image[:3].transpose(1, 2, 0), solid_depth_mm(image[3], image[4], scale), image[4])
 
     return view_of
 
@@ -321,9 +319,6 @@ def report_of(
     held_out = measure(clip, split.held_out, view_of)
     trained = measure(clip, sample_frames(split.train), view_of)
     baselines = copy_baselines(clip, split.train, split.held_out)
-    known = [score for score in held_out.psnr_tissue_db if not math.isnan(score)]
-    if known and run.curve:
-        run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=float(np.mean(known)))
     seconds |= {"score_s": time.perf_counter() - start, "t_post_s": time.time() - accepted_at_s}
     training = Training(
         preset=run.preset.name,
@@ -344,7 +339,10 @@ def report_of(
             "numba": numba.__version__,
         },
     )
-    return build_report(clip, split, held_out, trained, baselines, training)
+    report = build_report(clip, split, held_out, trained, baselines, training)
+    if report.psnr_tissue_db is not None and run.curve:
+        run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=report.psnr_tissue_db)
+    return report
 
 
 def chosen(run: Run, clip: DepthClip, bases: int) -> tuple[str, ...]:

@@ -17,13 +17,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from contract.camera import Intrinsics
 from worker.checkpoint import Scene
 from worker.deformation import HexPlane
+from worker.metrics import COVERED_ALPHA
 from worker.raster.cpu import Rasterizer, camera_vector
 from worker.raster.cpu.model import FusedModel
-from worker.targets import MEDIAN_DEPTH_UNITS, camera_in_units
+from worker.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
 from worker.unfused import UnfusedModel
 
-SOLID_ALPHA = 0.5
-"""Below this sum of weights a pixel has no depth and no confidence."""
 POSE_FALL_OFF = 0.25
 """Distance from the nearest trained pose, in median depths, at which confidence has fallen to exp(-1/2): 14 degrees."""
 FAR_POSE = 0.35
@@ -126,12 +125,11 @@ def render_frame(
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
     image, seen = renderer_of(scene).layers(shown, pose, intrinsics or scene.intrinsics)
     alpha = image[4]
-    solid = alpha >= SOLID_ALPHA
-    divisor = np.where(solid, alpha, 1)
-    depth_mm = np.where(solid, image[3] / divisor / scene.units_per_mm, 0).astype(np.float32)
+    solid = alpha >= COVERED_ALPHA
+    depth_mm = solid_depth_mm(image[3], alpha, scene.units_per_mm)
     distance = _distance_from_trained(scene, pose)
     fall_off = float(np.exp(-0.5 * (distance / POSE_FALL_OFF) ** 2))
-    confidence = np.where(solid, np.clip(seen / divisor * fall_off, 0, 1), 0).astype(np.float32)
+    confidence = np.where(solid, np.clip(seen / np.where(solid, alpha, 1) * fall_off, 0, 1), 0).astype(np.float32)
     if distance > FAR_POSE:
         warnings.append(f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess.")
     if (confidence < LOW_CONFIDENCE).mean() > MANY:

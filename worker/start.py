@@ -22,7 +22,7 @@ from worker.raster.cpu.model import FusedModel
 from worker.unfused import UnfusedModel
 
 FRAMES_A_BASIS, MIN_BASES = 5, 3
-"""Training frames a shared basis stands for: denser ones fit noise, sparser ones miss motion (docs/decisions)."""
+"""Training frames a shared basis stands for, and the fewest bases (docs/decisions/004)."""
 MIN_STRIDE = 2
 """Pixels between the points of a grid at the least: a Gaussian a pixel is noise, not surface."""
 

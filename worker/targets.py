@@ -15,6 +15,7 @@ from contract.camera import Intrinsics
 from contract.errors import InputError
 from worker.clip import DepthClip
 from worker.loss import LossSettings
+from worker.metrics import COVERED_ALPHA
 from worker.raster import Camera
 from worker.raster.cpu import Target, camera_vector, padded
 
@@ -44,6 +45,12 @@ def camera_in_units(intrinsics: Intrinsics, world_from_camera: NDArray[np.float6
     camera_from_world[:3, 3] *= scale
     k = intrinsics
     return Camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, camera_from_world)
+
+
+def solid_depth_mm(depth: NDArray[np.float32], alpha: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
+    """[H, W] camera z in mm of a render: sum(w z) / sum(w) out of optimiser units, 0 where the alpha is too thin."""
+    solid = alpha >= COVERED_ALPHA
+    return np.where(solid, depth / np.where(solid, alpha, 1) / scale, 0).astype(np.float32)
 
 
 class TrainingFrames:

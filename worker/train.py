@@ -31,7 +31,7 @@ CALIBRATION_STEPS = (3, 12)
 """Untimed and timed steps that tell how many fit into a budget; they are taken back. Their median counts: the first
 steps fill caches, and other processes come and go."""
 LATER_STEPS = 1.15
-"""How much slower steps become while Gaussians grow and sharpen; measured over a run of `fast`."""
+"""Allowance for steps that become slower while Gaussians grow. A judgement: it differs from clip to clip."""
 REPORT_EVERY_S = 0.25
 
 
