@@ -27,6 +27,15 @@ PoseConvention = Literal["opengl", "llff"]
 """Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
 
 
+Priority = Literal["standard", "high"]
+"""high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
+
+LOCAL_TENANT = "local"
+"""Whose jobs they are where no key is asked for."""
+
+TENANT_PATTERN = r"^[a-z0-9-]{1,40}$"
+
+
 class JobState(StrEnum):
     """Where a job stands."""
 
@@ -43,13 +52,15 @@ TRANSITIONS: Mapping[JobState, frozenset[JobState]] = MappingProxyType(
         # Back to queued: its worker died or handed it back, and another attempt may start.
         JobState.RUNNING: frozenset({JobState.QUEUED, JobState.DONE, JobState.FAILED, JobState.CANCELLED}),
         JobState.DONE: frozenset(),
-        JobState.FAILED: frozenset(),
+        # Only because a caller asked to try again: by itself a failed job stays where it is.
+        JobState.FAILED: frozenset({JobState.QUEUED}),
         JobState.CANCELLED: frozenset(),
     }
 )
 """The only changes of state there are; the queue's scripts are given their rows of it, so no second copy exists."""
 
-TERMINAL_STATES = frozenset(state for state, following in TRANSITIONS.items() if not following)
+TERMINAL_STATES = frozenset({JobState.DONE, JobState.FAILED, JobState.CANCELLED})
+"""States that a job does not leave by itself."""
 
 
 def sources_of(target: JobState) -> frozenset[JobState]:
@@ -74,6 +85,10 @@ class JobOptions(BaseModel):
         description="every8, blocks8, none, or frame numbers such as 1,9,17",
     )
     seed: int = Field(default=0, ge=0, lt=2**31)
+    priority: Priority = Field(default="standard", description="high: before, and in place of, standard jobs")
+    retention_hours: float | None = Field(
+        default=None, gt=0, le=87_600, description="clip, scene and record are purged so long after the job ended"
+    )
 
     @field_validator("holdout", mode="before")
     @classmethod
@@ -147,21 +162,34 @@ class JobRecord(BaseModel):
     state: JobState = JobState.QUEUED
     options: JobOptions = JobOptions()
     files: JobFiles
+    tenant: str = Field(default=LOCAL_TENANT, pattern=TENANT_PATTERN)
+    """Whose it is; nobody else learns that it exists."""
     input_bytes: int = Field(default=0, ge=0)
     input_sha256: str = ""
-    """Of the clip, or of the left then the right file."""
+    """Of all files in the order of their parts' names."""
+    idempotency_key: str | None = None
+    """SHA-256 of the caller's Idempotency-Key: a second submission under it yields this job."""
     created_at_s: float
     started_at_s: float | None = None
     finished_at_s: float | None = None
     attempt: int = 0
     """Counts claims; a worker's report is accepted only for the attempt it holds."""
     released: int = 0
-    """How many of the attempts ended because their worker was told to end; the others, but the last, died."""
+    """How many of the attempts are not held against the job: handed back, made way, or forgiven by a retry."""
     owner: str | None = None
     """Name of the worker that holds, or last held, the job."""
     cancel_requested: bool = False
     progress: JobProgress | None = None
     error: JobError | None = None
+
+
+class Standing(BaseModel):
+    """Where a queued or running job stands: how many will be claimed before it, and when it may be done."""
+
+    model_config = ConfigDict(frozen=True)
+
+    position: int | None
+    eta_s: float | None
 
 
 class JobView(BaseModel):
@@ -175,6 +203,8 @@ class JobView(BaseModel):
     iterations: int | None = None
     psnr_db: float | None = None
     seconds_left: float | None = None
+    position: int | None = Field(default=None, description="jobs that will be claimed before this one; while queued")
+    eta_s: float | None = Field(default=None, description="estimated seconds until it is done; None if unknown")
     error: JobError | None = None
     cancel_requested: bool = False
     attempt: int = 0
@@ -186,14 +216,19 @@ class JobView(BaseModel):
     links: dict[str, str]
 
     @classmethod
-    def of(cls, record: JobRecord) -> JobView:
+    def of(cls, record: JobRecord, standing: Standing | None = None) -> JobView:
         """The view of one record; `links` names what may be asked for next."""
-        links = {"self": f"/jobs/{record.job_id}"}
+        links = {"self": f"/jobs/{record.job_id}", "events": f"/jobs/{record.job_id}/events"}
+        if record.state is JobState.FAILED:
+            links["retry"] = f"/jobs/{record.job_id}/retry"
+        if record.state in (JobState.RUNNING, JobState.DONE):
+            links["render"] = f"/render?scene={record.job_id}"
         if record.state is JobState.DONE:
-            links |= {"scene": f"/scenes/{record.job_id}", "render": f"/render?scene={record.job_id}"}
+            links["scene"] = f"/scenes/{record.job_id}"
         progress = record.progress.model_dump() if record.progress else {}
         shared = record.model_dump(
             include={"state", "error", "cancel_requested", "attempt", "options", "input_bytes"}
             | {"created_at_s", "started_at_s", "finished_at_s"}
         )
+        progress |= {"position": standing.position, "eta_s": standing.eta_s} if standing else {}
         return cls(id=record.job_id, links=links, **shared, **progress)

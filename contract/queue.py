@@ -1,27 +1,58 @@
-"""The queue, as everyone sees it: the service submits and cancels, a worker claims, reports and settles.
+"""The queue, as everyone sees it: the service submits, cancels and retries, a worker claims, beats and settles.
 
 Two implementations obey this file and pass the same tests: contract/queue_redis.py, which deployments use, and
 contract/queue_memory.py, for tests and for a worker inside one process.
+
+A claim is a lease by liveness: it stands as long as its worker beats. After LEASE_S without a beat the job is
+anybody's again, as a new attempt; every report carries the attempt, so what a worker says that was thought dead
+changes nothing (the attempt is the fence).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Protocol
 
-from contract.job import JobError, JobProgress, JobRecord
+from contract.errors import UnavailableError
+from contract.job import JobError, JobProgress, JobRecord, JobState, Standing
 from contract.rendering import WorkerAddress
 
 MAX_ATTEMPTS = 3
 """A job whose worker died this often is taken for the cause of it and fails."""
 
+BEAT_PERIOD_S = 2.0
+LEASE_S = 8.0
+"""Three beats may be late or lost."""
+
+PREEMPT_AFTER_S = 1.0
+"""A high-priority job that nobody has claimed for so long takes the place of a standard one."""
+
 WORKER_TTL_S = 10.0
 """A worker that has not announced itself for this long is not live."""
 
-ANNOUNCE_PERIOD_S = 3.0
+ANNOUNCE_PERIOD_S = 2.0
+
+IDEMPOTENCY_S = 24 * 3600
+"""How long a submission may be repeated under its idempotency key."""
 
 LISTING_LIMIT = 200
 """GET /jobs shows the newest this many."""
+
+EVENTS_KEPT = 200
+"""Of each job, for callers that come back and ask for what they missed."""
+
+
+class Order(StrEnum):
+    """What a beat is answered with."""
+
+    GO_ON = "go-on"
+    CANCEL = "cancel"
+    """Stop, remove, confirm_cancel."""
+    YIELD = "yield"
+    """Stop, keep the state, release: a high-priority job waits and nobody is free."""
+    LOST = "lost"
+    """The claim no longer stands: stop, and touch nothing but this attempt's own folder."""
 
 
 @dataclass(frozen=True)
@@ -33,26 +64,73 @@ class Claim:
     owner: str
 
 
-class Queue(Protocol):
-    """Every method is atomic; those that change a job return whether, or to what, it changed.
+@dataclass(frozen=True)
+class Admission:
+    """How many jobs may wait: of all callers, and of one tenant."""
 
-    All raise UnavailableError when the queue cannot be reached.
+    queued: int
+    queued_per_tenant: int
+
+
+@dataclass(frozen=True)
+class Event:
+    """A change of a job: its number, which only grows, and the record as the change left it."""
+
+    number: str
+    record: JobRecord
+
+
+@dataclass(frozen=True)
+class QueueFigures:
+    """For metrics. ended: jobs that came to each terminal state since the queue was made."""
+
+    queued: int
+    running: int
+    oldest_queued_s: float
+    ended: dict[JobState, int]
+
+
+class QueueFullError(UnavailableError):
+    """Too many jobs wait; `tenant` says whether the caller's own share is used up (HTTP 429, else 503)."""
+
+    def __init__(self, problem: str, remedy: str, *, tenant: bool) -> None:
+        super().__init__(problem, remedy)
+        self.tenant = tenant
+
+
+class Queue(Protocol):
+    """Every method is atomic and may be repeated when its answer was lost; those that change a job say what came of it.
+
+    All raise UnavailableError when the queue cannot be reached or its memory is full.
     """
 
-    def submit(self, record: JobRecord) -> bool:
-        """Enqueue a job; False if one of that id is there already (so that a submit may be repeated)."""
+    def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
+        """Enqueue a job; the record that stands in the queue afterwards.
+
+        That is another one if the tenant submitted a job under the same idempotency key within IDEMPOTENCY_S, and the
+        job itself, unchanged, if its id is there already.
+
+        Raises:
+            QueueFullError: admission leaves no room; nothing was changed.
+        """
+        ...
+
+    def restore(self, record: JobRecord) -> bool:
+        """Put back the record of an ended job that the queue has lost; False if it knows the job."""
         ...
 
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
         """The next job, now running and owned; None after timeout_s.
 
-        A job that an earlier process of the same name left running or released is handed out first, as a new attempt;
-        after MAX_ATTEMPTS deaths it fails instead. One with cancel_requested is handed out to be cleared away.
+        First jobs that were released or whose lease has run out, then new ones; high priority before standard within
+        each. An owner holds one job at a time: while it holds one (because the answer to its claim was lost), it is
+        given that one again, as the same attempt. A job whose workers died MAX_ATTEMPTS times fails instead; one with
+        cancel_requested ends as cancelled instead.
         """
         ...
 
-    def progress(self, claim: Claim, progress: JobProgress) -> bool:
-        """Record progress; True while the claim stands and nobody asked to cancel."""
+    def beat(self, claim: Claim, progress: JobProgress | None = None) -> Order:
+        """Renew the lease, record progress if there is any, and hear what to do."""
         ...
 
     def finish(self, claim: Claim) -> bool:
@@ -60,17 +138,17 @@ class Queue(Protocol):
         ...
 
     def fail(self, claim: Claim, error: JobError) -> bool:
-        """running -> failed; False if the claim no longer stands or a cancel was asked for."""
+        """running -> failed, a dead letter; False if the claim no longer stands or a cancel was asked for."""
         ...
 
     def confirm_cancel(self, claim: Claim) -> bool:
         """running -> cancelled, by the worker that has stopped; False if nobody asked for it."""
         ...
 
-    def release(self, claim: Claim) -> bool:
-        """running -> queued, by a worker that is to end; the attempt is not held against the job.
+    def release(self, claim: Claim, *, died: bool = False) -> bool:
+        """running -> queued, first in line; False if the claim no longer stands or a cancel was asked for.
 
-        False if the claim no longer stands or a cancel was asked for.
+        died: the attempt is held against the job, and after MAX_ATTEMPTS of them it is failed, a dead letter.
         """
         ...
 
@@ -78,16 +156,28 @@ class Queue(Protocol):
         """queued -> cancelled at once; running: ask its worker. The record afterwards; None if there is none."""
         ...
 
+    def retry(self, job_id: str) -> JobRecord | None:
+        """failed -> queued, earlier deaths forgiven. The record afterwards; None if there is none."""
+        ...
+
     def get(self, job_id: str) -> JobRecord | None:
         """The job's record."""
         ...
 
-    def records(self, limit: int = LISTING_LIMIT) -> list[JobRecord]:
-        """The newest jobs, newest first."""
+    def standing(self, job_id: str) -> Standing:
+        """Position in the queue and when the job may be done, from the duration of the last ones."""
+        ...
+
+    def records(self, tenant: str | None = None, limit: int | None = LISTING_LIMIT) -> list[JobRecord]:
+        """The newest jobs of a tenant, or of all, newest first."""
+        ...
+
+    def events(self, job_id: str, after: str = "0") -> list[Event]:
+        """What has happened to the job after the event of that number, oldest first; at once, without waiting."""
         ...
 
     def forget(self, job_id: str) -> bool:
-        """Remove the record of a job in a terminal state; False if it is missing or still live."""
+        """Remove record, events and idempotency key of a job in a terminal state; False if missing or still live."""
         ...
 
     def announce(self, address: WorkerAddress) -> None:
@@ -100,6 +190,10 @@ class Queue(Protocol):
 
     def workers(self) -> list[WorkerAddress]:
         """The live workers, by name."""
+        ...
+
+    def figures(self) -> QueueFigures:
+        """How much waits, runs and has ended."""
         ...
 
     def ping(self) -> None:

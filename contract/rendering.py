@@ -25,16 +25,18 @@ class Layer(StrEnum):
 
 
 class ImageFormat(StrEnum):
-    """png and npy are exact (depth: 16-bit PNG in 0.01 mm, npy float32 mm); jpeg is for eyes (false colour)."""
+    """png and npy are exact (depth: 16-bit PNG in 0.01 mm, npy float32 mm); jpeg and webp are for eyes."""
 
     PNG = "png"
     JPEG = "jpeg"
+    WEBP = "webp"
     NPY = "npy"
 
 
 MEDIA_TYPES = {
     ImageFormat.PNG: "image/png",
     ImageFormat.JPEG: "image/jpeg",
+    ImageFormat.WEBP: "image/webp",
     ImageFormat.NPY: "application/x-npy",
 }
 
@@ -56,17 +58,23 @@ class IntrinsicsOverride(BaseModel):
 
 
 class RenderRequest(BaseModel):
-    """One view of one scene. t in [0, 1], later times clamp with a warning; pose None is the endoscope's own at t."""
+    """One view of one scene. t in [0, 1], later times clamp with a warning; pose None is the endoscope's own at t.
+
+    attempt is the one whose scene was published; None asks for the newest snapshot of the job while it trains.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["render"] = "render"
     scene_id: str = Field(pattern=JOB_ID_PATTERN)
+    attempt: int | None = None
     t: float = Field(ge=0, le=1e6)
     pose: MatrixPose | OrbitPose | None = Field(default=None, discriminator="kind")
     camera: IntrinsicsOverride = IntrinsicsOverride()
     layer: Layer = Layer.RGB
     format: ImageFormat = ImageFormat.PNG
+    quality: int = Field(default=90, ge=1, le=100)
+    """Of jpeg and webp."""
     max_pixels: int = Field(default=4096 * 2160, gt=0)
 
 
@@ -77,6 +85,7 @@ class ExportRequest(BaseModel):
 
     kind: Literal["export"] = "export"
     scene_id: str = Field(pattern=JOB_ID_PATTERN)
+    attempt: int
     t: float = Field(ge=0, le=1e6)
     format: Literal["ply"] = "ply"
 
@@ -90,7 +99,8 @@ class WorkerRequest(BaseModel):
 class ReplyError(BaseModel):
     """A request that could not be answered; `kind` decides the HTTP status."""
 
-    kind: Literal["input", "scene", "internal"]
+    kind: Literal["input", "scene", "not-yet", "internal"]
+    """not-yet: the job runs here and has no snapshot so far."""
     problem: str
     field: str | None = None
     remedy: str | None = None
@@ -103,11 +113,18 @@ class WorkerReply(BaseModel):
     media_type: str = "application/octet-stream"
     t: float = 0.0
     warnings: tuple[str, ...] = ()
+    iteration: int | None = None
+    """Of the snapshot that is shown; None: the scene is finished."""
+    render_ms: float = 0.0
 
 
 class WorkerAddress(BaseModel):
-    """What a live worker announces: where it answers requests, on which device."""
+    """What a live worker announces: where it answers requests, on which device, and what it has at hand."""
 
     name: str
     endpoint: str
     device: str
+    job_id: str | None = None
+    """The job it runs."""
+    scenes: tuple[str, ...] = ()
+    """Scenes it holds in memory."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from contract.errors import InputError
 
@@ -18,6 +19,11 @@ def default_data_dir() -> Path:
     """Where clips and scenes live unless told otherwise: the XDG state directory of this user."""
     state_home = os.environ.get("XDG_STATE_HOME")
     return (Path(state_home) if state_home else Path.home() / ".local" / "state") / "intrasplat"
+
+
+def _listed(value: object) -> object:
+    """A list from its comma-separated text."""
+    return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
 
 class Settings(BaseModel):
@@ -33,11 +39,49 @@ class Settings(BaseModel):
     dashboard_dir: Path | None = None
     worker_name: str = Field(default="worker-1", pattern=r"^[A-Za-z0-9-]{1,40}$")
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda)$")
+    log_format: Literal["text", "json"] = "text"
+
+    # what is accepted
     max_upload_bytes: int = Field(default=4 * GIB, gt=0)
+    max_frames: int = Field(default=1000, gt=0)
+    max_frame_pixels: int = Field(default=4096 * 2160, gt=0)
+    """Of one eye."""
+    max_clip_s: float = Field(default=600.0, gt=0)
     min_free_bytes: int = Field(default=2 * GIB, ge=0)
     """An upload is refused while the data directory's disk has less than this left."""
+    max_uploads: int = Field(default=8, gt=0)
+    """Received at the same time, of all callers."""
+    upload_silence_s: float = Field(default=60.0, gt=0)
+    """A request body that brings nothing for so long is given up."""
+    max_queued: int = Field(default=200, gt=0)
+    max_queued_per_tenant: int = Field(default=50, gt=0)
+    requests_per_s: float = Field(default=400.0, gt=0)
+    """Of one key, or of one address where no key is asked for; each process of the service counts for itself."""
+
+    # who may come in
+    hosts: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
+    """Names besides loopback and `host` that requests may be addressed to."""
+    cors_origins: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
+    """Origins of pages from elsewhere that may use the service; none by default."""
+
+    # how long things are kept
+    retention_hours: float | None = Field(default=None, gt=0)
+    """Of jobs that do not say themselves; None keeps them until they are deleted."""
+    max_retention_hours: float | None = Field(default=None, gt=0)
+
+    # renders
     max_render_pixels: int = Field(default=4096 * 2160, gt=0)
     render_timeout_s: float = Field(default=20.0, gt=0)
+    render_endpoint: str | None = Field(default=None, pattern=r"^tcp://[^\s]+:\d+$")
+    """Where the worker answers services on other machines, as they reach it; needs render_secret. None: a socket."""
+    render_secret: str | None = Field(default=None, min_length=32)
+    """Shared by services and workers; the keys of the encrypted connection between them are made from it."""
+    hot_bytes: int = Field(default=2 * GIB, gt=0)
+    """Scenes a worker keeps in memory, together."""
+
+    # many machines
+    store_url: str | None = Field(default=None, pattern=r"^s3://[^\s]+$")
+    """Where clips and scenes are kept for all machines; None: in data_dir."""
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] | None = None) -> Settings:
@@ -65,7 +109,7 @@ class Settings(BaseModel):
     def to_environment(self) -> dict[str, str]:
         """The variables that make another process read these very settings."""
         values = {
-            ENVIRONMENT_PREFIX + name.upper(): str(value)
+            ENVIRONMENT_PREFIX + name.upper(): ",".join(value) if isinstance(value, tuple) else str(value)
             for name, value in self
             if value is not None and name != "redis_url"
         }
