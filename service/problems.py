@@ -19,7 +19,8 @@ logger = logging.getLogger("intrasplat.service")
 
 TITLES = {
     400: "The request cannot be understood",
-    403: "Not from here",
+    401: "A key is needed",
+    403: "Not allowed",
     404: "Not found",
     405: "Method not allowed",
     409: "Not in this state",
@@ -34,12 +35,21 @@ TITLES = {
 class Problem(Exception):
     """An answer other than the one asked for; raised anywhere below a route."""
 
-    def __init__(self, status: int, detail: str, *, field: str | None = None, remedy: str | None = None) -> None:
+    def __init__(
+        self,
+        status: int,
+        detail: str,
+        *,
+        field: str | None = None,
+        remedy: str | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
         super().__init__(detail)
         self.status = status
         self.detail = detail
         self.field = field
         self.remedy = remedy
+        self.headers = headers or {}
 
     def response(self, headers: Mapping[str, str] | None = None) -> JSONResponse:
         """The problem document; 503 also says when to come back."""
@@ -53,7 +63,9 @@ class Problem(Exception):
         }
         extra = {"Retry-After": str(RETRY_AFTER_S)} if self.status == 503 else {}
         content = {name: value for name, value in document.items() if value is not None}
-        return JSONResponse(content, self.status, headers={**(headers or {}), **extra}, media_type=MEDIA_TYPE)
+        return JSONResponse(
+            content, self.status, headers={**self.headers, **(headers or {}), **extra}, media_type=MEDIA_TYPE
+        )
 
 
 def install_handlers(app: FastAPI) -> None:

@@ -1,0 +1,85 @@
+"""Who calls: the key of a request, or nobody in particular where that is allowed.
+
+A key is required unless the service is bound to loopback and answers to no other name. There, requests without a key
+are this machine's user's, tenant "local", with every scope; but a request that a proxy has passed on comes from
+elsewhere, whatever address it has. A key that is wrong is refused everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from contract.job import LOCAL_TENANT, JobRecord
+from contract.keys import ApiKey, KeyFile, KeyScope
+from contract.settings import Settings
+from service.guard import LOOPBACK_NAMES
+from service.problems import Problem
+
+ALL_SCOPES = frozenset(KeyScope)
+CHALLENGE = {"WWW-Authenticate": 'Bearer realm="intrasplat"'}
+KEY_REMEDY = "Send `Authorization: Bearer KEY`; whoever runs the service makes keys with `intrasplat keys create`."
+FORWARDED_HEADERS = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Whose request it is and what it may do. key_id is None for this machine's user."""
+
+    tenant: str
+    scopes: frozenset[KeyScope]
+    key_id: str | None
+    address: str
+
+    def require(self, scope: KeyScope) -> None:
+        """Return if the caller has the scope; Problem 403 that names it otherwise."""
+        if scope not in self.scopes:
+            remedy = f"Use a key that has it: `intrasplat keys create --scopes {scope}`."
+            raise Problem(403, f"This key lacks the scope {scope.value!r}.", field="Authorization", remedy=remedy)
+
+    def owns(self, record: JobRecord) -> bool:
+        """Whether the job is the caller's tenant's; if not, the caller hears what it would hear of no job at all."""
+        return record.tenant == self.tenant
+
+
+class Access:
+    """The rules above for one service."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._keys = KeyFile(settings.data_dir)
+        self.keys_required = settings.host not in LOOPBACK_NAMES or bool(settings.hosts)
+
+    def caller(self, headers: Mapping[str, str], address: str) -> Caller | None:
+        """Whose request has these headers (names in lower case); None if it has no key and needs one.
+
+        Raises:
+            Problem: 401, the key is not one of ours.
+            UnavailableError: the file of keys is damaged.
+        """
+        text = _key_text(headers)
+        if text is not None:
+            return self.caller_of_key(text, address)
+        if self.keys_required or any(name in headers for name in FORWARDED_HEADERS):
+            return None
+        return Caller(LOCAL_TENANT, ALL_SCOPES, None, address)
+
+    def caller_of_key(self, text: str, address: str) -> Caller:
+        """Whose key it is; raises as caller()."""
+        key: ApiKey | None = self._keys.find(text)
+        if key is None:
+            raise Problem(401, "This key is not known.", field="Authorization", remedy=KEY_REMEDY, headers=CHALLENGE)
+        return Caller(key.tenant, key.scopes, key.key_id, address)
+
+
+def key_missing() -> Problem:
+    """The answer to a request that needs a key and has none."""
+    return Problem(401, "A key is needed.", field="Authorization", remedy=KEY_REMEDY, headers=CHALLENGE)
+
+
+def _key_text(headers: Mapping[str, str]) -> str | None:
+    """What was sent as a key, in either header; an Authorization of another kind is a wrong key."""
+    authorization = headers.get("authorization")
+    if authorization is None:
+        return headers.get("x-api-key")
+    kind, _, text = authorization.partition(" ")
+    return text.strip() if kind.lower() == "bearer" else ""
