@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import errno
-import logging
 from collections.abc import Mapping
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.websockets import WebSocketState
 
 from contract.errors import InputError, LimitError, SceneError, UnavailableError
+from contract.queue import QueueFullError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
-logger = logging.getLogger("intrasplat.service")
+"""Said with 429 and 503, unless the problem knows better."""
+API_REMEDY = "The API is described at /openapi.json."
+FAULT_REMEDY = "Report it with the log's lines of this X-Request-Id."
 
 TITLES = {
     400: "The request cannot be understood",
@@ -23,9 +27,14 @@ TITLES = {
     403: "Not allowed",
     404: "Not found",
     405: "Method not allowed",
+    408: "Nothing came",
     409: "Not in this state",
+    412: "Another version is spoken here",
     413: "Too large",
+    415: "Not this type of content",
     422: "The input cannot be used",
+    423: "Being written to",
+    429: "Too much at once",
     500: "A fault of the service",
     503: "Not available now",
     507: "No room on disk",
@@ -33,7 +42,10 @@ TITLES = {
 
 
 class Problem(Exception):
-    """An answer other than the one asked for; raised anywhere below a route."""
+    """An answer other than the one asked for; raised anywhere below a route.
+
+    `extensions` are further members of the document, such as the job it speaks of.
+    """
 
     def __init__(
         self,
@@ -43,41 +55,78 @@ class Problem(Exception):
         field: str | None = None,
         remedy: str | None = None,
         headers: Mapping[str, str] | None = None,
+        extensions: Mapping[str, object] | None = None,
     ) -> None:
         super().__init__(detail)
         self.status = status
         self.detail = detail
         self.field = field
         self.remedy = remedy
-        self.headers = headers or {}
+        self.headers = dict(headers or {})
+        self.extensions = dict(extensions or {})
+        if status in (429, 503):
+            self.headers.setdefault("Retry-After", str(RETRY_AFTER_S))
 
-    def response(self, headers: Mapping[str, str] | None = None) -> JSONResponse:
-        """The problem document; 503 also says when to come back."""
-        document = {
-            "type": "about:blank",
-            "title": TITLES.get(self.status, "Error"),
-            "status": self.status,
-            "detail": self.detail,
-            "field": self.field,
-            "remedy": self.remedy,
-        }
-        extra = {"Retry-After": str(RETRY_AFTER_S)} if self.status == 503 else {}
-        content = {name: value for name, value in document.items() if value is not None}
-        return JSONResponse(
-            content, self.status, headers={**self.headers, **(headers or {}), **extra}, media_type=MEDIA_TYPE
-        )
+    def document(self) -> dict[str, object]:
+        """The problem as RFC 9457 has it, with the field at fault and the remedy where there are any."""
+        title = TITLES.get(self.status, "Error")
+        document = {"type": "about:blank", "title": title, "status": self.status, "detail": self.detail}
+        about = {"field": self.field, "remedy": self.remedy, **self.extensions}
+        return document | {name: value for name, value in about.items() if value is not None}
+
+    def response(self) -> JSONResponse:
+        """The problem document as an answer."""
+        return JSONResponse(self.document(), self.status, headers=self.headers, media_type=MEDIA_TYPE)
 
 
 def install_handlers(app: FastAPI) -> None:
-    """Answer every exception that leaves a route as a problem document."""
-    app.add_exception_handler(Problem, _on_problem)
-    app.add_exception_handler(InputError, _on_input_error)
-    app.add_exception_handler(SceneError, _on_scene_error)
-    app.add_exception_handler(UnavailableError, _on_unavailable)
-    app.add_exception_handler(RequestValidationError, _on_validation_error)
-    app.add_exception_handler(HTTPException, _on_http_exception)
-    app.add_exception_handler(OSError, _on_os_error)
-    app.add_exception_handler(Exception, _on_fault)
+    """Answer every exception that leaves a route as a problem document; what is no error of ours stays one (500)."""
+    for kind in (Problem, InputError, SceneError, UnavailableError, RequestValidationError, HTTPException, OSError):
+        app.add_exception_handler(kind, _answer)
+
+
+async def _answer(connection: Any, error: Exception) -> Any:
+    """Of a Request: the problem's answer. Of a WebSocket: its handshake refused, or its end after a last message."""
+    problem = problem_of(error)
+    if problem is None:
+        raise error
+    if isinstance(connection, Request):
+        return problem.response()
+    if connection.application_state is WebSocketState.CONNECTING:
+        await connection.send_denial_response(problem.response())
+    else:
+        await connection.send_json(problem.document())
+        await connection.close(1011)
+    return None
+
+
+def problem_of(error: Exception) -> Problem | None:
+    """What an error is over HTTP; None for one that nobody foresaw."""
+    match error:
+        case Problem():
+            return error
+        case InputError():
+            status = 413 if isinstance(error, LimitError) else 422
+            return Problem(status, error.problem, field=error.field, remedy=error.remedy)
+        case SceneError():
+            return Problem(404, str(error), field="scene", remedy="GET /scenes lists what there is.")
+        case QueueFullError():
+            return Problem(429 if error.tenant else 503, error.problem, field="queue", remedy=error.remedy)
+        case UnavailableError():
+            return Problem(503, error.problem, remedy=error.remedy)
+        case RequestValidationError():
+            return _problem_of_validation(error)
+        case HTTPException():
+            return _problem_of_http_exception(error)
+        case OSError() if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return no_room("The data directory's disk is full.")
+        case _:
+            return None
+
+
+def fault() -> Problem:
+    """The answer where an error was that nobody foresaw; the log has the details, under the request's id."""
+    return Problem(500, "Something went wrong in the service; its log has the details.", remedy=FAULT_REMEDY)
 
 
 def no_room(detail: str) -> Problem:
@@ -85,47 +134,14 @@ def no_room(detail: str) -> Problem:
     return Problem(507, detail, remedy="Delete scenes (DELETE /scenes/{id}) or give it more room.")
 
 
-async def _on_problem(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, Problem)
-    return error.response()
-
-
-async def _on_input_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, InputError)
-    status = 413 if isinstance(error, LimitError) else 422
-    return Problem(status, error.problem, field=error.field, remedy=error.remedy).response()
-
-
-async def _on_scene_error(request: Request, error: Exception) -> JSONResponse:
-    return Problem(404, str(error), field="scene", remedy="GET /scenes lists what there is.").response()
-
-
-async def _on_unavailable(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, UnavailableError)
-    return Problem(503, error.problem, remedy=error.remedy).response()
-
-
-async def _on_validation_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError)
+def _problem_of_validation(error: RequestValidationError) -> Problem:
     first = error.errors()[0]
-    field = str(first["loc"][-1])
+    if first["type"] == "json_invalid":
+        return Problem(400, "The body is not JSON.", field="body", remedy=API_REMEDY)
     given = "" if first["type"] == "missing" else f" (given: {str(first.get('input'))[:80]!r})"
-    detail = f"{first['msg']}{given}."
-    return Problem(422, detail, field=field, remedy="The API is described at /openapi.json.").response()
+    return Problem(422, f"{first['msg']}{given}.", field=str(first["loc"][-1]), remedy=API_REMEDY)
 
 
-async def _on_http_exception(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, HTTPException)
-    remedy = "The API is described at /openapi.json." if error.status_code in (404, 405) else None
-    return Problem(error.status_code, str(error.detail), remedy=remedy).response(error.headers)
-
-
-async def _on_os_error(request: Request, error: Exception) -> JSONResponse:
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return no_room("The data directory's disk is full.").response()
-    return await _on_fault(request, error)
-
-
-async def _on_fault(request: Request, error: Exception) -> JSONResponse:
-    logger.error("fault in %s %s: %s", request.method, request.url.path, type(error).__name__, exc_info=error)
-    return Problem(500, "Something went wrong in the service; its log has the details.").response()
+def _problem_of_http_exception(error: HTTPException) -> Problem:
+    remedy = API_REMEDY if error.status_code in (404, 405) else None
+    return Problem(error.status_code, str(error.detail), remedy=remedy, headers=error.headers)
