@@ -82,6 +82,21 @@ class Store:
         """Where the job's clip lies, or lay."""
         return self._folder("spool", job_id)
 
+    def spooled_ids(self) -> list[str]:
+        """The jobs whose clips are spooled."""
+        return [entry.name for entry in (self.data_dir / "spool").iterdir() if is_job_id(entry.name)]
+
+    def submission(self, job_id: str) -> JobRecord | None:
+        """The record of a spooled clip as it was submitted; None if the clip is gone, or its submission unreadable."""
+        try:
+            return JobRecord.model_validate_json((self.spool_folder(job_id) / SUBMISSION).read_bytes())
+        except (FileNotFoundError, ValueError):
+            return None
+
+    def incoming_folder(self, upload_id: str) -> Path:
+        """Where an upload in progress lies, or lay."""
+        return self._folder("incoming", upload_id)
+
     def work_folder(self, job_id: str, attempt: int, keep: str | None = None) -> Path:
         """The folder for one attempt, empty but for the file `keep` if the attempt before left one to go on from.
 
