@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from contract.errors import SceneError
+from contract.errors import SceneError, UnavailableError
 from contract.job import JobFiles, JobRecord
 from contract.store import ABANDONED_AFTER_S, MANIFEST, SUBMISSION, Store, is_job_id, new_job_id
 
@@ -26,11 +26,13 @@ def accepted(store: Store) -> JobRecord:
     return record
 
 
-def published(store: Store) -> str:
-    record = accepted(store)
-    (store.work_folder(record.job_id, 1) / MANIFEST).write_text("{}")
-    store.publish_scene(record.job_id, 1)
-    return record.job_id
+def publish(store: Store, job_id: str, attempt: int, content: str = "{}") -> Path:
+    (store.work_folder(job_id, attempt) / MANIFEST).write_text(content)
+    return store.publish_scene(job_id, attempt)
+
+
+def everything_of(store: Store, job_id: str) -> list[Path]:
+    return [path for path in store.data_dir.rglob("*") if job_id in path.name]
 
 
 def test_an_accepted_upload_lies_in_the_spool_with_its_record(store: Store) -> None:
@@ -45,15 +47,62 @@ def test_the_data_directory_is_for_its_owner_only(store: Store) -> None:
     assert stat.S_IMODE(store.data_dir.stat().st_mode) == 0o700
 
 
+def test_the_accepted_clips_can_be_listed_and_read_again(store: Store) -> None:
+    records = {record.job_id: record for record in (accepted(store), accepted(store))}
+    store.open_incoming(new_job_id())
+    assert store.spooled_ids() == sorted(records)
+    assert {job_id: store.submission(job_id) for job_id in store.spooled_ids()} == records
+    assert (store.fetch_clip(store.spooled_ids()[0]) / "clip.mp4").read_bytes() == b"frames"
+
+
+def test_a_damaged_submission_hides_no_other(store: Store) -> None:
+    damaged, sound = accepted(store).job_id, accepted(store).job_id
+    (store.spool_folder(damaged) / SUBMISSION).write_text('{"job_id": ')
+    assert store.spooled_ids() == sorted([damaged, sound])
+    assert store.submission(damaged) is None
+    assert store.submission(sound) is not None
+    assert store.submission(new_job_id()) is None
+
+
+def test_a_clip_that_is_not_there_cannot_be_fetched(store: Store) -> None:
+    with pytest.raises(UnavailableError, match="is not there"):
+        store.fetch_clip(new_job_id())
+
+
 def test_a_scene_is_there_only_once_it_is_published(store: Store) -> None:
-    record = accepted(store)
-    (store.work_folder(record.job_id, 1) / MANIFEST).write_text("{}")
-    assert store.scene_ids() == []
+    job_id = accepted(store).job_id
+    (store.work_folder(job_id, 1) / MANIFEST).write_text("{}")
+    assert store.scene_attempts(job_id) == []
     with pytest.raises(SceneError):
-        store.scene_folder(record.job_id)
-    store.publish_scene(record.job_id, 1)
-    assert store.scene_ids() == [record.job_id]
-    assert store.scene_folder(record.job_id).is_dir()
+        store.scene_folder(job_id, 1)
+    store.publish_scene(job_id, 1)
+    assert store.scene_attempts(job_id) == [1]
+    assert store.has_scene(job_id, 1)
+    assert store.scene_folder(job_id, 1).is_dir()
+
+
+def test_publishing_may_be_repeated(store: Store) -> None:
+    job_id = new_job_id()
+    scene = publish(store, job_id, 1)
+    assert store.publish_scene(job_id, 1) == scene
+    assert publish(store, job_id, 1, "another") == scene
+    assert (scene / MANIFEST).read_text() == "another"
+
+
+def test_an_attempt_thought_dead_replaces_no_scene_and_removes_only_its_own(store: Store) -> None:
+    job_id = new_job_id()
+    zombie = store.work_folder(job_id, 1)
+    publish(store, job_id, 2, "of attempt 2")
+    assert not zombie.exists()
+    with pytest.raises(SceneError):
+        store.publish_scene(job_id, 1)
+    publish(store, job_id, 1, "of the zombie")
+    assert store.scene_attempts(job_id) == [1, 2]
+    assert (store.scene_folder(job_id, 2) / MANIFEST).read_text() == "of attempt 2"
+    store.remove_attempt(job_id, 1)
+    assert store.scene_attempts(job_id) == [2]
+    assert store.published_attempt(job_id) == 2
+    assert store.published_attempt(new_job_id()) is None
 
 
 def test_an_attempt_starts_from_an_empty_folder(store: Store) -> None:
@@ -71,13 +120,39 @@ def test_an_attempt_takes_over_the_one_file_to_go_on_from_and_removes_earlier_fo
     assert [path.name for path in (store.data_dir / "work").iterdir()] == [folder.name]
 
 
-def test_publishing_leaves_no_work_of_any_attempt(store: Store) -> None:
-    job_id = published(store)
-    assert list((store.data_dir / "work").iterdir()) == []
-    (store.work_folder(job_id, 2) / MANIFEST).write_text("{}")
-    (store.data_dir / "work" / f"{job_id}.1").mkdir()
-    store.publish_scene(job_id, 2)
-    assert list((store.data_dir / "work").iterdir()) == []
+def test_what_an_attempt_goes_on_from_is_the_latest_that_any_earlier_one_left(store: Store) -> None:
+    job_id = new_job_id()
+    for attempt, left in ((1, True), (2, True), (3, False)):
+        folder = store.data_dir / "work" / f"{job_id}.{attempt}"
+        folder.mkdir()
+        if left:
+            (folder / "kept").write_text(f"of attempt {attempt}")
+    assert (store.work_folder(job_id, 4, keep="kept") / "kept").read_text() == "of attempt 2"
+    assert (store.work_folder(job_id, 4, keep="kept") / "kept").read_text() == "of attempt 2"
+
+
+def test_an_attempt_that_starts_late_leaves_a_later_one_alone(store: Store) -> None:
+    job_id = new_job_id()
+    (store.work_folder(job_id, 2, keep="kept") / "kept").write_text("of attempt 2")
+    assert list(store.work_folder(job_id, 1, keep="kept").iterdir()) == []
+    assert (store.data_dir / "work" / f"{job_id}.2" / "kept").is_file()
+
+
+def test_after_a_scene_is_reported_nothing_else_is_left_of_its_attempts(store: Store) -> None:
+    job_id = new_job_id()
+    for attempt in (1, 2):
+        publish(store, job_id, attempt)
+    store.work_folder(job_id, 3)
+    store.remove_other_attempts(job_id, 2)
+    assert [path.name for path in everything_of(store, job_id)] == [f"{job_id}.2"]
+    assert store.scene_attempts(job_id) == [2]
+
+
+def test_scenes_of_the_version_before_count_as_the_first_attempts(store: Store) -> None:
+    job_id = new_job_id()
+    (store.data_dir / "scenes" / job_id).mkdir()
+    (store.data_dir / "scenes" / job_id / MANIFEST).write_text("{}")
+    assert Store(store.data_dir).scene_attempts(job_id) == [1]
 
 
 def test_scratch_is_emptied_when_its_worker_starts_again_and_is_no_attempt(store: Store) -> None:
@@ -99,17 +174,36 @@ def test_uploads_that_stopped_a_day_ago_are_removed_and_younger_ones_are_not(sto
     assert {path.name for path in (store.data_dir / "incoming").iterdir()} == {paused.name, going_on.name}
 
 
-def test_removing_a_job_leaves_no_file_of_it(store: Store) -> None:
-    job_id = published(store)
-    store.work_folder(job_id, 2)
-    store.remove(job_id)
-    assert [path for path in store.data_dir.rglob("*") if job_id in path.name] == []
+def test_a_purge_leaves_no_file_of_a_job_and_says_what_it_took(store: Store) -> None:
+    job_id, other = accepted(store).job_id, accepted(store).job_id
+    publish(store, job_id, 1)
+    (store.work_folder(job_id, 2) / "resume").write_bytes(b"12345")
+    store.open_incoming(job_id)
+    removed = store.purge(job_id)
+    assert everything_of(store, job_id) == []
+    assert removed.files == {"incoming": 0, "spool": 2, "work": 1, "scenes": 1}
+    assert removed.bytes["work"] == 5
+    assert removed.bytes["scenes"] == len("{}")
+    assert store.spooled_ids() == [other]
+    assert sum(store.purge(job_id).files.values()) == 0
+
+
+def test_a_purge_that_was_cut_off_shows_nothing_and_is_completed(store: Store) -> None:
+    job_id = accepted(store).job_id
+    publish(store, job_id, 1)
+    (store.spool_folder(job_id) / SUBMISSION).unlink()
+    (store.scene_folder(job_id, 1) / MANIFEST).unlink()
+    assert store.spooled_ids() == []
+    assert store.scene_attempts(job_id) == []
+    store.remove_abandoned_uploads()
+    assert everything_of(store, job_id) == []
 
 
 @pytest.mark.parametrize("text", ["..", "../x", "", "A" * 32, "a" * 31, "a" * 32 + "\n", "a" * 32 + "/x"])
 def test_nothing_but_our_own_ids_is_ever_part_of_a_path(store: Store, text: str) -> None:
     assert not is_job_id(text)
     with pytest.raises(SceneError):
-        store.scene_folder(text)
-    with pytest.raises(ValueError, match="not a job id"):
-        store.spool_folder(text)
+        store.scene_folder(text, 1)
+    for method in (store.spool_folder, store.incoming_folder, store.purge):
+        with pytest.raises(ValueError, match="not a job id"):
+            method(text)
