@@ -14,11 +14,16 @@ from contract.job import LOCAL_TENANT, JobRecord
 from contract.keys import ApiKey, KeyFile, KeyScope
 from contract.settings import Settings
 from service.guard import LOOPBACK_NAMES
+from service.limits import Limiter
 from service.problems import Problem
 
 ALL_SCOPES = frozenset(KeyScope)
 CHALLENGE = {"WWW-Authenticate": 'Bearer realm="intrasplat"'}
 KEY_REMEDY = "Send `Authorization: Bearer KEY`; whoever runs the service makes keys with `intrasplat keys create`."
+WRONG_KEYS_PER_S = 0.2
+WRONG_KEYS_AT_ONCE = 10.0
+"""From one address. Keys cannot be guessed; this keeps whoever tries from filling logs and audit."""
+
 FORWARDED_HEADERS = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
 
 
@@ -35,11 +40,32 @@ class Caller:
         """Return if the caller has the scope; Problem 403 that names it otherwise."""
         if scope not in self.scopes:
             remedy = f"Use a key that has it: `intrasplat keys create --scopes {scope}`."
-            raise Problem(403, f"This key lacks the scope {scope.value!r}.", field="Authorization", remedy=remedy)
+            detail = f"This key lacks the scope {scope.value!r}."
+            raise Refusal(403, detail, remedy, address=self.address, caller=self)
 
     def owns(self, record: JobRecord) -> bool:
         """Whether the job is the caller's tenant's; if not, the caller hears what it would hear of no job at all."""
         return record.tenant == self.tenant
+
+
+class Refusal(Problem):
+    """A caller asked for what it may not have; recorded in the audit (service/audit.py) where it leaves a route."""
+
+    def __init__(
+        self,
+        status: int,
+        detail: str,
+        remedy: str,
+        *,
+        field: str = "Authorization",
+        address: str,
+        caller: Caller | None = None,
+        job_id: str | None = None,
+    ) -> None:
+        super().__init__(status, detail, field=field, remedy=remedy, headers=CHALLENGE if status == 401 else None)
+        self.address = address
+        self.caller = caller
+        self.job_id = job_id
 
 
 class Access:
@@ -47,13 +73,15 @@ class Access:
 
     def __init__(self, settings: Settings) -> None:
         self._keys = KeyFile(settings.data_dir)
+        self._wrong_keys = Limiter(WRONG_KEYS_PER_S, WRONG_KEYS_AT_ONCE)
         self.keys_required = settings.host not in LOOPBACK_NAMES or bool(settings.hosts)
 
     def caller(self, headers: Mapping[str, str], address: str) -> Caller | None:
         """Whose request has these headers (names in lower case); None if it has no key and needs one.
 
         Raises:
-            Problem: 401, the key is not one of ours.
+            Problem: 401, the key is not one of ours; 429, too many from this address were not. Keys that are known
+                pass all the same, so that nobody behind a common proxy can lock out the others.
             UnavailableError: the file of keys is damaged.
         """
         text = _key_text(headers)
@@ -67,13 +95,14 @@ class Access:
         """Whose key it is; raises as caller()."""
         key: ApiKey | None = self._keys.find(text)
         if key is None:
-            raise Problem(401, "This key is not known.", field="Authorization", remedy=KEY_REMEDY, headers=CHALLENGE)
+            self._wrong_keys.admit(address)
+            raise Refusal(401, "This key is not known.", KEY_REMEDY, address=address)
         return Caller(key.tenant, key.scopes, key.key_id, address)
 
 
-def key_missing() -> Problem:
+def key_missing(address: str) -> Refusal:
     """The answer to a request that needs a key and has none."""
-    return Problem(401, "A key is needed.", field="Authorization", remedy=KEY_REMEDY, headers=CHALLENGE)
+    return Refusal(401, "A key is needed.", KEY_REMEDY, address=address)
 
 
 def _key_text(headers: Mapping[str, str]) -> str | None:

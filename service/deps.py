@@ -14,13 +14,18 @@ from typing import Annotated
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
+from contract.audit import AuditLog
 from contract.job import JobRecord
 from contract.queue import Queue
 from contract.settings import Settings
 from contract.store import Store, is_job_id
-from service.access import Access, Caller, key_missing
+from service.access import Access, Caller, Refusal, key_missing
+from service.audit import Audit
+from service.limits import Limiter
 from service.problems import Problem
 from service.renderer import Renderer
+
+UNIX_SOCKET = "unix"
 
 
 @dataclass(frozen=True)
@@ -32,9 +37,13 @@ class Deps:
     store: Store
     renderer: Renderer
     access: Access = field(init=False)
+    limiter: Limiter = field(init=False)
+    audit: Audit = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "access", Access(self.settings))
+        object.__setattr__(self, "limiter", Limiter(self.settings.requests_per_s))
+        object.__setattr__(self, "audit", Audit(AuditLog(self.settings.data_dir)))
 
 
 def _deps_of(connection: HTTPConnection) -> Deps:
@@ -46,14 +55,21 @@ def _deps_of(connection: HTTPConnection) -> Deps:
 Services = Annotated[Deps, Depends(_deps_of)]
 
 
+def address_of(connection: HTTPConnection) -> str:
+    """The caller's address, as far as the proxies in between are trusted to tell it."""
+    return connection.client.host if connection.client else UNIX_SOCKET
+
+
 async def _caller_if_known(connection: HTTPConnection, services: Services) -> Caller | None:
-    address = connection.client.host if connection.client else "-"
-    return services.access.caller(connection.headers, address)
+    address = address_of(connection)
+    caller = services.access.caller(connection.headers, address)
+    services.limiter.admit(caller.key_id or address if caller else address)
+    return caller
 
 
-async def _caller(caller: Annotated[Caller | None, Depends(_caller_if_known)]) -> Caller:
+async def _caller(connection: HTTPConnection, caller: Annotated[Caller | None, Depends(_caller_if_known)]) -> Caller:
     if caller is None:
-        raise key_missing()
+        raise key_missing(address_of(connection))
     return caller
 
 
@@ -68,7 +84,13 @@ services.access.caller_of_key(text, address) then says whose it is."""
 def owned_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:
     """The record of a job of the caller's tenant; the same 404 if there is none and if it is another's."""
     record = services.queue.get(job_id) if is_job_id(job_id) else None
-    if record is None or not caller.owns(record):
-        remedy = "GET /jobs lists what there is."
-        raise Problem(404, f"There is no job {job_id[:40]!r}.", field="job_id", remedy=remedy)
-    return record
+    if record is not None and caller.owns(record):
+        return record
+    raise not_found(f"There is no job {job_id[:40]!r}.", "job_id", "GET /jobs lists what there is.", caller, record)
+
+
+def not_found(detail: str, field: str, remedy: str, caller: Caller, record: JobRecord | None) -> Problem:
+    """The 404 of what is not there and of what is another tenant's: alike, but the latter is recorded in the audit."""
+    if record is None:
+        return Problem(404, detail, field=field, remedy=remedy)
+    return Refusal(404, detail, remedy, field=field, address=caller.address, caller=caller, job_id=record.job_id)

@@ -1,7 +1,8 @@
 """What every request and answer passes: no foreign page may use a service that trusts the loopback interface.
 
-There are no accounts yet, so the service binds to loopback. A page from elsewhere that is open in a browser on this
-machine could still reach it; it is refused by its Origin, and a name that was rebound to 127.0.0.1 by its Host.
+A page from elsewhere that is open in a browser on this machine could reach a service that asks for no key; it is
+refused by its Origin, and a name that was rebound to 127.0.0.1 by its Host. WebSockets are asked the same, since
+browsers let any page open one. HTTPS, and the header that insists on it, are the proxy's.
 """
 
 from __future__ import annotations
@@ -10,37 +11,60 @@ from collections.abc import Collection
 from urllib.parse import SplitResult, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.problems import Problem
 
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
+ANY_HOST = "*"
+"""As a host: every name is answered, for clusters that address a service by changing ones. Keys are required then."""
 
 ANSWER_HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
         "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     ),
+    "Cross-Origin-Resource-Policy": "same-origin",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
+EXPOSED_HEADERS = (
+    *("Location", "Retry-After", "ETag", "Server-Timing", "X-Request-Id"),
+    *("Upload-Offset", "Upload-Length", "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Max-Size"),
+    *(f"X-Intrasplat-{name}" for name in ("Scene", "State", "T", "Iteration", "Warning")),
+)
+"""What a page from elsewhere may read of an answer."""
+CORS_METHODS = ("GET", "HEAD", "POST", "PATCH", "DELETE")
 
 
 class Guard:
-    """ASGI middleware: refuses foreign hosts and origins, adds the security headers."""
+    """ASGI middleware: refuses foreign hosts and origins, adds the security headers.
 
-    def __init__(self, app: ASGIApp, hosts: Collection[str] = LOOPBACK_NAMES) -> None:
+    origins: of pages from elsewhere that may use the service all the same; they send a key, never cookies.
+    """
+
+    def __init__(self, app: ASGIApp, hosts: Collection[str] = LOOPBACK_NAMES, origins: Collection[str] = ()) -> None:
+        self._hosts = frozenset(host.lower() for host in hosts)
+        self._origins = frozenset(origins)
         self._app = app
-        self._hosts = frozenset(hosts)
+        if origins:
+            self._app = CORSMiddleware(
+                app,
+                allow_origins=tuple(origins),
+                allow_methods=CORS_METHODS,
+                allow_headers=("*",),
+                expose_headers=EXPOSED_HEADERS,
+            )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
+        if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
 
         async def send_with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
+            if message["type"] in ("http.response.start", "websocket.http.response.start"):
                 headers = MutableHeaders(scope=message)
                 for name, value in ANSWER_HEADERS.items():
                     headers.setdefault(name, value)
@@ -52,11 +76,13 @@ class Guard:
 
     def _refusal(self, headers: Headers) -> Problem | None:
         host = headers.get("host", "")
-        if _split(f"//{host}").hostname not in self._hosts:
-            return Problem(403, f"This service does not answer to the name {host[:80]!r}.", field="Host")
+        if ANY_HOST not in self._hosts and _split(f"//{host}").hostname not in self._hosts:
+            remedy = "Whoever runs the service adds names with INTRASPLAT_HOSTS."
+            return Problem(403, f"This service does not answer to the name {host[:80]!r}.", field="Host", remedy=remedy)
         origin = headers.get("origin")
-        if origin is not None and _split(origin).netloc != host:
-            return Problem(403, f"Pages from {origin[:80]!r} may not use this service.", field="Origin")
+        if origin is not None and origin not in self._origins and _split(origin).netloc != host:
+            remedy = "Whoever runs the service admits pages from elsewhere with INTRASPLAT_CORS_ORIGINS."
+            return Problem(403, f"Pages from {origin[:80]!r} may not use this service.", field="Origin", remedy=remedy)
         return None
 
 
