@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -11,7 +13,8 @@ from fastapi.staticfiles import StaticFiles
 from contract.queue import Queue
 from contract.settings import Settings
 from contract.store import Store
-from service import jobs, renders, scenes, system
+from service import jobs, reconstruct, renders, scenes, system
+from service.audit import install_refusal_handler
 from service.deps import Deps
 from service.guard import LOOPBACK_NAMES, Guard
 from service.problems import install_handlers
@@ -26,11 +29,15 @@ DESCRIPTION = (
 
 def create_app(settings: Settings, queue: Queue, store: Store, renderer: Renderer) -> FastAPI:
     """The application; it takes over `queue` and `renderer` and closes them when it ends."""
+    deps = Deps(settings, queue, store, renderer)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        store.remove_abandoned_uploads()
+        sweeping = asyncio.create_task(deps.sweep.run())
         yield
+        sweeping.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await sweeping
         await renderer.close()
         queue.close()
 
@@ -42,10 +49,11 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
         redoc_url=None,
         lifespan=lifespan,
     )
-    app.state.deps = Deps(settings, queue, store, renderer)
-    app.add_middleware(Guard, hosts=LOOPBACK_NAMES | {settings.host})
+    app.state.deps = deps
+    app.add_middleware(Guard, hosts=LOOPBACK_NAMES | {settings.host, *settings.hosts}, origins=settings.cors_origins)
     install_handlers(app)
-    for router in (jobs.router, renders.router, scenes.router, system.router):
+    install_refusal_handler(app, deps.audit)
+    for router in (reconstruct.router, jobs.router, renders.router, scenes.router, system.router):
         app.include_router(router)
     if settings.dashboard_dir is not None:
         app.mount("/", StaticFiles(directory=settings.dashboard_dir, html=True), name="dashboard")

@@ -21,9 +21,11 @@ from contract.settings import Settings
 from contract.store import Store, is_job_id
 from service.access import Access, Caller, Refusal, key_missing
 from service.audit import Audit
+from service.intake import Intake
 from service.limits import Limiter
 from service.problems import Problem
 from service.renderer import Renderer
+from service.sweep import Sweep
 
 UNIX_SOCKET = "unix"
 
@@ -39,11 +41,15 @@ class Deps:
     access: Access = field(init=False)
     limiter: Limiter = field(init=False)
     audit: Audit = field(init=False)
+    intake: Intake = field(init=False)
+    sweep: Sweep = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "access", Access(self.settings))
         object.__setattr__(self, "limiter", Limiter(self.settings.requests_per_s))
         object.__setattr__(self, "audit", Audit(AuditLog(self.settings.data_dir)))
+        object.__setattr__(self, "intake", Intake(self.settings, self.store))
+        object.__setattr__(self, "sweep", Sweep(self.queue, self.store))
 
 
 def _deps_of(connection: HTTPConnection) -> Deps:

@@ -1,130 +1,74 @@
-"""POST /reconstruct and the jobs it makes."""
+"""Where jobs stand, and what may be done to them."""
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-import time
-from typing import Any
+from typing import Annotated
 
-from fastapi import APIRouter, Request, Response
-from starlette.concurrency import run_in_threadpool
-from starlette.requests import ClientDisconnect
+from fastapi import APIRouter, Query, Response
 
-from contract.errors import UnavailableError
-from contract.job import TERMINAL_STATES, JobOptions, JobRecord, JobState, JobView, parse_options
-from contract.store import is_job_id, new_job_id
-from service.deps import Deps, Services
-from service.problems import RETRY_AFTER_S, Problem, no_room
-from service.upload import Received, UploadLimits, receive_upload
+from contract.audit import AuditAction
+from contract.job import TERMINAL_STATES, JobRecord, JobState, JobView
+from contract.keys import KeyScope
+from contract.queue import LISTING_LIMIT
+from service.deps import AnyCaller, Deps, Services, owned_job
+from service.problems import RETRY_AFTER_S, Problem
 
-router = APIRouter(tags=["jobs"])
+router = APIRouter(prefix="/jobs", tags=["jobs"])
 
-UPLOAD_SCHEMA: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "description": "clip, or left and right; the file name's ending tells the format",
-                    "properties": {
-                        "clip": {"type": "string", "format": "binary"},
-                        "left": {"type": "string", "format": "binary"},
-                        "right": {"type": "string", "format": "binary"},
-                        "calibration": {"type": "string", "format": "binary"},
-                        "masks": {"type": "string", "format": "binary"},
-                        "options": JobOptions.model_json_schema(),
-                    },
-                },
-                "encoding": {"options": {"contentType": "application/json"}},
-            }
-        },
-    }
-}
+Limit = Annotated[int, Query(ge=1, le=LISTING_LIMIT, description="at most so many")]
 
 
-@router.post("/reconstruct", status_code=202, operation_id="reconstruct", openapi_extra=UPLOAD_SCHEMA)
-async def reconstruct(request: Request, response: Response, services: Services) -> JobView:
-    """Send a clip. 202 means that it is safely on disk and queued; Location is the job."""
-    store, settings = services.store, services.settings
-    free_bytes = store.free_bytes()
-    if free_bytes < settings.min_free_bytes:
-        raise no_room(f"{free_bytes} bytes are left on the data directory's disk.")
-    job_id = new_job_id()
-    folder = store.open_incoming(job_id)
-    room_bytes = free_bytes - settings.min_free_bytes
-    try:
-        content_type = request.headers.get("content-type", "")
-        limits = UploadLimits(settings.max_upload_bytes, room_bytes)
-        received = await receive_upload(content_type, request.stream(), folder, limits)
-        record = await run_in_threadpool(_accept, services, job_id, received)
-    except ClientDisconnect:
-        raise Problem(400, "The connection was closed before the upload was complete.") from None
-    finally:
-        store.discard_incoming(job_id)
-    response.headers["Location"] = f"/jobs/{job_id}"
-    response.headers["Retry-After"] = str(RETRY_AFTER_S)
-    return JobView.of(record)
+@router.get("", operation_id="list_jobs")
+def list_jobs(
+    services: Services, caller: AnyCaller, state: JobState | None = None, limit: Limit = LISTING_LIMIT
+) -> list[JobView]:
+    """The newest jobs, newest first; of one state if it is given. Positions in the queue are told of each by itself."""
+    caller.require(KeyScope.VIEW)
+    records = services.queue.records(caller.tenant, limit if state is None else None)
+    return [JobView.of(record) for record in records if state in (None, record.state)][:limit]
 
 
-@router.get("/jobs", operation_id="list_jobs")
-def list_jobs(services: Services) -> list[JobView]:
-    """The newest jobs, newest first."""
-    return [JobView.of(record) for record in services.queue.records()]
+@router.get("/{job_id}", operation_id="get_job")
+def get_job(job_id: str, response: Response, services: Services, caller: AnyCaller) -> JobView:
+    """State, position, stage, progress, held-out dB so far, seconds left, and the error if it failed."""
+    caller.require(KeyScope.VIEW)
+    return _view(services, owned_job(services, caller, job_id), response)
 
 
-@router.get("/jobs/{job_id}", operation_id="get_job")
-def get_job(job_id: str, response: Response, services: Services) -> JobView:
-    """State, stage, progress, held-out dB so far, seconds left, and the error if it failed."""
-    record = known_job(services, job_id)
-    if record.state not in TERMINAL_STATES:
-        response.headers["Retry-After"] = str(RETRY_AFTER_S)
-    return JobView.of(record)
-
-
-@router.delete("/jobs/{job_id}", operation_id="cancel_job")
-def cancel_job(job_id: str, services: Services) -> JobView:
+@router.delete("/{job_id}", operation_id="cancel_job")
+def cancel_job(job_id: str, response: Response, services: Services, caller: AnyCaller) -> JobView:
     """Cancel: a queued job at once, a running one as soon as its worker hears of it. The clip is removed with it."""
-    known_job(services, job_id)
-    record = services.queue.cancel(job_id)
-    if record is None:
-        raise _no_such_job(job_id)
+    caller.require(KeyScope.RECONSTRUCT)
+    owned_job(services, caller, job_id)
+    services.audit.record(AuditAction.CANCELLED, caller, job_id)
+    record = services.queue.cancel(job_id) or owned_job(services, caller, job_id)
     if record.state in (JobState.DONE, JobState.FAILED):
         remedy = f"DELETE /scenes/{job_id} removes what is left of it."
         raise Problem(409, f"The job is already {record.state}.", field="job_id", remedy=remedy)
     if record.state is JobState.CANCELLED:
-        services.store.remove_clip(job_id)
-    return JobView.of(record)
+        services.store.purge(job_id)
+    return _view(services, record, response)
 
 
-def known_job(services: Deps, job_id: str) -> JobRecord:
-    """The record of a job; 404 if there is none."""
-    record = services.queue.get(job_id) if is_job_id(job_id) else None
-    if record is None:
-        raise _no_such_job(job_id)
-    return record
+@router.post("/{job_id}/retry", status_code=202, operation_id="retry_job")
+def retry_job(job_id: str, response: Response, services: Services, caller: AnyCaller) -> JobView:
+    """Try a failed job again, as if its workers had not died."""
+    caller.require(KeyScope.RECONSTRUCT)
+    before = owned_job(services, caller, job_id)
+    if before.state is not JobState.FAILED:
+        detail = f"The job is {before.state}; only a failed one is tried again."
+        raise Problem(409, detail, field="job_id", remedy=f"See GET /jobs/{job_id}.")
+    if services.store.submission(job_id) is None:
+        raise Problem(409, "The job's clip is gone.", field="job_id", remedy="Send it again: POST /reconstruct.")
+    services.audit.record(AuditAction.RETRIED, caller, job_id)
+    record = services.queue.retry(job_id) or owned_job(services, caller, job_id)
+    response.headers["Location"] = f"/jobs/{job_id}"
+    return _view(services, record, response)
 
 
-def _no_such_job(job_id: str) -> Problem:
-    return Problem(404, f"There is no job {job_id[:40]!r}.", field="job_id", remedy="GET /jobs lists what there is.")
-
-
-def _accept(services: Deps, job_id: str, received: Received) -> JobRecord:
-    """Spool first, then queue: a job exists only for a clip that is on disk."""
-    record = JobRecord(
-        job_id=job_id,
-        files=received.files(),
-        options=parse_options(received.options),
-        input_bytes=received.total_bytes,
-        input_sha256=received.sha256(),
-        created_at_s=time.time(),
-    )
-    spooled = services.store.accept(record)
-    try:
-        services.queue.submit(record)
-    except UnavailableError:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(spooled)  # nothing was promised: the caller hears 503
-        raise
-    return record
+def _view(services: Deps, record: JobRecord, response: Response) -> JobView:
+    """The job as it stands, with when to ask again while it is under way."""
+    if record.state in TERMINAL_STATES:
+        return JobView.of(record)
+    response.headers["Retry-After"] = str(RETRY_AFTER_S)
+    return JobView.of(record, services.queue.standing(record.job_id))

@@ -27,6 +27,8 @@ SUFFIXES = {
 }
 """File parts and the endings they may have; the ending is all that is kept of the caller's file name."""
 
+PARTS = tuple(SUFFIXES)
+
 OPTIONS = "options"
 MAX_OPTIONS_BYTES = 64 * 1024
 MAX_CALIBRATION_BYTES = 16 * 2**20
@@ -76,10 +78,11 @@ class Received:
         )
 
     def sha256(self) -> str:
-        """Of the clip; of the two digests in hexadecimal, left first, when there are two files."""
-        if "clip" in self.digests:
-            return self.digests["clip"]
-        return hashlib.sha256((self.digests["left"] + self.digests["right"]).encode()).hexdigest()
+        """Of the only file; of several, of a line `part digest` for each, in the order of the parts' names."""
+        if len(self.digests) == 1:
+            return next(iter(self.digests.values()))
+        lines = "".join(f"{part} {digest}\n" for part, digest in sorted(self.digests.items()))
+        return hashlib.sha256(lines.encode()).hexdigest()
 
 
 async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: Path, limits: UploadLimits) -> Received:

@@ -1,0 +1,100 @@
+"""How much may come in: uploads at once, bytes of each, bytes of all that the disk still has room for."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from starlette.requests import Request
+
+from contract.errors import LimitError
+from contract.settings import Settings
+from contract.store import Store
+from service.partial import promised_bytes
+from service.problems import Problem, no_room
+
+LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
+
+
+@dataclass(eq=False)
+class Place:
+    """One of the uploads that are being received, and the bytes on disk that are kept for what it has yet to bring."""
+
+    kept_bytes: int
+
+
+class Intake:
+    """Counts what this process is receiving; what resumable uploads were promised stands in their folders."""
+
+    def __init__(self, settings: Settings, store: Store) -> None:
+        self._settings = settings
+        self._store = store
+        self._places: set[Place] = set()
+
+    @contextmanager
+    def place(self, declared_bytes: int = 0) -> Iterator[Place]:
+        """A place among the uploads that are received at once, with room for so many bytes.
+
+        Raises:
+            Problem: 503, all places are taken; 507, the disk has no room for it.
+            LimitError: it is larger than any upload may be.
+        """
+        if len(self._places) >= self._settings.max_uploads:
+            detail = f"{len(self._places)} uploads are being received, as many as may be."
+            raise Problem(503, detail, field="uploads", remedy="Come back when one of them is through.")
+        if declared_bytes:
+            self.check(declared_bytes)
+        place = Place(declared_bytes)
+        self._places.add(place)
+        try:
+            yield place
+        finally:
+            self._places.discard(place)
+
+    def check(self, declared_bytes: int) -> None:
+        """Return if an upload of so many bytes may come and has room; raises as place()."""
+        if declared_bytes > self._settings.max_upload_bytes:
+            problem = f"{declared_bytes} bytes are more than the {self._settings.max_upload_bytes} of an upload."
+            raise LimitError("clip", problem, LIMIT_REMEDY)
+        room_bytes = self.room_bytes()
+        if declared_bytes > room_bytes:
+            raise no_room(f"The disk has room for {max(room_bytes, 0)} bytes of an upload.")
+
+    def room_bytes(self) -> int:
+        """What may be written now: not what must stay free, nor what is kept for uploads that are on their way."""
+        kept_bytes = sum(place.kept_bytes for place in self._places) + promised_bytes(self._store)
+        return self._store.free_bytes() - self._settings.min_free_bytes - kept_bytes
+
+    async def body(self, request: Request, place: Place) -> AsyncIterator[bytes]:
+        """The pieces of a request's body as they come.
+
+        Raises:
+            Problem: 408, nothing came for upload_silence_s.
+            ClientDisconnect: the caller has gone.
+        """
+        pieces = request.stream()
+        while True:
+            try:
+                async with asyncio.timeout(self._settings.upload_silence_s):
+                    piece = await anext(pieces, None)
+            except TimeoutError:
+                detail = f"Nothing came for {self._settings.upload_silence_s:g} s."
+                raise Problem(408, detail, remedy="Send it again.", headers={"Connection": "close"}) from None
+            if piece is None:
+                return
+            place.kept_bytes = max(place.kept_bytes - len(piece), 0)
+            yield piece
+
+
+def declared_length(request: Request) -> int:
+    """Content-Length of a request; 0 if it does not say.
+
+    Raises:
+        Problem: 400, it is not a number.
+    """
+    text = request.headers.get("content-length", "0")
+    if not (text.isascii() and text.isdigit() and len(text) < 20):
+        raise Problem(400, f"{text[:40]!r} is not a length.", field="Content-Length")
+    return int(text)

@@ -1,0 +1,147 @@
+"""Uploads that come in pieces, on disk: how far one has come is the size of its file, so a restart forgets nothing.
+
+    incoming/<upload>/upload.json   what was declared, and the job it became part of
+    incoming/<upload>/<part>.mp4    what has come so far; gone once a job has it
+
+One request at a time writes to the file, whichever process has it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from contract.job import JOB_ID_PATTERN
+from contract.store import Store, is_job_id, new_job_id
+
+DECLARATION = "upload.json"
+HASHED_AT_ONCE_BYTES = 2**20
+
+
+class Declaration(BaseModel):
+    """What was said of an upload when it was created, and later the job that took it."""
+
+    model_config = ConfigDict(frozen=True)
+
+    tenant: str
+    part: str
+    suffix: str
+    length_bytes: int = Field(gt=0)
+    created_at_s: float
+    job_id: str | None = Field(default=None, pattern=JOB_ID_PATTERN)
+
+
+@dataclass(frozen=True)
+class Partial:
+    """One upload in its folder."""
+
+    upload_id: str
+    folder: Path
+    declaration: Declaration
+
+    @property
+    def path(self) -> Path:
+        """The file that grows."""
+        return self.folder / (self.declaration.part + self.declaration.suffix)
+
+    @property
+    def offset_bytes(self) -> int:
+        """How much has come; all of it once a job has taken the file."""
+        try:
+            return self.path.stat().st_size
+        except FileNotFoundError:
+            return self.declaration.length_bytes
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all of it has come."""
+        return self.offset_bytes == self.declaration.length_bytes
+
+    @contextmanager
+    def appending(self) -> Iterator[BinaryIO]:
+        """The file, to write at its end; what was written is on disk when the context ends, however it ends.
+
+        Raises:
+            BlockingIOError: another request is writing to it, of this process or another.
+            FileNotFoundError: a job has taken it, or it was removed.
+        """
+        with self.path.open("r+b", buffering=0) as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            file.seek(0, os.SEEK_END)
+            try:
+                yield file
+            finally:
+                os.fsync(file.fileno())
+
+    def sha256(self) -> str:
+        """Of the file."""
+        digest = hashlib.sha256()
+        with self.path.open("rb") as file:
+            while piece := file.read(HASHED_AT_ONCE_BYTES):
+                digest.update(piece)
+        return digest.hexdigest()
+
+    def give_to(self, job_id: str) -> None:
+        """Say which job has the file, and let go of it here."""
+        taken = self.declaration.model_copy(update={"job_id": job_id})
+        _write(self.folder, taken)
+        self.path.unlink(missing_ok=True)
+
+
+def create_partial(store: Store, declaration: Declaration) -> Partial:
+    """A new upload of which nothing has come, on disk before this returns."""
+    upload_id = new_job_id()
+    partial = Partial(upload_id, store.open_incoming(upload_id), declaration)
+    partial.path.touch(mode=0o600)
+    _write(partial.folder, declaration)
+    return partial
+
+
+def find_partial(store: Store, upload_id: str, tenant: str) -> Partial | None:
+    """The tenant's upload of that id; None if there is none."""
+    partial = _read(store.incoming_folder(upload_id)) if is_job_id(upload_id) else None
+    return partial if partial is not None and partial.declaration.tenant == tenant else None
+
+
+def open_partials(store: Store) -> list[Partial]:
+    """All uploads that no job has taken."""
+    read = [_read(folder) for folder in (store.data_dir / "incoming").iterdir()]
+    return [partial for partial in read if partial is not None and partial.declaration.job_id is None]
+
+
+def promised_bytes(store: Store) -> int:
+    """What uploads have declared and not sent yet: room on disk that is theirs."""
+    return sum(partial.declaration.length_bytes - partial.offset_bytes for partial in open_partials(store))
+
+
+def _read(folder: Path) -> Partial | None:
+    try:
+        text = (folder / DECLARATION).read_bytes()
+        return Partial(folder.name, folder, Declaration.model_validate_json(text))
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return None
+
+
+def _write(folder: Path, declaration: Declaration) -> None:
+    """Written aside, made durable, renamed: a reader sees the old one or the new one."""
+    aside = folder / f"{DECLARATION}.{time.monotonic_ns()}"
+    with aside.open("w") as file:
+        file.write(declaration.model_dump_json())
+        file.flush()
+        os.fsync(file.fileno())
+    aside.rename(folder / DECLARATION)
+    for path in (folder, folder.parent):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,254 @@
+"""POST /reconstruct: a clip, in one form or as finished uploads, becomes a job."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Request, Response
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+
+from contract.audit import AuditAction
+from contract.errors import InputError, LimitError, UnavailableError
+from contract.job import JobOptions, JobRecord, JobView, Standing, parse_options
+from contract.keys import KeyScope
+from contract.queue import Admission, QueueFullError
+from contract.store import new_job_id
+from service.access import Caller
+from service.deps import AnyCaller, Deps, Services
+from service.intake import LIMIT_REMEDY, declared_length
+from service.partial import Partial, find_partial
+from service.problems import RETRY_AFTER_S, Problem
+from service.upload import PARTS, Received, UploadLimits, receive_upload
+
+router = APIRouter(tags=["jobs"])
+
+MAX_SUBMISSION_BYTES = 128 * 1024
+"""Of a JSON body."""
+JSON_REMEDY = 'Send ids of finished uploads by part, and options: {"clip": ID, "options": {"budget_s": 20}}.'
+UPLOAD_ID = {"type": "string", "pattern": "^[0-9a-f]{32}$", "description": "a finished upload (POST /uploads)"}
+FILE = {"type": "string", "format": "binary"}
+
+
+def _body_schema(part: dict[str, str]) -> dict[str, Any]:
+    parts = dict.fromkeys(PARTS, part)
+    one_clip = [{"required": ["clip"]}, {"required": ["left", "right"]}]
+    properties = {**parts, "options": JobOptions.model_json_schema()}
+    return {"type": "object", "properties": properties, "additionalProperties": False, "oneOf": one_clip}
+
+
+REQUEST_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "clip, or left and right; a file name's ending tells the format",
+        "content": {
+            "multipart/form-data": {
+                "schema": _body_schema(FILE),
+                "encoding": {"options": {"contentType": "application/json"}},
+            },
+            "application/json": {
+                "schema": _body_schema(UPLOAD_ID),
+                "example": {"clip": "0123456789abcdef0123456789abcdef", "options": {"budget_s": 20}},
+            },
+        },
+    }
+}
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(min_length=1, max_length=200, description="the same key with the same clip and options is the same job"),
+]
+
+
+class Submission(BaseModel):
+    """The JSON body: ids of finished uploads by their part, and the options."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    clip: str | None = None
+    left: str | None = None
+    right: str | None = None
+    calibration: str | None = None
+    masks: str | None = None
+    options: dict[str, object] = Field(default={})
+
+    def uploads(self) -> dict[str, str]:
+        """Upload ids by part."""
+        return {part: getattr(self, part) for part in PARTS if getattr(self, part) is not None}
+
+
+@router.post("/reconstruct", status_code=202, operation_id="reconstruct", openapi_extra=REQUEST_BODY)
+async def reconstruct(
+    request: Request, response: Response, services: Services, caller: AnyCaller, idempotency_key: IdempotencyKey = None
+) -> JobView:
+    """Send a clip. 202 means that it is safely on disk and queued; Location is the job."""
+    caller.require(KeyScope.RECONSTRUCT)
+    key = None if idempotency_key is None else hashlib.sha256(idempotency_key.encode()).hexdigest()
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() == "application/json":
+        submission = await _read_submission(request, services)
+        record = await run_in_threadpool(_accept_uploads, services, caller, submission, key)
+    else:
+        record = await _receive_form(request, services, caller, key)
+    response.headers["Location"] = f"/jobs/{record.job_id}"
+    response.headers["Retry-After"] = str(RETRY_AFTER_S)
+    return JobView.of(record, await run_in_threadpool(standing_of, services, record))
+
+
+def standing_of(services: Deps, record: JobRecord) -> Standing | None:
+    """Where a job stands; None where that is unknown just now."""
+    try:
+        return services.queue.standing(record.job_id)
+    except UnavailableError:
+        return None
+
+
+async def _receive_form(request: Request, services: Deps, caller: Caller, key: str | None) -> JobRecord:
+    """The whole clip in one request."""
+    store, settings = services.store, services.settings
+    with services.intake.place(declared_length(request)) as place:
+        job_id = new_job_id()
+        folder = store.open_incoming(job_id)
+        try:
+            limits = UploadLimits(settings.max_upload_bytes, services.intake.room_bytes() + place.kept_bytes)
+            content_type = request.headers.get("content-type", "")
+            received = await receive_upload(content_type, services.intake.body(request, place), folder, limits)
+            return await run_in_threadpool(_accept, services, caller, job_id, received, key)
+        except ClientDisconnect:
+            raise Problem(400, "The connection was closed before the upload was complete.") from None
+        finally:
+            await run_in_threadpool(store.discard_incoming, job_id)
+
+
+async def _read_submission(request: Request, services: Deps) -> Submission:
+    """The JSON body.
+
+    Raises:
+        Problem: 400, it is no JSON, or larger than such a body can be.
+        InputError: it names something that there is not.
+    """
+    body = b""
+    with services.intake.place() as place:
+        async for piece in services.intake.body(request, place):
+            body += piece
+            if len(body) > MAX_SUBMISSION_BYTES:
+                raise Problem(413, f"The JSON body is larger than {MAX_SUBMISSION_BYTES} bytes.", remedy=JSON_REMEDY)
+    try:
+        return Submission.model_validate_json(body)
+    except ValidationError as error:
+        first = error.errors()[0]
+        if first["type"] == "json_invalid":
+            raise Problem(400, "The body is not JSON.", field="body", remedy=JSON_REMEDY) from None
+        field = ".".join(str(part) for part in first["loc"]) or "body"
+        raise InputError(field, f"{first['msg']}.", JSON_REMEDY) from None
+
+
+def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key: str | None) -> JobRecord:
+    """Finished uploads become a job; once they have, asking again yields that job."""
+    options = parse_options(submission.options)
+    given = submission.uploads()
+    partials = {part: _finished(services, caller, part, upload_id) for part, upload_id in given.items()}
+    job_ids = {partial.declaration.job_id for partial in partials.values()}
+    if job_ids - {None}:
+        return _taken_before(services, job_ids, options)
+    received = Received(options=options.model_dump_json())
+    received.names = {part: partial.path.name for part, partial in partials.items()}
+    received.files()  # names what is missing before anything is read
+    job_id = new_job_id()
+    folder = services.store.open_incoming(job_id)
+    try:
+        for part, partial in partials.items():
+            os.link(partial.path, folder / partial.path.name)
+            received.digests[part] = partial.sha256()
+            received.total_bytes += partial.declaration.length_bytes
+        if received.total_bytes > services.settings.max_upload_bytes:
+            problem = f"all files together have {received.total_bytes} bytes, more than an upload may have."
+            raise LimitError("clip", problem, LIMIT_REMEDY)
+        record = _accept(services, caller, job_id, received, key)
+    except Problem as problem:
+        if "job_id" in problem.extensions:  # the clip is in the spool all the same
+            _give(partials, job_id)
+        raise
+    finally:
+        services.store.discard_incoming(job_id)
+    _give(partials, record.job_id)
+    return record
+
+
+def _finished(services: Deps, caller: Caller, part: str, upload_id: str) -> Partial:
+    """The caller's upload for that part, all of which has come."""
+    partial = find_partial(services.store, upload_id, caller.tenant)
+    if partial is None:
+        raise InputError(part, f"there is no upload {upload_id[:40]!r}.", "Create one: POST /uploads.")
+    if partial.declaration.part != part:
+        problem = f"the upload was created as {partial.declaration.part!r}."
+        raise InputError(part, problem, "Use it as what it was created for.")
+    if not partial.is_complete:
+        detail = f"{partial.offset_bytes} of its {partial.declaration.length_bytes} bytes have come."
+        raise Problem(409, detail, field=part, remedy=f"Send the rest: PATCH /uploads/{upload_id}.")
+    return partial
+
+
+def _taken_before(services: Deps, job_ids: set[str | None], options: JobOptions) -> JobRecord:
+    """The job that has the uploads, if they all went into one and nothing else is wanted of it now."""
+    job_id = next(job_id for job_id in job_ids if job_id is not None)
+    record = services.queue.get(job_id) or services.store.submission(job_id)
+    if len(job_ids) > 1 or record is None or record.options != options:
+        detail = f"An upload was used for the job {job_id} already."
+        raise Problem(409, detail, remedy="Upload it again.", extensions={"job_id": job_id})
+    return _enqueue(services, record)
+
+
+def _give(partials: Mapping[str, Partial], job_id: str) -> None:
+    for partial in partials.values():
+        partial.give_to(job_id)
+
+
+def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key: str | None) -> JobRecord:
+    """Spool first, then queue: a job exists only for a clip that is on disk."""
+    record = JobRecord(
+        job_id=job_id,
+        tenant=caller.tenant,
+        files=received.files(),
+        options=parse_options(received.options),
+        input_bytes=received.total_bytes,
+        input_sha256=received.sha256(),
+        idempotency_key=key,
+        created_at_s=time.time(),
+    )
+    services.audit.record(AuditAction.ACCEPTED, caller, job_id)
+    with services.sweep.in_hand(job_id):
+        services.store.accept(record)
+        return _enqueue(services, record)
+
+
+def _enqueue(services: Deps, record: JobRecord) -> JobRecord:
+    """The record that stands in the queue for a clip in the spool.
+
+    Raises:
+        QueueFullError: there is no room in the queue; the clip is removed.
+        Problem: 503, the queue is away; the clip stays, and is queued as soon as the queue is back.
+        InputError: the idempotency key stands for something else; the clip is removed.
+    """
+    settings = services.settings
+    try:
+        standing = services.queue.submit(record, Admission(settings.max_queued, settings.max_queued_per_tenant))
+    except QueueFullError:
+        services.store.purge(record.job_id)
+        raise
+    except UnavailableError as error:
+        services.sweep.owe(record.job_id)
+        detail = f"{error.problem} The clip is safe and is queued as soon as the queue is back."
+        remedy = f"Send nothing again; ask for GET /jobs/{record.job_id} later."
+        raise Problem(503, detail, field="queue", remedy=remedy, extensions={"job_id": record.job_id}) from error
+    if standing.job_id == record.job_id:
+        return standing
+    services.store.purge(record.job_id)
+    if (standing.input_sha256, standing.options) != (record.input_sha256, record.options):
+        problem = f"it stands for the job {standing.job_id}, with another clip or other options."
+        raise InputError("Idempotency-Key", problem, "Use a new key for every new job.")
+    return standing

@@ -1,0 +1,118 @@
+"""What a death or an unreachable queue has left between the spool and the queue is put right here.
+
+A clip in the spool was accepted, or was about to be: its job must stand in the queue. The sweep goes through the
+spool at the start of the service, and again for as long as a submission's answer is owing. It may run in several
+services at once, for all it does may be repeated.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from starlette.concurrency import run_in_threadpool
+
+from contract.errors import UnavailableError
+from contract.job import JobRecord, JobState
+from contract.queue import Queue
+from contract.store import Store
+
+SWEEP_PERIOD_S = 2.0
+ABANDONED_PERIOD_S = 3600.0
+"""Uploads that nobody goes on with are looked for this often."""
+
+logger = logging.getLogger("intrasplat.service")
+
+
+class Sweep:
+    """Knows whether anything may be unsettled, and settles it."""
+
+    def __init__(self, queue: Queue, store: Store) -> None:
+        self._queue = queue
+        self._store = store
+        self._in_hand: set[str] = set()
+        self._lock = threading.Lock()
+        self._unsettled = True
+
+    @contextmanager
+    def in_hand(self, job_id: str) -> Iterator[None]:
+        """A request is submitting this job; the sweep lets it be until the context ends."""
+        with self._lock:
+            self._in_hand.add(job_id)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._in_hand.discard(job_id)
+
+    def owe(self, job_id: str) -> None:
+        """The queue may not know this job, whose clip is in the spool: it is the sweep's from now on."""
+        with self._lock:
+            self._in_hand.discard(job_id)
+        self._unsettled = True
+
+    async def run(self) -> None:
+        """Settle what there is whenever something may be unsettled, until cancelled."""
+        abandoned_at_s = time.monotonic()
+        while True:
+            if self._unsettled:
+                await run_in_threadpool(self._try_to_settle)
+            if time.monotonic() >= abandoned_at_s:
+                await run_in_threadpool(self._store.remove_abandoned_uploads)
+                abandoned_at_s = time.monotonic() + ABANDONED_PERIOD_S
+            await asyncio.sleep(SWEEP_PERIOD_S)
+
+    def settle(self) -> None:
+        """Bring the queue to what the spool says.
+
+        Raises:
+            UnavailableError: the queue cannot be reached; what is left can be settled later.
+        """
+        for job_id in self._store.spooled_ids():
+            with self._lock:
+                if job_id in self._in_hand:
+                    continue
+            record = self._queue.get(job_id)
+            if record is None:
+                self._recover(job_id)
+            elif record.state is JobState.CANCELLED:  # its canceller died before it removed the clip
+                self._store.purge(job_id)
+
+    def _try_to_settle(self) -> None:
+        self._unsettled = False  # before the work, so that what comes to be owed meanwhile is not forgotten
+        try:
+            self.settle()
+        except UnavailableError as error:
+            logger.warning("accepted clips wait for the queue: %s", error.problem)
+            self._unsettled = True
+        except OSError as error:
+            logger.error("the spool cannot be read", extra={"error": type(error).__name__})
+            self._unsettled = True
+
+    def _recover(self, job_id: str) -> None:
+        """Make the queue know a job again: as done if its scene is there, else to be run."""
+        submitted = self._store.submission(job_id)
+        if submitted is None:  # removed since it was listed, or damaged
+            return
+        attempt = self._store.published_attempt(job_id)
+        if attempt is not None:
+            ended = {"state": JobState.DONE, "attempt": attempt, "finished_at_s": time.time()}
+            self._queue.restore(submitted.model_copy(update=ended))
+            logger.info("a finished job was restored", extra={"job_id": job_id, "attempt": attempt})
+            return
+        standing = self._queue.submit(submitted)
+        if standing.job_id != job_id:  # submitted twice under one idempotency key
+            self._store.purge(job_id)
+        elif self._store.submission(job_id) is None:
+            self._take_back(standing)
+        else:
+            logger.info("an accepted clip was queued", extra={"job_id": job_id})
+
+    def _take_back(self, record: JobRecord) -> None:
+        """Its clip went while it was being queued: whoever removed it promised nothing."""
+        self._queue.cancel(record.job_id)
+        self._queue.forget(record.job_id)
