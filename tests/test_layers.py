@@ -54,6 +54,7 @@ STAGES = (
     "phantom",
     "evaluate",
     "serve",
+    "snapshot",
     "views",
     "consume",
     "process",

@@ -1,8 +1,9 @@
-"""A rendered layer as a file: png and npy are exact, jpeg is for eyes.
+"""A rendered layer as a file: png and npy are exact, jpeg and webp are for eyes.
 
-rgb         png, jpeg: 8 bit; npy: uint8 [H, W, 3]
-depth       png: 16 bit, 0.01 mm, 0 invalid; npy: float32 mm [H, W]; jpeg: false colour, near bright, invalid black
-confidence  png: 8 bit, 255 = 1; npy: float32 [H, W]; jpeg: false colour
+            png                         npy                   jpeg, webp
+rgb         8 bit                       uint8 [H, W, 3]       8 bit
+depth       16 bit, 0.01 mm, 0 invalid  float32 mm [H, W]     false colour, near bright, invalid black
+confidence  8 bit, 255 = 1              float32 [H, W]        false colour
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 from contract.rendering import ImageFormat, Layer
 
 DEPTH_PNG_PER_MM = 100.0
-JPEG_QUALITY = 90
+DEFAULT_QUALITY = 90
+FOR_EYES = frozenset({ImageFormat.JPEG, ImageFormat.WEBP})
 PNG_COMPRESSION = 1
 """Fast rather than small: renders travel over the loopback or a hospital's own network."""
 
@@ -38,19 +40,19 @@ class Layers(Protocol):
     def confidence(self) -> NDArray[np.float32]: ...
 
 
-def encode_layer(frame: Layers, layer: Layer, image_format: ImageFormat) -> bytes:
-    """The file's bytes."""
+def encode_layer(frame: Layers, layer: Layer, image_format: ImageFormat, quality: int = DEFAULT_QUALITY) -> bytes:
+    """The file's bytes; quality, 1 to 100, is that of jpeg and webp."""
     if image_format is ImageFormat.NPY:
         return _npy(frame, layer)
     if layer is Layer.RGB:
-        return _image(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), image_format)
-    if image_format is ImageFormat.JPEG:
+        return _image(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), image_format, quality)
+    if image_format in FOR_EYES:
         false_colour = view_depth(frame.depth_mm) if layer is Layer.DEPTH else view_confidence(frame.confidence)
-        return _image(false_colour, image_format)
+        return _image(false_colour, image_format, quality)
     if layer is Layer.DEPTH:
         steps = np.clip(np.rint(frame.depth_mm * DEPTH_PNG_PER_MM), 0, np.iinfo(np.uint16).max)
-        return _image(steps.astype(np.uint16), image_format)
-    return _image(np.rint(np.clip(frame.confidence, 0, 1) * 255).astype(np.uint8), image_format)
+        return _image(steps.astype(np.uint16), image_format, quality)
+    return _image(np.rint(np.clip(frame.confidence, 0, 1) * 255).astype(np.uint8), image_format, quality)
 
 
 def view_depth(depth_mm: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -72,12 +74,12 @@ def view_confidence(confidence: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), np.uint8)
 
 
-def _image(pixels: NDArray[np.uint8] | NDArray[np.uint16], image_format: ImageFormat) -> bytes:
-    if image_format is ImageFormat.JPEG:
-        parameters = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    else:
-        parameters = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
-    done, encoded = cv2.imencode(f".{image_format.value}", pixels, parameters)
+def _image(pixels: NDArray[np.uint8] | NDArray[np.uint16], image_format: ImageFormat, quality: int) -> bytes:
+    parameter, value = {
+        ImageFormat.JPEG: (cv2.IMWRITE_JPEG_QUALITY, quality),
+        ImageFormat.WEBP: (cv2.IMWRITE_WEBP_QUALITY, quality),
+    }.get(image_format, (cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION))
+    done, encoded = cv2.imencode(f".{image_format.value}", pixels, [parameter, value])
     if not done:
         raise RuntimeError(f"OpenCV could not encode {pixels.shape} as {image_format.value}")
     return bytes(encoded.tobytes())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -26,9 +27,19 @@ def _never() -> bool:
     return False
 
 
+def _show_nobody(scene: Any, iteration: int) -> None:
+    del scene, iteration
+
+
 @dataclass(frozen=True)
 class Hooks:
-    """on_progress is called at least once a second while work goes on; should_stop is asked between steps."""
+    """on_progress is called at least once a second while work goes on; should_stop is asked between steps.
+
+    wants_snapshot is asked between steps of training; if it says so, on_snapshot is given the model as it is then, a
+    Scene of worker/checkpoint.py, and how many iterations made it. Neither changes what training comes to.
+    """
 
     on_progress: Callable[[Progress], None] = _ignore
     should_stop: Callable[[], bool] = _never
+    wants_snapshot: Callable[[], bool] = _never
+    on_snapshot: Callable[[Any, int], None] = _show_nobody

@@ -104,7 +104,13 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
     started_s = clock.elapsed_s
     view_of = view_function(run, scale)
     try:
-        train(run, clock, lambda: held_out_psnr(clip, split, view_of), hooks)
+        train(
+            run,
+            clock,
+            evaluate=lambda: held_out_psnr(clip, split, view_of),
+            hooks=hooks,
+            copy_scene=lambda: snapshot_of(run, clip, split, scale, request.seed),
+        )
     except Cancelled:
         save_run(out_dir, run, clock.elapsed_s)
         raise
@@ -284,6 +290,12 @@ def held_out_psnr(clip: DepthClip, split: FrameSplit, view_of: Callable[[int], V
 def scene_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: int) -> Scene:
     """What is kept of a finished run; strays are taken out of its model first."""
     drop_strays(run.model, clip, run.frames)
+    seen = torch.from_numpy(seen_share(run.model, clip, run.frames))
+    return dataclasses.replace(snapshot_of(run, clip, split, scale, seed), seen=seen)
+
+
+def snapshot_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: int) -> Scene:
+    """A copy of what training has come to. Nobody has looked yet what it saw: seen is 0, and so is the confidence."""
     gaussians, deformation = run.model.export()
     return Scene(
         gaussians=gaussians,
@@ -294,7 +306,7 @@ def scene_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: i
         units_per_mm=scale,
         preset=run.preset.name,
         trained_t=tuple(float(clip.t[i]) for i in split.train),
-        seen=torch.from_numpy(seen_share(run.model, clip, run.frames)),
+        seen=torch.zeros(len(gaussians)),
         seed=seed,
         settings={"made_iterations": run.iteration, "preset": json.loads(json.dumps(asdict(run.preset), default=str))},
     )

@@ -29,6 +29,7 @@ FAR_POSE = 0.35
 """In the same unit: from here on the frame carries a warning, for it shows sides the clip never saw."""
 LOW_CONFIDENCE, MANY = 0.3, 0.1
 """A frame warns when this share of its pixels lies below this confidence."""
+HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
 SIZES_KEPT = 3
 ROUNDING = 1e-6
 """Model time by which t may exceed the last frame's without a warning: i / T need not survive a decimal fraction."""
@@ -133,7 +134,7 @@ def render_frame(
     if distance > FAR_POSE:
         warnings.append(f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess.")
     if (confidence < LOW_CONFIDENCE).mean() > MANY:
-        warnings.append("More than a tenth of this view was hardly seen in the clip; see layer=confidence.")
+        warnings.append(HARDLY_SEEN)
     rgb = np.clip(image[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255).astype(np.uint8)
     return Frame(rgb, depth_mm, confidence, tuple(warnings))
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from contract.errors import Cancelled, TrainingDiverged
-from worker.checkpoint import load_resume, save_resume
+from worker.checkpoint import Scene, load_resume, save_resume
 from worker.densify import Densifier
 from worker.hooks import Hooks, Progress
 from worker.model import Model
@@ -129,12 +129,19 @@ def iterations_within(run: Run, budget_s: float, elapsed_s: float) -> int:
     return max(len(run.frames.indices), int(left_s / step_s))
 
 
-def train(run: Run, clock: Stopwatch, evaluate: Callable[[], float], hooks: Hooks) -> None:
+def train(
+    run: Run,
+    clock: Stopwatch,
+    evaluate: Callable[[], float],
+    hooks: Hooks,
+    copy_scene: Callable[[], Scene] | None = None,
+) -> None:
     """Take run from its iteration to its last.
 
     Args:
         clock: t_train_s so far; paused while held-out frames are scored.
         evaluate: mean psnr_tissue over the held-out frames, NaN without any.
+        copy_scene: the scene as the model is now, for hooks.on_snapshot; None shows none.
 
     Raises:
         Cancelled: hooks.should_stop said so; run is as it was after its last full iteration and can be resumed.
@@ -147,6 +154,8 @@ def train(run: Run, clock: Stopwatch, evaluate: Callable[[], float], hooks: Hook
     while run.iteration < run.iterations:
         if hooks.should_stop():
             raise Cancelled(f"Stopped after iteration {run.iteration} of {run.iterations}.")
+        if copy_scene is not None and hooks.wants_snapshot():
+            hooks.on_snapshot(copy_scene(), run.iteration)
 
         # the step
         iteration = run.iteration + 1

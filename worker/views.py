@@ -1,6 +1,6 @@
-"""Renders and exports of finished scenes, which stay loaded between requests.
+"""Renders and exports of finished scenes, which stay loaded between requests, and renders of the job that trains.
 
-A scene whose folder is gone is forgotten at once: a deleted patient's tissue is not shown from memory.
+A scene whose folder is gone is forgotten at once: a deleted patient's tissue is not shown from memory, nor kept there.
 """
 
 from __future__ import annotations
@@ -14,55 +14,97 @@ from contract.camera import Intrinsics
 from contract.errors import LimitError
 from contract.pose import MatrixPose, OrbitPose, world_from_camera
 from contract.rendering import MEDIA_TYPES, ExportRequest, IntrinsicsOverride, RenderRequest
+from contract.settings import GIB
 from contract.store import Store
 from worker.checkpoint import Scene, load_scene
 from worker.encode import encode_layer
 from worker.export import export_ply
-from worker.render import ROUNDING, render_frame
-from worker.serve import View
+from worker.render import HARDLY_SEEN, ROUNDING, render_frame
+from worker.serve import NotYetError, View
+from worker.snapshot import Snapshots
 from worker.targets import MEDIAN_DEPTH_UNITS
 
-LOADED_SCENES = 4
-"""Scenes kept in memory; a scene of a hundred thousand Gaussians is some tens of MB."""
+COPIES = 2
+"""A loaded scene is in memory twice: its tensors, and the arrays of its renderer."""
 
 
 class Views:
-    """Answers render and export requests from the scenes of a store; for one thread."""
+    """Answers render and export requests from the scenes of a store and the snapshots of a job; for one thread.
 
-    def __init__(self, store: Store) -> None:
+    `held` names the scenes that are in memory, the one used last at the end; it may be read from other threads.
+    """
+
+    def __init__(self, store: Store, snapshots: Snapshots | None = None, hot_bytes: int = 2 * GIB) -> None:
         self._store = store
-        self._scenes: OrderedDict[str, Scene] = OrderedDict()
+        self._snapshots = snapshots or Snapshots()
+        self._hot_bytes = hot_bytes
+        self._scenes: OrderedDict[tuple[str, int], Scene] = OrderedDict()
+        self.held: tuple[str, ...] = ()
 
     def answer(self, request: RenderRequest | ExportRequest) -> View:
         """The encoded image or file.
 
         Raises:
             SceneError: the scene is not there, or damaged.
+            NotYetError: a running job is asked for, and there is no snapshot of it here.
             LimitError: the image would have more than request.max_pixels.
         """
-        scene = self._scene(request.scene_id)
         if isinstance(request, ExportRequest):
-            shown = shown_time(scene, request.t)
-            outside = f"t = {request.t:g} lies outside the clip; t = {shown:.4g} is exported."
-            warnings = (outside,) if request.t > shown + ROUNDING else ()
-            return View(export_ply(scene, shown), "application/octet-stream", shown, warnings)
-        intrinsics = camera_of(scene.intrinsics, request.camera, request.max_pixels)
-        frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics)
-        body = encode_layer(frame, request.layer, request.format)
-        return View(body, MEDIA_TYPES[request.format], shown_time(scene, request.t), frame.warnings)
+            return _export(self._stored(request.scene_id, request.attempt), request.t)
+        if request.attempt is not None:
+            return _render(self._stored(request.scene_id, request.attempt), request)
+        snapshot = self._snapshots.newest(request.scene_id)
+        if snapshot is None:
+            raise NotYetError(f"Job {request.scene_id} has nothing to show yet.")
+        return _render(snapshot.scene, request, snapshot.iteration)
 
-    def _scene(self, scene_id: str) -> Scene:
+    def forget_purged(self) -> None:
+        """Let go of scenes whose folders are gone; to be called now and then."""
+        for key in [key for key in self._scenes if not self._store.has_scene(*key)]:
+            self._forget(key)
+
+    def _stored(self, scene_id: str, attempt: int) -> Scene:
+        key = (scene_id, attempt)
         try:
-            folder = self._store.scene_folder(scene_id)
+            folder = self._store.scene_folder(scene_id, attempt)
         except Exception:
-            self._scenes.pop(scene_id, None)
+            self._forget(key)
             raise
-        if scene_id not in self._scenes:
-            self._scenes[scene_id] = load_scene(folder)
-        self._scenes.move_to_end(scene_id)
-        while len(self._scenes) > LOADED_SCENES:
+        if key not in self._scenes:
+            self._scenes[key] = load_scene(folder)
+        self._scenes.move_to_end(key)
+        while len(self._scenes) > 1 and self._byte_count() > self._hot_bytes:
             self._scenes.popitem(last=False)
-        return self._scenes[scene_id]
+        self.held = tuple(name for name, _ in self._scenes)
+        return self._scenes[key]
+
+    def _forget(self, key: tuple[str, int]) -> None:
+        self._scenes.pop(key, None)
+        self.held = tuple(name for name, _ in self._scenes)
+
+    def _byte_count(self) -> int:
+        return COPIES * sum(scene.byte_count for scene in self._scenes.values())
+
+
+def _render(scene: Scene, request: RenderRequest, iteration: int | None = None) -> View:
+    """One view; iteration is that of a snapshot, None of a finished scene."""
+    intrinsics = camera_of(scene.intrinsics, request.camera, request.max_pixels)
+    frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics)
+    body = encode_layer(frame, request.layer, request.format, request.quality)
+    warnings = frame.warnings
+    if iteration is not None:
+        # What the clip shows of each place is counted when training has ended: until then nothing is vouched for.
+        goes_on = f"Training goes on: this is iteration {iteration}, and how far to trust it is not known yet."
+        warnings = (goes_on, *(each for each in warnings if each != HARDLY_SEEN))
+    return View(body, MEDIA_TYPES[request.format], shown_time(scene, request.t), warnings, iteration)
+
+
+def _export(scene: Scene, t: float) -> View:
+    """The Gaussians at time t as PLY."""
+    shown = shown_time(scene, t)
+    outside = f"t = {t:g} lies outside the clip; t = {shown:.4g} is exported."
+    warnings = (outside,) if t > shown + ROUNDING else ()
+    return View(export_ply(scene, shown), "application/octet-stream", shown, warnings)
 
 
 def shown_time(scene: Scene, t: float) -> float:

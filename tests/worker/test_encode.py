@@ -65,8 +65,27 @@ def test_npy_is_the_array_itself(images: Images, layer: Layer, name: str) -> Non
 
 
 @pytest.mark.parametrize("layer", list(Layer))
-def test_a_jpeg_of_any_layer_is_a_colour_picture_of_its_size(images: Images, layer: Layer) -> None:
-    assert decoded(encode_layer(images, layer, ImageFormat.JPEG)).shape == (HEIGHT, WIDTH, 3)
+@pytest.mark.parametrize("image_format", [ImageFormat.JPEG, ImageFormat.WEBP])
+def test_what_is_for_eyes_is_a_colour_picture_of_its_size(
+    images: Images, layer: Layer, image_format: ImageFormat
+) -> None:
+    assert decoded(encode_layer(images, layer, image_format)).shape == (HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize("image_format", [ImageFormat.JPEG, ImageFormat.WEBP])
+def test_quality_is_paid_for_in_bytes(images: Images, image_format: ImageFormat) -> None:
+    sizes = [len(encode_layer(images, Layer.RGB, image_format, quality)) for quality in (1, 50, 100)]
+    assert sizes == sorted(set(sizes))
+
+
+def test_a_webp_begins_as_one(images: Images) -> None:
+    encoded = encode_layer(images, Layer.RGB, ImageFormat.WEBP)
+    assert (encoded[:4], encoded[8:12]) == (b"RIFF", b"WEBP")
+
+
+def test_depth_beyond_the_range_of_a_png_is_held_at_its_end(images: Images) -> None:
+    far = Images(images.rgb, np.full_like(images.depth_mm, 1000.0), images.confidence)
+    assert (decoded(encode_layer(far, Layer.DEPTH, ImageFormat.PNG)) == 65535).all()
 
 
 def test_depth_that_is_invalid_everywhere_is_a_black_picture(images: Images) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import shutil
 from pathlib import Path
@@ -18,7 +19,9 @@ from contract.store import Store, new_job_id
 from worker.checkpoint import Scene, save_scene
 from worker.deformation import FlexibleDeformation
 from worker.gaussians import Gaussians
-from worker.views import Views, camera_of, pose_of, shown_time
+from worker.serve import NotYetError
+from worker.snapshot import Snapshots
+from worker.views import COPIES, Views, camera_of, pose_of, shown_time
 
 CLIP = Intrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
 FRAMES = 10
@@ -59,13 +62,27 @@ def store(tmp_path: Path) -> Store:
 @pytest.fixture
 def scene_id(store: Store) -> str:
     job_id = new_job_id()
-    save_scene(store.work_folder(job_id, 1), scene())
-    store.publish_scene(job_id, 1)
+    publish(store, job_id)
     return job_id
 
 
+def publish(store: Store, job_id: str, attempt: int = 1, *, dimmed: float = 0.0) -> Scene:
+    """A stored scene; its colours are dimmed by so much, so that attempts can be told apart."""
+    made = scene()
+    made.gaussians.sh.sub_(dimmed)
+    save_scene(store.work_folder(job_id, attempt), made)
+    store.publish_scene(job_id, attempt)
+    return made
+
+
+def request_of(scene_id: str, attempt: int | None = 1, t: float = 0.0) -> RenderRequest:
+    return RenderRequest(scene_id=scene_id, attempt=attempt, t=t, format=ImageFormat.NPY)
+
+
 def test_a_stored_scene_is_rendered_at_the_size_of_the_clip(store: Store, scene_id: str) -> None:
-    view = Views(store).answer(RenderRequest(scene_id=scene_id, t=0.25, layer=Layer.DEPTH, format=ImageFormat.NPY))
+    view = Views(store).answer(
+        RenderRequest(scene_id=scene_id, attempt=1, t=0.25, layer=Layer.DEPTH, format=ImageFormat.NPY)
+    )
     assert view.media_type == "application/x-npy"
     assert view.t == 0.25
     depth_mm = np.load(io.BytesIO(view.body))
@@ -74,28 +91,86 @@ def test_a_stored_scene_is_rendered_at_the_size_of_the_clip(store: Store, scene_
 
 
 def test_a_time_after_the_clip_shows_its_last_frame_and_warns(store: Store, scene_id: str) -> None:
-    view = Views(store).answer(RenderRequest(scene_id=scene_id, t=3))
+    view = Views(store).answer(request_of(scene_id, t=3))
     assert view.t == (FRAMES - 1) / FRAMES
     assert view.warnings
 
 
 def test_a_deleted_scene_is_not_shown_from_memory(store: Store, scene_id: str) -> None:
     views = Views(store)
-    views.answer(RenderRequest(scene_id=scene_id, t=0))
-    shutil.rmtree(store.scene_folder(scene_id))
+    views.answer(request_of(scene_id))
+    shutil.rmtree(store.scene_folder(scene_id, 1))
     with pytest.raises(SceneError):
-        views.answer(RenderRequest(scene_id=scene_id, t=0))
+        views.answer(request_of(scene_id))
+    assert views.held == ()
+
+
+def test_a_deleted_scene_is_let_go_of_although_nobody_asks(store: Store, scene_id: str) -> None:
+    views, other = Views(store), new_job_id()
+    publish(store, other)
+    views.answer(request_of(scene_id))
+    views.answer(request_of(other))
+    store.purge(scene_id)
+    views.forget_purged()
+    assert views.held == (other,)
+
+
+def test_the_attempt_that_is_named_is_shown(store: Store, scene_id: str) -> None:
+    views = Views(store)
+    first = views.answer(request_of(scene_id, attempt=1)).body
+    publish(store, scene_id, attempt=2, dimmed=0.4)
+    assert views.answer(request_of(scene_id, attempt=2)).body != first
+    assert views.answer(request_of(scene_id, attempt=1)).body == first
+    with pytest.raises(SceneError):
+        views.answer(request_of(scene_id, attempt=3))
+
+
+def test_no_more_scenes_are_held_than_their_bytes_allow_and_the_one_used_longest_ago_goes(store: Store) -> None:
+    scene_ids = [new_job_id() for _ in range(4)]
+    size = max(publish(store, each).byte_count for each in scene_ids)
+    views = Views(store, hot_bytes=COPIES * size * 3)
+    for each in (*scene_ids[:3], scene_ids[0], scene_ids[3]):
+        views.answer(request_of(each))
+    assert views.held == (scene_ids[2], scene_ids[0], scene_ids[3])
+
+
+def test_a_scene_larger_than_all_that_may_be_held_is_shown(store: Store, scene_id: str) -> None:
+    views = Views(store, hot_bytes=1)
+    assert views.answer(request_of(scene_id)).body
+    assert views.held == (scene_id,)
+
+
+def test_a_running_job_is_shown_by_its_snapshot_which_vouches_for_nothing(store: Store, scene_id: str) -> None:
+    snapshots = Snapshots()
+    views = Views(store, snapshots)
+    running = new_job_id()
+    snapshots.begin(running)
+    with pytest.raises(NotYetError):
+        views.answer(request_of(running, attempt=None))
+    snapshots.offer(dataclasses.replace(scene(), seen=torch.zeros(120)), 40)
+    view = views.answer(request_of(running, attempt=None))
+    assert view.iteration == 40
+    (warning,) = view.warnings
+    assert "Training goes on" in warning
+    layer = RenderRequest(scene_id=running, t=0, layer=Layer.CONFIDENCE, format=ImageFormat.NPY)
+    assert not np.load(io.BytesIO(views.answer(layer).body)).any()
+    assert views.answer(request_of(scene_id)).iteration is None
+
+
+def test_a_finished_scene_is_not_taken_for_a_running_job(store: Store, scene_id: str) -> None:
+    with pytest.raises(NotYetError):
+        Views(store).answer(request_of(scene_id, attempt=None))
 
 
 def test_an_export_holds_every_gaussian(store: Store, scene_id: str) -> None:
-    view = Views(store).answer(ExportRequest(scene_id=scene_id, t=0.5))
+    view = Views(store).answer(ExportRequest(scene_id=scene_id, attempt=1, t=0.5))
     assert b"element vertex 120\n" in view.body
     assert (view.t, view.warnings) == (0.5, ())
 
 
 def test_an_export_after_the_clip_is_of_its_last_frame_and_says_so(store: Store, scene_id: str) -> None:
-    view = Views(store).answer(ExportRequest(scene_id=scene_id, t=1))
-    last = Views(store).answer(ExportRequest(scene_id=scene_id, t=(FRAMES - 1) / FRAMES))
+    view = Views(store).answer(ExportRequest(scene_id=scene_id, attempt=1, t=1))
+    last = Views(store).answer(ExportRequest(scene_id=scene_id, attempt=1, t=(FRAMES - 1) / FRAMES))
     assert view.t == last.t == (FRAMES - 1) / FRAMES
     assert view.body == last.body
     assert view.warnings
