@@ -27,6 +27,7 @@ STAGES = (
     "opencv",
     "clip",
     "calibration",
+    "decode",
     "stereo",
     "fusion",
     "motion",

@@ -7,7 +7,6 @@ import dataclasses
 import json
 import math
 import platform
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -24,17 +23,10 @@ from contract.job import Layout, MaskPolarity, PoseConvention
 from contract.report import Report
 from contract.store import CURVE, REPORT
 from worker.baselines import copy_baselines
-from worker.calibration import load_calibration, rectify
+from worker.calibration import rectify
 from worker.checkpoint import RESUME_FILE, Scene, save_scene
-from worker.clip import (
-    DepthClip,
-    FrameSplit,
-    StereoClip,
-    find_calibration,
-    held_out_frames,
-    open_clip,
-    split_frames,
-)
+from worker.clip import ClipLimits, DepthClip, FrameSplit, held_out_frames, split_frames
+from worker.decode import decode_clip
 from worker.densify import Densifier
 from worker.fusion import fuse
 from worker.hooks import Hooks, Progress
@@ -58,6 +50,7 @@ class ReconstructionRequest:
 
     preset is a name, or a preset of the caller's own. budget_s and iterations exclude each other; without either the
     preset decides. accepted_at_s is the Unix time at which the clip was accepted, for t_post_s; None means now.
+    limits are what this machine accepts; None means what its memory allows.
     """
 
     clip: Path
@@ -74,6 +67,7 @@ class ReconstructionRequest:
     device: str = "auto"
     seed: int = 0
     accepted_at_s: float | None = None
+    limits: ClipLimits | None = None
 
 
 def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> Report:
@@ -168,38 +162,28 @@ def report_stage(hooks: Hooks, stage: str, share: float) -> None:
 def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: dict[str, float]) -> DepthClip:
     """Decode, and for stereo input rectify and match: the left frames with depth."""
     report_stage(hooks, "decode", 0.0)
-    clip = timed(
+    decoded = timed(
         seconds,
         "decode_s",
-        lambda: open_clip(
+        lambda: decode_clip(
             request.clip,
             request.right,
             layout=request.layout,
+            calibration=request.calibration,
             masks=request.masks,
             mask_polarity=request.mask_polarity,
             pose_convention=request.pose_convention,
+            limits=request.limits,
+            hooks=hooks,
         ),
     )
-    if isinstance(clip, DepthClip):
-        return clip
-    with tempfile.TemporaryDirectory(prefix="intrasplat-") as scratch:
-        calibration = load_calibration(
-            calibration_path(request, clip, Path(scratch)), eye_width=clip.width, eye_height=clip.height
-        )
-    rectified = rectify(clip, calibration)
-    held_out = set(held_out_frames(clip.frame_count, request.holdout))
-    measured = [i for i in range(clip.frame_count) if i not in held_out]
+    if isinstance(decoded, DepthClip):
+        return decoded
+    rectified = rectify(decoded.clip, decoded.calibration)
+    frame_count = decoded.clip.frame_count
+    held_out = set(held_out_frames(frame_count, request.holdout))
+    measured = [i for i in range(frame_count) if i not in held_out]
     return timed(seconds, "stereo_s", lambda: estimate_depth(rectified, hooks, measured_frames=measured))
-
-
-def calibration_path(request: ReconstructionRequest, clip: StereoClip, scratch: Path) -> Path:
-    """The given calibration, or the one that lies in the clip's folder or zip."""
-    path = request.calibration or find_calibration(request.clip, scratch)
-    if path is None:
-        problem = f"a stereo clip of {clip.width} x {clip.height} px an eye came without one."
-        remedy = "Give a calibration: our JSON (docs/conventions.md), OpenCV YAML or XML, or StereoMIS ini."
-        raise InputError("calibration", problem, remedy)
-    return path
 
 
 def prepare(

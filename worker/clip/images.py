@@ -57,6 +57,7 @@ class ImageSequence:
         image = decode_image(data, self.tree.field, name)
         if image.shape[:2] != (self.height, self.width):
             raise InputError(self.tree.field, f"{name} changed while it was read.", "Do not write to the clip.")
+        self.tree.limits.on_picture()
         return image
 
 

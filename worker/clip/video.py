@@ -72,6 +72,7 @@ class VideoFile:
     height: int
     width: int
     frame_times_s: NDArray[np.float64] | None  # None: the container has no usable times
+    limits: ClipLimits
     warnings: tuple[str, ...] = ()
 
     def frames(self) -> Iterator[RgbFrame]:
@@ -88,6 +89,7 @@ class VideoFile:
                         f"the first is {self.width}x{self.height}.",
                         "Encode the clip in one size.",
                     )
+                self.limits.on_picture()
                 yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
 
 
@@ -140,20 +142,22 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
     times_ms: list[float] = []
     while capture.grab():
         times_ms.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)))
+        limits.on_picture()
         if len(times_ms) == 1:
             good, frame = capture.retrieve()  # turned clips have another size than their header
             height, width = frame.shape[:2] if good else (height, width)
         limits.check_clip(field, label, len(times_ms), width, height)
     times_s = _times_s(times_ms, rate_hz)
+    limits.check_duration(field, label, 0.0 if times_s is None or len(times_s) == 0 else float(times_s[-1]))
     whole = len(times_ms) + MISSING_FRAMES_ALLOWED >= declared
-    if not times_ms or not (whole or _whole_despite_count(path, decoder, declared, times_s, rate_hz)):
+    if not times_ms or not (whole or _whole_despite_count(path, decoder, declared, times_s, rate_hz, limits)):
         raise _cut_short(field, label, len(times_ms), declared)
     warnings = () if declared else (f"{field}: the video names no frame count, a missing end would not be noticed",)
-    return VideoFile(path, field, label, decoder, len(times_ms), height, width, times_s, warnings)
+    return VideoFile(path, field, label, decoder, len(times_ms), height, width, times_s, limits, warnings)
 
 
 def _whole_despite_count(
-    path: Path, decoder: str, declared: int, times_s: NDArray[np.float64] | None, rate_hz: float
+    path: Path, decoder: str, declared: int, times_s: NDArray[np.float64] | None, rate_hz: float, limits: ClipLimits
 ) -> bool:
     """Whether a video that shows fewer frames than `declared` is whole all the same.
 
@@ -168,6 +172,7 @@ def _whole_despite_count(
         found = 0
         while capture is not None and found < declared and capture.grab():
             found += 1
+            limits.on_picture()
     return found + MISSING_FRAMES_ALLOWED >= declared
 
 

@@ -1,0 +1,96 @@
+"""How the decoding process locks itself in, before it opens anything that came from outside.
+
+Its limits always hold. What the kernel need not grant is named when it did: without it decoding goes on, and the report
+says so. Everything here is for good: nothing in this process can take it back.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import resource
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from worker.decode.landlock import confine_files
+from worker.decode.seccomp import forbid_network_and_programs
+
+MOST_OPEN_FILES = 128  # a zip, a video, the results, and what Python loads
+
+_PR_SET_PDEATHSIG = 1
+_PR_SET_NO_NEW_PRIVS = 38
+_CLONE_NEWUSER = 0x10000000
+_CLONE_NEWNET = 0x40000000
+
+NO_NETWORK = "no network"
+NO_PROGRAMS = "no other program"
+OWN_FILES = "no files but its own"
+PROTECTIONS = (NO_NETWORK, NO_PROGRAMS, OWN_FILES)
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """What the process may take: memory, the largest file it writes, seconds of all its cores together."""
+
+    memory_bytes: int
+    file_bytes: int
+    cpu_s: int
+
+
+def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> list[str]:
+    """Give up what decoding does not need; what was granted, in words.
+
+    Must come before the first thread. readable are the files and folders that came from outside, writable the folder
+    for the results.
+
+    Raises:
+        OSError: a limit cannot be set.
+    """
+    _end_with_parent()
+    for kind, most in (
+        (resource.RLIMIT_CORE, 0),  # a dump would hold the clip
+        (resource.RLIMIT_AS, allowance.memory_bytes),
+        (resource.RLIMIT_FSIZE, allowance.file_bytes),
+        (resource.RLIMIT_CPU, allowance.cpu_s),
+        (resource.RLIMIT_NOFILE, MOST_OPEN_FILES),
+    ):
+        _, hard = resource.getrlimit(kind)
+        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(kind, (most, most))
+    granted = []
+    apart = _leave_network()
+    confined = confine_files(_libraries() + list(readable), writable)
+    filtered = forbid_network_and_programs()
+    if apart or filtered:
+        granted.append(NO_NETWORK)
+    if filtered:
+        granted.append(NO_PROGRAMS)
+    if confined:
+        granted.append(OWN_FILES)
+    return granted
+
+
+def _end_with_parent() -> None:
+    """No decoder outlives the process that asked for it, and none gains rights by what it starts."""
+    if not sys.platform.startswith("linux"):
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+
+
+def _leave_network() -> bool:
+    """Move to a network of its own that leads nowhere; a user who may not do so alone gets a user namespace too."""
+    if not sys.platform.startswith("linux"):
+        return False
+    libc = ctypes.CDLL(None, use_errno=True)
+    return any(libc.unshare(flags) == 0 for flags in (_CLONE_NEWNET, _CLONE_NEWUSER | _CLONE_NEWNET))
+
+
+def _libraries() -> list[Path]:
+    """Where Python and the libraries it loads lie."""
+    package = Path(__file__).resolve().parent.parent
+    installed = (sys.prefix, sys.base_prefix, *(each for each in sys.path if "-packages" in each))
+    return [package, package.parent / "contract", *map(Path, (*installed, "/usr", "/lib", "/lib64"))]
