@@ -49,16 +49,11 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
         OSError: a limit cannot be set.
     """
     _end_with_parent()
-    for kind, most in (
-        (resource.RLIMIT_CORE, 0),  # a dump would hold the clip
-        (resource.RLIMIT_AS, allowance.memory_bytes),
-        (resource.RLIMIT_FSIZE, allowance.file_bytes),
-        (resource.RLIMIT_CPU, allowance.cpu_s),
-        (resource.RLIMIT_NOFILE, MOST_OPEN_FILES),
-    ):
-        _, hard = resource.getrlimit(kind)
-        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(kind, (most, most))
+    _limit(resource.RLIMIT_CORE, 0)  # a dump would hold the clip
+    _limit(resource.RLIMIT_AS, allowance.memory_bytes)
+    _limit(resource.RLIMIT_FSIZE, allowance.file_bytes)
+    _limit(resource.RLIMIT_CPU, allowance.cpu_s, allowance.cpu_s + 1)  # SIGXCPU tells why; SIGKILL follows
+    _limit(resource.RLIMIT_NOFILE, MOST_OPEN_FILES)
     granted = []
     apart = _leave_network()
     confined = confine_files(_libraries() + list(readable), writable)
@@ -70,6 +65,14 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
     if confined:
         granted.append(OWN_FILES)
     return granted
+
+
+def _limit(kind: int, soft: int, hard: int | None = None) -> None:
+    """Lower a limit; one that is lower already stays."""
+    _, most = resource.getrlimit(kind)
+    hard = soft if hard is None else hard
+    hard = hard if most == resource.RLIM_INFINITY else min(hard, most)
+    resource.setrlimit(kind, (min(soft, hard), hard))
 
 
 def _end_with_parent() -> None:
