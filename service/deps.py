@@ -21,10 +21,14 @@ from contract.settings import Settings
 from contract.store import Store, is_job_id
 from service.access import Access, Caller, Refusal, key_missing
 from service.audit import Audit
+from service.events import Feeds
 from service.intake import Intake
 from service.limits import Limiter
+from service.metrics import Metrics
 from service.problems import Problem
+from service.purge import Purger
 from service.renderer import Renderer
+from service.retention import Retention
 from service.sweep import Sweep
 
 UNIX_SOCKET = "unix"
@@ -43,6 +47,10 @@ class Deps:
     audit: Audit = field(init=False)
     intake: Intake = field(init=False)
     sweep: Sweep = field(init=False)
+    feeds: Feeds = field(init=False)
+    purger: Purger = field(init=False)
+    retention: Retention = field(init=False)
+    metrics: Metrics = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "access", Access(self.settings))
@@ -50,6 +58,10 @@ class Deps:
         object.__setattr__(self, "audit", Audit(AuditLog(self.settings.data_dir)))
         object.__setattr__(self, "intake", Intake(self.settings, self.store))
         object.__setattr__(self, "sweep", Sweep(self.queue, self.store))
+        object.__setattr__(self, "feeds", Feeds(self.queue))
+        object.__setattr__(self, "purger", Purger(self.queue, self.store, self.audit))
+        object.__setattr__(self, "retention", Retention(self.settings, self.queue, self.store, self.purger))
+        object.__setattr__(self, "metrics", Metrics(self.queue, self.store))
 
 
 def _deps_of(connection: HTTPConnection) -> Deps:

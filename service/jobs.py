@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Header, Query, Response
+from fastapi.sse import EventSourceResponse
+from starlette.concurrency import run_in_threadpool
 
 from contract.audit import AuditAction
 from contract.job import TERMINAL_STATES, JobRecord, JobState, JobView
 from contract.keys import KeyScope
 from contract.queue import LISTING_LIMIT
 from service.deps import AnyCaller, Deps, Services, owned_job
+from service.events import NOTHING_SEEN, parse_number
 from service.problems import RETRY_AFTER_S, Problem
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
+
+STREAM_HEADERS = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+"""The second keeps nginx from collecting events before it passes them on."""
 
 Limit = Annotated[int, Query(ge=1, le=LISTING_LIMIT, description="at most so many")]
 
@@ -64,6 +70,29 @@ def retry_job(job_id: str, response: Response, services: Services, caller: AnyCa
     record = services.queue.retry(job_id) or owned_job(services, caller, job_id)
     response.headers["Location"] = f"/jobs/{job_id}"
     return _view(services, record, response)
+
+
+@router.get(
+    "/{job_id}/events",
+    operation_id="watch_job",
+    response_class=EventSourceResponse,
+    responses={204: {"description": "the job has ended, and the caller knows all of it"}},
+)
+async def watch_job(
+    job_id: str, services: Services, caller: AnyCaller, last_event_id: Annotated[str, Header()] = "0"
+) -> Response:
+    """Every change of the job as a server-sent event `job` whose data is the job, until it has ended.
+
+    Whoever was cut off sends Last-Event-ID and is told what it missed.
+    """
+    caller.require(KeyScope.VIEW)
+    record = await run_in_threadpool(owned_job, services, caller, job_id)
+    after = parse_number(last_event_id) or NOTHING_SEEN
+    if after != NOTHING_SEEN and record.state in TERMINAL_STATES:
+        missed = await run_in_threadpool(services.queue.events, job_id, last_event_id)
+        if not missed:
+            return Response(status_code=204)  # which tells a browser not to come again
+    return EventSourceResponse(services.feeds.stream(job_id, after), headers=STREAM_HEADERS)
 
 
 def _view(services: Deps, record: JobRecord, response: Response) -> JobView:

@@ -12,11 +12,9 @@ import fcntl
 import hashlib
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
+from io import RawIOBase
 from pathlib import Path
-from typing import BinaryIO
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -66,21 +64,21 @@ class Partial:
         """Whether all of it has come."""
         return self.offset_bytes == self.declaration.length_bytes
 
-    @contextmanager
-    def appending(self) -> Iterator[BinaryIO]:
-        """The file, to write at its end; what was written is on disk when the context ends, however it ends.
+    def open(self) -> RawIOBase:
+        """The file, to append to; to be given to close().
 
         Raises:
             BlockingIOError: another request is writing to it, of this process or another.
             FileNotFoundError: a job has taken it, or it was removed.
         """
-        with self.path.open("r+b", buffering=0) as file:
+        file = self.path.open("r+b", buffering=0)
+        try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            file.seek(0, os.SEEK_END)
-            try:
-                yield file
-            finally:
-                os.fsync(file.fileno())
+        except BlockingIOError:
+            file.close()
+            raise
+        file.seek(0, os.SEEK_END)
+        return file
 
     def sha256(self) -> str:
         """Of the file."""
@@ -95,6 +93,19 @@ class Partial:
         taken = self.declaration.model_copy(update={"job_id": job_id})
         _write(self.folder, taken)
         self.path.unlink(missing_ok=True)
+
+
+def append(file: RawIOBase, piece: bytes) -> None:
+    """Write all of it."""
+    rest = memoryview(piece)
+    while rest:
+        rest = rest[file.write(rest) or 0 :]
+
+
+def close(file: RawIOBase) -> None:
+    """Let go of an upload's file once all that was written is on disk."""
+    with file:
+        os.fsync(file.fileno())
 
 
 def create_partial(store: Store, declaration: Declaration) -> Partial:
@@ -118,9 +129,30 @@ def open_partials(store: Store) -> list[Partial]:
     return [partial for partial in read if partial is not None and partial.declaration.job_id is None]
 
 
+def partials_of(store: Store, job_id: str) -> list[Partial]:
+    """Uploads a job has taken; also those whose file it has, though the service died before it could note that."""
+    spool = store.spool_folder(job_id)
+    taken = {_identity(path) for path in spool.iterdir()} - {None} if spool.is_dir() else set()
+    read = [_read(folder) for folder in (store.data_dir / "incoming").iterdir()]
+    return [
+        partial
+        for partial in read
+        if partial is not None and (partial.declaration.job_id == job_id or _identity(partial.path) in taken)
+    ]
+
+
 def promised_bytes(store: Store) -> int:
     """What uploads have declared and not sent yet: room on disk that is theirs."""
     return sum(partial.declaration.length_bytes - partial.offset_bytes for partial in open_partials(store))
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Of the file itself, whatever its names are."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def _read(folder: Path) -> Partial | None:

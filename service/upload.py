@@ -85,6 +85,18 @@ class Received:
         return hashlib.sha256(lines.encode()).hexdigest()
 
 
+def checked_suffix(part: str, suffix: str) -> str:
+    """The ending of a part's file in lower case.
+
+    Raises:
+        InputError: this part may not have it.
+    """
+    if suffix.lower() not in SUFFIXES[part]:
+        accepted = ", ".join(SUFFIXES[part])
+        raise InputError(part, f"a file that ends in {suffix[:20]!r} is not accepted.", f"Send {accepted}.")
+    return suffix.lower()
+
+
 async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: Path, limits: UploadLimits) -> Received:
     """Write the parts of a multipart body into folder.
 
@@ -192,11 +204,7 @@ class _Receiver:
             self._open_file(part, parameters.get(b"filename", b"").decode("utf-8", "replace"))
 
     def _open_file(self, part: str, filename: str) -> None:
-        suffix = PurePosixPath(filename).suffix.lower()
-        if suffix not in SUFFIXES[part]:
-            accepted = ", ".join(SUFFIXES[part])
-            raise InputError(part, f"a file that ends in {suffix[:20]!r} is not accepted.", f"Send {accepted}.")
-        name = part + suffix
+        name = part + checked_suffix(part, PurePosixPath(filename).suffix)
         self._file = (self._folder / name).open("xb")
         self._digest = hashlib.sha256()
         self._received.names[part] = name

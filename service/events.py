@@ -1,0 +1,174 @@
+"""What happens to a job, as it happens: server-sent events from the queue's own record of changes.
+
+One poller a watched job asks the queue, whatever number of callers listen; each of them goes through the same list of
+the last EVENTS_KEPT changes at its own pace, so a slow one costs no memory and holds nobody up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+
+from fastapi.sse import format_sse_event
+from starlette.concurrency import run_in_threadpool
+
+from contract.errors import UnavailableError
+from contract.job import TERMINAL_STATES, JobRecord, JobState, JobView, Standing
+from contract.queue import EVENTS_KEPT, Queue
+
+POLL_PERIOD_S = 0.4
+LOOK_PERIOD_S = 2.0
+"""How often a job that has not ended is looked at: whether it was purged, and how far it has come in the queue."""
+HEARTBEAT_S = 15.0
+"""Proxies take a connection for dead after 30 s or more of silence."""
+STREAM_S = 3600.0
+"""Then the caller comes again, with its key: a revoked one ends here at the latest."""
+RETRY_MS = 2000
+
+Number = tuple[int, ...]
+"""An event's number, to compare."""
+NOTHING_SEEN: Number = (0,)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One thing to tell the listeners; number is None for what is no change of the record."""
+
+    number: str | None
+    state: JobState
+    data: str
+
+
+def parse_number(text: str) -> Number | None:
+    """An event's number as it can be compared; None if it is none."""
+    return tuple(int(part) for part in text.split("-")) if re.fullmatch(r"\d{1,20}(-\d{1,20})?", text) else None
+
+
+class Feed:
+    """The last changes of one job; `count` of them there have been, and `changed` is set at the next."""
+
+    def __init__(self, job_id: str) -> None:
+        self.job_id = job_id
+        self.listeners = 0
+        self.count = 0
+        self.is_over = False
+        self.changed = asyncio.Event()
+        self._entries: deque[Entry] = deque(maxlen=EVENTS_KEPT)
+
+    @property
+    def newest(self) -> Entry | None:
+        """The last entry."""
+        return self._entries[-1] if self._entries else None
+
+    def add(self, record: JobRecord, number: str | None = None, standing: Standing | None = None) -> None:
+        """Tell the listeners how the job is now."""
+        self._entries.append(Entry(number, record.state, JobView.of(record, standing).model_dump_json()))
+        self.count += 1
+        self.wake()
+
+    def end(self) -> None:
+        """There is nothing more to come."""
+        self.is_over = True
+        self.wake()
+
+    def wake(self) -> None:
+        """Let all listeners look again."""
+        self.changed.set()
+        self.changed = asyncio.Event()
+
+    def since(self, seen: int) -> list[Entry]:
+        """The entries after the first `seen`, as far as they are kept."""
+        new = min(self.count - seen, len(self._entries))
+        return list(self._entries)[len(self._entries) - new :]
+
+    def seen_at(self, number: Number) -> int:
+        """How many of all entries somebody has seen who was told of the event of this number."""
+        for unseen, entry in enumerate(reversed(self._entries)):
+            told = parse_number(entry.number or "")
+            if told is not None and told <= number:
+                return self.count - unseen
+        return self.count - len(self._entries)
+
+
+class Feeds:
+    """The feeds that somebody listens to, with their pollers."""
+
+    def __init__(self, queue: Queue) -> None:
+        self._queue = queue
+        self._feeds: dict[str, Feed] = {}
+        self._pollers: dict[str, asyncio.Task[None]] = {}
+        self._is_ending = False
+
+    def end(self) -> None:
+        """All streams end within a poll's period; may be called from a signal's handler."""
+        self._is_ending = True
+
+    async def stream(self, job_id: str, after: Number) -> AsyncIterator[bytes]:
+        """The events after that number, and those to come until the job's end, as they go over the wire."""
+        ends_at_s = time.monotonic() + STREAM_S
+        with self._listening(job_id) as feed:
+            yield format_sse_event(retry=RETRY_MS)
+            while not (feed.count or feed.is_over):
+                await feed.changed.wait()
+            seen = feed.seen_at(after)
+            while True:
+                changed = feed.changed
+                for entry in feed.since(seen):
+                    yield format_sse_event(event="job", id=entry.number, data_str=entry.data)
+                seen = feed.count
+                newest = feed.newest
+                has_ended = newest is not None and newest.state in TERMINAL_STATES
+                if feed.is_over or has_ended or time.monotonic() > ends_at_s:
+                    return
+                try:
+                    await asyncio.wait_for(changed.wait(), HEARTBEAT_S)
+                except TimeoutError:
+                    yield format_sse_event(comment="still here")
+
+    @contextlib.contextmanager
+    def _listening(self, job_id: str) -> Iterator[Feed]:
+        feed = self._feeds.get(job_id)
+        if feed is None:
+            feed = self._feeds[job_id] = Feed(job_id)
+            self._pollers[job_id] = asyncio.create_task(self._poll(feed))
+        feed.listeners += 1
+        try:
+            yield feed
+        finally:
+            feed.listeners -= 1
+            if feed.listeners == 0:
+                self._pollers.pop(job_id).cancel()
+                del self._feeds[job_id]
+
+    async def _poll(self, feed: Feed) -> None:
+        after, looked_at_s, standing = "0", 0.0, None
+        while not (feed.is_over or self._is_ending):
+            with contextlib.suppress(UnavailableError):  # the listeners hear of the job when the queue is back
+                for event in await run_in_threadpool(self._queue.events, feed.job_id, after):
+                    feed.add(event.record, event.number)
+                    after, standing = event.number, None
+                if time.monotonic() >= looked_at_s + LOOK_PERIOD_S:
+                    standing = await self._look(feed, standing)
+                    looked_at_s = time.monotonic()
+            await asyncio.sleep(POLL_PERIOD_S)
+        feed.end()
+
+    async def _look(self, feed: Feed, told: Standing | None) -> Standing | None:
+        """Tell of another position in the queue, and of a job without events; the standing that was told last."""
+        record = await run_in_threadpool(self._queue.get, feed.job_id)
+        if record is None:
+            feed.end()
+            return None
+        if record.state in TERMINAL_STATES:
+            if feed.newest is None:  # put back after the queue had lost it
+                feed.add(record)
+            return None
+        standing = await run_in_threadpool(self._queue.standing, feed.job_id)
+        if told is None or standing.position != told.position:
+            feed.add(record, standing=standing)
+        return standing
