@@ -33,6 +33,7 @@ from pydantic import ValidationError
 
 from contract.errors import SceneError, UnavailableError
 from contract.job import JOB_ID_PATTERN, JobRecord
+from contract.settings import Settings
 
 AREAS = ("incoming", "spool", "work", "scenes", "run")
 
@@ -40,6 +41,7 @@ SUBMISSION = "submission.json"
 MANIFEST = "manifest.json"
 REPORT = "report.json"
 CURVE = "curve.csv"
+RESUME = "resume.safetensors"
 
 ABANDONED_AFTER_S = 24 * 3600.0
 """An upload that has received nothing for this long was given up, or cut off by the end of its service."""
@@ -59,6 +61,19 @@ class Removed:
 
     files: dict[str, int]
     bytes: dict[str, int]
+
+
+def open_store(settings: Settings) -> Store:
+    """The store that the settings name: a bucket's if there is a store_url, else the data directory's.
+
+    Raises:
+        UnavailableError: the data directory cannot be made, or the package for buckets is not installed.
+    """
+    if settings.store_url is None:
+        return Store(settings.data_dir)
+    from contract.bucket import BucketStore  # it imports this module
+
+    return BucketStore(settings.data_dir, settings.store_url)
 
 
 def new_job_id() -> str:
@@ -131,7 +146,7 @@ class Store:
     @disk_errors()
     def discard_incoming(self, job_id: str) -> None:
         """Remove an upload that will not become a job."""
-        _remove(self.incoming_folder(job_id))
+        remove_tree(self.incoming_folder(job_id))
 
     @disk_errors()
     def accept(self, record: JobRecord) -> None:
@@ -181,14 +196,20 @@ class Store:
         folder = self._folder("work", job_id, attempt)
         folder.mkdir(mode=0o700, exist_ok=True)
         for name in (entry.name for entry in list(folder.iterdir()) if entry.name != keep):
-            _remove(folder / name)
+            remove_tree(folder / name)
         for number in sorted((each for each in self._attempts("work", job_id) if each < attempt), reverse=True):
             earlier = self._folder("work", job_id, number)
             if keep and not (folder / keep).exists():
                 with contextlib.suppress(FileNotFoundError):
                     (earlier / keep).rename(folder / keep)
-            _remove(earlier)
+            remove_tree(earlier)
         return folder
+
+    def hand_over(self, job_id: str, attempt: int, keep: str) -> None:
+        """Before a job is released: let an attempt on any machine go on from the file `keep`.
+
+        On one disk it lies where work_folder() looks for it; there is nothing to do.
+        """
 
     @disk_errors()
     def publish_scene(self, job_id: str, attempt: int) -> Path:
@@ -230,14 +251,14 @@ class Store:
     @disk_errors()
     def remove_attempt(self, job_id: str, attempt: int) -> None:
         """Remove what one attempt has written, also if it is in place and its report was refused."""
-        _remove(self._folder("work", job_id, attempt))
+        remove_tree(self._folder("work", job_id, attempt))
         _remove_scene(self._folder("scenes", job_id, attempt))
 
     @disk_errors()
     def remove_other_attempts(self, job_id: str, attempt: int) -> None:
         """Remove all work on the job, and scenes other than that of the attempt, whose report was accepted."""
         for number in self._attempts("work", job_id):
-            _remove(self._folder("work", job_id, number))
+            remove_tree(self._folder("work", job_id, number))
         for number in self._attempts("scenes", job_id):
             if number != attempt:
                 _remove_scene(self._folder("scenes", job_id, number))
@@ -246,7 +267,7 @@ class Store:
     def scratch_folder(self, worker_name: str) -> Path:
         """Where one worker unpacks clips, emptied of what an earlier process of that name left."""
         folder = self.data_dir / "work" / f"tmp-{worker_name}"
-        _remove(folder)
+        remove_tree(folder)
         folder.mkdir(mode=0o700)
         return folder
 
@@ -285,11 +306,11 @@ class Store:
             with contextlib.suppress(FileNotFoundError):  # its upload has just ended
                 touched_s = max(path.stat().st_mtime for path in (folder, *folder.iterdir()))
                 if touched_s < time.time() - ABANDONED_AFTER_S:
-                    _remove(folder)
+                    remove_tree(folder)
         for area, marker in (("spool", SUBMISSION), ("scenes", MANIFEST)):
             for folder in (self.data_dir / area).iterdir():
                 if not (folder / marker).is_file():
-                    _remove(folder)
+                    remove_tree(folder)
 
     def _folders_of(self, job_id: str) -> dict[str, list[Path]]:
         """Everything that is there of a job, by area."""
@@ -319,7 +340,7 @@ class Store:
         return job_id
 
 
-def _remove(path: Path) -> None:
+def remove_tree(path: Path) -> None:
     """Remove a file or a folder with all that is in it, as far as it is there."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, onerror=_unless_gone)
@@ -330,7 +351,7 @@ def _remove(path: Path) -> None:
 def _remove_scene(folder: Path) -> None:
     """Remove a folder; its manifest first, so that nobody finds half a scene."""
     (folder / MANIFEST).unlink(missing_ok=True)
-    _remove(folder)
+    remove_tree(folder)
 
 
 def _unless_gone(_: object, __: object, failure: tuple[type[BaseException], BaseException, object]) -> None:
