@@ -17,6 +17,7 @@ from service import jobs, reconstruct, renders, scenes, system, tus
 from service.audit import install_refusal_handler
 from service.deps import Deps
 from service.guard import LOOPBACK_NAMES, Guard
+from service.metrics import Measure
 from service.problems import install_handlers
 from service.renderer import Renderer
 from service.version import version
@@ -33,11 +34,12 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        sweeping = asyncio.create_task(deps.sweep.run())
+        tasks = [asyncio.create_task(work) for work in (deps.sweep.run(), deps.retention.run())]
         yield
-        sweeping.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await sweeping
+        for task in tasks:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
         await renderer.close()
         queue.close()
 
@@ -51,6 +53,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     )
     app.state.deps = deps
     app.add_middleware(Guard, hosts=LOOPBACK_NAMES | {settings.host, *settings.hosts}, origins=settings.cors_origins)
+    app.add_middleware(Measure, metrics=deps.metrics)
     install_handlers(app)
     install_refusal_handler(app, deps.audit)
     for router in (reconstruct.router, tus.router, jobs.router, renders.router, scenes.router, system.router):

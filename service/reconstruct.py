@@ -220,6 +220,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         idempotency_key=key,
         created_at_s=time.time(),
     )
+    check_retention(record.options, services.settings)
     services.audit.record(AuditAction.ACCEPTED, caller, job_id)
     with services.sweep.in_hand(job_id):
         services.store.accept(record)

@@ -10,15 +10,23 @@ from pydantic import BaseModel, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
+from contract.audit import AuditAction
 from contract.errors import SceneError
-from contract.job import TERMINAL_STATES
+from contract.job import JobRecord, JobState
+from contract.keys import KeyScope
+from contract.queue import LISTING_LIMIT
 from contract.rendering import ExportRequest
 from contract.store import CURVE, REPORT, is_job_id
-from service.deps import Services
+from service.access import Caller
+from service.deps import AnyCaller, Deps, Services, not_found
 from service.problems import Problem
-from service.renders import ModelTime, image_response, servable_scene
+from service.purge import Receipt
+from service.renders import ModelTime, image_response
 
-router = APIRouter(tags=["scenes"])
+router = APIRouter(prefix="/scenes", tags=["scenes"])
+
+SCENES_REMEDY = "GET /scenes lists what there is."
+Limit = Annotated[int, Query(ge=1, le=LISTING_LIMIT, description="at most so many")]
 
 
 class SceneSummary(BaseModel):
@@ -30,60 +38,101 @@ class SceneSummary(BaseModel):
     links: dict[str, str]
 
 
-@router.get("/scenes", operation_id="list_scenes")
-def list_scenes(services: Services) -> list[SceneSummary]:
-    """All finished scenes, newest first."""
-    return [_summary(services, scene_id) for scene_id in services.store.scene_ids()]
+@router.get("", operation_id="list_scenes")
+def list_scenes(services: Services, caller: AnyCaller, limit: Limit = LISTING_LIMIT) -> list[SceneSummary]:
+    """The newest finished scenes, newest first."""
+    caller.require(KeyScope.VIEW)
+    records = services.queue.records(caller.tenant, None)
+    done = [record for record in records if record.state is JobState.DONE]
+    return [_summary(services, record) for record in done[:limit]]
 
 
-@router.get("/scenes/{scene_id}", operation_id="get_scene")
-def get_scene(scene_id: str, services: Services) -> dict[str, Any]:
+@router.get("/{scene_id}", operation_id="get_scene")
+async def get_scene(scene_id: str, services: Services, caller: AnyCaller) -> dict[str, Any]:
     """The scene's quality report: held-out quality, what was assumed, warnings."""
-    return _report(services, servable_scene(services, scene_id))
+    caller.require(KeyScope.VIEW)
+    record = await run_in_threadpool(finished_job, services, caller, scene_id)
+    await services.audit.viewed(caller, scene_id)
+    return await run_in_threadpool(_report, services, record)
 
 
-@router.get("/scenes/{scene_id}/curve", operation_id="get_curve", response_class=FileResponse)
-def get_curve(scene_id: str, services: Services) -> FileResponse:
+@router.get("/{scene_id}/curve", operation_id="get_curve", response_class=FileResponse)
+async def get_curve(scene_id: str, services: Services, caller: AnyCaller) -> FileResponse:
     """Held-out psnr_tissue over seconds of training, as CSV."""
-    folder = services.store.scene_folder(servable_scene(services, scene_id))
+    caller.require(KeyScope.VIEW)
+    record = await run_in_threadpool(finished_job, services, caller, scene_id)
+    folder = services.store.scene_folder(scene_id, record.attempt)
     if not (folder / CURVE).is_file():
         raise Problem(404, "This scene has no curve.", field="scene_id")
+    await services.audit.viewed(caller, scene_id)
     return FileResponse(folder / CURVE, media_type="text/csv")
 
 
-@router.get("/scenes/{scene_id}/export", operation_id="export_scene", response_class=Response)
+@router.get("/{scene_id}/export", operation_id="export_scene", response_class=Response)
 async def export_scene(
     scene_id: str,
     services: Services,
+    caller: AnyCaller,
     t: ModelTime = 0.0,
     format: Annotated[Literal["ply"], Query(description="the property order common splat viewers read")] = "ply",
 ) -> Response:
-    """The scene's Gaussians at time t, in mm."""
-    scene_id = await run_in_threadpool(servable_scene, services, scene_id)
-    answer = await services.renderer.ask(ExportRequest(scene_id=scene_id, t=t, format=format))
-    response = image_response(scene_id, answer)
+    """The scene's Gaussians at time t as a file."""
+    caller.require(KeyScope.VIEW)
+    record = await run_in_threadpool(finished_job, services, caller, scene_id)
+    await run_in_threadpool(services.audit.record, AuditAction.EXPORTED, caller, scene_id)
+    request = ExportRequest(scene_id=scene_id, attempt=record.attempt, t=t, format=format)
+    response = image_response(scene_id, await services.renderer.ask(request))
     response.headers["Content-Disposition"] = f'attachment; filename="{scene_id}.{format}"'
     return response
 
 
-@router.delete("/scenes/{scene_id}", status_code=204, operation_id="delete_scene")
-def delete_scene(scene_id: str, services: Services) -> None:
-    """Remove clip, scene and record of a job that has ended."""
+@router.delete("/{scene_id}", operation_id="purge_scene")
+def purge_scene(scene_id: str, services: Services, caller: AnyCaller) -> Receipt:
+    """Remove a job that has ended, however it ended: clip, scene, record, events. The receipt says what was removed.
+
+    A removal that was cut off is finished by asking again, or by the service itself within minutes.
+    """
+    caller.require(KeyScope.PURGE)
+    record = _known(services, scene_id)
+    if record is None or not caller.owns(record):
+        raise _no_such_scene(scene_id, caller, record)
+    return services.purger.purge(scene_id, caller)
+
+
+def finished_job(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
+    """The record of a done job of the caller's tenant, whose scene is there.
+
+    Raises:
+        Problem: 404, there is none of that id, or it is another's; 409, the job has not come to a scene.
+    """
     record = services.queue.get(scene_id) if is_job_id(scene_id) else None
-    if record is None:
-        services.store.scene_folder(scene_id)  # raises SceneError unless a scene is there without its record
-    elif record.state not in TERMINAL_STATES:
-        remedy = f"Cancel it first: DELETE /jobs/{scene_id}."
-        raise Problem(409, f"The job is still {record.state}.", field="scene_id", remedy=remedy)
-    services.store.remove(scene_id)  # before its record, by which a removal that was cut short can be asked for again
-    services.queue.forget(scene_id)
+    if record is None or not caller.owns(record):
+        raise _no_such_scene(scene_id, caller, record)
+    if record.state is not JobState.DONE:
+        detail = f"The job is {record.state}; there is no finished scene."
+        raise Problem(409, detail, field="scene", remedy=f"See GET /jobs/{scene_id}.")
+    if not services.store.has_scene(scene_id, record.attempt):
+        raise _no_such_scene(scene_id, caller, None)
+    return record
 
 
-def _summary(services: Services, scene_id: str) -> SceneSummary:
+def _known(services: Deps, scene_id: str) -> JobRecord | None:
+    """The job's record; if the queue has lost it, as it was when the clip was accepted."""
+    if not is_job_id(scene_id):
+        return None
+    return services.queue.get(scene_id) or services.store.submission(scene_id)
+
+
+def _no_such_scene(scene_id: str, caller: Caller, record: JobRecord | None) -> Problem:
+    return not_found(f"There is no scene {scene_id[:40]!r}.", "scene", SCENES_REMEDY, caller, record)
+
+
+def _summary(services: Deps, record: JobRecord) -> SceneSummary:
     """A scene's line in the list; a damaged one hides no other."""
+    scene_id = record.job_id
     links = {"report": f"/scenes/{scene_id}", "render": f"/render?scene={scene_id}"}
     try:
-        quality_db = _report(services, scene_id).get("psnr_tissue_db")
+        quality_db = _report(services, record).get("psnr_tissue_db")
         return SceneSummary(id=scene_id, psnr_tissue_db=quality_db, links=links)
     except SceneError as error:
         return SceneSummary(id=scene_id, error=str(error), links=links)
@@ -91,14 +140,14 @@ def _summary(services: Services, scene_id: str) -> SceneSummary:
         return SceneSummary(id=scene_id, error="The report of this scene holds no quality.", links=links)
 
 
-def _report(services: Services, scene_id: str) -> dict[str, Any]:
-    path = services.store.scene_folder(scene_id) / REPORT
+def _report(services: Deps, record: JobRecord) -> dict[str, Any]:
+    path = services.store.scene_folder(record.job_id, record.attempt) / REPORT
     try:
         report = json.loads(path.read_text(), parse_constant=_refuse)
     except (OSError, ValueError) as error:
-        raise SceneError(f"The report of scene {scene_id} cannot be read ({type(error).__name__}).") from error
+        raise SceneError(f"The report of scene {record.job_id} cannot be read ({type(error).__name__}).") from error
     if not isinstance(report, dict):
-        raise SceneError(f"The report of scene {scene_id} is not a JSON object.")
+        raise SceneError(f"The report of scene {record.job_id} is not a JSON object.")
     return report
 
 

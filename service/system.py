@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import APIRouter
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import BaseModel
-from starlette.responses import JSONResponse
+from starlette.responses import JSONResponse, Response
 
 from contract import CONTRACT_VERSION
 from contract.errors import UnavailableError
+from contract.keys import KeyScope
 from contract.rendering import ImageFormat, Layer
-from service.deps import Deps, Services
+from service.deps import AnyCaller, Deps, Services
 from service.problems import Problem
 from service.renderer import WORKER_REMEDY
 from service.upload import SUFFIXES
@@ -67,6 +69,13 @@ def info(services: Services) -> dict[str, Any]:
         "layers": [layer.value for layer in Layer],
         "formats": [format.value for format in ImageFormat],
     }
+
+
+@router.get("/metrics", operation_id="metrics", response_class=Response)
+def read_metrics(services: Services, caller: AnyCaller) -> Response:
+    """Figures for Prometheus, in its text format."""
+    caller.require(KeyScope.OPERATE)
+    return Response(services.metrics.exposition(), media_type=CONTENT_TYPE_LATEST)
 
 
 def _trouble(services: Deps) -> Problem | None:

@@ -1,0 +1,165 @@
+"""GET /metrics: what Prometheus asks for. Labels are routes, states and devices: never a tenant, an id or a name."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from http import HTTPStatus
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, ProcessCollector
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.exposition import generate_latest
+from prometheus_client.registry import Collector
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from contract.errors import UnavailableError
+from contract.queue import Queue
+from contract.store import Store
+from service.version import version
+
+NO_ROUTE = "none"
+"""The page's files, and all that does not exist: paths are a caller's to choose, so they are no label."""
+METHODS = frozenset({"GET", "HEAD", "POST", "PATCH", "DELETE", "OPTIONS"})
+DURATIONS_S = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0, 60.0, 600.0)
+RENDER_DURATIONS_S = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 5.0)
+REASONS = {
+    401: "key",
+    403: "scope",
+    409: "state",
+    413: "size",
+    422: "input",
+    429: "rate",
+    503: "unavailable",
+    507: "disk",
+}
+
+
+class Metrics:
+    """The figures of one service; those of the queue are asked for when Prometheus asks."""
+
+    def __init__(self, queue: Queue, store: Store) -> None:
+        registry = self._registry = CollectorRegistry()
+        registry.register(_QueueCollector(queue, store))
+        ProcessCollector(registry=registry)
+        Info("intrasplat_build", "The running version.", registry=registry).info({"version": version()})
+        self.requests = Counter(
+            "intrasplat_http_requests",
+            "Answers by route template.",
+            ("method", "route", "status"),
+            registry=registry,
+        )
+        self.durations = Histogram(
+            "intrasplat_http_request_duration_seconds",
+            "From the first byte of a request to the last of its answer.",
+            ("method", "route"),
+            buckets=DURATIONS_S,
+            registry=registry,
+        )
+        self.received = Counter(
+            "intrasplat_http_received_bytes", "Bytes of bodies, uploads above all.", ("route",), registry=registry
+        )
+        self.rejected = Counter(
+            "intrasplat_rejected", "Requests that were not served, by reason.", ("reason",), registry=registry
+        )
+        self.renders = Histogram(
+            "intrasplat_render_duration_seconds",
+            "What the worker took for a view, without queueing and transport.",
+            ("state",),
+            buckets=RENDER_DURATIONS_S,
+            registry=registry,
+        )
+        self.streams = Gauge("intrasplat_streams", "Open WebSockets.", registry=registry)
+
+    def exposition(self) -> bytes:
+        """All figures in Prometheus' text format; asks queue and disk."""
+        return generate_latest(self._registry)
+
+    def rendered(self, state: str, render_ms: float) -> None:
+        """Count a view of a running or done job."""
+        self.renders.labels(state).observe(render_ms / 1000.0)
+
+
+class Measure:
+    """ASGI middleware, outside of all others: counts requests and times them."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "websocket":
+            with self._metrics.streams.track_inprogress():
+                await self._app(scope, receive, send)
+        elif scope["type"] == "http":
+            await self._measured(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
+
+    async def _measured(self, scope: Scope, receive: Receive, send: Send) -> None:
+        status, received_bytes, began_s = HTTPStatus.INTERNAL_SERVER_ERROR.value, 0, time.perf_counter()
+
+        async def counted_receive() -> Message:
+            nonlocal received_bytes
+            message = await receive()
+            received_bytes += len(message.get("body", b""))
+            return message
+
+        async def watched_send(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            await send(message)
+
+        try:
+            await self._app(scope, counted_receive, watched_send)
+        finally:
+            self._count(scope, status, received_bytes, time.perf_counter() - began_s)
+
+    def _count(self, scope: Scope, status: int, received_bytes: int, seconds: float) -> None:
+        route = getattr(scope.get("route"), "path", NO_ROUTE)
+        method = scope["method"] if scope["method"] in METHODS else "other"
+        self._metrics.requests.labels(method, route, str(status)).inc()
+        self._metrics.durations.labels(method, route).observe(seconds)
+        if received_bytes:
+            self._metrics.received.labels(route).inc(received_bytes)
+        if status in REASONS:
+            self._metrics.rejected.labels(REASONS[status]).inc()
+
+
+class _QueueCollector(Collector):
+    """What the queue, the workers and the disk say at this moment."""
+
+    def __init__(self, queue: Queue, store: Store) -> None:
+        self._queue = queue
+        self._store = store
+
+    def collect(self) -> Iterator[Metric]:
+        """The figures; of a queue or disk that is away, that it is."""
+        try:
+            yield from self._of_queue()
+            yield GaugeMetricFamily("intrasplat_queue_up", "Whether the queue answers.", 1)
+        except UnavailableError:
+            yield GaugeMetricFamily("intrasplat_queue_up", "Whether the queue answers.", 0)
+        try:
+            free_bytes = self._store.free_bytes()
+        except UnavailableError:
+            free_bytes = 0
+        yield GaugeMetricFamily("intrasplat_free_bytes", "Left on the data directory's disk.", free_bytes)
+
+    def _of_queue(self) -> list[Metric]:
+        figures, workers = self._queue.figures(), self._queue.workers()
+        ended = CounterMetricFamily("intrasplat_jobs_ended", "Jobs that came to each end.", labels=("state",))
+        for state, count in figures.ended.items():
+            ended.add_metric((state.value,), count)
+        live = GaugeMetricFamily("intrasplat_workers", "Live workers.", labels=("device",))
+        for device in sorted({worker.device for worker in workers}):
+            live.add_metric((device,), sum(worker.device == device for worker in workers))
+        return [
+            GaugeMetricFamily("intrasplat_jobs_queued", "Jobs that wait.", figures.queued),
+            GaugeMetricFamily("intrasplat_jobs_running", "Jobs that a worker holds.", figures.running),
+            GaugeMetricFamily(
+                "intrasplat_oldest_queued_seconds", "How long the oldest job has waited.", figures.oldest_queued_s
+            ),
+            ended,
+            live,
+        ]

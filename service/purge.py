@@ -1,0 +1,133 @@
+"""Removal of a job and of all that is known of it, with a receipt; and what a removal that was cut off left undone.
+
+Order: a note on disk (data_dir/purging/<job>), the files, the queue's record, the note. Whatever ends the service in
+between, the note makes the next sweep go through all of it again; and while the record is there, so does whoever asks
+once more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import time
+from pathlib import Path
+
+from pydantic import BaseModel, Field
+
+from contract.audit import AuditAction, utc_now
+from contract.errors import UnavailableError
+from contract.job import TERMINAL_STATES
+from contract.queue import Queue
+from contract.store import Removed, Store, StoreFullError, disk_errors, is_job_id
+from service.access import Caller
+from service.audit import Audit
+from service.partial import partials_of
+from service.problems import Problem
+
+NOTES = "purging"
+NOTE_IS_OLD_S = 60.0
+"""A younger note may be of a removal that is under way."""
+logger = logging.getLogger("intrasplat.service")
+
+
+class Receipt(BaseModel):
+    """What was removed of a job. Counts are of this removal: one that goes on after a cut counts the rest."""
+
+    job_id: str
+    purged_at: str = Field(description="ISO 8601, UTC")
+    files: dict[str, int] = Field(description="removed files by area: incoming, spool, work, scenes, uploads")
+    bytes: dict[str, int] = Field(description="removed bytes by area")
+    record: bool = Field(description="the queue holds no record, event or idempotency key of it")
+    verified: bool = Field(description="it was looked whether anything is left, and nothing is")
+
+
+class Purger:
+    """Removes jobs from queue and store."""
+
+    def __init__(self, queue: Queue, store: Store, audit: Audit) -> None:
+        self._queue = queue
+        self._store = store
+        self._audit = audit
+        self._notes = store.data_dir / NOTES
+
+    def purge(self, job_id: str, caller: Caller | None, reason: str = "request") -> Receipt:
+        """Remove a job that has ended, recorded in the audit before it begins and before it is reported.
+
+        Raises:
+            Problem: 409, the job is queued or running, or became so meanwhile.
+            UnavailableError: queue, store or audit cannot do their part; the removal is finished later, or by asking
+                again.
+        """
+        self._refuse_live(job_id)
+        self._audit.record(AuditAction.PURGED, caller, job_id, f"begun ({reason})")
+        note = self._write_note(job_id)
+        uploads = self._remove_uploads(job_id)
+        removed = self._store.purge(job_id)
+        self._audit.record(AuditAction.PURGED, caller, job_id, f"done ({reason})")
+        self._queue.forget(job_id)
+        self._refuse_live(job_id)
+        receipt = self._receipt(job_id, removed, uploads)
+        note.unlink(missing_ok=True)
+        return receipt
+
+    def finish_cut_off(self) -> None:
+        """Finish what earlier services were removing when they ended."""
+        for note in list(self._notes.glob("*")) if self._notes.is_dir() else []:
+            with contextlib.suppress(FileNotFoundError):  # finished meanwhile
+                if is_job_id(note.name) and note.stat().st_mtime < time.time() - NOTE_IS_OLD_S:
+                    try_to_purge(self, note.name, "finished later")
+
+    def _refuse_live(self, job_id: str) -> None:
+        record = self._queue.get(job_id)
+        if record is not None and record.state not in TERMINAL_STATES:
+            remedy = f"Cancel it first: DELETE /jobs/{job_id}."
+            raise Problem(409, f"The job is still {record.state}.", field="scene_id", remedy=remedy)
+
+    def _write_note(self, job_id: str) -> Path:
+        """Say on disk that the job is being removed. A full disk is no hindrance: it is why one removes."""
+        note = self._notes / job_id
+        with contextlib.suppress(StoreFullError), disk_errors():
+            self._notes.mkdir(mode=0o700, exist_ok=True)
+            note.touch(mode=0o600)
+            descriptor = os.open(self._notes, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        return note
+
+    def _remove_uploads(self, job_id: str) -> Removed:
+        """Remove what the job's resumable uploads have left."""
+        files = sizes = 0
+        with disk_errors():
+            for partial in partials_of(self._store, job_id):
+                found = [path.stat().st_size for path in partial.folder.iterdir()]
+                files, sizes = files + len(found), sizes + sum(found)
+                self._store.discard_incoming(partial.upload_id)
+        return Removed({"uploads": files}, {"uploads": sizes})
+
+    def _receipt(self, job_id: str, removed: Removed, uploads: Removed) -> Receipt:
+        """The receipt, after a look whether anything is left; the store has looked for itself."""
+        if self._queue.get(job_id) is not None or self._queue.events(job_id):
+            raise UnavailableError(f"The queue still knows job {job_id}.", "Ask for its removal once more.")
+        return Receipt(
+            job_id=job_id,
+            purged_at=utc_now(),
+            files=removed.files | uploads.files,
+            bytes=removed.bytes | uploads.bytes,
+            record=True,
+            verified=True,
+        )
+
+
+def try_to_purge(purger: Purger, job_id: str, reason: str) -> bool:
+    """Purge for the service itself; False, and a line in the log, if that must wait until the next time."""
+    try:
+        purger.purge(job_id, None, reason)
+    except Problem:  # it came to life again, and ends some time
+        return False
+    except (OSError, UnavailableError) as error:
+        logger.error("a job could not be purged", extra={"job_id": job_id, "error": type(error).__name__})
+        return False
+    return True

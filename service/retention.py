@@ -1,0 +1,86 @@
+"""How long jobs are kept: their own retention_hours, else the deployment's, and never longer than its maximum."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+
+from starlette.concurrency import run_in_threadpool
+
+from contract.audit import AuditLog
+from contract.errors import InputError, UnavailableError
+from contract.job import TERMINAL_STATES, JobOptions, JobRecord
+from contract.locks import FolderLock
+from contract.queue import Queue
+from contract.settings import Settings
+from contract.store import Store
+from service.purge import Purger, try_to_purge
+
+SWEEP_PERIOD_S = 60.0
+HOUR_S = 3600.0
+logger = logging.getLogger("intrasplat.service")
+
+
+def check_retention(options: JobOptions, settings: Settings) -> None:
+    """Return if a job may be kept as long as it asks.
+
+    Raises:
+        InputError: it asks for longer than settings.max_retention_hours.
+    """
+    asked, most = options.retention_hours, settings.max_retention_hours
+    if asked is not None and most is not None and asked > most:
+        problem = f"{asked:g} is longer than the {most:g} hours that anything is kept here."
+        raise InputError("options.retention_hours", problem, f"Ask for {most:g} or less, or leave it out.")
+
+
+def kept_hours(options: JobOptions, settings: Settings) -> float | None:
+    """How long a job is kept after its end; None: until somebody removes it."""
+    wanted = settings.retention_hours if options.retention_hours is None else options.retention_hours
+    limits = [hours for hours in (wanted, settings.max_retention_hours) if hours is not None]
+    return min(limits, default=None)
+
+
+class Retention:
+    """The sweep that purges what was kept long enough. Of the services of one data directory one does it at a time;
+    on several machines they may do it at once, for a purge may be repeated."""
+
+    def __init__(self, settings: Settings, queue: Queue, store: Store, purger: Purger) -> None:
+        self._settings = settings
+        self._queue = queue
+        self._purger = purger
+        self._reserve = AuditLog(settings.data_dir)
+        self._lock = FolderLock(store.run_dir / "retention.lock")
+
+    async def run(self) -> None:
+        """Sweep every SWEEP_PERIOD_S, until cancelled."""
+        try:
+            while True:
+                await run_in_threadpool(self._try_to_sweep)
+                await asyncio.sleep(SWEEP_PERIOD_S)
+        finally:
+            self._lock.release()
+
+    def sweep(self, now_s: float) -> int:
+        """Finish what was cut off, and purge what is due at that UNIX time; how many jobs that were."""
+        self._purger.finish_cut_off()
+        due = [record.job_id for record in self._queue.records(None, None) if self._is_due(record, now_s)]
+        return sum(try_to_purge(self._purger, job_id, "retention") for job_id in due)
+
+    def _is_due(self, record: JobRecord, now_s: float) -> bool:
+        hours = kept_hours(record.options, self._settings)
+        ended_s = record.finished_at_s
+        if hours is None or ended_s is None or record.state not in TERMINAL_STATES:
+            return False
+        return ended_s + hours * HOUR_S <= now_s
+
+    def _try_to_sweep(self) -> None:
+        if not self._lock.take():
+            return
+        self._reserve.fill_reserve()
+        try:
+            self.sweep(time.time())
+        except UnavailableError as error:
+            logger.warning("retention waits: %s", error.problem)
+        except OSError as error:
+            logger.error("retention cannot work", extra={"error": type(error).__name__})
