@@ -24,6 +24,7 @@ from service.deps import AnyCaller, Deps, Services
 from service.intake import LIMIT_REMEDY, declared_length
 from service.partial import Partial, find_partial
 from service.problems import RETRY_AFTER_S, Problem
+from service.retention import check_retention
 from service.upload import PARTS, Received, UploadLimits, receive_upload
 
 router = APIRouter(tags=["jobs"])
