@@ -18,8 +18,10 @@ from service.audit import install_refusal_handler
 from service.deps import Deps
 from service.guard import LOOPBACK_NAMES, Guard
 from service.metrics import Measure
+from service.openapi import DescribedApp
 from service.problems import install_handlers
 from service.renderer import Renderer
+from service.surface import Surface
 from service.version import version
 
 DESCRIPTION = (
@@ -36,6 +38,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(work) for work in (deps.sweep.run(), deps.retention.run())]
         yield
+        deps.feeds.end()
         for task in tasks:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -43,7 +46,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
         await renderer.close()
         queue.close()
 
-    app = FastAPI(
+    app = DescribedApp(
         title="intrasplat",
         version=version(),
         description=DESCRIPTION,
@@ -53,6 +56,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     )
     app.state.deps = deps
     app.add_middleware(Guard, hosts=LOOPBACK_NAMES | {settings.host, *settings.hosts}, origins=settings.cors_origins)
+    app.add_middleware(Surface)
     app.add_middleware(Measure, metrics=deps.metrics)
     install_handlers(app)
     install_refusal_handler(app, deps.audit)

@@ -22,6 +22,14 @@ from service.version import version
 router = APIRouter(tags=["system"])
 
 
+LIMITS = (
+    *("max_upload_bytes", "max_frames", "max_frame_pixels", "max_clip_s", "min_free_bytes"),
+    *("max_uploads", "upload_silence_s", "max_queued", "max_queued_per_tenant", "requests_per_s"),
+    *("max_render_pixels", "render_timeout_s", "retention_hours", "max_retention_hours"),
+)
+"""Settings that callers are told; None where there is no limit."""
+
+
 class Readiness(BaseModel):
     """What a ready service has."""
 
@@ -60,11 +68,7 @@ def info(services: Services) -> dict[str, Any]:
         "version": version(),
         "contract_version": CONTRACT_VERSION,
         "notice": "Research use only. Not a medical device.",
-        "limits": {
-            "max_upload_bytes": settings.max_upload_bytes,
-            "max_render_pixels": settings.max_render_pixels,
-            "min_free_bytes": settings.min_free_bytes,
-        },
+        "limits": {name: getattr(settings, name) for name in LIMITS},
         "accepts": {part: list(suffixes) for part, suffixes in SUFFIXES.items()},
         "layers": [layer.value for layer in Layer],
         "formats": [format.value for format in ImageFormat],

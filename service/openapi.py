@@ -1,0 +1,92 @@
+"""What the API says of itself: what FastAPI finds in the routes, and the problem that every operation may answer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from fastapi import FastAPI
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.problems import MEDIA_TYPE
+
+EXAMPLE_JOB_ID = "0123456789abcdef0123456789abcdef"
+EXAMPLES: dict[str, dict[str, Any]] = {
+    "JobView": {
+        "id": EXAMPLE_JOB_ID,
+        "state": "running",
+        "stage": "train",
+        "fraction": 0.4,
+        "psnr_db": 33.1,
+        "seconds_left": 20.0,
+        "eta_s": 27.0,
+        "attempt": 1,
+        "options": {"budget_s": 30},
+        "input_bytes": 41943040,
+        "created_at_s": 1767225600.0,
+        "links": {"self": f"/jobs/{EXAMPLE_JOB_ID}", "events": f"/jobs/{EXAMPLE_JOB_ID}/events"},
+    },
+    "Problem": {
+        "type": "about:blank",
+        "title": "The input cannot be used",
+        "status": 422,
+        "detail": "a file that ends in '.exe' is not accepted.",
+        "field": "clip",
+        "remedy": "Send .mp4, .mov, .mkv, .webm, .zip.",
+    },
+}
+KEY_SCHEME = {
+    "type": "http",
+    "scheme": "bearer",
+    "description": "a key of `intrasplat keys create`; not needed on the machine itself",
+}
+
+
+class ProblemDocument(BaseModel):
+    """Every answer that is not what was asked for (RFC 9457)."""
+
+    model_config = ConfigDict(extra="allow", title="Problem")
+
+    type: str = Field(description="about:blank: the status says what kind of problem it is")
+    title: str
+    status: int = Field(ge=400, le=599)
+    detail: str = Field(description="what is wrong, with the value at fault")
+    field: str | None = Field(default=None, description="of the request; absent if no part of it is at fault")
+    remedy: str | None = Field(default=None, description="what to do about it")
+    job_id: str | None = Field(default=None, description="the job that stands for the clip all the same")
+
+
+class DescribedApp(FastAPI):
+    """A FastAPI whose description tells the truth about errors and keys."""
+
+    def openapi(self) -> dict[str, Any]:
+        """The OpenAPI document, made once."""
+        if self.openapi_schema is None:
+            self.openapi_schema = _completed(super().openapi())
+        return self.openapi_schema
+
+
+def _completed(document: dict[str, Any]) -> dict[str, Any]:
+    components = document.setdefault("components", {})
+    schemas = components.setdefault("schemas", {})
+    for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which nobody is answered here
+        schemas.pop(name, None)
+    schemas["Problem"] = ProblemDocument.model_json_schema()
+    for name, example in EXAMPLES.items():
+        if name in schemas:
+            schemas[name]["examples"] = [example]
+    components["securitySchemes"] = {"key": KEY_SCHEME}
+    document["security"] = [{"key": []}, {}]
+    for operation in _operations(document):
+        responses = operation["responses"]
+        responses.pop("422", None)
+        responses["default"] = {
+            "description": "a problem",
+            "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+        }
+    return document
+
+
+def _operations(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    for path in document["paths"].values():
+        yield from path.values()

@@ -1,0 +1,107 @@
+"""What every request passes first and every answer last: its id, its line in the log, and the answer to a fault.
+
+The line tells the route's template, not the path, and nothing of query, headers or body: callers put anything there.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+import uuid
+from dataclasses import dataclass
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from contract.logs import answering
+from service.problems import Problem, fault
+
+REQUEST_ID = "X-Request-Id"
+KEPT_REQUEST_ID = re.compile(r"[0-9a-fA-F-]{8,64}")
+"""UUIDs and trace ids are kept. Words are not: the id goes into the log, and words may name somebody."""
+
+QUIET_ROUTES = frozenset({"/healthz", "/readyz", "/metrics"})
+"""Asked every few seconds by machines; in the log only when they fail."""
+
+GONE = 499
+"""In the log alone: the caller left before it was answered."""
+SWITCHED = 101
+
+logger = logging.getLogger("intrasplat.access")
+
+
+@dataclass
+class _Answered:
+    """How far the answer to one request is."""
+
+    status: int | None = None
+
+
+class Surface:
+    """ASGI middleware; only counting is further out."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        given = Headers(scope=scope).get(REQUEST_ID, "")
+        request_id = given if KEPT_REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+        answered, began_s = _Answered(), time.perf_counter()
+        with answering(request_id):
+            try:
+                await self._answer(scope, receive, _marking(scope, send, request_id, answered), answered)
+            finally:
+                _log(scope, answered.status or GONE, time.perf_counter() - began_s)
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send, answered: _Answered) -> None:
+        try:
+            await self._app(scope, receive, send)
+        except Exception:
+            logger.exception("a fault")
+            if answered.status is not None:
+                raise  # too late for another answer: the server cuts the connection
+            await _refuse(fault(), scope, receive, send)
+
+
+def _marking(scope: Scope, send: Send, request_id: str, answered: _Answered) -> Send:
+    """A `send` that notes the status, adds the request's id, and gives refused WebSockets a problem document."""
+
+    async def marked(message: Message) -> None:
+        kind = message["type"]
+        if kind == "websocket.close" and answered.status is None:
+            await _refuse(Problem(404, "There is no such WebSocket."), scope, _nothing, marked)
+            return
+        if kind == "websocket.accept":
+            answered.status = SWITCHED
+        elif kind in ("http.response.start", "websocket.http.response.start"):
+            answered.status = message["status"]
+            MutableHeaders(scope=message)[REQUEST_ID] = request_id
+        await send(message)
+
+    return marked
+
+
+async def _refuse(problem: Problem, scope: Scope, receive: Receive, send: Send) -> None:
+    response: Response = problem.response()
+    await response(scope, receive, send)
+
+
+async def _nothing() -> Message:
+    return {"type": "websocket.disconnect"}
+
+
+def _log(scope: Scope, status: int, seconds: float) -> None:
+    route = getattr(scope.get("route"), "path", "-")
+    level = logging.DEBUG if route in QUIET_ROUTES and status < 400 else logging.INFO
+    fields = {
+        "method": scope.get("method", "WEBSOCKET"),
+        "route": route,
+        "status": status,
+        "duration_ms": round(seconds * 1000.0, 1),
+    }
+    logger.log(level, "answered", extra=fields)
