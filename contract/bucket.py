@@ -41,7 +41,7 @@ from contract.store import (
 )
 
 LOOKED_FOR_S = 2.0
-"""A copy is shown for so long before it is asked again whether its original is there: a purge takes effect as late."""
+"""What was there is taken to be there for so long: a purge on another machine takes effect as late."""
 
 CONNECT_TIMEOUT_S = 5
 READ_TIMEOUT_S = 60
@@ -165,6 +165,7 @@ class BucketStore(Store):
         super().__init__(data_dir)
         self._bucket = Bucket(url)
         self._seen_s: dict[Path, float] = {}
+        """When, on the monotonic clock, the original of a folder here was last known to be there."""
 
     def accept(self, record: JobRecord) -> None:
         """As Store.accept; the clip is in the bucket when this returns, and no longer here."""
@@ -237,7 +238,7 @@ class BucketStore(Store):
 
     def has_scene(self, job_id: str, attempt: int) -> bool:
         """As Store.has_scene, of the bucket."""
-        return self._bucket.holds(f"scenes/{self._checked(job_id)}.{attempt}/{MANIFEST}")
+        return self._is_there(self._folder("scenes", job_id, attempt), f"scenes/{job_id}.{attempt}/{MANIFEST}")
 
     def scene_attempts(self, job_id: str) -> list[int]:
         """As Store.scene_attempts, of the bucket."""
@@ -249,6 +250,7 @@ class BucketStore(Store):
         """As Store.remove_attempt, in the bucket and here."""
         for area in ("scenes", "resume"):
             self._bucket.remove(f"{area}/{self._checked(job_id)}.{attempt}/", first=MANIFEST)
+        self._forget(job_id)
         super().remove_attempt(job_id, attempt)
 
     def remove_other_attempts(self, job_id: str, attempt: int) -> None:
@@ -257,6 +259,7 @@ class BucketStore(Store):
             if number != attempt:
                 self._bucket.remove(f"scenes/{job_id}.{number}/", first=MANIFEST)
         self._bucket.remove(f"resume/{self._checked(job_id)}.")
+        self._forget(job_id)
         with disk_errors():
             remove_tree(self.spool_folder(job_id))
         super().remove_other_attempts(job_id, attempt)
@@ -269,6 +272,7 @@ class BucketStore(Store):
             removed = self._bucket.remove(start, first)
             files["bucket"] += removed.files["bucket"]
             sizes["bucket"] += removed.bytes["bucket"]
+        self._forget(job_id)
         here = super().purge(job_id)
         return Removed(here.files | files, here.bytes | sizes)
 
@@ -292,17 +296,28 @@ class BucketStore(Store):
     def _copy(self, folder: Path, key: str, marker: str) -> bool:
         """Have the objects under `key` in the folder; False, and no folder, if they are not in the bucket."""
         with disk_errors():
-            if (folder / marker).is_file() and time.monotonic() < self._seen_s.get(folder, 0.0) + LOOKED_FOR_S:
-                return True
-            if not self._bucket.holds(key + marker):
+            if not self._is_there(folder, key + marker):
                 remove_tree(folder)
                 return False
             if (folder / marker).is_file():
                 os.utime(folder)  # in use, for remove_abandoned_uploads
             else:
                 self._get_folder(key, folder, marker)
+            return (folder / marker).is_file()
+
+    def _is_there(self, folder: Path, key: str) -> bool:
+        """Whether the bucket holds the object by which the folder's original is complete; asked now and then."""
+        if time.monotonic() < self._seen_s.get(folder, -LOOKED_FOR_S) + LOOKED_FOR_S:
+            return True
+        if not self._bucket.holds(key):
+            return False
         self._seen_s[folder] = time.monotonic()
         return True
+
+    def _forget(self, job_id: str) -> None:
+        """What was there of the job may be gone."""
+        for folder in [folder for folder in tuple(self._seen_s) if job_id in folder.name]:
+            self._seen_s.pop(folder, None)
 
     def _get_folder(self, key: str, folder: Path, marker: str) -> None:
         """Bring the objects here aside, check them, and rename them into place."""
@@ -315,7 +330,7 @@ class BucketStore(Store):
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                 self._bucket.get(each.key, path)
             _check(aside)
-            if not (folder / marker).is_file():
+            if (aside / marker).is_file() and not (folder / marker).is_file():
                 remove_tree(folder)
                 aside.rename(folder)
         except OSError:

@@ -191,7 +191,9 @@ def test_a_purge_leaves_nothing_in_the_bucket_nor_on_any_machine_that_shows_it(
         scene = published(worker, job_id, 1, content)
     (worker.work_folder(job_id, 2) / "resume").write_bytes(b"state")
     worker.hand_over(job_id, 2, "resume")
+    assert service.has_scene(job_id, 1)
     removed = service.purge(job_id)
+    assert not service.has_scene(job_id, 1)
     assert removed.files["bucket"] == 5
     assert [each.key for each in bucket.object_versions.all() if job_id in each.key] == []
     assert service.spooled_ids() == [other]
@@ -236,7 +238,7 @@ def test_while_the_bucket_is_away_nothing_is_accepted_nor_taken_for_missing(tmp_
         for asked in (
             lambda: store.accept(record),
             lambda: store.submission(job_id),
-            lambda: store.has_scene(job_id, 1),
+            lambda: store.has_scene(job_id, 2),
             lambda: store.purge(job_id),
         ):
             with pytest.raises(UnavailableError, match="bucket does not answer"):
