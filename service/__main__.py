@@ -10,7 +10,7 @@ from contract.errors import UnavailableError
 from contract.exits import ExitCode
 from contract.queue_redis import RedisQueue
 from contract.settings import Settings
-from contract.store import Store
+from contract.store import open_store
 from service.app import create_app
 from service.guard import LOOPBACK_NAMES
 from service.renderer import ZmqRenderer
@@ -34,7 +34,7 @@ def main() -> int:
     except UnavailableError as error:
         print(error, file=sys.stderr)
         return ExitCode.UNAVAILABLE
-    app = create_app(settings, queue, Store(settings.data_dir), ZmqRenderer(queue, settings.render_timeout_s))
+    app = create_app(settings, queue, open_store(settings), ZmqRenderer(queue, settings.render_timeout_s))
     uvicorn.run(
         app,
         host=settings.host,
