@@ -19,6 +19,7 @@ from typing import get_args
 from pydantic import ValidationError
 
 from client.api import DEFAULT_URL, Client
+from client.keys import add_keys
 from contract.arguments import Commands, add_command, finite, positive
 from contract.errors import InputError, IntrasplatError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
@@ -85,6 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_submit(commands)
     _add_watch(commands)
     _add_fetch(commands)
+    add_keys(commands)
     return parser
 
 

@@ -16,14 +16,13 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from contract.errors import UnavailableError
+from contract.store import StoreFullError, disk_errors
 
 AUDIT_FILE = "audit.jsonl"
 RESERVE_FILE = "audit.reserve"
 RESERVE_BYTES = 4 * 2**20
 """About 16,000 lines."""
 RESERVE_PIECE_BYTES = 64 * 2**10
-NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 class AuditAction(StrEnum):
@@ -75,22 +74,17 @@ class AuditLog:
         """Write one line and wait until it is on disk.
 
         Raises:
-            OSError: the disk is full, and the reserve used up (ENOSPC or EDQUOT).
+            StoreFullError: the disk is full, and the reserve used up.
             UnavailableError: the file cannot be written for another reason.
         """
         line = entry.model_dump_json(exclude_none=True).encode() + b"\n"
-        try:
-            while True:
-                try:
+        while True:
+            try:
+                with disk_errors():
                     return self._write(line)
-                except OSError as error:
-                    if error.errno not in NO_ROOM or not self._give_up_a_piece():
-                        raise
-        except OSError as error:
-            if error.errno in NO_ROOM:
-                raise
-            problem = f"The audit cannot be written ({error.strerror})."
-            raise UnavailableError(problem, f"Make {AUDIT_FILE} in the data directory writable.") from error
+            except StoreFullError:
+                if not self._give_up_a_piece():
+                    raise
 
     def fill_reserve(self) -> None:
         """Take the room for a bad hour, as far as the disk has it now."""

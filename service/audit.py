@@ -34,7 +34,7 @@ class Audit:
         """Record an act before it is done. caller None: the service itself.
 
         Raises:
-            OSError, UnavailableError: it cannot be recorded, so the act must not happen (507, 503).
+            UnavailableError: it cannot be recorded, so the act must not happen.
         """
         self._log.append(_entry(action, caller, job_id, outcome))
 
@@ -49,7 +49,7 @@ class Audit:
         entry = _entry(AuditAction.REFUSED, refusal.caller, refusal.job_id, str(refusal.status))
         try:
             await run_in_threadpool(self._once_a_minute, entry.model_copy(update={"address": refusal.address}))
-        except (OSError, UnavailableError) as error:
+        except UnavailableError as error:
             logger.error("a refusal was not recorded in the audit: %s", type(error).__name__)
 
     def _once_a_minute(self, entry: AuditEntry) -> None:

@@ -1,0 +1,88 @@
+"""`intrasplat keys`: make, list and revoke the API keys of an installation, in its data directory.
+
+The commands work on the file that the services read (contract/keys.py), so whoever may use them is whoever may read the
+clips anyway; run them as the user that runs the service.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+from contract.arguments import Commands, add_command
+from contract.audit import AuditAction, AuditEntry, AuditLog, utc_now
+from contract.errors import InputError
+from contract.exits import ExitCode
+from contract.keys import DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope
+from contract.settings import Settings
+
+
+def add_keys(commands: Commands) -> None:
+    """Add the command with its own three."""
+    parser = commands.add_parser("keys", help="make, list and revoke API keys", description="API keys of a service.")
+    own: Commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    create = add_command(own, "create", "make a key and print it, this once", _create)
+    create.add_argument("--tenant", required=True, help="whose jobs the key reaches: 1 to 40 of a-z, 0-9 and -")
+    create.add_argument(
+        "--scopes",
+        default=",".join(sorted(DEFAULT_SCOPES)),
+        metavar="A,B",
+        help=f"of {', '.join(KeyScope)} (default: %(default)s)",
+    )
+    create.add_argument("--label", help="what the list shows, at most 60 characters; name no patient")
+    revoke = add_command(own, "revoke", "refuse a key from now on", _revoke)
+    revoke.add_argument("key_id", metavar="ID", help="as `intrasplat keys list` shows it")
+    for command in (create, add_command(own, "list", "show all keys, without their secrets", _list), revoke):
+        command.add_argument("--data-dir", type=Path, metavar="DIR", help="of the service (default: its settings')")
+
+
+def _create(options: argparse.Namespace) -> int:
+    keys = KeyFile(_data_dir(options))
+    key, text = keys.create(options.tenant, _scopes(options.scopes), options.label)
+    try:
+        _record(options, AuditAction.KEY_CREATED, key)
+    except BaseException:
+        keys.revoke(key.key_id)  # nobody has seen it
+        raise
+    print(text)
+    print(f"{_line(key)}\nKeep the key; it is not shown again.", file=sys.stderr)
+    return ExitCode.OK
+
+
+def _list(options: argparse.Namespace) -> int:
+    for key in KeyFile(_data_dir(options)).list():
+        print(_line(key))
+    return ExitCode.OK
+
+
+def _revoke(options: argparse.Namespace) -> int:
+    key = KeyFile(_data_dir(options)).revoke(options.key_id)
+    if key is None:
+        raise InputError("ID", f"there is no key {options.key_id!r}.", "See `intrasplat keys list`.")
+    print(f"revoked {_line(key)}", file=sys.stderr)
+    _record(options, AuditAction.KEY_REVOKED, key)
+    return ExitCode.OK
+
+
+def _record(options: argparse.Namespace, action: AuditAction, key: ApiKey) -> None:
+    entry = AuditEntry(time=utc_now(), action=action, tenant=key.tenant, key_id=key.key_id)
+    AuditLog(_data_dir(options)).append(entry)
+
+
+def _scopes(text: str) -> frozenset[KeyScope]:
+    try:
+        return frozenset(KeyScope(name.strip()) for name in text.split(","))
+    except ValueError as error:
+        raise InputError("--scopes", f"{error}.", f"Use some of {', '.join(KeyScope)}.") from error
+
+
+def _line(key: ApiKey) -> str:
+    created = datetime.fromtimestamp(key.created_at_s, UTC).strftime("%Y-%m-%d")
+    return f"{key.key_id}  {key.tenant}  {','.join(sorted(key.scopes))}  {created}  {key.label or ''}".rstrip()
+
+
+def _data_dir(options: argparse.Namespace) -> Path:
+    chosen: Path | None = options.data_dir
+    return Settings.from_environment().data_dir if chosen is None else chosen
