@@ -2,50 +2,60 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import sys
 
-import uvicorn
-
-from contract.errors import UnavailableError
-from contract.exits import ExitCode
+from contract.errors import IntrasplatError, UnavailableError
+from contract.exits import ExitCode, exit_code_of
+from contract.keys import KeyFile
+from contract.logs import configure
 from contract.queue_redis import RedisQueue
 from contract.settings import Settings
-from contract.store import open_store
+from contract.store import Store
 from service.app import create_app
 from service.guard import LOOPBACK_NAMES
 from service.renderer import ZmqRenderer
+from service.server import Server
 
-KEEP_ALIVE_S = 15
-MAX_CONNECTIONS = 256
+logger = logging.getLogger("intrasplat.service")
 
 
 def main() -> int:
     """Serve until a signal ends it."""
-    settings = Settings.from_environment()
+    try:
+        settings = Settings.from_environment()
+        _check_host(settings)
+    except IntrasplatError as error:
+        print(error, file=sys.stderr)
+        return exit_code_of(error)
     if settings.redis_url is None:
         print("REDIS_URL is not set; `intrasplat up` starts a queue of its own.", file=sys.stderr)
         return ExitCode.UNAVAILABLE
-    if settings.host not in LOOPBACK_NAMES:
-        print("There are no accounts yet, so only a loopback INTRASPLAT_HOST is accepted.", file=sys.stderr)
-        return ExitCode.USAGE
+    configure(settings, "service")
     queue = RedisQueue(settings.redis_url)
     try:
         queue.ping()
+        app = create_app(settings, queue, Store(settings.data_dir), ZmqRenderer(queue, settings.render_timeout_s))
     except UnavailableError as error:
         print(error, file=sys.stderr)
         return ExitCode.UNAVAILABLE
-    app = create_app(settings, queue, open_store(settings), ZmqRenderer(queue, settings.render_timeout_s))
-    uvicorn.run(
-        app,
-        host=settings.host,
-        port=settings.port,
-        log_level="warning",
-        access_log=False,
-        server_header=False,
-        timeout_keep_alive=KEEP_ALIVE_S,
-        limit_concurrency=MAX_CONNECTIONS,
-    )
-    return ExitCode.OK
+    logger.info("listening on port %d", settings.port)
+    server = Server(app, settings)
+    with contextlib.suppress(KeyboardInterrupt):
+        server.run()
+    return ExitCode.OK if server.started else ExitCode.UNAVAILABLE
+
+
+def _check_host(settings: Settings) -> None:
+    """Return if the host may be served.
+
+    Raises:
+        UnavailableError: others could reach the service, and there is no key to let the right ones in.
+    """
+    if settings.host not in LOOPBACK_NAMES and not KeyFile(settings.data_dir).list():
+        problem = f"INTRASPLAT_HOST={settings.host} can be reached from elsewhere, and there are no keys."
+        raise UnavailableError(problem, "Make one first: `intrasplat keys create --tenant NAME`.")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,89 @@
+"""uvicorn as this service uses it: bounded in what it takes in, polite in its refusals, quick to end."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from types import FrameType
+
+import h11
+import uvicorn
+from fastapi import FastAPI
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from contract.settings import Settings
+from service.deps import Deps
+from service.problems import MEDIA_TYPE, Problem
+
+KEEP_ALIVE_S = 15
+FIRST_REQUEST_S = 20.0
+"""A connection that has not brought the head of a request by then is closed."""
+MAX_HEAD_BYTES = 32 * 1024
+"""Of a request's line and headers together."""
+MAX_CONNECTIONS = 1024
+"""Open ones, whether or not something is asked on them; service/surface.py counts requests."""
+GRACE_S = 10
+"""What is being answered when the service is asked to end has so long; an upload can be gone on with afterwards."""
+
+PING_PERIOD_S = 20.0
+PING_TIMEOUT_S = 20.0
+MAX_MESSAGE_BYTES = 64 * 1024
+"""Of a WebSocket's client, who sends times and poses."""
+MAX_WAITING_MESSAGES = 16
+
+UNREADABLE = Problem(400, "This is not a sound HTTP request.", remedy="See that its lengths and headers are right.")
+
+
+class HttpConnection(H11Protocol):
+    """Answers what is no HTTP with a problem document too, and does not wait forever for the first request."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.loop.call_later(FIRST_REQUEST_S, self._end_if_silent)
+
+    def send_400_response(self, msg: str) -> None:
+        """The answer to what h11 cannot read."""
+        headers = [("content-type", MEDIA_TYPE), ("connection", "close"), ("x-content-type-options", "nosniff")]
+        body = json.dumps(UNREADABLE.document()).encode()
+        headers.append(("content-length", str(len(body))))
+        answer = (h11.Response(status_code=400, headers=headers), h11.Data(data=body), h11.EndOfMessage())
+        for event in answer:
+            self.transport.write(self.conn.send(event) or b"")
+        self.transport.close()
+
+    def _end_if_silent(self) -> None:
+        first_request: object = self.cycle
+        if first_request is None and self.transport.get_protocol() is self:  # and not a WebSocket by now
+            self.transport.close()
+
+
+class Server(uvicorn.Server):
+    """Ends the streams of events as soon as a signal asks it to end, for they would end last by themselves."""
+
+    def __init__(self, app: FastAPI, settings: Settings) -> None:
+        config = uvicorn.Config(
+            app,
+            host=settings.host,
+            port=settings.port,
+            http=HttpConnection,
+            ws="websockets-sansio",
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            timeout_keep_alive=KEEP_ALIVE_S,
+            timeout_graceful_shutdown=GRACE_S,
+            limit_concurrency=MAX_CONNECTIONS,
+            h11_max_incomplete_event_size=MAX_HEAD_BYTES,
+            ws_max_size=MAX_MESSAGE_BYTES,
+            ws_max_queue=MAX_WAITING_MESSAGES,
+            ws_ping_interval=PING_PERIOD_S,
+            ws_ping_timeout=PING_TIMEOUT_S,
+        )
+        super().__init__(config)
+        deps = app.state.deps
+        assert isinstance(deps, Deps)
+        self._feeds = deps.feeds
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        self._feeds.end()
+        super().handle_exit(sig, frame)
