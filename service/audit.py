@@ -11,6 +11,7 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.audit import AuditAction, AuditEntry, AuditLog, utc_now
 from contract.errors import UnavailableError
+from contract.logs import current_request_id
 from service.access import Caller, Refusal
 from service.problems import Problem
 
@@ -76,6 +77,7 @@ def _entry(action: AuditAction, caller: Caller | None, job_id: str | None, outco
         tenant=tenant,
         key_id=key_id,
         address=address,
+        request_id=current_request_id(),
     )
 
 
