@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from contract.calibration import RectifiedCalibration, StereoCalibration, parse_calibration
+from contract.clip_limits import MOST_CALIBRATION_BYTES
 from contract.errors import InputError
 from worker.calibration.check import FIELD, check_calibration
-from worker.clip.limits import MOST_CALIBRATION_BYTES
 
 MAX_ASPECT_CHANGE = 0.005  # 1348x1080 read as 640x512 is still one scale; a cropped image is not
 

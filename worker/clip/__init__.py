@@ -1,6 +1,6 @@
 """Decode and validate what the user gave: a stereo clip, or frames whose depth is already known."""
 
-from worker.clip.limits import ClipLimits
+from contract.clip_limits import ClipLimits
 from worker.clip.opening import find_calibration, open_clip
 from worker.clip.split import FrameSplit, held_out_frames, split_frames
 from worker.clip.types import DepthClip, StereoClip

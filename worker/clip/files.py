@@ -1,15 +1,12 @@
 """A folder, a zip or a single image as one flat list of named files, read in memory.
 
-Archives come from strangers: members are never written under their own names, and everything that could reach outside
-(absolute paths, "..", links), hide its content (encryption, nested archives, duplicates, overlaps) or outgrow the
-limits is refused.
+Archives come from strangers (contract/zips.py says what is refused); members are never written under their own names.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import stat
 import tempfile
 import zipfile
 import zlib
@@ -19,14 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, TypeVar
 
+from contract.clip_limits import ClipLimits
 from contract.errors import InputError, LimitError
-from worker.clip.limits import ClipLimits
+from contract.zips import check_member_count, open_zip
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm"})
-ARCHIVE_SUFFIXES = frozenset({".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar", ".jar"})
-
-MOST_MEMBERS = 20_000  # images, depth, masks and right frames of 1000 frames are 4000
 DEEPEST_FOLDER = 6  # levels below the given folder; also what ends a loop of linked folders
 _CHUNK_BYTES = 1 << 20
 _LAYOUT_FOLDERS = frozenset({"images", "depth", "masks", "mask", "left", "right"})  # never stripped as mere wrapping
@@ -73,7 +68,8 @@ class FileTree(ABC):
 
         Raises what `read` does; most_bytes is the limit for everything in an archive unless given.
         """
-        with target.open("xb") as stream:
+        descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+        with open(descriptor, "wb") as stream:
             for chunk in self._chunks(name, self.limits.decoded_bytes if most_bytes is None else most_bytes):
                 stream.write(chunk)
 
@@ -164,75 +160,15 @@ def _open_folder(root: Path, field: str, limits: ClipLimits) -> FileTree:
             subfolders.clear()
         for file in files:
             paths[(relative / file).as_posix()] = Path(folder) / file
-        _check_member_count(len(paths), field, root.name)
+        check_member_count(len(paths), field, root.name)
     named = _without_wrapping(paths)
     return _Folder(field, root.name, tuple(sorted(named, key=natural_key)), limits, named)
 
 
 def _open_zip(path: Path, field: str, limits: ClipLimits) -> FileTree:
-    try:
-        archive = zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, OSError, ValueError) as error:
-        raise InputError(field, f"{path.name} is not a readable zip ({error}).", "Zip the files again.") from error
-    entries = archive.infolist()
-    _check_member_count(len(entries), field, path.name)
-    members: dict[str, zipfile.ZipInfo] = {}
-    for entry in entries:
-        _check_member(entry, field, path.name)
-        if entry.filename in members:
-            raise InputError(field, f"{path.name} holds {entry.filename!r} twice.", "Zip the files again.")
-        if not entry.is_dir():
-            members[entry.filename] = entry
-    _check_inflated(list(members.values()), field, path, limits)
-    named = _without_wrapping(members)
+    archive, entries = open_zip(path, field, path.name, limits)
+    named = _without_wrapping({entry.filename: entry for entry in entries})
     return _Zip(field, path.name, tuple(sorted(named, key=natural_key)), limits, archive, named)
-
-
-def _check_member_count(count: int, field: str, label: str) -> None:
-    if count > MOST_MEMBERS:
-        raise LimitError(
-            field, f"{label} holds {count} files or more; the limit is {MOST_MEMBERS}.", "Keep the clip's own."
-        )
-
-
-def _check_member(entry: zipfile.ZipInfo, field: str, label: str) -> None:
-    """InputError for a member that could reach outside the archive or hide what it holds."""
-    name = entry.filename
-    problem = None
-    kind = stat.S_IFMT(entry.external_attr >> 16)
-    # zipfile cuts names at NUL, so the name as stored is asked too
-    if any(ord(letter) < 32 for letter in entry.orig_filename) or "\\" in entry.orig_filename:
-        problem = "has a name with a backslash or a control character"
-    elif name.startswith("/") or re.match(r"[A-Za-z]:", name):
-        problem = "has an absolute path"
-    elif ".." in name.split("/"):
-        problem = 'has ".." in its path'
-    elif kind == stat.S_IFLNK:
-        problem = "is a symbolic link"
-    elif kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-        problem = "is not a plain file"
-    elif entry.flag_bits & 0x1:
-        problem = "is encrypted"
-    elif PurePosixPath(name).suffix.lower() in ARCHIVE_SUFFIXES:
-        problem = "is an archive inside the archive"
-    if problem is not None:
-        raise InputError(field, f"{name!r} in {label} {problem}.", "Zip plain files only, without links or passwords.")
-
-
-def _check_inflated(entries: list[zipfile.ZipInfo], field: str, path: Path, limits: ClipLimits) -> None:
-    """LimitError when the declared sizes add up to too much; InputError when members share compressed bytes."""
-    total = sum(entry.file_size for entry in entries)
-    if total > limits.decoded_bytes:
-        raise LimitError(
-            field,
-            f"{path.name} inflates to {total} bytes; the limit is {limits.decoded_bytes}.",
-            "Give a shorter clip.",
-        )
-    ordered = sorted(entries, key=lambda entry: entry.header_offset)
-    ends = [entry.header_offset + entry.compress_size for entry in ordered]
-    starts = [entry.header_offset for entry in ordered[1:]] + [path.stat().st_size]
-    if any(end > start for end, start in zip(ends, starts, strict=True)):
-        raise InputError(field, f"members of {path.name} overlap.", "Zip the files again.")
 
 
 def _without_wrapping(items: dict[str, _Item]) -> dict[str, _Item]:

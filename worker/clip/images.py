@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.clip_limits import MOST_IMAGE_BYTES
 from contract.errors import InputError
 from worker.clip.files import FileTree
-from worker.clip.limits import MOST_IMAGE_BYTES
 from worker.clip.types import RgbFrame
 
 MASK_THRESHOLD = 128  # of 255: masks are binary, but lossy video and resizing leave grey edges

@@ -13,11 +13,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.clip_limits import ClipLimits
 from contract.errors import InputError
 from contract.job import MaskPolarity
 from worker.clip.files import FileTree, check_exists, open_tree
 from worker.clip.images import MASK_THRESHOLD, ImageSequence, as_mask, open_images
-from worker.clip.limits import ClipLimits
 from worker.clip.naming import left_eye_only
 from worker.clip.video import VideoFile, open_video, open_video_in
 

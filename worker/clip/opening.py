@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import get_args
 
+from contract.clip_limits import MOST_CALIBRATION_BYTES, ClipLimits
 from contract.errors import InputError
 from contract.job import Layout, MaskPolarity, PoseConvention
 from worker.clip.endonerf import is_endonerf, read_endonerf
 from worker.clip.files import FileTree, check_exists, open_tree, scratch_folder
-from worker.clip.limits import MOST_CALIBRATION_BYTES, ClipLimits
 from worker.clip.masks import NO_MASKS, BrightClass, MaskFrames, open_masks
 from worker.clip.stereo_source import (
     STEREOMIS,

@@ -11,11 +11,11 @@ from typing import Literal
 
 import numpy as np
 
+from contract.clip_limits import SMALLEST_SIDE_PX, ClipLimits
 from contract.errors import InputError
 from contract.job import MaskPolarity
 from worker.clip.files import FileTree, open_tree
 from worker.clip.images import ImageSequence, open_images
-from worker.clip.limits import SMALLEST_SIDE_PX, ClipLimits
 from worker.clip.masks import BrightClass, MaskFrames, mask_names, tissue_from_masks
 from worker.clip.naming import eye_of, left_eye_only, pair_names
 from worker.clip.packing import (

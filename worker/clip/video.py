@@ -22,9 +22,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.clip_limits import ClipLimits
 from contract.errors import InputError
 from worker.clip.files import FileTree, scratch_folder
-from worker.clip.limits import ClipLimits
 from worker.clip.types import RgbFrame
 
 DECODERS: dict[str, tuple[bytes, ...]] = {  # decoder: how containers name its codec

@@ -89,7 +89,33 @@ def test_what_inflates_to_too_much_is_refused_before_it_is_read(tmp_path: Path) 
         open_clip(path, limits=ClipLimits(decoded_bytes=4_000_000))
 
 
-BOMB_BYTES = 64 << 20  # zeros: 64 kB in a zip
+BOMB = (np.random.default_rng(5).bytes(1 << 10) + bytes(127 << 10)) * 512
+"""64 MiB of zeros with a little noise, so that they shrink not quite as suspiciously: to less than 1 MiB in a zip."""
+
+
+def test_a_member_that_inflates_as_no_picture_does_is_refused(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "clip.zip", [(named(GOOD), bytes(2 << 20))])
+    with pytest.raises(LimitError, match=r"left/000000.png' in clip.zip inflates from \d+ to 2097152 bytes"):
+        open_clip(path)
+
+
+def test_names_that_differ_in_case_only_are_refused(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "clip.zip", [(named(GOOD), b"x"), (named(GOOD.upper()), b"y")])
+    with pytest.raises(InputError, match="twice"):
+        open_clip(path)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "problem"), [(10, 40_000, "40000 files"), (12, 1 << 30, "has 1073741824 bytes")]
+)
+def test_a_directory_beyond_any_clips_is_refused_unread(tmp_path: Path, at: int, value: int, problem: str) -> None:
+    path = write_zip(tmp_path / "clip.zip", [(named(GOOD), b"x")])
+    data = bytearray(path.read_bytes())
+    end = data.rindex(b"PK\x05\x06")
+    data[end + at : end + at + (2 if at == 10 else 4)] = value.to_bytes(2 if at == 10 else 4, "little")
+    path.write_bytes(data)
+    with pytest.raises(LimitError, match=problem):
+        open_clip(path)
 
 
 def peak_bytes_of_refusing(work: Callable[[], object]) -> int:
@@ -108,17 +134,17 @@ def test_a_member_larger_than_its_kind_can_be_is_refused_before_it_fills_the_mem
     """The images keep their right header and picture; zeros follow."""
     folder = studio.endonerf()
     with (folder / name).open("ab") as file:
-        file.write(bytes(BOMB_BYTES))
+        file.write(BOMB)
     path = studio.zip(folder)
-    assert path.stat().st_size < 500_000
-    assert peak_bytes_of_refusing(lambda: open_clip(path)) < BOMB_BYTES // 8
+    assert path.stat().st_size < 1_000_000
+    assert peak_bytes_of_refusing(lambda: open_clip(path)) < len(BOMB) // 8
 
 
 def test_a_calibration_larger_than_any_is_not_copied_out_of_a_zip(studio, tmp_path: Path) -> None:
     folder = studio.endonerf()
-    (folder / "calibration.json").write_bytes(bytes(BOMB_BYTES))
+    (folder / "calibration.json").write_bytes(BOMB)
     path = studio.zip(folder)
-    assert peak_bytes_of_refusing(lambda: find_calibration(path, tmp_path)) < BOMB_BYTES // 8
+    assert peak_bytes_of_refusing(lambda: find_calibration(path, tmp_path)) < len(BOMB) // 8
 
 
 def test_a_member_whose_content_is_damaged_is_named(studio) -> None:

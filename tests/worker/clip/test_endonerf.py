@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from contract.clip_limits import HELD_BYTES_PER_PIXEL
 from contract.errors import InputError, LimitError
 from worker.clip import ClipLimits, DepthClip, open_clip
-from worker.clip.limits import HELD_BYTES_PER_PIXEL
 
 
 def depth_clip(path: Path, **options) -> DepthClip:

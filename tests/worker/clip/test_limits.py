@@ -7,10 +7,10 @@ import os
 import numpy as np
 import pytest
 
+from contract.clip_limits import HELD_BYTES_PER_PIXEL, MOST_MEMORY_BYTES, memory_for_clip_bytes
 from contract.errors import LimitError
 from tests.worker.clips import HEIGHT, WIDTH, plane_clip
 from worker.clip import ClipLimits
-from worker.clip.limits import HELD_BYTES_PER_PIXEL, MOST_MEMORY_BYTES, memory_for_clip_bytes
 from worker.targets import TrainingFrames
 
 GIB = 1024**3

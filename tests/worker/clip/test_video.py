@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from contract.clip_limits import HELD_BYTES_PER_PIXEL
 from contract.errors import InputError, LimitError
 from worker.clip import ClipLimits, StereoClip, open_clip
-from worker.clip.limits import HELD_BYTES_PER_PIXEL
 
 DATA = Path(__file__).parents[2] / "data"
 SBS_H264 = DATA / "stereo_sbs_h264.mp4"

@@ -1,4 +1,4 @@
-"""How large a clip may be.
+"""How large a clip may be, to the service that takes it in and the worker that reads it.
 
 A 166 kB file can decode to 18 GB, so sizes are checked in the header and again while decoding.
 """
