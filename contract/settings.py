@@ -26,8 +26,23 @@ def _listed(value: object) -> object:
     return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
 
+def _value(source: Mapping[str, str], variable: str) -> str:
+    """What a variable holds, or the file that its namesake with _FILE names; empty if neither is set."""
+    path = source.get(f"{variable}_FILE")
+    if source.get(variable) or not path:
+        return source.get(variable, "")
+    try:
+        return Path(path).read_text().strip()
+    except (OSError, UnicodeError) as error:
+        problem = f"{path} cannot be read ({type(error).__name__})."
+        raise InputError(f"{variable}_FILE", problem, "Name a text file that this user may read.") from error
+
+
 class Settings(BaseModel):
-    """Each field `name` is read from `INTRASPLAT_NAME`; the queue's address alone has the customary name REDIS_URL."""
+    """Each field `name` is read from `INTRASPLAT_NAME`; the queue's address alone has the customary name REDIS_URL.
+
+    A variable with _FILE after its name (REDIS_URL_FILE) names a file that holds the value: for secrets.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -88,16 +103,13 @@ class Settings(BaseModel):
         """Read the settings from environment variables; empty ones count as unset.
 
         Raises:
-            InputError: a variable holds a value its setting does not accept.
+            InputError: a variable holds a value its setting does not accept, or names a file that cannot be read.
         """
         source = os.environ if environment is None else environment
-        values = {
-            name: source[ENVIRONMENT_PREFIX + name.upper()]
-            for name in cls.model_fields
-            if source.get(ENVIRONMENT_PREFIX + name.upper())
-        }
-        if source.get("REDIS_URL"):
-            values["redis_url"] = source["REDIS_URL"]
+        variables = {name: ENVIRONMENT_PREFIX + name.upper() for name in cls.model_fields}
+        values = {name: _value(source, variable) for name, variable in variables.items()}
+        values["redis_url"] = _value(source, "REDIS_URL") or values["redis_url"]
+        values = {name: value for name, value in values.items() if value}
         try:
             return cls.model_validate(values)
         except ValidationError as error:
