@@ -10,8 +10,11 @@ changes nothing (the attempt is the fence).
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from statistics import median
 from typing import Protocol
 
 from contract.errors import UnavailableError
@@ -28,6 +31,9 @@ LEASE_S = 8.0
 PREEMPT_AFTER_S = 1.0
 """A high-priority job that nobody has claimed for so long takes the place of a standard one."""
 
+YIELD_S = 20.0
+"""How long the worker that was told to make way may take before another is told too."""
+
 WORKER_TTL_S = 10.0
 """A worker that has not announced itself for this long is not live."""
 
@@ -36,11 +42,20 @@ ANNOUNCE_PERIOD_S = 2.0
 IDEMPOTENCY_S = 24 * 3600
 """How long a submission may be repeated under its idempotency key."""
 
+DURATIONS_KEPT = 20
+"""Done jobs from whose durations the next ones' are estimated."""
+
 LISTING_LIMIT = 200
 """GET /jobs shows the newest this many."""
 
 EVENTS_KEPT = 200
 """Of each job, for callers that come back and ask for what they missed."""
+
+DURATIONS_KEPT = 20
+"""How many of the last finished jobs the estimate of the next ones' end is made from."""
+
+EVENT_NUMBER = re.compile(r"(\d{1,19})(?:-(\d{1,19}))?", re.ASCII)
+"""Milliseconds, and a count within them."""
 
 
 class Order(StrEnum):
@@ -97,6 +112,16 @@ class QueueFullError(UnavailableError):
         super().__init__(problem, remedy)
         self.tenant = tenant
 
+    @classmethod
+    def for_tenant(cls, waiting: int) -> QueueFullError:
+        """The caller's own jobs fill its share."""
+        return cls(f"{waiting} of your jobs wait already.", "Wait until one has ended, or cancel one.", tenant=True)
+
+    @classmethod
+    def for_all(cls, waiting: int) -> QueueFullError:
+        """All jobs together fill the queue."""
+        return cls(f"{waiting} jobs wait already.", "Try again later, or start more workers.", tenant=False)
+
 
 class Queue(Protocol):
     """Every method is atomic and may be repeated when its answer was lost; those that change a job say what came of it.
@@ -122,8 +147,8 @@ class Queue(Protocol):
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
         """The next job, now running and owned; None after timeout_s.
 
-        First jobs that were released or whose lease has run out, then new ones; high priority before standard within
-        each. An owner holds one job at a time: while it holds one (because the answer to its claim was lost), it is
+        High priority before standard, so that a job that made way waits for the one it made way for; within each,
+        jobs that were released or whose lease has run out before new ones. An owner holds one job at a time: while it holds one (because the answer to its claim was lost), it is
         given that one again, as the same attempt. A job whose workers died MAX_ATTEMPTS times fails instead; one with
         cancel_requested ends as cancelled instead.
         """
@@ -205,7 +230,62 @@ class Queue(Protocol):
         ...
 
 
+def estimate(record: JobRecord, position: int | None, workers: int, durations_s: Sequence[float]) -> Standing:
+    """When a live job may be done, if it takes as long as the median of the last ones and as those before it.
+
+    position is None for a running job, whose own estimate of what is left comes before that of others.
+    """
+    if position is None and record.progress is not None and record.progress.seconds_left is not None:
+        return Standing(position=None, eta_s=record.progress.seconds_left)
+    if not durations_s or not workers:
+        return Standing(position=position, eta_s=None)
+    typical_s = median(durations_s)
+    if position is None:
+        return Standing(position=None, eta_s=max(0.0, typical_s - (time.time() - (record.started_at_s or 0.0))))
+    return Standing(position=position, eta_s=typical_s * (1 + (position + 1) / workers))
+
+
 def worker_died() -> JobError:
     """The error of a job that took MAX_ATTEMPTS workers down with it."""
     problem = f"The worker died {MAX_ATTEMPTS} times while it ran this job."
     return JobError(problem=problem, remedy="Try a shorter or smaller clip, and look at the worker's log.")
+
+
+def check_admission(admission: Admission, queued: int, queued_of_tenant: int) -> None:
+    """Refuse one job more when so many wait.
+
+    Raises:
+        QueueFullError: the tenant's share or the whole queue is used up.
+    """
+    if queued_of_tenant >= admission.queued_per_tenant:
+        problem = f"{queued_of_tenant} jobs of yours wait already; {admission.queued_per_tenant} may."
+        raise QueueFullError(problem, "Submit again when one of them has been started.", tenant=True)
+    if queued >= admission.queued:
+        raise QueueFullError(
+            f"{queued} jobs wait already; {admission.queued} may.", "Submit again later.", tenant=False
+        )
+
+
+def estimate_end_s(
+    durations_s: list[float], position: int | None, own_s: float, running_s: list[float], workers: int
+) -> float | None:
+    """Seconds until a job is done, if it and all before it take as long as the median of the last ones; None: unknown.
+
+    position: how many jobs wait before it, None while it runs itself, since own_s; running_s: how long each running
+    job has run; workers: how many are live and share the work.
+    """
+    if not durations_s:
+        return None
+    usual_s = median(durations_s)
+    if position is None:
+        return max(0.0, usual_s - own_s)
+    if workers == 0:
+        return None
+    left_s = sum(max(0.0, usual_s - ran_s) for ran_s in running_s)
+    return (left_s + position * usual_s) / workers + usual_s
+
+
+def event_order(number: str) -> tuple[int, int]:
+    """What event numbers are compared by; a number that no event can have comes before all."""
+    parts = EVENT_NUMBER.fullmatch(number)
+    return (int(parts[1]), int(parts[2] or 0)) if parts else (0, 0)
