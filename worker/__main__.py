@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import logging
 import signal
 import sys
 import threading
@@ -24,6 +23,7 @@ from contract.arguments import Commands, add_command, finite, positive
 from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
 from contract.job import Layout, MaskPolarity, PoseConvention, PresetName
+from contract.logs import configure
 from contract.progress_bar import ProgressBar
 from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
 from contract.settings import Settings
@@ -31,8 +31,6 @@ from contract.store import REPORT
 
 SUFFIX_FORMATS = {".png": ImageFormat.PNG, ".jpg": ImageFormat.JPEG, ".jpeg": ImageFormat.JPEG, ".npy": ImageFormat.NPY}
 MAX_RENDER_PIXELS = 8192 * 8192
-
-logger = logging.getLogger("intrasplat.worker")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,6 +56,7 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     _add_render(commands)
     _add_phantom(commands, wanted="phantom" in argv[:1])
     add_command(commands, "consume", "claim jobs from the queue and serve renders, until a signal ends it", _consume)
+    add_command(commands, "device", "what consume starts for itself: train and render as it is told on stdin", _device)
     add_command(commands, "doctor", "say what is installed, what would be used, what is missing", _doctor)
     return parser
 
@@ -137,8 +136,8 @@ def _frames(text: str) -> list[int]:
 
 def _reconstruct(options: argparse.Namespace) -> int:
     from worker.checkpoint import RESUME_FILE
-    from worker.consume import job_progress
     from worker.hooks import Hooks
+    from worker.orders import job_progress
     from worker.pipeline import ReconstructionRequest, reconstruct
 
     out: Path = options.out
@@ -239,17 +238,31 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _consume(options: argparse.Namespace) -> int:
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    settings = Settings.from_environment()
-    if settings.redis_url is None:
-        raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
-    from worker.process import run_worker
+    settings = _service_settings("worker")
+    from worker.supervisor import run_supervisor
 
     end = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: end.set())
-    run_worker(settings, end)
+    run_supervisor(settings, end)
     return ExitCode.OK
+
+
+def _device(options: argparse.Namespace) -> int:
+    settings = _service_settings("device")
+    from worker.device import run_device
+
+    run_device(settings)
+    return ExitCode.OK
+
+
+def _service_settings(process: str) -> Settings:
+    """Settings of a process of the service, which logs; it needs a queue."""
+    settings = Settings.from_environment()
+    configure(settings, process)
+    if settings.redis_url is None:
+        raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
+    return settings
 
 
 if __name__ == "__main__":

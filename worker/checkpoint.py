@@ -30,6 +30,7 @@ from torch import Tensor
 
 from contract.camera import Intrinsics
 from contract.errors import SceneError
+from contract.store import RESUME
 from worker.deformation import Deformation, restore
 from worker.gaussians import Gaussians
 
@@ -38,7 +39,7 @@ FORMAT_VERSION = 1
 """Raised when an older reader would misread what is written."""
 SCENE_FILE = "scene.safetensors"
 MANIFEST_FILE = "manifest.json"
-RESUME_FILE = "resume.safetensors"
+RESUME_FILE = RESUME
 
 
 @dataclass(frozen=True, eq=False)

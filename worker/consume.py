@@ -1,218 +1,266 @@
-"""The job loop: claim, reconstruct, settle. What a reconstruction is comes in as an argument.
+"""The job loop: claim, let the device child reconstruct, settle. No torch in here: nothing in this process can hang.
 
-A job ends in exactly one of done, failed and cancelled. If this process dies or is told to end before that, the next
-one of the same name gets the job again (contract/queue.py) and goes on from where training was stopped.
-
-Logs name jobs by their ids and errors by their kinds: the text of an error may hold the names of a caller's files.
+A job ends in exactly one of done, failed and cancelled. If the child dies the job is handed back and held against it;
+if this process is told to end, or to make way, it is handed back and a later attempt goes on from there; if this
+process dies its child dies with it, the claim runs out, and any worker takes the job again (contract/queue.py).
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import math
 import threading
 import time
-import traceback
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
 
-from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableError
-from contract.job import JobError, JobProgress, JobRecord
-from contract.queue import ANNOUNCE_PERIOD_S, Claim, Queue
-from contract.rendering import WorkerAddress
-from contract.store import Store
-from worker.checkpoint import RESUME_FILE
-from worker.hooks import Hooks, Progress
+from contract.errors import IntrasplatError, UnavailableError
+from contract.job import JobProgress, JobRecord, JobState
+from contract.queue import Claim, Order, Queue
+from contract.store import RESUME, Store
+from worker.child import DeviceChild, Ended, Keeper
+from worker.faults import describe
+from worker.heartbeat import Heartbeat
+from worker.liveness import Watch
+from worker.orders import Advanced, Failed, Finished, Run, Stop, Stopped, StopReason
 
 CLAIM_TIMEOUT_S = 2.0
-"""How soon an idle worker notices that it should end."""
+"""How soon an idle worker notices that it should end, or that its child has."""
 
-REPORT_PERIOD_S = 0.3
-"""Least time between two reports of one stage: each is a write that the queue's server puts on disk."""
+LOOK_PERIOD_S = 0.1
+"""How soon a new order of the queue, or a hang, is acted on."""
+
+STOP_LIMIT_S = 5.0
+"""A child that is told to stop has so long to keep the job's state; then it is killed."""
 
 UNREACHABLE_PAUSE_S = 1.0
-SILENCE_S = 5.0
-"""After a report that did not arrive there are none for so long: each try holds training up until it is given up."""
 
+STORE_PATIENCE_S = 60.0
+"""A store that fails for so long fails the job."""
+
+FETCHING = "fetch"
 PUBLISHING = "publish"
-"""The last stage a caller sees: the scene is put in its place."""
+"""The first and the last stage a caller sees: the clip is brought here, the scene put in its place."""
 
-FAULT_REMEDY = "This is a fault of intrasplat: please report it with the worker's log."
+WAIT_FOR_QUEUE = "the queue is away; the lease will run out"
 
-Work = Callable[[JobRecord, Path, Path, Hooks], object]
-"""work(record, spool folder, folder for the scene, hooks); raises Cancelled soon after hooks.should_stop().
-
-The folder is empty, or holds the RESUME_FILE that an attempt left when it was stopped.
-"""
+_Result = TypeVar("_Result")
 
 logger = logging.getLogger("intrasplat.worker")
 
 
-def consume(
-    queue: Queue,
-    store: Store,
-    owner: str,
-    work: Work,
-    end: threading.Event,
-    claim_timeout_s: float = CLAIM_TIMEOUT_S,
-) -> None:
-    """Take jobs one after the other until `end` is set."""
-    while not end.is_set():
-        try:
-            record = queue.claim(owner, claim_timeout_s)
-        except UnavailableError as error:
-            logger.warning("waiting for the queue: %s", error.problem)
-            end.wait(UNREACHABLE_PAUSE_S)
-            continue
-        if record is not None:
-            run_job(queue, store, record, work, end)
+@dataclass(frozen=True)
+class Died:
+    """The child is gone. excused: not because of the job; it had been told to stop, or had died before."""
+
+    cause: str
+    excused: bool
 
 
-def run_job(queue: Queue, store: Store, record: JobRecord, work: Work, end: threading.Event) -> None:
-    """Run one claimed job to its end; if `end` is set first, give it back for the next process of this name."""
+class Consumer:
+    """Takes jobs one after the other; job_id is that of the running one and may be read from any thread."""
+
+    def __init__(self, queue: Queue, store: Store, keeper: Keeper, owner: str, end: threading.Event) -> None:
+        self._queue = queue
+        self._store = store
+        self._keeper = keeper
+        self._owner = owner
+        self._end = end
+        self.job_id: str | None = None
+
+    def run(self, claim_timeout_s: float = CLAIM_TIMEOUT_S) -> None:
+        """Until `end` is set.
+
+        Raises:
+            UnavailableError: the child says that it cannot work here.
+        """
+        away = False
+        while (child := self._keeper.child(self._end)) is not None:
+            try:
+                record = self._queue.claim(self._owner, claim_timeout_s)
+            except UnavailableError as error:
+                if not away:
+                    logger.warning("waiting for the queue: %s", error.problem)
+                away = True
+                self._end.wait(UNREACHABLE_PAUSE_S)
+                continue
+            away = False
+            if record is not None:
+                self.job_id = record.job_id
+                run_job(self._queue, self._store, child, record, self._end)
+                self.job_id = None
+
+
+def run_job(queue: Queue, store: Store, child: DeviceChild, record: JobRecord, end: threading.Event) -> None:
+    """Run one claimed job to its end; if `end` is set first, hand it back."""
     assert record.owner is not None
     claim = Claim(record.job_id, record.attempt, record.owner)
-    if record.cancel_requested:  # its worker died before it could clear up
-        _withdraw(queue, store, claim, end)
-        return
-    reporter = _Reporter(queue, claim)
-    hooks = Hooks(on_progress=reporter.report, should_stop=lambda: reporter.cancelled or end.is_set())
-    logger.info("job %s: attempt %d starts", claim.job_id, claim.attempt)
+    log = _log_of(claim)
+    log.info("an attempt starts")
     started_s = time.monotonic()
-    settled: bool | None = False
-    try:
-        out = store.work_folder(claim.job_id, claim.attempt, keep=RESUME_FILE)
-        work(record, store.spool_folder(claim.job_id), out, hooks)
-        outcome = "done"
-        if reporter.may_publish():
-            store.publish_scene(claim.job_id, claim.attempt)
-            settled = _settle(lambda: queue.finish(claim), end)
-    except Cancelled:
-        outcome = "given back"
-        if not reporter.cancelled:
-            settled = _settle(lambda: queue.release(claim), end)
-    except Exception as error:
-        job_error = describe(error)
-        outcome = f"failed ({type(error).__name__})"
-        settled = _settle(lambda: queue.fail(claim, job_error), end)
-        if settled:
-            store.remove_attempt(claim.job_id, claim.attempt)
-    if settled:
-        logger.info("job %s: %s after %.1f s", claim.job_id, outcome, time.monotonic() - started_s)
-    elif settled is not None:
-        _withdraw(queue, store, claim, end)
+    with Heartbeat(queue, claim) as heart:
+        job = _Job(queue, store, claim, heart, end)
+        try:
+            outcome = job.settle(job.work(child, record))
+        except IntrasplatError as error:  # of the store; the child is idle
+            outcome = job.settle(job.without_store(error))
+        except Exception as error:
+            child.kill()
+            outcome = job.settle(Failed(error=describe(error), fault=type(error).__name__))
+    log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
 
 
-def describe(error: Exception) -> JobError:
-    """What the caller is told of an error; of one nobody foresaw only its kind, for its text may hold anything."""
-    if isinstance(error, InputError):
-        return JobError(problem=error.problem, field=error.field, remedy=error.remedy)
-    if isinstance(error, UnavailableError):
-        return JobError(problem=error.problem, remedy=error.remedy)
-    if isinstance(error, IntrasplatError):
-        return JobError(problem=str(error), remedy="The worker's log has the details.")
-    where = "".join(traceback.format_tb(error.__traceback__))
-    logger.error("a fault while a job ran: %s\n%s", type(error).__name__, where)
-    if isinstance(error, MemoryError):
-        return JobError(problem="The worker ran out of memory.", remedy="Send a shorter or smaller clip.")
-    return JobError(problem=f"A fault in the worker ({type(error).__name__}).", remedy=FAULT_REMEDY)
+def _log_of(claim: Claim) -> logging.LoggerAdapter[logging.Logger]:
+    """Lines that name the job by its id."""
+    return logging.LoggerAdapter(logger, {"job_id": claim.job_id, "attempt": claim.attempt})
 
 
-@contextlib.contextmanager
-def announced(queue: Queue, address: WorkerAddress) -> Iterator[None]:
-    """Say that this worker is live for as long as the context lasts."""
-    end = threading.Event()
+class _Job:
+    """One attempt: watched while the child works on it, then settled."""
 
-    def announce() -> None:
-        while not end.is_set():
-            with contextlib.suppress(UnavailableError):
-                queue.announce(address)
-            end.wait(ANNOUNCE_PERIOD_S)
-
-    thread = threading.Thread(target=announce, name="announce", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        end.set()
-        thread.join()
-        with contextlib.suppress(UnavailableError):
-            queue.withdraw(address.name)
-
-
-class _Reporter:
-    """Passes progress on to the queue, not too often, and hears from it that the job is cancelled."""
-
-    def __init__(self, queue: Queue, claim: Claim) -> None:
+    def __init__(self, queue: Queue, store: Store, claim: Claim, heart: Heartbeat, end: threading.Event) -> None:
         self._queue = queue
+        self._store = store
         self._claim = claim
-        self._last = Progress(stage="", fraction=0.0)
-        self._next_s = 0.0
-        self._silent_until_s = 0.0
-        self.cancelled = False
+        self._heart = heart
+        self._end = end
+        self._log = _log_of(claim)
 
-    def report(self, progress: Progress) -> None:
-        """Send it on, if it is time for another."""
-        now_s = time.monotonic()
-        same_stage = progress.stage == self._last.stage
-        if now_s < self._silent_until_s or (same_stage and now_s < self._next_s):
-            return
-        self._send(progress)
+    # the work
 
-    def may_publish(self) -> bool:
-        """Whether the job is still this attempt's, as far as the queue can be asked."""
-        self._send(replace(self._last, stage=PUBLISHING, fraction=1.0, seconds_left=0.0))
-        return not self.cancelled
+    def work(self, child: DeviceChild, record: JobRecord) -> Finished | Stopped | Failed | Died:
+        """Let the child reconstruct, stop it if that is wanted, and kill it if it hangs."""
+        job_id, attempt = self._claim.job_id, self._claim.attempt
+        self._heart.report(JobProgress(stage=FETCHING, fraction=0.0))
+        spool = self._with_patience(lambda: self._store.fetch_clip(job_id))
+        out = self._with_patience(lambda: self._store.work_folder(job_id, attempt, keep=RESUME))
+        if child.ended is not None:
+            return Died(child.ended.cause, excused=True)
+        child.send(Run(record=record, spool=spool, out=out))
+        watch, asked_s = Watch(), None
+        while True:
+            report = child.next_report(LOOK_PERIOD_S)
+            if isinstance(report, Finished | Stopped | Failed):
+                return report
+            if isinstance(report, Ended):
+                return Died(report.cause, excused=asked_s is not None)
+            if isinstance(report, Advanced):
+                watch.hear(report.progress)
+                self._heart.report(report.progress)
+            reason = self._reason_to_stop()
+            if asked_s is None and reason is not None:
+                child.send(Stop(reason=reason))
+                asked_s = time.monotonic()
+            if asked_s is not None and time.monotonic() - asked_s > STOP_LIMIT_S:
+                child.kill()
+                return Died(f"did not stop within {STOP_LIMIT_S:g} s and was killed", excused=True)
+            if watch.is_hung():
+                child.kill()
+                return Died(f"hung in stage {watch.stage!r} and was killed", excused=asked_s is not None)
 
-    def _send(self, progress: Progress) -> None:
-        if progress.psnr_db is None:  # a later stage measures none; what training reached stays visible
-            progress = replace(progress, psnr_db=self._last.psnr_db)
-        self._last = progress
+    def _reason_to_stop(self) -> StopReason | None:
+        reasons: dict[Order, StopReason] = {Order.CANCEL: "cancel", Order.LOST: "lost", Order.YIELD: "yield"}
+        return reasons.get(self._heart.order, "end" if self._end.is_set() else None)
+
+    def without_store(self, error: IntrasplatError) -> Failed | Died:
+        """What becomes of an attempt that the store fails: another is made if this one was to stop anyway."""
+        if self._reason_to_stop() is not None:
+            return Died("waited for the store", excused=True)
+        return Failed(error=describe(error), fault=type(error).__name__)
+
+    # its end
+
+    def settle(self, result: Finished | Stopped | Failed | Died) -> str:
+        """Tell the queue how the attempt ended, and tidy up; what came of it, for the log.
+
+        A queue that is away is asked again until `end` is set; after that nothing may be touched: the claim may have
+        ended as was said, or still stand.
+        """
+        if self._heart.order in (Order.CANCEL, Order.LOST):
+            return self._withdraw()
+        accepted, outcome = self._tell(result)
+        if accepted is None:
+            return WAIT_FOR_QUEUE
+        if not accepted:
+            return self._withdraw()
+        self._tidy(result)
+        return outcome
+
+    def _tell(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
+        """Whether the queue accepts how the attempt ended, None if it cannot be reached, and the end in words."""
+        if isinstance(result, Finished):
+            return self._publish(), "done"
+        if isinstance(result, Failed):
+            return self._insist(lambda: self._queue.fail(self._claim, result.error)), f"failed ({result.fault})"
+        died = isinstance(result, Died) and not result.excused
+        if isinstance(result, Died):
+            self._log.warning("the device process %s", result.cause)
+        if isinstance(result, Stopped) and result.checkpointed:
+            self._store.hand_over(self._claim.job_id, self._claim.attempt, RESUME)
+        accepted = self._insist(lambda: self._queue.release(self._claim, died=died))
+        return accepted, "handed back, its worker's death held against it" if died else "handed back"
+
+    def _publish(self) -> bool | None:
+        """Scene first, then the record: whoever sees the record done finds the scene."""
+        self._heart.report(JobProgress(stage=PUBLISHING, fraction=1.0, seconds_left=0.0))
+        order = self._insist(self._heart.beat)
+        if order is None or order in (Order.CANCEL, Order.LOST):
+            return None if order is None else False
+        self._with_patience(lambda: self._store.publish_scene(self._claim.job_id, self._claim.attempt))
+        return self._insist(lambda: self._queue.finish(self._claim))
+
+    def _withdraw(self) -> str:
+        """The job is cancelled, or not ours any more: remove all of it, or what this attempt has made."""
+        order = self._heart.order
+        if order not in (Order.CANCEL, Order.LOST):
+            order = self._insist(self._heart.beat) or order
+        if order is Order.CANCEL:
+            self._remove(lambda: self._store.purge(self._claim.job_id))
+            confirmed = self._insist(lambda: self._queue.confirm_cancel(self._claim))
+            return WAIT_FOR_QUEUE if confirmed is None else "cancelled"
+        if order is Order.LOST:
+            self._remove(lambda: self._store.remove_attempt(self._claim.job_id, self._claim.attempt))
+            return "lost to another attempt"
+        return WAIT_FOR_QUEUE
+
+    def _tidy(self, result: Finished | Stopped | Failed | Died) -> None:
+        """Remove what nobody needs after an end that was accepted."""
+        job_id, attempt = self._claim.job_id, self._claim.attempt
+        if isinstance(result, Finished):
+            self._remove(lambda: self._store.remove_other_attempts(job_id, attempt))
+        elif isinstance(result, Failed) or (isinstance(result, Died) and self._is_given_up()):
+            self._remove(lambda: self._store.remove_attempt(job_id, attempt))
+
+    def _is_given_up(self) -> bool:
+        """Whether that was one death too many."""
+        record = self._insist(lambda: self._queue.get(self._claim.job_id))
+        return record is not None and record.state is JobState.FAILED
+
+    def _insist(self, ask: Callable[[], _Result]) -> _Result | None:
+        """Ask the queue as often as it takes to reach it; None if `end` comes first."""
+        while True:
+            try:
+                return ask()
+            except UnavailableError as error:
+                self._log.warning("waits for the queue: %s", error.problem)
+                if self._end.wait(UNREACHABLE_PAUSE_S):
+                    return None
+
+    def _with_patience(self, work: Callable[[], _Result]) -> _Result:
+        """Let the store do something, again if it fails for a while; the beats go on."""
+        deadline_s = time.monotonic() + STORE_PATIENCE_S
+        while True:
+            try:
+                return work()
+            except UnavailableError as error:
+                if time.monotonic() > deadline_s or self._reason_to_stop() is not None:
+                    raise
+                self._log.warning("waits for the store: %s", error.problem)
+                self._end.wait(UNREACHABLE_PAUSE_S)
+
+    def _remove(self, work: Callable[[], object]) -> None:
+        """What cannot be removed now does not change how the job ended; the service sweeps."""
         try:
-            self.cancelled = not self._queue.progress(self._claim, job_progress(progress)) or self.cancelled
-        except UnavailableError:
-            # A queue that is away does not stop the work: the result is settled when it is back.
-            self._silent_until_s = time.monotonic() + SILENCE_S
-        self._next_s = time.monotonic() + REPORT_PERIOD_S
-
-
-def job_progress(progress: Progress) -> JobProgress:
-    """The report as the contract has it: fraction in [0, 1], no numbers that JSON cannot hold."""
-    return JobProgress(
-        stage=progress.stage,
-        fraction=min(1.0, max(0.0, progress.fraction)) if math.isfinite(progress.fraction) else 0.0,
-        iteration=progress.iteration,
-        iterations=progress.iterations,
-        psnr_db=_finite(progress.psnr_db),
-        seconds_left=_finite(progress.seconds_left),
-    )
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
-
-
-def _settle(settle: Callable[[], bool], end: threading.Event) -> bool | None:
-    """Tell the queue how the job ended, as often as it takes to reach it; None if `end` comes first.
-
-    After None nothing may be touched: the job may have ended as was said, or still be this worker's.
-    """
-    while True:
-        try:
-            return settle()
+            work()
         except UnavailableError as error:
-            logger.warning("the result waits for the queue: %s", error.problem)
-            if end.wait(UNREACHABLE_PAUSE_S):
-                return None
-
-
-def _withdraw(queue: Queue, store: Store, claim: Claim, end: threading.Event) -> None:
-    """The job was cancelled, or is no longer ours: remove what this attempt made."""
-    cancelled = _settle(lambda: queue.confirm_cancel(claim), end)
-    if cancelled:
-        store.remove(claim.job_id)
-        logger.info("job %s: cancelled", claim.job_id)
-    elif cancelled is not None:
-        store.remove_attempt(claim.job_id, claim.attempt)
+            self._log.warning("files were not removed: %s", error.problem)

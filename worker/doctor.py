@@ -109,7 +109,7 @@ def _packages() -> list[Finding]:
 def _device(settings: Settings) -> list[Finding]:
     try:
         torch = importlib.import_module("torch")
-        device = importlib.import_module("worker.process").training_device(settings.device)
+        device = importlib.import_module("worker.device").training_device(settings.device)
     except ImportError:
         return []  # said above
     except UnavailableError as error:

@@ -105,12 +105,14 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
             hooks=hooks,
             copy_scene=lambda: snapshot_of(run, clip, split, scale, request.seed),
         )
+        seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
+        hooks.on_progress(Progress("finish", 0.0, run.iteration, run.iterations))
+        scene = timed(seconds, "finish_s", lambda: scene_of(run, clip, split, scale, request.seed))
+        scored = reporting(run, view_of, split, hooks)
+        report = report_of(run, clip, split, scene, request, seconds, scored, accepted_at_s)
     except Cancelled:
-        save_run(out_dir, run, clock.elapsed_s)
+        save_run(out_dir, run, seconds.get("t_train_s", clock.elapsed_s))
         raise
-    seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
-    scene = timed(seconds, "finish_s", lambda: scene_of(run, clip, split, scale, request.seed))
-    report = report_of(run, clip, split, scene, request, seconds, reporting(run, view_of, split, hooks), accepted_at_s)
     hooks.on_progress(Progress("score", 1.0, run.iteration, run.iterations, report.psnr_tissue_db))
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)
@@ -206,6 +208,7 @@ def prepare(
         tracks = timed(
             seconds, "motion_s", lambda: track(clip, split.train, lambda share: report_stage(hooks, "motion", share))
         )
+    report_stage(hooks, "start", 0.0)
     model = timed(
         seconds, "start_s", lambda: start_model(cloud, tracks, clip, split.train, preset, scale, request.seed)
     )

@@ -179,7 +179,8 @@ def train(
             share = iteration / run.iterations
             hooks.on_progress(Progress("train", share, iteration, run.iterations, scored, left_s))
     _check_finite(run)
-    _score(run, clock, evaluate)
+    if not run.curve or run.curve[-1].iteration < run.iteration:  # else it was stopped after its last score
+        _score(run, clock, evaluate)
 
 
 def _check_finite(run: Run) -> None:

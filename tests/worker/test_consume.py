@@ -1,70 +1,63 @@
-"""The job loop on a real queue and store, with small reconstructions that do what a test needs."""
+"""The job loop on a real queue, a real store and a child process that does what a clip tells it (standin.py)."""
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from contract.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
-from contract.job import JobError, JobFiles, JobProgress, JobRecord, JobState
-from contract.queue import MAX_ATTEMPTS, Claim
+from contract.errors import UnavailableError
+from contract.job import JobError, JobFiles, JobOptions, JobProgress, JobRecord, JobState
+from contract.queue import MAX_ATTEMPTS, Claim, Order
 from contract.queue_memory import MemoryQueue
 from contract.rendering import WorkerAddress
-from contract.store import MANIFEST, Store, new_job_id
-from worker.checkpoint import RESUME_FILE
-from worker.consume import announced, consume, job_progress
-from worker.hooks import Hooks, Progress
+from contract.store import MANIFEST, RESUME, Store, new_job_id
+from worker import child, consume, liveness
+from worker.child import Keeper
+from worker.consume import Consumer
+from worker.supervisor import address_of, announced
 
-WAIT_S = 10.0
-
-
-def writes_a_scene(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
-    assert (spool / record.files.clip).read_bytes() == b"frames"
-    hooks.on_progress(Progress("train", 0.5, 5, 10, psnr_db=30.0, seconds_left=1.0))
-    (out / MANIFEST).write_text("{}")
+WAIT_S = 20.0
+STANDIN = Path(__file__).with_name("standin.py")
+ENDED = (JobState.DONE, JobState.FAILED, JobState.CANCELLED)
 
 
-def waits_to_be_stopped(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while time.monotonic() < deadline:
-        hooks.on_progress(Progress("train", 0.1))
-        if hooks.should_stop():
-            raise Cancelled
-        time.sleep(0.01)
-    raise AssertionError("nobody asked to stop")
-
-
-def raises(error: Exception) -> Callable[[JobRecord, Path, Path, Hooks], None]:
-    def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
-        (out / "half").write_text("written")
-        raise error
-
-    return work
+def eventually(holds: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + WAIT_S
+    while not holds():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
 
 
 class Bench:
-    """A queue, a store and a worker thread."""
+    """A queue, a store and a worker in a thread, with a child process."""
 
-    def __init__(self, data_dir: Path) -> None:
-        self.queue = MemoryQueue()
+    def __init__(self, data_dir: Path, queue: MemoryQueue | None = None, *arguments: str) -> None:
+        self.queue = queue or MemoryQueue()
         self.store = Store(data_dir)
         self.end = threading.Event()
+        self.keeper = Keeper([sys.executable, str(STANDIN), *arguments])
+        self.consumer = Consumer(self.queue, self.store, self.keeper, "worker-1.a", self.end)
         self.thread: threading.Thread | None = None
 
-    def submit(self) -> str:
-        record = JobRecord(job_id=new_job_id(), files=JobFiles(clip="clip.mp4"), created_at_s=time.time())
-        (self.store.open_incoming(record.job_id) / "clip.mp4").write_bytes(b"frames")
+    def submit(self, clip: str, **options: object) -> str:
+        files, chosen = JobFiles(clip="clip.mp4"), JobOptions.model_validate(options)
+        record = JobRecord(job_id=new_job_id(), files=files, options=chosen, created_at_s=time.time())
+        (self.store.open_incoming(record.job_id) / "clip.mp4").write_text(clip)
         self.store.accept(record)
         self.queue.submit(record)
         return record.job_id
 
-    def start(self, work: Callable[[JobRecord, Path, Path, Hooks], None]) -> None:
-        arguments = (self.queue, self.store, "worker-1", work, self.end, 0.02)
-        self.thread = threading.Thread(target=consume, args=arguments)
+    def start(self) -> None:
+        self.end.clear()
+        self.thread = threading.Thread(target=self.consumer.run, args=(0.05,))
         self.thread.start()
 
     def stop(self) -> None:
@@ -78,268 +71,350 @@ class Bench:
         return record
 
     def wait_for(self, job_id: str, *states: JobState) -> JobRecord:
-        deadline = time.monotonic() + WAIT_S
-        while self.record(job_id).state not in states:
-            assert time.monotonic() < deadline, self.record(job_id)
-            time.sleep(0.005)
+        eventually(lambda: self.record(job_id).state in states)
         return self.record(job_id)
 
-    def files_of(self, job_id: str) -> list[Path]:
-        return [path for path in self.store.data_dir.rglob("*") if path.name.startswith(job_id)]
+    def wait_for_step(self, job_id: str, attempt: int = 1) -> None:
+        """Until this attempt trains."""
+
+        def trains() -> bool:
+            record = self.record(job_id)
+            return record.attempt == attempt and record.progress is not None and record.progress.iteration > 0
+
+        eventually(trains)
+
+    def outcome(self, clip: str) -> JobRecord:
+        job_id = self.submit(clip)
+        self.start()
+        return self.wait_for(job_id, *ENDED)
+
+    def child_id(self) -> int:
+        eventually(lambda: self.keeper.live is not None)
+        live = self.keeper.live
+        assert live is not None
+        return live.process_id
+
+    def files_of(self, job_id: str, area: str = "") -> list[Path]:
+        return [path for path in (self.store.data_dir / area).rglob("*") if path.name.startswith(job_id)]
+
+    def went_on_from(self, record: JobRecord) -> str:
+        folder = self.store.scene_folder(record.job_id, record.attempt)
+        text: str = json.loads((folder / MANIFEST).read_text())["went_on_from"]
+        return text
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
-    return Bench(tmp_path)
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path)
+    yield bench
+    bench.stop()
+    bench.keeper.stop()
 
 
-def run(bench: Bench, work: Callable[[JobRecord, Path, Path, Hooks], None]) -> JobRecord:
-    job_id = bench.submit()
-    bench.start(work)
-    try:
-        return bench.wait_for(job_id, JobState.DONE, JobState.FAILED, JobState.CANCELLED)
-    finally:
-        bench.stop()
-
-
-def test_a_reconstruction_that_returns_makes_its_job_done_and_its_scene_visible(bench: Bench) -> None:
-    record = run(bench, writes_a_scene)
+def test_a_reconstruction_that_finishes_makes_its_job_done_and_its_scene_visible(bench: Bench) -> None:
+    record = bench.outcome("publish")
+    bench.stop()
     assert record.state is JobState.DONE
-    assert bench.store.scene_ids() == [record.job_id]
+    assert bench.store.has_scene(record.job_id, record.attempt)
     assert record.progress is not None
     assert record.progress.psnr_db == 30.0
-    assert list((bench.store.data_dir / "work").iterdir()) == []
+    assert bench.files_of(record.job_id, "work") == []
+
+
+def test_one_child_does_many_jobs(bench: Bench) -> None:
+    jobs = [bench.submit("publish"), bench.submit("fail"), bench.submit("publish")]
+    before = None
+    bench.start()
+    before = bench.child_id()
+    states = [bench.wait_for(job_id, *ENDED).state for job_id in jobs]
+    assert states == [JobState.DONE, JobState.FAILED, JobState.DONE]
+    assert bench.child_id() == before
 
 
 def test_an_input_error_fails_the_job_with_its_field_and_remedy(bench: Bench) -> None:
-    record = run(bench, raises(InputError("masks", "they cover everything.", "Invert them.")))
+    record = bench.outcome("fail")
+    bench.stop()
     assert record.state is JobState.FAILED
     assert record.error == JobError(problem="they cover everything.", field="masks", remedy="Invert them.")
-    assert bench.store.scene_ids() == []
-    assert list((bench.store.data_dir / "work").iterdir()) == []
+    assert bench.files_of(record.job_id, "work") == bench.files_of(record.job_id, "scenes") == []
 
 
-@pytest.mark.parametrize(
-    ("error", "says"),
-    [
-        (TrainingDiverged("NaN after 12 iterations."), "NaN after 12"),
-        (UnavailableError("No CUDA device.", "Use --device cpu."), "No CUDA device"),
-        (MemoryError(), "out of memory"),
-        (ValueError("patient Smith"), "A fault in the worker (ValueError)"),
-    ],
-)
-def test_every_other_error_fails_the_job_and_says_why(bench: Bench, error: Exception, says: str) -> None:
-    record = run(bench, raises(error))
-    assert record.state is JobState.FAILED
-    assert record.error is not None
-    assert says in record.error.problem
-    assert record.error.remedy
-    assert "Smith" not in record.model_dump_json()
+def test_what_a_library_prints_in_the_child_changes_nothing(bench: Bench) -> None:
+    assert bench.outcome("noise").state is JobState.DONE
 
 
-def test_the_worker_goes_on_after_a_failed_job(bench: Bench) -> None:
-    broken, sound = bench.submit(), bench.submit()
+@pytest.mark.parametrize("death", ["SIGSEGV", "SIGKILL", "SIGABRT", "exit"])
+def test_a_child_that_dies_is_replaced_at_once_and_its_job_runs_again(bench: Bench, death: str) -> None:
+    record = bench.outcome(f"{death} publish")
+    assert (record.state, record.attempt, record.released) == (JobState.DONE, 2, 0)
 
-    def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
-        (raises(ValueError()) if record.job_id == broken else writes_a_scene)(record, spool, out, hooks)
 
-    bench.start(work)
-    assert bench.wait_for(broken, JobState.FAILED).state is JobState.FAILED
-    assert bench.wait_for(sound, JobState.DONE).state is JobState.DONE
+def test_a_job_that_takes_every_child_down_fails_and_leaves_no_work(bench: Bench) -> None:
+    record = bench.outcome("SIGSEGV")
     bench.stop()
+    assert (record.state, record.attempt) == (JobState.FAILED, MAX_ATTEMPTS)
+    assert record.error is not None
+    assert "died" in record.error.problem
+    assert bench.files_of(record.job_id, "work") == []
+
+
+def test_a_child_without_memory_is_named_in_the_log(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", logger="intrasplat.worker"):
+        record = bench.outcome("SIGKILL publish")
+        bench.stop()
+    assert "SIGKILL (was there not enough memory?)" in caplog.text
+    assert {getattr(line, "job_id", record.job_id) for line in caplog.records} == {record.job_id}
+
+
+def test_a_hung_job_is_killed_and_runs_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(liveness, "STAGE_LIMITS_S", {"train": 0.3})
+    record = bench.outcome("hang publish")
+    assert (record.state, record.attempt, record.released) == (JobState.DONE, 2, 0)
+
+
+def test_a_child_that_died_idle_is_not_held_against_the_next_job(bench: Bench) -> None:
+    bench.start()
+    os.kill(bench.child_id(), signal.SIGKILL)
+    record = bench.record(bench.submit("publish"))
+    record = bench.wait_for(record.job_id, *ENDED)
+    assert record.state is JobState.DONE
+    assert record.attempt == record.released + 1
 
 
 def test_cancelling_a_running_job_stops_it_and_removes_every_file_of_it(bench: Bench) -> None:
-    job_id = bench.submit()
-    bench.start(waits_to_be_stopped)
-    bench.wait_for(job_id, JobState.RUNNING)
+    job_id = bench.submit("wait")
+    bench.start()
+    bench.wait_for_step(job_id)
+    child_id = bench.child_id()
     bench.queue.cancel(job_id)
-    assert bench.wait_for(job_id, JobState.CANCELLED, JobState.DONE).state is JobState.CANCELLED
-    bench.stop()
+    assert bench.wait_for(job_id, *ENDED).state is JobState.CANCELLED
     assert bench.files_of(job_id) == []
+    assert bench.child_id() == child_id
 
 
-def test_a_job_cancelled_in_its_last_moment_publishes_nothing(bench: Bench) -> None:
-    def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
-        writes_a_scene(record, spool, out, hooks)
-        bench.queue.cancel(record.job_id)
+@pytest.mark.parametrize("word", ["deaf", "hang"])
+def test_a_cancelled_job_that_does_not_stop_is_killed(bench: Bench, monkeypatch: pytest.MonkeyPatch, word: str) -> None:
+    monkeypatch.setattr(consume, "STOP_LIMIT_S", 0.3)
+    job_id, after = bench.submit(word), bench.submit("publish")
+    bench.start()
+    bench.wait_for_step(job_id)
+    bench.queue.cancel(job_id)
+    assert bench.wait_for(job_id, *ENDED).state is JobState.CANCELLED
+    assert bench.files_of(job_id) == []
+    assert bench.wait_for(after, *ENDED).state is JobState.DONE
 
-    record = run(bench, work)
+
+class Lane(MemoryQueue):
+    """A queue that does something else just before a call, or whose connection is cut from then on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.before: dict[str, Callable[[Claim], object]] = {}
+        self.cut = threading.Event()
+
+    def beat(self, claim: Claim, progress: JobProgress | None = None) -> Order:
+        self._pass("beat", claim)
+        return super().beat(claim, progress)
+
+    def finish(self, claim: Claim) -> bool:
+        self._pass("finish", claim)
+        return super().finish(claim)
+
+    def fail(self, claim: Claim, error: JobError) -> bool:
+        self._pass("fail", claim)
+        return super().fail(claim, error)
+
+    def release(self, claim: Claim, *, died: bool = False) -> bool:
+        self._pass("release", claim)
+        return super().release(claim, died=died)
+
+    def _pass(self, name: str, claim: Claim) -> None:
+        if self.cut.is_set():
+            raise UnavailableError("The lane is cut.", "Wait.")
+        act = self.before.pop(name, None)
+        if act is not None:
+            act(claim)
+
+
+@pytest.fixture
+def lane(tmp_path: Path) -> Iterator[tuple[Bench, Lane]]:
+    lane = Lane()
+    bench = Bench(tmp_path, lane)
+    yield bench, lane
+    bench.stop()
+    bench.keeper.stop()
+
+
+@pytest.mark.parametrize(
+    ("clip", "call"), [("publish", "beat"), ("publish", "finish"), ("fail", "fail"), ("SIGSEGV", "release")]
+)
+def test_a_cancel_in_the_last_moment_ends_as_cancelled_and_leaves_nothing(
+    lane: tuple[Bench, Lane], clip: str, call: str
+) -> None:
+    bench, queue = lane
+    queue.before[call] = lambda claim: queue.cancel(claim.job_id)
+    record = bench.outcome(clip)
+    bench.stop()
     assert record.state is JobState.CANCELLED
     assert bench.files_of(record.job_id) == []
 
 
-def test_a_worker_that_is_told_to_end_leaves_its_job_to_the_next(bench: Bench) -> None:
-    job_id = bench.submit()
-    bench.start(waits_to_be_stopped)
-    bench.wait_for(job_id, JobState.RUNNING)
-    bench.stop()
-    assert bench.record(job_id).state is JobState.QUEUED
-    bench.end.clear()
-    bench.start(writes_a_scene)
-    assert bench.wait_for(job_id, JobState.DONE).attempt == 2
-    bench.stop()
+def test_an_attempt_that_was_thought_dead_publishes_nothing(lane: tuple[Bench, Lane]) -> None:
+    bench, queue = lane
+    others: list[JobRecord | None] = []
 
+    def be_taken_over(claim: Claim) -> None:
+        assert MemoryQueue.release(queue, claim)
+        others.append(queue.claim("worker-2.b", 0.0))
 
-def test_any_number_of_polite_restarts_ends_in_a_scene_and_each_goes_on_from_the_one_before(bench: Bench) -> None:
-    steps: list[int] = []
-
-    def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
-        state = out / RESUME_FILE
-        steps.append(int(state.read_text()) + 1 if state.exists() else 0)
-        if len(steps) > 2 * MAX_ATTEMPTS:
-            writes_a_scene(record, spool, out, hooks)
-            return
-        state.write_text(str(steps[-1]))
-        (out / "half").write_text("written")
-        bench.end.set()
-        waits_to_be_stopped(record, spool, out, hooks)
-
-    job_id = bench.submit()
-    for _ in range(2 * MAX_ATTEMPTS):
-        bench.end.clear()
-        consume(bench.queue, bench.store, "worker-1", work, bench.end, 0.0)
-        assert bench.record(job_id).state is JobState.QUEUED
-    bench.end.clear()
-    bench.start(work)
-    assert bench.wait_for(job_id, JobState.DONE, JobState.FAILED).state is JobState.DONE
-    bench.stop()
-    assert steps == list(range(2 * MAX_ATTEMPTS + 1))
-    assert not (bench.store.scene_folder(job_id) / "half").exists()
-    assert list((bench.store.data_dir / "work").iterdir()) == []
-
-
-class Lane(MemoryQueue):
-    """A queue whose connection can be cut."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.cut = threading.Event()
-        self.reports = 0
-
-    def progress(self, claim: Claim, progress: JobProgress) -> bool:
-        self.reports += 1
-        self._pass()
-        return super().progress(claim, progress)
-
-    def finish(self, claim: Claim) -> bool:
-        self._pass()
-        return super().finish(claim)
-
-    def fail(self, claim: Claim, error: JobError) -> bool:
-        self._pass()
-        return super().fail(claim, error)
-
-    def release(self, claim: Claim) -> bool:
-        self._pass()
-        return super().release(claim)
-
-    def _pass(self) -> None:
-        if self.cut.is_set():
-            raise UnavailableError("The lane is cut.", "Wait.")
-
-
-def finishes(record: JobRecord, out: Path) -> None:
-    (out / MANIFEST).write_text("{}")
-
-
-def breaks(record: JobRecord, out: Path) -> None:
-    raise ValueError
-
-
-def is_stopped(record: JobRecord, out: Path) -> None:
-    raise Cancelled
-
-
-@pytest.mark.parametrize(("ends", "kept"), [(finishes, "scenes"), (breaks, "work"), (is_stopped, "work")])
-def test_a_worker_that_must_end_while_the_queue_is_away_touches_nothing(
-    tmp_path: Path, ends: Callable[[JobRecord, Path], None], kept: str
-) -> None:
-    bench, lane = Bench(tmp_path), Lane()
-    bench.queue = lane
-    job_id = bench.submit()
-
-    def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
-        lane.cut.set()
-        bench.end.set()
-        ends(record, out)
-
-    consume(lane, bench.store, "worker-1", work, bench.end, 0.0)
+    queue.before["finish"] = be_taken_over
+    job_id = bench.submit("publish")
+    bench.start()
+    eventually(lambda: bool(others) and bench.consumer.job_id is None)
+    assert bench.record(job_id).owner == "worker-2.b"
     assert bench.record(job_id).state is JobState.RUNNING
-    assert bench.store.spool_folder(job_id).is_dir()
-    assert [path.name.split(".")[0] for path in (bench.store.data_dir / kept).iterdir()] == [job_id]
+    assert bench.files_of(job_id, "scenes") == bench.files_of(job_id, "work") == []
+    assert bench.store.fetch_clip(job_id).is_dir()
 
 
-def test_a_queue_that_is_away_is_not_tried_again_at_every_report(tmp_path: Path) -> None:
-    bench, lane = Bench(tmp_path), Lane()
-    bench.queue = lane
-    job_id = bench.submit()
+def test_a_job_that_was_taken_over_is_stopped(bench: Bench) -> None:
+    job_id = bench.submit("wait")
+    bench.start()
+    bench.wait_for_step(job_id)
+    assert bench.queue.release(Claim(job_id, 1, "worker-1.a"))
+    assert bench.queue.claim("worker-2.b", 0.0) is not None
+    eventually(lambda: bench.consumer.job_id is None)
+    assert bench.record(job_id).owner == "worker-2.b"
+    assert bench.files_of(job_id, "work") == []
 
-    def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
-        lane.cut.set()
-        for stage in ("decode", "depth", "train"):
-            hooks.on_progress(Progress(stage, 0.5))
-        assert lane.reports == 1
-        lane.cut.clear()
-        (out / MANIFEST).write_text("{}")
 
-    bench.start(work)
-    assert bench.wait_for(job_id, JobState.DONE, JobState.FAILED).state is JobState.DONE
+def test_a_worker_that_is_told_to_end_hands_its_job_back_and_any_number_of_times(bench: Bench) -> None:
+    polite = 2 * MAX_ATTEMPTS
+    job_id = bench.submit(" ".join(["wait"] * polite + ["publish"]))
+    for attempt in range(1, polite + 1):
+        bench.start()
+        bench.wait_for_step(job_id, attempt)
+        bench.stop()
+        assert bench.record(job_id).state is JobState.QUEUED
+    bench.start()
+    record = bench.wait_for(job_id, *ENDED)
     bench.stop()
+    assert record.state is JobState.DONE
+    assert bench.went_on_from(record) == "x" * polite
+    assert not (bench.store.scene_folder(job_id, record.attempt) / "half").exists()
+    assert bench.files_of(job_id, "work") == []
 
 
-def test_a_job_that_was_cancelled_while_its_worker_was_dead_leaves_no_file(bench: Bench) -> None:
-    job_id = bench.submit()
-    died = bench.queue.claim("worker-1", 0.0)
-    assert died is not None
-    (bench.store.work_folder(job_id, died.attempt) / "half").write_text("written")
-    bench.queue.cancel(job_id)
-    bench.start(writes_a_scene)
-    bench.wait_for(job_id, JobState.CANCELLED, JobState.DONE)
+def test_a_worker_that_is_told_to_end_does_not_wait_for_a_deaf_child(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(consume, "STOP_LIMIT_S", 0.3)
+    job_id = bench.submit("deaf")
+    bench.start()
+    bench.wait_for_step(job_id)
     bench.stop()
-    assert bench.record(job_id).state is JobState.CANCELLED
-    assert bench.files_of(job_id) == []
+    assert (bench.record(job_id).state, bench.record(job_id).released) == (JobState.QUEUED, 1)
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        ValueError("smith.png"),
-        InputError("clip", "smith.png is no picture.", "Send one."),
-        TrainingDiverged("smith.png diverged."),
-    ],
-)
-def test_the_log_names_jobs_by_their_ids_only(bench: Bench, error: Exception, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level("INFO", logger="intrasplat.worker"):
-        record = run(bench, raises(error))
-    assert record.job_id in caplog.text
-    assert type(error).__name__ in caplog.text
-    assert "smith" not in caplog.text
-
-
-def test_an_attempt_that_lost_its_job_publishes_nothing(bench: Bench) -> None:
-    def work(record: JobRecord, spool: Path, out: Path, hooks: Hooks) -> None:
-        writes_a_scene(record, spool, out, hooks)
-        taken_over = bench.queue.claim("worker-1", 0.0)
-        assert taken_over is not None
-        bench.queue.fail(Claim(record.job_id, taken_over.attempt, "worker-1"), JobError(problem="elsewhere"))
-
-    record = run(bench, work)
+def test_a_standard_job_makes_way_for_a_high_priority_one_and_goes_on_later(bench: Bench) -> None:
+    standard = bench.submit("wait publish")
+    bench.start()
+    bench.wait_for_step(standard)
+    high = bench.submit("publish", priority="high")
+    first, second = bench.wait_for(high, *ENDED), bench.wait_for(standard, *ENDED)
     bench.stop()
-    assert record.state is JobState.FAILED
-    assert bench.store.scene_ids() == []
+    assert (first.state, second.state) == (JobState.DONE, JobState.DONE)
+    assert first.finished_at_s is not None
+    assert second.started_at_s is not None
+    assert first.finished_at_s <= second.started_at_s
+    assert (second.attempt, second.released) == (2, 1)
+    assert bench.went_on_from(second) == "x"
 
 
-def test_a_worker_is_announced_while_it_lives(bench: Bench) -> None:
-    address = WorkerAddress(name="worker-1", endpoint="ipc:///x", device="cpu")
-    with announced(bench.queue, address):
-        deadline = time.monotonic() + WAIT_S
-        while bench.queue.workers() != [address]:
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-    assert bench.queue.workers() == []
+@pytest.mark.parametrize("clip", ["wait", "SIGSEGV"])
+def test_a_worker_that_must_end_while_the_queue_is_away_touches_nothing(lane: tuple[Bench, Lane], clip: str) -> None:
+    bench, queue = lane
+    job_id = bench.submit(clip)
+
+    def cut(claim: Claim) -> None:
+        queue.cut.set()
+        raise UnavailableError("The lane is cut.", "Wait.")
+
+    queue.before["release"] = cut
+    bench.start()
+    if clip == "wait":
+        bench.wait_for_step(job_id)
+    else:
+        eventually(queue.cut.is_set)
+    bench.stop()
+    assert bench.record(job_id).state is JobState.RUNNING
+    assert bench.store.fetch_clip(job_id).is_dir()
+    assert [path.name for path in bench.files_of(job_id, "work")] == [f"{job_id}.1"]
 
 
-def test_progress_holds_only_numbers_that_json_can() -> None:
-    odd = Progress("train", 1.5, psnr_db=float("nan"), seconds_left=float("inf"))
-    assert job_progress(odd) == JobProgress(stage="train", fraction=1.0)
+def test_a_result_waits_for_a_queue_that_is_away(lane: tuple[Bench, Lane]) -> None:
+    bench, queue = lane
+
+    def cut(claim: Claim) -> None:
+        queue.cut.set()
+        threading.Timer(0.2, queue.cut.clear).start()
+        raise UnavailableError("The lane is cut.", "Wait.")
+
+    queue.before["finish"] = cut
+    record = bench.outcome("publish")
+    assert record.state is JobState.DONE
+    assert bench.store.has_scene(record.job_id, record.attempt)
+
+
+def test_a_clip_that_is_gone_fails_its_job(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(consume, "STORE_PATIENCE_S", 0.0)
+    lost, sound = bench.submit("publish"), bench.submit("publish")
+    bench.store.purge(lost)
+    bench.start()
+    assert bench.wait_for(lost, *ENDED).state is JobState.FAILED
+    assert bench.wait_for(sound, *ENDED).state is JobState.DONE
+
+
+def test_a_child_that_dies_at_its_start_is_not_started_in_a_hurry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(child, "FIRST_PAUSE_S", 0.05)
+    bench = Bench(tmp_path, None, "dies")
+    bench.start()
+    eventually(lambda: "starts in 0.2 s" in caplog.text)
+    bench.stop()
+    pauses = [line.getMessage().rsplit(" ", 2)[1] for line in caplog.records if "before it was ready" in line.msg]
+    assert pauses[:3] == ["0.05", "0.1", "0.2"]
+
+
+def test_a_child_that_cannot_work_here_ends_the_worker_with_its_remedy(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, None, "unable")
+    with pytest.raises(UnavailableError, match=r"no such device.*INTRASPLAT_DEVICE"):
+        bench.consumer.run(0.0)
+    bench.keeper.stop()
+
+
+def test_a_worker_is_announced_with_its_job_and_scenes_while_its_child_lives(bench: Bench) -> None:
+    job_id = bench.submit("wait")
+    with announced(bench.queue, "worker-1", lambda: address_of("worker-1", bench.keeper, bench.consumer)):
+        assert bench.queue.workers() == []
+        bench.start()
+        told = WorkerAddress(
+            name="worker-1", endpoint="ipc:///nowhere", device="cpu", job_id=job_id, scenes=("a" * 32,)
+        )
+        eventually(lambda: bench.queue.workers() == [told])
+        bench.stop()
+        bench.keeper.stop()
+        eventually(lambda: bench.queue.workers() == [])
+
+
+def test_the_state_of_an_attempt_goes_to_the_next(bench: Bench) -> None:
+    job_id = bench.submit("wait SIGSEGV publish")
+    bench.start()
+    bench.wait_for_step(job_id)
+    bench.stop()
+    assert (bench.store.data_dir / "work" / f"{job_id}.1" / RESUME).exists()
+    bench.start()
+    record = bench.wait_for(job_id, *ENDED)
+    assert (record.state, record.attempt, record.released) == (JobState.DONE, 3, 1)
+    assert bench.went_on_from(record) == "x"

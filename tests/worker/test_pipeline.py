@@ -15,7 +15,7 @@ import pytest
 from contract.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
 from contract.report import Report
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, bits, phantom_clip, prepared_on, trained, view
-from worker.checkpoint import RESUME_FILE, load_scene
+from worker.checkpoint import RESUME_FILE, load_resume, load_scene
 from worker.clip import DepthClip, open_clip, split_frames
 from worker.hooks import Hooks, Progress
 from worker.metrics import coverage
@@ -109,7 +109,9 @@ def test_the_report_tells_what_was_done(clip: Path, tmp_path: Path) -> None:
         "compile",
         "fusion",
         "motion",
+        "start",
         "train",
+        "finish",
         "score",
     ]
 
@@ -130,6 +132,21 @@ def test_a_stopped_run_goes_on_in_its_folder(name: str, clip: Path, tmp_path: Pa
     assert files(tmp_path / "stopped") == SCENE_FILES
     assert tensor_bits(tmp_path / "stopped") == tensor_bits(tmp_path / "whole")
     assert (resumed.frames, resumed.iterations) == (whole.frames, whole.iterations)
+
+
+def test_a_run_stopped_while_it_is_scored_goes_on_from_there(clip: Path, tmp_path: Path) -> None:
+    whole = run(clip, tmp_path / "whole", preset="fast")
+    stages: set[str] = set()
+    hooks = Hooks(lambda progress: stages.add(progress.stage), lambda: "score" in stages)
+    with pytest.raises(Cancelled, match="scoring"):
+        run(clip, tmp_path / "stopped", hooks, preset="fast")
+    assert load_resume(tmp_path / "stopped")[1]["iteration"] == ITERATIONS
+    resumed = run(clip, tmp_path / "stopped", preset="fast")
+    assert tensor_bits(tmp_path / "stopped") == tensor_bits(tmp_path / "whole")
+    assert resumed.frames == whole.frames
+    assert len((tmp_path / "stopped" / "curve.csv").read_text().splitlines()) == len(
+        (tmp_path / "whole" / "curve.csv").read_text().splitlines()
+    )
 
 
 def test_a_stopped_run_with_a_budget_keeps_its_schedule(clip: Path, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from worker.__main__ import main
 from worker.checkpoint import RESUME_FILE, load_resume
 from worker.hooks import Hooks
 from worker.pipeline import ReconstructionRequest
-from worker.process import request_of, run_or_start_anew, training_device
+from worker.device import request_of, run_or_start_anew, training_device
 
 SPOOL = Path("spool")
 CHOSEN = {

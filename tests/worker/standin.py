@@ -1,0 +1,107 @@
+"""A device child without torch: `python standin.py` does to each attempt what its clip says.
+
+The clip's text is a list of words, one for each attempt; the last stands for all further ones.
+
+    publish    advance, write a scene, finish            wait     advance until told to stop, keep the state
+    fail       fail with an InputError's fields          deaf     advance for ever
+    noise      print what is no report, then publish     hang     advance once, then say nothing for ever
+    SIGKILL, SIGSEGV, ...   die of that signal           exit     end with status 3
+
+The words "unable" and "dies", as arguments of the program, spoil its start.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+STATE = "resume.safetensors"
+
+
+def tell(kind: str, **fields: object) -> None:
+    """One report."""
+    print(json.dumps({"kind": kind, **fields}), flush=True)
+
+
+def advance(step: int, **fields: object) -> None:
+    """Say that training has come to this step of 1000."""
+    progress = {"stage": "train", "fraction": step % 1000 / 1000, "iteration": step, "iterations": 1000}
+    tell("advanced", progress=progress | fields)
+
+
+def publish(out: Path) -> None:
+    """A scene that went on from what an earlier attempt kept."""
+    advance(500, psnr_db=30.0, seconds_left=1.0)
+    steps = (out / STATE).read_text() if (out / STATE).exists() else ""
+    (out / STATE).unlink(missing_ok=True)
+    (out / "manifest.json").write_text(json.dumps({"went_on_from": steps}))
+    tell("finished")
+
+
+def wait(out: Path, stop: threading.Event) -> None:
+    """Work that never ends by itself; each attempt leaves a mark in the state it keeps."""
+    (out / "half").write_text("written")
+    step = 0
+    while not stop.wait(0.01):
+        step += 1
+        advance(step)
+    with (out / STATE).open("a") as file:
+        file.write("x")
+    tell("stopped", checkpointed=True)
+
+
+def run(word: str, out: Path, stop: threading.Event) -> None:
+    """One attempt."""
+    if word in ("publish", "noise"):
+        if word == "noise":
+            print("a library's chatter\n{}", flush=True)
+        publish(out)
+    elif word == "wait":
+        wait(out, stop)
+    elif word == "fail":
+        (out / "half").write_text("written")
+        error = {"problem": "they cover everything.", "field": "masks", "remedy": "Invert them."}
+        tell("failed", error=error, fault="InputError")
+    elif word == "exit":
+        os._exit(3)
+    elif word.startswith("SIG"):
+        advance(1)
+        os.kill(os.getpid(), signal.Signals[word])
+    for step in range(1, sys.maxsize) if word == "deaf" else (1,) if word == "hang" else ():
+        advance(step)
+        time.sleep(0.01)
+    if word == "hang":
+        time.sleep(3600)
+
+
+def main() -> None:
+    """Obey orders until they end."""
+    if "dies" in sys.argv:
+        sys.exit(7)
+    if "unable" in sys.argv:
+        tell("unable", problem="There is no such device.", remedy="Set INTRASPLAT_DEVICE.")
+        sys.exit(1)
+    tell("ready", endpoint="ipc:///nowhere", device="cpu")
+    tell("holding", scenes=["a" * 32])
+    stop = threading.Event()
+    for line in sys.stdin:
+        order: dict[str, Any] = json.loads(line)
+        if order["kind"] == "stop":
+            stop.set()
+            continue
+        stop = threading.Event()
+        record = order["record"]
+        words = (Path(order["spool"]) / record["files"]["clip"]).read_text().split()
+        word = words[min(record["attempt"], len(words)) - 1]
+        threading.Thread(target=run, args=(word, Path(order["out"]), stop), daemon=True).start()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,253 @@
+"""The device child: owns torch, kernels and models, trains one job at a time, and answers renders beside it.
+
+It belongs to a supervisor (worker/supervisor.py), obeys worker/orders.py, and dies with it, however that dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import queue
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from pydantic import BaseModel
+
+from contract.embedded import short_socket_path
+from contract.errors import Cancelled, InputError, UnavailableError
+from contract.job import JobRecord
+from contract.processes import die_with_parent
+from contract.settings import Settings
+from contract.store import Store, open_store
+from worker.checkpoint import RESUME_FILE
+from worker.faults import describe
+from worker.hooks import Hooks, Progress
+from worker.orders import (
+    Advanced,
+    Failed,
+    Finished,
+    Holding,
+    Ready,
+    Run,
+    Stopped,
+    Unable,
+    job_progress,
+    line_of,
+    read_order,
+)
+from worker.pipeline import ReconstructionRequest, check_device, reconstruct
+from worker.raster.cpu import compile_kernels
+from worker.serve import RequestServer
+from worker.snapshot import Snapshots
+from worker.views import Views
+
+REPORT_PERIOD_S = 0.1
+"""Least time between two reports from one stage."""
+
+AFTERGLOW_S = 10.0
+"""The last snapshot of a finished job is shown for so long, until the service knows of the scene."""
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+def run_device(settings: Settings) -> None:
+    """Obey the orders on stdin; never returns but by an error at the start, for the end of the orders ends the process.
+
+    Raises:
+        UnavailableError: the device is not one to train on, or the endpoint not one to listen at.
+    """
+    die_with_parent()
+    channel = Channel.instead_of_stdout()
+    orders = Orders(sys.stdin.buffer)
+    try:
+        device = training_device(settings.device)
+    except UnavailableError as error:
+        channel.send(Unable(problem=error.problem, remedy=error.remedy))
+        raise
+    store, snapshots = open_store(settings), Snapshots()
+    # What is unpacked of clips stays in the data directory, and does not outlive the next start.
+    tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
+    started_s = time.monotonic()
+    compile_kernels()
+    logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
+    views = Views(store, snapshots, settings.hot_bytes)
+
+    def tell_what_is_held() -> None:
+        views.forget_purged()
+        channel.send_if_new(Holding(scenes=views.held))
+
+    endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
+    with RequestServer(endpoint, views.answer, between=tell_what_is_held, render_secret=settings.render_secret):
+        channel.send(Ready(endpoint=endpoint, device=device))
+        logger.info("the device process is ready on %s", device)
+        shown = ""
+        while True:
+            task = orders.next(AFTERGLOW_S)
+            if task is None:
+                snapshots.drop(shown)
+            else:
+                shown = task.run.record.job_id
+                channel.send(work_on(task, device, snapshots, channel))
+
+
+class Channel:
+    """Where reports go; for any thread."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._lock = threading.Lock()
+        self._last: dict[type[BaseModel], BaseModel] = {}
+
+    @classmethod
+    def instead_of_stdout(cls) -> Channel:
+        """Takes stdout for itself: whatever else is printed from now on goes to stderr."""
+        sys.stdout.flush()
+        own = os.dup(sys.stdout.fileno())  # not inherited by processes that are started from here
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        return cls(os.fdopen(own, "wb"))
+
+    def send(self, message: BaseModel) -> None:
+        """Write one report. A supervisor that is gone ends this process by other means."""
+        with self._lock, contextlib.suppress(BrokenPipeError):
+            self._stream.write(line_of(message))
+            self._stream.flush()
+
+    def send_if_new(self, message: BaseModel) -> None:
+        """Write a report unless it says what the last of its kind said; for one thread."""
+        if self._last.get(type(message)) != message:
+            self._last[type(message)] = message
+            self.send(message)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A job that was ordered, and whether its end was since."""
+
+    run: Run
+    stop: threading.Event = field(default_factory=threading.Event)
+
+
+class Orders:
+    """Reads orders in a thread of its own; at their end it ends the process, whatever else goes on in it."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
+        threading.Thread(target=self._read, name="orders", daemon=True).start()
+
+    def next(self, timeout_s: float) -> Task | None:
+        """The next job; None after timeout_s."""
+        try:
+            return self._tasks.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def _read(self) -> None:
+        task: Task | None = None
+        for line in self._stream:
+            order = read_order(line)
+            if isinstance(order, Run):
+                task = Task(order)
+                self._tasks.put(task)
+            elif task is not None:
+                task.stop.set()
+        os._exit(0)  # nothing here is worth keeping: what is durable is on disk already
+
+
+def work_on(task: Task, device: str, snapshots: Snapshots, channel: Channel) -> Finished | Stopped | Failed:
+    """Run one job; every error is its end and not this process's."""
+    run = task.run
+    reporter = _Reporter(channel)
+    hooks = Hooks(
+        on_progress=reporter.report,
+        should_stop=task.stop.is_set,
+        wants_snapshot=snapshots.wanted,
+        on_snapshot=snapshots.offer,
+    )
+    snapshots.begin(run.record.job_id)
+    try:
+        run_or_start_anew(request_of(run.record, run.spool, device), run.out, hooks)
+    except Cancelled:
+        snapshots.drop(run.record.job_id)
+        return Stopped(checkpointed=(run.out / RESUME_FILE).exists())
+    except Exception as error:
+        snapshots.drop(run.record.job_id)
+        return Failed(error=describe(error), fault=type(error).__name__)
+    return Finished()
+
+
+class _Reporter:
+    """Passes progress on, not too often; for any thread."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+        self._stage = ""
+        self._next_s = 0.0
+
+    def report(self, progress: Progress) -> None:
+        """Send it, if it is time for another."""
+        now_s = time.monotonic()
+        if progress.stage == self._stage and now_s < self._next_s:
+            return
+        self._stage, self._next_s = progress.stage, now_s + REPORT_PERIOD_S
+        self._channel.send(Advanced(progress=job_progress(progress)))
+
+
+def request_of(record: JobRecord, spool: Path, device: str) -> ReconstructionRequest:
+    """The reconstruction that a job asks for, with its files where the store keeps them."""
+    files, options = record.files, record.options
+    return ReconstructionRequest(
+        clip=spool / files.clip,
+        right=spool / files.right if files.right else None,
+        layout=options.layout,
+        calibration=spool / files.calibration if files.calibration else None,
+        masks=spool / files.masks if files.masks else None,
+        mask_polarity=options.mask_polarity,
+        pose_convention=options.pose_convention,
+        holdout=options.holdout,
+        preset=options.preset,
+        budget_s=options.budget_s,
+        iterations=options.iterations,
+        device=device,
+        seed=options.seed,
+        accepted_at_s=record.created_at_s,
+    )
+
+
+def run_or_start_anew(request: ReconstructionRequest, out: Path, hooks: Hooks) -> None:
+    """Reconstruct; from the beginning if the state in `out` is damaged, or of an earlier version of this program."""
+    resumes = (out / RESUME_FILE).exists()
+    try:
+        reconstruct(request, out, hooks)
+    except InputError as error:
+        if error.field != "--out" or not resumes:
+            raise
+        logger.warning("the stored state is of no use to this version; training starts anew")
+        (out / RESUME_FILE).unlink()
+        reconstruct(request, out, hooks)
+
+
+def training_device(device: str) -> str:
+    """The device that jobs are trained on, where INTRASPLAT_DEVICE is `device`.
+
+    Raises:
+        UnavailableError: this version cannot train there.
+    """
+    try:
+        check_device(device)
+    except UnavailableError as error:
+        raise UnavailableError(error.problem, "Set INTRASPLAT_DEVICE to auto or cpu.") from error
+    return "cpu"
+
+
+def _socket_endpoint(store: Store, name: str) -> str:
+    """A unix socket in the data directory, cleared of what an earlier process of this name left."""
+    path = short_socket_path(store.run_dir, f"{name}.sock")
+    path.unlink(missing_ok=True)
+    return f"ipc://{path}"
