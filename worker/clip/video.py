@@ -24,40 +24,19 @@ from numpy.typing import NDArray
 
 from contract.clip_limits import ClipLimits
 from contract.errors import InputError
+from contract.video_header import CODECS, REMEDY, check_video, is_matroska
 from worker.clip.files import FileTree, scratch_folder
 from worker.clip.types import RgbFrame
 
-DECODERS: dict[str, tuple[bytes, ...]] = {  # decoder: how containers name its codec
-    "h264": (b"avc1", b"avc3", b"V_MPEG4/ISO/AVC"),
-    "hevc": (b"hvc1", b"hev1", b"V_MPEGH/ISO/HEVC"),
-    "vp9": (b"vp09", b"V_VP9"),
-}
 MISSING_FRAMES_ALLOWED = 1  # containers that store a duration instead of a count round it
 FALLBACK_RATE_HZ = 30.0
 
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm"
-_REMEDY = "Give H.264, HEVC or VP9 video in mp4, mov, mkv or webm."
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
-_EBML = b"\x1aE\xdf\xa3"  # first bytes of Matroska and WebM
 _SILENT = 0  # OpenCV's own messages
 _QUIET = "-8"  # AV_LOG_QUIET: what a refused decoder says is not for the user
 _environment_lock = threading.Lock()  # OpenCV takes these options from the environment only, which the process shares
-
-_OTHER_CODECS = {  # how containers name the codecs people are likely to bring
-    b"av01": "AV1",
-    b"V_AV1": "AV1",
-    b"V_VP8": "VP8",
-    b"mp4v": "MPEG-4 part 2",
-    b"jpeg": "Motion JPEG",
-    b"mjpg": "Motion JPEG",
-    b"V_MJPEG": "Motion JPEG",
-    b"apch": "ProRes",
-    b"apcn": "ProRes",
-    b"V_FFV1": "FFV1",
-    b"V_MPEG4/ISO/ASP": "MPEG-4 part 2",
-}
-_CODEC_SCAN_BYTES = 1 << 18  # the track description stands at the head or, in streamed mp4, at the tail
 
 
 @dataclass(frozen=True)
@@ -99,20 +78,14 @@ def open_video(path: Path, field: str, limits: ClipLimits, label: str | None = N
     Raises InputError when it is no video, its codec is not allowed, or it ends early; LimitError when it is too large.
     """
     label = label or path.name
-    if not _has_container_magic(path):
-        raise InputError(field, f"{label} is not an mp4, mov, mkv or webm file.", _REMEDY)
-    names = _codec_names(path)
+    codec = check_video(path, field, label, limits).codec
     # the order only saves failed attempts: what a file says of itself does not choose the decoder
-    for decoder in sorted(DECODERS, key=lambda decoder: not any(sign in names for sign in DECODERS[decoder])):
+    for decoder in sorted(CODECS, key=lambda decoder: codec not in CODECS[decoder]):
         with _capture(path, decoder) as capture:
             if capture is not None:
                 return _survey(capture, path, field, limits, label, decoder)
-    codec = next((codec for sign, codec in _OTHER_CODECS.items() if sign in names), None)
-    if codec is not None:
-        raise InputError(field, f"{label} is encoded as {codec}, which is not accepted.", _REMEDY)
-    raise InputError(
-        field, f"{label} cannot be decoded: it is damaged, or its codec is none of {', '.join(DECODERS)}.", _REMEDY
-    )
+    problem = f"{label} cannot be decoded: it is damaged, or its codec is none of {', '.join(CODECS)}."
+    raise InputError(field, problem, REMEDY)
 
 
 def open_video_in(tree: FileTree, name: str) -> VideoFile:
@@ -164,7 +137,7 @@ def _whole_despite_count(
     Matroska stores a duration, and declared is that times the nominal rate: frames of varying length may be fewer, as
     long as they last to the end. An mp4 cut without re-encoding keeps frames that its edit list hides: these count.
     """
-    if _is_matroska(path):
+    if is_matroska(path):
         if times_s is None or len(times_s) < 2:
             return False
         return bool(declared / rate_hz - times_s[-1] <= (1 + MISSING_FRAMES_ALLOWED) * np.diff(times_s).max())
@@ -208,26 +181,6 @@ def _capture(path: Path, decoder: str, more_options: str = "") -> Iterator[Any |
         yield capture if capture.isOpened() else None
     finally:
         capture.release()
-
-
-def _has_container_magic(path: Path) -> bool:
-    """ISO base media files (mp4, mov) name a box at byte 4; Matroska and WebM open with the EBML sign."""
-    with path.open("rb") as stream:
-        head = stream.read(12)
-    return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip") or head.startswith(_EBML)
-
-
-def _is_matroska(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return stream.read(4) == _EBML
-
-
-def _codec_names(path: Path) -> bytes:
-    """The parts of the file in which containers name their codecs."""
-    with path.open("rb") as stream:
-        head = stream.read(_CODEC_SCAN_BYTES)
-        stream.seek(max(0, path.stat().st_size - _CODEC_SCAN_BYTES))
-        return head + stream.read(_CODEC_SCAN_BYTES)
 
 
 def _cut_short(field: str, label: str, found: int, declared: int) -> InputError:

@@ -176,7 +176,7 @@ def test_a_video_cut_in_half_is_refused(studio, tmp_path: Path) -> None:
     whole = studio.video("clip.webm", np.concatenate([left, right], axis=2))
     cut = tmp_path / "cut.webm"
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    with pytest.raises(InputError, match=r"ends after|cannot be decoded") as caught:
+    with pytest.raises(InputError, match="ends after") as caught:
         open_clip(cut)
     assert caught.value.field == "clip"
 
@@ -187,14 +187,14 @@ def test_an_mp4_whose_media_data_is_missing_is_refused(tmp_path: Path) -> None:
     data[start + 1500 : start + 5000] = bytes(3500)
     path = tmp_path / "holes.mp4"
     path.write_bytes(data)
-    with pytest.raises(InputError, match=r"ends after|cannot be decoded"):
+    with pytest.raises(InputError, match="has no header"):
         open_clip(path)
 
 
 def test_an_mp4_cut_before_its_index_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "cut.mp4"
     path.write_bytes(SBS_H264.read_bytes()[:3000])
-    with pytest.raises(InputError, match="cannot be decoded"):
+    with pytest.raises(InputError, match="ends after the file does"):
         open_clip(path)
 
 
