@@ -10,6 +10,7 @@ changes nothing (the attempt is the fence).
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,9 +51,6 @@ LISTING_LIMIT = 200
 
 EVENTS_KEPT = 200
 """Of each job, for callers that come back and ask for what they missed."""
-
-DURATIONS_KEPT = 20
-"""How many of the last finished jobs the estimate of the next ones' end is made from."""
 
 EVENT_NUMBER = re.compile(r"(\d{1,19})(?:-(\d{1,19}))?", re.ASCII)
 """Milliseconds, and a count within them."""
@@ -148,9 +146,9 @@ class Queue(Protocol):
         """The next job, now running and owned; None after timeout_s.
 
         High priority before standard, so that a job that made way waits for the one it made way for; within each,
-        jobs that were released or whose lease has run out before new ones. An owner holds one job at a time: while it holds one (because the answer to its claim was lost), it is
-        given that one again, as the same attempt. A job whose workers died MAX_ATTEMPTS times fails instead; one with
-        cancel_requested ends as cancelled instead.
+        jobs that were released or whose lease has run out before new ones. An owner holds one job at a time: while it
+        holds one (because the answer to its claim was lost), it is given that one again, as the same attempt. A job
+        whose workers died MAX_ATTEMPTS times fails instead; one with cancel_requested ends as cancelled instead.
         """
         ...
 
