@@ -36,7 +36,8 @@ def main() -> int:
     queue = RedisQueue(settings.redis_url)
     try:
         queue.ping()
-        app = create_app(settings, queue, Store(settings.data_dir), ZmqRenderer(queue, settings.render_timeout_s))
+        renderer = ZmqRenderer(queue, settings.render_timeout_s, settings.render_secret)
+        app = create_app(settings, queue, Store(settings.data_dir), renderer)
     except UnavailableError as error:
         print(error, file=sys.stderr)
         return ExitCode.UNAVAILABLE

@@ -13,7 +13,7 @@ from fastapi.staticfiles import StaticFiles
 from contract.queue import Queue
 from contract.settings import Settings
 from contract.store import Store
-from service import jobs, reconstruct, renders, scenes, system, tus
+from service import jobs, reconstruct, renders, scenes, stream, system, tus
 from service.audit import install_refusal_handler
 from service.deps import Deps
 from service.guard import LOOPBACK_NAMES, Guard
@@ -60,8 +60,8 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     app.add_middleware(Measure, metrics=deps.metrics)
     install_handlers(app)
     install_refusal_handler(app, deps.audit)
-    for router in (reconstruct.router, tus.router, jobs.router, renders.router, scenes.router, system.router):
-        app.include_router(router)
+    for part in (reconstruct, tus, jobs, renders, stream, scenes, system):
+        app.include_router(part.router)
     if settings.dashboard_dir is not None:
         app.mount("/", StaticFiles(directory=settings.dashboard_dir, html=True), name="dashboard")
     return app

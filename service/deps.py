@@ -21,6 +21,7 @@ from contract.settings import Settings
 from contract.store import Store, is_job_id
 from service.access import Access, Caller, Refusal, key_missing
 from service.audit import Audit
+from service.done import DoneJobs
 from service.events import Feeds
 from service.intake import Intake
 from service.limits import Limiter
@@ -51,6 +52,7 @@ class Deps:
     purger: Purger = field(init=False)
     retention: Retention = field(init=False)
     metrics: Metrics = field(init=False)
+    done: DoneJobs = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "access", Access(self.settings))
@@ -62,6 +64,7 @@ class Deps:
         object.__setattr__(self, "purger", Purger(self.queue, self.store, self.audit))
         object.__setattr__(self, "retention", Retention(self.settings, self.queue, self.store, self.purger))
         object.__setattr__(self, "metrics", Metrics(self.queue, self.store))
+        object.__setattr__(self, "done", DoneJobs(self.queue, self.store))
 
 
 def _deps_of(connection: HTTPConnection) -> Deps:

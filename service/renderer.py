@@ -1,38 +1,28 @@
-"""The way from the service to the worker that renders: one lasting ZeroMQ connection a worker, many requests on it."""
+"""Which worker is asked for a render, and who is asked instead when that one does not answer."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
+import hashlib
 import logging
+import math
 import time
-import zlib
-from dataclasses import dataclass
 from typing import Protocol
 
-import zmq
 import zmq.asyncio
-from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from contract.errors import UnavailableError
-from contract.queue import Queue
-from contract.rendering import ExportRequest, RenderRequest, WorkerAddress, WorkerReply, WorkerRequest
+from contract.queue import WORKER_TTL_S, Queue
+from contract.rendering import ExportRequest, RenderRequest, ReplyError, WorkerAddress, WorkerReply
+from service.connection import Answer, Connection, WorkerGoneError
 
 WORKER_REMEDY = "Start one with `intrasplat up`, or `python -m worker consume`."
 ADDRESSES_VALID_S = 1.0
-"""How long the list of live workers is used before the queue is asked again."""
+"""How long the list of live workers is used before the queue is asked again, beside the renders that go on."""
 
 logger = logging.getLogger("intrasplat.service")
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A worker's answer: its head, and the encoded image or file."""
-
-    head: WorkerReply
-    body: bytes
 
 
 class Renderer(Protocol):
@@ -48,89 +38,110 @@ class Renderer(Protocol):
 
 
 class ZmqRenderer:
-    """Asks the live workers that the queue lists; the same scene goes to the same worker, which keeps it loaded."""
+    """Asks the live workers that the queue lists.
 
-    def __init__(self, queue: Queue, timeout_s: float) -> None:
+    A running job is shown by the worker that runs it. A finished scene any worker can show: one that holds it is asked,
+    or else always the same one, which will; and if that one is gone or mute, another, once.
+    """
+
+    def __init__(self, queue: Queue, timeout_s: float, render_secret: str | None = None) -> None:
         self._queue = queue
         self._timeout_s = timeout_s
+        self._render_secret = render_secret
         self._context: zmq.asyncio.Context | None = None
-        self._connections: dict[str, _Connection] = {}
+        self._connections: dict[str, Connection] = {}
         self._addresses: list[WorkerAddress] = []
-        self._addresses_until_s = 0.0
+        self._read_s = self._heard_s = -math.inf
+        self._reading: asyncio.Task[None] | None = None
 
     async def ask(self, request: RenderRequest | ExportRequest) -> Answer:
-        address = await self._choose(request.scene_id)
-        connection = self._connections.get(address.endpoint)
-        if connection is None:
-            self._context = self._context or zmq.asyncio.Context()
-            connection = self._connections[address.endpoint] = _Connection(self._context, address.endpoint)
+        workers = await self._workers_for(request)
+        if not workers:
+            problem = f"No worker runs job {request.scene_id} yet."
+            return Answer(WorkerReply(error=ReplyError(kind="not-yet", problem=problem, field="scene")), b"")
+        until_s = time.monotonic() + self._timeout_s
+        first, *others = workers
+        if others:
+            with contextlib.suppress(WorkerGoneError, TimeoutError):
+                return await asyncio.wait_for(self._ask(first, request), self._timeout_s / 2)
+            first = others[0]
         try:
-            return await asyncio.wait_for(connection.ask(WorkerRequest(request=request)), self._timeout_s)
+            return await asyncio.wait_for(self._ask(first, request), until_s - time.monotonic())
         except TimeoutError:
             problem = f"The worker did not answer within {self._timeout_s:g} s."
-            raise UnavailableError(problem, "Ask again, or look at the worker's log.") from None
+            raise UnavailableError(problem, _remedy(first)) from None
+        except WorkerGoneError:
+            raise UnavailableError("The worker is gone.", _remedy(first)) from None
+
+    async def _ask(self, address: WorkerAddress, request: RenderRequest | ExportRequest) -> Answer:
+        return await (await self._connection(address)).ask(request)
 
     async def close(self) -> None:
-        for connection in self._connections.values():
-            await connection.close()
-        self._connections.clear()
+        if self._reading is not None:
+            await self._reading
+        for endpoint in list(self._connections):
+            await self._connections.pop(endpoint).close()
         if self._context is not None:
             self._context.term()
             self._context = None
 
-    async def _choose(self, scene_id: str) -> WorkerAddress:
-        if time.monotonic() > self._addresses_until_s:
-            try:
-                self._addresses = await run_in_threadpool(self._queue.workers)
-            except UnavailableError as error:
-                # Renders do not need the queue: go on with the workers that were known.
-                logger.warning("the queue does not answer; using the workers known before: %s", error.problem)
-            self._addresses_until_s = time.monotonic() + ADDRESSES_VALID_S
+    async def _workers_for(self, request: RenderRequest | ExportRequest) -> list[WorkerAddress]:
+        """Who can answer, best first; none if a job is asked for that nobody runs.
+
+        Raises:
+            UnavailableError: there is no worker at all.
+        """
+        addresses = await self._live()
+        if request.attempt is not None:
+            return sorted(addresses, key=lambda address: self._preference(address, request.scene_id), reverse=True)
+        running = [address for address in addresses if address.job_id == request.scene_id]
+        return running or [each for each in await self._live(anew=True) if each.job_id == request.scene_id]
+
+    def _preference(self, address: WorkerAddress, scene_id: str) -> tuple[bool, bool, bytes]:
+        """Rather one that answers, and holds the scene; of several always the same (rendezvous hashing)."""
+        connection = self._connections.get(address.endpoint)
+        place = hashlib.sha256(f"{scene_id} {address.name}".encode()).digest()
+        return connection is None or not connection.is_down, scene_id in address.scenes, place
+
+    async def _connection(self, address: WorkerAddress) -> Connection:
+        endpoint = address.endpoint
+        if endpoint in self._connections and self._connections[endpoint].is_refused:
+            await self._connections.pop(endpoint).close()
+        if endpoint not in self._connections:
+            self._context = self._context or zmq.asyncio.Context()
+            self._connections[endpoint] = Connection(self._context, endpoint, self._render_secret)
+        return self._connections[endpoint]
+
+    async def _live(self, *, anew: bool = False) -> list[WorkerAddress]:
+        """The live workers. The queue is asked beside, unless what is known is too old: renders do not wait for it."""
+        age_s = time.monotonic() - self._read_s
+        if age_s > ADDRESSES_VALID_S or anew or not self._addresses:
+            if self._reading is None or self._reading.done():
+                self._reading = asyncio.create_task(self._read_addresses())
+            if age_s > WORKER_TTL_S or anew or not self._addresses:
+                await asyncio.shield(self._reading)
         if not self._addresses:
-            self._addresses_until_s = 0.0
             raise UnavailableError("No worker is ready.", WORKER_REMEDY)
-        return self._addresses[zlib.crc32(scene_id.encode()) % len(self._addresses)]
+        return self._addresses
 
-
-class _Connection:
-    """A DEALER to one worker; answers find their request by its id."""
-
-    def __init__(self, context: zmq.asyncio.Context, endpoint: str) -> None:
-        self._socket = context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.connect(endpoint)
-        self._ids = itertools.count()
-        self._waiting: dict[bytes, asyncio.Future[Answer]] = {}
-        self._reader = asyncio.create_task(self._read())
-
-    async def ask(self, request: WorkerRequest) -> Answer:
-        request_id = next(self._ids).to_bytes(8, "big")
-        future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
-        self._waiting[request_id] = future
+    async def _read_addresses(self) -> None:
         try:
-            await self._socket.send_multipart([request_id, request.model_dump_json().encode()])
-            return await future
-        finally:
-            del self._waiting[request_id]
+            addresses = await run_in_threadpool(self._queue.workers)
+        except UnavailableError as error:
+            # Renders do not need the queue: go on with the workers that were known.
+            logger.warning("the queue does not answer; using the workers known before: %s", error.problem)
+            addresses = []
+        now_s = self._read_s = time.monotonic()
+        # A queue that was away knows of no worker either until they have spoken again.
+        if addresses or now_s - self._heard_s > WORKER_TTL_S:
+            self._addresses, self._heard_s = addresses, now_s
+        live = {address.endpoint for address in self._addresses}
+        for endpoint in self._connections.keys() - live:
+            if self._connections[endpoint].is_idle:
+                await self._connections.pop(endpoint).close()
 
-    async def close(self) -> None:
-        self._reader.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await self._reader
-        self._socket.close()
 
-    async def _read(self) -> None:
-        while True:
-            frames = await self._socket.recv_multipart()
-            if len(frames) != 3:
-                logger.warning("an answer of %d parts was ignored", len(frames))
-                continue
-            request_id, head, body = frames
-            future = self._waiting.get(request_id)
-            if future is None or future.done():  # its caller has given up
-                continue
-            try:
-                future.set_result(Answer(WorkerReply.model_validate_json(head), body))
-            except ValidationError:
-                problem = "The worker's answer cannot be read."
-                future.set_exception(UnavailableError(problem, "Start service and worker from the same version."))
+def _remedy(address: WorkerAddress) -> str:
+    if address.endpoint.startswith("tcp:"):
+        return "Look at the worker's log, and see that INTRASPLAT_RENDER_SECRET is the same here and there."
+    return "Ask again, or look at the worker's log."

@@ -1,116 +1,210 @@
-"""GET /render: one view of one scene, straight from the worker that holds it."""
+"""GET /render: one view of one scene, straight from the worker that holds it, or that makes it."""
 
 from __future__ import annotations
 
+import hashlib
+import time
+from dataclasses import dataclass
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Header, Query, Response
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
-from contract.errors import SceneError
 from contract.job import JobState
+from contract.keys import KeyScope
 from contract.pose import parse_pose
 from contract.rendering import MEDIA_TYPES, ImageFormat, IntrinsicsOverride, Layer, RenderRequest, ReplyError
+from contract.settings import Settings
 from contract.store import is_job_id
-from service.deps import Deps, Services
+from service.access import Caller
+from service.connection import Answer
+from service.deps import AnyCaller, Deps, Services, not_found
 from service.problems import Problem
-from service.renderer import Answer
+from service.version import version
 
 router = APIRouter(tags=["renders"])
 
 IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
-    200: {"description": "the image", "content": {media_type: {} for media_type in MEDIA_TYPES.values()}}
+    200: {"description": "the image", "content": {media_type: {} for media_type in MEDIA_TYPES.values()}},
+    304: {"description": "it is the one that the caller has"},
 }
-STATUS_OF_REPLY = {"input": 422, "scene": 404, "internal": 500}
+STATUS_OF_REPLY = {"input": 422, "scene": 404, "not-yet": 503, "internal": 500}
+NOT_YET_RETRY_S = "1"
+SCENES_REMEDY = "GET /scenes lists what there is."
 
-Pixels = Annotated[int | None, Query(ge=8, le=8192)]
-FocalLength = Annotated[float | None, Query(gt=0, le=1e5, allow_inf_nan=False)]
-Centre = Annotated[float | None, Query(ge=-1e5, le=1e5, allow_inf_nan=False)]
 ModelTime = Annotated[
     float, Query(ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip")
 ]
-PoseText = Annotated[
-    str | None,
-    Query(
+Pixels = Annotated[int | None, Field(ge=8, le=8192)]
+FocalLength = Annotated[float | None, Field(gt=0, le=1e5, allow_inf_nan=False)]
+Centre = Annotated[float | None, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
+
+
+class RenderQuery(BaseModel):
+    """A view as a caller asks for it: the query of /render, and with an id the messages of /stream."""
+
+    model_config = ConfigDict(frozen=True)
+
+    scene: str | None = Field(default=None, description="may be left out only while there is exactly one scene")
+    t: float = Field(
+        default=0.0, ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip"
+    )
+    pose: str | None = Field(
+        default=None,
         max_length=1000,
         description="12 or 16 numbers, row-major world_from_camera in mm, or orbit:yaw,pitch,zoom; default: the "
         "endoscope's own pose at t",
         examples=["orbit:10,0,1"],
-    ),
-]
-SceneText = Annotated[str | None, Query(description="may be left out only while there is exactly one scene")]
+    )
+    width: Pixels = None
+    height: Pixels = None
+    fx: FocalLength = None
+    fy: FocalLength = None
+    cx: Centre = None
+    cy: Centre = None
+    layer: Layer = Layer.RGB
+    format: ImageFormat = ImageFormat.PNG
+    quality: int = Field(default=90, ge=1, le=100, description="of jpeg and webp")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a caller is shown: the scene that an attempt has finished, or, attempt None, the job while it runs."""
+
+    scene_id: str
+    attempt: int | None
+
+    @property
+    def state(self) -> JobState:
+        return JobState.RUNNING if self.attempt is None else JobState.DONE
 
 
 @router.get("/render", operation_id="render", response_class=Response, responses=IMAGE_RESPONSES)
 async def render(
     services: Services,
-    t: ModelTime = 0.0,
-    pose: PoseText = None,
-    scene: SceneText = None,
-    width: Pixels = None,
-    height: Pixels = None,
-    fx: FocalLength = None,
-    fy: FocalLength = None,
-    cx: Centre = None,
-    cy: Centre = None,
-    layer: Layer = Layer.RGB,
-    format: ImageFormat = ImageFormat.PNG,
+    caller: AnyCaller,
+    query: Annotated[RenderQuery, Query()],
+    if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """An image of the scene at time t from a pose, without the instruments."""
-    scene_id = await run_in_threadpool(servable_scene, services, scene)
-    request = RenderRequest(
-        scene_id=scene_id,
-        t=t,
-        pose=None if pose is None else parse_pose(pose),
-        camera=IntrinsicsOverride(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy),
-        layer=layer,
-        format=format,
-        max_pixels=services.settings.max_render_pixels,
+    """An image of the scene at time t from a pose, without the instruments; while the job runs, of what there is."""
+    start = time.perf_counter()
+    shown = await find_shown(services, caller, query.scene)
+    tag = tag_of(request_of(query, shown, services.settings))
+    if shown.attempt is not None and matches(if_none_match, tag):
+        return Response(status_code=304, headers=cache_headers(shown, tag))
+    shown, answer = await answer_to(services, caller, query, shown)
+    response = image_response(shown.scene_id, answer)
+    response.headers.update(cache_headers(shown, tag_of(request_of(query, shown, services.settings))))
+    total_ms = (time.perf_counter() - start) * 1e3
+    response.headers["Server-Timing"] = f"render;dur={answer.head.render_ms:.1f}, total;dur={total_ms:.1f}"
+    return response
+
+
+async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown:
+    """What the caller may be shown of the scene named, or of the only one there is; the audit records that it sees it.
+
+    Raises:
+        Problem: 400, none is named and the tenant has not exactly one: never show another patient by accident;
+            403, the key may not; 404, there is no such scene for this tenant; 409, there is nothing to show of the job.
+    """
+    caller.require(KeyScope.VIEW)
+    shown = await run_in_threadpool(_find, services, caller, scene)
+    await services.audit.viewed(caller, shown.scene_id)
+    return shown
+
+
+def _find(services: Deps, caller: Caller, scene: str | None) -> Shown:
+    if scene is None:
+        return _only(services, caller)
+    record = services.done.record(scene) if is_job_id(scene) else None
+    if record is None or not caller.owns(record):
+        raise not_found(f"There is no scene {scene[:40]!r}.", "scene", SCENES_REMEDY, caller, record)
+    if record.state is JobState.DONE:
+        return Shown(scene, record.attempt)
+    if record.state is JobState.RUNNING:
+        return Shown(scene, None)
+    detail = f"The job is {record.state}; there is nothing to show."
+    raise Problem(409, detail, field="scene", remedy=f"See GET /jobs/{scene}.")
+
+
+def _only(services: Deps, caller: Caller) -> Shown:
+    records = services.queue.records(caller.tenant, None)
+    done = [record for record in records if record.state is JobState.DONE]
+    there = [record for record in done if services.store.has_scene(record.job_id, record.attempt)]
+    if len(there) != 1:
+        detail = f"There are {len(there)} scenes and none was named."
+        raise Problem(400, detail, field="scene", remedy="Add scene=ID; GET /scenes lists them.")
+    return Shown(there[0].job_id, there[0].attempt)
+
+
+async def answer_to(services: Deps, caller: Caller, query: RenderQuery, shown: Shown) -> tuple[Shown, Answer]:
+    """The worker's answer, and what it shows: a job that ends just now is shown as the scene that it came to."""
+    answer = await services.renderer.ask(request_of(query, shown, services.settings))
+    if answer.head.error is not None and answer.head.error.kind == "not-yet":
+        shown = await find_shown(services, caller, shown.scene_id)
+        if shown.attempt is not None:
+            answer = await services.renderer.ask(request_of(query, shown, services.settings))
+    if answer.head.error is None:
+        services.metrics.rendered(shown.state.value, answer.head.render_ms)
+    return shown, answer
+
+
+def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRequest:
+    """What the worker is asked.
+
+    Raises:
+        InputError: the pose is none.
+    """
+    return RenderRequest(
+        scene_id=shown.scene_id,
+        attempt=shown.attempt,
+        t=query.t,
+        pose=None if query.pose is None else parse_pose(query.pose),
+        camera=IntrinsicsOverride(**query.model_dump(include=set(IntrinsicsOverride.model_fields))),
+        layer=query.layer,
+        format=query.format,
+        quality=query.quality,
+        max_pixels=settings.max_render_pixels,
     )
-    return image_response(scene_id, await services.renderer.ask(request))
 
 
 def image_response(scene_id: str, answer: Answer) -> Response:
     """The body with the headers that say what it shows; a worker's error becomes a problem."""
-    if answer.head.error is not None:
-        raise problem_of_reply(answer.head.error)
-    headers = {
-        "X-Intrasplat-Scene": scene_id,
-        "X-Intrasplat-State": JobState.DONE.value,
-        "X-Intrasplat-T": f"{answer.head.t:.6g}",
-    }
-    if answer.head.warnings:
-        text = "; ".join(answer.head.warnings)
+    head = answer.head
+    if head.error is not None:
+        raise problem_of_reply(head.error)
+    state = JobState.DONE if head.iteration is None else JobState.RUNNING
+    headers = {"X-Intrasplat-Scene": scene_id, "X-Intrasplat-State": state.value, "X-Intrasplat-T": f"{head.t:.6g}"}
+    if head.iteration is not None:
+        headers["X-Intrasplat-Iteration"] = str(head.iteration)
+    if head.warnings:
+        text = "; ".join(head.warnings)
         headers["X-Intrasplat-Warning"] = " ".join(text.encode("ascii", "replace").decode().split())
-    return Response(answer.body, media_type=answer.head.media_type, headers=headers)
+    return Response(answer.body, media_type=head.media_type, headers=headers)
 
 
 def problem_of_reply(error: ReplyError) -> Problem:
     """What a worker's error is over HTTP."""
-    return Problem(STATUS_OF_REPLY[error.kind], error.problem, field=error.field, remedy=error.remedy)
+    headers = {"Retry-After": NOT_YET_RETRY_S} if error.kind == "not-yet" else None
+    status = STATUS_OF_REPLY[error.kind]
+    return Problem(status, error.problem, field=error.field, remedy=error.remedy, headers=headers)
 
 
-def servable_scene(services: Deps, scene: str | None) -> str:
-    """The id of a finished scene: the one named, or the only one there is.
+def tag_of(request: RenderRequest) -> str:
+    """The ETag of what a request shows of a finished scene: the same question to the same attempt has one answer."""
+    asked = f"{version()} {request.model_dump_json()}"
+    return f'W/"{hashlib.sha256(asked.encode()).hexdigest()[:32]}"'
 
-    Raises:
-        Problem: 400, none is named and there is not exactly one: never show another patient by accident;
-            409, the job has not come to a scene.
-        SceneError: there is no such scene.
-    """
-    if scene is None:
-        scene_ids = services.store.scene_ids()
-        if len(scene_ids) != 1:
-            detail = f"There are {len(scene_ids)} scenes and none was named."
-            raise Problem(400, detail, field="scene", remedy="Add scene=ID; GET /scenes lists them.")
-        return scene_ids[0]
-    try:
-        services.store.scene_folder(scene)
-    except SceneError:
-        record = services.queue.get(scene) if is_job_id(scene) else None
-        if record is None:
-            raise
-        raise Problem(
-            409, f"The job is {record.state}; there is no scene.", field="scene", remedy=f"See GET /jobs/{scene}."
-        ) from None
-    return scene
+
+def matches(if_none_match: str | None, tag: str) -> bool:
+    """Whether the caller has the answer of this tag (RFC 9110, 13.1.2)."""
+    given = [each.strip() for each in (if_none_match or "").split(",")]
+    return "*" in given or tag.removeprefix("W/") in [each.removeprefix("W/") for each in given]
+
+
+def cache_headers(shown: Shown, tag: str) -> dict[str, str]:
+    """A finished scene may be kept and must be asked for each time, so that its removal is noticed; a snapshot not."""
+    if shown.attempt is None:
+        return {"Cache-Control": "no-store"}
+    return {"Cache-Control": "private, no-cache", "ETag": tag}

@@ -76,6 +76,7 @@ class Server(uvicorn.Server):
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,
             ws_max_size=MAX_MESSAGE_BYTES,
             ws_max_queue=MAX_WAITING_MESSAGES,
+            ws_per_message_deflate=False,  # images are compressed already
             ws_ping_interval=PING_PERIOD_S,
             ws_ping_timeout=PING_TIMEOUT_S,
         )

@@ -1,0 +1,156 @@
+"""One lasting ZeroMQ connection from the service to a worker, with many requests on it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import logging
+from dataclasses import dataclass
+
+import zmq
+import zmq.asyncio
+from pydantic import ValidationError
+from zmq.utils.monitor import parse_monitor_message
+
+from contract.curve import service_keys, worker_keys
+from contract.errors import UnavailableError
+from contract.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
+
+CONNECT_TIMEOUT_S = 2.0
+"""A worker that listens is connected to in milliseconds; one that has just died is tried for no longer than this."""
+
+IN_FLIGHT = 4
+"""Requests handed to a worker at a time: it has the next one at hand. Who gives up waiting here is not rendered for."""
+
+HEARTBEAT_MS, SILENCE_MS = 2000, 6000
+"""ZeroMQ's own: a machine that is gone without a word, or a process that is stopped, is noticed by its silence."""
+
+UP = zmq.Event.HANDSHAKE_SUCCEEDED
+DOWN = zmq.Event.DISCONNECTED | zmq.Event.CONNECT_RETRIED
+REFUSED = zmq.Event.HANDSHAKE_FAILED_AUTH | zmq.Event.HANDSHAKE_FAILED_PROTOCOL | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
+
+logger = logging.getLogger("intrasplat.service")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A worker's answer: its head, and the encoded image or file."""
+
+    head: WorkerReply
+    body: bytes
+
+
+class WorkerGoneError(Exception):
+    """The worker cannot be reached, or went away before it answered."""
+
+
+class Connection:
+    """A DEALER to one worker; answers find their request by its id.
+
+    is_down: the worker was not there when it was last tried; ZeroMQ goes on trying. is_refused: the two do not know the
+    same secret; ZeroMQ gives up then, and a new connection is needed to try again.
+    """
+
+    def __init__(self, context: zmq.asyncio.Context, endpoint: str, render_secret: str | None = None) -> None:
+        if endpoint.startswith("tcp:") and render_secret is None:
+            problem = f"A worker answers at {endpoint}, and no secret is set here."
+            raise UnavailableError(problem, "Set INTRASPLAT_RENDER_SECRET to the one that the worker has.")
+        self.is_down = False
+        self.is_refused = False
+        self._decided = asyncio.Event()
+        """Whether it is known if the worker can be reached."""
+        self._turns = asyncio.Semaphore(IN_FLIGHT)
+        self._ids = itertools.count()
+        self._waiting: dict[bytes, asyncio.Future[Answer]] = {}
+        self._socket = context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
+        self._socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, SILENCE_MS)
+        if endpoint.startswith("tcp:"):
+            assert render_secret is not None
+            own = service_keys(render_secret)
+            self._socket.curve_serverkey = worker_keys(render_secret).public
+            self._socket.curve_publickey, self._socket.curve_secretkey = own.public, own.secret
+        self._monitor = self._socket.get_monitor_socket(UP | DOWN | REFUSED)
+        self._socket.connect(endpoint)
+        self._tasks = [asyncio.create_task(self._read()), asyncio.create_task(self._watch())]
+
+    async def ask(self, request: RenderRequest | ExportRequest) -> Answer:
+        """The worker's answer.
+
+        Raises:
+            WorkerGoneError: there will be none.
+            UnavailableError: it is not one that this version can read.
+        """
+        document = WorkerRequest(request=request).model_dump_json().encode()
+        async with self._turns:
+            await self._reach()
+            request_id = next(self._ids).to_bytes(8, "big")
+            future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+            self._waiting[request_id] = future
+            try:
+                await self._socket.send_multipart([request_id, document])
+                return await future
+            finally:
+                del self._waiting[request_id]
+
+    @property
+    def is_idle(self) -> bool:
+        """Nobody waits for an answer."""
+        return not self._waiting
+
+    async def close(self) -> None:
+        """End the connection; who still waits is told that the worker is gone."""
+        for task in self._tasks:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+        self._lost()
+        self._socket.disable_monitor()
+        self._monitor.close()
+        self._socket.close()
+
+    async def _reach(self) -> None:
+        try:
+            await asyncio.wait_for(self._decided.wait(), CONNECT_TIMEOUT_S)
+        except TimeoutError:
+            self.is_down = True
+        if self.is_down:
+            raise WorkerGoneError
+
+    def _lost(self) -> None:
+        """What was asked and not answered died with the worker."""
+        self._decided.clear()
+        self.is_down = True
+        for future in self._waiting.values():
+            if not future.done():
+                future.set_exception(WorkerGoneError())
+
+    async def _watch(self) -> None:
+        while True:
+            event = parse_monitor_message(await self._monitor.recv_multipart())["event"]
+            if event == UP:
+                self.is_down = False
+                self._decided.set()
+            else:
+                self._lost()
+            if event & REFUSED:
+                self.is_refused = True
+                self._decided.set()
+
+    async def _read(self) -> None:
+        while True:
+            frames = await self._socket.recv_multipart()
+            if len(frames) != 3:
+                logger.warning("an answer of %d parts was ignored", len(frames))
+                continue
+            request_id, head, body = frames
+            future = self._waiting.get(request_id)
+            if future is None or future.done():  # its caller has given up
+                continue
+            try:
+                future.set_result(Answer(WorkerReply.model_validate_json(head), body))
+            except ValidationError:
+                problem = "The worker's answer cannot be read."
+                future.set_exception(UnavailableError(problem, "Start service and worker from the same version."))

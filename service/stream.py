@@ -1,0 +1,252 @@
+"""WS /stream: one view after the other over one connection, each the newest that was asked for.
+
+The client sends JSON texts: the query of /render, and an `id` of its choice that comes back with the answer. An answer
+is one binary message: the length of its head (4 bytes, big-endian), the head (JSON, StreamHead), the image. What went
+wrong comes as a JSON text, the problem document of HTTP with the `id`; the connection stays open unless it says who
+may not come in (1008) or was sent what is no request (1003, 1009). With keys, the first message of a browser, which
+cannot send headers, is {"authorize": KEY}.
+
+While a view is made and sent only the newest of the messages that arrive is kept, so a viewer that asks faster than it
+is served skips views, and one that does not read is sent one and then none.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from contract.job import JobState
+from contract.keys import KeyScope
+from service.access import Caller, Refusal, key_missing
+from service.connection import Answer
+from service.deps import Deps, EarlyCaller, Services, address_of
+from service.problems import API_REMEDY, Problem, fault, problem_of
+from service.renders import RenderQuery, Shown, answer_to, find_shown, problem_of_reply
+
+router = APIRouter()
+
+LENGTH_BYTES = 4
+LONGEST_MESSAGE = 16 * 1024
+"""Characters; a request is some hundred."""
+SEND_TIMEOUT_S = 30.0
+"""A viewer that takes so long for one view is not there any more."""
+
+NOT_TEXT, NOT_ALLOWED, TOO_LARGE = 1003, 1008, 1009
+"""Codes of RFC 6455, 7.4.1."""
+
+AUTHORIZE = "authorize"
+GONE = (WebSocketDisconnect, TimeoutError)
+"""What is raised when the viewer has left, or takes nothing more."""
+
+logger = logging.getLogger("intrasplat.service")
+
+
+class StreamMessage(RenderQuery):
+    """A view that is asked for."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: str | int | None = Field(default=None, description="comes back with the answer")
+
+
+class StreamHead(BaseModel):
+    """What a view shows; the fields are those of /render's headers."""
+
+    id: str | int | None
+    scene: str
+    state: JobState
+    t: float
+    iteration: int | None
+    warnings: tuple[str, ...]
+    media_type: str
+    render_ms: float
+    total_ms: float
+
+
+class _HangUp(Exception):
+    """The connection is to be closed with this code, after what there is to say."""
+
+    def __init__(self, code: int, problem: Problem) -> None:
+        super().__init__(problem.detail)
+        self.code = code
+        self.problem = problem
+
+
+@router.websocket("/stream")
+async def stream(websocket: WebSocket, services: Services, caller: EarlyCaller) -> None:
+    """Views one after the other; see the head of this file."""
+    if caller is not None:
+        caller.require(KeyScope.VIEW)  # refused before the handshake
+    await websocket.accept()
+    with services.metrics.streams.track_inprogress():
+        await _Viewer(websocket, services, may_come_in=caller is not None).serve()
+
+
+class _Viewer:
+    """One connection: a task that reads, and keeps the newest request, and one that answers."""
+
+    def __init__(self, websocket: WebSocket, services: Deps, *, may_come_in: bool) -> None:
+        self._websocket = websocket
+        self._services = services
+        self._address = address_of(websocket)
+        self._caller: Callable[[], Caller] | None = self._caller_of_headers if may_come_in else None
+        self._newest: dict[str, Any] | Problem | None = None
+        self._arrived = asyncio.Event()
+
+    async def serve(self) -> None:
+        """Until one side hangs up."""
+        tasks = [asyncio.create_task(self._read()), asyncio.create_task(self._answer_all())]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            results = await asyncio.gather(*tasks, return_exceptions=True)
+        for result in results:
+            if isinstance(result, _HangUp):
+                await self._hang_up(result)
+            elif isinstance(result, Exception) and not isinstance(result, GONE):
+                raise result
+
+    async def _read(self) -> None:
+        while True:
+            message = await self._websocket.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            text = message.get("text")
+            if text is None:
+                raise _HangUp(NOT_TEXT, Problem(422, "A binary message is no request.", remedy=API_REMEDY))
+            if len(text) > LONGEST_MESSAGE:
+                detail = f"The message has {len(text)} characters, more than {LONGEST_MESSAGE}."
+                raise _HangUp(TOO_LARGE, Problem(413, detail, remedy=API_REMEDY))
+            document = document_of(text)
+            if self._caller is None or (isinstance(document, dict) and AUTHORIZE in document):
+                self._caller = self._authorized(document)
+            else:
+                self._newest = document
+                self._arrived.set()
+
+    async def _answer_all(self) -> None:
+        while True:
+            await self._arrived.wait()
+            self._arrived.clear()
+            document, start = self._newest, time.perf_counter()
+            assert document is not None
+            try:
+                answer = await self._answer(document, start)
+            except Exception as error:
+                await self._tell(error, document.get("id") if isinstance(document, dict) else None)
+            else:
+                await asyncio.wait_for(self._websocket.send_bytes(answer), SEND_TIMEOUT_S)
+
+    async def _answer(self, document: dict[str, Any] | Problem, start: float) -> bytes:
+        """The message with the view."""
+        if isinstance(document, Problem):
+            raise document
+        message = message_of(document)
+        caller = self._known_caller()
+        self._services.limiter.admit(caller.key_id or caller.address)
+        shown = await find_shown(self._services, caller, message.scene)
+        shown, answer = await answer_to(self._services, caller, message, shown)
+        if answer.head.error is not None:
+            raise problem_of_reply(answer.head.error)
+        return packed(message, shown, answer, (time.perf_counter() - start) * 1e3)
+
+    async def _tell(self, error: Exception, message_id: object) -> None:
+        """Say what went wrong; who is not known here, or no more, is shown out."""
+        problem = problem_of(error)
+        if problem is None:
+            logger.error("a fault in a stream: %s", type(error).__name__, exc_info=error)
+            problem = fault()
+        if problem.status == 401:
+            raise _HangUp(NOT_ALLOWED, problem)
+        if isinstance(problem, Refusal):
+            await self._services.audit.refused(problem)
+        document = {**problem.document(), "id": message_id}
+        await asyncio.wait_for(self._websocket.send_text(json.dumps(document)), SEND_TIMEOUT_S)
+
+    async def _hang_up(self, reason: _HangUp) -> None:
+        if isinstance(reason.problem, Refusal):
+            await self._services.audit.refused(reason.problem)
+        with contextlib.suppress(*GONE):
+            async with asyncio.timeout(SEND_TIMEOUT_S):
+                await self._websocket.send_text(json.dumps(reason.problem.document()))
+                await self._websocket.close(reason.code)
+
+    def _known_caller(self) -> Caller:
+        """Whose connection it is, asked for each view: a key that is revoked ends its streams too."""
+        assert self._caller is not None
+        caller = self._caller()
+        caller.require(KeyScope.VIEW)
+        return caller
+
+    def _caller_of_headers(self) -> Caller:
+        caller = self._services.access.caller(self._websocket.headers, self._address)
+        if caller is None:
+            raise key_missing(self._address)
+        return caller
+
+    def _authorized(self, document: dict[str, Any] | Problem) -> Callable[[], Caller]:
+        """Whose connection it is, by the key in a message."""
+        key = document.get(AUTHORIZE) if isinstance(document, dict) else None
+        if not isinstance(key, str):
+            raise _HangUp(NOT_ALLOWED, key_missing(self._address))
+
+        def caller() -> Caller:
+            return self._services.access.caller_of_key(key, self._address)
+
+        try:
+            caller().require(KeyScope.VIEW)
+        except Problem as problem:
+            raise _HangUp(NOT_ALLOWED, problem) from None
+        return caller
+
+
+def document_of(text: str) -> dict[str, Any] | Problem:
+    """The JSON object of a message, or what is to be said of one that is none."""
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError):
+        document = None
+    if not isinstance(document, dict):
+        return Problem(400, "The message is not a JSON object.", remedy=API_REMEDY)
+    return document
+
+
+def message_of(document: dict[str, Any]) -> StreamMessage:
+    """The request that the document is.
+
+    Raises:
+        Problem: 422, it is none; names the field.
+    """
+    try:
+        return StreamMessage.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        detail = f"{first['msg']} (given: {str(first['input'])[:80]!r})."
+        raise Problem(422, detail, field=str(first["loc"][0]), remedy=API_REMEDY) from None
+
+
+def packed(message: StreamMessage, shown: Shown, answer: Answer, total_ms: float) -> bytes:
+    """A view as one binary message."""
+    head = StreamHead(
+        id=message.id,
+        scene=shown.scene_id,
+        state=shown.state,
+        t=answer.head.t,
+        iteration=answer.head.iteration,
+        warnings=answer.head.warnings,
+        media_type=answer.head.media_type,
+        render_ms=answer.head.render_ms,
+        total_ms=total_ms,
+    )
+    text = head.model_dump_json().encode()
+    return len(text).to_bytes(LENGTH_BYTES, "big") + text + answer.body
