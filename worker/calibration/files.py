@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from contract.calibration import RectifiedCalibration, StereoCalibration, parse_calibration
 from contract.clip_limits import MOST_CALIBRATION_BYTES
 from contract.errors import InputError
+from contract.sniff import check_calibration_text
 from worker.calibration.check import FIELD, check_calibration
 
 MAX_ASPECT_CHANGE = 0.005  # 1348x1080 read as 640x512 is still one scale; a cropped image is not
@@ -76,12 +77,14 @@ def _read_text(path: Path) -> str:
     try:
         if path.stat().st_size > MOST_CALIBRATION_BYTES:
             raise InputError(FIELD, f"{path.name} has {path.stat().st_size} bytes.", FORMATS_REMEDY)
-        return path.read_text(encoding="utf-8-sig")
+        text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(FIELD, f"{path.name} is not a text file.", FORMATS_REMEDY) from None
     except OSError as error:
         problem = f"{path.name} cannot be read: {error.strerror or error}."
         raise InputError(FIELD, problem, "Name a file that exists and may be read.") from None
+    check_calibration_text(text, FIELD, path.name)
+    return text
 
 
 def _parse(text: str, eye_width: int, eye_height: int) -> tuple[dict[str, Any], bool]:

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from contract.clip_limits import MOST_IMAGE_BYTES
 from contract.errors import InputError
+from contract.sniff import JPEG_MAGIC, PNG_MAGIC, png_size
 from worker.clip.files import FileTree
 from worker.clip.types import RgbFrame
 
 MASK_THRESHOLD = 128  # of 255: masks are binary, but lossy video and resizing leave grey edges
 _HEADER_BYTES = 1 << 16  # a JPEG's size stands behind its metadata blocks, one of which may fill 64 kB
-_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
-_JPEG_MAGIC = b"\xff\xd8\xff"
 _JPEG_NOT_SIZES = frozenset({0xC4, 0xC8, 0xCC})  # markers in the range of frame headers that are none
 
 
@@ -80,7 +79,7 @@ def open_images(tree: FileTree, names: tuple[str, ...]) -> ImageSequence:
 
 def decode_image(data: bytes, field: str, name: str) -> NDArray[Any]:
     """Pixels of a PNG or JPEG as stored (BGR order). InputError when it is cut short or damaged."""
-    whole = _PNG_END in data[-64:] if data.startswith(_PNG_MAGIC) else b"\xff\xd9" in data[-64:]
+    whole = _PNG_END in data[-64:] if data.startswith(PNG_MAGIC) else b"\xff\xd9" in data[-64:]
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
     if image is None:
         raise InputError(field, f"{name} is damaged or cut short.", "Write the image again.")
@@ -122,19 +121,13 @@ def as_depth_mm(image: NDArray[Any], field: str, name: str) -> NDArray[np.float3
 def _size_of(tree: FileTree, name: str) -> tuple[int, int]:
     """(width, height) from the header."""
     header = tree.head(name, 32)
-    size = _png_size(header)
-    if size is None and header.startswith(_JPEG_MAGIC):
+    size = png_size(header)
+    if size is None and header.startswith(JPEG_MAGIC):
         size = _jpeg_size(tree.head(name, 4 * _HEADER_BYTES))
     if size is None:
         problem = f"{name} is empty (0 bytes)." if not header else f"{name} is not a PNG or JPEG image."
         raise InputError(tree.field, problem, "Write the image again, as PNG.")
     return size
-
-
-def _png_size(header: bytes) -> tuple[int, int] | None:
-    if not header.startswith(_PNG_MAGIC) or len(header) < 24:
-        return None
-    return int.from_bytes(header[16:20], "big"), int.from_bytes(header[20:24], "big")
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
