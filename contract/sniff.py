@@ -130,5 +130,5 @@ def _check_npy(head: bytes, name: str, part: str) -> None:
     remedy = "Save it with numpy.save as floating-point numbers."
     if not head.startswith(_NPY_MAGIC) or header_bytes + 12 > _NPY_HEAD_BYTES:
         raise InputError(part, f"{name} is not an array as NumPy writes it.", remedy)
-    if b"O" in head[8 : 12 + header_bytes]:
+    if b"O" in head[12 : 12 + header_bytes]:
         raise InputError(part, f"{name} holds Python objects.", remedy)

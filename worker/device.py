@@ -19,6 +19,7 @@ from typing import BinaryIO
 
 from pydantic import BaseModel
 
+from contract.clip_limits import ClipLimits
 from contract.embedded import short_socket_path
 from contract.errors import Cancelled, InputError, UnavailableError
 from contract.job import JobRecord
@@ -93,7 +94,7 @@ def run_device(settings: Settings) -> None:
                 snapshots.drop(shown)
             else:
                 shown = task.run.record.job_id
-                channel.send(work_on(task, device, snapshots, channel))
+                channel.send(work_on(task, device, ClipLimits.of(settings), snapshots, channel))
 
 
 class Channel:
@@ -160,7 +161,9 @@ class Orders:
         os._exit(0)  # nothing here is worth keeping: what is durable is on disk already
 
 
-def work_on(task: Task, device: str, snapshots: Snapshots, channel: Channel) -> Finished | Stopped | Failed:
+def work_on(
+    task: Task, device: str, limits: ClipLimits, snapshots: Snapshots, channel: Channel
+) -> Finished | Stopped | Failed:
     """Run one job; every error is its end and not this process's."""
     run = task.run
     reporter = _Reporter(channel)
@@ -172,7 +175,7 @@ def work_on(task: Task, device: str, snapshots: Snapshots, channel: Channel) -> 
     )
     snapshots.begin(run.record.job_id)
     try:
-        run_or_start_anew(request_of(run.record, run.spool, device), run.out, hooks)
+        run_or_start_anew(request_of(run.record, run.spool, device, limits), run.out, hooks)
     except Cancelled:
         snapshots.drop(run.record.job_id)
         return Stopped(checkpointed=(run.out / RESUME_FILE).exists())
@@ -199,7 +202,7 @@ class _Reporter:
         self._channel.send(Advanced(progress=job_progress(progress)))
 
 
-def request_of(record: JobRecord, spool: Path, device: str) -> ReconstructionRequest:
+def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits | None = None) -> ReconstructionRequest:
     """The reconstruction that a job asks for, with its files where the store keeps them."""
     files, options = record.files, record.options
     return ReconstructionRequest(
@@ -217,6 +220,7 @@ def request_of(record: JobRecord, spool: Path, device: str) -> ReconstructionReq
         device=device,
         seed=options.seed,
         accepted_at_s=record.created_at_s,
+        limits=limits,
     )
 
 
