@@ -1,0 +1,277 @@
+"""A purge leaves nothing and says so; retention purges in time; what was cut off is finished."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import redis
+
+from contract.audit import AUDIT_FILE, RESERVE_FILE, AuditAction, AuditLog
+from contract.embedded import EmbeddedServer
+from contract.errors import InputError, UnavailableError
+from contract.job import JobError, JobFiles, JobOptions, JobRecord
+from contract.queue import Claim
+from contract.queue_redis import RedisQueue
+from contract.settings import Settings
+from contract.store import CURVE, MANIFEST, REPORT, Store
+from service.audit import Audit
+from service.purge import NOTES, Purger
+from service.retention import HOUR_S, Retention, check_retention, kept_hours
+from tests.service.house import CLIP, House, assert_problem, make_house
+
+KEPT_FILES = {AUDIT_FILE, RESERVE_FILE}
+"""What tells of a job after its purge: that it was purged."""
+
+
+def files_of(data_dir: Path) -> list[Path]:
+    """All files but those of the queue's server, which test_..._queue looks into by itself."""
+    found = [path for path in data_dir.rglob("*") if path.is_file() or not path.is_dir()]
+    return [path for path in found if path.relative_to(data_dir).parts[0] not in ("valkey", "run")]
+
+
+def traces_of(data_dir: Path, job_id: str) -> list[Path]:
+    """Whatever names the job, or holds its id."""
+    named = [path for path in data_dir.rglob("*") if job_id in path.name]
+    holding = [path for path in files_of(data_dir) if path.name not in KEPT_FILES]
+    return named + [path for path in holding if job_id.encode() in path.read_bytes()]
+
+
+def upload_in_pieces(house: House) -> str:
+    """A job whose clip came as a resumable upload."""
+    tus = {"Tus-Resumable": "1.0.0"}
+    metadata = {"Upload-Length": str(len(CLIP)), "Upload-Metadata": "part Y2xpcA==,suffix Lm1wNA=="}
+    path = house.http.post("/uploads", headers={**tus, **metadata}).headers["location"]
+    sending = {**tus, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+    house.http.request("PATCH", path, headers=sending, content=CLIP)
+    job_id: str = house.http.post("/reconstruct", json={"clip": path.rsplit("/", 1)[1]}).json()["id"]
+    return job_id
+
+
+def failed_job(house: House, job_id: str) -> str:
+    record, claim = house.claimed()
+    assert record.job_id == job_id
+    assert house.queue.fail(claim, JobError(problem="no depth."))
+    return job_id
+
+
+def parts(house: House) -> tuple[Purger, Retention]:
+    settings = Settings(data_dir=house.store.data_dir, retention_hours=1.0)
+    purger = Purger(house.queue, house.store, Audit(AuditLog(house.store.data_dir)))
+    return purger, Retention(settings, house.queue, house.store, purger)
+
+
+def test_a_purge_leaves_nothing_and_its_receipt_counts_what_there_was(house: House) -> None:
+    scene_id = house.finished_scene()
+    sizes = {
+        area: sum(path.stat().st_size for path in (house.store.data_dir / area).rglob("*") if path.is_file())
+        for area in ("spool", "scenes")
+    }
+    response = house.http.delete(f"/scenes/{scene_id}")
+    assert response.status_code == 200
+    receipt = response.json()
+    assert (receipt["job_id"], receipt["record"], receipt["verified"]) == (scene_id, True, True)
+    assert receipt["files"] == {"incoming": 0, "spool": 2, "work": 0, "scenes": 3, "uploads": 0}
+    assert (receipt["bytes"]["spool"], receipt["bytes"]["scenes"]) == (sizes["spool"], sizes["scenes"])
+    assert receipt["purged_at"].startswith("20")
+    assert traces_of(house.store.data_dir, scene_id) == []
+    assert not [path for path in files_of(house.store.data_dir) if CLIP in path.read_bytes()]
+    assert (house.queue.get(scene_id), house.queue.events(scene_id)) == (None, [])
+    for path in (f"/scenes/{scene_id}", f"/jobs/{scene_id}", f"/render?scene={scene_id}"):
+        assert_problem(house.http.get(path), 404, "job_id" if "jobs" in path else "scene")
+    assert_problem(house.http.delete(f"/scenes/{scene_id}"), 404, "scene")
+
+
+def test_a_purge_takes_resumable_uploads_along(house: House) -> None:
+    job_id = failed_job(house, upload_in_pieces(house))
+    receipt = house.http.delete(f"/scenes/{job_id}").json()
+    assert receipt["files"]["uploads"] >= 1
+    assert traces_of(house.store.data_dir, job_id) == []
+    assert house.spooled() == []
+
+
+def test_an_upload_that_its_job_had_not_noted_yet_is_found_by_its_file(house: House) -> None:
+    job_id = house.upload().json()["id"]
+    failed_job(house, job_id)
+    upload = house.store.open_incoming("e" * 32)
+    declaration = {"tenant": "local", "part": "clip", "suffix": ".mp4", "length_bytes": len(CLIP), "created_at_s": 1.0}
+    (upload / "upload.json").write_text(json.dumps(declaration))
+    os.link(house.store.spool_folder(job_id) / "clip.mp4", upload / "clip.mp4")
+    assert house.http.delete(f"/scenes/{job_id}").json()["files"]["uploads"] == 2
+    assert traces_of(house.store.data_dir, job_id) == []
+
+
+def test_a_live_job_is_not_purged(house: House) -> None:
+    job_id = house.upload().json()["id"]
+    assert "Cancel it first" in assert_problem(house.http.delete(f"/scenes/{job_id}"), 409, "scene_id")["remedy"]
+    house.claimed()
+    assert_problem(house.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
+    assert house.spooled() != []
+    assert not (house.store.data_dir / NOTES).exists()
+
+
+@pytest.mark.parametrize("cut_at", ["store.purge", "queue.forget"])
+@pytest.mark.parametrize("finisher", ["again", "sweep"])
+def test_a_purge_that_was_cut_off_is_finished(
+    house: House, monkeypatch: pytest.MonkeyPatch, cut_at: str, finisher: str
+) -> None:
+    scene_id = house.finished_scene()
+    part, method = cut_at.split(".")
+    with monkeypatch.context() as patch:
+
+        def cut(*arguments: Any) -> None:
+            raise UnavailableError("The power went.", "Wait.")
+
+        patch.setattr(getattr(house, part), method, cut)
+        assert_problem(house.http.delete(f"/scenes/{scene_id}"), 503)
+    if finisher == "again":
+        assert house.http.delete(f"/scenes/{scene_id}").json()["verified"] is True
+    else:
+        _, retention = parts(house)
+        retention.sweep(time.time())
+        assert house.queue.get(scene_id) is not None  # so young a note may be of a purge that is under way
+        note = house.store.data_dir / NOTES / scene_id
+        os.utime(note, (1.0, 1.0))
+        retention.sweep(time.time())
+        assert not note.exists()
+    assert house.queue.get(scene_id) is None
+    assert traces_of(house.store.data_dir, scene_id) == []
+
+
+def test_a_job_that_is_retried_during_its_purge_is_not_reported_as_purged(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = failed_job(house, house.upload().json()["id"])
+    purge = house.store.purge
+
+    def purge_while_somebody_retries(purged_id: str) -> Any:
+        house.queue.retry(purged_id)
+        return purge(purged_id)
+
+    monkeypatch.setattr(house.store, "purge", purge_while_somebody_retries)
+    assert_problem(house.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
+    assert (house.store.data_dir / NOTES / job_id).exists()
+
+
+def test_retention_purges_in_time_and_nothing_before_and_nothing_live(house: House) -> None:
+    own = house.upload('{"retention_hours": 3}').json()["id"]
+    failed_job(house, own)
+    usual = failed_job(house, house.upload().json()["id"])
+    waiting = house.upload().json()["id"]
+    _, retention = parts(house)
+    now_s = time.time()
+    assert retention.sweep(now_s + 0.9 * HOUR_S) == 0
+    assert retention.sweep(now_s + 1.1 * HOUR_S) == 1
+    assert [house.queue.get(job_id) is None for job_id in (own, usual, waiting)] == [False, True, False]
+    assert retention.sweep(now_s + 3.1 * HOUR_S) == 1
+    assert [house.queue.get(job_id) is None for job_id in (own, usual, waiting)] == [True, True, False]
+    assert traces_of(house.store.data_dir, own) == []
+    lines = [json.loads(line) for line in (house.store.data_dir / AUDIT_FILE).read_text().splitlines()]
+    purged = [line for line in lines if line["action"] == AuditAction.PURGED and line["job_id"] == own]
+    assert [line["outcome"] for line in purged] == ["begun (retention)", "done (retention)"]
+    assert "tenant" not in purged[0]
+
+
+def test_one_job_that_cannot_be_purged_keeps_no_other(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    stuck = failed_job(house, house.upload().json()["id"])
+    other = failed_job(house, house.upload().json()["id"])
+    purge = house.store.purge
+
+    def purge_but_one(job_id: str) -> Any:
+        if job_id == stuck:
+            raise UnavailableError("The disk fails.", "Mend it.")
+        return purge(job_id)
+
+    monkeypatch.setattr(house.store, "purge", purge_but_one)
+    _, retention = parts(house)
+    assert retention.sweep(time.time() + 2 * HOUR_S) == 1
+    assert house.queue.get(other) is None
+    assert house.queue.get(stuck) is not None
+
+
+@pytest.mark.parametrize(
+    ("asked", "usual", "most", "kept"),
+    [
+        (None, None, None, None),
+        (5.0, None, None, 5.0),
+        (5.0, 2.0, None, 5.0),
+        (None, 2.0, None, 2.0),
+        (None, None, 7.0, 7.0),
+        (None, 9.0, 7.0, 7.0),
+        (5.0, 9.0, 7.0, 5.0),
+    ],
+)
+def test_a_job_is_kept_as_long_as_it_asks_else_as_usual_and_never_longer_than_the_maximum(
+    asked: float | None, usual: float | None, most: float | None, kept: float | None
+) -> None:
+    settings = Settings(retention_hours=usual, max_retention_hours=most)
+    assert kept_hours(JobOptions(retention_hours=asked), settings) == kept
+    check_retention(JobOptions(retention_hours=asked), settings)
+
+
+def test_asking_to_be_kept_longer_than_the_maximum_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="7 hours"):
+        check_retention(JobOptions(retention_hours=8.0), Settings(max_retention_hours=7.0))
+    for house in make_house(tmp_path, max_retention_hours=7.0):
+        assert_problem(house.upload('{"retention_hours": 8}'), 422, "options.retention_hours")
+        assert house.spooled() == []
+
+
+@pytest.fixture
+def valkey(tmp_path: Path) -> Iterator[EmbeddedServer]:
+    server = EmbeddedServer(tmp_path / "data")
+    server.start()
+    yield server
+    server.stop()
+
+
+def test_a_purge_leaves_no_key_in_the_queues_server_that_names_the_job(valkey: EmbeddedServer, tmp_path: Path) -> None:
+    queue, store = RedisQueue(valkey.url), Store(tmp_path / "data")
+    purger = Purger(queue, store, Audit(AuditLog(store.data_dir)))
+    kept, purged = ("1" * 32, "2" * 32)
+    for job_id in (kept, purged):
+        files = JobFiles(clip="clip.mp4")
+        record = JobRecord(job_id=job_id, files=files, created_at_s=time.time(), idempotency_key=job_id * 2)
+        (store.open_incoming(job_id) / "clip.mp4").write_bytes(CLIP)
+        store.accept(record)
+        queue.submit(record)
+        claimed = queue.claim("worker-1", 0.0)
+        assert claimed is not None
+        folder = store.work_folder(job_id, claimed.attempt)
+        for name in (MANIFEST, REPORT, CURVE):
+            (folder / name).write_text("{}")
+        store.publish_scene(job_id, claimed.attempt)
+        assert queue.finish(Claim(job_id, claimed.attempt, "worker-1"))
+    assert naming(valkey, purged)
+    assert purger.purge(purged, None).verified
+    assert naming(valkey, purged) == []
+    assert naming(valkey, kept)
+    assert traces_of(store.data_dir, purged) == []
+    queue.close()
+
+
+def naming(server: EmbeddedServer, job_id: str) -> list[bytes]:
+    """Keys of the server whose name or content holds the id."""
+    with redis.Redis.from_url(server.url) as client:
+        return [key for key in client.scan_iter() if job_id.encode() in key + b"%r" % [content(client, key)]]
+
+
+def content(client: Any, key: bytes) -> Any:
+    match client.type(key):
+        case b"hash":
+            return client.hgetall(key)
+        case b"stream":
+            return client.xrange(key)
+        case b"zset":
+            return client.zrange(key, 0, -1)
+        case b"set":
+            return client.smembers(key)
+        case b"list":
+            return client.lrange(key, 0, -1)
+        case _:
+            return client.get(key)

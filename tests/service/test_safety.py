@@ -1,0 +1,339 @@
+"""Nobody reaches a route, a job or a scene that is not theirs; nothing tells of a patient or of another tenant."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI
+from fastapi.dependencies.models import Dependant
+from fastapi.routing import APIRoute, APIWebSocketRoute
+from starlette.routing import BaseRoute, Route
+
+from contract.audit import AUDIT_FILE
+from contract.job import JobError
+from contract.keys import KEYS_FILE, KeyFile, KeyScope
+from contract.settings import Settings
+from contract.store import Store
+from service import deps
+from service.app import create_app
+from tests.service.house import CLIP, House, assert_problem, make_house
+
+OPEN_TO_ALL = {"/healthz", "/readyz", "/info", "/openapi.json", "OPTIONS /uploads"}
+"""They tell of nobody's work. The page's own files are the only others."""
+
+NETWORK = "0.0.0.0"
+ALL_SCOPES = frozenset(KeyScope)
+MARKER = "SMITH-1957-05-24"
+
+
+@dataclass(frozen=True)
+class Ward:
+    """A key holder."""
+
+    http: Any
+    key: str
+
+    def request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
+        headers = {**arguments.pop("headers", {}), "Authorization": f"Bearer {self.key}"}
+        response: httpx.Response = self.http.request(method, path, headers=headers, **arguments)
+        return response
+
+    def upload(self, name: str = "a.mp4") -> str:
+        response = self.request("POST", "/reconstruct", files={"clip": (name, CLIP)})
+        assert response.status_code == 202, response.text
+        job_id: str = response.json()["id"]
+        return job_id
+
+
+@pytest.fixture
+def open_house(tmp_path: Path) -> Iterator[House]:
+    """A service that listens to the network, and so asks for keys."""
+    yield from make_house(tmp_path, host=NETWORK)
+
+
+def ward(house: House, tenant: str, scopes: frozenset[KeyScope] = ALL_SCOPES) -> Ward:
+    return Ward(house.http, KeyFile(house.store.data_dir).create(tenant, scopes)[1])
+
+
+def finished(house: House, owner: Ward) -> str:
+    job_id = owner.upload()
+    record, claim = house.claimed()
+    assert record.job_id == job_id
+    folder = house.store.work_folder(job_id, record.attempt)
+    (folder / "manifest.json").write_text("{}")
+    (folder / "report.json").write_text('{"psnr_tissue_db": 36.2}')
+    (folder / "curve.csv").write_text("t_train_s,psnr_tissue_db\n1,30\n")
+    house.store.publish_scene(job_id, record.attempt)
+    assert house.queue.finish(claim)
+    return job_id
+
+
+def audit(house: House) -> list[dict[str, Any]]:
+    path = house.store.data_dir / AUDIT_FILE
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def acts(house: House) -> list[tuple[str, str, str | None]]:
+    return [(line["action"], line["outcome"], line.get("job_id")) for line in audit(house)]
+
+
+def routes_of(routes: list[BaseRoute]) -> Iterator[BaseRoute]:
+    for route in routes:
+        included = getattr(route, "original_router", None)
+        if included is None:
+            yield route
+        else:
+            yield from routes_of(included.routes)
+
+
+def all_routes(data_dir: Path) -> list[BaseRoute]:
+    for house in make_house(data_dir):
+        app: FastAPI = create_app(Settings(data_dir=data_dir), house.queue, house.store, None)  # type: ignore[arg-type]
+        return list(routes_of(app.routes))
+    raise AssertionError("no house")
+
+
+def requests_of(data_dir: Path, job_id: str) -> list[tuple[str, str]]:
+    """Method and path of every HTTP route that is not open to all, for one job."""
+    asked = []
+    for route in all_routes(data_dir):
+        if isinstance(route, Route):
+            path = route.path.format(job_id=job_id, scene_id=job_id, upload_id=job_id)
+            if route.path == "/render":
+                path += f"?scene={job_id}"
+            asked += [(method, path) for method in sorted(route.methods or ())]
+    return [(method, path) for method, path in asked if not {path, f"{method} {path}"} & OPEN_TO_ALL]
+
+
+def calls(dependant: Dependant) -> set[Any]:
+    return {dependant.call}.union(*(calls(each) for each in dependant.dependencies))
+
+
+def test_no_route_is_without_the_question_who_calls(tmp_path: Path) -> None:
+    routes = all_routes(tmp_path)
+    assert sum(isinstance(route, APIRoute | APIWebSocketRoute) for route in routes) >= 15
+    forgotten = []
+    for route in routes:
+        if isinstance(route, APIRoute | APIWebSocketRoute):
+            if deps._caller_if_known not in calls(route.dependant):
+                methods = "".join(sorted(getattr(route, "methods", ["WS"])))
+                forgotten.append(route.path if {route.path} & OPEN_TO_ALL else f"{methods} {route.path}")
+        else:
+            forgotten.append(str(getattr(route, "path", route)))
+    assert set(forgotten) == OPEN_TO_ALL
+
+
+@pytest.mark.parametrize("key", [None, "isp_000000000000_00", "nonsense"])
+def test_without_a_known_key_every_route_answers_401_and_tells_nothing(
+    open_house: House, tmp_path: Path, key: str | None
+) -> None:
+    job_id = finished(open_house, ward(open_house, "ward-3"))
+    headers = {} if key is None else {"X-API-Key": key}
+    asked = requests_of(tmp_path / "other", job_id)
+    assert len(asked) >= 14
+    bodies = set()
+    for method, path in asked:
+        headers["Tus-Resumable"] = "1.0.0"
+        response = open_house.http.request(method, path, headers=headers)
+        assert response.status_code in (401, 429), f"{method} {path}: {response.status_code}"
+        assert "www-authenticate" in response.headers or response.status_code == 429
+        bodies.add(response.text)
+    assert not [body for body in bodies if job_id in body]
+    assert [line["action"] for line in audit(open_house)].count("refused") == 1
+
+
+def test_another_tenants_job_is_answered_exactly_like_one_that_is_not_there(open_house: House, tmp_path: Path) -> None:
+    mine, theirs = ward(open_house, "ward-3"), ward(open_house, "ward-4")
+    job_id = finished(open_house, mine)
+    missing = "f" * 32
+    named = [
+        (method, path)
+        for method, path in requests_of(tmp_path / "other", job_id)
+        if job_id in path and "/uploads" not in path
+    ]
+    assert len(named) >= 8
+    for method, path in named:
+        foreign = theirs.request(method, path)
+        absent = theirs.request(method, path.replace(job_id, missing))
+        assert foreign.status_code == 404, f"{method} {path}: {foreign.status_code}"
+        assert foreign.text == absent.text.replace(missing, job_id)
+        assert {*foreign.headers} == {*absent.headers}
+    assert theirs.request("GET", "/jobs").json() == theirs.request("GET", "/scenes").json() == []
+    assert mine.request("GET", f"/render?scene={job_id}").status_code == 200
+    refused = [line for line in audit(open_house) if line["action"] == "refused"]
+    assert {(line["tenant"], line["job_id"], line["outcome"]) for line in refused} == {("ward-4", job_id, "404")}
+
+
+def test_another_tenants_upload_is_not_there_either(open_house: House) -> None:
+    mine, theirs = ward(open_house, "ward-3"), ward(open_house, "ward-4")
+    tus = {"Tus-Resumable": "1.0.0"}
+    created = {**tus, "Upload-Length": "4", "Upload-Metadata": "part Y2xpcA==,suffix Lm1wNA=="}
+    path = mine.request("POST", "/uploads", headers=created).headers["location"]
+    upload_id = path.rsplit("/", 1)[1]
+    assert mine.request("HEAD", f"/uploads/{upload_id}", headers=tus).status_code == 200
+    sending = {**tus, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+    for method, headers in (("HEAD", tus), ("DELETE", tus), ("PATCH", sending)):
+        content = b"abcd" if method == "PATCH" else None
+        response = theirs.request(method, f"/uploads/{upload_id}", headers=headers, content=content)
+        assert response.status_code == 404, method
+    sent = mine.request("PATCH", f"/uploads/{upload_id}", headers=sending, content=b"abcd")
+    assert sent.status_code == 204
+    assert theirs.request("POST", "/reconstruct", json={"clip": upload_id}).status_code in (404, 422)
+    assert mine.request("POST", "/reconstruct", json={"clip": upload_id}).status_code == 202
+
+
+@pytest.mark.parametrize("scope", list(KeyScope))
+def test_a_key_does_what_its_scope_says_and_nothing_else(open_house: House, tmp_path: Path, scope: KeyScope) -> None:
+    job_id = finished(open_house, ward(open_house, "ward-3"))
+    limited = ward(open_house, "ward-3", frozenset({scope}))
+    needed = {"/metrics": KeyScope.OPERATE, "DELETE /scenes": KeyScope.PURGE}
+    for method, path in requests_of(tmp_path / "other", job_id):
+        writes = (
+            "/uploads" in path or path == "/reconstruct" or (path.startswith("/jobs") and method in ("POST", "DELETE"))
+        )
+        usual = KeyScope.RECONSTRUCT if writes else KeyScope.VIEW
+        wanted = needed.get(path) or needed.get(f"{method} {path.rpartition('/')[0]}") or usual
+        response = limited.request(method, path, headers={"Tus-Resumable": "1.0.0"})
+        if wanted is scope:
+            assert response.status_code not in (401, 403), f"{method} {path}"
+        else:
+            assert response.status_code in (403, 422), f"{method} {path}: {response.status_code}"
+            assert response.status_code == 422 or method == "HEAD" or wanted.value in response.json()["detail"]
+
+
+def test_a_revoked_key_is_refused_with_the_next_request(open_house: House) -> None:
+    holder = ward(open_house, "ward-3")
+    assert holder.request("GET", "/jobs").status_code == 200
+    keys = KeyFile(open_house.store.data_dir)
+    keys.revoke(keys.list()[0].key_id)
+    assert_problem(holder.request("GET", "/jobs"), 401, "Authorization")
+
+
+def test_a_damaged_file_of_keys_lets_nobody_in(open_house: House) -> None:
+    holder = ward(open_house, "ward-3")
+    assert holder.request("GET", "/jobs").status_code == 200
+    (open_house.store.data_dir / KEYS_FILE).write_text("{")
+    assert_problem(holder.request("GET", "/jobs"), 503)
+    assert_problem(open_house.http.get("/jobs"), 401, "Authorization")
+
+
+def test_on_loopback_no_key_is_needed_a_wrong_one_is_refused_and_a_right_one_counts(house: House) -> None:
+    local_id = house.finished_scene()
+    assert_problem(house.http.request("GET", "/jobs", headers={"X-API-Key": "isp_1_2"}), 401, "Authorization")
+    holder = ward(house, "ward-3")
+    assert holder.request("GET", "/jobs").json() == []
+    assert holder.request("GET", f"/scenes/{local_id}").status_code == 404
+    assert house.http.get(f"/scenes/{local_id}").status_code == 200
+
+
+def test_no_scene_is_shown_unasked_when_several_are_owned_and_none_of_others_ever(open_house: House) -> None:
+    mine, theirs = ward(open_house, "ward-3"), ward(open_house, "ward-4")
+    first = finished(open_house, mine)
+    assert_problem(theirs.request("GET", "/render"), 400, "scene")
+    assert mine.request("GET", "/render").headers["x-intrasplat-scene"] == first
+    finished(open_house, mine)
+    assert_problem(mine.request("GET", "/render"), 400, "scene")
+
+
+def test_a_caller_that_asks_too_often_hears_when_to_come_back_and_others_are_served(tmp_path: Path) -> None:
+    for house in make_house(tmp_path, host=NETWORK, requests_per_s=3.0):
+        hasty, calm = ward(house, "ward-3"), ward(house, "ward-4")
+        responses = [hasty.request("GET", "/jobs") for _ in range(8)]
+        assert responses[0].status_code == 200
+        assert_problem(responses[-1], 429)
+        assert int(responses[-1].headers["retry-after"]) >= 1
+        assert "ratelimit" in responses[-1].headers
+        assert calm.request("GET", "/jobs").status_code == 200
+
+
+def test_what_is_done_is_in_the_audit_and_a_view_once_a_minute(open_house: House) -> None:
+    holder = ward(open_house, "ward-3")
+    done = finished(open_house, holder)
+    for _ in range(5):
+        assert holder.request("GET", f"/render?scene={done}").status_code == 200
+    holder.request("GET", f"/scenes/{done}")
+    holder.request("GET", f"/scenes/{done}/export")
+    failed = holder.upload()
+    _, claim = open_house.claimed()
+    open_house.queue.fail(claim, JobError(problem="no depth."))
+    holder.request("POST", f"/jobs/{failed}/retry")
+    holder.request("DELETE", f"/jobs/{failed}")
+    holder.request("DELETE", f"/scenes/{done}")
+    recorded = acts(open_house)
+    views = recorded.count(("viewed", "ok", done))
+    assert views in (1, 2)  # a minute may have ended in between
+    assert [act for act in recorded if act[0] != "viewed"] == [
+        ("accepted", "ok", done),
+        ("exported", "ok", done),
+        ("accepted", "ok", failed),
+        ("retried", "ok", failed),
+        ("cancelled", "ok", failed),
+        ("purged", "begun (request)", done),
+        ("purged", "done (request)", done),
+    ]
+    key_id = KeyFile(open_house.store.data_dir).list()[0].key_id
+    assert {(line["tenant"], line["key_id"]) for line in audit(open_house)} == {("ward-3", key_id)}
+    assert all(line["request_id"] for line in audit(open_house))
+
+
+def test_what_cannot_be_recorded_does_not_happen(house: House) -> None:
+    scene_id = house.finished_scene()
+    queued = house.upload().json()["id"]
+    path = house.store.data_dir / AUDIT_FILE
+    path.rename(path.with_suffix(".away"))
+    path.mkdir()
+    for method, asked in (
+        ("GET", f"/render?scene={scene_id}"),
+        ("GET", f"/scenes/{scene_id}"),
+        ("GET", f"/scenes/{scene_id}/export"),
+        ("DELETE", f"/scenes/{scene_id}"),
+        ("DELETE", f"/jobs/{queued}"),
+    ):
+        assert_problem(house.http.request(method, asked), 503)
+    before = house.spooled()
+    assert_problem(house.upload(), 503)
+    assert house.spooled() == before
+    assert house.painter.requests == []
+    path.rmdir()
+    assert house.http.get(f"/scenes/{scene_id}").status_code == 200
+    assert house.http.get(f"/jobs/{queued}").json()["state"] == "queued"
+
+
+def test_a_callers_words_appear_in_no_metric_audit_problem_event_log_or_file_name(
+    open_house: House, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    holder = ward(open_house, "ward-3")
+    caplog.set_level(0)
+    job_id = holder.upload(f"{MARKER}.mp4")
+    told = [holder.request("GET", f"/jobs/{job_id}").text]
+    refused = holder.request("POST", "/reconstruct", files={"clip": (f"{MARKER}.{MARKER}", CLIP)})
+    assert refused.status_code == 422
+    holder.request("GET", f"/{MARKER}", headers={"User-Agent": MARKER, "X-Request-Id": f"{MARKER} {MARKER}"})
+    holder.request("POST", f"/jobs/{job_id}/{MARKER}")
+    record, claim = open_house.claimed()
+    open_house.queue.fail(claim, JobError(problem="no depth."))
+    told.append(holder.request("GET", f"/jobs/{job_id}/events").text)
+    told.append(holder.request("GET", "/metrics").text)
+    told += [event.record.model_dump_json() for event in open_house.queue.events(job_id)]
+    told.append(record.model_dump_json())
+    told.append((open_house.store.data_dir / AUDIT_FILE).read_text())
+    told += [str(path) for path in open_house.store.data_dir.rglob("*")]
+    told += [path.read_text() for path in open_house.store.data_dir.rglob("*.json")]
+    told += ["".join(capfd.readouterr())]
+    assert "intrasplat_http_requests_total" in told[2]
+    assert not [text for text in told if MARKER in text]
+    assert not [line for line in caplog.records if line.name.startswith("intrasplat") and MARKER in line.getMessage()]
+
+
+def test_folders_and_files_are_their_owners_alone(open_house: House) -> None:
+    ward(open_house, "ward-3").upload()
+    data_dir = Store(open_house.store.data_dir).data_dir
+    assert data_dir.stat().st_mode & 0o077 == 0
+    for name in (AUDIT_FILE, KEYS_FILE):
+        assert (data_dir / name).stat().st_mode & 0o077 == 0
