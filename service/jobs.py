@@ -21,6 +21,11 @@ router = APIRouter(prefix="/jobs", tags=["jobs"])
 STREAM_HEADERS = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
 """The second keeps nginx from collecting events before it passes them on."""
 
+STREAM_RESPONSES: dict[int | str, dict[str, object]] = {
+    200: {"description": "server-sent events", "content": {EventSourceResponse.media_type: {}}},
+    204: {"description": "the job has ended, and the caller knows all of it"},
+}
+
 Limit = Annotated[int, Query(ge=1, le=LISTING_LIMIT, description="at most so many")]
 
 
@@ -75,8 +80,8 @@ def retry_job(job_id: str, response: Response, services: Services, caller: AnyCa
 @router.get(
     "/{job_id}/events",
     operation_id="watch_job",
-    response_class=EventSourceResponse,
-    responses={204: {"description": "the job has ended, and the caller knows all of it"}},
+    response_class=Response,
+    responses=STREAM_RESPONSES,
 )
 async def watch_job(
     job_id: str, services: Services, caller: AnyCaller, last_event_id: Annotated[str, Header()] = "0"

@@ -55,8 +55,14 @@ class House:
     store: Store
     painter: Painter
 
-    def upload(self, options: str = "{}", parts: Mapping[str, tuple[str, bytes]] | None = None) -> httpx.Response:
-        return self.http.post("/reconstruct", files=parts or {"clip": ("a.mp4", CLIP)}, data={"options": options})
+    def upload(
+        self,
+        options: str = "{}",
+        parts: Mapping[str, tuple[str, bytes]] | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> httpx.Response:
+        files = parts or {"clip": ("a.mp4", CLIP)}
+        return self.http.post("/reconstruct", files=files, data={"options": options}, headers=headers)
 
     def claimed(self) -> tuple[JobRecord, Claim]:
         record = self.queue.claim("worker-1", 0.0)
@@ -71,7 +77,7 @@ class House:
         (folder / REPORT).write_text('{"psnr_tissue_db": 36.2, "warnings": []}')
         (folder / CURVE).write_text("t_train_s,psnr_tissue_db\n1,30\n")
         self.store.publish_scene(record.job_id, record.attempt)
-        self.queue.finish(claim)
+        assert self.queue.finish(claim)
         return record.job_id
 
     def spooled(self) -> list[Path]:

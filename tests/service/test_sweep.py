@@ -1,0 +1,157 @@
+"""A clip that was accepted reaches the queue, whatever died or was away in between."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from contract.errors import UnavailableError
+from contract.job import JobRecord, JobState
+from contract.queue import Admission
+from contract.queue_memory import MemoryQueue
+from contract.store import MANIFEST, SUBMISSION, Store
+from service.sweep import Sweep
+from tests.service.house import House, assert_problem, make_house
+
+PATIENCE_S = 10.0
+
+
+class AbsentQueue(MemoryQueue):
+    """Can be away; `loses` says that it does what it is told and its answer is lost."""
+
+    is_away = False
+    loses = False
+
+    def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
+        if self.is_away and not self.loses:
+            raise UnavailableError("The queue does not answer.", "Start it.")
+        standing = super().submit(record, admission)
+        if self.is_away:
+            raise UnavailableError("The queue does not answer.", "Start it.")
+        return standing
+
+
+def wait_for_job(queue: MemoryQueue, job_id: str) -> JobRecord:
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        record = queue.get(job_id)
+        if record is not None:
+            return record
+        time.sleep(0.02)
+    raise AssertionError("the sweep did not queue the job")
+
+
+@pytest.mark.parametrize("loses", [False, True])
+def test_a_clip_accepted_while_the_queue_is_away_is_queued_once_it_is_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, loses: bool
+) -> None:
+    monkeypatch.setattr("service.sweep.SWEEP_PERIOD_S", 0.05)
+    queue = AbsentQueue()
+    for house in make_house(tmp_path, queue):
+        queue.is_away, queue.loses = True, loses
+        refused = house.upload()
+        problem = assert_problem(refused, 503, "queue")
+        assert refused.headers["retry-after"]
+        assert house.store.submission(problem["job_id"]) is not None
+        queue.is_away = False
+        assert wait_for_job(queue, problem["job_id"]).state is JobState.QUEUED
+        assert len(queue.records()) == 1
+
+
+def test_a_repeat_under_the_same_key_finds_the_job_that_the_sweep_queued(tmp_path: Path) -> None:
+    queue = AbsentQueue()
+    for house in make_house(tmp_path, queue):
+        queue.is_away = True
+        job_id = house.upload(headers={"Idempotency-Key": "k"}).json()["job_id"]
+        queue.is_away = False
+        Sweep(queue, house.store).settle()
+        assert house.upload(headers={"Idempotency-Key": "k"}).json()["id"] == job_id
+        assert house.store.spooled_ids() == [job_id]
+
+
+def test_of_two_clips_under_one_key_the_sweep_keeps_one(tmp_path: Path) -> None:
+    queue = AbsentQueue()
+    for house in make_house(tmp_path, queue):
+        queue.is_away = True
+        for _ in range(2):
+            house.upload(headers={"Idempotency-Key": "k"})
+        assert len(house.store.spooled_ids()) == 2
+        queue.is_away = False
+        Sweep(queue, house.store).settle()
+        (record,) = queue.records()
+        assert house.store.spooled_ids() == [record.job_id]
+
+
+def test_a_service_that_starts_queues_what_an_earlier_one_left(tmp_path: Path) -> None:
+    for house in make_house(tmp_path):
+        job_id = house.upload().json()["id"]
+    emptied = MemoryQueue()
+    for _ in make_house(tmp_path, emptied):
+        assert wait_for_job(emptied, job_id).state is JobState.QUEUED
+
+
+def test_a_finished_scene_whose_record_was_lost_is_restored_and_not_run_again(tmp_path: Path) -> None:
+    for house in make_house(tmp_path):
+        scene = house.finished_scene()
+    emptied, store = MemoryQueue(), Store(tmp_path)
+    Sweep(emptied, store).settle()
+    record = emptied.get(scene)
+    assert record is not None
+    assert (record.state, record.attempt) == (JobState.DONE, 1)
+    assert (store.scene_folder(scene, record.attempt) / MANIFEST).is_file()
+
+
+def test_the_sweep_may_run_as_often_as_it_likes(house: House) -> None:
+    job_id = house.upload().json()["id"]
+    before = house.queue.get(job_id)
+    for _ in range(3):
+        Sweep(house.queue, house.store).settle()
+    assert house.queue.get(job_id) == before
+
+
+def test_the_clip_of_a_cancelled_job_goes_even_if_its_canceller_died(house: House) -> None:
+    job_id = house.upload().json()["id"]
+    house.queue.cancel(job_id)
+    Sweep(house.queue, house.store).settle()
+    assert house.store.spooled_ids() == []
+
+
+def test_a_submission_that_cannot_be_read_stops_no_other(tmp_path: Path) -> None:
+    for house in make_house(tmp_path):
+        ids = [house.upload().json()["id"] for _ in range(3)]
+    (Store(tmp_path).spool_folder(ids[1]) / SUBMISSION).write_text("{")
+    queue = MemoryQueue()
+    Sweep(queue, Store(tmp_path)).settle()
+    assert {record.job_id for record in queue.records()} == {ids[0], ids[2]}
+
+
+def test_a_job_that_a_request_is_submitting_is_let_be(house: House) -> None:
+    job_id = house.upload().json()["id"]
+    emptied = MemoryQueue()
+    sweep = Sweep(emptied, house.store)
+    with sweep.in_hand(job_id):
+        sweep.settle()
+        assert emptied.records() == []
+    sweep.settle()
+    assert [record.job_id for record in emptied.records()] == [job_id]
+
+
+class WithdrawingQueue(MemoryQueue):
+    """Its clip goes while a job is being submitted."""
+
+    def __init__(self, store: Store) -> None:
+        super().__init__()
+        self._store = store
+
+    def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
+        self._store.purge(record.job_id)
+        return super().submit(record, admission)
+
+
+def test_a_job_whose_clip_was_withdrawn_meanwhile_is_taken_back(house: House) -> None:
+    house.upload()
+    queue = WithdrawingQueue(house.store)
+    Sweep(queue, house.store).settle()
+    assert queue.records() == []
