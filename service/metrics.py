@@ -68,7 +68,7 @@ class Metrics:
             buckets=RENDER_DURATIONS_S,
             registry=registry,
         )
-        self.streams = Gauge("intrasplat_streams", "Open WebSockets.", registry=registry)
+        self.streams = Gauge("intrasplat_streams", "Open WebSockets on /stream.", registry=registry)
 
     def exposition(self) -> bytes:
         """All figures in Prometheus' text format; asks queue and disk."""
@@ -87,10 +87,7 @@ class Measure:
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "websocket":
-            with self._metrics.streams.track_inprogress():
-                await self._app(scope, receive, send)
-        elif scope["type"] == "http":
+        if scope["type"] == "http":
             await self._measured(scope, receive, send)
         else:
             await self._app(scope, receive, send)

@@ -21,11 +21,10 @@ from service.access import Caller
 from service.deps import AnyCaller, Deps, Services, not_found
 from service.problems import Problem
 from service.purge import Receipt
-from service.renders import ModelTime, image_response
+from service.renders import SCENES_REMEDY, ModelTime, image_response
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
-SCENES_REMEDY = "GET /scenes lists what there is."
 Limit = Annotated[int, Query(ge=1, le=LISTING_LIMIT, description="at most so many")]
 
 
@@ -105,14 +104,12 @@ def finished_job(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
     Raises:
         Problem: 404, there is none of that id, or it is another's; 409, the job has not come to a scene.
     """
-    record = services.queue.get(scene_id) if is_job_id(scene_id) else None
+    record = services.done.record(scene_id) if is_job_id(scene_id) else None
     if record is None or not caller.owns(record):
         raise _no_such_scene(scene_id, caller, record)
     if record.state is not JobState.DONE:
         detail = f"The job is {record.state}; there is no finished scene."
         raise Problem(409, detail, field="scene", remedy=f"See GET /jobs/{scene_id}.")
-    if not services.store.has_scene(scene_id, record.attempt):
-        raise _no_such_scene(scene_id, caller, None)
     return record
 
 

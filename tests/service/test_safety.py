@@ -173,16 +173,16 @@ def test_another_tenants_job_is_answered_exactly_like_one_that_is_not_there(open
 def test_another_tenants_upload_is_not_there_either(open_house: House) -> None:
     mine, theirs = ward(open_house, "ward-3"), ward(open_house, "ward-4")
     tus = {"Tus-Resumable": "1.0.0"}
-    created = {**tus, "Upload-Length": "4", "Upload-Metadata": "part Y2xpcA==,suffix Lm1wNA=="}
+    created = {**tus, "Upload-Length": str(len(CLIP)), "Upload-Metadata": "part Y2xpcA==,suffix Lm1wNA=="}
     path = mine.request("POST", "/uploads", headers=created).headers["location"]
     upload_id = path.rsplit("/", 1)[1]
     assert mine.request("HEAD", f"/uploads/{upload_id}", headers=tus).status_code == 200
     sending = {**tus, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
     for method, headers in (("HEAD", tus), ("DELETE", tus), ("PATCH", sending)):
-        content = b"abcd" if method == "PATCH" else None
+        content = CLIP if method == "PATCH" else None
         response = theirs.request(method, f"/uploads/{upload_id}", headers=headers, content=content)
         assert response.status_code == 404, method
-    sent = mine.request("PATCH", f"/uploads/{upload_id}", headers=sending, content=b"abcd")
+    sent = mine.request("PATCH", f"/uploads/{upload_id}", headers=sending, content=CLIP)
     assert sent.status_code == 204
     assert theirs.request("POST", "/reconstruct", json={"clip": upload_id}).status_code in (404, 422)
     assert mine.request("POST", "/reconstruct", json={"clip": upload_id}).status_code == 202
