@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import threading
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import pytest
@@ -10,10 +12,12 @@ import zmq
 
 from contract.embedded import short_socket_path
 from contract.errors import UnavailableError
-from contract.job import JobState
+from contract.job import JobRecord, JobState
+from contract.keys import DEFAULT_SCOPES, KeyFile, KeyScope
+from contract.queue import Claim
 from contract.queue_memory import MemoryQueue
 from contract.rendering import RenderRequest, WorkerAddress, WorkerReply
-from contract.store import REPORT
+from contract.store import MANIFEST, REPORT
 from tests.service.house import IDENTITY, House, assert_problem, make_house
 
 
@@ -96,6 +100,154 @@ def test_a_worker_that_does_not_answer_is_given_up_in_time(tmp_path: Path) -> No
         house.queue.withdraw("worker-1")
         house.queue.announce(WorkerAddress(name="worker-2", endpoint=nobody, device="cpu"))
         assert_problem(house.http.get("/render"), 503)
+
+
+def test_format_and_quality_reach_the_worker(house: House) -> None:
+    scene = house.finished_scene()
+    response = house.http.get("/render", params={"scene": scene, "format": "webp", "quality": "35"})
+    assert response.headers["content-type"] == "image/webp"
+    (request,) = house.painter.requests
+    assert isinstance(request, RenderRequest)
+    assert (request.attempt, request.format, request.quality) == (1, "webp", 35)
+    assert_problem(house.http.get("/render", params={"scene": scene, "quality": "0"}), 422, "quality")
+
+
+def test_an_answer_says_how_long_it_took(house: House) -> None:
+    timing = house.http.get("/render", params={"scene": house.finished_scene()}).headers["server-timing"]
+    figures = re.fullmatch(r"render;dur=(\d+\.\d), total;dur=(\d+\.\d)", timing)
+    assert figures is not None
+    assert float(figures[1]) <= float(figures[2])
+
+
+def test_who_has_the_picture_is_told_so_without_asking_the_worker(house: House) -> None:
+    query = {"scene": house.finished_scene(), "t": "0.5", "pose": "orbit:10,0,1"}
+    first = house.http.get("/render", params=query)
+    assert first.headers["cache-control"] == "private, no-cache"
+    for given in (first.headers["etag"], f'"other", {first.headers["etag"]}', "*"):
+        again = house.http.get("/render", params=query, headers={"If-None-Match": given})
+        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", first.headers["etag"])
+    assert len(house.painter.requests) == 1
+    another = house.http.get("/render", params=query | {"t": "0.6"}, headers={"If-None-Match": first.headers["etag"]})
+    assert another.status_code == 200
+    assert another.headers["etag"] != first.headers["etag"]
+
+
+def test_who_has_the_picture_of_a_purged_scene_is_not_told_that_it_is_still_right(house: House) -> None:
+    query = {"scene": house.finished_scene()}
+    tag = house.http.get("/render", params=query).headers["etag"]
+    assert house.http.delete(f"/scenes/{query['scene']}").status_code == 200
+    assert_problem(house.http.get("/render", params=query, headers={"If-None-Match": tag}), 404, "scene")
+
+
+def test_a_running_job_is_shown_by_its_newest_snapshot_which_nobody_may_keep(house: House) -> None:
+    job_id = house.running_job()
+    response = house.http.get("/render", params={"scene": job_id}, headers={"If-None-Match": "*"})
+    assert response.status_code == 200, response.text
+    assert response.headers["x-intrasplat-state"] == "running"
+    assert response.headers["x-intrasplat-iteration"] == "7"
+    assert response.headers["cache-control"] == "no-store"
+    assert "etag" not in response.headers
+    (request,) = house.painter.requests
+    assert request.attempt is None
+
+
+def test_a_running_job_that_no_worker_shows_yet_is_to_be_asked_for_again_in_a_second(house: House) -> None:
+    house.upload()
+    record, _ = house.claimed()
+    response = house.http.get("/render", params={"scene": record.job_id})
+    assert_problem(response, 503, "scene")
+    assert response.headers["retry-after"] == "1"
+
+
+def test_a_job_that_has_nothing_to_show_says_where_it_stands(house: House) -> None:
+    job_id = house.upload().json()["id"]
+    assert "queued" in assert_problem(house.http.get("/render", params={"scene": job_id}), 409, "scene")["detail"]
+    house.queue.cancel(job_id)
+    assert "cancelled" in assert_problem(house.http.get("/render", params={"scene": job_id}), 409, "scene")["detail"]
+
+
+def test_a_tenant_sees_and_counts_only_its_own_scenes(tmp_path: Path) -> None:
+    for house in make_house(tmp_path, host="0.0.0.0", hosts=("127.0.0.1",)):
+        own, other = (bearer(house, tenant) for tenant in ("ward-3", "ward-4"))
+        scene, job = house.finished_scene(own), house.running_job(other)
+        assert house.http.get("/render", headers=own).headers["x-intrasplat-scene"] == scene
+        assert_problem(house.http.get("/render", headers=other), 400, "scene")
+        unknown = assert_problem(house.http.get("/render", params={"scene": "0" * 32}, headers=own), 404, "scene")
+        for headers, foreign in ((own, job), (other, scene)):
+            refused = assert_problem(
+                house.http.get("/render", params={"scene": foreign}, headers=headers), 404, "scene"
+            )
+            assert refused | {"detail": ""} == unknown | {"detail": ""}
+        assert_problem(house.http.get("/render", params={"scene": scene}), 401, "Authorization")
+        blind = bearer(house, "ward-3", {KeyScope.RECONSTRUCT})
+        assert_problem(house.http.get("/render", params={"scene": scene}, headers=blind), 403, "Authorization")
+
+
+def bearer(house: House, tenant: str, scopes: Collection[KeyScope] = DEFAULT_SCOPES) -> dict[str, str]:
+    _, text = KeyFile(house.store.data_dir).create(tenant, scopes)
+    return {"Authorization": f"Bearer {text}"}
+
+
+class LeavingQueue(MemoryQueue):
+    """Goes away when it is told to."""
+
+    is_away = False
+
+    def get(self, job_id: str) -> JobRecord | None:
+        self._stay()
+        return super().get(job_id)
+
+    def workers(self) -> list[WorkerAddress]:
+        self._stay()
+        return super().workers()
+
+    def _stay(self) -> None:
+        if self.is_away:
+            raise UnavailableError("The queue does not answer.", "Start it.")
+
+
+def test_what_was_shown_before_is_shown_while_the_queue_is_away_but_not_if_it_was_purged(tmp_path: Path) -> None:
+    queue = LeavingQueue()
+    for house in make_house(tmp_path, queue):
+        kept, purged, unknown = (house.finished_scene() for _ in range(3))
+        for scene in (kept, purged):
+            assert house.http.get("/render", params={"scene": scene}).status_code == 200
+        queue.is_away = True
+        house.store.purge(purged)
+        assert house.http.get("/render", params={"scene": kept, "t": "0.3"}).status_code == 200
+        assert_problem(house.http.get("/render", params={"scene": purged}), 404, "scene")
+        assert_problem(house.http.get("/render", params={"scene": unknown}), 503)
+
+
+class EndingQueue(MemoryQueue):
+    """The job ends just after it was looked up as running."""
+
+    finish_next: Callable[[], None] | None = None
+
+    def get(self, job_id: str) -> JobRecord | None:
+        record = super().get(job_id)
+        if self.finish_next is not None:
+            finish, self.finish_next = self.finish_next, None
+            finish()
+        return record
+
+
+def test_a_job_that_ends_while_it_is_asked_for_is_shown_as_its_scene(tmp_path: Path) -> None:
+    queue = EndingQueue()
+    for house in make_house(tmp_path, queue):
+        house.upload()
+        record, claim = house.claimed()
+
+        def finish(house: House = house, claim: Claim = claim) -> None:
+            (house.store.work_folder(claim.job_id, claim.attempt) / MANIFEST).write_text("{}")
+            house.store.publish_scene(claim.job_id, claim.attempt)
+            assert house.queue.finish(claim)
+
+        queue.finish_next = finish
+        response = house.http.get("/render", params={"scene": record.job_id})
+        assert response.status_code == 200, response.text
+        assert response.headers["x-intrasplat-state"] == "done"
+        assert response.headers["etag"]
 
 
 def test_scenes_have_report_curve_and_export_until_they_are_deleted(house: House) -> None:
