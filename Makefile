@@ -18,7 +18,7 @@ NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do \
 	"$$each" -c '$(NEW_ENOUGH)' 2>/dev/null && { echo "$$each"; break; }; done)
 
-.PHONY: help setup demo test check bench clean
+.PHONY: help setup demo test check bench chaos sbom clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -46,16 +46,22 @@ demo: setup ## reconstruct a synthetic clip of tissue and render it without the 
 test: setup ## the whole test suite; ARGS="tests/test_layers.py -k law" narrows it
 	@$(BIN)/python -m pytest $(ARGS)
 
-check: setup ## style, types and the import rules
+check: setup ## style, types, the import rules and the containers' rules
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
-	@$(BIN)/python -m pytest tests/test_layers.py
+	@$(BIN)/python -m pytest tests/test_layers.py tests/test_docker.py
 
 bench: setup ## every benchmarks/bm_*.py, one after the other
 	@set -e; for each in benchmarks/bm_*.py; do \
 		[ -e "$$each" ] || { echo "bench: benchmarks/ holds no bm_*.py" >&2; exit 1; }; \
 		echo "== $$each"; $(BIN)/python "$$each"; done
+
+chaos: setup ## kill every part of a running service at every point, and count what was lost; ARGS narrows it
+	@$(BIN)/python -m tests.chaos $(ARGS)
+
+sbom: setup ## build/sbom.json: every component of this environment, as CycloneDX
+	@$(BIN)/python docker/sbom.py build/sbom.json
 
 clean: ## remove .venv, caches and build leftovers; scenes and the demo's pictures stay
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

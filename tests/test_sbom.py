@@ -1,0 +1,21 @@
+"""The bill of materials names what the project is made of, the video decoder inside a wheel included."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.test_house import REPOSITORY, project, requirement_name
+
+
+def test_the_bill_names_every_direct_dependency_and_the_ffmpeg_that_reads_clips(tmp_path: Path) -> None:
+    path = tmp_path / "build" / "sbom.json"
+    subprocess.run([sys.executable, REPOSITORY / "docker" / "sbom.py", path], check=True, timeout=120)
+    bill = json.loads(path.read_text())
+    assert bill["bomFormat"] == "CycloneDX"
+    versions = {each["name"].lower().replace("_", "-"): each["version"] for each in bill["components"]}
+    assert {requirement_name(each) for each in project()["dependencies"]} - versions.keys() == set()
+    assert int(versions["ffmpeg"].split(".")[0]) >= 8
+    assert {"libavcodec", "libavformat", "libswscale"} <= versions.keys()
