@@ -238,7 +238,10 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _consume(options: argparse.Namespace) -> int:
-    settings = _service_settings("worker")
+    settings = Settings.from_environment()
+    configure(settings, "worker")
+    if settings.redis_url is None:
+        raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
     from worker.supervisor import run_supervisor
 
     end = threading.Event()
@@ -249,20 +252,12 @@ def _consume(options: argparse.Namespace) -> int:
 
 
 def _device(options: argparse.Namespace) -> int:
-    settings = _service_settings("device")
+    settings = Settings.from_environment()
+    configure(settings, "device")
     from worker.device import run_device
 
     run_device(settings)
     return ExitCode.OK
-
-
-def _service_settings(process: str) -> Settings:
-    """Settings of a process of the service, which logs; it needs a queue."""
-    settings = Settings.from_environment()
-    configure(settings, process)
-    if settings.redis_url is None:
-        raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
-    return settings
 
 
 if __name__ == "__main__":

@@ -1,29 +1,29 @@
-"""The worker's process: what a job asks for reaches the reconstruction whole, and no way to end it loses the job."""
+"""The device child: what a job asks for reaches the reconstruction whole, and no order, error or death upsets it."""
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from contract.embedded import EmbeddedServer
 from contract.errors import InputError, UnavailableError
 from contract.exits import ExitCode
-from contract.job import JobFiles, JobOptions, JobRecord, JobState
-from contract.queue_redis import RedisQueue
+from contract.job import JobFiles, JobOptions, JobRecord
 from contract.settings import Settings
-from contract.store import REPORT, Store, new_job_id
+from contract.store import REPORT, new_job_id
 from worker.__main__ import main
-from worker.checkpoint import RESUME_FILE, load_resume
-from worker.hooks import Hooks
-from worker.pipeline import ReconstructionRequest
+from worker.checkpoint import RESUME_FILE, load_resume, load_scene
+from worker.child import DeviceChild
 from worker.device import request_of, run_or_start_anew, training_device
+from worker.hooks import Hooks
+from worker.orders import Advanced, Failed, Finished, Run, Stop, Stopped
+from worker.pipeline import ReconstructionRequest
 
 SPOOL = Path("spool")
 CHOSEN = {
@@ -46,7 +46,8 @@ def request(files: JobFiles, options: dict[str, object]) -> ReconstructionReques
 def test_every_option_of_a_job_is_one_of_the_request(chosen: dict[str, object]) -> None:
     asked = request(JobFiles(clip="clip.mp4"), chosen)
     for name, value in JobOptions.model_validate(chosen):
-        assert getattr(asked, name) == value, name
+        if name not in ("priority", "retention_hours"):  # they are the queue's and the service's business
+            assert getattr(asked, name) == value, name
     assert asked.device == "cpu"
 
 
@@ -68,53 +69,94 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.make_archive(str(folder), "zip", folder))
 
 
-@contextmanager
-def worker_of(settings: Settings) -> Iterator[subprocess.Popen[bytes]]:
-    """`python -m worker consume`, told to end when the context is left."""
-    command = [sys.executable, "-m", "worker", "consume"]
-    with subprocess.Popen(command, env=settings.to_environment(), stderr=subprocess.PIPE) as process:
-        yield process
-        process.terminate()
-        assert process.stderr is not None
-        assert b"Traceback" not in process.stderr.read()
-        assert process.wait(timeout=60) == ExitCode.OK
+@pytest.fixture
+def device(tmp_path: Path) -> Iterator[DeviceChild]:
+    """`python -m worker device`, ready."""
+    settings = Settings(data_dir=tmp_path / "data")
+    child = DeviceChild([sys.executable, "-m", "worker", "device"], {**os.environ, **settings.to_environment()})
+    wait_until(lambda: child.ready is not None)
+    yield child
+    child.end()
 
 
-def wait_until(holds: Callable[[], bool], timeout_s: float = 120.0) -> None:
+def wait_until(holds: Callable[[], bool], timeout_s: float = 60.0) -> None:
     deadline_s = time.monotonic() + timeout_s
     while not holds():
         assert time.monotonic() < deadline_s
-        time.sleep(0.02)
+        time.sleep(0.01)
 
 
-def test_a_worker_told_to_end_gives_its_job_back_and_the_next_goes_on_from_there(tmp_path: Path, clip: Path) -> None:
-    server = EmbeddedServer(tmp_path)
-    server.start()
-    store, queue = Store(tmp_path), RedisQueue(server.url)
-    settings = Settings(data_dir=tmp_path, redis_url=server.url)
-    options = JobOptions(iterations=100_000)
-    record = JobRecord(job_id=new_job_id(), files=JobFiles(clip="clip.zip"), options=options, created_at_s=0.0)
-    shutil.copy(clip, store.open_incoming(record.job_id) / "clip.zip")
-    store.accept(record)
-    queue.submit(record)
-    (store.scratch_folder(settings.worker_name) / "of a process that was killed").write_text("frames")
+def order(clip: Path, out: Path, **options: object) -> Run:
+    chosen = JobOptions.model_validate(options)
+    record = JobRecord(job_id="a" * 32, files=JobFiles(clip=clip.name), options=chosen, created_at_s=time.time())
+    out.mkdir(exist_ok=True)
+    return Run(record=record, spool=clip.parent, out=out)
 
-    def now() -> JobRecord:
-        found = queue.get(record.job_id)
-        assert found is not None
-        return found
 
-    iterations = [0]
-    for attempt in (1, 2):
-        with worker_of(settings):
-            wait_until(lambda: (progress := now().progress) is not None and progress.iteration > iterations[-1])
-            assert now().attempt == attempt
-        assert (now().state, now().released) == (JobState.QUEUED, attempt)
-        iterations.append(load_resume(store.data_dir / "work" / f"{record.job_id}.{attempt}")[1]["iteration"])
-    assert iterations[2] > iterations[1] > 0
-    assert list((store.data_dir / "work" / f"tmp-{settings.worker_name}").iterdir()) == []
-    queue.close()
-    server.stop()
+def end_of_job(child: DeviceChild, stop_after: int | None = None) -> tuple[object, list[Advanced]]:
+    """The job's last report and those before it; it is stopped after so many iterations."""
+    advances: list[Advanced] = []
+    while True:
+        report = child.next_report(60.0)
+        if not isinstance(report, Advanced):
+            return report, advances
+        advances.append(report)
+        if stop_after is not None and report.progress.iteration > stop_after:
+            child.send(Stop(reason="end"))
+            stop_after = None
+
+
+def test_a_stopped_job_goes_on_to_the_same_bits_and_the_process_does_any_number_of_jobs(
+    device: DeviceChild, tmp_path: Path, clip: Path
+) -> None:
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    device.send(order(clip, whole, iterations=600))
+    assert end_of_job(device)[0] == Finished()
+    device.send(order(clip, tmp_path / "no", holdout="99", iterations=3))
+    failed, _ = end_of_job(device)
+    assert isinstance(failed, Failed)
+    assert (failed.fault, failed.error.field) == ("InputError", "options.holdout")
+    device.send(order(clip, out, iterations=600))
+    assert end_of_job(device, stop_after=1)[0] == Stopped(checkpointed=True)
+    assert [path.name for path in out.iterdir()] == [RESUME_FILE]
+    stopped_at = load_resume(out)[1]["iteration"]
+    device.send(Stop(reason="end"))  # too late for the last job, and not meant for the next
+    device.send(order(clip, out, iterations=600))
+    finished, advances = end_of_job(device)
+    assert finished == Finished()
+    assert min(each.progress.iteration for each in advances if each.progress.stage == "train") == stopped_at
+    assert tensor_bits(out) == tensor_bits(whole)
+
+
+def tensor_bits(folder: Path) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in load_scene(folder).tensors().items()}
+
+
+def test_a_job_that_trains_dies_with_the_process_that_ordered_it(tmp_path: Path, clip: Path) -> None:
+    spool, out = clip.parent, tmp_path / "out"
+    program = (
+        "import os, sys; from pathlib import Path; from worker.child import DeviceChild; from worker.orders import *;"
+        "child = DeviceChild([sys.executable, '-m', 'worker', 'device'], os.environ);"
+        "child.send(read_order(sys.argv[1].encode())); report = None\n"
+        "while report is None or report.progress.stage != 'train': report = child.next_report(60)\n"
+        "print(child.process_id, flush=True); child.next_report(60)"
+    )
+    settings = Settings(data_dir=tmp_path / "data").to_environment()
+    ordered = order(spool / clip.name, out, iterations=1_000_000).model_dump_json()
+    command = [sys.executable, "-c", program, ordered]
+    with subprocess.Popen(command, env={**os.environ, **settings}, stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        process_id = int(parent.stdout.readline())
+        parent.kill()
+    wait_until(lambda: not is_alive(process_id), timeout_s=5.0)
+
+
+def is_alive(process_id: int) -> bool:
+    """Whether it runs; a dead process that nobody has waited for does not."""
+    try:
+        return Path(f"/proc/{process_id}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def test_a_state_of_another_version_is_left_behind_and_training_starts_anew(tmp_path: Path, clip: Path) -> None:

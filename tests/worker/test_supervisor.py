@@ -1,0 +1,186 @@
+"""The worker's process with an embedded queue: however it ends, its job goes on elsewhere and only one scene stands."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from contract.embedded import EmbeddedServer
+from contract.errors import UnavailableError
+from contract.exits import ExitCode
+from contract.job import JobFiles, JobRecord, JobState
+from contract.queue_redis import RedisQueue
+from contract.settings import Settings
+from contract.store import Store, new_job_id
+from worker.supervisor import run_supervisor
+
+WAIT_S = 40.0
+REPOSITORY = Path(__file__).resolve().parents[2]
+STANDIN = Path(__file__).with_name("standin.py")
+PROGRAM = f"""
+import signal, sys, threading
+from contract.logs import configure
+from contract.settings import Settings
+from worker.supervisor import run_supervisor
+end = threading.Event()
+signal.signal(signal.SIGTERM, lambda *_: end.set())
+settings = Settings.from_environment()
+configure(settings, settings.worker_name)
+run_supervisor(settings, end, [sys.executable, {str(STANDIN)!r}])
+"""
+"""A worker as `python -m worker consume` makes one, with a child that needs no torch."""
+
+
+class Bench:
+    """A queue, a store and any number of workers."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self.server = EmbeddedServer(data_dir)
+        self.server.start()
+        self.queue = RedisQueue(self.server.url)
+        self.store = Store(data_dir)
+
+    def close(self) -> None:
+        self.queue.close()
+        self.server.stop()
+
+    def settings(self, name: str = "worker-1") -> Settings:
+        return Settings(data_dir=self.store.data_dir, redis_url=self.server.url, worker_name=name)
+
+    @contextmanager
+    def worker(self, name: str = "worker-1") -> Iterator[subprocess.Popen[bytes]]:
+        environment = {**os.environ, **self.settings(name).to_environment()}
+        command = [sys.executable, "-c", PROGRAM]
+        with subprocess.Popen(command, env=environment, cwd=REPOSITORY, stderr=subprocess.PIPE) as process:
+            try:
+                yield process
+            finally:
+                process.send_signal(signal.SIGCONT)
+                process.terminate()
+                _, errors = process.communicate(timeout=WAIT_S)
+                assert b"Traceback" not in errors
+                assert b"nobody caught" not in errors, errors.decode()
+
+    def submit(self, clip: str) -> str:
+        record = JobRecord(job_id=new_job_id(), files=JobFiles(clip="clip.mp4"), created_at_s=time.time())
+        (self.store.open_incoming(record.job_id) / "clip.mp4").write_text(clip)
+        self.store.accept(record)
+        self.queue.submit(record)
+        return record.job_id
+
+    def record(self, job_id: str) -> JobRecord:
+        record = self.queue.get(job_id)
+        assert record is not None
+        return record
+
+    def holder(self, job_id: str) -> str:
+        """Name of the worker that holds, or last held, the job."""
+        return (self.record(job_id).owner or "").split(".")[0]
+
+    def wait_for_step(self, job_id: str, attempt: int = 1) -> None:
+        def trains() -> bool:
+            record = self.record(job_id)
+            return record.attempt == attempt and record.progress is not None and record.progress.iteration > 0
+
+        eventually(trains)
+
+    def wait_for_end(self, job_id: str) -> JobRecord:
+        eventually(lambda: self.record(job_id).state in (JobState.DONE, JobState.FAILED, JobState.CANCELLED))
+        return self.record(job_id)
+
+
+def eventually(holds: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + WAIT_S
+    while not holds():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def children_of(process: subprocess.Popen[bytes]) -> list[int]:
+    return [int(each) for each in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path)
+    yield bench
+    bench.close()
+
+
+def test_a_worker_told_to_end_hands_its_job_back_and_is_gone(bench: Bench) -> None:
+    job_id = bench.submit("wait publish")
+    with bench.worker() as worker:
+        bench.wait_for_step(job_id)
+        address = bench.queue.workers()[0]
+        assert (address.name, address.job_id) == ("worker-1", job_id)
+        worker.terminate()
+        assert worker.wait(WAIT_S) == ExitCode.OK
+    assert bench.queue.workers() == []
+    record = bench.record(job_id)
+    assert (record.state, record.released) == (JobState.QUEUED, 1)
+    with bench.worker("worker-2"):
+        record = bench.wait_for_end(job_id)
+    assert (record.state, record.attempt) == (JobState.DONE, 2)
+
+
+def test_a_worker_that_is_killed_takes_its_child_along_and_another_takes_the_job(bench: Bench) -> None:
+    job_id = bench.submit("wait publish")
+    with bench.worker() as killed, bench.worker("worker-2") as other:
+        bench.wait_for_step(job_id)
+        first, second = (killed, other) if bench.holder(job_id) == "worker-1" else (other, killed)
+        child_id = children_of(first)[0]
+        first.kill()
+        eventually(lambda: not Path(f"/proc/{child_id}").exists())
+        record = bench.wait_for_end(job_id)
+        assert (record.state, record.attempt) == (JobState.DONE, 2)
+        assert second.poll() is None
+
+
+def test_a_worker_that_slept_through_its_lease_publishes_nothing(bench: Bench) -> None:
+    job_id = bench.submit("slow wait")
+    with bench.worker() as asleep:
+        bench.wait_for_step(job_id)
+        asleep.send_signal(signal.SIGSTOP)  # its child goes on, and finishes
+        with bench.worker("worker-2"):
+            bench.wait_for_step(job_id, attempt=2)
+            asleep.send_signal(signal.SIGCONT)
+            eventually(lambda: not (bench.store.data_dir / "work" / f"{job_id}.1").exists())
+            time.sleep(1.0)
+            assert bench.store.scene_attempts(job_id) == []
+            assert bench.holder(job_id) == "worker-2"
+            assert bench.record(job_id).state is JobState.RUNNING
+
+
+def test_a_second_worker_of_one_name_is_refused(bench: Bench) -> None:
+    with bench.worker():
+        eventually(lambda: bool(bench.queue.workers()))
+        with pytest.raises(UnavailableError, match="worker-1 already works"):
+            run_supervisor(bench.settings(), threading.Event(), [sys.executable, str(STANDIN)])
+
+
+def test_a_worker_waits_for_a_queue_that_is_not_there_yet(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.server.stop()
+    with bench.worker() as worker:
+        time.sleep(1.0)
+        bench.server.start()
+        eventually(lambda: len(bench.queue.workers()) == 1)
+        assert worker.poll() is None
+    bench.close()
+
+
+def test_the_supervisor_loads_nothing_that_could_hang_or_eat_memory() -> None:
+    heavy = ("torch", "numba", "cv2", "scipy", "numpy", "zmq")
+    program = f"import sys, worker.supervisor; print(*(each for each in {heavy!r} if each in sys.modules))"
+    command = [sys.executable, "-c", program]
+    result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=60, check=True)
+    assert result.stdout.split() == []
