@@ -66,6 +66,7 @@ def configure(settings: Settings, process: str) -> None:
         logger.handlers.clear()
         logger.propagate = True
     logging.captureWarnings(True)
+    logging.raiseExceptions = False  # it would print what a line was to be made of
     sys.excepthook = _log_uncaught
     threading.excepthook = lambda args: _log_uncaught(args.exc_type, args.exc_value, args.exc_traceback)
 

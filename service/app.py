@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-from collections.abc import AsyncIterator
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
@@ -29,6 +29,10 @@ DESCRIPTION = (
     "Research use only; not a medical device."
 )
 
+BACKGROUND_PAUSE_S = 10.0
+
+logger = logging.getLogger("intrasplat.service")
+
 
 def create_app(settings: Settings, queue: Queue, store: Store, renderer: Renderer) -> FastAPI:
     """The application; it takes over `queue` and `renderer` and closes them when it ends."""
@@ -36,13 +40,12 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(work) for work in (deps.sweep.run(), deps.retention.run())]
+        tasks = [asyncio.create_task(_kept_up(run)) for run in (deps.sweep.run, deps.retention.run)]
         yield
         deps.feeds.end()
         for task in tasks:
             task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
+        await asyncio.wait(tasks)
         await renderer.close()
         queue.close()
 
@@ -65,3 +68,13 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     if settings.dashboard_dir is not None:
         app.mount("/", StaticFiles(directory=settings.dashboard_dir, html=True), name="dashboard")
     return app
+
+
+async def _kept_up(run: Callable[[], Awaitable[None]]) -> None:
+    """Work in the background that goes on after an error nobody foresaw."""
+    while True:
+        try:
+            await run()
+        except Exception:
+            logger.exception("work in the background failed and starts again")
+        await asyncio.sleep(BACKGROUND_PAUSE_S)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from contract.errors import UnavailableError
 from tests.service.house import House, assert_problem, make_house
 
 
@@ -30,25 +31,74 @@ def test_the_page_itself_may_use_the_service_and_nothing_from_elsewhere_may_run(
     assert response.headers["x-content-type-options"] == "nosniff"
 
 
+OPERATIONS = {
+    *("reconstruct", "list_jobs", "get_job", "cancel_job", "retry_job", "watch_job"),
+    *("describe_uploads", "create_upload", "get_upload", "append_to_upload", "delete_upload"),
+    *("render", "list_scenes", "get_scene", "get_curve", "export_scene", "purge_scene"),
+    *("healthz", "readyz", "info", "metrics"),
+}
+"""What clients are generated from: renaming or removing one breaks them."""
+
+
 def test_the_api_describes_itself_with_stable_operation_ids(house: House) -> None:
     document = house.http.get("/openapi.json").json()
-    operations = {each["operationId"] for path in document["paths"].values() for each in path.values()}
-    assert operations == {
-        "reconstruct",
-        "list_jobs",
-        "get_job",
-        "cancel_job",
-        "render",
-        "list_scenes",
-        "get_scene",
-        "get_curve",
-        "export_scene",
-        "delete_scene",
-        "healthz",
-        "readyz",
-        "info",
-    }
-    assert "Not a medical device" in house.http.get("/info").json()["notice"]
+    operations = [each for path in document["paths"].values() for each in path.values()]
+    assert {each["operationId"] for each in operations} == OPERATIONS
+    problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    assert all(each["responses"]["default"]["content"] == problem for each in operations)
+    assert all(each["description"] for each in operations)
+    assert document["components"]["schemas"]["JobView"]["examples"]
+    assert "HTTPValidationError" not in document["components"]["schemas"]
+
+
+def test_the_service_tells_its_limits_in_numbers(house: House) -> None:
+    info = house.http.get("/info").json()
+    assert "Not a medical device" in info["notice"]
+    limits = info["limits"]
+    assert limits["max_frames"] == 1000
+    assert limits["retention_hours"] is None
+    numbers = [value for name, value in limits.items() if "retention" not in name]
+    assert all(isinstance(value, int | float) for value in numbers)
+
+
+def test_every_answer_has_an_id_and_a_safe_one_that_was_given_is_kept(house: House) -> None:
+    given = "4bf92f35-77b3-4da6-a3ce-929d0e0e4736"
+    assert house.http.get("/jobs", headers={"X-Request-Id": given}).headers["x-request-id"] == given
+    for unsafe in ("Smith", "a b", "x" * 100, "<script>"):
+        made = house.http.get("/nothing", headers={"X-Request-Id": unsafe}).headers["x-request-id"]
+        assert unsafe not in made
+        assert len(made) == 32
+    assert house.http.get("/jobs", headers={"host": "evil.example"}).headers["x-request-id"]
+
+
+def test_an_unforeseen_error_is_a_problem_that_tells_nothing(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("patient Smith")
+
+    monkeypatch.setattr(house.queue, "ping", broken)
+    response = house.http.get("/readyz")
+    assert "X-Request-Id" in assert_problem(response, 500)["remedy"]
+    assert "Smith" not in response.text
+    assert response.headers["x-request-id"]
+
+
+@pytest.mark.parametrize("length", ["-1", "ten", "1e3", "9" * 30])
+def test_a_length_that_is_none_is_a_problem(house: House, length: str) -> None:
+    headers = {"content-length": length, "content-type": "multipart/form-data; boundary=x"}
+    assert_problem(house.http.post("/reconstruct", content=b"", headers=headers), 400, "Content-Length")
+
+
+def test_the_service_is_not_ready_without_queue_worker_or_room(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert house.http.get("/readyz").json()["ready"] is True
+
+    def away() -> None:
+        raise UnavailableError("The queue does not answer.", "Start it.")
+
+    house.queue.withdraw("worker-1")
+    assert_problem(house.http.get("/readyz"), 503, "worker")
+    monkeypatch.setattr(house.queue, "ping", away)
+    assert_problem(house.http.get("/readyz"), 503, "queue")
+    assert house.http.get("/healthz").json() == {"alive": True}
 
 
 def test_the_dashboard_is_served_at_the_root(tmp_path: Path) -> None:

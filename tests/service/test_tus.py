@@ -13,7 +13,7 @@ import pytest
 
 from contract.store import is_job_id
 from service.partial import promised_bytes
-from tests.service.house import CLIP, House, assert_problem, make_house
+from tests.service.house import CLIP, EMPTY_ZIP, House, another_clip, assert_problem, make_house
 
 TUS = {"Tus-Resumable": "1.0.0"}
 BYTES = {**TUS, "Content-Type": "application/offset+octet-stream"}
@@ -176,8 +176,8 @@ def test_the_server_describes_what_it_speaks(house: House) -> None:
 
 def test_two_eyes_and_a_calibration_come_as_three_uploads(house: House) -> None:
     ids = {
-        "left": uploaded(house, b"left", "left", ".mov"),
-        "right": uploaded(house, b"right", "right", ".mov"),
+        "left": uploaded(house, CLIP, "left", ".mov"),
+        "right": uploaded(house, CLIP, "right", ".mov"),
         "calibration": uploaded(house, b"K: 1", "calibration", ".yaml"),
     }
     job = house.http.post("/reconstruct", json=ids)
@@ -187,9 +187,9 @@ def test_two_eyes_and_a_calibration_come_as_three_uploads(house: House) -> None:
 
 
 def test_the_same_clip_has_the_same_digest_whichever_way_it_came(house: House) -> None:
-    parts = {"left": ("l.mp4", b"left"), "right": ("r.mp4", b"right")}
+    parts = {"left": ("l.mp4", CLIP), "right": ("r.mp4", another_clip(b"right"))}
     whole = house.queue.get(house.upload(parts=parts).json()["id"])
-    ids = {eye: uploaded(house, content, eye) for eye, content in (("right", b"right"), ("left", b"left"))}
+    ids = {eye: uploaded(house, content, eye) for eye, content in (("right", another_clip(b"right")), ("left", CLIP))}
     pieces = house.queue.get(house.http.post("/reconstruct", json=ids).json()["id"])
     assert whole is not None
     assert pieces is not None
@@ -212,7 +212,7 @@ def test_submissions_that_name_no_finished_upload_of_that_part_are_refused(house
     assert_problem(house.http.post("/reconstruct", json={"clip": unfinished}), 409, "clip")
     assert_problem(house.http.post("/reconstruct", json={"clip": "0" * 32}), 422, "clip")
     assert_problem(house.http.post("/reconstruct", json={"clip": "../../etc/passwd"}), 422, "clip")
-    masks = uploaded(house, b"zip", "masks", ".zip")
+    masks = uploaded(house, EMPTY_ZIP, "masks", ".zip")
     assert_problem(house.http.post("/reconstruct", json={"clip": masks}), 422, "clip")
     assert_problem(house.http.post("/reconstruct", json={"masks": masks}), 422, "clip")
     assert_problem(house.http.post("/reconstruct", json={"clip": unfinished, "passwd": "x"}), 422, "passwd")

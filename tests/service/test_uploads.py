@@ -17,7 +17,7 @@ from contract.store import ABANDONED_AFTER_S, SUBMISSION, Store, new_job_id
 from service.problems import Problem, install_handlers
 from service.upload import UploadLimits, receive_upload
 from tests.service.asgi import serving
-from tests.service.house import CLIP, House, assert_problem, make_house
+from tests.service.house import CLIP, EMPTY_ZIP, House, assert_problem, make_house
 
 PATIENCE_S = 10.0
 
@@ -39,8 +39,8 @@ def test_an_accepted_clip_is_on_disk_and_queued_before_the_answer(house: House) 
 
 
 def test_two_eyes_calibration_and_masks_are_kept_under_our_names(house: House) -> None:
-    eyes = {"left": ("Smith_L.MOV", b"left"), "right": ("Smith_R.mov", b"right")}
-    response = house.upload(parts={**eyes, "calibration": ("stereo.yaml", b"K: 1"), "masks": ("m.zip", b"zip")})
+    eyes = {"left": ("Smith_L.MOV", CLIP), "right": ("Smith_R.mov", CLIP)}
+    response = house.upload(parts={**eyes, "calibration": ("stereo.yaml", b"K: 1"), "masks": ("m.zip", EMPTY_ZIP)})
     record = house.queue.get(response.json()["id"])
     assert record is not None
     assert record.files.model_dump() == {
@@ -162,3 +162,37 @@ def test_nothing_is_accepted_on_a_full_disk(tmp_path: Path) -> None:
     for house in make_house(tmp_path, min_free_bytes=2**62):
         assert_problem(house.upload(), 507)
         assert_problem(house.http.get("/readyz"), 503, "disk")
+
+
+def test_a_declared_length_that_is_too_large_is_refused_before_the_body_is_read(tmp_path: Path) -> None:
+    async def never() -> AsyncIterator[bytes]:
+        raise AssertionError("the body was read")
+        yield b""
+
+    headers = {"content-type": "multipart/form-data; boundary=x", "content-length": "1001"}
+    for house in make_house(tmp_path, max_upload_bytes=1000):
+        assert_problem(house.http.post("/reconstruct", content=never(), headers=headers), 413, "clip")
+        assert house.spooled() == []
+    headers["content-length"] = str(2**62)
+    for house in make_house(tmp_path, max_upload_bytes=2**63):
+        assert_problem(house.http.post("/reconstruct", content=never(), headers=headers), 507)
+
+
+def test_only_so_many_uploads_are_received_at_once(tmp_path: Path) -> None:
+    for house in make_house(tmp_path, max_uploads=0):
+        refused = house.upload()
+        assert_problem(refused, 503, "uploads")
+        assert refused.headers["retry-after"]
+        assert house.spooled() == []
+
+
+def test_a_body_that_brings_nothing_is_given_up(tmp_path: Path) -> None:
+    async def stalled() -> AsyncIterator[bytes]:
+        yield b"--x\r\n"
+        await asyncio.sleep(PATIENCE_S)
+
+    headers = {"content-type": "multipart/form-data; boundary=x"}
+    for house in make_house(tmp_path, upload_silence_s=0.05):
+        assert_problem(house.http.post("/reconstruct", content=stalled(), headers=headers), 408)
+        assert house.spooled() == []
+        assert house.upload().status_code == 202
