@@ -12,7 +12,7 @@ from contract.keys import KeyFile
 from contract.logs import configure
 from contract.queue_redis import RedisQueue
 from contract.settings import Settings
-from contract.store import Store
+from contract.store import open_store
 from service.app import create_app
 from service.guard import LOOPBACK_NAMES
 from service.renderer import ZmqRenderer
@@ -37,7 +37,7 @@ def main() -> int:
     try:
         queue.ping()
         renderer = ZmqRenderer(queue, settings.render_timeout_s, settings.render_secret)
-        app = create_app(settings, queue, Store(settings.data_dir), renderer)
+        app = create_app(settings, queue, open_store(settings), renderer)
     except UnavailableError as error:
         print(error, file=sys.stderr)
         return ExitCode.UNAVAILABLE
