@@ -24,7 +24,7 @@ from worker.heartbeat import Heartbeat
 from worker.liveness import Watch
 from worker.orders import Advanced, Failed, Finished, Run, Stop, Stopped, StopReason
 
-CLAIM_TIMEOUT_S = 2.0
+CLAIM_TIMEOUT_S = 1.0
 """How soon an idle worker notices that it should end, or that its child has."""
 
 LOOK_PERIOD_S = 0.1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,10 +18,14 @@ import pytest
 from contract.embedded import EmbeddedServer
 from contract.errors import UnavailableError
 from contract.exits import ExitCode
-from contract.job import JobFiles, JobRecord, JobState
+from contract.job import JobFiles, JobOptions, JobRecord, JobState
 from contract.queue_redis import RedisQueue
 from contract.settings import Settings
 from contract.store import Store, new_job_id
+from worker.checkpoint import load_resume, load_scene
+from worker.hooks import Hooks
+from worker.phantom import PhantomSettings, make_phantom, write_endonerf
+from worker.pipeline import ReconstructionRequest, reconstruct
 from worker.supervisor import run_supervisor
 
 WAIT_S = 40.0
@@ -30,6 +35,10 @@ PROGRAM = f"""
 import signal, sys, threading
 from contract.logs import configure
 from contract.settings import Settings
+from worker.checkpoint import load_resume, load_scene
+from worker.hooks import Hooks
+from worker.phantom import PhantomSettings, make_phantom, write_endonerf
+from worker.pipeline import ReconstructionRequest, reconstruct
 from worker.supervisor import run_supervisor
 end = threading.Event()
 signal.signal(signal.SIGTERM, lambda *_: end.set())
@@ -57,9 +66,9 @@ class Bench:
         return Settings(data_dir=self.store.data_dir, redis_url=self.server.url, worker_name=name)
 
     @contextmanager
-    def worker(self, name: str = "worker-1") -> Iterator[subprocess.Popen[bytes]]:
+    def worker(self, name: str = "worker-1", command: list[str] | None = None) -> Iterator[subprocess.Popen[bytes]]:
         environment = {**os.environ, **self.settings(name).to_environment()}
-        command = [sys.executable, "-c", PROGRAM]
+        command = command or [sys.executable, "-c", PROGRAM]
         with subprocess.Popen(command, env=environment, cwd=REPOSITORY, stderr=subprocess.PIPE) as process:
             try:
                 yield process
@@ -70,9 +79,12 @@ class Bench:
                 assert b"Traceback" not in errors
                 assert b"nobody caught" not in errors, errors.decode()
 
-    def submit(self, clip: str) -> str:
-        record = JobRecord(job_id=new_job_id(), files=JobFiles(clip="clip.mp4"), created_at_s=time.time())
-        (self.store.open_incoming(record.job_id) / "clip.mp4").write_text(clip)
+    def submit(self, clip: str | Path, **options: object) -> str:
+        name = "clip.mp4" if isinstance(clip, str) else clip.name
+        files, chosen = JobFiles(clip=name), JobOptions.model_validate(options)
+        record = JobRecord(job_id=new_job_id(), files=files, options=chosen, created_at_s=time.time())
+        content = clip.encode() if isinstance(clip, str) else clip.read_bytes()
+        (self.store.open_incoming(record.job_id) / name).write_bytes(content)
         self.store.accept(record)
         self.queue.submit(record)
         return record.job_id
@@ -120,8 +132,7 @@ def test_a_worker_told_to_end_hands_its_job_back_and_is_gone(bench: Bench) -> No
     job_id = bench.submit("wait publish")
     with bench.worker() as worker:
         bench.wait_for_step(job_id)
-        address = bench.queue.workers()[0]
-        assert (address.name, address.job_id) == ("worker-1", job_id)
+        eventually(lambda: [each.job_id for each in bench.queue.workers()] == [job_id])
         worker.terminate()
         assert worker.wait(WAIT_S) == ExitCode.OK
     assert bench.queue.workers() == []
@@ -130,6 +141,31 @@ def test_a_worker_told_to_end_hands_its_job_back_and_is_gone(bench: Bench) -> No
     with bench.worker("worker-2"):
         record = bench.wait_for_end(job_id)
     assert (record.state, record.attempt) == (JobState.DONE, 2)
+
+
+def test_a_real_worker_told_to_end_keeps_what_was_trained_and_the_next_comes_to_the_same_bits(
+    bench: Bench, tmp_path: Path
+) -> None:
+    write_endonerf(make_phantom(PhantomSettings(width=96, height=80, frames=8)), tmp_path / "clip")
+    clip = Path(shutil.make_archive(str(tmp_path / "clip"), "zip", tmp_path / "clip"))
+    reconstruct(ReconstructionRequest(clip, iterations=800), tmp_path / "whole", Hooks())
+    real = [sys.executable, "-m", "worker", "consume"]
+    job_id = bench.submit(clip, iterations=800)
+    with bench.worker(command=real) as worker:
+        bench.wait_for_step(job_id)
+        worker.terminate()
+        assert worker.wait(WAIT_S) == ExitCode.OK
+    assert bench.record(job_id).state is JobState.QUEUED
+    stopped_at = load_resume(bench.store.data_dir / "work" / f"{job_id}.1")[1]["iteration"]
+    assert 0 < stopped_at < 800
+    with bench.worker("worker-2", real):
+        record = bench.wait_for_end(job_id)
+    assert (record.state, record.attempt, record.released) == (JobState.DONE, 2, 1)
+    assert tensor_bits(bench.store.scene_folder(job_id, 2)) == tensor_bits(tmp_path / "whole")
+
+
+def tensor_bits(folder: Path) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in load_scene(folder).tensors().items()}
 
 
 def test_a_worker_that_is_killed_takes_its_child_along_and_another_takes_the_job(bench: Bench) -> None:
