@@ -6,7 +6,9 @@ import asyncio
 import contextlib
 import itertools
 import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import StrEnum
 
 import zmq
 import zmq.asyncio
@@ -22,6 +24,8 @@ CONNECT_TIMEOUT_S = 2.0
 
 IN_FLIGHT = 4
 """Requests handed to a worker at a time: it has the next one at hand. Who gives up waiting here is not rendered for."""
+
+LAST_ANSWERS_S = 0.05
 
 HEARTBEAT_MS, SILENCE_MS = 2000, 6000
 """ZeroMQ's own: a machine that is gone without a word, or a process that is stopped, is noticed by its silence."""
@@ -45,21 +49,26 @@ class WorkerGoneError(Exception):
     """The worker cannot be reached, or went away before it answered."""
 
 
-class Connection:
-    """A DEALER to one worker; answers find their request by its id.
+class Reached(StrEnum):
+    """Whether the worker is there."""
 
-    is_down: the worker was not there when it was last tried; ZeroMQ goes on trying. is_refused: the two do not know the
-    same secret; ZeroMQ gives up then, and a new connection is needed to try again.
-    """
+    TRYING = "trying"
+    UP = "up"
+    DOWN = "down"
+    """ZeroMQ goes on trying."""
+    REFUSED = "refused"
+    """The two do not know the same secret. ZeroMQ gives up then: a new connection is needed to try again."""
+
+
+class Connection:
+    """A DEALER to one worker; answers find their request by its id."""
 
     def __init__(self, context: zmq.asyncio.Context, endpoint: str, render_secret: str | None = None) -> None:
         if endpoint.startswith("tcp:") and render_secret is None:
             problem = f"A worker answers at {endpoint}, and no secret is set here."
             raise UnavailableError(problem, "Set INTRASPLAT_RENDER_SECRET to the one that the worker has.")
-        self.is_down = False
-        self.is_refused = False
-        self._decided = asyncio.Event()
-        """Whether it is known if the worker can be reached."""
+        self.state = Reached.TRYING
+        self._changed = asyncio.Event()
         self._turns = asyncio.Semaphore(IN_FLIGHT)
         self._ids = itertools.count()
         self._waiting: dict[bytes, asyncio.Future[Answer]] = {}
@@ -76,8 +85,8 @@ class Connection:
         self._socket.connect(endpoint)
         self._tasks = [asyncio.create_task(self._read()), asyncio.create_task(self._watch())]
 
-    async def ask(self, request: RenderRequest | ExportRequest) -> Answer:
-        """The worker's answer.
+    async def ask(self, request: RenderRequest | ExportRequest, *, patiently: bool = True) -> Answer:
+        """The worker's answer. patiently: wait a moment for a worker that is down, for there is no other.
 
         Raises:
             WorkerGoneError: there will be none.
@@ -85,7 +94,7 @@ class Connection:
         """
         document = WorkerRequest(request=request).model_dump_json().encode()
         async with self._turns:
-            await self._reach()
+            await self._reach(patiently)
             request_id = next(self._ids).to_bytes(8, "big")
             future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
             self._waiting[request_id] = future
@@ -106,38 +115,38 @@ class Connection:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task
-        self._lost()
+        _give_up(self._waiting.values())
         self._socket.disable_monitor()
         self._monitor.close()
         self._socket.close()
 
-    async def _reach(self) -> None:
+    async def _reach(self, patiently: bool) -> None:
+        hopeless = {Reached.REFUSED} if patiently else {Reached.REFUSED, Reached.DOWN}
         try:
-            await asyncio.wait_for(self._decided.wait(), CONNECT_TIMEOUT_S)
+            async with asyncio.timeout(CONNECT_TIMEOUT_S):
+                while self.state is not Reached.UP:
+                    if self.state in hopeless:
+                        raise WorkerGoneError
+                    await self._changed.wait()
         except TimeoutError:
-            self.is_down = True
-        if self.is_down:
-            raise WorkerGoneError
-
-    def _lost(self) -> None:
-        """What was asked and not answered died with the worker."""
-        self._decided.clear()
-        self.is_down = True
-        for future in self._waiting.values():
-            if not future.done():
-                future.set_exception(WorkerGoneError())
+            self.state = Reached.DOWN
+            raise WorkerGoneError from None
 
     async def _watch(self) -> None:
+        loop = asyncio.get_running_loop()
         while True:
             event = parse_monitor_message(await self._monitor.recv_multipart())["event"]
             if event == UP:
-                self.is_down = False
-                self._decided.set()
+                self.state = Reached.UP
+            elif event & REFUSED or self.state is Reached.REFUSED:
+                self.state = Reached.REFUSED
             else:
-                self._lost()
-            if event & REFUSED:
-                self.is_refused = True
-                self._decided.set()
+                self.state = Reached.DOWN
+            if self.state is not Reached.UP:
+                # What was asked and not answered died with the worker; an answer that has just come is read before.
+                loop.call_later(LAST_ANSWERS_S, _give_up, list(self._waiting.values()))
+            self._changed.set()  # wakes who waits now
+            self._changed.clear()
 
     async def _read(self) -> None:
         while True:
@@ -154,3 +163,9 @@ class Connection:
             except ValidationError:
                 problem = "The worker's answer cannot be read."
                 future.set_exception(UnavailableError(problem, "Start service and worker from the same version."))
+
+
+def _give_up(futures: Iterable[asyncio.Future[Answer]]) -> None:
+    for future in futures:
+        if not future.done():
+            future.set_exception(WorkerGoneError())

@@ -16,7 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from contract.errors import UnavailableError
 from contract.queue import WORKER_TTL_S, Queue
 from contract.rendering import ExportRequest, RenderRequest, ReplyError, WorkerAddress, WorkerReply
-from service.connection import Answer, Connection, WorkerGoneError
+from service.connection import Answer, Connection, Reached, WorkerGoneError
 
 WORKER_REMEDY = "Start one with `intrasplat up`, or `python -m worker consume`."
 ADDRESSES_VALID_S = 1.0
@@ -63,7 +63,7 @@ class ZmqRenderer:
         first, *others = workers
         if others:
             with contextlib.suppress(WorkerGoneError, TimeoutError):
-                return await asyncio.wait_for(self._ask(first, request), self._timeout_s / 2)
+                return await asyncio.wait_for(self._ask(first, request, patiently=False), self._timeout_s / 2)
             first = others[0]
         try:
             return await asyncio.wait_for(self._ask(first, request), until_s - time.monotonic())
@@ -73,8 +73,11 @@ class ZmqRenderer:
         except WorkerGoneError:
             raise UnavailableError("The worker is gone.", _remedy(first)) from None
 
-    async def _ask(self, address: WorkerAddress, request: RenderRequest | ExportRequest) -> Answer:
-        return await (await self._connection(address)).ask(request)
+    async def _ask(
+        self, address: WorkerAddress, request: RenderRequest | ExportRequest, *, patiently: bool = True
+    ) -> Answer:
+        connection = await self._connection(address)
+        return await connection.ask(request, patiently=patiently)
 
     async def close(self) -> None:
         if self._reading is not None:
@@ -101,11 +104,12 @@ class ZmqRenderer:
         """Rather one that answers, and holds the scene; of several always the same (rendezvous hashing)."""
         connection = self._connections.get(address.endpoint)
         place = hashlib.sha256(f"{scene_id} {address.name}".encode()).digest()
-        return connection is None or not connection.is_down, scene_id in address.scenes, place
+        is_down = connection is not None and connection.state in (Reached.DOWN, Reached.REFUSED)
+        return not is_down, scene_id in address.scenes, place
 
     async def _connection(self, address: WorkerAddress) -> Connection:
         endpoint = address.endpoint
-        if endpoint in self._connections and self._connections[endpoint].is_refused:
+        if endpoint in self._connections and self._connections[endpoint].state is Reached.REFUSED:
             await self._connections.pop(endpoint).close()
         if endpoint not in self._connections:
             self._context = self._context or zmq.asyncio.Context()
