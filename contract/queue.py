@@ -11,8 +11,6 @@ changes nothing (the attempt is the fence).
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from statistics import median
@@ -110,16 +108,6 @@ class QueueFullError(UnavailableError):
         super().__init__(problem, remedy)
         self.tenant = tenant
 
-    @classmethod
-    def for_tenant(cls, waiting: int) -> QueueFullError:
-        """The caller's own jobs fill its share."""
-        return cls(f"{waiting} of your jobs wait already.", "Wait until one has ended, or cancel one.", tenant=True)
-
-    @classmethod
-    def for_all(cls, waiting: int) -> QueueFullError:
-        """All jobs together fill the queue."""
-        return cls(f"{waiting} jobs wait already.", "Try again later, or start more workers.", tenant=False)
-
 
 class Queue(Protocol):
     """Every method is atomic and may be repeated when its answer was lost; those that change a job say what came of it.
@@ -203,6 +191,10 @@ class Queue(Protocol):
         """Remove record, events and idempotency key of a job in a terminal state; False if missing or still live."""
         ...
 
+    def rewrite_log(self) -> bool:
+        """Drop from the server's log on disk what it still holds of forgotten jobs; False if it cannot just now."""
+        ...
+
     def announce(self, address: WorkerAddress) -> None:
         """Say that a worker is live, for WORKER_TTL_S."""
         ...
@@ -226,21 +218,6 @@ class Queue(Protocol):
     def close(self) -> None:
         """Let go of connections."""
         ...
-
-
-def estimate(record: JobRecord, position: int | None, workers: int, durations_s: Sequence[float]) -> Standing:
-    """When a live job may be done, if it takes as long as the median of the last ones and as those before it.
-
-    position is None for a running job, whose own estimate of what is left comes before that of others.
-    """
-    if position is None and record.progress is not None and record.progress.seconds_left is not None:
-        return Standing(position=None, eta_s=record.progress.seconds_left)
-    if not durations_s or not workers:
-        return Standing(position=position, eta_s=None)
-    typical_s = median(durations_s)
-    if position is None:
-        return Standing(position=None, eta_s=max(0.0, typical_s - (time.time() - (record.started_at_s or 0.0))))
-    return Standing(position=position, eta_s=typical_s * (1 + (position + 1) / workers))
 
 
 def worker_died() -> JobError:

