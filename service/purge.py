@@ -28,6 +28,8 @@ from service.problems import Problem
 NOTES = "purging"
 NOTE_IS_OLD_S = 60.0
 """A younger note may be of a removal that is under way."""
+LOG_CLEARED_AFTER_S = 90.0
+"""The queue itself remembers for a minute which ids are gone."""
 logger = logging.getLogger("intrasplat.service")
 
 
@@ -50,6 +52,7 @@ class Purger:
         self._store = store
         self._audit = audit
         self._notes = store.data_dir / NOTES
+        self._log_stale_since_s: float | None = None
 
     def purge(self, job_id: str, caller: Caller | None, reason: str = "request") -> Receipt:
         """Remove a job that has ended, recorded in the audit before it begins and before it is reported.
@@ -66,10 +69,17 @@ class Purger:
         removed = self._store.purge(job_id)
         self._audit.record(AuditAction.PURGED, caller, job_id, f"done ({reason})")
         self._queue.forget(job_id)
+        self._log_stale_since_s = time.monotonic()
         self._refuse_live(job_id)
         receipt = self._receipt(job_id, removed, uploads)
         note.unlink(missing_ok=True)
         return receipt
+
+    def clear_log(self, now_s: float | None = None) -> None:
+        """Rid the queue's log on disk of what was purged, once its notes of that have expired. now_s: monotonic."""
+        since_s, now_s = self._log_stale_since_s, time.monotonic() if now_s is None else now_s
+        if since_s is not None and now_s - since_s > LOG_CLEARED_AFTER_S and self._queue.rewrite_log():
+            self._log_stale_since_s = None
 
     def finish_cut_off(self) -> None:
         """Finish what earlier services were removing when they ended."""

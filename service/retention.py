@@ -62,10 +62,12 @@ class Retention:
             self._lock.release()
 
     def sweep(self, now_s: float) -> int:
-        """Finish what was cut off, and purge what is due at that UNIX time; how many jobs that were."""
+        """Finish what was cut off, and purge what is due at that UNIX time; how many jobs those were."""
         self._purger.finish_cut_off()
         due = [record.job_id for record in self._queue.records(None, None) if self._is_due(record, now_s)]
-        return sum(try_to_purge(self._purger, job_id, "retention") for job_id in due)
+        purged = sum(try_to_purge(self._purger, job_id, "retention") for job_id in due)
+        self._purger.clear_log()
+        return purged
 
     def _is_due(self, record: JobRecord, now_s: float) -> bool:
         hours = kept_hours(record.options, self._settings)

@@ -22,7 +22,7 @@ def test_a_key_is_printed_once_and_alone_and_opens_what_it_was_made_for(
     text = capsys.readouterr().out.strip()
     key = KeyFile(tmp_path).find(text)
     assert key is not None
-    assert (key.tenant, key.scopes) == ("ward-3", {KeyScope.VIEW, KeyScope.OPERATE})
+    assert (key.tenant, key.scopes) == ("ward-3", frozenset({KeyScope.VIEW, KeyScope.OPERATE}))
     assert main(["keys", "list", *where]) == ExitCode.OK
     listed = capsys.readouterr().out
     assert listed.split()[:3] == [key.key_id, "ward-3", "operate,view"]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,9 @@ from contract.job import JobError, JobFiles, JobOptions, JobRecord
 from contract.queue import Claim
 from contract.queue_redis import RedisQueue
 from contract.settings import Settings
-from contract.store import CURVE, MANIFEST, REPORT, Store
+from contract.store import CURVE, MANIFEST, REPORT, Store, new_job_id
 from service.audit import Audit
-from service.purge import NOTES, Purger
+from service.purge import LOG_CLEARED_AFTER_S, NOTES, Purger
 from service.retention import HOUR_S, Retention, check_retention, kept_hours
 from tests.service.house import CLIP, House, assert_problem, make_house
 
@@ -30,7 +31,7 @@ KEPT_FILES = {AUDIT_FILE, RESERVE_FILE}
 
 
 def files_of(data_dir: Path) -> list[Path]:
-    """All files but those of the queue's server, which test_..._queue looks into by itself."""
+    """All files but those of the queue's server, whose log is looked into by itself."""
     found = [path for path in data_dir.rglob("*") if path.is_file() or not path.is_dir()]
     return [path for path in found if path.relative_to(data_dir).parts[0] not in ("valkey", "run")]
 
@@ -233,7 +234,7 @@ def valkey(tmp_path: Path) -> Iterator[EmbeddedServer]:
 def test_a_purge_leaves_no_key_in_the_queues_server_that_names_the_job(valkey: EmbeddedServer, tmp_path: Path) -> None:
     queue, store = RedisQueue(valkey.url), Store(tmp_path / "data")
     purger = Purger(queue, store, Audit(AuditLog(store.data_dir)))
-    kept, purged = ("1" * 32, "2" * 32)
+    kept, purged = new_job_id(), new_job_id()
     for job_id in (kept, purged):
         files = JobFiles(clip="clip.mp4")
         record = JobRecord(job_id=job_id, files=files, created_at_s=time.time(), idempotency_key=job_id * 2)
@@ -249,10 +250,37 @@ def test_a_purge_leaves_no_key_in_the_queues_server_that_names_the_job(valkey: E
         assert queue.finish(Claim(job_id, claimed.attempt, "worker-1"))
     assert naming(valkey, purged)
     assert purger.purge(purged, None).verified
-    assert naming(valkey, purged) == []
     assert naming(valkey, kept)
     assert traces_of(store.data_dir, purged) == []
+    with redis.Redis.from_url(valkey.url) as client:
+        for key in naming(valkey, purged):  # for a minute the queue may know that this id is gone, and nothing else
+            assert b"forgotten" in key
+            assert 0 < client.pttl(key) <= 60_000
+            client.delete(key)
+    purger.clear_log(time.monotonic() + LOG_CLEARED_AFTER_S + 1.0)
+    assert comes_true(lambda: not log_names(store.data_dir, purged))
+    assert log_names(store.data_dir, kept)
     queue.close()
+
+
+def log_names(data_dir: Path, job_id: str) -> bool:
+    """Whether the server's log on disk holds the id."""
+    return any(job_id.encode() in path.read_bytes() for path in files_below(data_dir / "valkey"))
+
+
+def files_below(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
+def comes_true(is_so: Callable[[], bool]) -> bool:
+    """Whether it is so within ten seconds."""
+    deadline_s = time.monotonic() + 10.0
+    while time.monotonic() < deadline_s:
+        with contextlib.suppress(FileNotFoundError):  # files come and go while the log is rewritten
+            if is_so():
+                return True
+        time.sleep(0.05)
+    return False
 
 
 def naming(server: EmbeddedServer, job_id: str) -> list[bytes]:
