@@ -1,0 +1,73 @@
+"""The page for whoever runs a service says what the code does."""
+
+from __future__ import annotations
+
+import re
+from typing import get_args
+
+import yaml  # type: ignore[import-untyped]
+
+from contract.job import Priority
+from contract.queue import LEASE_S, MAX_ATTEMPTS
+from contract.queue_redis import PREFIX
+from contract.settings import ENVIRONMENT_PREFIX, Settings, default_data_dir
+from tests.test_house import REPOSITORY
+
+PAGE = (REPOSITORY / "docs" / "operations.md").read_text(encoding="utf-8")
+
+
+def block(language: str) -> str:
+    """The page's one code block in that language."""
+    (found,) = re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    return str(found)
+
+
+def shown(value: object) -> str:
+    """A default as the table has it."""
+    if value is None or value == ():
+        return "none"
+    if value == default_data_dir():
+        return "`~/.local/state/intrasplat`"
+    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
+
+
+def test_the_table_of_settings_has_every_setting_with_its_default() -> None:
+    rows = re.findall(r"^\| `((?:INTRASPLAT|REDIS)_\w+)` \| (.*?) \|", PAGE, re.MULTILINE)
+    defaults = {ENVIRONMENT_PREFIX + name.upper(): shown(value) for name, value in Settings()}
+    defaults["REDIS_URL"] = defaults.pop("INTRASPLAT_REDIS_URL")
+    assert dict(rows) == defaults
+    assert len(rows) == len(defaults)
+
+
+def test_every_variable_that_is_named_exists() -> None:
+    named = set(re.findall(r"INTRASPLAT_[A-Z_]+", PAGE))
+    assert named <= {ENVIRONMENT_PREFIX + name.upper() for name in Settings.model_fields}
+
+
+def test_keda_watches_the_queues_own_streams() -> None:
+    watched = [trigger["metadata"] for trigger in yaml.safe_load(block("yaml"))["spec"]["triggers"]]
+    assert {each["stream"] for each in watched} == {f"{PREFIX}jobs:{name}" for name in get_args(Priority)}
+    scripts = (REPOSITORY / "contract" / "queue_scripts.py").read_text(encoding="utf-8")
+    assert all(f"'{each['consumerGroup']}'" in scripts for each in watched)
+
+
+def test_the_access_list_is_that_of_the_containers() -> None:
+    made = (REPOSITORY / "docker" / "make-secrets.sh").read_text(encoding="utf-8")
+    (rights,) = re.findall(r"user intrasplat on #\S+ (.*?)\"?$", made, re.MULTILINE)
+    assert rights in PAGE
+
+
+def test_the_figures_are_those_of_the_code() -> None:
+    assert f"after {LEASE_S:g} s of silence" in PAGE
+    assert f"up to {MAX_ATTEMPTS} times" in PAGE
+
+
+def test_every_metric_that_is_named_exists() -> None:
+    source = (REPOSITORY / "service" / "metrics.py").read_text(encoding="utf-8")
+    named = {name.removesuffix("_total") for name in re.findall(r"intrasplat_[a-z_]+", PAGE)}
+    assert [name for name in sorted(named) if f'"{name}"' not in source] == []
+
+
+def test_every_area_of_the_store_is_said_to_be_copied_or_not() -> None:
+    areas = re.findall(r"[├└]── (\w+)/", (REPOSITORY / "contract" / "store.py").read_text(encoding="utf-8"))
+    assert [area for area in areas if f"`{area}/`" not in PAGE] == []
