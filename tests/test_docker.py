@@ -221,6 +221,7 @@ def test_the_access_list_lets_the_queue_do_all_it_does(secret_url: str) -> None:
     queue.withdraw("worker-1")
     assert len(queue.records()) == 2
     assert queue.figures().queued == 1
+    assert queue.rewrite_log()
     queue.close()
 
 
