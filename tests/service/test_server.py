@@ -1,0 +1,116 @@
+"""What only a real connection shows: refusals below the application, WebSockets turned away, a prompt end."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from service.server import MAX_HEAD_BYTES
+from tests.service.house import CLIP
+from tests.service.live import LiveService, live_service
+
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Iterator[LiveService]:
+    with live_service(tmp_path) as running:
+        yield running
+
+
+def answer_to(live: LiveService, request: bytes) -> tuple[bytes, dict[str, str], bytes]:
+    """Status line, headers and body of what raw bytes are answered with, until the connection is closed."""
+    with socket.create_connection(("127.0.0.1", live.port), timeout=PATIENCE_S) as connection:
+        connection.sendall(request)
+        answer = b""
+        while piece := connection.recv(65536):
+            answer += piece
+    head, _, body = answer.partition(b"\r\n\r\n")
+    status, *lines = head.decode().split("\r\n")
+    return status.encode(), dict(line.lower().split(": ", 1) for line in lines), body
+
+
+@pytest.mark.parametrize(
+    "request_bytes",
+    [
+        b"nonsense\r\n\r\n",
+        b"POST /reconstruct HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: ten\r\n\r\n",
+        b"POST /reconstruct HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 1\r\nContent-Length: 2\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"x" * MAX_HEAD_BYTES,  # and no end
+    ],
+)
+def test_what_is_no_http_is_answered_with_a_problem(live: LiveService, request_bytes: bytes) -> None:
+    status, headers, body = answer_to(live, request_bytes)
+    assert status.startswith(b"HTTP/1.1 4")
+    assert headers["content-type"] == "application/problem+json"
+    assert json.loads(body)["status"] == 400
+
+
+def test_a_websocket_that_is_turned_away_is_told_why(live: LiveService) -> None:
+    for path, origin, status in (("/nothing", None, 404), ("/stream", "https://evil.example", 403)):
+        with pytest.raises(InvalidStatus) as caught, connect(f"ws://127.0.0.1:{live.port}{path}", origin=origin):  # type: ignore[arg-type]
+            pass
+        answer = caught.value.response
+        assert answer.status_code == status
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert answer.headers["x-request-id"]
+        assert answer.body is not None
+        assert json.loads(answer.body)["status"] == status
+
+
+def test_an_upload_whose_caller_leaves_keeps_what_came(live: LiveService) -> None:
+    tus = {"Tus-Resumable": "1.0.0"}
+    announced = {**tus, "Upload-Length": "1000000", "Upload-Metadata": "part Y2xpcA==,suffix Lm1wNA=="}
+    path = httpx.post(f"{live.url}/uploads", headers=announced).headers["location"]
+    head = (
+        f"PATCH {path} HTTP/1.1\r\nHost: 127.0.0.1:{live.port}\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\n"
+        "Content-Type: application/offset+octet-stream\r\nContent-Length: 1000000\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", live.port), timeout=PATIENCE_S) as connection:
+        connection.sendall(head.encode() + b"x" * 400_000)
+        offset = 0
+        while offset < 400_000:
+            offset = int(httpx.head(live.url + path, headers=tus).headers["upload-offset"])
+    piece = {**tus, "Upload-Offset": "400000", "Content-Type": "application/offset+octet-stream"}
+    status = 423
+    while status == 423:  # until the service has noticed
+        status = httpx.patch(live.url + path, headers=piece, content=b"y" * 600_000).status_code
+    assert status == 204
+
+
+def test_a_stream_of_events_ends_when_the_service_is_asked_to(live: LiveService) -> None:
+    job_id = httpx.post(f"{live.url}/reconstruct", files={"clip": ("a.mp4", CLIP)}).json()["id"]
+    with httpx.stream("GET", f"{live.url}/jobs/{job_id}/events", timeout=PATIENCE_S) as stream:
+        lines = stream.iter_lines()
+        assert next(line for line in lines if line.startswith("data"))
+        live.server.handle_exit(signal.SIGTERM, None)
+        assert list(lines)[-1:] == [""]
+    live.thread.join(PATIENCE_S)
+    assert not live.thread.is_alive()
+
+
+def test_many_listeners_leave_the_service_free_for_others(live: LiveService) -> None:
+    job_id = httpx.post(f"{live.url}/reconstruct", files={"clip": ("a.mp4", CLIP)}).json()["id"]
+    endings: list[str] = []
+
+    def listen() -> None:
+        endings.append(httpx.get(f"{live.url}/jobs/{job_id}/events", timeout=PATIENCE_S).text)
+
+    listeners = [threading.Thread(target=listen) for _ in range(60)]  # more than the thread pool has threads
+    for listener in listeners:
+        listener.start()
+    assert httpx.get(f"{live.url}/jobs/{job_id}", timeout=PATIENCE_S).status_code == 200
+    assert httpx.delete(f"{live.url}/jobs/{job_id}", timeout=PATIENCE_S).json()["state"] == "cancelled"
+    for listener in listeners:
+        listener.join()
+    assert len(endings) == 60
+    assert all("cancelled" in ending for ending in endings)
