@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from contract.errors import InputError, UnavailableError
+from contract.errors import InputError, TrainingDiverged, UnavailableError
 from contract.exits import ExitCode
 from contract.job import JobFiles, JobOptions, JobRecord
 from contract.settings import Settings
@@ -21,6 +21,7 @@ from worker.__main__ import main
 from worker.checkpoint import RESUME_FILE, load_resume, load_scene
 from worker.child import DeviceChild
 from worker.device import request_of, run_or_start_anew, training_device
+from worker.faults import describe
 from worker.hooks import Hooks
 from worker.orders import Advanced, Failed, Finished, Run, Stop, Stopped
 from worker.pipeline import ReconstructionRequest
@@ -165,6 +166,24 @@ def test_a_state_of_another_version_is_left_behind_and_training_starts_anew(tmp_
     run_or_start_anew(request_here, tmp_path, Hooks())
     assert (tmp_path / REPORT).exists()
     assert not (tmp_path / RESUME_FILE).exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (TrainingDiverged("NaN after 12 iterations."), "NaN after 12"),
+        (UnavailableError("No CUDA device.", "Use --device cpu."), "No CUDA device"),
+        (MemoryError("smith.mp4"), "out of memory"),
+        (ValueError("smith.mp4"), "A fault in the worker (ValueError)"),
+    ],
+)
+def test_every_error_is_told_with_a_remedy_and_without_what_nobody_wrote_for_the_caller(
+    error: Exception, says: str
+) -> None:
+    told = describe(error)
+    assert says in told.problem
+    assert told.remedy
+    assert "smith" not in told.model_dump_json()
 
 
 def test_other_trouble_with_the_input_is_not_tried_twice(tmp_path: Path) -> None:
