@@ -142,6 +142,6 @@ def _check_overlap(entries: list[zipfile.ZipInfo], path: Path, field: str, label
     """InputError when members share compressed bytes, by which a small file would inflate to any size."""
     ordered = sorted(entries, key=lambda entry: entry.header_offset)
     ends = [entry.header_offset + _LOCAL_HEADER_BYTES + entry.compress_size for entry in ordered]
-    starts = [entry.header_offset for entry in ordered[1:]] + [path.stat().st_size]
-    if any(end > start for end, start in zip(ends, starts, strict=True)):
+    starts = [entry.header_offset for entry in ordered] + [path.stat().st_size]
+    if any(end > start for end, start in zip(ends, starts[1:], strict=True)):
         raise InputError(field, f"members of {label} overlap.", _AGAIN)

@@ -6,6 +6,7 @@ import hashlib
 import os
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Request, Response
@@ -14,10 +15,12 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from contract.audit import AuditAction
+from contract.clip_limits import MOST_MEMORY_BYTES, ClipLimits
 from contract.errors import InputError, LimitError, UnavailableError
 from contract.job import JobOptions, JobRecord, JobView, Standing, parse_options
 from contract.keys import KeyScope
 from contract.queue import Admission, QueueFullError
+from contract.sniff import check_file
 from contract.store import new_job_id
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
@@ -222,10 +225,18 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         created_at_s=time.time(),
     )
     check_retention(record.options, services.settings)
+    _look_at(services, job_id, received)
     services.audit.record(AuditAction.ACCEPTED, caller, job_id)
     with services.sweep.in_hand(job_id):
         services.store.accept(record)
         return _enqueue(services, record)
+
+
+def _look_at(services: Deps, job_id: str, received: Received) -> None:
+    """Refuse what cannot be a clip. How much memory it may take is for the worker to say, which may be elsewhere."""
+    limits = replace(ClipLimits.of(services.settings), decoded_bytes=MOST_MEMORY_BYTES)
+    for part, name in received.names.items():
+        check_file(services.store.incoming_folder(job_id) / name, part, limits)
 
 
 def _enqueue(services: Deps, record: JobRecord) -> JobRecord:

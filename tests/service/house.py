@@ -22,8 +22,14 @@ from service.renderer import ZmqRenderer
 from tests.service.asgi import AsgiClient, serving
 from worker.serve import RequestServer, View
 
-CLIP = b"not a video, but the service does not look inside" * 100
+CLIP = (Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4").read_bytes()
+EMPTY_ZIP = b"PK\x05\x06" + bytes(18)
 IDENTITY = "1,0,0,0,0,1,0,0,0,0,1,0"
+
+
+def another_clip(mark: bytes) -> bytes:
+    """A clip with other bytes and the same pictures."""
+    return CLIP + (8 + len(mark)).to_bytes(4, "big") + b"free" + mark
 
 
 class Painter:
@@ -43,7 +49,9 @@ class Painter:
         if request.camera.width == 10:
             raise RuntimeError("patient Smith")
         warnings = ("t is after the last frame", "ansicht – geschätzt") if request.t > 1 else ()
-        return View(request.format.value.encode(), f"image/{request.format.value}", min(request.t, 1.0), warnings)
+        iteration = 7 if request.attempt is None else None
+        media_type, shown_t = f"image/{request.format.value}", min(request.t, 1.0)
+        return View(request.format.value.encode(), media_type, shown_t, warnings, iteration)
 
 
 @dataclass
@@ -69,8 +77,8 @@ class House:
         assert record is not None
         return record, Claim(record.job_id, record.attempt, "worker-1")
 
-    def finished_scene(self) -> str:
-        self.upload()
+    def finished_scene(self, headers: Mapping[str, str] | None = None) -> str:
+        assert self.upload(headers=headers).status_code == 202
         record, claim = self.claimed()
         folder = self.store.work_folder(record.job_id, record.attempt)
         (folder / MANIFEST).write_text("{}")
@@ -78,6 +86,14 @@ class House:
         (folder / CURVE).write_text("t_train_s,psnr_tissue_db\n1,30\n")
         self.store.publish_scene(record.job_id, record.attempt)
         assert self.queue.finish(claim)
+        return record.job_id
+
+    def running_job(self, headers: Mapping[str, str] | None = None) -> str:
+        """A job that worker-1 runs, and says so."""
+        assert self.upload(headers=headers).status_code == 202
+        record, _ = self.claimed()
+        (address,) = self.queue.workers()
+        self.queue.announce(address.model_copy(update={"job_id": record.job_id}))
         return record.job_id
 
     def spooled(self) -> list[Path]:
