@@ -14,6 +14,7 @@ from starlette.websockets import WebSocketState
 
 from contract.errors import InputError, LimitError, SceneError, UnavailableError
 from contract.queue import QueueFullError
+from contract.store import StoreFullError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
@@ -112,6 +113,8 @@ def problem_of(error: Exception) -> Problem | None:
             return Problem(404, str(error), field="scene", remedy="GET /scenes lists what there is.")
         case QueueFullError():
             return Problem(429 if error.tenant else 503, error.problem, field="queue", remedy=error.remedy)
+        case StoreFullError():
+            return Problem(507, error.problem, remedy=error.remedy)
         case UnavailableError():
             return Problem(503, error.problem, remedy=error.remedy)
         case RequestValidationError():

@@ -17,7 +17,9 @@ from contract.settings import Settings
 from contract.store import Store
 from service.purge import Purger, try_to_purge
 
-SWEEP_PERIOD_S = 60.0
+SWEEP_PERIOD_S = 300.0
+"""Each sweep reads all records."""
+
 HOUR_S = 3600.0
 logger = logging.getLogger("intrasplat.service")
 

@@ -21,6 +21,7 @@ def test_a_key_is_found_by_its_text_and_by_nothing_else(tmp_path: Path) -> None:
         text.upper(),
         text.replace("isp_", "xyz_"),
         f"isp_{key.key_id}_",
+        f"isp_{key.key_id}_\ud800",
         "isp",
         "",
         "é" * 9,

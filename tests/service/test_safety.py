@@ -15,7 +15,7 @@ from fastapi.dependencies.models import Dependant
 from fastapi.routing import APIRoute, APIWebSocketRoute
 from starlette.routing import BaseRoute, Route
 
-from contract.audit import AUDIT_FILE
+from contract.audit import AUDIT_FILE, RESERVE_FILE
 from contract.job import JobError
 from contract.keys import KEYS_FILE, KeyFile, KeyScope
 from contract.settings import Settings
@@ -303,6 +303,16 @@ def test_what_cannot_be_recorded_does_not_happen(house: House) -> None:
     path.rmdir()
     assert house.http.get(f"/scenes/{scene_id}").status_code == 200
     assert house.http.get(f"/jobs/{queued}").json()["state"] == "queued"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_on_a_full_disk_without_a_reserve_nothing_is_shown_and_the_answer_says_why(house: House) -> None:
+    scene_id = house.finished_scene()
+    (house.store.data_dir / AUDIT_FILE).unlink()
+    (house.store.data_dir / RESERVE_FILE).unlink(missing_ok=True)
+    (house.store.data_dir / AUDIT_FILE).symlink_to("/dev/full")
+    assert_problem(house.http.get(f"/render?scene={scene_id}"), 507)
+    assert house.painter.requests == []
 
 
 def test_a_callers_words_appear_in_no_metric_audit_problem_event_log_or_file_name(
