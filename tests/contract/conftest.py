@@ -39,14 +39,14 @@ def redis_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.fixture(params=["valkey", "redis"])
-def url(request: pytest.FixtureRequest) -> Iterator[str]:
+def url(request: pytest.FixtureRequest) -> str:
     """Of a server whose queue is empty."""
     found: str = request.getfixturevalue(f"{request.param}_url")
     client = redis.Redis.from_url(found)
     for key in client.scan_iter(f"{PREFIX}*"):
         client.delete(key)
     client.close()
-    yield found
+    return found
 
 
 @pytest.fixture(params=["memory", "valkey", "redis"])
