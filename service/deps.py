@@ -8,7 +8,6 @@ Every route but those of service/system.py that say nothing of anybody's work ta
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends
@@ -35,36 +34,26 @@ from service.sweep import Sweep
 UNIX_SOCKET = "unix"
 
 
-@dataclass(frozen=True)
 class Deps:
-    """What the service is made of; what follows from the settings alone is made here."""
+    """What the service is made of: four things that it is given, and its own parts, made of those."""
 
-    settings: Settings
-    queue: Queue
-    store: Store
-    renderer: Renderer
-    access: Access = field(init=False)
-    limiter: Limiter = field(init=False)
-    audit: Audit = field(init=False)
-    intake: Intake = field(init=False)
-    sweep: Sweep = field(init=False)
-    feeds: Feeds = field(init=False)
-    purger: Purger = field(init=False)
-    retention: Retention = field(init=False)
-    metrics: Metrics = field(init=False)
-    done: DoneJobs = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "access", Access(self.settings))
-        object.__setattr__(self, "limiter", Limiter(self.settings.requests_per_s))
-        object.__setattr__(self, "audit", Audit(AuditLog(self.settings.data_dir)))
-        object.__setattr__(self, "intake", Intake(self.settings, self.store))
-        object.__setattr__(self, "sweep", Sweep(self.queue, self.store))
-        object.__setattr__(self, "feeds", Feeds(self.queue))
-        object.__setattr__(self, "purger", Purger(self.queue, self.store, self.audit))
-        object.__setattr__(self, "retention", Retention(self.settings, self.queue, self.store, self.purger))
-        object.__setattr__(self, "metrics", Metrics(self.queue, self.store))
-        object.__setattr__(self, "done", DoneJobs(self.queue, self.store))
+    def __init__(self, settings: Settings, queue: Queue, store: Store, renderer: Renderer) -> None:
+        self.settings = settings
+        self.queue = queue
+        self.store = store
+        self.renderer = renderer
+        # who may do what, and what is known of it afterwards
+        self.access = Access(settings)
+        self.limiter = Limiter(settings.requests_per_s)
+        self.audit = Audit(AuditLog(settings.data_dir))
+        self.metrics = Metrics(queue, store)
+        # how a clip comes in, what is told of its job, and how all of it goes again
+        self.intake = Intake(settings, store)
+        self.sweep = Sweep(queue, store)
+        self.feeds = Feeds(queue)
+        self.done = DoneJobs(queue, store)
+        self.purger = Purger(queue, store, self.audit)
+        self.retention = Retention(settings, queue, store, self.purger)
 
 
 def _deps_of(connection: HTTPConnection) -> Deps:
