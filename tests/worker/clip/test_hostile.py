@@ -1,0 +1,67 @@
+"""The hostile corpus, through the decoding process: a clear error each, and the next clip is read as ever."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from contract.clip_limits import ClipLimits
+from contract.errors import InputError
+from contract.sniff import check_file
+from tests.worker.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile
+from worker.decode import StereoRecording, decode_clip
+
+
+def given(tmp_path: Path, hostile: Hostile) -> dict[str, Path]:
+    """The hostile file as its part, good files for the others."""
+    (tmp_path / "good.json").write_bytes(CALIBRATION)
+    return {"clip": VIDEO, "calibration": tmp_path / "good.json"} | {hostile.part: hostile.write(tmp_path)}
+
+
+@pytest.mark.parametrize("name", CORPUS)
+def test_a_hostile_file_is_refused_with_its_field_and_a_remedy(tmp_path: Path, name: str) -> None:
+    hostile = CORPUS[name]
+    with pytest.raises(InputError, match=hostile.problem) as caught:
+        decode_clip(**given(tmp_path, hostile))
+    assert caught.value.field == hostile.part
+    assert caught.value.remedy
+    assert "crashed" not in caught.value.problem
+
+
+@pytest.mark.parametrize("name", CORPUS)
+def test_what_shows_without_a_decoder_is_refused_without_one(tmp_path: Path, name: str) -> None:
+    hostile = CORPUS[name]
+    path = hostile.write(tmp_path)
+    if hostile.refused_at == "decoding":
+        check_file(path, hostile.part, ClipLimits())
+        return
+    with pytest.raises(InputError, match=hostile.problem) as caught:
+        check_file(path, hostile.part, ClipLimits())
+    assert caught.value.field == hostile.part
+
+
+def test_after_all_that_a_clip_is_read(tmp_path: Path) -> None:
+    (tmp_path / "good.json").write_bytes(CALIBRATION)
+    decoded = decode_clip(VIDEO, calibration=tmp_path / "good.json")
+    assert isinstance(decoded, StereoRecording)
+    assert decoded.clip.frame_count == 12
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("clip.mkv", VIDEO.read_bytes()), ("clip.mp4", b"PK\x05\x06" + bytes(18))]
+)
+def test_a_file_that_bears_the_ending_of_another_kind_is_refused_when_it_arrives(
+    tmp_path: Path, name: str, content: bytes
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="Give the file the ending of what it is"):
+        check_file(path, "clip", ClipLimits())
+
+
+@pytest.mark.parametrize(
+    "path", sorted(VIDEO.parent.glob("*.m*")) + sorted(VIDEO.parent.glob("*.webm")), ids=lambda path: path.name
+)
+def test_videos_of_every_container_pass(path: Path) -> None:
+    check_file(path, "clip", ClipLimits())
