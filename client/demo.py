@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from client.api import Client
-from client.cli import progress_of
 from client.pictures import Panel, draw_curve, draw_sheet, draw_strip
+from client.remote import progress_of
 from contract.errors import IntrasplatError, UnavailableError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
 from contract.progress_bar import ProgressBar

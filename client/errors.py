@@ -2,31 +2,110 @@
 
 IntrasplatError (contract/errors.py)
 ├── InputError
-│   ├── RequestRefused    the service refused the request: status, field, remedy
-│   └── JobRejected       the job failed because of what was sent
-├── UnavailableError      the service, its queue or its worker cannot be reached
-├── JobFailed             the job failed for another reason
+│   ├── RequestRefused          the service refused the request (4xx, 507)
+│   │   ├── Unauthorized        401: a key is needed, or this one is not known
+│   │   ├── Forbidden           403: the key lacks a scope, or the service does not answer to this name
+│   │   ├── NotFound            404: there is no such job or scene, or it is another tenant's
+│   │   └── Conflict            409: not in this state, such as a render of a job that waits
+│   └── JobRejected             the job failed because of what was sent
+├── UnavailableError
+│   └── ServiceUnavailable      503, or nobody answers; tried again as often as the client's patience allowed
+│       └── RateLimited         429: too much from this caller at once
+├── JobFailed                   the job failed for another reason
 ├── Cancelled
-│   └── JobCancelled      somebody cancelled the job
-└── ServiceFault          the service answered with a fault of its own
+│   └── JobCancelled            somebody cancelled the job
+└── ServiceFault                the service answered with a fault of its own (5xx), or with what is no answer of its
+
+Those that come from an answer carry field, remedy, status and request_id; the service's log has more under the last.
 """
 
 from __future__ import annotations
 
-from contract.errors import Cancelled, InputError, IntrasplatError
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Any
+
+from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableError
 from contract.job import JobView
+
+UNAVAILABLE_REMEDY = "Start one with `intrasplat up`, or correct the address."
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """An answer other than the one asked for, as the service's problem document and headers tell it."""
+
+    status: int
+    problem: str
+    field: str | None = None
+    remedy: str = ""
+    request_id: str | None = None
+    retry_after_s: float | None = None
+    job_id: str | None = None
+    """The job that the clip became all the same."""
 
 
 class RequestRefused(InputError):
     """The service refused the request; `status` is HTTP's."""
 
-    def __init__(self, status: int, field: str, problem: str, remedy: str) -> None:
-        super().__init__(field, problem, remedy)
-        self.status = status
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(refusal.field or "request", refusal.problem, refusal.remedy)
+        self.status = refusal.status
+        self.request_id = refusal.request_id
+
+
+class Unauthorized(RequestRefused):
+    """A key is needed, or the one that was sent is not known."""
+
+
+class Forbidden(RequestRefused):
+    """The key may not do this."""
+
+
+class NotFound(RequestRefused):
+    """There is no such job, scene or upload."""
+
+
+class Conflict(RequestRefused):
+    """What was asked for cannot be done as things stand."""
+
+
+class ServiceUnavailable(UnavailableError):
+    """The service cannot do it now, or cannot be reached (status None). field: what is missing, such as "queue"."""
+
+    def __init__(self, refusal: Refusal | None, problem: str, remedy: str) -> None:
+        super().__init__(problem, remedy)
+        self.status = refusal.status if refusal else None
+        self.field = refusal.field if refusal else None
+        self.request_id = refusal.request_id if refusal else None
+        self.retry_after_s = refusal.retry_after_s if refusal else None
+        self.job_id = refusal.job_id if refusal else None
+
+
+class RateLimited(ServiceUnavailable):
+    """Too much came from this caller; `retry_after_s` says when there is room again."""
+
+
+class Unreachable(ServiceUnavailable):
+    """The connection failed. is_nobody_there: nothing was sent, because nobody took the call."""
+
+    def __init__(self, url: str, error: Exception, is_nobody_there: bool) -> None:
+        what = "No service answers at" if is_nobody_there else "The connection was lost to the service at"
+        super().__init__(None, f"{what} {url} ({type(error).__name__}).", UNAVAILABLE_REMEDY)
+        self.is_nobody_there = is_nobody_there
 
 
 class ServiceFault(IntrasplatError):
     """The service answered, but not with anything that was asked for."""
+
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(" ".join(part for part in (refusal.problem, refusal.remedy) if part))
+        self.status = refusal.status
+        self.field = refusal.field
+        self.remedy = refusal.remedy
+        self.request_id = refusal.request_id
 
 
 class JobRejected(InputError):
@@ -52,3 +131,53 @@ class JobCancelled(Cancelled):
     def __init__(self, job: JobView) -> None:
         super().__init__(f"Job {job.id} was cancelled.")
         self.job = job
+
+
+REFUSED: Mapping[int, type[RequestRefused]] = {
+    HTTPStatus.UNAUTHORIZED: Unauthorized,
+    HTTPStatus.FORBIDDEN: Forbidden,
+    HTTPStatus.NOT_FOUND: NotFound,
+    HTTPStatus.CONFLICT: Conflict,
+}
+
+
+def error_of_answer(status: int, headers: Mapping[str, str], content: bytes) -> IntrasplatError:
+    """The exception that an answer with an error's status means."""
+    request_id = headers.get("x-request-id")
+    try:
+        document = json.loads(content)
+        return error_of_document({**document, "status": status}, request_id, _seconds(headers.get("retry-after")))
+    except (ValueError, KeyError, TypeError):
+        problem = f"The service answered {status} without saying why."
+        return ServiceFault(Refusal(status, problem, request_id=request_id))
+
+
+def error_of_document(
+    document: Mapping[str, Any], request_id: str | None = None, retry_after_s: float | None = None
+) -> IntrasplatError:
+    """The exception that a problem document means.
+
+    Raises:
+        KeyError, TypeError, ValueError: it is no problem document.
+    """
+    refusal = Refusal(
+        status=int(document["status"]),
+        problem=str(document["detail"]),
+        field=document.get("field"),
+        remedy=str(document.get("remedy") or ""),
+        request_id=request_id,
+        retry_after_s=retry_after_s,
+        job_id=document.get("job_id"),
+    )
+    if refusal.status == HTTPStatus.TOO_MANY_REQUESTS:
+        return RateLimited(refusal, refusal.problem, refusal.remedy)
+    if refusal.status == HTTPStatus.SERVICE_UNAVAILABLE:
+        return ServiceUnavailable(refusal, refusal.problem, refusal.remedy)
+    if refusal.status >= HTTPStatus.INTERNAL_SERVER_ERROR and refusal.status != HTTPStatus.INSUFFICIENT_STORAGE:
+        return ServiceFault(refusal)
+    return REFUSED.get(refusal.status, RequestRefused)(refusal)
+
+
+def _seconds(retry_after: str | None) -> float | None:
+    """Retry-After in seconds; a date, which it may be as well, is not understood."""
+    return float(retry_after) if retry_after and retry_after.isascii() and retry_after.isdigit() else None

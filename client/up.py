@@ -1,4 +1,9 @@
-"""`intrasplat up`: a queue, the service and one worker on this machine, watched until the caller ends them."""
+"""`intrasplat up`: a queue, the service and its workers on this machine, watched until the caller ends them.
+
+If `up` itself is killed, service and workers are killed with it: what was accepted is on disk, and what was training
+goes on from its last checkpoint at the next start. The queue's server alone stays; the next `up` of the same data
+directory takes it over, and ends it when it ends itself.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +14,15 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from client.api import Client
 from contract.embedded import EmbeddedServer
 from contract.errors import UnavailableError
+from contract.keys import KeyFile
 from contract.locks import FolderLock
-from contract.processes import end_process
+from contract.processes import die_with_parent, end_process
 from contract.settings import Settings
 from contract.store import Store
 
@@ -28,6 +34,10 @@ STEADY_S = 60.0
 """A process that lived this long was sound: its next crash is the first again."""
 
 STOP_TIMEOUT_S = 15.0
+WORKER_NAME_VARIABLE = "INTRASPLAT_WORKER_NAME"
+LOOPBACK_ADDRESSES = frozenset({"127.0.0.1", "localhost", "::1"})
+EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+"""Where this machine finds itself when the service answers at all of its addresses."""
 
 
 class WatchedProcess:
@@ -62,9 +72,18 @@ class WatchedProcess:
         if now_s >= self._start_at_s:
             # A session of its own: Ctrl-C reaches the launcher alone, which ends the others in order.
             self._process = subprocess.Popen(
-                self._command, env=self._environment, stdin=subprocess.DEVNULL, start_new_session=True
+                self._command,
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                preexec_fn=die_with_parent if os.name == "posix" else None,
             )
             self._started_s = now_s
+
+    def ask_to_end(self) -> None:
+        """Send SIGTERM, and do not wait."""
+        if self._process is not None:
+            self._process.terminate()
 
     def stop(self) -> None:
         """Ask the child to end, and insist after STOP_TIMEOUT_S."""
@@ -75,9 +94,9 @@ class WatchedProcess:
 
 
 class Installation:
-    """Queue, service and worker of one data directory; a context manager that starts and ends them."""
+    """Queue, service and workers of one data directory; a context manager that starts and ends them."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, worker_count: int = 1) -> None:
         Store(settings.data_dir)  # makes the folders, readable by their owner only
         data_dir = settings.data_dir.expanduser().resolve()
         self._lock = FolderLock(data_dir / "run" / "up.lock")
@@ -88,12 +107,17 @@ class Installation:
         )
         environment = {**os.environ, **self.settings.to_environment()}
         self.service = WatchedProcess("service", [sys.executable, "-m", "service"], environment)
-        self.worker = WatchedProcess("worker", [sys.executable, "-m", "worker", "consume"], environment)
+        command = [sys.executable, "-m", "worker", "consume"]
+        self.workers = [
+            WatchedProcess(name, command, {**environment, WORKER_NAME_VARIABLE: name})
+            for name in worker_names(settings.worker_name, worker_count)
+        ]
 
     @property
     def url(self) -> str:
-        """Where the service answers."""
-        return f"http://{self.settings.host}:{self.settings.port}"
+        """Where the service answers callers on this machine."""
+        host = EVERY_ADDRESS.get(self.settings.host, self.settings.host)
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.settings.port}"
 
     def __enter__(self) -> Installation:
         if not self._lock.take():
@@ -105,8 +129,7 @@ class Installation:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self.service.stop()
-        self.worker.stop()
+        end_together([self.service, *self.workers])
         if self._queue is not None:
             self._queue.stop()
         self._lock.release()
@@ -115,8 +138,8 @@ class Installation:
         """Start again what has died; call it often."""
         if self._queue is not None and self._queue.ensure_running():
             say("the queue's server had died and was started again; nothing it had accepted is lost")
-        self.service.watch()
-        self.worker.watch()
+        for process in (self.service, *self.workers):
+            process.watch()
 
     def wait_until_ready(self, is_ended: Callable[[], bool], timeout_s: float) -> bool:
         """Watch until a clip would be trained; False if that takes too long or the caller ends."""
@@ -130,22 +153,38 @@ class Installation:
         return False
 
 
+def end_together(processes: Sequence[WatchedProcess]) -> None:
+    """Ask all to end, then wait for each, so that the slowest alone is waited for."""
+    for process in processes:
+        process.ask_to_end()
+    for process in processes:
+        process.stop()
+
+
+def worker_names(first: str, number: int) -> list[str]:
+    """`first` alone; of several, worker-1, worker-2 and so on, or what stands in place of `worker`."""
+    stem = first.removesuffix("-1")
+    return [first] if number == 1 else [f"{stem}-{each}" for each in range(1, number + 1)]
+
+
 def say(text: str) -> None:
     """A line for whoever watches the launcher."""
     print(f"intrasplat: {text}", file=sys.stderr, flush=True)
 
 
-def run(settings: Settings, ready_timeout_s: float = 300.0) -> None:
+def run(settings: Settings, worker_count: int = 1, ready_timeout_s: float = 300.0) -> None:
     """Start everything, say where it is, and watch until SIGINT or SIGTERM.
 
     Raises:
-        UnavailableError: the port is taken, there is no queue, or nothing becomes ready.
+        UnavailableError: there is no key to let anybody in, the port is taken, there is no queue, or nothing becomes
+            ready.
     """
     end = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: end.set())
+    check_keys(settings)
     check_port(settings.host, settings.port)
-    with Installation(settings) as installation:
+    with Installation(settings, worker_count) as installation:
         say("starting; the first time, the kernels are compiled, which takes up to a minute")
         if not installation.wait_until_ready(end.is_set, ready_timeout_s):
             if end.is_set():
@@ -159,12 +198,20 @@ def run(settings: Settings, ready_timeout_s: float = 300.0) -> None:
         say("ending")
 
 
+def check_keys(settings: Settings) -> None:
+    """Raise UnavailableError if others could reach the service and there is no key to let the right ones in."""
+    if settings.host not in LOOPBACK_ADDRESSES and not KeyFile(settings.data_dir).list():
+        problem = f"{settings.host} can be reached from other machines, and there are no keys."
+        remedy = f"Make one first: `intrasplat keys create --tenant NAME --data-dir {settings.data_dir}`."
+        raise UnavailableError(problem, remedy)
+
+
 def check_port(host: str, port: int) -> None:
     """Raise UnavailableError if somebody else listens there."""
-    with socket.socket() as probe:
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
         except OSError as error:
-            problem = f"Port {port} is not free ({error.strerror})."
+            problem = f"Port {port} of {host} cannot be had ({error.strerror})."
             raise UnavailableError(problem, f"Choose another: --port {port + 1}.") from error

@@ -40,3 +40,10 @@ def positive(text: str) -> float:
     if value <= 0:
         raise argparse.ArgumentTypeError(f"{text} is not above 0.")
     return value
+
+
+def count(text: str) -> int:
+    """An argument's whole number of at least 1; ArgumentTypeError for any other."""
+    if not (text.isascii() and text.isdigit() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of at least 1.")
+    return int(text)

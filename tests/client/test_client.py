@@ -1,104 +1,44 @@
-"""The client against the real application: what the service says arrives as values or as the right exception."""
+"""The blocking client against a real service: clip to scene, lines that are cut, and every refusal by its name."""
 
 from __future__ import annotations
 
-import asyncio
-import io
-import os
-import signal
-import subprocess
-import sys
-import threading
-import time
-from collections.abc import Iterator
+import inspect
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 
-import client as client_package
-from client import Client, JobCancelled, JobFailed, JobRejected, RequestRefused, ServiceFault
-from client.cli import main, progress_of
-from contract.embedded import short_socket_path
-from contract.errors import InputError, UnavailableError
-from contract.exits import ExitCode
-from contract.job import JobError, JobState
-from contract.queue import Claim
-from contract.queue_memory import MemoryQueue
-from contract.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
-from contract.settings import Settings
-from contract.store import CURVE, MANIFEST, REPORT, Store
-from service.app import create_app
-from service.renderer import ZmqRenderer
-from worker.serve import RequestServer, View
+from client import (
+    AsyncClient,
+    Client,
+    Conflict,
+    Forbidden,
+    JobCancelled,
+    JobFailed,
+    JobRejected,
+    NotFound,
+    RateLimited,
+    RequestRefused,
+    ServiceFault,
+    ServiceUnavailable,
+    Unauthorized,
+    submission,
+)
+from contract.errors import InputError, IntrasplatError, UnavailableError
+from contract.job import JobError, JobProgress, JobState
+from contract.keys import KeyFile, KeyScope
+from tests.client.town import SNAPSHOT_ITERATION, Town, line_to, town_at
 
-
-def paint(request: RenderRequest | ExportRequest) -> View:
-    """A 4 x 6 depth map that holds t everywhere."""
-    if isinstance(request, ExportRequest):
-        return View(b"ply\n", "application/octet-stream", request.t)
-    buffer = io.BytesIO()
-    np.save(buffer, np.full((4, 6), request.t, np.float32))
-    return View(buffer.getvalue(), MEDIA_TYPES[request.format], request.t, ("seen from afar",))
-
-
-class Town:
-    """A service on a real port, and the queue and store behind it."""
-
-    def __init__(self, data_dir: Path) -> None:
-        self.queue, self.store = MemoryQueue(), Store(data_dir)
-        settings = Settings(data_dir=data_dir, min_free_bytes=0)
-        app = create_app(settings, self.queue, self.store, ZmqRenderer(self.queue, 5.0))
-        self.server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="warning"))
-        self.thread = threading.Thread(target=lambda: asyncio.run(self.server.serve()))
-        self.thread.start()
-        while not self.server.started:
-            time.sleep(0.01)
-        self.url = f"http://127.0.0.1:{self.server.servers[0].sockets[0].getsockname()[1]}"
-
-    def stop(self) -> None:
-        self.server.should_exit = True
-        self.thread.join()
-
-    def claim(self) -> Claim:
-        record = self.queue.claim("worker-1", 5.0)
-        assert record is not None
-        return Claim(record.job_id, record.attempt, "worker-1")
-
-    def finish(self) -> None:
-        claim = self.claim()
-        folder = self.store.work_folder(claim.job_id, claim.attempt)
-        (folder / MANIFEST).write_text("{}")
-        (folder / REPORT).write_text('{"psnr_tissue_db": 36.2, "warnings": []}')
-        (folder / CURVE).write_text("t_train_s,psnr_tissue_db\n1,30\n")
-        self.store.publish_scene(claim.job_id, claim.attempt)
-        self.queue.finish(claim)
-
-
-@pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
-    town = Town(tmp_path_factory.mktemp("data"))
-    endpoint = f"ipc://{short_socket_path(town.store.run_dir, 'worker-1.sock')}"
-    with RequestServer(endpoint, paint):
-        town.queue.announce(WorkerAddress(name="worker-1", endpoint=endpoint, device="cpu"))
-        yield town
-        town.stop()
-
-
-@pytest.fixture
-def client(town: Town) -> Iterator[Client]:
-    town.queue.announce(town.queue.workers()[0])
-    with Client(town.url) as client:
-        yield client
-
-
-@pytest.fixture
-def clip(tmp_path: Path) -> Path:
-    path = tmp_path / "clip.mp4"
-    path.write_bytes(b"frames")
-    return path
+JOB_ID = "0" * 32
+JOB = {
+    "id": JOB_ID,
+    "state": "queued",
+    "options": {},
+    "input_bytes": 1,
+    "created_at_s": 0.0,
+    "links": {},
+}
 
 
 def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(town: Town, client: Client, clip: Path) -> None:
@@ -110,58 +50,228 @@ def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(town: Town,
     assert client.report(job.id)["psnr_tissue_db"] == 36.2
     assert client.curve(job.id).startswith("t_train_s")
     assert client.export(job.id) == b"ply\n"
-    image = client.render(t=0.5, scene=job.id, layer="depth", format="npy", width=64)
-    np.testing.assert_array_equal(image.array(), np.full((4, 6), 0.5, np.float32))
-    assert (image.scene, image.t, image.warning) == (job.id, 0.5, "seen from afar")
-    client.delete(job.id)
-    with pytest.raises(RequestRefused) as caught:
+    assert job.id in {scene["id"] for scene in client.scenes()}
+    receipt = client.delete(job.id)
+    assert receipt["verified"]
+    with pytest.raises(NotFound) as caught:
         client.report(job.id)
     assert caught.value.status == 404
+
+
+def test_a_render_comes_as_a_file_as_an_array_or_as_what_is_known(town: Town, client: Client, clip: Path) -> None:
+    job = client.reconstruct(clip)
+    town.finish()
+    image = client.render(t=0.5, scene=job.id, layer="depth", format="npy", width=64)
+    np.testing.assert_array_equal(image.array(), np.full((4, 6), 0.5, np.float32))
+    np.testing.assert_array_equal(client.render_array(t=0.25, scene=job.id), np.full((4, 6), 0.25, np.float32))
+    assert (image.scene, image.t, image.state, image.warning) == (job.id, 0.5, "done", "seen from afar")
+    assert client.render(t=0.5, scene=job.id, layer="depth", format="npy", width=64, known=image) is image
+    assert client.render(t=0.5, scene=job.id, layer="rgb", known=image) is not image
+    with pytest.raises(InputError, match="npy"):
+        client.render(t=0.5, scene=job.id).array()
+
+
+def test_a_job_that_trains_shows_its_newest_snapshot_and_one_that_waits_is_a_conflict(
+    town: Town, client: Client, clip: Path
+) -> None:
+    job = client.reconstruct(clip)
+    with pytest.raises(Conflict):
+        client.render(scene=job.id)
+    town.claim()
+    image = client.render(scene=job.id)
+    assert (image.state, image.iteration) == ("running", SNAPSHOT_ITERATION)
+
+
+def test_many_views_come_over_one_connection(town: Town, client: Client, clip: Path) -> None:
+    job = client.reconstruct(clip)
+    town.finish()
+    with client.stream(job.id) as viewer:
+        for t in (0.0, 0.5, 1.0):
+            image = viewer.render(t, "orbit:5,0,1", layer="depth", format="npy")
+            assert (image.t, image.scene) == (t, job.id)
+            assert image.array()[0, 0] == t
+        with pytest.raises(RequestRefused) as caught:
+            viewer.render(0.0, "orbit:999,0,1")
+        assert caught.value.field == "pose"
+        assert viewer.render(0.0).media_type == "image/jpeg"
+    with client.stream("nosuch") as viewer, pytest.raises(NotFound):
+        viewer.render()
 
 
 def test_watching_shows_each_state_and_ends_with_the_last(town: Town, client: Client, clip: Path) -> None:
     job = client.reconstruct(clip)
     states = []
-    for view in client.watch(job.id, poll_s=0.01):
+    for view in client.watch(job.id):
         states.append(view.state)
-        if view.state is JobState.QUEUED:
+        if view.state is JobState.QUEUED and states.count(JobState.QUEUED) == 1:
             client.cancel(job.id)
-    assert states == [JobState.QUEUED, JobState.CANCELLED]
+    assert (states[0], states[-1]) == (JobState.QUEUED, JobState.CANCELLED)
     with pytest.raises(JobCancelled):
         client.wait(job.id)
+
+
+def test_a_watch_that_is_cut_off_goes_on_and_misses_nothing(town: Town, client: Client, clip: Path) -> None:
+    job = client.reconstruct(clip)
+    seen: list[float] = []
+    with line_to(town) as line, Client(line.url) as far:
+        claim = town.claim()
+        for view in far.watch(job.id):
+            seen.append(view.fraction or 0.0)
+            if view.state is JobState.RUNNING and view.fraction is None:
+                line.cut()
+                for fraction in (0.25, 0.5):
+                    town.queue.beat(claim, JobProgress(stage="train", fraction=fraction))
+                town.finish(claim)
+        assert line.connections == 2
+    assert [fraction for fraction in seen if fraction] == [0.25, 0.5, 0.5]
+
+
+def test_where_no_events_come_through_the_job_is_polled() -> None:
+    def answer(request: httpx.Request) -> httpx.Response:
+        if request.url.path.endswith("/events"):
+            return httpx.Response(200, text="<html>proxy</html>", headers={"content-type": "text/html"})
+        return httpx.Response(200, json={**JOB, "state": "done"})
+
+    with Client(transport=httpx.MockTransport(answer)) as client:
+        assert client.wait(JOB_ID).state is JobState.DONE
 
 
 def test_a_job_that_failed_by_its_input_differs_from_one_that_failed_otherwise(
     town: Town, client: Client, clip: Path
 ) -> None:
-    rejected, broken = client.reconstruct(clip), client.reconstruct(clip)
-    town.queue.fail(town.claim(), JobError(problem="one eye only.", field="clip", remedy="Send both."))
-    town.queue.fail(town.claim(), JobError(problem="it diverged."))
+    rejected = client.reconstruct(clip)
+    town.fail(JobError(problem="one eye only.", field="clip", remedy="Send both."))
+    broken = client.reconstruct(clip)
+    town.fail(JobError(problem="it diverged."))
     with pytest.raises(JobRejected, match="Send both"):
         client.wait(rejected.id)
     with pytest.raises(JobFailed, match="diverged"):
         client.wait(broken.id)
+    assert {job.id for job in client.jobs(JobState.FAILED)} >= {rejected.id, broken.id}
+    assert client.retry(broken.id).state is JobState.QUEUED
+    with pytest.raises(Conflict):
+        client.retry(broken.id)
 
 
-def test_a_refused_request_names_field_and_remedy(client: Client, tmp_path: Path) -> None:
+def test_a_large_clip_goes_in_pieces_and_on_from_where_the_line_was_cut(
+    town: Town, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(submission, "PIECE_BYTES", 2**22)
+    large = tmp_path / "Smith.mp4"
+    small, size = clip.read_bytes(), 3 * 2**22
+    with large.open("wb") as file:
+        file.write(small + (size - len(small)).to_bytes(4, "big") + b"free")
+        file.truncate(size)
+    told: list[int] = []
+    with line_to(town) as line:
+
+        def on_upload(sent: int, total: int) -> None:
+            assert total == size
+            if sent > 5 * 2**20 and not any(each > 5 * 2**20 for each in told):
+                line.cut()
+            told.append(sent)
+
+        with Client(line.url) as far:
+            job = far.reconstruct(large, in_pieces=True, on_upload=on_upload)
+        assert line.connections == 2
+    assert job.input_bytes == size
+    assert told[-1] == size
+    assert (town.store.spool_folder(job.id) / "clip.mp4").read_bytes() == large.read_bytes()
+
+
+def test_two_eyes_calibration_and_masks_arrive_as_what_they_are(
+    town: Town, client: Client, clip: Path, tmp_path: Path
+) -> None:
+    calibration = tmp_path / "calibration.json"
+    calibration.write_text("{}")
+    for in_pieces in (False, True):
+        job = client.reconstruct(clip, clip, calibration=calibration, masks=clip, in_pieces=in_pieces)
+        spooled = {path.name for path in town.store.spool_folder(job.id).iterdir()}
+        assert spooled >= {"left.mp4", "right.mp4", "calibration.json", "masks.mp4"}
+
+
+def test_the_same_key_is_the_same_job_and_another_is_another(town: Town, client: Client, clip: Path) -> None:
+    first, again, other = (client.reconstruct(clip, idempotency_key=key) for key in ("a", "a", None))
+    assert first.id == again.id != other.id
+    with pytest.raises(RequestRefused) as caught:
+        client.reconstruct(clip, idempotency_key="a", seed=5)
+    assert (caught.value.status, caught.value.field) == (422, "Idempotency-Key")
+
+
+def test_a_refused_request_names_field_remedy_and_request(client: Client, tmp_path: Path) -> None:
     odd = tmp_path / "clip.exe"
     odd.write_bytes(b"x")
-    with pytest.raises(RequestRefused) as caught:
-        client.reconstruct(odd)
-    assert (caught.value.status, caught.value.field) == (422, "clip")
-    assert ".mp4" in caught.value.remedy
+    for in_pieces in (False, True):
+        with pytest.raises(RequestRefused) as caught:
+            client.reconstruct(odd, in_pieces=in_pieces)
+        assert (caught.value.status, caught.value.field) == (422, "clip")
+        assert ".mp4" in caught.value.remedy
+        assert caught.value.request_id
 
 
-def test_a_file_that_is_not_there_is_a_bad_input(client: Client, tmp_path: Path) -> None:
+def test_a_file_that_is_not_there_or_empty_is_a_bad_input(client: Client, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nothing\.mp4"):
         client.reconstruct(tmp_path / "nothing.mp4")
+    (tmp_path / "empty.mp4").touch()
+    with pytest.raises(InputError, match="is empty"):
+        client.reconstruct(tmp_path / "empty.mp4")
 
 
-def test_no_service_is_unavailable_and_not_ready() -> None:
+def test_a_key_opens_what_it_may_and_nothing_else(tmp_path: Path, clip: Path) -> None:
+    keys = KeyFile(tmp_path)
+    _, viewing = keys.create("ward", {KeyScope.VIEW})
+    _, both = keys.create("ward")
+    with town_at(tmp_path, hosts=("ward.example",)) as town:
+        with Client(town.url) as nobody, pytest.raises(Unauthorized):
+            nobody.jobs()
+        with Client(town.url, api_key=both) as client:
+            job = client.reconstruct(clip)
+            with pytest.raises(Forbidden, match="purge"):
+                client.delete(job.id)
+        with Client(town.url, api_key=viewing) as client:
+            assert client.job(job.id).id == job.id
+            with pytest.raises(Forbidden, match="reconstruct"):
+                client.cancel(job.id)
+            with client.stream(job.id) as viewer, pytest.raises(Conflict):
+                viewer.render()
+        with Client(town.url, api_key="isp_wrong") as client, pytest.raises(Unauthorized), client.stream(job.id):
+            pass
+
+
+def test_no_service_is_unavailable_at_once_and_not_ready() -> None:
     with Client("http://127.0.0.1:9") as client:
         assert not client.is_ready()
-        with pytest.raises(UnavailableError, match="intrasplat up"):
-            client.jobs()
+        for ask in (client.jobs, lambda: client.wait("a"), lambda: client.stream("a")):
+            with pytest.raises(UnavailableError, match="intrasplat up"):
+                ask()
+
+
+@pytest.mark.parametrize(
+    ("status", "kind"),
+    [
+        (400, RequestRefused),
+        (401, Unauthorized),
+        (403, Forbidden),
+        (404, NotFound),
+        (409, Conflict),
+        (413, RequestRefused),
+        (422, RequestRefused),
+        (429, RateLimited),
+        (500, ServiceFault),
+        (503, ServiceUnavailable),
+        (507, RequestRefused),
+    ],
+)
+def test_every_status_is_an_error_with_field_remedy_and_request_id(status: int, kind: type[IntrasplatError]) -> None:
+    document = {"status": status, "detail": "It rains.", "field": "sky", "remedy": "Wait."}
+    headers = {"x-request-id": "r1", "retry-after": "3600"}
+    transport = httpx.MockTransport(lambda request: httpx.Response(status, json=document, headers=headers))
+    with Client(transport=transport) as client, pytest.raises(kind) as caught:
+        client.jobs()
+    assert type(caught.value) is kind
+    told = {name: getattr(caught.value, name) for name in ("status", "field", "remedy", "request_id")}
+    assert told == {"status": status, "field": "sky", "remedy": "Wait.", "request_id": "r1"}
+    assert "It rains." in str(caught.value)
 
 
 def test_an_answer_that_is_no_problem_document_is_a_fault_of_the_service() -> None:
@@ -170,88 +280,57 @@ def test_an_answer_that_is_no_problem_document_is_a_fault_of_the_service() -> No
         client.jobs()
 
 
-def test_submit_watch_and_fetch_on_the_command_line(
-    town: Town, client: Client, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["submit", str(clip), "--iterations", "30", "--url", town.url]) == ExitCode.OK
-    job_id = capsys.readouterr().out.strip()
-    assert client.job(job_id).options.iterations == 30
-    town.finish()
-    assert main(["watch", job_id, "--url", town.url]) == ExitCode.OK
-    out = tmp_path / "results"
-    assert main(["fetch", job_id, "--out", str(out), "--t", "0.5", "--url", town.url]) == ExitCode.OK
-    assert {path.name for path in out.iterdir()} == {"report.json", "curve.csv", "view.png", "scene.ply"}
+class Busy:
+    """Refuses the first requests, then answers."""
+
+    def __init__(self, status: int, times: int, **extensions: str) -> None:
+        self.status = status
+        self.document = {"status": status, "detail": "Busy.", "remedy": "Wait.", **extensions}
+        self.left = times
+        self.requests: list[httpx.Request] = []
+
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        request.read()
+        self.requests.append(request)
+        self.left -= 1
+        if self.left >= 0:
+            return httpx.Response(self.status, json=self.document, headers={"retry-after": "0"})
+        return httpx.Response(200, json=[] if request.url.path == "/jobs" else JOB)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code"),
-    [
-        (["submit", "nothing.mp4"], ExitCode.BAD_INPUT),
-        (["submit", "clip.mp4", "--holdout", "every9"], ExitCode.BAD_INPUT),
-        (["watch", "0" * 32], ExitCode.BAD_INPUT),
-        (["watch", "0" * 32, "--url", "http://127.0.0.1:9"], ExitCode.UNAVAILABLE),
-    ],
-)
-def test_exit_codes_tell_what_went_wrong(
-    town: Town, arguments: list[str], code: ExitCode, capsys: pytest.CaptureFixture[str]
-) -> None:
-    url = [] if "--url" in arguments else ["--url", town.url]
-    assert main([*arguments, *url]) == code
-    assert capsys.readouterr().err.startswith("intrasplat: ")
+@pytest.mark.parametrize("status", [429, 503])
+def test_a_busy_service_is_asked_again_until_patience_ends(status: int) -> None:
+    busy = Busy(status, times=2)
+    with Client(transport=httpx.MockTransport(busy)) as client:
+        assert client.jobs() == []
+    assert len(busy.requests) == 3
+    busy = Busy(status, times=9)
+    with Client(transport=httpx.MockTransport(busy), patience_s=0.3) as client, pytest.raises(ServiceUnavailable):
+        client.jobs()
+    assert len(busy.requests) == 2
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        [],
-        ["unknown"],
-        ["submit"],
-        ["submit", "a", "--budget-s", "1", "--iterations", "1"],
-        ["fetch", "a", "--out", "b", "--t", "nan"],
-    ],
-)
-def test_wrong_usage_ends_with_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    assert caught.value.code == ExitCode.USAGE
+def test_a_clip_is_sent_again_whole_and_under_the_same_key(clip: Path) -> None:
+    busy = Busy(503, times=1)
+    with Client(transport=httpx.MockTransport(busy)) as client:
+        client.reconstruct(clip)
+    first, second = busy.requests
+    assert first.content == second.content
+    assert first.headers["idempotency-key"] == second.headers["idempotency-key"]
 
 
-@pytest.mark.parametrize("command", ["up", "submit", "watch", "fetch"])
-def test_every_help_tells_the_exit_codes(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main([command, "--help"])
-    assert caught.value.code == 0
-    assert "exit codes" in capsys.readouterr().out
+def test_a_clip_that_is_safe_though_the_queue_is_away_is_not_sent_again(clip: Path) -> None:
+    busy = Busy(503, times=2, job_id=JOB_ID)
+    with Client(transport=httpx.MockTransport(busy)) as client:
+        assert client.reconstruct(clip).id == JOB_ID
+    assert [request.method for request in busy.requests] == ["POST", "GET", "GET"]
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "render", "phantom", "doctor"])
-def test_local_commands_have_help_too(command: str) -> None:
-    assert "exit codes" in run_here(Path.cwd(), command, "--help").stdout
+def test_both_clients_can_do_the_same() -> None:
+    def methods(kind: type) -> dict[str, list[str]]:
+        found = inspect.getmembers(kind, inspect.isfunction)
+        return {name: list(inspect.signature(each).parameters) for name, each in found if not name.startswith("_")}
 
-
-def run_here(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """The command line in a process of its own, started in `folder`, whose `worker` is taken if it has one."""
-    environment = os.environ | {"PYTHONPATH": str(Path(client_package.__file__).parents[1])}
-    command = [sys.executable, "-m", "client.cli", *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=60)
-
-
-def test_a_local_command_is_one_process_that_ends_as_the_workers_program_ends(tmp_path: Path) -> None:
-    program = tmp_path / "worker" / "__main__.py"
-    program.parent.mkdir()
-    (program.parent / "__init__.py").touch()
-    for source, status in (
-        ("raise SystemExit(7)", 7),
-        ("import os; os.kill(os.getpid(), 9)", -signal.SIGKILL),
-        ("import os; os.kill(os.getpid(), 15)", -signal.SIGTERM),
-    ):
-        program.write_text(f"import sys; print(*sys.argv[1:], flush=True)\n{source}\n")
-        ended = run_here(tmp_path, "reconstruct", "a b", "--out", "c")
-        assert ended.returncode == status
-        assert ended.stdout == "reconstruct a b --out c\n"
-
-
-def test_a_job_that_has_not_begun_is_shown_by_its_state(client: Client, clip: Path) -> None:
-    job = client.reconstruct(clip)
-    assert progress_of(job).stage == "queued"
-    client.cancel(job.id)
+    blocking, awaited = methods(Client), methods(AsyncClient)
+    assert blocking.pop("close") == awaited.pop("aclose")
+    assert blocking == awaited

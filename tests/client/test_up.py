@@ -1,18 +1,20 @@
-"""`up`'s parts: children come back after a crash, and one data directory has one launcher."""
+"""`up`'s parts: children come back after a crash and end with it, and one data directory has one launcher."""
 
 from __future__ import annotations
 
 import os
 import signal
 import socket
+import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from client.up import Installation, WatchedProcess, check_port
+from client.up import Installation, WatchedProcess, check_keys, check_port, worker_names
 from contract.errors import UnavailableError
+from contract.keys import KeyFile
 from contract.locks import FolderLock
 from contract.settings import Settings
 
@@ -60,3 +62,53 @@ def test_a_port_that_is_taken_is_said_before_anything_starts() -> None:
         listener.listen()
         with pytest.raises(UnavailableError, match="--port"):
             check_port("127.0.0.1", listener.getsockname()[1])
+
+
+def test_children_end_with_a_launcher_that_was_killed() -> None:
+    program = (
+        "import os, sys, time\n"
+        "from client.up import WatchedProcess\n"
+        "child = WatchedProcess('worker', [sys.executable, '-c', 'import time; time.sleep(60)'], dict(os.environ))\n"
+        "child.watch()\n"
+        "print(child.process_id, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as launcher:
+        assert launcher.stdout is not None
+        child_id = int(launcher.stdout.readline())
+        assert is_running(child_id)
+        launcher.kill()
+    deadline_s = time.monotonic() + WAIT_S
+    while is_running(child_id):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
+def is_running(process_id: int) -> bool:
+    """Whether the process is there and has not ended; one that ended may wait for somebody to ask for its status."""
+    try:
+        state = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def test_every_worker_has_a_name_of_its_own(tmp_path: Path) -> None:
+    assert worker_names("worker-1", 1) == ["worker-1"]
+    assert worker_names("worker-1", 3) == ["worker-1", "worker-2", "worker-3"]
+    assert worker_names("theatre-2", 2) == ["theatre-2-1", "theatre-2-2"]
+    assert len(Installation(Settings(data_dir=tmp_path), worker_count=3).workers) == 3
+
+
+def test_others_are_let_in_only_once_there_is_a_key(tmp_path: Path) -> None:
+    check_keys(Settings(data_dir=tmp_path))
+    abroad = Settings(data_dir=tmp_path, host="0.0.0.0")
+    with pytest.raises(UnavailableError, match="intrasplat keys create"):
+        check_keys(abroad)
+    KeyFile(tmp_path).create("ward")
+    check_keys(abroad)
+
+
+def test_a_service_at_every_address_is_found_at_loopback(tmp_path: Path) -> None:
+    urls = [Installation(Settings(data_dir=tmp_path, host=host)).url for host in ("127.0.0.1", "0.0.0.0", "::")]
+    assert urls == ["http://127.0.0.1:8765", "http://127.0.0.1:8765", "http://[::1]:8765"]

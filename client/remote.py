@@ -1,0 +1,226 @@
+"""The commands that talk to a service: submit, watch, fetch, jobs, cancel, retry, delete."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+from pathlib import Path
+from typing import get_args
+
+from client.api import DEFAULT_URL, Client
+from contract.arguments import Commands, add_command, finite, positive
+from contract.errors import InputError
+from contract.exits import ExitCode
+from contract.job import JobProgress, JobState, JobView, Layout, MaskPolarity, PoseConvention, PresetName, Priority
+from contract.progress_bar import ProgressBar
+
+URL_VARIABLE = "INTRASPLAT_URL"
+KEY_VARIABLE = "INTRASPLAT_API_KEY"
+
+OPTIONS = (
+    *("mask_polarity", "layout", "pose_convention", "holdout", "preset", "budget_s", "iterations", "seed"),
+    *("priority", "retention_hours"),
+)
+
+COMMANDS_OF_ROUTES = (
+    (r"GET /(?:jobs|scenes) lists", "`intrasplat jobs` lists"),
+    (r"GET /jobs/(\w+)", r"`intrasplat watch \1`"),
+    (r"DELETE /jobs/(\w+)", r"`intrasplat cancel \1`"),
+    (r"DELETE /scenes/(\w+)", r"`intrasplat delete \1`"),
+    (r"DELETE /scenes/\{id\}", "`intrasplat delete JOB`"),
+    (r"POST /jobs/(\w+)/retry", r"`intrasplat retry \1`"),
+    (r"POST /reconstruct", "`intrasplat submit`"),
+    (r"Send `Authorization: Bearer KEY`", f"Give it as --api-key or {KEY_VARIABLE}"),
+    (r"The API is described at /openapi\.json\.", "See --help."),
+)
+
+
+def in_commands(text: str) -> str:
+    """What the service says, with commands where it names routes."""
+    for route, command in COMMANDS_OF_ROUTES:
+        text = re.sub(route, command, text)
+    return text
+
+
+def add_remote(commands: Commands) -> None:
+    """Add them all."""
+    _add_submit(commands)
+    watch = add_command(commands, "watch", "wait for a job, with a progress bar", _watch)
+    _add_fetch(commands)
+    jobs = add_command(commands, "jobs", "list the newest jobs, newest first", _jobs)
+    jobs.add_argument("--state", choices=[state.value for state in JobState], help="of one state only")
+    jobs.add_argument("--limit", type=int, metavar="N", help="at most so many (default: 200)")
+    cancel = add_command(commands, "cancel", "stop a job and remove its clip", _cancel)
+    retry = add_command(commands, "retry", "queue a failed job again", _retry)
+    delete = add_command(commands, "delete", "remove clip, scene and record of a job that has ended", _delete)
+    for parser in (watch, cancel, retry, delete):
+        parser.add_argument("job", metavar="JOB", help="the id that submit printed")
+    for parser in (watch, jobs, cancel, retry, delete):
+        _add_service(parser)
+
+
+def _add_submit(commands: Commands) -> None:
+    parser = add_command(commands, "submit", "send a clip to a service and print its job's id", _submit)
+    parser.add_argument("clip", type=Path, metavar="INPUT", help="a video or a zip; both eyes, or the left one")
+    parser.add_argument(
+        "right", type=Path, metavar="RIGHT", nargs="?", help="the right eye, if it is a file of its own"
+    )
+    parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini")
+    parser.add_argument("--masks", type=Path, metavar="F", help="zip of PNGs or a video that shows the instruments")
+    parser.add_argument("--mask-polarity", choices=get_args(MaskPolarity), help="what is bright in the masks")
+    parser.add_argument("--layout", choices=get_args(Layout), help="how the eyes are laid out")
+    parser.add_argument("--pose-convention", choices=get_args(PoseConvention), help="axes of poses_bounds.npy")
+    parser.add_argument(
+        "--holdout", metavar="every8|blocks8|none|LIST", help="frames kept from training, to measure on"
+    )
+    parser.add_argument(
+        "--preset", choices=get_args(PresetName), help="fast, ours, is the default; paper, as published"
+    )
+    limit = parser.add_mutually_exclusive_group()
+    limit.add_argument("--budget-s", type=positive, metavar="S", help="seconds of training")
+    limit.add_argument("--iterations", type=int, metavar="N", help="steps of training")
+    parser.add_argument("--seed", type=int, metavar="N", help="of the random numbers (default: 0)")
+    parser.add_argument("--priority", choices=get_args(Priority), help="high: before, and in place of, standard jobs")
+    parser.add_argument(
+        "--retention-hours", type=positive, metavar="H", help="purge clip and scene so many hours after the job's end"
+    )
+    parser.add_argument("--idempotency-key", metavar="TEXT", help="the same key with the same clip is the same job")
+    parser.add_argument("--watch", action="store_true", help="wait for the scene, with a progress bar")
+    _add_service(parser)
+
+
+def _add_fetch(commands: Commands) -> None:
+    parser = add_command(commands, "fetch", "save a finished scene's report, curve, picture and Gaussians", _fetch)
+    parser.add_argument("job", metavar="JOB", help="the id that submit printed")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write into; made if need be")
+    parser.add_argument(
+        "--t", type=finite, default=0.0, help="time of picture and Gaussians, as a fraction of the clip (default: 0)"
+    )
+    parser.add_argument(
+        "--pose",
+        help="world_from_camera, 12 or 16 numbers in mm, or orbit:YAW,PITCH,ZOOM in degrees and times nearer "
+        "(default: the endoscope's own)",
+    )
+    parser.add_argument("--no-ply", action="store_true", help="leave the Gaussians out")
+    _add_service(parser)
+
+
+def _add_service(parser: argparse.ArgumentParser) -> None:
+    url = os.environ.get(URL_VARIABLE) or DEFAULT_URL
+    parser.add_argument("--url", default=url, help=f"the service (default: {URL_VARIABLE}, or {DEFAULT_URL})")
+    parser.add_argument(
+        "--api-key",
+        default=os.environ.get(KEY_VARIABLE) or None,
+        metavar="KEY",
+        help=f"from `intrasplat keys create` (default: {KEY_VARIABLE}, which no list of processes shows)",
+    )
+
+
+def _client(options: argparse.Namespace) -> Client:
+    return Client(options.url, api_key=options.api_key)
+
+
+def _submit(options: argparse.Namespace) -> int:
+    chosen = {name: getattr(options, name) for name in OPTIONS if getattr(options, name) is not None}
+    with _client(options) as client:
+        with ProgressBar(sys.stderr) as bar:
+            job = client.reconstruct(
+                options.clip,
+                options.right,
+                calibration=options.calibration,
+                masks=options.masks,
+                idempotency_key=options.idempotency_key,
+                on_upload=lambda sent, total: bar.show(JobProgress(stage="upload", fraction=sent / total)),
+                **chosen,
+            )
+        print(job.id, flush=True)
+        return _show_until_done(client, job.id) if options.watch else ExitCode.OK
+
+
+def _watch(options: argparse.Namespace) -> int:
+    with _client(options) as client:
+        return _show_until_done(client, options.job)
+
+
+def _show_until_done(client: Client, job_id: str) -> int:
+    try:
+        with ProgressBar(sys.stderr) as bar:
+            client.wait(job_id, on_progress=lambda job: bar.show(progress_of(job)))
+    except KeyboardInterrupt:
+        again = f"`intrasplat watch {job_id}` shows it, `intrasplat cancel {job_id}` ends it"
+        print(f"intrasplat: the job goes on; {again}.", file=sys.stderr)
+        raise
+    print(f"done: `intrasplat fetch {job_id} --out DIR`, or {client.url}/render?scene={job_id}", file=sys.stderr)
+    return ExitCode.OK
+
+
+def progress_of(job: JobView) -> JobProgress:
+    """What the bar shows of a job; before its first report that is its state."""
+    if job.stage is None or job.state is JobState.QUEUED:
+        return JobProgress(stage=job.state.value, fraction=0.0, seconds_left=job.eta_s)
+    return JobProgress(
+        stage=job.stage,
+        fraction=job.fraction or 0.0,
+        iteration=job.iteration or 0,
+        iterations=job.iterations or 0,
+        psnr_db=job.psnr_db,
+        seconds_left=job.seconds_left,
+    )
+
+
+def _fetch(options: argparse.Namespace) -> int:
+    with _client(options) as client:
+        files: dict[str, bytes] = {
+            "report.json": json.dumps(client.report(options.job), indent=1).encode(),
+            "curve.csv": client.curve(options.job).encode(),
+            "view.png": client.render(options.t, scene=options.job, pose=options.pose).content,
+        }
+        if not options.no_ply:
+            files["scene.ply"] = client.export(options.job, options.t)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            (options.out / name).write_bytes(content)
+            print(options.out / name)
+    except OSError as error:
+        raise InputError("--out", f"{options.out} cannot be written ({error.strerror}).", "Name a folder.") from error
+    return ExitCode.OK
+
+
+def _jobs(options: argparse.Namespace) -> int:
+    with _client(options) as client:
+        for job in client.jobs(options.state, options.limit):
+            print(f"{job.id}  {job.state.value:<9}  {_detail_of(job)}".rstrip())
+    return ExitCode.OK
+
+
+def _detail_of(job: JobView) -> str:
+    if job.state is JobState.FAILED and job.error is not None:
+        return job.error.problem
+    if job.state is JobState.RUNNING and job.stage is not None:
+        return f"{job.stage} {job.fraction or 0.0:.0%}"
+    if job.state is JobState.DONE and job.psnr_db is not None:
+        return f"{job.psnr_db:.2f} dB on held-out frames"
+    return ""
+
+
+def _cancel(options: argparse.Namespace) -> int:
+    with _client(options) as client:
+        job = client.cancel(options.job)
+    print("cancelled" if job.state is JobState.CANCELLED else "it stops as soon as its worker hears of it")
+    return ExitCode.OK
+
+
+def _retry(options: argparse.Namespace) -> int:
+    with _client(options) as client:
+        print(client.retry(options.job).state.value)
+    return ExitCode.OK
+
+
+def _delete(options: argparse.Namespace) -> int:
+    with _client(options) as client:
+        print(json.dumps(client.delete(options.job), indent=1))
+    return ExitCode.OK

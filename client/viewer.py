@@ -1,0 +1,163 @@
+"""One connection for many views of a scene: faster than a request each, and the newest wins."""
+
+from __future__ import annotations
+
+import json
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
+
+from client.errors import Unreachable, error_of_answer
+from client.views import Image, image_of_message, view_query
+from contract.errors import IntrasplatError
+
+if TYPE_CHECKING:
+    from websockets.asyncio.client import ClientConnection as AsyncConnection
+    from websockets.sync.client import ClientConnection as Connection
+
+CONNECT_TIMEOUT_S = 5.0
+ANSWER_TIMEOUT_S = 60.0
+LONGEST_MESSAGE_BYTES = 2**28
+"""A view as npy has 12 bytes a pixel at most; the library's own limit, 1 MiB, is for chat."""
+
+CONNECTION_ERRORS = (OSError, InvalidHandshake, InvalidURI, ConnectionClosed)
+"""OSError includes TimeoutError."""
+
+
+class Talk:
+    """What is said on the connection; both viewers share it."""
+
+    def __init__(self, url: str, scene: str, api_key: str | None) -> None:
+        self.http_url = url
+        self.url = f"ws{url.removeprefix('http')}/stream"
+        self.headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
+        self._scene = scene
+        self._asked = 0
+
+    def request(
+        self, t: float, pose: str | None, layer: str, format: str, quality: int | None, camera: dict[str, float]
+    ) -> str:
+        """The message that asks for a view."""
+        self._asked += 1
+        return json.dumps({"id": self._asked, **view_query(t, self._scene, pose, layer, format, quality, camera)})
+
+    def answer(self, message: str | bytes) -> Image | None:
+        """The view that was asked for last; None if the message tells of an earlier one.
+
+        Raises:
+            RequestRefused and others: the service's refusal.
+        """
+        about, answer = image_of_message(message)
+        if about not in (self._asked, None):
+            return None
+        if isinstance(answer, IntrasplatError):
+            raise answer
+        return answer
+
+    def error_of(self, error: Exception) -> IntrasplatError:
+        """What a failure of the connection means."""
+        if isinstance(error, InvalidStatus):
+            response = error.response
+            headers = {name.lower(): value for name, value in response.headers.raw_items()}
+            return error_of_answer(response.status_code, headers, bytes(response.body or b""))
+        return Unreachable(self.http_url, error, is_nobody_there=not isinstance(error, ConnectionClosed))
+
+
+class Viewer:
+    """Client.stream(): use it as a context. One thread at a time may use it."""
+
+    def __init__(self, talk: Talk) -> None:
+        from websockets.sync.client import connect
+
+        self._talk = talk
+        try:
+            self._socket: Connection = connect(
+                talk.url,
+                additional_headers=talk.headers,
+                open_timeout=CONNECT_TIMEOUT_S,
+                max_size=LONGEST_MESSAGE_BYTES,
+            )
+        except CONNECTION_ERRORS as error:
+            raise talk.error_of(error) from error
+
+    def render(
+        self,
+        t: float = 0.0,
+        pose: str | None = None,
+        *,
+        layer: str = "rgb",
+        format: str = "jpeg",
+        quality: int | None = None,
+        **camera: float,
+    ) -> Image:
+        """One view; arguments as Client.render has them."""
+        try:
+            self._socket.send(self._talk.request(t, pose, layer, format, quality, camera))
+            while True:
+                image = self._talk.answer(self._socket.recv(ANSWER_TIMEOUT_S))
+                if image is not None:
+                    return image
+        except CONNECTION_ERRORS as error:
+            raise self._talk.error_of(error) from error
+
+    def close(self) -> None:
+        """Hang up."""
+        self._socket.close()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class AsyncViewer:
+    """AsyncClient.stream(): an asynchronous context. One task at a time may use it; asyncio only."""
+
+    def __init__(self, talk: Talk) -> None:
+        self._talk = talk
+        self._socket: AsyncConnection
+
+    async def render(
+        self,
+        t: float = 0.0,
+        pose: str | None = None,
+        *,
+        layer: str = "rgb",
+        format: str = "jpeg",
+        quality: int | None = None,
+        **camera: float,
+    ) -> Image:
+        """One view; arguments as Client.render has them."""
+        import asyncio
+
+        try:
+            await self._socket.send(self._talk.request(t, pose, layer, format, quality, camera))
+            async with asyncio.timeout(ANSWER_TIMEOUT_S):
+                while True:
+                    image = self._talk.answer(await self._socket.recv())
+                    if image is not None:
+                        return image
+        except CONNECTION_ERRORS as error:
+            raise self._talk.error_of(error) from error
+
+    async def __aenter__(self) -> AsyncViewer:
+        from websockets.asyncio.client import connect
+
+        talk = self._talk
+        try:
+            self._socket = await connect(
+                talk.url,
+                additional_headers=talk.headers,
+                open_timeout=CONNECT_TIMEOUT_S,
+                max_size=LONGEST_MESSAGE_BYTES,
+            )
+        except CONNECTION_ERRORS as error:
+            raise talk.error_of(error) from error
+        return self
+
+    async def __aexit__(self, *_: Any) -> None:
+        await self._socket.close()

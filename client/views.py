@@ -1,0 +1,119 @@
+"""Rendered views: how they are asked for, and what comes back over HTTP or over the stream."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import httpx
+
+from client.errors import Refusal, ServiceFault, error_of_document
+from client.steps import Call, Steps, answered
+from contract.errors import InputError, IntrasplatError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+NPY = "application/x-npy"
+LENGTH_BYTES = 4
+"""Of the length that opens a message of the stream."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """A rendered view: the encoded file, and what it shows.
+
+    state is "running" for a view of a job that still trains; iteration is then the step that is shown.
+    """
+
+    content: bytes
+    media_type: str
+    scene: str
+    t: float
+    state: str = "done"
+    iteration: int | None = None
+    warning: str | None = None
+    etag: str | None = None
+    render_ms: float | None = None
+
+    def array(self) -> NDArray[Any]:
+        """The values of a view asked for with format="npy"; needs numpy."""
+        if self.media_type != NPY:
+            raise InputError("format", f"this render is {self.media_type}.", 'Ask for it with format="npy".')
+        import numpy as np  # here, so that a client without numpy can do everything else
+
+        values: NDArray[Any] = np.load(io.BytesIO(self.content), allow_pickle=False)
+        return values
+
+
+def view_query(
+    t: float,
+    scene: str | None,
+    pose: str | None,
+    layer: str,
+    format: str,
+    quality: int | None,
+    camera: Mapping[str, float],
+) -> dict[str, Any]:
+    """The parameters of a view, as GET /render and the messages of the stream have them."""
+    values = {"t": t, "scene": scene, "pose": pose, "layer": layer, "format": format, "quality": quality, **camera}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def render(query: Mapping[str, Any], known: Image | None, patience_s: float) -> Steps[Image]:
+    """One view; `known` itself if it still is what would be sent."""
+    headers = {"If-None-Match": known.etag} if known is not None and known.etag is not None else {}
+    response = yield from answered(Call("GET", "/render", query, headers, is_repeatable=True), patience_s)
+    if response.status_code == httpx.codes.NOT_MODIFIED and known is not None:
+        return known
+    return _image_of(response)
+
+
+def _image_of(response: httpx.Response) -> Image:
+    about = {name.removeprefix("x-intrasplat-"): value for name, value in response.headers.items()}
+    return Image(
+        content=response.content,
+        media_type=about["content-type"],
+        scene=about["scene"],
+        t=float(about["t"]),
+        state=about["state"],
+        iteration=int(about["iteration"]) if "iteration" in about else None,
+        warning=about.get("warning"),
+        etag=about.get("etag"),
+        render_ms=_duration_ms(about.get("server-timing", ""), "render"),
+    )
+
+
+def _duration_ms(server_timing: str, name: str) -> float | None:
+    """`render` of "render;dur=3.1, total;dur=4.0"."""
+    for entry in server_timing.split(","):
+        metric, _, duration = entry.strip().partition(";dur=")
+        if metric == name and duration:
+            return float(duration)
+    return None
+
+
+def image_of_message(message: bytes | str) -> tuple[object, Image | IntrasplatError]:
+    """The id that the request had, and the view or the refusal that the stream answers."""
+    try:
+        if isinstance(message, str):
+            document = json.loads(message)
+            return document.get("id"), error_of_document(document)
+        end = LENGTH_BYTES + int.from_bytes(message[:LENGTH_BYTES], "big")
+        head = json.loads(message[LENGTH_BYTES:end])
+        image = Image(
+            content=message[end:],
+            media_type=head["media_type"],
+            scene=head["scene"],
+            t=head["t"],
+            state=head["state"],
+            iteration=head["iteration"],
+            warning="; ".join(head["warnings"]) or None,
+            render_ms=head["render_ms"],
+        )
+        return head["id"], image
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None, ServiceFault(Refusal(200, "The service sent a message that is no view."))

@@ -1,0 +1,120 @@
+"""The client that is awaited: the same steps, taken without blocking anybody."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client import AsyncClient, JobCancelled, NotFound, RequestRefused, Unauthorized, submission
+from contract.errors import InputError, UnavailableError
+from contract.job import JobProgress, JobState
+from tests.client.town import Town, line_to
+
+
+def test_a_clip_becomes_a_scene_while_other_work_goes_on(town: Town, clip: Path) -> None:
+    async def use() -> None:
+        async with AsyncClient(town.url) as client:
+            assert await client.is_ready()
+            job = await client.reconstruct(clip, iterations=30)
+            waiting = asyncio.create_task(client.wait(job.id))
+            assert (await client.job(job.id)).state is JobState.QUEUED
+            assert job.id in {each.id for each in await client.jobs(JobState.QUEUED)}
+            await asyncio.to_thread(town.finish)
+            assert (await waiting).state is JobState.DONE
+            assert (await client.report(job.id))["psnr_tissue_db"] == 36.2
+            assert (await client.curve(job.id)).startswith("t_train_s")
+            assert await client.export(job.id) == b"ply\n"
+            assert job.id in {scene["id"] for scene in await client.scenes()}
+            values = await client.render_array(t=0.5, scene=job.id, layer="depth")
+            np.testing.assert_array_equal(values, np.full((4, 6), 0.5, np.float32))
+            image = await client.render(scene=job.id)
+            assert await client.render(scene=job.id, known=image) is image
+            assert (await client.delete(job.id))["verified"]
+            with pytest.raises(NotFound):
+                await client.job(job.id)
+            assert (await client.info())["name"] == "intrasplat"
+
+    asyncio.run(use())
+
+
+def test_many_views_come_over_one_connection(town: Town, clip: Path) -> None:
+    async def use() -> None:
+        async with AsyncClient(town.url) as client:
+            job = await client.reconstruct(clip)
+            await asyncio.to_thread(town.finish)
+            async with client.stream(job.id) as viewer:
+                for t in (0.0, 1.0):
+                    assert (await viewer.render(t, format="npy")).array()[0, 0] == t
+                with pytest.raises(RequestRefused, match="yaw"):
+                    await viewer.render(pose="orbit:999,0,1")
+        async with AsyncClient(town.url, api_key="isp_wrong") as client:
+            with pytest.raises(Unauthorized):
+                async with client.stream(job.id):
+                    pass
+
+    asyncio.run(use())
+
+
+def test_a_watch_that_is_cut_off_goes_on_and_misses_nothing(town: Town, clip: Path) -> None:
+    async def use() -> list[float | None]:
+        seen = []
+        async with AsyncClient(line.url) as far:
+            job = await far.reconstruct(clip)
+            claim = town.claim()
+            async for view in far.watch(job.id):
+                seen.append(view.fraction)
+                if view.state is JobState.RUNNING and view.fraction is None:
+                    line.cut()
+                    town.queue.beat(claim, JobProgress(stage="train", fraction=0.5))
+                    town.finish(claim)
+        return seen
+
+    with line_to(town) as line:
+        assert [fraction for fraction in asyncio.run(use()) if fraction] == [0.5, 0.5]
+        assert line.connections >= 2
+
+
+def test_a_clip_in_pieces_goes_on_from_where_the_line_was_cut(
+    town: Town, clip: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = clip.stat().st_size
+    monkeypatch.setattr(submission, "PIECE_BYTES", size // 3)
+    monkeypatch.setattr(submission, "READ_BYTES", size // 20)
+    told: list[int] = []
+
+    async def use() -> str:
+        async with AsyncClient(line.url) as far:
+            return (await far.reconstruct(clip, in_pieces=True, on_upload=on_upload)).id
+
+    def on_upload(sent: int, total: int) -> None:
+        if sent > total // 2 and not any(each > total // 2 for each in told):
+            line.cut()
+        told.append(sent)
+
+    with line_to(town) as line:
+        job_id = asyncio.run(use())
+        assert line.connections == 2
+    assert told[-1] == size
+    assert (town.store.spool_folder(job_id) / "clip.mp4").read_bytes() == clip.read_bytes()
+
+
+def test_errors_are_the_same(town: Town, clip: Path, tmp_path: Path) -> None:
+    async def use() -> None:
+        async with AsyncClient(town.url) as client:
+            with pytest.raises(InputError, match="cannot be read"):
+                await client.reconstruct(tmp_path / "nothing.mp4")
+            job = await client.reconstruct(clip, idempotency_key="async", seed=1)
+            with pytest.raises(RequestRefused, match="Idempotency-Key"):
+                await client.reconstruct(clip, idempotency_key="async", seed=2)
+            await client.cancel(job.id)
+            with pytest.raises(JobCancelled):
+                await client.wait(job.id)
+        async with AsyncClient("http://127.0.0.1:9") as nobody:
+            assert not await nobody.is_ready()
+            with pytest.raises(UnavailableError, match="intrasplat up"):
+                await nobody.wait("a")
+
+    asyncio.run(use())

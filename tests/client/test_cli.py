@@ -1,0 +1,198 @@
+"""The command line against a real service: what it prints, what it exits with, what it says to do next."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import client as client_package
+from client import Client
+from client.cli import main
+from client.remote import in_commands, progress_of
+from contract.exits import ExitCode
+from contract.job import JobError, JobState
+from contract.keys import KeyFile, KeyScope
+from tests.client.town import Town, town_at
+
+
+def run_in(town: Town, *arguments: str) -> int:
+    return main([*arguments, "--url", town.url])
+
+
+def submitted(town: Town, clip: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert run_in(town, "submit", str(clip), *arguments) == ExitCode.OK
+    return capsys.readouterr().out.strip()
+
+
+def test_submit_watch_fetch_and_delete(
+    town: Town, client: Client, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["--iterations", "30", "--priority", "high", "--retention-hours", "12"]
+    job_id = submitted(town, clip, capsys, *asked)
+    options = client.job(job_id).options
+    assert (options.iterations, options.priority, options.retention_hours) == (30, "high", 12.0)
+    town.finish()
+    assert run_in(town, "watch", job_id) == ExitCode.OK
+    out = tmp_path / "results"
+    assert run_in(town, "fetch", job_id, "--out", str(out), "--t", "0.5") == ExitCode.OK
+    assert {path.name for path in out.iterdir()} == {"report.json", "curve.csv", "view.png", "scene.ply"}
+    capsys.readouterr()
+    assert run_in(town, "delete", job_id) == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["job_id"] == job_id
+
+
+def test_jobs_lists_cancel_stops_and_retry_queues_again(
+    town: Town, client: Client, clip: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failed = submitted(town, clip, capsys)
+    town.fail(JobError(problem="it diverged."))
+    waiting = submitted(town, clip, capsys)
+    assert run_in(town, "jobs", "--limit", "2") == ExitCode.OK
+    assert capsys.readouterr().out.split() == [waiting, "queued", failed, "failed", "it", "diverged."]
+    assert run_in(town, "jobs", "--state", "failed", "--limit", "1") == ExitCode.OK
+    assert capsys.readouterr().out.startswith(failed)
+    assert run_in(town, "retry", failed) == ExitCode.OK
+    assert client.job(failed).state is JobState.QUEUED
+    assert run_in(town, "cancel", waiting) == ExitCode.OK
+    assert client.job(waiting).state is JobState.CANCELLED
+
+
+def test_the_same_idempotency_key_prints_the_same_job(
+    town: Town, clip: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    same = ["--idempotency-key", "monday 9:30"]
+    assert submitted(town, clip, capsys, *same) == submitted(town, clip, capsys, *same)
+
+
+def test_url_and_key_come_from_the_environment(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, key = KeyFile(tmp_path).create("ward", {KeyScope.VIEW})
+    with town_at(tmp_path, hosts=("ward.example",)) as town:
+        monkeypatch.setenv("INTRASPLAT_URL", town.url)
+        assert main(["jobs"]) == ExitCode.BAD_INPUT
+        told = capsys.readouterr().err
+        assert "--api-key" in told
+        assert "Bearer" not in told
+        monkeypatch.setenv("INTRASPLAT_API_KEY", key)
+        assert main(["jobs"]) == ExitCode.OK
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["submit", "nothing.mp4"], ExitCode.BAD_INPUT),
+        (["submit", "clip.mp4", "--holdout", "every9"], ExitCode.BAD_INPUT),
+        (["watch", "0" * 32], ExitCode.BAD_INPUT),
+        (["watch", "0" * 32, "--url", "http://127.0.0.1:9"], ExitCode.UNAVAILABLE),
+        (["jobs", "--url", "http://127.0.0.1:none"], ExitCode.BAD_INPUT),
+    ],
+)
+def test_exit_codes_tell_what_went_wrong(
+    town: Town, arguments: list[str], code: ExitCode, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = [] if "--url" in arguments else ["--url", town.url]
+    assert main([*arguments, *url]) == code
+    assert capsys.readouterr().err.startswith("intrasplat: ")
+
+
+@pytest.mark.parametrize("command", ["watch", "fetch", "cancel", "retry", "delete"])
+def test_a_job_that_is_not_there_leads_to_the_list_of_those_that_are(
+    town: Town, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", "never"] if command == "fetch" else []
+    for job in ("nosuch", "0" * 32, "../jobs"):
+        assert run_in(town, command, job, *out) == ExitCode.BAD_INPUT
+        told = capsys.readouterr().err
+        assert "GET" not in told
+        assert "`intrasplat jobs` lists what there is" in told or "--help" in told
+    assert not Path("never").exists()
+
+
+def test_a_job_in_the_wrong_state_leads_to_the_command_that_helps(
+    town: Town, clip: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    job_id = submitted(town, clip, capsys)
+    for command, remedy in (("fetch", f"intrasplat watch {job_id}"), ("delete", f"intrasplat cancel {job_id}")):
+        assert run_in(town, command, job_id, *(["--out", "never"] if command == "fetch" else [])) == ExitCode.BAD_INPUT
+        assert remedy in capsys.readouterr().err
+    town.finish()
+    assert run_in(town, "cancel", job_id) == ExitCode.BAD_INPUT
+    assert f"intrasplat delete {job_id}" in capsys.readouterr().err
+
+
+def test_routes_are_told_as_commands_and_other_words_stay() -> None:
+    assert in_commands("Send it again: POST /reconstruct.") == "Send it again: `intrasplat submit`."
+    assert in_commands("See GET /jobs/abc.") == "See `intrasplat watch abc`."
+    assert in_commands("Send both eyes.") == "Send both eyes."
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["unknown"],
+        ["submit"],
+        ["submit", "a", "--budget-s", "1", "--iterations", "1"],
+        ["submit", "a", "--retention-hours", "0"],
+        ["fetch", "a", "--out", "b", "--t", "nan"],
+        ["up", "--workers", "0"],
+        ["jobs", "--state", "lost"],
+    ],
+)
+def test_wrong_usage_ends_with_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == ExitCode.USAGE
+
+
+@pytest.mark.parametrize("command", ["up", "submit", "watch", "fetch", "jobs", "cancel", "retry", "delete"])
+def test_every_help_tells_the_exit_codes(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("INTRASPLAT_API_KEY", "isp_secret")
+    with pytest.raises(SystemExit) as caught:
+        main([command, "--help"])
+    assert caught.value.code == 0
+    told = capsys.readouterr().out
+    assert "exit codes" in told
+    assert "isp_secret" not in told
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "render", "phantom", "doctor"])
+def test_local_commands_have_help_too(command: str) -> None:
+    assert "exit codes" in run_here(Path.cwd(), command, "--help").stdout
+
+
+def run_here(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command line in a process of its own, started in `folder`, whose `worker` is taken if it has one."""
+    environment = os.environ | {"PYTHONPATH": str(Path(client_package.__file__).parents[1])}
+    command = [sys.executable, "-m", "client.cli", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=60)
+
+
+def test_a_local_command_is_one_process_that_ends_as_the_workers_program_ends(tmp_path: Path) -> None:
+    program = tmp_path / "worker" / "__main__.py"
+    program.parent.mkdir()
+    (program.parent / "__init__.py").touch()
+    for source, status in (
+        ("raise SystemExit(7)", 7),
+        ("import os; os.kill(os.getpid(), 9)", -signal.SIGKILL),
+        ("import os; os.kill(os.getpid(), 15)", -signal.SIGTERM),
+    ):
+        program.write_text(f"import sys; print(*sys.argv[1:], flush=True)\n{source}\n")
+        ended = run_here(tmp_path, "reconstruct", "a b", "--out", "c")
+        assert ended.returncode == status
+        assert ended.stdout == "reconstruct a b --out c\n"
+
+
+def test_a_job_that_has_not_begun_is_shown_by_its_state(client: Client, clip: Path) -> None:
+    job = client.reconstruct(clip)
+    assert progress_of(job).stage == "queued"
+    client.cancel(job.id)

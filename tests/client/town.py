@@ -1,0 +1,154 @@
+"""A service on a real port for the client's tests, and a line to it that can be cut."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from contract.embedded import short_socket_path
+from contract.job import JobError
+from contract.queue import Claim
+from contract.queue_memory import MemoryQueue
+from contract.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
+from contract.settings import Settings
+from contract.store import CURVE, MANIFEST, REPORT, Store
+from service.app import create_app
+from service.renderer import ZmqRenderer
+from service.server import Server
+from worker.serve import RequestServer, View
+
+CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
+SNAPSHOT_ITERATION = 7
+
+
+def paint(request: RenderRequest | ExportRequest) -> View:
+    """A 4 x 6 depth map that holds t everywhere."""
+    if isinstance(request, ExportRequest):
+        return View(b"ply\n", "application/octet-stream", request.t)
+    buffer = io.BytesIO()
+    np.save(buffer, np.full((4, 6), request.t, np.float32))
+    iteration = SNAPSHOT_ITERATION if request.attempt is None else None
+    return View(buffer.getvalue(), MEDIA_TYPES[request.format], request.t, ("seen from afar",), iteration)
+
+
+class Town:
+    """The service, and the queue and store behind it."""
+
+    def __init__(self, data_dir: Path, **changes: Any) -> None:
+        self.queue, self.store = MemoryQueue(), Store(data_dir)
+        self.endpoint = f"ipc://{short_socket_path(self.store.run_dir, 'worker-1.sock')}"
+        settings = Settings(data_dir=data_dir, min_free_bytes=0).model_copy(update=changes)
+        app = create_app(settings, self.queue, self.store, ZmqRenderer(self.queue, 5.0))
+        self._server = Server(app, settings)
+        self._server.config.port = 0
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._server.serve()))
+        self._thread.start()
+        while not self._server.started:
+            time.sleep(0.01)
+        self.port: int = self._server.servers[0].sockets[0].getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+
+    def stop(self) -> None:
+        self._server.should_exit = True
+        self._thread.join()
+
+    def announce(self, job_id: str | None = None) -> None:
+        """Say that the worker is there, and what it runs."""
+        self.queue.announce(WorkerAddress(name="worker-1", endpoint=self.endpoint, device="cpu", job_id=job_id))
+
+    def claim(self) -> Claim:
+        record = self.queue.claim("worker-1", 5.0)
+        assert record is not None
+        self.announce(record.job_id)
+        return Claim(record.job_id, record.attempt, "worker-1")
+
+    def finish(self, claim: Claim | None = None) -> None:
+        claim = claim or self.claim()
+        folder = self.store.work_folder(claim.job_id, claim.attempt)
+        (folder / MANIFEST).write_text("{}")
+        (folder / REPORT).write_text('{"psnr_tissue_db": 36.2, "warnings": []}')
+        (folder / CURVE).write_text("t_train_s,psnr_tissue_db\n1,30\n")
+        self.store.publish_scene(claim.job_id, claim.attempt)
+        assert self.queue.finish(claim)
+
+    def fail(self, error: JobError) -> None:
+        assert self.queue.fail(self.claim(), error)
+
+
+@contextmanager
+def town_at(data_dir: Path, **changes: Any) -> Iterator[Town]:
+    town = Town(data_dir, **changes)
+    try:
+        with RequestServer(town.endpoint, paint):
+            town.announce()
+            yield town
+    finally:
+        town.stop()
+
+
+class Line:
+    """A TCP line to a port, as through a proxy; cut() ends all connections that are open, new ones are put through."""
+
+    def __init__(self, port: int) -> None:
+        self._target = ("127.0.0.1", port)
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._open: list[socket.socket] = []
+        self.connections = 0
+        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        cut, self._open = self._open, []
+        for end in cut:
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self.cut()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                far = socket.create_connection(self._target)
+                self.connections += 1
+                self._open += [near, far]
+                threading.Thread(target=self._put_through, args=(near, far), daemon=True).start()
+
+    @classmethod
+    def _put_through(cls, near: socket.socket, far: socket.socket) -> None:
+        with near, far:
+            back = threading.Thread(target=cls._forward, args=(far, near), daemon=True)
+            back.start()
+            cls._forward(near, far)
+            back.join()
+
+    @staticmethod
+    def _forward(source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while piece := source.recv(65536):
+                target.sendall(piece)
+        for end in (source, target):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+
+@contextmanager
+def line_to(town: Town) -> Iterator[Line]:
+    line = Line(town.port)
+    try:
+        yield line
+    finally:
+        line.close()
