@@ -276,9 +276,9 @@ class BucketStore(Store):
         here = super().purge(job_id)
         return Removed(here.files | files, here.bytes | sizes)
 
-    def remove_abandoned_uploads(self) -> None:
-        """As Store.remove_abandoned_uploads; also copies that are out of use, or whose original is gone."""
-        super().remove_abandoned_uploads()
+    def tidy(self) -> None:
+        """As Store.tidy; also copies that are out of use, or whose original is gone."""
+        super().tidy()
         then_s = time.time() - ABANDONED_AFTER_S
         for area, marker in (("spool", SUBMISSION), ("scenes", MANIFEST)):
             with disk_errors():
@@ -300,7 +300,7 @@ class BucketStore(Store):
                 remove_tree(folder)
                 return False
             if (folder / marker).is_file():
-                os.utime(folder)  # in use, for remove_abandoned_uploads
+                os.utime(folder)  # in use, for tidy
             else:
                 self._get_folder(key, folder, marker)
             return (folder / marker).is_file()

@@ -44,7 +44,7 @@ CURVE = "curve.csv"
 RESUME = "resume.safetensors"
 
 ABANDONED_AFTER_S = 24 * 3600.0
-"""An upload that has received nothing for this long was given up, or cut off by the end of its service."""
+"""What has not changed for this long was given up, or cut off by the end of its process."""
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
@@ -288,9 +288,7 @@ class Store:
                     sizes[area] += path.stat().st_size
                     files[area] += 1
         for place in (place for places in folders.values() for place in places):
-            (place / SUBMISSION).unlink(
-                missing_ok=True
-            )  # a clip without it counts as removed (remove_abandoned_uploads)
+            (place / SUBMISSION).unlink(missing_ok=True)  # without it a clip counts as removed
             _remove_scene(place)
         for area in folders:
             _flush(self.data_dir / area)
@@ -300,13 +298,18 @@ class Store:
         return Removed(files, sizes)
 
     @disk_errors()
-    def remove_abandoned_uploads(self) -> None:
-        """Remove uploads that have received nothing for ABANDONED_AFTER_S, and the rest of purges that were cut off."""
-        for folder in (self.data_dir / "incoming").iterdir():
-            with contextlib.suppress(FileNotFoundError):  # its upload has just ended
-                touched_s = max(path.stat().st_mtime for path in (folder, *folder.iterdir()))
+    def tidy(self) -> None:
+        """Remove what nobody will come back for.
+
+        That is what has not changed for ABANDONED_AFTER_S among uploads and what workers have unpacked, and the rest
+        of purges that were cut off.
+        """
+        left = [*(self.data_dir / "incoming").iterdir(), *(self.data_dir / "work").glob("tmp-*/*")]
+        for path in left:
+            with contextlib.suppress(FileNotFoundError):  # its user has just ended
+                touched_s = max(each.stat().st_mtime for each in (path, *path.rglob("*")))
                 if touched_s < time.time() - ABANDONED_AFTER_S:
-                    remove_tree(folder)
+                    remove_tree(path)
         for area, marker in (("spool", SUBMISSION), ("scenes", MANIFEST)):
             for folder in (self.data_dir / area).iterdir():
                 if not (folder / marker).is_file():

@@ -62,7 +62,7 @@ class Sweep:
             if self._unsettled:
                 await run_in_threadpool(self._try_to_settle)
             if time.monotonic() >= abandoned_at_s:
-                await run_in_threadpool(self._store.remove_abandoned_uploads)
+                await run_in_threadpool(self._store.tidy)
                 abandoned_at_s = time.monotonic() + ABANDONED_PERIOD_S
             await asyncio.sleep(SWEEP_PERIOD_S)
 

@@ -20,12 +20,15 @@ from contract.queue import ANNOUNCE_PERIOD_S, Queue
 from contract.queue_redis import RedisQueue
 from contract.rendering import WorkerAddress
 from contract.settings import Settings
-from contract.store import open_store
+from contract.store import Store, open_store
 from worker.child import Keeper
 from worker.consume import Consumer
 
 LOOK_PERIOD_S = 0.1
 """How soon a change of what is announced is seen."""
+
+TIDY_PERIOD_S = 600.0
+"""How long a copy may outlive a scene that was purged on another machine."""
 
 DEVICE_COMMAND = (sys.executable, "-m", "worker", "device")
 
@@ -54,7 +57,7 @@ def run_supervisor(settings: Settings, end: threading.Event, child_command: Sequ
     # New at each start: what an earlier process of this name still holds is given up by its silence alone.
     consumer = Consumer(queue, store, keeper, f"{name}.{secrets.token_hex(4)}", end)
     try:
-        with announced(queue, name, lambda: address_of(name, keeper, consumer)):
+        with announced(queue, name, lambda: address_of(name, keeper, consumer)), kept_tidy(store):
             consumer.run()
     finally:
         keeper.stop()
@@ -71,6 +74,26 @@ def address_of(name: str, keeper: Keeper, consumer: Consumer) -> WorkerAddress |
     return WorkerAddress(
         name=name, endpoint=ready.endpoint, device=ready.device, job_id=consumer.job_id, scenes=child.scenes
     )
+
+
+@contextlib.contextmanager
+def kept_tidy(store: Store) -> Iterator[None]:
+    """Remove what nobody needs on this machine, every TIDY_PERIOD_S for as long as the context lasts."""
+    end = threading.Event()
+
+    def tidy() -> None:
+        while not end.is_set():
+            try:
+                store.tidy()
+            except UnavailableError as error:
+                logger.warning("the store was not tidied: %s", error.problem)
+            end.wait(TIDY_PERIOD_S)
+
+    threading.Thread(target=tidy, name="tidy", daemon=True).start()  # not waited for: a bucket may answer slowly
+    try:
+        yield
+    finally:
+        end.set()
 
 
 @contextlib.contextmanager

@@ -107,7 +107,7 @@ def test_a_clip_without_its_submission_is_not_accepted_and_goes_in_the_end(tmp_p
     assert store.submission(job_id) is None
     with pytest.raises(UnavailableError, match="is not there"):
         store.fetch_clip(job_id)
-    store.remove_abandoned_uploads()
+    store.tidy()
     assert keys(bucket) == [f"spool/{job_id}/clip.mp4"]  # its acceptance may still be going on
 
 
@@ -201,7 +201,7 @@ def test_a_purge_leaves_nothing_in_the_bucket_nor_on_any_machine_that_shows_it(
     with pytest.raises(SceneError):
         worker.scene_folder(job_id, 1)
     assert not scene.exists()
-    worker.remove_abandoned_uploads()
+    worker.tidy()
     assert not worker.spool_folder(job_id).exists()
     assert sum(service.purge(job_id).files.values()) == 0
 
@@ -209,10 +209,10 @@ def test_a_purge_leaves_nothing_in_the_bucket_nor_on_any_machine_that_shows_it(
 def test_copies_that_nobody_has_used_for_a_day_are_dropped_and_come_back(tmp_path: Path, bucket: Any) -> None:
     store, job_id = machine(tmp_path, "worker"), new_job_id()
     scene = published(store, job_id, 1)
-    store.remove_abandoned_uploads()
+    store.tidy()
     assert scene.is_dir()
     os.utime(scene, (time.time() - ABANDONED_AFTER_S - 60,) * 2)
-    store.remove_abandoned_uploads()
+    store.tidy()
     assert not scene.exists()
     assert store.scene_folder(job_id, 1) == scene
     assert (scene / MANIFEST).is_file()

@@ -170,8 +170,19 @@ def test_uploads_that_stopped_a_day_ago_are_removed_and_younger_ones_are_not(sto
         then_s = time.time() - silent_s
         os.utime(folder / "clip.mp4", (then_s, then_s))
         os.utime(folder, (time.time() - ABANDONED_AFTER_S - 60,) * 2)
-    store.remove_abandoned_uploads()
+    store.tidy()
     assert {path.name for path in (store.data_dir / "incoming").iterdir()} == {paused.name, going_on.name}
+
+
+def test_what_a_worker_unpacked_and_never_came_back_for_is_removed_after_a_day(store: Store) -> None:
+    scratch = store.scratch_folder("worker-1")
+    for name, silent_s in (("of a dead job", ABANDONED_AFTER_S + 60), ("in use", 0.0)):
+        (scratch / name).mkdir()
+        (scratch / name / "frames").write_bytes(b"frames")
+        for path in (scratch / name / "frames", scratch / name, scratch):
+            os.utime(path, (time.time() - silent_s,) * 2)
+    store.tidy()
+    assert [path.name for path in scratch.iterdir()] == ["in use"]
 
 
 def test_a_purge_leaves_no_file_of_a_job_and_says_what_it_took(store: Store) -> None:
@@ -195,7 +206,7 @@ def test_a_purge_that_was_cut_off_shows_nothing_and_is_completed(store: Store) -
     (store.scene_folder(job_id, 1) / MANIFEST).unlink()
     assert store.spooled_ids() == []
     assert store.scene_attempts(job_id) == []
-    store.remove_abandoned_uploads()
+    store.tidy()
     assert everything_of(store, job_id) == []
 
 
