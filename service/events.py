@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Iterator
@@ -19,7 +18,7 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.errors import UnavailableError
 from contract.job import TERMINAL_STATES, JobRecord, JobState, JobView, Standing
-from contract.queue import EVENTS_KEPT, Queue
+from contract.queue import EVENTS_KEPT, Queue, event_order
 
 POLL_PERIOD_S = 0.4
 LOOK_PERIOD_S = 2.0
@@ -30,9 +29,9 @@ STREAM_S = 3600.0
 """Then the caller comes again, with its key: a revoked one ends here at the latest."""
 RETRY_MS = 2000
 
-Number = tuple[int, ...]
-"""An event's number, to compare."""
-NOTHING_SEEN: Number = (0,)
+EventOrder = tuple[int, int]
+"""What events' numbers are compared by."""
+NOTHING_SEEN: EventOrder = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -42,11 +41,6 @@ class Entry:
     number: str | None
     state: JobState
     data: str
-
-
-def parse_number(text: str) -> Number | None:
-    """An event's number as it can be compared; None if it is none."""
-    return tuple(int(part) for part in text.split("-")) if re.fullmatch(r"\d{1,20}(-\d{1,20})?", text) else None
 
 
 class Feed:
@@ -86,11 +80,10 @@ class Feed:
         new = min(self.count - seen, len(self._entries))
         return list(self._entries)[len(self._entries) - new :]
 
-    def seen_at(self, number: Number) -> int:
-        """How many of all entries somebody has seen who was told of the event of this number."""
+    def seen_at(self, order: EventOrder) -> int:
+        """How many of all entries somebody has seen who was told of the event there."""
         for unseen, entry in enumerate(reversed(self._entries)):
-            told = parse_number(entry.number or "")
-            if told is not None and told <= number:
+            if entry.number is not None and event_order(entry.number) <= order:
                 return self.count - unseen
         return self.count - len(self._entries)
 
@@ -113,8 +106,8 @@ class Feeds:
         """All streams end within a poll's period; may be called from a signal's handler."""
         self._is_ending = True
 
-    async def stream(self, job_id: str, after: Number) -> AsyncIterator[bytes]:
-        """The events after that number, and those to come until the job's end, as they go over the wire."""
+    async def stream(self, job_id: str, after: EventOrder) -> AsyncIterator[bytes]:
+        """The events after that one, and those to come until the job's end, as they go over the wire."""
         ends_at_s = time.monotonic() + STREAM_S
         with self._listening(job_id) as feed:
             yield format_sse_event(retry=RETRY_MS)

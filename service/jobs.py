@@ -11,9 +11,9 @@ from starlette.concurrency import run_in_threadpool
 from contract.audit import AuditAction
 from contract.job import TERMINAL_STATES, JobRecord, JobState, JobView
 from contract.keys import KeyScope
-from contract.queue import LISTING_LIMIT
+from contract.queue import LISTING_LIMIT, event_order
 from service.deps import AnyCaller, Deps, Services, owned_job
-from service.events import NOTHING_SEEN, parse_number
+from service.events import NOTHING_SEEN
 from service.problems import RETRY_AFTER_S, Problem
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
@@ -92,8 +92,8 @@ async def watch_job(
     """
     caller.require(KeyScope.VIEW)
     record = await run_in_threadpool(owned_job, services, caller, job_id)
-    after = parse_number(last_event_id) or NOTHING_SEEN
-    if after != NOTHING_SEEN and record.state in TERMINAL_STATES:
+    after = event_order(last_event_id)
+    if after > NOTHING_SEEN and record.state in TERMINAL_STATES:
         missed = await run_in_threadpool(services.queue.events, job_id, last_event_id)
         if not missed:
             return Response(status_code=204)  # which tells a browser not to come again
