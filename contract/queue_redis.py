@@ -107,6 +107,8 @@ REFUSALS = (
 )
 """First words of errors by which a server says that it, or its disk, cannot or may not serve now."""
 
+UNREADABLE = JobError(problem="The queue's record of this job cannot be read.", remedy="Submit the clip again.")
+
 logger = logging.getLogger("intrasplat.queue")
 
 
@@ -137,7 +139,7 @@ class RedisQueue:
             check_admission(admission, *answer[1:])
         standing = record_of(answer[1], table_of(answer[2]))
         if standing is None:
-            raise UnavailableError(f"The queue's record of job {answer[1]} cannot be read.", "Remove the job.")
+            raise UnavailableError(f"The queue's record of job {answer[1]} cannot be read.", "Submit under a new key.")
         return standing
 
     def restore(self, record: JobRecord) -> bool:
@@ -251,7 +253,8 @@ class RedisQueue:
         with _reachable():
             names = sorted(self._client.smembers(WORKERS))
             documents = self._client.mget([_worker_key(name) for name in names]) if names else []
-        return [WorkerAddress.model_validate_json(document) for document in documents if document]
+        found = [_address(name, document) for name, document in zip(names, documents, strict=True) if document]
+        return [address for address in found if address is not None]
 
     def figures(self) -> QueueFigures:
         with _reachable(), self._client.pipeline(transaction=True) as batch:
@@ -289,9 +292,8 @@ class RedisQueue:
         fields = table_of(answer)
         record = record_of(job_id, fields)
         if record is None:
-            error = JobError(problem="The job's record cannot be read.", remedy="Submit the clip again.")
             claim = Claim(job_id, int(fields["attempt"]), owner)
-            if not self.fail(claim, error):
+            if not self.fail(claim, UNREADABLE):
                 self.confirm_cancel(claim)
         return record
 
@@ -354,11 +356,21 @@ def _rules(lease_s: float, preempt_after_s: float) -> str:
         "yield_ms": round(YIELD_S * 1000),
         "max_attempts": MAX_ATTEMPTS,
         "worker_died": worker_died().model_dump_json(),
+        "unreadable": UNREADABLE.model_dump_json(),
         "events_kept": EVENTS_KEPT,
         "event_fields": EVENT_FIELDS,
         "durations_kept": DURATIONS_KEPT,
     }
     return json.dumps(rules)
+
+
+def _address(name: str, document: str) -> WorkerAddress | None:
+    """What a worker announced; None if it cannot be read, which is logged."""
+    try:
+        return WorkerAddress.model_validate_json(document)
+    except ValueError as error:
+        logger.error("A worker's address cannot be read.", extra={"worker": name, "error": type(error).__name__})
+        return None
 
 
 def _job_key(job_id: str) -> str:

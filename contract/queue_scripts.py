@@ -199,10 +199,14 @@ local function group_of(priority)
   redis.call('XGROUP', 'CREATE', stream(priority), GROUP, '0', 'MKSTREAM')
 end
 
--- What nobody can work with is taken out of everybody's way, and kept for whoever looks for the cause.
+-- A job that no script can work with fails, as far as there is a hash, and is in nobody's way.
 local function set_aside(id, priority)
+  redis.pcall('HSET', document(id), 'state', 'failed', 'error', RULES.unreadable, 'finished', now())
   redis.call('ZREM', waiting(priority), id)
   redis.call('ZREM', P .. 'queued', id)
+  local tenant = redis.pcall('HGET', document(id), 'tenant')
+  if type(tenant) == 'string' then redis.call('SREM', waiting_of(tenant), id) end
+  redis.call('HINCRBY', P .. 'ended', 'failed', 1)
   redis.call('ZADD', P .. 'dead', now(), id)
 end
 
@@ -210,14 +214,14 @@ end
 local function take(priority, entry, fields)
   local id = table_of(fields).job
   local job = id and read(id)
-  if not job or job.entry ~= entry then
-    if id and not job and redis.call('EXISTS', document(id)) == 1 then set_aside(id, priority) end
-    drop(priority, entry)
-    return nil
+  local known = job and RULES.sources[job.state]
+  if known and job.entry == entry then
+    if job.state == 'running' then count_death(job) end
+    local claim = {owner = owner, attempt = job.attempt + 1, started = now(), progress = false}
+    if change(job, 'running', claim) then return answer(job) end
+  elseif id and not known and redis.call('EXISTS', document(id)) == 1 then
+    set_aside(id, priority)
   end
-  if job.state == 'running' then count_death(job) end
-  local claim = {owner = owner, attempt = job.attempt + 1, started = now(), progress = false}
-  if change(job, 'running', claim) then return answer(job) end
   drop(priority, entry)
   return nil
 end

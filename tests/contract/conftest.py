@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 import redis
@@ -38,15 +39,20 @@ def redis_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     server.stop()
 
 
+def emptied(url: str) -> str:
+    """The same server, without a queue."""
+    client = redis.Redis.from_url(url)
+    for key in client.scan_iter(f"{PREFIX}*"):
+        client.delete(key)
+    client.close()
+    return url
+
+
 @pytest.fixture(params=["valkey", "redis"])
 def url(request: pytest.FixtureRequest) -> str:
     """Of a server whose queue is empty."""
     found: str = request.getfixturevalue(f"{request.param}_url")
-    client = redis.Redis.from_url(found)
-    for key in client.scan_iter(f"{PREFIX}*"):
-        client.delete(key)
-    client.close()
-    return found
+    return emptied(found)
 
 
 @pytest.fixture(params=["memory", "valkey", "redis"])
@@ -56,10 +62,7 @@ def queues(request: pytest.FixtureRequest) -> Iterator[MakeQueue]:
         yield lambda **leases: MemoryQueue(**leases)
         return
     found: str = request.getfixturevalue(f"{request.param}_url")
-    client = redis.Redis.from_url(found)
-    for key in client.scan_iter(f"{PREFIX}*"):
-        client.delete(key)
-    client.close()
+    emptied(found)
     made: list[RedisQueue] = []
 
     def make(**leases: float) -> Queue:
@@ -80,3 +83,34 @@ def queue(queues: MakeQueue) -> Queue:
 def hasty(queues: MakeQueue) -> Queue:
     """A queue whose leases run out at once unless they are renewed."""
     return queues(lease_s=0.02, preempt_after_s=0.0)
+
+
+@pytest.fixture
+def served(url: str) -> Iterator[RedisQueue]:
+    """The queue of that server."""
+    queue = RedisQueue(url, preempt_after_s=0.0)
+    yield queue
+    queue.close()
+
+
+@pytest.fixture
+def client(url: str) -> Iterator[redis.Redis]:
+    client = redis.Redis.from_url(url, decode_responses=True)
+    yield client
+    client.close()
+
+
+@pytest.fixture(params=["valkey", "redis"])
+def binary(request: pytest.FixtureRequest) -> Path:
+    """For tests that change a server's settings and so need one of their own."""
+    found = valkey_binary() if request.param == "valkey" else redis_binary()
+    if found is None:
+        pytest.skip("no redis-server on PATH")
+    return found
+
+
+@pytest.fixture
+def own(binary: Path, tmp_path: Path) -> Iterator[RunningServer]:
+    server = RunningServer(binary, tmp_path)
+    yield server
+    server.stop()
