@@ -1,0 +1,220 @@
+"""What a whole installation answers under load, idle and while a job trains, side by side in one run.
+
+    python benchmarks/bm_service.py [--seconds 10] [--upload-gib 1] [--csv docs/results/service.csv]
+
+Starts `intrasplat up` on a data directory of its own, trains a synthetic clip of 640x512 and then measures, each once
+idle and once while another clip trains:
+- GET /render as JPEG at 640x512, times and poses at random, by 1, 4 and 16 viewers that ask again when they are
+  answered; ms at the viewer, and all viewers' frames a second;
+- GET /jobs/{id}, 200 a second whether answered or not; ms from when each was due.
+Then uploads of --upload-gib GiB, in one request and resumable, with the service's memory before and at its peak.
+Viewers, service, queue and worker share the machine's cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import csv
+import os
+import platform
+import random
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+from client.api import Client
+from client.demo import started_service
+
+WIDTH, HEIGHT, FRAMES = 640, 512, 48
+SCENE_ITERATIONS = 300
+VIEWERS = (1, 4, 16)
+JOB_REQUESTS_A_SECOND = 200
+TRAINING_BUDGET_S = 1800  # longer than any of this takes; it is cancelled at the end
+CHUNK_BYTES = 1 << 20
+VIDEO = Path(__file__).parents[1] / "tests" / "data" / "stereo_sbs_h264.mp4"
+
+Row = dict[str, Any]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each measurement")
+    parser.add_argument("--upload-gib", type=float, default=1.0, help="0: no uploads")
+    parser.add_argument("--csv", type=Path, help="file that gets a row a figure")
+    arguments = parser.parse_args()
+    machine = {"cores": os.cpu_count(), "machine": platform.machine(), "commit": _commit()}
+    print(", ".join(f"{name} {value}" for name, value in machine.items()))
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix="intrasplat-load-") as name:
+        folder = Path(name)
+        clip = make_clip(folder)
+        with started_service(folder / "data", folder / "service.log") as client:
+            scene = trained(client, clip, iterations=SCENE_ITERATIONS)
+            rows += asyncio.run(_under_load(client.url, scene, "idle", arguments.seconds))
+            busy = client.reconstruct(*clip.files, calibration=clip.calibration, budget_s=TRAINING_BUDGET_S)
+            wait_for_stage(client, busy.id, "train")
+            rows += asyncio.run(_under_load(client.url, scene, "training", arguments.seconds))
+            client.cancel(busy.id)
+            if arguments.upload_gib:
+                rows += _uploads(client.url, folder, arguments.upload_gib)
+    if arguments.csv:
+        _write(arguments.csv, [{**machine, **row} for row in rows])
+
+
+class PhantomClip:
+    """A stereo video with its calibration, as the phantom wrote them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.files = (folder / "stereo.webm",)
+        self.calibration = folder / "calibration.json"
+
+
+def make_clip(folder: Path) -> PhantomClip:
+    """A synthetic stereo clip of WIDTH x HEIGHT an eye."""
+    size = ("--frames", str(FRAMES), "--width", str(WIDTH), "--height", str(HEIGHT))
+    out = folder / "clip"
+    command = [sys.executable, "-m", "worker", "phantom", *size, "--out", str(out)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return PhantomClip(out)
+
+
+def trained(client: Client, clip: PhantomClip, **options: Any) -> str:
+    """The id of a finished scene of the clip."""
+    job = client.reconstruct(*clip.files, calibration=clip.calibration, **options)
+    return client.wait(job.id).id
+
+
+def wait_for_stage(client: Client, job_id: str, stage: str) -> None:
+    """Until the job has come to the stage."""
+    for job in client.watch(job_id):
+        if job.stage == stage:
+            return
+    raise RuntimeError(f"job {job_id} ended before stage {stage}")
+
+
+async def _under_load(url: str, scene: str, worker: str, seconds: float) -> list[Row]:
+    rows = []
+    limits = httpx.Limits(max_connections=256, max_keepalive_connections=256)
+    async with httpx.AsyncClient(base_url=url, timeout=60, limits=limits) as http:
+        for viewers in VIEWERS:
+            spent_ms = await _closed_loop(lambda: _view(http, scene), viewers, seconds)
+            name = f"GET /render, {viewers} viewer{'s' if viewers > 1 else ''}"
+            rows.append(_row(name, worker, spent_ms, len(spent_ms) / seconds))
+        spent_ms = await _open_loop(lambda: http.get(f"/jobs/{scene}"), JOB_REQUESTS_A_SECOND, seconds)
+        rows.append(_row(f"GET /jobs/{{id}}, {JOB_REQUESTS_A_SECOND}/s", worker, spent_ms, len(spent_ms) / seconds))
+    return rows
+
+
+async def _view(http: httpx.AsyncClient, scene: str) -> httpx.Response:
+    pose = f"orbit:{random.uniform(-15, 15):.2f},{random.uniform(-15, 15):.2f},1"
+    query = {"scene": scene, "t": f"{random.random():.3f}", "pose": pose, "format": "jpeg"}
+    return await http.get("/render", params=query)
+
+
+async def _closed_loop(ask: Callable[[], Awaitable[httpx.Response]], callers: int, seconds: float) -> list[float]:
+    """Each caller asks again as soon as it is answered; ms of all answers."""
+    end_s = time.perf_counter() + seconds
+    spent_ms: list[float] = []
+
+    async def call() -> None:
+        while (start_s := time.perf_counter()) < end_s:
+            (await ask()).raise_for_status()
+            spent_ms.append(1e3 * (time.perf_counter() - start_s))
+
+    await asyncio.gather(*(call() for _ in range(callers)))
+    return spent_ms
+
+
+async def _open_loop(ask: Callable[[], Awaitable[httpx.Response]], a_second: int, seconds: float) -> list[float]:
+    """As many requests a second as said, whether answered or not; ms from when each was due."""
+    start_s = time.perf_counter()
+    spent_ms: list[float] = []
+
+    async def call(due_s: float) -> None:
+        (await ask()).raise_for_status()
+        spent_ms.append(1e3 * (time.perf_counter() - due_s))
+
+    async with asyncio.TaskGroup() as group:
+        for number in range(round(a_second * seconds)):
+            due_s = start_s + number / a_second
+            await asyncio.sleep(max(0.0, due_s - time.perf_counter()))
+            group.create_task(call(due_s))
+    return spent_ms
+
+
+def _row(work: str, worker: str, spent_ms: list[float], a_second: float) -> Row:
+    p50, p99 = np.percentile(spent_ms, (50, 99))
+    print(f"{work:28} worker {worker:9} p50 {p50:8.1f} ms  p99 {p99:8.1f} ms  {a_second:7.1f}/s")
+    return {"work": work, "worker": worker, "p50_ms": round(p50, 1), "p99_ms": round(p99, 1),
+            "per_s": round(a_second, 1), "answers": len(spent_ms)}  # fmt: skip
+
+
+def _uploads(url: str, folder: Path, gib: float) -> list[Row]:
+    """A video with so much padding behind it: received, hashed and stored like any other."""
+    video = folder / "large.mp4"
+    padding = round(gib * 2**30)
+    with video.open("wb") as file:
+        file.write(VIDEO.read_bytes() + struct.pack(">I4sQ", 1, b"free", 16 + padding))
+        for _ in range(padding // CHUNK_BYTES):
+            file.write(os.urandom(CHUNK_BYTES))
+    service = _service_process()
+    rows = []
+    with Client(url) as client:
+        for name, resumable in (("multipart", False), ("tus", True)):
+            before_mib = memory_mib(service)
+            _reset_peak(service)
+            start_s = time.perf_counter()
+            job = client.reconstruct(video, layout="sbs", resumable=resumable)
+            seconds = time.perf_counter() - start_s
+            peak_mib = memory_mib(service, "VmHWM")
+            client.cancel(job.id)
+            print(
+                f"upload of {gib:g} GiB, {name}: {seconds:.1f} s, service {before_mib:.0f} MiB, peak {peak_mib:.0f} MiB"
+            )
+            rows.append({"work": f"upload {gib:g} GiB, {name}", "seconds": round(seconds, 1),
+                         "before_mib": round(before_mib), "peak_mib": round(peak_mib)})  # fmt: skip
+    return rows
+
+
+def _service_process() -> int:
+    """The process id of the service that this run started."""
+    command = ["pgrep", "--newest", "--full", "python.* -m service$"]
+    return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def memory_mib(process_id: int, field: str = "VmRSS") -> float:
+    """Resident memory of a process now, or with field VmHWM at its peak (Linux)."""
+    for line in Path(f"/proc/{process_id}/status").read_text().splitlines():
+        if line.startswith(field + ":"):
+            return int(line.split()[1]) / 1024
+    raise ValueError(f"process {process_id} has no {field}")
+
+
+def _reset_peak(process_id: int) -> None:
+    Path(f"/proc/{process_id}/clear_refs").write_text("5")
+
+
+def _commit() -> str:
+    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    return found.stdout.strip() or "unknown"
+
+
+def _write(path: Path, rows: list[Row]) -> None:
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,221 @@
+"""Whether a whole installation stays as large as it is: half an hour of clips, views, listeners, cancels and purges.
+
+    python benchmarks/bm_soak.py [--minutes 30] [--csv docs/results/soak.csv]
+
+Starts `intrasplat up` on a data directory of its own. Round after round a small synthetic clip is uploaded (in turn in
+one request, resumable, and broken off in the middle), watched over SSE while it trains, viewed all the while by two
+viewers over HTTP and one over the WebSocket, now and then cancelled, and purged. Every ten seconds resident memory,
+open files and threads of service, supervisor, device child and Valkey are noted. At the end: the median of the three
+minutes after the fifth against that of the last three. A rise of more than 2 % is marked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import os
+import platform
+import random
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from statistics import median
+from typing import Any
+from urllib.parse import urlsplit
+
+from client.api import Client
+from client.demo import started_service
+from contract.errors import IntrasplatError
+
+WIDTH, HEIGHT, FRAMES = 160, 128, 16
+ROUND_ITERATIONS = 100
+SAMPLE_PERIOD_S = 10.0
+SETTLED_AFTER_MIN = 5.0
+WINDOW_MIN = 3.0
+ALLOWED_RISE = 0.02
+VIEW_PAUSE_S = 0.1
+MEASURES = ("rss_mib", "files", "threads")
+
+Row = dict[str, Any]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--csv", type=Path, help="file that gets the samples")
+    arguments = parser.parse_args()
+    print(f"cores {os.cpu_count()}, {platform.machine()}, commit {_commit()}, {arguments.minutes:g} minutes")
+    with tempfile.TemporaryDirectory(prefix="intrasplat-soak-") as name:
+        folder = Path(name)
+        clip = _make_clip(folder)
+        with started_service(folder / "data", folder / "service.log") as client:
+            rows, rounds, views = _soak(client.url, clip, folder / "data", arguments.minutes)
+    print(f"{rounds} rounds, {views} views, {len(rows)} samples")
+    if arguments.csv:
+        _write(arguments.csv, rows)
+    return _judge(rows, arguments.minutes)
+
+
+def _soak(url: str, clip: Path, data_dir: Path, minutes: float) -> tuple[list[Row], int, int]:
+    end = threading.Event()
+    shown: list[str] = []  # the scene that is looked at now, if any
+    counts = {"views": 0}
+    threads = [threading.Thread(target=_look, args=(url, shown, end, counts)) for _ in range(2)]
+    threads.append(threading.Thread(target=_look_through_socket, args=(url, shown, end, counts)))
+    for thread in threads:
+        thread.start()
+    rows: list[Row] = []
+    sampler = threading.Thread(target=_sample, args=(data_dir, end, rows))
+    sampler.start()
+    rounds = 0
+    deadline_s = time.monotonic() + 60 * minutes
+    while time.monotonic() < deadline_s:
+        _round(url, clip, rounds, shown)
+        rounds += 1
+    end.set()
+    for thread in (*threads, sampler):
+        thread.join()
+    return rows, rounds, counts["views"]
+
+
+def _round(url: str, clip: Path, number: int, shown: list[str]) -> None:
+    with Client(url) as client:
+        if number % 3 == 2:
+            _break_off(url, clip)
+        job = client.reconstruct(
+            clip / "stereo.webm",
+            calibration=clip / "calibration.json",
+            iterations=ROUND_ITERATIONS,
+            resumable=number % 3 == 1,
+        )
+        shown[:] = [job.id]
+        if number % 5 == 4:
+            for seen in itertools.islice(client.watch(job.id), 5):
+                if seen.stage == "train":
+                    break
+            client.cancel(job.id)
+        for seen in client.watch(job.id):
+            last = seen
+        shown.clear()
+        if last.state == "done":
+            client.render_array(t=0.5, scene=job.id)
+            client.delete(job.id)
+
+
+def _look(url: str, shown: list[str], end: threading.Event, counts: dict[str, int]) -> None:
+    with Client(url) as client:
+        while not end.wait(VIEW_PAUSE_S):
+            with suppress(IntrasplatError, IndexError):  # there may be nothing to see yet, or no longer
+                client.render(t=random.random(), scene=shown[0], pose=_pose(), format="jpeg")
+                counts["views"] += 1
+
+
+def _look_through_socket(url: str, shown: list[str], end: threading.Event, counts: dict[str, int]) -> None:
+    with Client(url) as client:
+        while not end.wait(VIEW_PAUSE_S):
+            with suppress(IntrasplatError, IndexError, OSError), client.stream(shown[0]) as viewer:
+                while shown and not end.wait(VIEW_PAUSE_S):
+                    viewer.render(t=random.random(), pose=_pose())
+                    counts["views"] += 1
+
+
+def _break_off(url: str, clip: Path) -> None:
+    """An upload that ends in the middle."""
+    address = urlsplit(url)
+    body = (clip / "stereo.webm").read_bytes()
+    head = (
+        f"POST /reconstruct HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Type: multipart/form-data; boundary=x\r\n"
+        f"Content-Length: {len(body) + 500}\r\n\r\n--x\r\n"
+        'Content-Disposition: form-data; name="clip"; filename="clip.webm"\r\n\r\n'
+    )
+    with socket.create_connection((address.hostname, address.port)) as connection:
+        connection.sendall(head.encode() + body[: len(body) // 2])
+
+
+def _pose() -> str:
+    return f"orbit:{random.uniform(-15, 15):.1f},{random.uniform(-15, 15):.1f},1"
+
+
+def _sample(data_dir: Path, end: threading.Event, rows: list[Row]) -> None:
+    start_s = time.monotonic()
+    while not end.wait(SAMPLE_PERIOD_S):
+        for name, process_id in _processes(data_dir).items():
+            with suppress(OSError):  # it has just ended
+                rows.append({"minute": round((time.monotonic() - start_s) / 60, 2), "process": name,
+                             **_figures(process_id)})  # fmt: skip
+
+
+def _processes(data_dir: Path) -> dict[str, int]:
+    """The installation's processes by what they are, told by their command lines and environments."""
+    kinds = {"-m service": "service", "-m worker consume": "supervisor", "-m worker device": "device child"}
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        with suppress(OSError):
+            command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            ours = str(data_dir).encode() in (entry / "environ").read_bytes() or str(data_dir) in command
+            for sign, kind in {**kinds, "queue.sock": "Valkey"}.items():
+                if ours and sign in command:
+                    found[kind] = int(entry.name)
+    return found
+
+
+def _figures(process_id: int) -> Row:
+    folder = Path(f"/proc/{process_id}")
+    status = dict(line.split(":\t", 1) for line in (folder / "status").read_text().splitlines() if ":\t" in line)
+    return {
+        "rss_mib": round(int(status["VmRSS"].split()[0]) / 1024, 1),
+        "files": len(list((folder / "fd").iterdir())),
+        "threads": int(status["Threads"]),
+    }
+
+
+def _judge(rows: list[Row], minutes: float) -> int:
+    """Print before and after for every process and measure; 1 if one has grown by more than is allowed."""
+    grown = 0
+    windows = ((SETTLED_AFTER_MIN, SETTLED_AFTER_MIN + WINDOW_MIN), (minutes - WINDOW_MIN, minutes + WINDOW_MIN))
+    for process in dict.fromkeys(row["process"] for row in rows):
+        for measure in MEASURES:
+            values = [
+                [row[measure] for row in rows if row["process"] == process and start <= row["minute"] <= end]
+                for start, end in windows
+            ]
+            if not all(values):
+                print(f"{process:13} {measure:8} too short a run to judge")
+                continue
+            before, after = (median(window) for window in values)
+            rise = after / before - 1 if before else 0.0
+            mark = "GREW" if rise > ALLOWED_RISE else "ok"
+            grown += mark != "ok"
+            print(f"{process:13} {measure:8} {before:9.1f} -> {after:9.1f}  {100 * rise:+6.2f} %  {mark}")
+    return 1 if grown else 0
+
+
+def _make_clip(folder: Path) -> Path:
+    size = ("--frames", str(FRAMES), "--width", str(WIDTH), "--height", str(HEIGHT))
+    command = [sys.executable, "-m", "worker", "phantom", *size, "--out", str(folder / "clip")]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return folder / "clip"
+
+
+def _commit() -> str:
+    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    return found.stdout.strip() or "unknown"
+
+
+def _write(path: Path, rows: list[Row]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["minute", "process", *MEASURES])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,156 @@
+"""One kill: send a clip, hold a process at a point, kill, let all come back, and see what became of the clip."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import threading
+import time
+import uuid
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import httpx
+
+from contract.errors import UnavailableError
+from contract.job import TERMINAL_STATES
+from tests.chaos.history import ClipHistory, violations
+from tests.chaos.house import House, Target
+from tests.chaos.points import Point
+
+CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
+PADDING_BYTES = 200_000
+ACCEPTED_WITHIN_S = 60.0
+ENDED_WITHIN_S = 90.0
+POINT_WITHIN_S = 40.0
+RETRY_PAUSE_S = 0.2
+
+NO_MATTER = frozenset(
+    (target, point)
+    for target in (Target.SUPERVISOR, Target.CHILD)
+    for point in (Point.UPLOAD, Point.SPOOLED)
+)  # fmt: skip
+"""Cells without meaning: the worker has no part in the clip before it is queued."""
+
+CELLS = [(target, point) for target in Target for point in Point if (target, point) not in NO_MATTER]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one kill came to."""
+
+    history: ClipHistory
+    violations: list[str]
+
+
+class Caller:
+    """A client that sends one clip until it is accepted, always under the same idempotency key."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._key = uuid.uuid4().hex
+        self._body, self._type = _form(_clip_of_its_own(self._key))
+        self.job_id: str | None = None
+        self._thread = threading.Thread(target=self._send_until_accepted, name="caller", daemon=True)
+
+    def start(self) -> None:
+        """Send in the background."""
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Until it was accepted or given up."""
+        self._thread.join()
+
+    def send_half(self) -> socket.socket:
+        """An upload that stops in the middle; the connection stays open until the caller closes it."""
+        address = urlsplit(self._url)
+        assert address.hostname is not None
+        connection = socket.create_connection((address.hostname, address.port), timeout=10)
+        head = (
+            f"POST /reconstruct HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Type: {self._type}\r\n"
+            f"Idempotency-Key: {self._key}\r\nContent-Length: {len(self._body)}\r\n\r\n"
+        )
+        connection.sendall(head.encode() + self._body[: len(self._body) // 2])
+        return connection
+
+    def _send_until_accepted(self) -> None:
+        deadline_s = time.monotonic() + ACCEPTED_WITHIN_S
+        headers = {"Content-Type": self._type, "Idempotency-Key": self._key}
+        while time.monotonic() < deadline_s:
+            with suppress(httpx.HTTPError, json.JSONDecodeError):
+                answer = httpx.post(f"{self._url}/reconstruct", content=self._body, headers=headers, timeout=30)
+                if answer.status_code == 202:
+                    self.job_id = answer.json()["id"]
+                    return
+            time.sleep(RETRY_PAUSE_S)
+
+
+def run_kill(house: House, target: Target, point: Point, cancels: bool) -> Outcome:
+    """Kill `target` while a clip is at `point`; with `cancels`, after asking to cancel it."""
+    house.points.reset()
+    history = ClipHistory((target.value, point.value))
+    caller = Caller(house.url)
+    half: socket.socket | None = None
+    if point is Point.UPLOAD:
+        half = caller.send_half()
+        time.sleep(0.1)  # the half arrives
+    else:
+        house.points.arm(point)
+        caller.start()
+        house.points.wait_for(point, POINT_WITHIN_S)
+    if cancels:
+        caller.wait()
+        history.cancel_heard = _cancel(house, caller.job_id)
+    history.killed_at_s = time.time()
+    house.kill(target)
+    house.points.let_go()
+    if half is not None:
+        half.close()
+        caller.start()
+    house.wait_until_ready()
+    history.restart_s = time.time() - history.killed_at_s if target in (Target.VALKEY, Target.ALL) else 0.0
+    caller.wait()
+    history.job_id = caller.job_id
+    watch(house, history)
+    return Outcome(history, violations(history, house.store))
+
+
+def _cancel(house: House, job_id: str | None) -> bool:
+    if job_id is None:
+        return False
+    with suppress(httpx.HTTPError):
+        answer = httpx.delete(f"{house.url}/jobs/{job_id}", timeout=10)
+        return answer.status_code == 200 and (
+            answer.json()["cancel_requested"] or answer.json()["state"] == "cancelled"
+        )
+    return False
+
+
+def watch(house: House, history: ClipHistory) -> None:
+    """Until the job has ended, and a moment longer, so that a second ending would be seen."""
+    if history.job_id is None:
+        return
+    deadline_s = time.monotonic() + ENDED_WITHIN_S
+    while time.monotonic() < deadline_s:
+        with suppress(UnavailableError):
+            record = house.queue.get(history.job_id)
+            if record is not None and record.state in TERMINAL_STATES:
+                break
+        time.sleep(0.05)
+    time.sleep(0.3)
+    history.events = house.queue.events(history.job_id)
+
+
+def _clip_of_its_own(name: str) -> bytes:
+    """A video like no other: with a box at its end that players skip."""
+    padding = name.encode() * (PADDING_BYTES // len(name))
+    return CLIP.read_bytes() + struct.pack(">I4s", 8 + len(padding), b"free") + padding
+
+
+def _form(clip: bytes) -> tuple[bytes, str]:
+    boundary = uuid.uuid4().hex
+    head = f'--{boundary}\r\nContent-Disposition: form-data; name="clip"; filename="clip.mp4"\r\n\r\n'
+    return head.encode() + clip + f"\r\n--{boundary}--\r\n".encode(), f"multipart/form-data; boundary={boundary}"

@@ -1,0 +1,84 @@
+"""What was observed of every clip, and the laws that it must obey."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from contract.job import TERMINAL_STATES, JobState
+from contract.queue import BEAT_PERIOD_S, LEASE_S, Event
+from contract.store import Store
+
+RERUN_SLACK_S = 2.0
+RERUN_WITHIN_S = LEASE_S + BEAT_PERIOD_S + RERUN_SLACK_S
+
+
+@dataclass
+class ClipHistory:
+    """One clip: who was killed where, what the caller was told, what the queue and the disk hold in the end.
+
+    cell           (target, point) as their texts
+    job_id         of the 202; None if the caller never got one
+    cancel_heard   the service confirmed that a cancel was asked for
+    killed_at_s    UNIX time of the kill
+    restart_s      until everything that was killed answered again; counted where Valkey or all were killed
+    """
+
+    cell: tuple[str, str]
+    job_id: str | None = None
+    cancel_heard: bool = False
+    killed_at_s: float = 0.0
+    restart_s: float = 0.0
+    events: list[Event] = field(default_factory=list)
+
+    @property
+    def final(self) -> JobState | None:
+        """The last state that was seen."""
+        return self.events[-1].record.state if self.events else None
+
+    @property
+    def rerun_s(self) -> float | None:
+        """From the kill to the start of the next attempt, if the job had to be run again."""
+        later = [
+            event.record.started_at_s
+            for event in self.events
+            if event.record.attempt > 1 and event.record.started_at_s and event.record.started_at_s > self.killed_at_s
+        ]
+        return min(later) - self.killed_at_s if later else None
+
+
+def violations(history: ClipHistory, store: Store) -> list[str]:
+    """The laws this clip breaks, in words; none if all is well."""
+    if history.job_id is None:
+        return ["the caller never got a 202"]
+    broken = []
+    states = [event.record.state for event in history.events]
+    ends = [n for n, state in enumerate(states) if state in TERMINAL_STATES]
+    endings = {(states[n], history.events[n].record.attempt) for n in ends}
+    if not ends:
+        broken.append(f"no terminal state: {[state.value for state in states]}")
+    elif len(endings) != 1:
+        broken.append(f"several endings: {sorted(endings)}")
+    if any(state not in TERMINAL_STATES for state in states[ends[0] :] if ends):
+        broken.append("it went on after its end")
+    if history.cancel_heard and history.final is not JobState.CANCELLED:
+        broken.append(f"a cancel was confirmed, and it ended as {history.final}")
+    published = store.scene_attempts(history.job_id)
+    expected = [history.events[-1].record.attempt] if history.final is JobState.DONE else []
+    if published != expected:
+        broken.append(f"attempts {published} are published, and {expected} should be")
+    if history.final is JobState.FAILED:
+        broken.append("it failed")
+    if history.rerun_s is not None and history.rerun_s > RERUN_WITHIN_S + history.restart_s:
+        broken.append(f"it ran again only after {history.rerun_s:.1f} s")
+    return broken
+
+
+def orphans(store: Store, known: set[str]) -> list[Path]:
+    """Folders of work and scenes that belong to no known job: nothing may be left lying about."""
+    return [
+        folder
+        for area in ("spool", "scenes")
+        for folder in (store.data_dir / area).iterdir()
+        if folder.name.split(".")[0] not in known
+    ]

@@ -1,0 +1,167 @@
+"""A whole installation that is killed again and again: Valkey, service, supervisor and its device child.
+
+Whatever dies is started again at once, as a process manager does; only the pauses between crashes are left out.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from enum import StrEnum
+from pathlib import Path
+
+import httpx
+
+from contract.embedded import EmbeddedServer
+from contract.queue_redis import RedisQueue
+from contract.settings import Settings
+from contract.store import Store
+from tests.chaos.points import FOLDER_VARIABLE, Points
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+KEEP_PERIOD_S = 0.05
+START_TIMEOUT_S = 60.0
+
+
+class Target(StrEnum):
+    """What is killed."""
+
+    SERVICE = "service"
+    SUPERVISOR = "supervisor"
+    CHILD = "device child"
+    VALKEY = "Valkey"
+    ALL = "all"
+
+
+class Kept:
+    """A process that is started again whenever it ends."""
+
+    def __init__(self, module: str, environment: dict[str, str], log: Path) -> None:
+        self._command = [sys.executable, "-m", module]
+        self._environment = environment
+        self._log = log
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def process_id(self) -> int | None:
+        """Of the live process."""
+        return self._process.pid if self._process is not None and self._process.poll() is None else None
+
+    def keep(self) -> None:
+        """Start it if it is not there."""
+        if self.process_id is None:
+            with self._log.open("ab") as log:
+                self._process = subprocess.Popen(
+                    self._command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                    start_new_session=True, cwd=REPOSITORY,
+                )  # fmt: skip
+
+    def end(self) -> None:
+        """For good."""
+        if self._process is not None:
+            with suppress(ProcessLookupError):
+                os.kill(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+
+
+class House:
+    """One installation in its own folder and on its own port; a context manager."""
+
+    def __init__(self, folder: Path, port: int, workers: int = 1) -> None:
+        folder.mkdir(parents=True)
+        self.data_dir = folder / "data"
+        self.points = Points(folder / "points")
+        self.server = EmbeddedServer(self.data_dir)
+        self.url = f"http://127.0.0.1:{port}"
+        self.store = Store(self.data_dir)
+        self.settings = Settings(data_dir=self.data_dir, port=port, redis_url=self.server.url, min_free_bytes=0)
+        self._folder = folder
+        self.service = Kept("tests.chaos.service_process", self._environment({}), folder / "service.log")
+        self.workers: list[Kept] = []
+        self.add_workers(workers)
+        self._end = threading.Event()
+        self._keeper = threading.Thread(target=self._keep, name="keeper", daemon=True)
+
+    def __enter__(self) -> House:
+        self.server.start()
+        self.queue = RedisQueue(self.server.url)
+        self._keeper.start()
+        self.wait_until_ready()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._end.set()
+        self._keeper.join()
+        for kept in (self.service, *self.workers):
+            kept.end()
+        self.queue.close()
+        self.server.stop()
+
+    @property
+    def socket(self) -> Path:
+        """Of the queue's server."""
+        return Path(self.server.url.removeprefix("unix://"))
+
+    def add_workers(self, count: int, **settings: str) -> None:
+        """Workers that are kept from now on, with settings of their own."""
+        for number in range(len(self.workers) + 1, len(self.workers) + count + 1):
+            environment = self._environment({"worker_name": f"worker-{number}", **settings})
+            log = self._folder / f"worker-{number}.log"
+            self.workers.append(Kept("tests.chaos.worker_process", environment, log))
+
+    def wait_until_ready(self, timeout_s: float = START_TIMEOUT_S) -> None:
+        """Until service, queue and all workers answer.
+
+        Raises:
+            TimeoutError: they do not.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while time.monotonic() < deadline_s:
+            with suppress(Exception):
+                address = "/readyz" if self.workers else "/healthz"
+                ready = httpx.get(f"{self.url}{address}", timeout=2.0).status_code == 200
+                if ready and len(self.queue.workers()) >= len(self.workers):
+                    return
+            time.sleep(0.05)
+        raise TimeoutError(f"{self.data_dir} is not ready after {timeout_s:g} s; its logs lie beside it")
+
+    def kill(self, target: Target) -> None:
+        """kill -9."""
+        supervisors = [kept.process_id for kept in self.workers]
+        children = [child for supervisor in supervisors if supervisor for child in children_of(supervisor)]
+        victims = {
+            Target.SERVICE: [self.service.process_id],
+            Target.SUPERVISOR: supervisors,
+            Target.CHILD: children,
+            Target.VALKEY: [self.server.process_id],
+            Target.ALL: [self.service.process_id, *supervisors, *children, self.server.process_id],
+        }[target]
+        for victim in victims:
+            if victim is not None:
+                with suppress(ProcessLookupError):
+                    os.kill(victim, signal.SIGKILL)
+
+    def _environment(self, changes: dict[str, str]) -> dict[str, str]:
+        settings = self.settings.model_copy(update=changes)
+        return {**os.environ, **settings.to_environment(), FOLDER_VARIABLE: str(self.points.folder)}
+
+    def _keep(self) -> None:
+        while not self._end.wait(KEEP_PERIOD_S):
+            with suppress(Exception):  # it is tried again
+                self.server.ensure_running()
+                for kept in (self.service, *self.workers):
+                    kept.keep()
+
+
+def children_of(process_id: int) -> list[int]:
+    """The direct children of a process (Linux)."""
+    try:
+        text = Path(f"/proc/{process_id}/task/{process_id}/children").read_text()
+    except FileNotFoundError:
+        return []
+    return [int(child) for child in text.split()]

@@ -1,0 +1,17 @@
+"""The supervisor as it is, with the points of tests/chaos/points.py and a stand-in for its device child."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+
+from contract.settings import Settings
+from tests.chaos.points import install_worker_points
+from worker.supervisor import run_supervisor
+
+if __name__ == "__main__":
+    install_worker_points()
+    end = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: end.set())
+    run_supervisor(Settings.from_environment(), end, child_command=[sys.executable, "-m", "tests.chaos.trainer"])
