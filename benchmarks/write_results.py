@@ -2,7 +2,8 @@
 
     python benchmarks/write_results.py
 
-Reads docs/results/{train,ablation,raster}.csv and stereo.txt (the output of bm_stereo.py); what is missing is left out.
+Reads docs/results/{train,ablation,raster,service}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of
+bm_soak.py); what is missing is left out.
 """
 
 from __future__ import annotations
@@ -54,6 +55,27 @@ _STEREO = """
 
 `python benchmarks/bm_stereo.py | tee docs/results/stereo.txt`:
 """
+_SERVICE = """
+## The service under load
+
+`python benchmarks/bm_service.py --csv docs/results/service.csv` ([service.csv](service.csv)): a whole installation,
+idle and while a clip trains, in one run; viewers, service, queue and worker share the cores. Renders are JPEGs of
+640x512 at random times and poses, and a viewer asks again when it is answered.
+"""
+_UPLOADS = """
+Uploads, the service's resident memory before and at its peak:
+"""
+_CHAOS = """
+## What survives what
+
+[chaos.md](chaos.md), written by `make chaos`: kill -9 of every process at every point of a clip's way, workers stopped
+past their lease, and a wire that misbehaves.
+"""
+_SOAK = """
+## Half an hour of everything
+
+`python benchmarks/bm_soak.py --csv docs/results/soak.csv | tee docs/results/soak.txt` ([soak.csv](soak.csv)):
+"""
 
 
 def main() -> None:
@@ -68,6 +90,12 @@ def main() -> None:
         parts += [_SCENE, f"\n```\n{(RESULTS / 'raster-scene.txt').read_text().strip()}\n```\n"]
     if (RESULTS / "stereo.txt").exists():
         parts += [_STEREO, f"\n```\n{(RESULTS / 'stereo.txt').read_text().strip()}\n```\n"]
+    if rows := _read("service.csv"):
+        parts += [_SERVICE, *_service_tables(rows)]
+    if (RESULTS / "chaos.md").exists():
+        parts.append(_CHAOS)
+    if (RESULTS / "soak.txt").exists():
+        parts += [_SOAK, f"\n```\n{(RESULTS / 'soak.txt').read_text().strip()}\n```\n"]
     (RESULTS / "index.md").write_text("".join(parts))
 
 
@@ -140,6 +168,26 @@ def _raster_table(rows: list[Row]) -> str:
     first = rows[0]
     machine = f"{first['cpu']}, {first['threads']} threads, commit {first['commit']}, load {first['load_1min']}"
     return _table(header, cells) + f"\n{machine}. Peak: {peaks}.\n"
+
+
+def _service_tables(rows: list[Row]) -> list[str]:
+    answered = [row for row in rows if row["p50_ms"]]
+    works = list(dict.fromkeys(row["work"] for row in answered))
+    found = {(row["work"], row["worker"]): row for row in answered}
+    cells = []
+    for work in works:
+        pair = [found[work, worker] for worker in ("idle", "training")]
+        cells.append([work, *(row[name] for row in pair for name in ("p50_ms", "p99_ms", "per_s"))])
+    header = [
+        "",
+        *(f"{worker}, {name}" for worker in ("idle", "training") for name in ("p50 ms", "p99 ms", "a second")),
+    ]
+    tables = [_table(header, cells)]
+    uploads = [[row[name] for name in ("work", "seconds", "before_mib", "peak_mib")] for row in rows if row["peak_mib"]]
+    if uploads:
+        tables += [_UPLOADS, _table(["", "seconds", "before, MiB", "peak, MiB"], uploads)]
+    first = rows[0]
+    return [*tables, f"\n{first['cores']} cores, {first['machine']}, commit {first['commit']}.\n"]
 
 
 if __name__ == "__main__":
