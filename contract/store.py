@@ -174,6 +174,7 @@ class Store:
         """Where the job's clip lies, or lay, on this machine."""
         return self._folder("spool", job_id)
 
+    @disk_errors()
     def fetch_clip(self, job_id: str) -> Path:
         """The folder with the job's clip, brought to this machine if need be.
 
@@ -224,6 +225,7 @@ class Store:
             _publish(work, scene)
         return self.scene_folder(job_id, attempt)
 
+    @disk_errors()
     def scene_folder(self, job_id: str, attempt: int) -> Path:
         """The scene that one attempt has finished.
 
@@ -235,6 +237,7 @@ class Store:
             raise SceneError(f"There is no scene {job_id[:40]!r}.")
         return folder
 
+    @disk_errors()
     def has_scene(self, job_id: str, attempt: int) -> bool:
         """Whether the attempt's scene is there."""
         return (self._folder("scenes", job_id, attempt) / MANIFEST).is_file()
