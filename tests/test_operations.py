@@ -7,11 +7,13 @@ from typing import get_args
 
 import yaml  # type: ignore[import-untyped]
 
+from contract.bucket import LOOKED_FOR_S
 from contract.job import Priority
 from contract.queue import LEASE_S, MAX_ATTEMPTS
 from contract.queue_redis import PREFIX
 from contract.settings import ENVIRONMENT_PREFIX, Settings, default_data_dir
 from tests.test_house import REPOSITORY
+from worker.supervisor import TIDY_PERIOD_S
 
 PAGE = (REPOSITORY / "docs" / "operations.md").read_text(encoding="utf-8")
 
@@ -60,6 +62,8 @@ def test_the_access_list_is_that_of_the_containers() -> None:
 def test_the_figures_are_those_of_the_code() -> None:
     assert f"after {LEASE_S:g} s of silence" in PAGE
     assert f"up to {MAX_ATTEMPTS} times" in PAGE
+    assert f"nowhere after {LOOKED_FOR_S:g} s" in " ".join(PAGE.split())
+    assert f"within {TIDY_PERIOD_S / 60:g} minutes" in PAGE
 
 
 def test_every_metric_that_is_named_exists() -> None:
