@@ -58,6 +58,7 @@ STAGES = (
     "snapshot",
     "views",
     "orders",
+    "channel",
     "faults",
     "device",
     "liveness",

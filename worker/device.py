@@ -5,19 +5,10 @@ It belongs to a supervisor (worker/supervisor.py), obeys worker/orders.py, and d
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import queue
-import sys
 import tempfile
-import threading
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
-
-from pydantic import BaseModel
 
 from contract.clip_limits import ClipLimits
 from contract.embedded import short_socket_path
@@ -26,6 +17,7 @@ from contract.job import JobRecord
 from contract.processes import die_with_parent
 from contract.settings import Settings
 from contract.store import Store, open_store
+from worker.channel import Channel, Orders, Task
 from worker.checkpoint import RESUME_FILE
 from worker.faults import describe
 from worker.hooks import Hooks, Progress
@@ -35,12 +27,9 @@ from worker.orders import (
     Finished,
     Holding,
     Ready,
-    Run,
     Stopped,
     Unable,
     job_progress,
-    line_of,
-    read_order,
 )
 from worker.pipeline import ReconstructionRequest, check_device, reconstruct
 from worker.raster.cpu import compile_kernels
@@ -61,16 +50,21 @@ def run_device(settings: Settings) -> None:
     """Obey the orders on stdin; never returns but by an error at the start, for the end of the orders ends the process.
 
     Raises:
-        UnavailableError: the device is not one to train on, or the endpoint not one to listen at.
+        UnavailableError: the device is not one to train on, or the data directory cannot be used.
+        InputError: the endpoint is not one to listen at.
     """
     die_with_parent()
     channel = Channel.instead_of_stdout()
-    orders = Orders(sys.stdin.buffer)
+    orders = Orders.from_stdin()
     try:
-        device = training_device(settings.device)
-    except UnavailableError as error:
+        _serve(settings, channel, orders)
+    except (UnavailableError, InputError) as error:
         channel.send(Unable(problem=error.problem, remedy=error.remedy))
         raise
+
+
+def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
+    device = training_device(settings.device)
     store, snapshots = open_store(settings), Snapshots()
     # What is unpacked of clips stays in the data directory, and does not outlive the next start.
     tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
@@ -95,70 +89,6 @@ def run_device(settings: Settings) -> None:
             else:
                 shown = task.run.record.job_id
                 channel.send(work_on(task, device, ClipLimits.of(settings), snapshots, channel))
-
-
-class Channel:
-    """Where reports go; for any thread."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
-        self._lock = threading.Lock()
-        self._last: dict[type[BaseModel], BaseModel] = {}
-
-    @classmethod
-    def instead_of_stdout(cls) -> Channel:
-        """Takes stdout for itself: whatever else is printed from now on goes to stderr."""
-        sys.stdout.flush()
-        own = os.dup(sys.stdout.fileno())  # not inherited by processes that are started from here
-        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-        return cls(os.fdopen(own, "wb"))
-
-    def send(self, message: BaseModel) -> None:
-        """Write one report. A supervisor that is gone ends this process by other means."""
-        with self._lock, contextlib.suppress(BrokenPipeError):
-            self._stream.write(line_of(message))
-            self._stream.flush()
-
-    def send_if_new(self, message: BaseModel) -> None:
-        """Write a report unless it says what the last of its kind said; for one thread."""
-        if self._last.get(type(message)) != message:
-            self._last[type(message)] = message
-            self.send(message)
-
-
-@dataclass(frozen=True)
-class Task:
-    """A job that was ordered, and whether its end was since."""
-
-    run: Run
-    stop: threading.Event = field(default_factory=threading.Event)
-
-
-class Orders:
-    """Reads orders in a thread of its own; at their end it ends the process, whatever else goes on in it."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
-        self._tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
-        threading.Thread(target=self._read, name="orders", daemon=True).start()
-
-    def next(self, timeout_s: float) -> Task | None:
-        """The next job; None after timeout_s."""
-        try:
-            return self._tasks.get(timeout=timeout_s)
-        except queue.Empty:
-            return None
-
-    def _read(self) -> None:
-        task: Task | None = None
-        for line in self._stream:
-            order = read_order(line)
-            if isinstance(order, Run):
-                task = Task(order)
-                self._tasks.put(task)
-            elif task is not None:
-                task.stop.set()
-        os._exit(0)  # nothing here is worth keeping: what is durable is on disk already
 
 
 def work_on(

@@ -148,16 +148,16 @@ def test_a_real_worker_told_to_end_keeps_what_was_trained_and_the_next_comes_to_
 ) -> None:
     write_endonerf(make_phantom(PhantomSettings(width=96, height=80, frames=8)), tmp_path / "clip")
     clip = Path(shutil.make_archive(str(tmp_path / "clip"), "zip", tmp_path / "clip"))
-    reconstruct(ReconstructionRequest(clip, iterations=800), tmp_path / "whole", Hooks())
+    reconstruct(ReconstructionRequest(clip, iterations=500), tmp_path / "whole", Hooks())
     real = [sys.executable, "-m", "worker", "consume"]
-    job_id = bench.submit(clip, iterations=800)
+    job_id = bench.submit(clip, iterations=500)
     with bench.worker(command=real) as worker:
         bench.wait_for_step(job_id)
         worker.terminate()
         assert worker.wait(WAIT_S) == ExitCode.OK
     assert bench.record(job_id).state is JobState.QUEUED
     stopped_at = load_resume(bench.store.data_dir / "work" / f"{job_id}.1")[1]["iteration"]
-    assert 0 < stopped_at < 800
+    assert 0 < stopped_at < 500
     with bench.worker("worker-2", real):
         record = bench.wait_for_end(job_id)
     assert (record.state, record.attempt, record.released) == (JobState.DONE, 2, 1)
