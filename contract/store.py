@@ -285,9 +285,9 @@ class Store:
         """
         folders = self._folders_of(job_id)
         files, sizes = dict.fromkeys(folders, 0), dict.fromkeys(folders, 0)
-        for area, places in folders.items():
-            for path in (path for place in places for path in place.rglob("*") if path.is_file()):
-                with contextlib.suppress(FileNotFoundError):  # its worker has just renamed it
+        for area, place in ((area, place) for area, places in folders.items() for place in places):
+            with contextlib.suppress(FileNotFoundError):  # its worker has just renamed it, or another purge removes it
+                for path in (path for path in place.rglob("*") if path.is_file()):
                     sizes[area] += path.stat().st_size
                     files[area] += 1
         for place in (place for places in folders.values() for place in places):

@@ -8,6 +8,7 @@ One request at a time writes to the file, whichever process has it.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import os
@@ -131,8 +132,9 @@ def open_partials(store: Store) -> list[Partial]:
 
 def partials_of(store: Store, job_id: str) -> list[Partial]:
     """Uploads a job has taken; also those whose file it has, though the service died before it could note that."""
-    spool = store.spool_folder(job_id)
-    taken = {_identity(path) for path in spool.iterdir()} - {None} if spool.is_dir() else set()
+    taken: set[tuple[int, int] | None] = set()
+    with contextlib.suppress(FileNotFoundError):
+        taken = {_identity(path) for path in store.spool_folder(job_id).iterdir()} - {None}
     read = [_read(folder) for folder in (store.data_dir / "incoming").iterdir()]
     return [
         partial

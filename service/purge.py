@@ -112,8 +112,9 @@ class Purger:
         files = sizes = 0
         with disk_errors():
             for partial in partials_of(self._store, job_id):
-                found = [path.stat().st_size for path in partial.folder.iterdir()]
-                files, sizes = files + len(found), sizes + sum(found)
+                with contextlib.suppress(FileNotFoundError):  # somebody else removes the same
+                    found = [path.stat().st_size for path in partial.folder.iterdir()]
+                    files, sizes = files + len(found), sizes + sum(found)
                 self._store.discard_incoming(partial.upload_id)
         return Removed({"uploads": files}, {"uploads": sizes})
 

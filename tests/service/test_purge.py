@@ -7,6 +7,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,16 @@ def test_a_job_that_is_retried_during_its_purge_is_not_reported_as_purged(
     monkeypatch.setattr(house.store, "purge", purge_while_somebody_retries)
     assert_problem(house.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
     assert (house.store.data_dir / NOTES / job_id).exists()
+
+
+def test_several_services_may_purge_the_same_job_at_once(house: House) -> None:
+    for _ in range(10):
+        job_id = failed_job(house, upload_in_pieces(house))
+        purgers = [parts(house)[0] for _ in range(4)]
+        with ThreadPoolExecutor(len(purgers)) as pool:
+            purges = [pool.submit(purger.purge, job_id, None) for purger in purgers]
+        assert all(purge.result().verified for purge in purges)
+        assert traces_of(house.store.data_dir, job_id) == []
 
 
 def test_retention_purges_in_time_and_nothing_before_and_nothing_live(house: House) -> None:
