@@ -18,7 +18,7 @@ from contract.store import StoreFullError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
-"""Said with 429 and 503, unless the problem knows better."""
+"""Said with 423, 429 and 503, unless the problem knows better."""
 API_REMEDY = "The API is described at /openapi.json."
 FAULT_REMEDY = "Report it with the log's lines of this X-Request-Id."
 
@@ -65,7 +65,7 @@ class Problem(Exception):
         self.remedy = remedy
         self.headers = dict(headers or {})
         self.extensions = dict(extensions or {})
-        if status in (429, 503):
+        if status in (423, 429, 503):
             self.headers.setdefault("Retry-After", str(RETRY_AFTER_S))
 
     def document(self) -> dict[str, object]:

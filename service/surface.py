@@ -25,6 +25,9 @@ KEPT_REQUEST_ID = re.compile(r"[0-9a-fA-F-]{8,64}")
 QUIET_ROUTES = frozenset({"/healthz", "/readyz", "/metrics"})
 """Asked every few seconds by machines; in the log only when they fail."""
 
+MAX_OPEN = 512
+"""Requests, streams of events and WebSockets at a time. Each of them may hold a connection for long."""
+
 GONE = 499
 """In the log alone: the caller left before it was answered."""
 SWITCHED = 101
@@ -44,6 +47,7 @@ class Surface:
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
+        self._open = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -52,13 +56,19 @@ class Surface:
         given = Headers(scope=scope).get(REQUEST_ID, "")
         request_id = given if KEPT_REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         answered, began_s = _Answered(), time.perf_counter()
+        self._open += 1
         with answering(request_id):
             try:
                 await self._answer(scope, receive, _marking(scope, send, request_id, answered), answered)
             finally:
+                self._open -= 1
                 _log(scope, answered.status or GONE, time.perf_counter() - began_s)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, answered: _Answered) -> None:
+        if self._open > MAX_OPEN:
+            problem = Problem(503, f"{MAX_OPEN} requests are being answered, as many as may be.", remedy="Come back.")
+            await _refuse(problem, scope, receive, send)
+            return
         try:
             await self._app(scope, receive, send)
         except Exception:

@@ -40,8 +40,8 @@ class Readiness(BaseModel):
 
 
 @router.get("/healthz", operation_id="healthz")
-def healthz() -> dict[str, bool]:
-    """The process answers; nothing more."""
+async def healthz() -> dict[str, bool]:
+    """The process answers; nothing more, and nothing that another part could hold up."""
     return {"alive": True}
 
 
@@ -60,7 +60,7 @@ def readyz(services: Services) -> Readiness | JSONResponse:
 
 
 @router.get("/info", operation_id="info")
-def info(services: Services) -> dict[str, Any]:
+async def info(services: Services) -> dict[str, Any]:
     """Version, limits and accepted formats."""
     settings = services.settings
     return {

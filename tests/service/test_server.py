@@ -27,6 +27,12 @@ def live(tmp_path: Path) -> Iterator[LiveService]:
         yield running
 
 
+def submitted(live: LiveService) -> str:
+    """The id of a job that waits."""
+    job_id: str = httpx.post(f"{live.url}/reconstruct", files={"clip": ("a.mp4", CLIP)}).json()["id"]
+    return job_id
+
+
 def answer_to(live: LiveService, request: bytes) -> tuple[bytes, dict[str, str], bytes]:
     """Status line, headers and body of what raw bytes are answered with, until the connection is closed."""
     with socket.create_connection(("127.0.0.1", live.port), timeout=PATIENCE_S) as connection:
@@ -88,7 +94,7 @@ def test_an_upload_whose_caller_leaves_keeps_what_came(live: LiveService) -> Non
 
 
 def test_a_stream_of_events_ends_when_the_service_is_asked_to(live: LiveService) -> None:
-    job_id = httpx.post(f"{live.url}/reconstruct", files={"clip": ("a.mp4", CLIP)}).json()["id"]
+    job_id = submitted(live)
     with httpx.stream("GET", f"{live.url}/jobs/{job_id}/events", timeout=PATIENCE_S) as stream:
         lines = stream.iter_lines()
         assert next(line for line in lines if line.startswith("data"))
@@ -98,8 +104,20 @@ def test_a_stream_of_events_ends_when_the_service_is_asked_to(live: LiveService)
     assert not live.thread.is_alive()
 
 
+def test_what_is_too_much_at_once_is_told_to_come_back(live: LiveService, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.surface.MAX_OPEN", 2)
+    events = f"{live.url}/jobs/{submitted(live)}/events"
+    with httpx.stream("GET", events) as first, httpx.stream("GET", events) as second:
+        streams = [first.iter_lines(), second.iter_lines()]  # kept: one that is dropped closes its connection
+        assert [next(lines) for lines in streams] == ["retry: 2000"] * 2
+        refused = httpx.get(f"{live.url}/jobs")
+        assert (refused.status_code, refused.headers["content-type"]) == (503, "application/problem+json")
+        assert refused.headers["retry-after"]
+        live.server.handle_exit(signal.SIGTERM, None)
+
+
 def test_many_listeners_leave_the_service_free_for_others(live: LiveService) -> None:
-    job_id = httpx.post(f"{live.url}/reconstruct", files={"clip": ("a.mp4", CLIP)}).json()["id"]
+    job_id = submitted(live)
     endings: list[str] = []
 
     def listen() -> None:
