@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import ctypes
 import resource
-import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from contract.processes import die_with_parent
 from worker.decode.landlock import confine_files
 from worker.decode.seccomp import forbid_network_and_programs
 
 MOST_OPEN_FILES = 128  # a zip, a video, the results, and what Python loads
 
-_PR_SET_PDEATHSIG = 1
 _PR_SET_NO_NEW_PRIVS = 38
 _CLONE_NEWUSER = 0x10000000
 _CLONE_NEWNET = 0x40000000
@@ -48,7 +47,8 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
     Raises:
         OSError: a limit cannot be set.
     """
-    _end_with_parent()
+    die_with_parent()
+    _gain_no_privileges()
     _limit(resource.RLIMIT_CORE, 0)  # a dump would hold the clip
     _limit(resource.RLIMIT_AS, allowance.memory_bytes)
     _limit(resource.RLIMIT_FSIZE, allowance.file_bytes)
@@ -75,13 +75,10 @@ def _limit(kind: int, soft: int, hard: int | None = None) -> None:
     resource.setrlimit(kind, (min(soft, hard), hard))
 
 
-def _end_with_parent() -> None:
-    """No decoder outlives the process that asked for it, and none gains rights by what it starts."""
-    if not sys.platform.startswith("linux"):
-        return
-    libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+def _gain_no_privileges() -> None:
+    """No program that this process starts has more rights than it; what follows needs that said."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
 
 
 def _leave_network() -> bool:
