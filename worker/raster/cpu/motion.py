@@ -68,7 +68,8 @@ class LinearMotion:
         self._deformation = deformation
         self.weight = np.zeros((bases, channels, columns), np.float32)
         self.weight[:, :, :count] = deformation.weight.permute(2, 1, 0).numpy()
-        self.first, self.second = np.zeros_like(self.weight), np.zeros_like(self.weight)
+        # zeros, not zeros_like: a model that is only rendered never touches these, and so they take no memory
+        self.first, self.second = (np.zeros(self.weight.shape, np.float32) for _ in range(2))
         self.steps = np.zeros(bases, np.int64)
 
     def _alive(self, t: float) -> tuple[Floats, int, int]:
@@ -114,7 +115,7 @@ class FdmMotion:
             for tensor, fill in ((deformation.weight, 0.0), (deformation.centre, 0.5), (deformation.width, 1.0))
         )
         self.first = np.zeros((3, *self.weight.shape), np.float32)
-        self.second = np.zeros_like(self.first)
+        self.second = np.zeros(self.first.shape, np.float32)
 
     def deform(self, canonical: Floats, t: float, state: Floats) -> None:
         quartic = self.form == "quartic"
