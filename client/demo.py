@@ -21,17 +21,21 @@ from client.pictures import Panel, draw_curve, draw_sheet, draw_strip
 from client.remote import progress_of
 from contract.errors import IntrasplatError, UnavailableError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
+from contract.job import JobState, JobView
 from contract.progress_bar import ProgressBar
 
 FRAMES = 48
 WIDTH, HEIGHT = 480, 384
 SEED = 3
+TRAINING = "train"
+"""The stage as a job's view names it."""
 BUDGET_S = 45.0
 """With these the demo takes two minutes on two quiet cores, and less than four on slow ones."""
 
 HOLDOUT = "blocks8"
 """Eight frames hidden at a time, as behind an instrument: the stretch that copying neighbours cannot fill."""
 READY_TIMEOUT_S = 180.0
+READY_PERIOD_S = 1.0
 STOP_TIMEOUT_S = 40.0
 LOG_LINES_SHOWN = 20
 
@@ -88,11 +92,15 @@ def run(folder: Path, out: Path, picture: Path | None = None) -> dict[Path, str]
     with started_service(folder / "data", out / "service.log") as client:
         say(f"sending the clip: POST {client.url}/reconstruct")
         job = client.reconstruct(zipped(clip), holdout=HOLDOUT, budget_s=BUDGET_S)
+        preview = Preview(client.url, out / "preview.png")
         with ProgressBar(sys.stderr) as bar:
-            client.wait(job.id, on_progress=lambda now: bar.show(progress_of(now)))
+            for now in client.watch(job.id):
+                bar.show(progress_of(now))
+                preview.look(now)
+        client.wait(job.id)  # says why, if there is no scene
         report = client.report(job.id)
         say(f"asking for views: GET {client.url}/render?t=...&pose=...")
-        written = save_renders(client, job.id, out)
+        written = preview.written() | save_renders(client, job.id, out)
         written |= save_sheet(client, job.id, clip, report, out)
         if picture is not None:
             draw_strip(strip_of(client, job.id, clip), picture)
@@ -100,6 +108,36 @@ def run(folder: Path, out: Path, picture: Path | None = None) -> dict[Path, str]
         written |= save_curve(client.curve(job.id), report, out)
     say(summary_of(report))
     return written
+
+
+class Preview:
+    """The first picture of a scene that training has changed, and still does, if there is one."""
+
+    def __init__(self, url: str, path: Path) -> None:
+        self._client = Client(url, patience_s=0.0)
+        self._path = path
+        self._began_s: float | None = None
+        self._seconds: float | None = None
+
+    def look(self, job: JobView) -> None:
+        """Ask for it, now that the job is there; one that does not come is asked for next time."""
+        if job.state is not JobState.RUNNING or job.stage != TRAINING or self._seconds is not None:
+            return
+        self._began_s = self._began_s or time.monotonic()
+        try:
+            image = self._client.render(time_of(VIEWED_FRAME), scene=job.id)
+        except IntrasplatError:
+            return
+        if image.iteration:
+            self._path.write_bytes(image.content)
+            self._seconds = time.monotonic() - self._began_s
+
+    def written(self) -> dict[Path, str]:
+        """The file, and what it shows."""
+        self._client.close()
+        if self._seconds is None:
+            return {}
+        return {self._path: f"the model {self._seconds:.0f} s after training began, while it went on"}
 
 
 def make_clip(clip: Path) -> Path:
@@ -256,7 +294,7 @@ def started_service(data_dir: Path, log: Path) -> Iterator[Client]:
                 if process.poll() is not None or time.monotonic() > deadline_s:
                     print("\n".join(log.read_text().splitlines()[-LOG_LINES_SHOWN:]), file=sys.stderr)
                     raise UnavailableError("The service did not become ready.", "Try `intrasplat doctor`.")
-                time.sleep(0.2)
+                time.sleep(READY_PERIOD_S)
             yield client
     finally:
         process.terminate()

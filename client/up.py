@@ -28,6 +28,7 @@ from contract.store import Store
 
 DASHBOARD = Path(__file__).resolve().parent / "dashboard"
 WATCH_PERIOD_S = 0.2
+READY_PERIOD_S = 1.0
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0
 STEADY_S = 60.0
@@ -144,11 +145,14 @@ class Installation:
     def wait_until_ready(self, is_ended: Callable[[], bool], timeout_s: float) -> bool:
         """Watch until a clip would be trained; False if that takes too long or the caller ends."""
         deadline_s = time.monotonic() + timeout_s
+        asked_s = 0.0
         with Client(self.url) as client:
             while time.monotonic() < deadline_s and not is_ended():
                 self.watch()
-                if client.is_ready():
-                    return True
+                if time.monotonic() > asked_s + READY_PERIOD_S:
+                    asked_s = time.monotonic()
+                    if client.is_ready():
+                        return True
                 time.sleep(WATCH_PERIOD_S)
         return False
 

@@ -27,7 +27,7 @@ from contract.logs import configure
 from contract.progress_bar import ProgressBar
 from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
 from contract.settings import Settings
-from contract.store import REPORT
+from contract.store import MANIFEST, REPORT
 
 SUFFIX_FORMATS = {".png": ImageFormat.PNG, ".jpg": ImageFormat.JPEG, ".jpeg": ImageFormat.JPEG, ".npy": ImageFormat.NPY}
 MAX_RENDER_PIXELS = 8192 * 8192
@@ -105,12 +105,21 @@ def _add_render(commands: Commands) -> None:
     when = parser.add_mutually_exclusive_group(required=True)
     when.add_argument("--t", type=finite, help="time: 0 is the first frame, 1 the end of the clip")
     when.add_argument("--frames", type=_frames, metavar="LIST", help="frame numbers such as 1,9,17; writes a folder")
-    parser.add_argument("--pose", help="12 or 16 numbers, or orbit:yaw,pitch,zoom (default: the endoscope's own)")
-    parser.add_argument("--width", type=int)
-    parser.add_argument("--height", type=int)
-    for name in ("fx", "fy", "cx", "cy"):
-        parser.add_argument(f"--{name}", type=float, metavar="PX")
-    parser.add_argument("--layer", choices=[layer.value for layer in Layer], default=Layer.RGB.value)
+    parser.add_argument(
+        "--pose",
+        help="world_from_camera, 12 or 16 numbers in mm, or orbit:YAW,PITCH,ZOOM in degrees and times nearer "
+        "(default: the endoscope's own)",
+    )
+    camera = {"width": "of the image", "height": "of the image", "fx": "focal length", "fy": "focal length"}
+    for name, what in (camera | {"cx": "optical axis from the left edge", "cy": "from the upper edge"}).items():
+        kind = int if name in ("width", "height") else float
+        parser.add_argument(f"--{name}", type=kind, metavar="PX", help=f"{what}, in pixels (default: the clip's)")
+    parser.add_argument(
+        "--layer",
+        choices=[layer.value for layer in Layer],
+        default=Layer.RGB.value,
+        help="depth: 16-bit PNG in 0.01 mm, or NPY in mm, 0 where there is none; confidence: 0 to 1 (default: rgb)",
+    )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="PATH", help="a .png, .jpg or .npy file; with --frames a folder"
     )
@@ -147,6 +156,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     fields = [field.name for field in dataclasses.fields(ReconstructionRequest)]
     chosen = {name: getattr(options, name) for name in fields if hasattr(options, name)}
     interrupted = threading.Event()
+    is_new = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
     before = {number: signal.signal(number, _once(interrupted)) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -159,6 +169,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        if is_new and not any(out.iterdir()):
+            out.rmdir()
     _print_report(json.loads((out / REPORT).read_text()), out)
     return ExitCode.OK
 
@@ -188,6 +200,8 @@ def _render(options: argparse.Namespace) -> int:
     from worker.render import render_frame
     from worker.views import camera_of, pose_of
 
+    if not (options.scene / MANIFEST).is_file():
+        raise InputError("SCENE", f"{options.scene} holds no scene.", "Name a folder that `reconstruct --out` wrote.")
     scene = load_scene(options.scene)
     wanted = _camera(options)
     camera = camera_of(scene.intrinsics, wanted, MAX_RENDER_PIXELS)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.errors import UnavailableError
+from worker.opencv import silent_stderr
 from worker.phantom.camera import orbit_pose
 from worker.phantom.scene import Phantom, PhantomFrame
 
@@ -40,12 +41,9 @@ def write_stereo_video(phantom: Phantom, path: Path, tick: Tick = _ignore) -> No
     """
     settings = phantom.settings
     path.mkdir(parents=True, exist_ok=True)
-    video = cv2.VideoWriter(
-        str(path / VIDEO),
-        cv2.VideoWriter.fourcc(*"VP90"),
-        settings.frame_rate_hz,
-        (2 * settings.width, settings.height),
-    )
+    size = (2 * settings.width, settings.height)
+    with silent_stderr():
+        video = cv2.VideoWriter(str(path / VIDEO), cv2.VideoWriter.fourcc(*"VP90"), settings.frame_rate_hz, size)
     if not video.isOpened():
         raise UnavailableError("OpenCV cannot write VP9 here.", "Write --format stereomis instead.")
     try:
