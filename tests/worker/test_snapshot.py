@@ -14,9 +14,10 @@ from contract.rendering import ImageFormat, RenderRequest
 from contract.store import Store
 from tests.worker.phantoms import bits, phantom_clip, prepared, view
 from tests.worker.scenes import random_scene
-from worker.checkpoint import Scene
-from worker.hooks import Hooks
-from worker.pipeline import snapshot_of
+from worker.checkpoint import SCENE_FILE, Scene
+from worker.hooks import Hooks, Progress
+from worker.phantom import PhantomSettings, make_phantom, write_endonerf
+from worker.pipeline import ReconstructionRequest, reconstruct, snapshot_of
 from worker.render import render_frame
 from worker.serve import NotYetError
 from worker.snapshot import Snapshots
@@ -75,6 +76,26 @@ def test_a_watched_run_comes_to_the_bits_of_an_unwatched_one(preset: str, tmp_pa
     assert newest.iteration > 0
     assert len(set(seen)) > 1
     assert bits(watched, clip, split) == bits(alone, clip, split)
+
+
+def test_a_reconstruction_can_be_watched_from_its_clip_to_its_scene(tmp_path: Path) -> None:
+    write_endonerf(make_phantom(PhantomSettings(width=96, height=80, frames=10, period_frames=12)), tmp_path / "clip")
+    request = ReconstructionRequest(tmp_path / "clip", iterations=ITERATIONS)
+    snapshots, stages = Snapshots(period_s=ALWAYS), set[str]()
+    snapshots.begin(JOB)
+
+    def note(progress: Progress) -> None:
+        if snapshots.newest(JOB) is not None:
+            stages.add(progress.stage)
+
+    hooks = Hooks(on_progress=note, wants_snapshot=snapshots.wanted, on_snapshot=snapshots.offer)
+    reconstruct(request, tmp_path / "watched", hooks)
+    reconstruct(request, tmp_path / "alone", Hooks())
+    newest = snapshots.newest(JOB)
+    assert newest is not None
+    assert {"train", "score"} <= stages <= {"train", "finish", "score"}
+    first, second = ((tmp_path / each / SCENE_FILE).read_bytes() for each in ("watched", "alone"))
+    assert first == second
 
 
 def test_a_run_that_nobody_watches_is_copied_once_at_its_start() -> None:
