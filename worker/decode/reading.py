@@ -40,7 +40,7 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
         "warnings": clip.warnings,
     }
     if isinstance(clip, DepthClip):
-        write_arrays(folder, ((name, getattr(clip, name)) for name in _DEPTH_ARRAYS))
+        write_arrays(folder, _depth_arrays(clip, reports))
         return told | {"kind": DEPTH, "intrinsics": clip.intrinsics.model_dump()}
     reports.reading("calibration")
     calibration = _calibration(request, clip, folder, limits)
@@ -50,7 +50,13 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
     return told | {"kind": STEREO, "masked": masked, "calibration": calibration}
 
 
-_DEPTH_ARRAYS = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera", "frame_times_s")
+def _depth_arrays(clip: DepthClip, reports: Reports) -> Iterator[tuple[str, NDArray[Any]]]:
+    names = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera", "frame_times_s")
+    for done, name in enumerate(names, start=1):
+        reports.share = max(reports.share, _OPENING_SHARE + (1 - _OPENING_SHARE) * done / len(names))
+        for frame in getattr(clip, name):
+            reports.picture()  # a slow disk is no decoder that hangs
+            yield name, frame
 
 
 def _stereo_arrays(clip: StereoClip, reports: Reports) -> Iterator[tuple[str, NDArray[Any]]]:
