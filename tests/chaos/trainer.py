@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import time
 from pathlib import Path
 
@@ -24,7 +23,7 @@ def main() -> None:
     """Obey until the orders end, which ends the process."""
     die_with_parent()
     channel = Channel.instead_of_stdout()
-    orders = Orders(sys.stdin.buffer)
+    orders = Orders.from_stdin()
     folder = Settings.from_environment().data_dir / "run"
     channel.send(Ready(endpoint=f"ipc://{folder}/standin-{os.getpid()}", device="cpu"))
     while True:
