@@ -67,7 +67,7 @@ class Intake:
         kept_bytes = sum(place.kept_bytes for place in self._places) + promised_bytes(self._store)
         return self._store.free_bytes() - self._settings.min_free_bytes - kept_bytes
 
-    async def body(self, request: Request, place: Place) -> AsyncIterator[bytes]:
+    async def body(self, request: Request, place: Place | None = None) -> AsyncIterator[bytes]:
         """The pieces of a request's body as they come.
 
         Raises:
@@ -84,7 +84,8 @@ class Intake:
                 raise Problem(408, detail, remedy="Send it again.", headers={"Connection": "close"}) from None
             if piece is None:
                 return
-            place.kept_bytes = max(place.kept_bytes - len(piece), 0)
+            if place is not None:
+                place.kept_bytes = max(place.kept_bytes - len(piece), 0)
             yield piece
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from io import RawIOBase
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Request, Response
@@ -136,11 +138,10 @@ async def _read_submission(request: Request, services: Deps) -> Submission:
         InputError: it names something that there is not.
     """
     body = b""
-    with services.intake.place() as place:
-        async for piece in services.intake.body(request, place):
-            body += piece
-            if len(body) > MAX_SUBMISSION_BYTES:
-                raise Problem(413, f"The JSON body is larger than {MAX_SUBMISSION_BYTES} bytes.", remedy=JSON_REMEDY)
+    async for piece in services.intake.body(request):
+        body += piece
+        if len(body) > MAX_SUBMISSION_BYTES:
+            raise Problem(413, f"The JSON body is larger than {MAX_SUBMISSION_BYTES} bytes.", remedy=JSON_REMEDY)
     try:
         return Submission.model_validate_json(body)
     except ValidationError as error:
@@ -162,6 +163,16 @@ def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key:
     received = Received(options=options.model_dump_json())
     received.names = {part: partial.path.name for part, partial in partials.items()}
     received.files()  # names what is missing before anything is read
+    with contextlib.ExitStack() as held:
+        for partial in partials.values():
+            held.enter_context(_held(partial))
+        return _make_job_of(services, caller, partials, received, key)
+
+
+def _make_job_of(
+    services: Deps, caller: Caller, partials: Mapping[str, Partial], received: Received, key: str | None
+) -> JobRecord:
+    """Link the uploads' files into a new job, and let go of them once it is accepted."""
     job_id = new_job_id()
     folder = services.store.open_incoming(job_id)
     try:
@@ -181,6 +192,15 @@ def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key:
         services.store.discard_incoming(job_id)
     _give(partials, record.job_id)
     return record
+
+
+def _held(partial: Partial) -> RawIOBase:
+    """The upload's file, locked: no other request writes to it or makes a job of it meanwhile."""
+    try:
+        return partial.open()
+    except (BlockingIOError, FileNotFoundError):
+        detail = "Another request is using this upload."
+        raise Problem(423, detail, field="upload", remedy="Send this again.") from None
 
 
 def _finished(services: Deps, caller: Caller, part: str, upload_id: str) -> Partial:

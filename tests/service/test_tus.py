@@ -207,6 +207,17 @@ def test_an_upload_becomes_one_job_however_often_it_is_submitted(house: House) -
     assert_problem(send(house, f"/uploads/{submission['clip']}", len(CLIP), b""), 409)
 
 
+def test_of_an_upload_that_is_in_use_no_job_is_made(house: House) -> None:
+    upload_id = uploaded(house)
+    with (house.store.incoming_folder(upload_id) / "clip.mp4").open("rb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        refused = house.http.post("/reconstruct", json={"clip": upload_id})
+        assert_problem(refused, 423, "upload")
+        assert refused.headers["retry-after"]
+    assert house.queue.records() == []
+    assert house.http.post("/reconstruct", json={"clip": upload_id}).status_code == 202
+
+
 def test_submissions_that_name_no_finished_upload_of_that_part_are_refused(house: House) -> None:
     unfinished = create(house).headers["location"].rpartition("/")[2]
     assert_problem(house.http.post("/reconstruct", json={"clip": unfinished}), 409, "clip")
