@@ -58,7 +58,8 @@ class ZmqRenderer:
         workers = await self._workers_for(request)
         if not workers:
             problem = f"No worker runs job {request.scene_id} yet."
-            return Answer(WorkerReply(error=ReplyError(kind="not-yet", problem=problem, field="scene")), b"")
+            not_yet = ReplyError(kind="not-yet", problem=problem, field="scene", remedy="Ask again in a second.")
+            return Answer(WorkerReply(error=not_yet), b"")
         until_s = time.monotonic() + self._timeout_s
         first, *others = workers
         if others:

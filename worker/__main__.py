@@ -29,7 +29,13 @@ from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
 from contract.settings import Settings
 from contract.store import MANIFEST, REPORT
 
-SUFFIX_FORMATS = {".png": ImageFormat.PNG, ".jpg": ImageFormat.JPEG, ".jpeg": ImageFormat.JPEG, ".npy": ImageFormat.NPY}
+SUFFIX_FORMATS = {
+    ".png": ImageFormat.PNG,
+    ".jpg": ImageFormat.JPEG,
+    ".jpeg": ImageFormat.JPEG,
+    ".webp": ImageFormat.WEBP,
+    ".npy": ImageFormat.NPY,
+}
 MAX_RENDER_PIXELS = 8192 * 8192
 
 

@@ -28,6 +28,9 @@ COPIES = 3
 """A loaded scene is in memory three times: its tensors, the arrays of its renderer, and about as much of buffers
 (measured: 100 MB more for each scene of 32 MB, of 36,000 Gaussians with 17 bases, shown at 640 x 512)."""
 
+HELD_AT_MOST = 64
+"""Scenes, however small: the worker names all of them whenever it announces itself."""
+
 
 class Views:
     """Answers render and export requests from the scenes of a store and the snapshots of a job; for one thread.
@@ -74,7 +77,7 @@ class Views:
         if key not in self._scenes:
             self._scenes[key] = load_scene(folder)
         self._scenes.move_to_end(key)
-        while len(self._scenes) > 1 and self._byte_count() > self._hot_bytes:
+        while len(self._scenes) > HELD_AT_MOST or (len(self._scenes) > 1 and self._byte_count() > self._hot_bytes):
             self._scenes.popitem(last=False)
         self.held = tuple(name for name, _ in self._scenes)
         return self._scenes[key]
