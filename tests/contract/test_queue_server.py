@@ -6,6 +6,7 @@ import logging
 import shutil
 import subprocess
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -324,4 +325,19 @@ def test_the_queue_is_reached_over_tls_by_who_trusts_its_certificate(certificate
     with pytest.raises(UnavailableError):
         doubting.ping()
     doubting.close()
+    server.stop()
+
+
+def test_all_keys_lie_in_one_slot_of_a_cluster(binary: Path, tmp_path: Path) -> None:
+    server = RunningServer(binary, tmp_path, cluster_enabled="yes", port=str(free_port()), bind="127.0.0.1")
+    client = server.client()
+    client.execute_command("CLUSTER", "ADDSLOTSRANGE", "0", "16383")
+    deadline = time.monotonic() + 20.0
+    while "cluster_state:ok" not in str(client.execute_command("CLUSTER", "INFO")):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    queue = RedisQueue(server.url, preempt_after_s=0.0)
+    full_course(queue)
+    assert len({client.execute_command("CLUSTER", "KEYSLOT", PREFIX + key) for key in keys_of(client)}) == 1
+    queue.close()
     server.stop()
