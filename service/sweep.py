@@ -84,14 +84,16 @@ class Sweep:
 
     def _try_to_settle(self) -> None:
         self._unsettled = False  # before the work, so that what comes to be owed meanwhile is not forgotten
+        is_settled = False
         try:
             self.settle()
+            is_settled = True
         except UnavailableError as error:
             logger.warning("accepted clips wait for the queue: %s", error.problem)
-            self._unsettled = True
         except OSError as error:
             logger.error("the spool cannot be read", extra={"error": type(error).__name__})
-            self._unsettled = True
+        finally:
+            self._unsettled = self._unsettled or not is_settled
 
     def _recover(self, job_id: str) -> None:
         """Make the queue know a job again: as done if its scene is there, else to be run."""
