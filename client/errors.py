@@ -9,8 +9,9 @@ IntrasplatError (contract/errors.py)
 │   │   └── Conflict            409: not in this state, such as a render of a job that waits
 │   └── JobRejected             the job failed because of what was sent
 ├── UnavailableError
-│   └── ServiceUnavailable      503, or nobody answers; tried again as often as the client's patience allowed
-│       └── RateLimited         429: too much from this caller at once
+│   └── ServiceUnavailable      503; tried again as often as the client's patience allowed, as are the next two
+│       ├── RateLimited         429: too much from this caller at once
+│       └── Unreachable         nobody answers (that is said at once), or the connection was lost
 ├── JobFailed                   the job failed for another reason
 ├── Cancelled
 │   └── JobCancelled            somebody cancelled the job

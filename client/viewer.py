@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 CONNECT_TIMEOUT_S = 5.0
 ANSWER_TIMEOUT_S = 60.0
 LONGEST_MESSAGE_BYTES = 2**28
-"""A view as npy has 12 bytes a pixel at most; the library's own limit, 1 MiB, is for chat."""
+"""64 million pixels of depth in mm, more than any service renders; the library's own limit, 1 MiB, is for chat."""
 
 CONNECTION_ERRORS = (OSError, InvalidHandshake, InvalidURI, ConnectionClosed)
 """OSError includes TimeoutError."""

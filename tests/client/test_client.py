@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from pathlib import Path
 
 import httpx
@@ -324,6 +325,43 @@ def test_a_clip_that_is_safe_though_the_queue_is_away_is_not_sent_again(clip: Pa
     with Client(transport=httpx.MockTransport(busy)) as client:
         assert client.reconstruct(clip).id == JOB_ID
     assert [request.method for request in busy.requests] == ["POST", "GET", "GET"]
+
+
+class Restarting:
+    """A service that takes one piece of an upload, and is gone for the next `away` requests."""
+
+    def __init__(self, away: int) -> None:
+        self.away = away
+        self.came = b""
+        self.cut = False
+
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        body = request.read()
+        if self.cut and self.away > 0:
+            self.away -= 1
+            raise httpx.ConnectError("refused", request=request)
+        if request.url.path == "/uploads":
+            return httpx.Response(201, headers={"location": "/uploads/u1"})
+        if request.method == "PATCH" and not self.cut:
+            self.came, self.cut = body[:1000], True
+            raise httpx.WriteError("lost", request=request)
+        if request.method == "PATCH":
+            assert int(request.headers["upload-offset"]) == len(self.came)
+            self.came += body
+        if request.url.path == "/reconstruct":
+            assert json.loads(body) == {"clip": "u1", "options": {"seed": 3}}
+            return httpx.Response(202, json=JOB)
+        return httpx.Response(200, headers={"upload-offset": str(len(self.came))})
+
+
+def test_an_upload_outlives_a_restart_of_the_service_but_not_its_end(clip: Path) -> None:
+    service = Restarting(away=2)
+    with Client(transport=httpx.MockTransport(service)) as client:
+        assert client.reconstruct(clip, in_pieces=True, seed=3).id == JOB_ID
+    assert service.came == clip.read_bytes()
+    service = Restarting(away=1000)
+    with Client(transport=httpx.MockTransport(service), patience_s=0.5) as client, pytest.raises(UnavailableError):
+        client.reconstruct(clip, in_pieces=True)
 
 
 def test_both_clients_can_do_the_same() -> None:
