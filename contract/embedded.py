@@ -10,6 +10,7 @@ import hashlib
 import importlib
 import os
 import shutil
+import socket
 import subprocess
 import tempfile
 import time
@@ -106,7 +107,7 @@ class EmbeddedServer:
             UnavailableError: no server program, or it does not come up.
         """
         owner = self._lock.take()
-        self._adopted = owner and self._answers()
+        self._adopted = owner and self._listens()
         if owner and not self._adopted:
             binary = find_server()
             with (self._folder / "server.log").open("ab") as log:
@@ -126,7 +127,11 @@ class EmbeddedServer:
 
     def ensure_running(self) -> bool:
         """Start the server again if it has died; True if that was needed."""
-        if self._process is None or self._process.poll() is None:
+        if self._process is not None:
+            running = self._process.poll() is None
+        else:
+            running = not self._adopted or self._listens()
+        if running:
             return False
         self.start()
         return True
@@ -140,6 +145,11 @@ class EmbeddedServer:
             redis.Redis.from_url(self.url, socket_timeout=STOP_TIMEOUT_S).shutdown()
             self._adopted = False
         self._lock.release()
+
+    def _listens(self) -> bool:
+        """Whether a server is there, even if it still replays its log: a second one would write to the same log."""
+        with socket.socket(socket.AF_UNIX) as caller:
+            return caller.connect_ex(str(self._socket)) == 0
 
     def _answers(self) -> bool:
         if not self._socket.exists():

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import stat
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -54,6 +56,45 @@ def test_a_server_whose_starter_died_is_adopted_and_ended(tmp_path: Path) -> Non
     heir.stop()
     with pytest.raises(redis.ConnectionError):
         redis.Redis.from_url(heir.url).ping()
+
+
+def test_an_adopted_server_that_dies_is_started_again_with_all_it_had(tmp_path: Path) -> None:
+    child = os.fork()
+    if child == 0:
+        starter = EmbeddedServer(tmp_path)
+        starter.start()
+        redis.Redis.from_url(starter.url).set("key", "kept")
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    heir = EmbeddedServer(tmp_path)
+    heir.start()
+    assert heir.process_id is None
+    assert not heir.ensure_running()
+    client = redis.Redis.from_url(heir.url)
+    os.kill(client.info("server")["process_id"], signal.SIGKILL)
+    deadline = time.monotonic() + 10.0
+    while not heir.ensure_running():  # until the kill has arrived
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert client.get("key") == b"kept"
+    assert heir.process_id is not None
+    heir.stop()
+
+
+def test_a_server_that_is_still_busy_is_adopted_and_not_started_twice(tmp_path: Path) -> None:
+    child = os.fork()
+    if child == 0:
+        EmbeddedServer(tmp_path).start()
+        os._exit(0)
+    os.waitpid(child, 0)
+    heir = EmbeddedServer(tmp_path)
+    process_id = redis.Redis.from_url(heir.url).info("server")["process_id"]
+    os.kill(process_id, signal.SIGSTOP)
+    threading.Timer(0.3, os.kill, (process_id, signal.SIGCONT)).start()
+    heir.start()
+    assert heir.process_id is None
+    assert redis.Redis.from_url(heir.url).info("server")["process_id"] == process_id
+    heir.stop()
 
 
 def test_only_this_user_may_reach_the_socket(tmp_path: Path) -> None:
