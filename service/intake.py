@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +17,9 @@ from service.partial import promised_bytes
 from service.problems import Problem, no_room
 
 LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
+
+LEAST_BYTES = 4096
+"""What a body must bring in upload_silence_s, or end: whoever drips holds a place that another could use."""
 
 
 @dataclass(eq=False)
@@ -71,22 +75,31 @@ class Intake:
         """The pieces of a request's body as they come.
 
         Raises:
-            Problem: 408, nothing came for upload_silence_s.
+            Problem: 408, hardly anything came for upload_silence_s.
             ClientDisconnect: the caller has gone.
         """
-        pieces = request.stream()
+        pieces, silence_s = request.stream(), self._settings.upload_silence_s
         while True:
-            try:
-                async with asyncio.timeout(self._settings.upload_silence_s):
-                    piece = await anext(pieces, None)
-            except TimeoutError:
-                detail = f"Nothing came for {self._settings.upload_silence_s:g} s."
-                raise Problem(408, detail, remedy="Send it again.", headers={"Connection": "close"}) from None
-            if piece is None:
-                return
-            if place is not None:
-                place.kept_bytes = max(place.kept_bytes - len(piece), 0)
-            yield piece
+            new_bytes, left_s = 0, silence_s
+            while new_bytes < LEAST_BYTES:
+                asked_at_s = time.monotonic()
+                try:
+                    async with asyncio.timeout(left_s):
+                        piece = await anext(pieces, None)
+                except TimeoutError:
+                    raise _silence(silence_s) from None
+                if piece is None:
+                    return
+                left_s -= time.monotonic() - asked_at_s  # the time that writing takes is not the caller's
+                new_bytes += len(piece)
+                if place is not None:
+                    place.kept_bytes = max(place.kept_bytes - len(piece), 0)
+                yield piece
+
+
+def _silence(silence_s: float) -> Problem:
+    detail = f"Fewer than {LEAST_BYTES} bytes came in {silence_s:g} s."
+    return Problem(408, detail, remedy="Send it again.", headers={"Connection": "close"})
 
 
 def declared_length(request: Request) -> int:

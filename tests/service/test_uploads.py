@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import os
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import pytest
@@ -186,13 +186,24 @@ def test_only_so_many_uploads_are_received_at_once(tmp_path: Path) -> None:
         assert house.spooled() == []
 
 
-def test_a_body_that_brings_nothing_is_given_up(tmp_path: Path) -> None:
-    async def stalled() -> AsyncIterator[bytes]:
-        yield b"--x\r\n"
-        await asyncio.sleep(PATIENCE_S)
+async def stalled() -> AsyncIterator[bytes]:
+    yield b"--x\r\n"
+    await asyncio.sleep(PATIENCE_S)
 
+
+async def dripping() -> AsyncIterator[bytes]:
+    yield b'--x\r\nContent-Disposition: form-data; name="clip"; filename="a.mp4"\r\n\r\n'
+    for _ in range(1000):
+        yield b"-"
+        await asyncio.sleep(0.01)
+
+
+@pytest.mark.parametrize("body", [stalled, dripping])
+def test_a_body_that_brings_hardly_anything_is_given_up(
+    tmp_path: Path, body: Callable[[], AsyncIterator[bytes]]
+) -> None:
     headers = {"content-type": "multipart/form-data; boundary=x"}
-    for house in make_house(tmp_path, upload_silence_s=0.05):
-        assert_problem(house.http.post("/reconstruct", content=stalled(), headers=headers), 408)
+    for house in make_house(tmp_path, upload_silence_s=0.1):
+        assert_problem(house.http.post("/reconstruct", content=body(), headers=headers), 408)
         assert house.spooled() == []
         assert house.upload().status_code == 202
