@@ -92,6 +92,20 @@ def test_a_clip_with_depth_comes_out_of_the_process_bit_for_bit(studio: Studio, 
     assert list(scratch.iterdir()) == []
 
 
+def test_a_folder_may_link_to_where_its_frames_lie(studio: Studio) -> None:
+    folder = studio.endonerf()
+    (folder / "images").rename(studio.root / "elsewhere")
+    (folder / "images").symlink_to(studio.root / "elsewhere")
+    mask = next((folder / "masks").iterdir())
+    mask.rename(studio.root / "mask.png")
+    mask.symlink_to("../../mask.png")
+    decoded = decode_clip(folder)
+    assert isinstance(decoded, DepthClip)
+    expected = open_clip(folder)
+    assert isinstance(expected, DepthClip)
+    assert_same(decoded.rgb, expected.rgb)
+
+
 def test_a_calibration_inside_the_clips_zip_is_found(studio: Studio) -> None:
     left, right = studio.eyes()
     studio.images("clip/left/{}.png", left)
@@ -139,7 +153,7 @@ def test_a_stopped_job_ends_the_process_and_leaves_nothing(studio: Studio, scrat
 def test_the_report_says_what_protected_the_worker(studio: Studio) -> None:
     decoded = decode_clip(studio.endonerf(), limits=ClipLimits(decoded_bytes=1 << 30))
     assert isinstance(decoded, DepthClip)
-    assert decoded.assumptions[-1].startswith("decoding: in a process of its own (memory 3.0 GiB")
+    assert decoded.assumptions[-1].startswith("decoding: in a process of its own (limited memory of 3.0 GiB")
     for word in PROTECTIONS:
         assert word in decoded.assumptions[-1]  # as held, or as what the kernel did not grant
 

@@ -5,6 +5,7 @@ Symbols: T frames, H W pixels of one eye.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +21,10 @@ from contract.errors import InputError
 from contract.job import Layout, MaskPolarity, PoseConvention
 from worker.calibration import check_calibration
 from worker.clip import ClipLimits, DepthClip, StereoClip
+from worker.clip.files import DEEPEST_FOLDER
 from worker.clip.types import RgbFrame
 from worker.decode.contained import REMEDY, private_folder, run_contained
-from worker.decode.guard import PROTECTIONS, Allowance
+from worker.decode.guard import LIMITED_MEMORY, PROTECTIONS, Allowance
 from worker.decode.handover import DEPTH, map_array
 from worker.hooks import Hooks, Progress
 
@@ -82,7 +84,7 @@ def decode_clip(
     request = {
         "clip": given | chosen,
         "calibration": own,
-        "readable": [path for path in (*given.values(), own) if path is not None],
+        "readable": [each for path in (*given.values(), own) if path is not None for each in _reached(path)],
         "limits": limits.numbers(),
     }
     allowance = Allowance(LIBRARIES_BYTES + limits.decoded_bytes, limits.decoded_bytes, CPU_S)
@@ -99,6 +101,17 @@ def decode_clip(
         except (ValueError, KeyError, TypeError, OSError, ValidationError) as error:
             problem = f"it cannot be decoded: the decoder's answer does not fit ({type(error).__name__})."
             raise InputError("clip", problem, REMEDY) from error
+
+
+def _reached(path: str) -> list[str]:
+    """A file or folder, and what links in the folder lead to; only who has this machine can give one with links."""
+    found = [path]
+    for folder, subfolders, files in os.walk(path, followlinks=True):
+        if len(Path(folder).relative_to(path).parts) >= DEEPEST_FOLDER:
+            subfolders.clear()
+        entries = (os.path.join(folder, name) for name in (*subfolders, *files))
+        found += [os.path.realpath(entry) for entry in entries if os.path.islink(entry)]
+    return found
 
 
 def _received(told: dict[str, Any], folder: Path, allowance: Allowance) -> StereoRecording | DepthClip:
@@ -131,10 +144,11 @@ def _received(told: dict[str, Any], folder: Path, allowance: Allowance) -> Stere
 
 def _protection(granted: list[str], allowance: Allowance) -> str:
     """What held while the clip was decoded, and what the kernel did not grant."""
-    held = [f"memory {allowance.memory_bytes / 2**30:.1f} GiB", *(each for each in PROTECTIONS if each in granted)]
+    amounts = {LIMITED_MEMORY: f" of {allowance.memory_bytes / 2**30:.1f} GiB"}
+    held = [each + amounts.get(each, "") for each in PROTECTIONS if each in granted]
     lacking = [each for each in PROTECTIONS if each not in granted]
     denied = f"; the kernel did not grant: {', '.join(lacking)}" if lacking else ""
-    return f"decoding: in a process of its own ({', '.join(held)}{denied})"
+    return f"decoding: in a process of its own ({', '.join(held) or 'not confined'}{denied})"
 
 
 def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """How the decoding process locks itself in, before it opens anything that came from outside.
 
-Its limits always hold. What the kernel need not grant is named when it did: without it decoding goes on, and the report
-says so. Everything here is for good: nothing in this process can take it back.
+Its limits hold on every system. What a kernel need not grant is named when it did: without it decoding goes on, and the
+report says so. Everything here is for good: nothing in this process can take it back.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ _PR_SET_NO_NEW_PRIVS = 38
 _CLONE_NEWUSER = 0x10000000
 _CLONE_NEWNET = 0x40000000
 
+LIMITED_MEMORY = "limited memory"
 NO_NETWORK = "no network"
 NO_PROGRAMS = "no other program"
 OWN_FILES = "no files but its own"
-PROTECTIONS = (NO_NETWORK, NO_PROGRAMS, OWN_FILES)
+PROTECTIONS = (LIMITED_MEMORY, NO_NETWORK, NO_PROGRAMS, OWN_FILES)
 
 
 @dataclass(frozen=True)
@@ -50,11 +51,10 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
     die_with_parent()
     _gain_no_privileges()
     _limit(resource.RLIMIT_CORE, 0)  # a dump would hold the clip
-    _limit(resource.RLIMIT_AS, allowance.memory_bytes)
     _limit(resource.RLIMIT_FSIZE, allowance.file_bytes)
     _limit(resource.RLIMIT_CPU, allowance.cpu_s, allowance.cpu_s + 1)  # SIGXCPU tells why; SIGKILL follows
     _limit(resource.RLIMIT_NOFILE, MOST_OPEN_FILES)
-    granted = []
+    granted = [LIMITED_MEMORY] if _limit_memory(allowance.memory_bytes) else []
     apart = _leave_network()
     confined = confine_files(_libraries() + list(readable), writable)
     filtered = forbid_network_and_programs()
@@ -73,6 +73,15 @@ def _limit(kind: int, soft: int, hard: int | None = None) -> None:
     hard = soft if hard is None else hard
     hard = hard if most == resource.RLIM_INFINITY else min(hard, most)
     resource.setrlimit(kind, (min(soft, hard), hard))
+
+
+def _limit_memory(most_bytes: int) -> bool:
+    """Whether memory is limited; macOS knows the limit and may refuse to set it."""
+    try:
+        _limit(resource.RLIMIT_AS, most_bytes)
+    except (ValueError, OSError):
+        return False
+    return True
 
 
 def _gain_no_privileges() -> None:
