@@ -70,7 +70,7 @@ def test_the_view_of_a_finished_job_links_to_its_scene_and_shows_no_worker() -> 
     record = JobRecord(job_id=new_job_id(), files=JobFiles(clip="clip.mp4"), created_at_s=1.0, owner="worker-7")
     queued = JobView.of(record)
     done = JobView.of(record.model_copy(update={"state": JobState.DONE, "progress": PROGRESS}))
-    assert list(queued.links) == ["self"]
+    assert list(queued.links) == ["self", "events"]
     assert done.links["scene"] == f"/scenes/{record.job_id}"
     assert (done.stage, done.psnr_db) == ("train", 31.237)
     assert "worker-7" not in done.model_dump_json()
