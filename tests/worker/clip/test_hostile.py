@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from contract.clip_limits import ClipLimits
 from contract.errors import InputError
 from contract.sniff import check_file
-from tests.worker.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile
+from tests.worker.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile, endonerf, npy
 from worker.decode import StereoRecording, decode_clip
 
 
@@ -65,3 +66,24 @@ def test_a_file_that_bears_the_ending_of_another_kind_is_refused_when_it_arrives
 )
 def test_videos_of_every_container_pass(path: Path) -> None:
     check_file(path, "clip", ClipLimits())
+
+
+@pytest.mark.parametrize("name", ["stereo_sbs_h264.mp4", "stereo_tb_hevc.mov", "stereo_sbs_varying.mkv", "clip.zip"])
+def test_whatever_happens_to_its_bytes_a_file_passes_or_is_refused(
+    tmp_path: Path, rng: np.random.Generator, name: str
+) -> None:
+    good = endonerf(npy(np.zeros((1, 17)))) if name == "clip.zip" else (VIDEO.parent / name).read_bytes()
+    path = tmp_path / name
+    refused = 0
+    for _ in range(150):
+        data = bytearray(good[: rng.integers(1, len(good))] if rng.random() < 0.2 else good)
+        near_an_end = rng.random() < 0.7  # where headers and directories stand
+        for _ in range(rng.integers(1, 8)):
+            at = int(rng.integers(0, min(len(data), 2000) if near_an_end else len(data)))
+            data[at if rng.random() < 0.5 else len(data) - 1 - at] = int(rng.integers(0, 256))
+        path.write_bytes(data)
+        try:
+            check_file(path, "clip", ClipLimits())
+        except InputError:
+            refused += 1
+    assert 0 < refused <= 150

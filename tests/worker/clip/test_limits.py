@@ -9,8 +9,9 @@ import pytest
 
 from contract.clip_limits import HELD_BYTES_PER_PIXEL, MOST_MEMORY_BYTES, memory_for_clip_bytes
 from contract.errors import LimitError
+from contract.settings import Settings
 from tests.worker.clips import HEIGHT, WIDTH, plane_clip
-from worker.clip import ClipLimits
+from worker.clip import ClipLimits, open_clip
 from worker.targets import TrainingFrames
 
 GIB = 1024**3
@@ -52,3 +53,21 @@ def test_a_clip_that_does_not_fit_is_told_how_many_of_its_frames_do() -> None:
     with pytest.raises(LimitError, match="holds 0") as caught:
         ClipLimits(decoded_bytes=1000).check_clip("clip", "it", 1, 1280, 1024)
     assert caught.value.remedy == "Scale it down."
+
+
+def test_the_limits_are_the_deployments() -> None:
+    limits = ClipLimits.of(Settings(max_frames=7, max_clip_s=2.5, max_frame_pixels=1000))
+    with pytest.raises(LimitError, match="the limit is 7"):
+        limits.check_clip("clip", "it", 8, 20, 20)
+    with pytest.raises(LimitError, match=r"lasts 2\.6 s; the limit is 2\.5 s"):
+        limits.check_duration("clip", "it", 2.6)
+    limits.check_frame("clip", "it", 80, 25)  # two eyes side by side
+    limits.check_clip("clip", "it", 1, 40, 25, eyes=1)
+    with pytest.raises(LimitError, match="an eye of it has 80x25 pixels; the limit is 1000"):
+        limits.check_clip("clip", "it", 1, 80, 25, eyes=1)
+
+
+def test_a_video_that_lasts_too_long_is_refused(studio) -> None:
+    clip = studio.video("clip.webm", np.concatenate(studio.eyes(6), axis=2), rate_hz=2.0)
+    with pytest.raises(LimitError, match="the limit is 2 s"):
+        open_clip(clip, limits=ClipLimits(duration_s=2.0))
