@@ -329,7 +329,8 @@ def test_the_queue_is_reached_over_tls_by_who_trusts_its_certificate(certificate
 
 
 def test_all_keys_lie_in_one_slot_of_a_cluster(binary: Path, tmp_path: Path) -> None:
-    server = RunningServer(binary, tmp_path, cluster_enabled="yes", port=str(free_port()), bind="127.0.0.1")
+    ports = {"port": str(free_port()), "cluster_port": str(free_port())}
+    server = RunningServer(binary, tmp_path, cluster_enabled="yes", bind="127.0.0.1", **ports)
     client = server.client()
     client.execute_command("CLUSTER", "ADDSLOTSRANGE", "0", "16383")
     deadline = time.monotonic() + 20.0
