@@ -6,13 +6,12 @@ Everything here reads a few bytes by rules of its own. What passes is still read
 from __future__ import annotations
 
 import zipfile
-import zlib
 from pathlib import Path, PurePosixPath
 
 from contract.clip_limits import MOST_CALIBRATION_BYTES, ClipLimits
 from contract.errors import InputError, LimitError
 from contract.video_header import EBML, check_video, is_video
-from contract.zips import open_zip
+from contract.zips import UNREADABLE, open_zip
 
 ZIP_SUFFIX = ".zip"
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -103,7 +102,7 @@ def _head(archive: zipfile.ZipFile, member: zipfile.ZipInfo, part: str, size: in
     try:
         with archive.open(member) as stream:
             return stream.read(size)
-    except (OSError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+    except UNREADABLE as error:
         raise InputError(part, f"{member.filename} cannot be read ({error}).", "Zip the files again.") from error
 
 

@@ -10,6 +10,7 @@ import re
 import stat
 import struct
 import zipfile
+import zlib
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
@@ -21,6 +22,9 @@ MOST_MEMBERS = 20_000  # images, depth, masks and right frames of 1000 frames ar
 MOST_DIRECTORY_BYTES = 16 << 20  # ample for as many: a record of 46 bytes and a path each
 MOST_RATIO = 200  # inflated to compressed; pictures hardly shrink, text some ten times, zeros a thousand times
 SMALL_BYTES = 1 << 20  # a member that inflates to no more than this may shrink as it likes
+
+UNREADABLE = (OSError, EOFError, NotImplementedError, RuntimeError, ValueError, zipfile.BadZipFile, zlib.error)
+"""What zipfile raises while a damaged member is read; a name that is no UTF-8 is a ValueError."""
 
 _END = struct.Struct("<4s4H2LH")  # end of central directory (APPNOTE 4.3.16)
 _END_64 = struct.Struct("<4sQ2H2L4Q")  # (4.3.14)

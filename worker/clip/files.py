@@ -9,7 +9,6 @@ import os
 import re
 import tempfile
 import zipfile
-import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from typing import IO, TypeVar
 
 from contract.clip_limits import ClipLimits
 from contract.errors import InputError, LimitError
-from contract.zips import check_member_count, open_zip
+from contract.zips import UNREADABLE, check_member_count, open_zip
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm"})
@@ -86,7 +85,7 @@ class FileTree(ABC):
                             self.field, problem, "Write the file again, without what does not belong in it."
                         )
                     yield chunk
-        except (OSError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        except UNREADABLE as error:
             raise InputError(
                 self.field, f"{name} in {self.label} cannot be read ({error}).", "Write the file again."
             ) from error

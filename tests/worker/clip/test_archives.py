@@ -189,3 +189,16 @@ def test_what_file_managers_add_is_ignored(studio) -> None:
         (folder / litter).write_bytes(b"litter")
     clip = open_clip(studio.zip(folder))
     np.testing.assert_array_equal(clip.rgb, studio.eyes(3, 64, 80)[0])
+
+
+def test_a_name_that_is_no_text_is_refused(studio) -> None:
+    left, right = studio.eyes(1)
+    studio.images("clip/left/{}.png", left)
+    studio.images("clip/right/{}.png", right)
+    path = studio.zip(studio.root / "clip")
+    data = bytearray(path.read_bytes())
+    data[7] |= 1 << 3  # bit 11 of the local header's flags says that the name is UTF-8
+    data[30] = 0xFF
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"left/000000.png"):
+        open_clip(path)
