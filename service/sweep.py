@@ -1,7 +1,8 @@
 """What a death or an unreachable queue has left between the spool and the queue is put right here.
 
 A clip in the spool was accepted, or was about to be: its job must stand in the queue. The sweep goes through the
-spool at the start of the service, and again for as long as a submission's answer is owing. It may run in several
+spool at the start of the service, again for as long as a submission's answer is owing, and whenever a job was
+cancelled: where its worker had died, the queue ended it, and nobody has removed its files. It may run in several
 services at once, for all it does may be repeated.
 """
 
@@ -37,6 +38,7 @@ class Sweep:
         self._in_hand: set[str] = set()
         self._lock = threading.Lock()
         self._unsettled = True
+        self._cancelled = 0
 
     @contextmanager
     def in_hand(self, job_id: str) -> Iterator[None]:
@@ -59,7 +61,7 @@ class Sweep:
         """Settle what there is whenever something may be unsettled, until cancelled."""
         abandoned_at_s = time.monotonic()
         while True:
-            if self._unsettled:
+            if self._unsettled or await run_in_threadpool(self._more_were_cancelled):
                 await run_in_threadpool(self._try_to_settle)
             if time.monotonic() >= abandoned_at_s:
                 await run_in_threadpool(self._store.tidy)
@@ -79,8 +81,17 @@ class Sweep:
             record = self._queue.get(job_id)
             if record is None:
                 self._recover(job_id)
-            elif record.state is JobState.CANCELLED:  # its canceller died before it removed the clip
+            elif record.state is JobState.CANCELLED:  # its canceller or its worker died before it removed the clip
                 self._store.purge(job_id)
+
+    def _more_were_cancelled(self) -> bool:
+        """Whether jobs came to be cancelled since this was asked before."""
+        try:
+            cancelled = self._queue.figures().ended.get(JobState.CANCELLED, 0)
+        except UnavailableError:
+            return False
+        before, self._cancelled = self._cancelled, cancelled
+        return cancelled != before
 
     def _try_to_settle(self) -> None:
         self._unsettled = False  # before the work, so that what comes to be owed meanwhile is not forgotten

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from contract.errors import UnavailableError
-from contract.job import TERMINAL_STATES
+from contract.job import TERMINAL_STATES, JobRecord, JobState
 from tests.chaos.history import ClipHistory, violations
 from tests.chaos.house import House, Target
 from tests.chaos.points import Point
@@ -26,6 +26,10 @@ PADDING_BYTES = 200_000
 ACCEPTED_WITHIN_S = 60.0
 ENDED_WITHIN_S = 90.0
 POINT_WITHIN_S = 40.0
+SECOND_ENDING_S = 0.3
+"""A job that has ended is looked at once more after this."""
+TIDIED_WITHIN_S = 5.0
+"""What is left of a job that was cancelled, and whose worker died, is removed by the service's sweep."""
 RETRY_PAUSE_S = 0.2
 
 NO_MATTER = frozenset(
@@ -134,13 +138,14 @@ def watch(house: House, history: ClipHistory) -> None:
     if history.job_id is None:
         return
     deadline_s = time.monotonic() + ENDED_WITHIN_S
+    record: JobRecord | None = None
     while time.monotonic() < deadline_s:
         with suppress(UnavailableError):
             record = house.queue.get(history.job_id)
             if record is not None and record.state in TERMINAL_STATES:
                 break
         time.sleep(0.05)
-    time.sleep(0.3)
+    time.sleep(SECOND_ENDING_S if record is not None and record.state is JobState.DONE else TIDIED_WITHIN_S)
     history.events = house.queue.events(history.job_id)
 
 

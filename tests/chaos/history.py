@@ -67,6 +67,8 @@ def violations(history: ClipHistory, store: Store) -> list[str]:
     expected = [history.events[-1].record.attempt] if history.final is JobState.DONE else []
     if published != expected:
         broken.append(f"attempts {published} are published, and {expected} should be")
+    if history.final is JobState.CANCELLED and store.spool_folder(history.job_id).exists():
+        broken.append("it was cancelled, and its clip is still there")
     if history.final is JobState.FAILED:
         broken.append("it failed")
     if history.rerun_s is not None and history.rerun_s > RERUN_WITHIN_S + history.restart_s:

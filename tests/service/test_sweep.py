@@ -155,3 +155,26 @@ def test_a_job_whose_clip_was_withdrawn_meanwhile_is_taken_back(house: House) ->
     queue = WithdrawingQueue(house.store)
     Sweep(queue, house.store).settle()
     assert queue.records() == []
+
+
+def test_the_files_of_a_cancelled_job_go_even_if_its_worker_died(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.sweep.SWEEP_PERIOD_S", 0.05)
+    queue = MemoryQueue(lease_s=0.0)
+    for house in make_house(tmp_path, queue):
+        job_id = house.upload().json()["id"]
+        record = queue.claim("worker-1.dead", 0.0)
+        assert record is not None
+        (house.store.work_folder(job_id, record.attempt) / MANIFEST).write_text("{}")
+        house.store.publish_scene(job_id, record.attempt)
+        queue.cancel(job_id)
+        assert queue.claim("worker-2", 0.0) is None  # which finds the lease run out
+        ended = queue.get(job_id)
+        assert ended is not None
+        assert ended.state is JobState.CANCELLED
+        deadline = time.monotonic() + PATIENCE_S
+        while house.store.submission(job_id) is not None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert house.store.submission(job_id) is None
+        assert house.store.scene_attempts(job_id) == []
