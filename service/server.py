@@ -9,7 +9,9 @@ from types import FrameType
 import h11
 import uvicorn
 from fastapi import FastAPI
+from uvicorn._types import ASGISendEvent
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from contract.settings import Settings
 from service.deps import Deps
@@ -57,6 +59,15 @@ class HttpConnection(H11Protocol):
             self.transport.close()
 
 
+class WebSocketConnection(WebSocketsSansIOProtocol):
+    """Takes a handshake that was refused with a whole answer for answered; uvicorn logs it as a fault otherwise."""
+
+    async def send(self, message: ASGISendEvent) -> None:
+        await super().send(message)
+        if message["type"] == "websocket.http.response.body" and not message.get("more_body", False):
+            self.handshake_complete = True
+
+
 class Server(uvicorn.Server):
     """Ends the streams of events as soon as a signal asks it to end, for they would end last by themselves."""
 
@@ -66,7 +77,7 @@ class Server(uvicorn.Server):
             host=settings.host,
             port=settings.port,
             http=HttpConnection,
-            ws="websockets-sansio",
+            ws=WebSocketConnection,
             log_config=None,
             access_log=False,
             server_header=False,

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from websockets import Origin
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -61,16 +62,31 @@ def test_what_is_no_http_is_answered_with_a_problem(live: LiveService, request_b
     assert json.loads(body)["status"] == 400
 
 
-def test_a_websocket_that_is_turned_away_is_told_why(live: LiveService) -> None:
-    for path, origin, status in (("/nothing", None, 404), ("/stream", "https://evil.example", 403)):
-        with pytest.raises(InvalidStatus) as caught, connect(f"ws://127.0.0.1:{live.port}{path}", origin=origin):  # type: ignore[arg-type]
-            pass
-        answer = caught.value.response
-        assert answer.status_code == status
-        assert answer.headers["content-type"] == "application/problem+json"
-        assert answer.headers["x-request-id"]
-        assert answer.body is not None
-        assert json.loads(answer.body)["status"] == status
+@pytest.mark.parametrize(
+    ("address", "origin", "status"),
+    [
+        ("127.0.0.1/nothing", None, 404),
+        ("127.0.0.1/stream", Origin("https://evil.example"), 403),
+        ("rebound.example/stream", None, 403),
+    ],
+)
+def test_a_websocket_that_is_turned_away_is_told_why_and_is_no_fault(
+    live: LiveService, caplog: pytest.LogCaptureFixture, address: str, origin: Origin | None, status: int
+) -> None:
+    host, path = address.split("/")
+    with (
+        socket.create_connection(("127.0.0.1", live.port)) as connection,
+        pytest.raises(InvalidStatus) as caught,
+        connect(f"ws://{host}:{live.port}/{path}", sock=connection, origin=origin),
+    ):
+        pass
+    answer = caught.value.response
+    assert answer.status_code == status
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert answer.headers["x-request-id"]
+    assert answer.body is not None
+    assert json.loads(answer.body)["status"] == status
+    assert [line for line in caplog.records if line.levelname == "ERROR"] == []
 
 
 def test_an_upload_whose_caller_leaves_keeps_what_came(live: LiveService) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets import Origin
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -187,17 +185,6 @@ def test_what_is_no_request_at_all_ends_the_connection(service: LiveService, mes
             assert problem(viewer)["status"] in (413, 422)  # of what uvicorn itself refuses there is none
             viewer.recv(timeout=TIMEOUT_S)
     assert viewer.close_code == code
-
-
-def test_a_page_from_elsewhere_is_refused_before_the_handshake(service: LiveService) -> None:
-    for name, origin in (("127.0.0.1", Origin("https://elsewhere.example")), ("rebound.example", None)):
-        connection = socket.create_connection(("127.0.0.1", service.port))
-        with (
-            pytest.raises(InvalidStatus) as refused,
-            connect(f"ws://{name}:{service.port}/stream", sock=connection, origin=origin),
-        ):
-            pass
-        assert refused.value.response.status_code == 403
 
 
 @pytest.fixture
