@@ -35,10 +35,6 @@ PROGRAM = f"""
 import signal, sys, threading
 from contract.logs import configure
 from contract.settings import Settings
-from worker.checkpoint import load_resume, load_scene
-from worker.hooks import Hooks
-from worker.phantom import PhantomSettings, make_phantom, write_endonerf
-from worker.pipeline import ReconstructionRequest, reconstruct
 from worker.supervisor import run_supervisor
 end = threading.Event()
 signal.signal(signal.SIGTERM, lambda *_: end.set())
