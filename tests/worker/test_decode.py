@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import platform
 import subprocess
 import sys
 import tempfile
@@ -222,6 +224,13 @@ def test_a_crash_over_the_calibration_names_the_calibration(tmp_path: Path) -> N
         ("import os; os.fork()", "no other program"),
         ("import os; os.execv('/bin/true', ['true'])", "no other program"),
         ("import os; os.kill(os.getppid(), 0)", "no other program"),
+        ("import os, resource; resource.prlimit(os.getppid(), resource.RLIMIT_CPU)", "no other program"),
+        ("import os; os.setpriority(os.PRIO_PROCESS, os.getppid(), 19)", "no other program"),
+        ("import os; os.chmod('SECRET', 0o666)", "no other program"),
+        ("import os; os.chown('SECRET', -1, -1)", "no other program"),
+        ("import os; os.utime('SECRET', (0, 0))", "no other program"),
+        ("import os; os.setxattr('SECRET', 'user.a', b'')", "no other program"),
+        ("import os; os.chroot('.')", "no other program"),
         ("open('SECRET').read()", "no files but its own"),
         ("open('SECRET', 'a')", "no files but its own"),
         ("import os; os.truncate('SECRET', 0)", "no files but its own"),
@@ -238,6 +247,40 @@ def test_a_decoder_that_was_taken_over_reaches_nothing(tmp_path: Path, work: str
         pytest.skip(f"this kernel does not grant: {protection}")
     assert told["refused"] == "PermissionError"
     assert secret.read_text() == "another's clip"
+
+
+@linux
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the calls' numbers are those of x86-64")
+@pytest.mark.parametrize("call", ["234, parent, parent, 0", "129, parent, 0, None"])  # tgkill, rt_sigqueueinfo
+def test_no_way_of_sending_a_signal_reaches_another_process(tmp_path: Path, call: str) -> None:
+    work = (
+        "import ctypes, os\n"
+        "parent, libc = os.getppid(), ctypes.CDLL(None, use_errno=True)\n"
+        f"return {{'value': libc.syscall({call}), 'errno': ctypes.get_errno()}}"
+    )
+    told = run_stand_in(tmp_path, work)
+    if "no other program" not in told["granted"]:
+        pytest.skip("this kernel does not grant: no other program")
+    assert (told["value"], told["errno"]) == (-1, errno.EPERM)
+
+
+@linux
+def test_a_decoder_of_roots_is_not_root(tmp_path: Path) -> None:
+    work = (
+        "import ctypes, struct\n"
+        "held = ctypes.create_string_buffer(24)\n"
+        "ctypes.CDLL(None).capget(struct.pack('=Ii', 0x20080522, 0), held)\n"
+        "return {'capabilities': struct.unpack('=6I', held)}"
+    )
+    may_read_any = 1 << 2
+    assert set(run_stand_in(tmp_path, work)["capabilities"]) <= {0, may_read_any}
+
+
+def test_a_decoder_that_stays_after_its_answer_is_ended(tmp_path: Path) -> None:
+    work = "import os, time\nreports.end({'result': {'pid': os.getpid()}})\ntime.sleep(60)"
+    pid = run_stand_in(tmp_path, work, patience=Patience(parting_s=0.3))["pid"]
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
 
 
 def test_a_decoder_reads_what_it_is_given_and_writes_in_its_folder(tmp_path: Path) -> None:

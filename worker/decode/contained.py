@@ -26,6 +26,7 @@ SILENCE_S = 10.0  # without another picture; the largest frame there may be take
 LONGEST_S = 1800.0  # of everything: a clip of the most and the largest frames takes minutes
 MOST_ANSWER_BYTES = 4 << 20  # a line of the answer; it grows with warnings, not with frames
 POLL_S = 0.1  # how soon a stop is noticed
+PARTING_S = 5.0  # to end after the answer; what lives on could change the arrays that the worker maps
 
 PROGRAM = ("-m", "worker.decode.child")
 REMEDY = "Export it again as H.264 in mp4, or give its frames as PNG in a zip."
@@ -39,10 +40,11 @@ OnReport = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Patience:
-    """How long the process may take: seconds without another picture, and seconds of everything."""
+    """How long the process may take: seconds without another picture, of everything, and from its answer to its end."""
 
     silence_s: float = SILENCE_S
     longest_s: float = LONGEST_S
+    parting_s: float = PARTING_S
 
 
 @contextmanager
@@ -92,12 +94,19 @@ def run_contained(
     except BrokenPipeError:
         answer = None
     finally:
-        if process.poll() is None and not watch.answered:
-            process.kill()
-        process.wait()
+        _end(process, patience.parting_s if watch.answered else 0.0)
         if process.stdout is not None:
             process.stdout.close()
     return _result(answer, process.returncode, watch.field, allowance)
+
+
+def _end(process: subprocess.Popen[bytes], parting_s: float) -> None:
+    """Wait until the process has ended; it is killed if that takes longer."""
+    try:
+        process.wait(parting_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 class _Watch:

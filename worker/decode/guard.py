@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import resource
+import struct
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ MOST_OPEN_FILES = 128  # a zip, a video, the results, and what Python loads
 _PR_SET_NO_NEW_PRIVS = 38
 _CLONE_NEWUSER = 0x10000000
 _CLONE_NEWNET = 0x40000000
+_CAPABILITY_VERSION = 0x20080522
+_CAP_DAC_READ_SEARCH = 1 << 2  # kept where it is there: a worker that is root is given files of other users
 
 LIMITED_MEMORY = "limited memory"
 NO_NETWORK = "no network"
@@ -57,6 +60,7 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
     granted = [LIMITED_MEMORY] if _limit_memory(allowance.memory_bytes) else []
     apart = _leave_network()
     confined = confine_files(_libraries() + list(readable), writable)
+    _drop_capabilities()
     filtered = forbid_network_and_programs()
     if apart or filtered:
         granted.append(NO_NETWORK)
@@ -88,6 +92,18 @@ def _gain_no_privileges() -> None:
     """No program that this process starts has more rights than it; what follows needs that said."""
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+
+
+def _drop_capabilities() -> None:
+    """Root is root no longer, and who has a user namespace of its own is not root in there."""
+    if not sys.platform.startswith("linux"):
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = struct.pack("=Ii", _CAPABILITY_VERSION, 0)
+    held = ctypes.create_string_buffer(struct.calcsize("=6I"))  # effective, permitted, inheritable; then bits 32 up
+    if libc.capget(header, held) == 0:
+        kept = struct.unpack_from("=I", held, 4)[0] & _CAP_DAC_READ_SEARCH
+        libc.capset(header, struct.pack("=6I", kept, kept, 0, 0, 0, 0))
 
 
 def _leave_network() -> bool:

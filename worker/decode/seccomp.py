@@ -1,5 +1,6 @@
 """A filter of system calls (Linux, seccomp): no sockets, no other programs or processes, no reaching into others.
 
+Nor any change to who may read a file or when it was written: Landlock lets those through for every file of this user.
 It holds where a container forbids new namespaces, too. A call that is filtered fails with EPERM, so that a library that
 merely asks goes on.
 """
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import os
 import platform
 import struct
 import sys
@@ -40,6 +42,8 @@ _FORBIDDEN = {  # numbers of system calls, x86-64 and arm64
     "kill": (62, 129),
     "tkill": (200, 130),
     "pidfd_send_signal": (424, 424),
+    "rt_sigqueueinfo": (129, 138),
+    "rt_tgsigqueueinfo": (297, 240),
     "ptrace": (101, 117),
     "process_vm_readv": (310, 270),
     "process_vm_writev": (311, 271),
@@ -52,7 +56,41 @@ _FORBIDDEN = {  # numbers of system calls, x86-64 and arm64
     "userfaultfd": (323, 282),
     "perf_event_open": (298, 241),
     "keyctl": (250, 219),
+    "chroot": (161, 51),
+    "setpriority": (141, 140),
+    "ioprio_set": (251, 30),
+    "sched_setparam": (142, 118),
+    "sched_setscheduler": (144, 119),
+    "sched_setaffinity": (203, 122),
+    "sched_setattr": (314, 274),
+    "shmget": (29, 194),
+    "semget": (64, 190),
+    "msgget": (68, 186),
+    "mq_open": (240, 180),
+    "inotify_add_watch": (254, 27),
+    "chmod": (90, None),
+    "fchmod": (91, 52),
+    "fchmodat": (268, 53),
+    "fchmodat2": (452, 452),
+    "chown": (92, None),
+    "lchown": (94, None),
+    "fchown": (93, 55),
+    "fchownat": (260, 54),
+    "setxattr": (188, 5),
+    "lsetxattr": (189, 6),
+    "fsetxattr": (190, 7),
+    "setxattrat": (463, 463),
+    "removexattr": (197, 14),
+    "lremovexattr": (198, 15),
+    "fremovexattr": (199, 16),
+    "removexattrat": (466, 466),
+    "utime": (132, None),
+    "utimes": (235, None),
+    "futimesat": (261, None),
+    "utimensat": (280, 88),
 }
+_TGKILL = {"x86_64": 234, "aarch64": 131}  # abort() needs it
+_PRLIMIT64 = {"x86_64": 302, "aarch64": 261}  # getrlimit() and setrlimit() are made of it, and say 0 for this process
 _CLONE = {"x86_64": 56, "aarch64": 220}
 _CLONE3 = 435  # its flags lie in memory, which a filter cannot read: "not there" makes libc use clone
 
@@ -88,6 +126,14 @@ def _instructions(machine: str) -> list[tuple[int, int, int, int]]:
     for number in numbers:
         if number is not None:
             program += [(_JUMP_IF_EQUAL, 0, 1, number), (_RETURN, 0, 0, _FAIL | errno.EPERM)]
+    for number, process in ((_TGKILL[machine], os.getpid()), (_PRLIMIT64[machine], 0)):
+        program += [
+            (_JUMP_IF_EQUAL, 0, 4, number),
+            (_LOAD, 0, 0, _FIRST_ARGUMENT_AT),
+            (_JUMP_IF_EQUAL, 1, 0, process),
+            (_RETURN, 0, 0, _FAIL | errno.EPERM),
+            (_RETURN, 0, 0, _ALLOW),
+        ]
     program += [(_JUMP_IF_EQUAL, 0, 1, _CLONE3), (_RETURN, 0, 0, _FAIL | errno.ENOSYS)]
     program += [
         (_JUMP_IF_EQUAL, 0, 3, _CLONE[machine]),
