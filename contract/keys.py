@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import hmac
-import os
 import secrets
 import time
 from collections.abc import Collection, Iterator
@@ -20,6 +19,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from contract.durable import replace_file
 from contract.errors import InputError, UnavailableError
 from contract.job import TENANT_PATTERN
 from contract.locks import FolderLock
@@ -178,20 +178,7 @@ class KeyFile:
             lock.release()
 
     def _write(self, keys: tuple[ApiKey, ...]) -> None:
-        """Replace the file; after a crash it is the old or the new one, whole."""
-        aside = self._path.with_name(f"{KEYS_FILE}.new")
-        aside.unlink(missing_ok=True)  # left by a crash; the lock says that nobody writes it now
-        descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with open(descriptor, "wb") as file:
-            file.write(_Stored(keys=keys).model_dump_json(indent=1).encode())
-            file.flush()
-            os.fsync(file.fileno())
-        aside.rename(self._path)
-        folder = os.open(self._path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        replace_file(self._path, _Stored(keys=keys).model_dump_json(indent=1).encode())
 
 
 def _sha256(secret: str) -> str:

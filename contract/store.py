@@ -31,6 +31,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from contract.durable import flush
 from contract.errors import SceneError, UnavailableError
 from contract.job import JOB_ID_PATTERN, JobRecord
 from contract.settings import Settings
@@ -294,7 +295,7 @@ class Store:
             (place / SUBMISSION).unlink(missing_ok=True)  # without it a clip counts as removed
             _remove_scene(place)
         for area in folders:
-            _flush(self.data_dir / area)
+            flush(self.data_dir / area)
         left = sum(len(places) for places in self._folders_of(job_id).values())
         if left:
             raise UnavailableError(f"{left} folders of job {job_id} could not be removed.", "Ask for it once more.")
@@ -369,19 +370,11 @@ def _unless_gone(_: object, __: object, failure: tuple[type[BaseException], Base
 def _publish(source: Path, target: Path) -> None:
     """Rename a folder into place only after every byte of it is on disk."""
     for path in source.rglob("*"):
-        _flush(path)
-    _flush(source)
+        flush(path)
+    flush(source)
     source.rename(target)
     try:
-        _flush(target.parent)
+        flush(target.parent)
     except OSError:
         target.rename(source)  # who is told that it failed must not find it done
         raise
-
-
-def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -12,13 +12,13 @@ import contextlib
 import fcntl
 import hashlib
 import os
-import time
 from dataclasses import dataclass
 from io import RawIOBase
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from contract.durable import flush, replace_file
 from contract.job import JOB_ID_PATTERN
 from contract.store import Store, is_job_id, new_job_id
 
@@ -92,7 +92,7 @@ class Partial:
     def give_to(self, job_id: str) -> None:
         """Say which job has the file, and let go of it here."""
         taken = self.declaration.model_copy(update={"job_id": job_id})
-        _write(self.folder, taken)
+        replace_file(self.folder / DECLARATION, taken.model_dump_json().encode())
         self.path.unlink(missing_ok=True)
 
 
@@ -114,7 +114,8 @@ def create_partial(store: Store, declaration: Declaration) -> Partial:
     upload_id = new_job_id()
     partial = Partial(upload_id, store.open_incoming(upload_id), declaration)
     partial.path.touch(mode=0o600)
-    _write(partial.folder, declaration)
+    replace_file(partial.folder / DECLARATION, declaration.model_dump_json().encode())
+    flush(partial.folder.parent)
     return partial
 
 
@@ -126,8 +127,7 @@ def find_partial(store: Store, upload_id: str, tenant: str) -> Partial | None:
 
 def open_partials(store: Store) -> list[Partial]:
     """All uploads that no job has taken."""
-    read = [_read(folder) for folder in (store.data_dir / "incoming").iterdir()]
-    return [partial for partial in read if partial is not None and partial.declaration.job_id is None]
+    return [partial for partial in _all(store) if partial.declaration.job_id is None]
 
 
 def partials_of(store: Store, job_id: str) -> list[Partial]:
@@ -135,17 +135,17 @@ def partials_of(store: Store, job_id: str) -> list[Partial]:
     taken: set[tuple[int, int] | None] = set()
     with contextlib.suppress(FileNotFoundError):
         taken = {_identity(path) for path in store.spool_folder(job_id).iterdir()} - {None}
-    read = [_read(folder) for folder in (store.data_dir / "incoming").iterdir()]
-    return [
-        partial
-        for partial in read
-        if partial is not None and (partial.declaration.job_id == job_id or _identity(partial.path) in taken)
-    ]
+    return [each for each in _all(store) if each.declaration.job_id == job_id or _identity(each.path) in taken]
 
 
 def promised_bytes(store: Store) -> int:
     """What uploads have declared and not sent yet: room on disk that is theirs."""
     return sum(partial.declaration.length_bytes - partial.offset_bytes for partial in open_partials(store))
+
+
+def _all(store: Store) -> list[Partial]:
+    read = [_read(folder) for folder in (store.data_dir / "incoming").iterdir()]
+    return [partial for partial in read if partial is not None]
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -163,19 +163,3 @@ def _read(folder: Path) -> Partial | None:
         return Partial(folder.name, folder, Declaration.model_validate_json(text))
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
-
-
-def _write(folder: Path, declaration: Declaration) -> None:
-    """Written aside, made durable, renamed: a reader sees the old one or the new one."""
-    aside = folder / f"{DECLARATION}.{time.monotonic_ns()}"
-    with aside.open("w") as file:
-        file.write(declaration.model_dump_json())
-        file.flush()
-        os.fsync(file.fileno())
-    aside.rename(folder / DECLARATION)
-    for path in (folder, folder.parent):
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

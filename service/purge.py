@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import time
 from pathlib import Path
 
 from pydantic import BaseModel, Field
 
 from contract.audit import AuditAction, utc_now
+from contract.durable import flush
 from contract.errors import UnavailableError
 from contract.job import TERMINAL_STATES
 from contract.queue import Queue
@@ -100,11 +100,7 @@ class Purger:
         with contextlib.suppress(StoreFullError), disk_errors():
             self._notes.mkdir(mode=0o700, exist_ok=True)
             note.touch(mode=0o600)
-            descriptor = os.open(self._notes, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            flush(self._notes)
         return note
 
     def _remove_uploads(self, job_id: str) -> Removed:
