@@ -8,11 +8,9 @@ directory takes it over, and ends it when it ends itself.
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,7 +20,7 @@ from contract.embedded import EmbeddedServer
 from contract.errors import UnavailableError
 from contract.keys import KeyFile
 from contract.locks import FolderLock
-from contract.processes import die_with_parent, end_process
+from contract.processes import die_with_parent, end_process, told_to_end
 from contract.settings import Settings
 from contract.store import Store
 
@@ -124,9 +122,13 @@ class Installation:
         if not self._lock.take():
             problem = f"Another `intrasplat up` uses {self.settings.data_dir}."
             raise UnavailableError(problem, "Use that one, end it, or choose another --data-dir.")
-        if self._queue is not None:
-            self._queue.start()
-        self.watch()
+        try:
+            if self._queue is not None:
+                self._queue.start()
+            self.watch()
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -183,9 +185,7 @@ def run(settings: Settings, worker_count: int = 1, ready_timeout_s: float = 300.
         UnavailableError: there is no key to let anybody in, the port is taken, there is no queue, or nothing becomes
             ready.
     """
-    end = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: end.set())
+    end = told_to_end()
     check_keys(settings)
     check_port(settings.host, settings.port)
     with Installation(settings, worker_count) as installation:

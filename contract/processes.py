@@ -1,14 +1,33 @@
-"""Ending a child process, politely first, and a child that ends with its parent."""
+"""How processes end: by signals, at another's request, or together with their parent."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import queue
 import signal
 import subprocess
 import sys
+import threading
 
 _PR_SET_PDEATHSIG = 1
+
+
+def told_to_end() -> threading.Event:
+    """An event that is set at the first SIGINT or SIGTERM from now on; for the main thread."""
+    end = threading.Event()
+    signals: queue.SimpleQueue[None] = queue.SimpleQueue()
+
+    def wait() -> None:
+        signals.get()
+        end.set()
+
+    # A handler interrupts the main thread anywhere, also where that holds the lock that end.set() takes: it would wait
+    # for itself. Only a SimpleQueue may be written to all the same.
+    threading.Thread(target=wait, name="signals", daemon=True).start()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: signals.put(None))
+    return end
 
 
 def end_process(process: subprocess.Popen[bytes], timeout_s: float) -> None:

@@ -24,6 +24,7 @@ from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableE
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
 from contract.job import Layout, MaskPolarity, PoseConvention, PresetName
 from contract.logs import configure
+from contract.processes import told_to_end
 from contract.progress_bar import ProgressBar
 from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
 from contract.settings import Settings
@@ -264,10 +265,7 @@ def _consume(options: argparse.Namespace) -> int:
         raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
     from worker.supervisor import run_supervisor
 
-    end = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: end.set())
-    run_supervisor(settings, end)
+    run_supervisor(settings, told_to_end())
     return ExitCode.OK
 
 

@@ -56,6 +56,16 @@ def test_a_second_launcher_of_a_data_directory_is_refused(tmp_path: Path) -> Non
     other.release()
 
 
+def test_a_launcher_that_cannot_start_everything_leaves_nothing_behind(tmp_path: Path) -> None:
+    installation = Installation(Settings(data_dir=tmp_path))
+    installation.service = WatchedProcess("service", [sys.executable, "-c", "import time; time.sleep(60)"], {})
+    installation.workers = [WatchedProcess("worker", [str(tmp_path / "no-such-program")], {})]
+    with pytest.raises(FileNotFoundError), installation:
+        pass
+    assert installation.service.process_id is None
+    assert all(FolderLock(tmp_path / each).take() for each in ("run/up.lock", "valkey/lock"))
+
+
 def test_a_port_that_is_taken_is_said_before_anything_starts() -> None:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))

@@ -29,20 +29,23 @@ from worker.pipeline import ReconstructionRequest, reconstruct
 from worker.supervisor import run_supervisor
 
 WAIT_S = 40.0
+LEASE_S = 3.0
+"""A beat and half of one: the worker here is never away for longer, unless it is meant to be."""
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 STANDIN = Path(__file__).with_name("standin.py")
 PROGRAM = f"""
-import signal, sys, threading
+import functools, sys
 from contract.logs import configure
+from contract.processes import told_to_end
 from contract.settings import Settings
-from worker.supervisor import run_supervisor
-end = threading.Event()
-signal.signal(signal.SIGTERM, lambda *_: end.set())
+from worker import supervisor
+supervisor.RedisQueue = functools.partial(supervisor.RedisQueue, lease_s={LEASE_S})
 settings = Settings.from_environment()
 configure(settings, settings.worker_name)
-run_supervisor(settings, end, [sys.executable, {str(STANDIN)!r}])
+supervisor.run_supervisor(settings, told_to_end(), [sys.executable, {str(STANDIN)!r}])
 """
-"""A worker as `python -m worker consume` makes one, with a child that needs no torch."""
+"""A worker as `python -m worker consume` makes one, with shorter leases and a child that needs no torch."""
 
 
 class Bench:
@@ -51,7 +54,7 @@ class Bench:
     def __init__(self, data_dir: Path) -> None:
         self.server = EmbeddedServer(data_dir)
         self.server.start()
-        self.queue = RedisQueue(self.server.url)
+        self.queue = RedisQueue(self.server.url, lease_s=LEASE_S)
         self.store = Store(data_dir)
 
     def close(self) -> None:

@@ -1,0 +1,26 @@
+"""A process that is told to end hears it, wherever the signal finds it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import os, signal, sys, time
+from contract.processes import told_to_end
+end = told_to_end()
+with end._cond:  # as end.wait() does for a moment
+    os.kill(os.getpid(), int(sys.argv[1]))
+    time.sleep(0.05)
+end.wait()
+print("ended")
+"""
+
+
+@pytest.mark.parametrize("number", [2, 15])
+def test_a_signal_that_finds_the_main_thread_inside_the_event_is_heard_all_the_same(number: int) -> None:
+    command = [sys.executable, "-c", PROGRAM, str(number)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+    assert ended.stdout == "ended\n"
