@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Depends
+from fastapi import Depends, Query
 from starlette.requests import HTTPConnection
 
 from contract.audit import AuditLog
 from contract.job import JobRecord
-from contract.queue import Queue
+from contract.queue import LISTING_LIMIT, Queue
 from contract.settings import Settings
 from contract.store import Store, is_job_id
 from service.access import Access, Caller, Refusal, key_missing
@@ -89,6 +89,9 @@ AnyCaller = Annotated[Caller, Depends(_caller)]
 EarlyCaller = Annotated[Caller | None, Depends(_caller_if_known)]
 """For a WebSocket whose key may come in its first message, since browsers send no header: None means that it must.
 services.access.caller_of_key(text, address) then says whose it is."""
+
+
+ListingLimit = Annotated[int, Query(ge=1, le=LISTING_LIMIT, description="at most so many")]
 
 
 def owned_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:

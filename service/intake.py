@@ -15,8 +15,7 @@ from contract.settings import Settings
 from contract.store import Store
 from service.partial import promised_bytes
 from service.problems import Problem, no_room
-
-LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
+from service.upload import LIMIT_REMEDY
 
 LEAST_BYTES = 4096
 """What a body must bring in upload_silence_s, or end: whoever drips holds a place that another could use."""

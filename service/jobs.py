@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Header, Response
 from fastapi.sse import EventSourceResponse
 from starlette.concurrency import run_in_threadpool
 
@@ -12,7 +12,7 @@ from contract.audit import AuditAction
 from contract.job import TERMINAL_STATES, JobRecord, JobState, JobView
 from contract.keys import KeyScope
 from contract.queue import LISTING_LIMIT, event_order
-from service.deps import AnyCaller, Deps, Services, owned_job
+from service.deps import AnyCaller, Deps, ListingLimit, Services, owned_job
 from service.events import NOTHING_SEEN
 from service.problems import RETRY_AFTER_S, Problem
 
@@ -26,12 +26,10 @@ STREAM_RESPONSES: dict[int | str, dict[str, object]] = {
     204: {"description": "the job has ended, and the caller knows all of it"},
 }
 
-Limit = Annotated[int, Query(ge=1, le=LISTING_LIMIT, description="at most so many")]
-
 
 @router.get("", operation_id="list_jobs")
 def list_jobs(
-    services: Services, caller: AnyCaller, state: JobState | None = None, limit: Limit = LISTING_LIMIT
+    services: Services, caller: AnyCaller, state: JobState | None = None, limit: ListingLimit = LISTING_LIMIT
 ) -> list[JobView]:
     """The newest jobs, newest first; of one state if it is given. Positions in the queue are told of each by itself."""
     caller.require(KeyScope.VIEW)

@@ -10,10 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.problems import MEDIA_TYPE
 
-EXAMPLE_JOB_ID = "0123456789abcdef0123456789abcdef"
+EXAMPLE_ID = "0123456789abcdef0123456789abcdef"
 EXAMPLES: dict[str, dict[str, Any]] = {
     "JobView": {
-        "id": EXAMPLE_JOB_ID,
+        "id": EXAMPLE_ID,
         "state": "running",
         "stage": "train",
         "fraction": 0.4,
@@ -24,7 +24,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
         "options": {"budget_s": 30},
         "input_bytes": 41943040,
         "created_at_s": 1767225600.0,
-        "links": {"self": f"/jobs/{EXAMPLE_JOB_ID}", "events": f"/jobs/{EXAMPLE_JOB_ID}/events"},
+        "links": {"self": f"/jobs/{EXAMPLE_ID}", "events": f"/jobs/{EXAMPLE_ID}/events"},
     },
     "Problem": {
         "type": "about:blank",

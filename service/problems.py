@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,7 +13,7 @@ from starlette.websockets import WebSocketState
 
 from contract.errors import InputError, LimitError, SceneError, UnavailableError
 from contract.queue import QueueFullError
-from contract.store import StoreFullError
+from contract.store import NO_ROOM, StoreFullError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
@@ -121,7 +120,7 @@ def problem_of(error: Exception) -> Problem | None:
             return _problem_of_validation(error)
         case HTTPException():
             return _problem_of_http_exception(error)
-        case OSError() if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        case OSError() if error.errno in NO_ROOM:
             return no_room("The data directory's disk is full.")
         case _:
             return None

@@ -19,25 +19,26 @@ from starlette.requests import ClientDisconnect
 from contract.audit import AuditAction
 from contract.clip_limits import MOST_MEMORY_BYTES, ClipLimits
 from contract.errors import InputError, LimitError, UnavailableError
-from contract.job import JobOptions, JobRecord, JobView, Standing, parse_options
+from contract.job import JOB_ID_PATTERN, JobOptions, JobRecord, JobView, Standing, parse_options
 from contract.keys import KeyScope
 from contract.queue import Admission, QueueFullError
 from contract.sniff import check_file
 from contract.store import new_job_id
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
-from service.intake import LIMIT_REMEDY, declared_length
+from service.intake import declared_length
+from service.openapi import EXAMPLE_ID
 from service.partial import Partial, find_partial
 from service.problems import RETRY_AFTER_S, Problem
 from service.retention import check_retention
-from service.upload import PARTS, Received, UploadLimits, receive_upload
+from service.upload import LIMIT_REMEDY, PARTS, Received, UploadLimits, receive_upload
 
 router = APIRouter(tags=["jobs"])
 
 MAX_SUBMISSION_BYTES = 128 * 1024
 """Of a JSON body."""
 JSON_REMEDY = 'Send ids of finished uploads by part, and options: {"clip": ID, "options": {"budget_s": 20}}.'
-UPLOAD_ID = {"type": "string", "pattern": "^[0-9a-f]{32}$", "description": "a finished upload (POST /uploads)"}
+UPLOAD_ID = {"type": "string", "pattern": JOB_ID_PATTERN, "description": "a finished upload (POST /uploads)"}
 FILE = {"type": "string", "format": "binary"}
 
 
@@ -59,7 +60,7 @@ REQUEST_BODY: dict[str, Any] = {
             },
             "application/json": {
                 "schema": _body_schema(UPLOAD_ID),
-                "example": {"clip": "0123456789abcdef0123456789abcdef", "options": {"budget_s": 20}},
+                "example": {"clip": EXAMPLE_ID, "options": {"budget_s": 20}},
             },
         },
     }

@@ -18,14 +18,12 @@ from contract.queue import LISTING_LIMIT
 from contract.rendering import ExportRequest
 from contract.store import CURVE, REPORT, is_job_id
 from service.access import Caller
-from service.deps import AnyCaller, Deps, Services, not_found
+from service.deps import AnyCaller, Deps, ListingLimit, Services, not_found
 from service.problems import Problem
 from service.purge import Receipt
 from service.renders import SCENES_REMEDY, ModelTime, image_response
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
-
-Limit = Annotated[int, Query(ge=1, le=LISTING_LIMIT, description="at most so many")]
 
 
 class SceneSummary(BaseModel):
@@ -38,7 +36,7 @@ class SceneSummary(BaseModel):
 
 
 @router.get("", operation_id="list_scenes")
-def list_scenes(services: Services, caller: AnyCaller, limit: Limit = LISTING_LIMIT) -> list[SceneSummary]:
+def list_scenes(services: Services, caller: AnyCaller, limit: ListingLimit = LISTING_LIMIT) -> list[SceneSummary]:
     """The newest finished scenes, newest first."""
     caller.require(KeyScope.VIEW)
     records = services.queue.records(caller.tenant, None)

@@ -19,14 +19,13 @@ from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from contract.errors import LimitError
 from contract.keys import KeyScope
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
 from service.intake import declared_length
 from service.partial import Declaration, Partial, append, close, create_partial, find_partial, open_partials
 from service.problems import Problem, problem_of
-from service.upload import MAX_CALIBRATION_BYTES, PARTS, checked_suffix
+from service.upload import PARTS, check_part_size, checked_suffix
 
 VERSION = "1.0.0"
 RESUMABLE = {"Tus-Resumable": VERSION}
@@ -209,8 +208,7 @@ def _check_version(request: Request) -> None:
 
 
 def _check_size(services: Deps, caller: Caller, part: str, length_bytes: int) -> None:
-    if part == "calibration" and length_bytes > MAX_CALIBRATION_BYTES:
-        raise LimitError(part, f"it is larger than {MAX_CALIBRATION_BYTES} bytes.", "Send a smaller one.")
+    check_part_size(part, length_bytes)
     services.intake.check(length_bytes)
     count = sum(partial.declaration.tenant == caller.tenant for partial in open_partials(services.store))
     if count >= MAX_OPEN_UPLOADS:

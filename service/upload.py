@@ -13,6 +13,7 @@ from python_multipart.exceptions import MultipartParseError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
+from contract.clip_limits import MOST_CALIBRATION_BYTES
 from contract.errors import InputError, LimitError
 from contract.job import JobFiles
 from service.problems import Problem, no_room
@@ -31,7 +32,9 @@ PARTS = tuple(SUFFIXES)
 
 OPTIONS = "options"
 MAX_OPTIONS_BYTES = 64 * 1024
-MAX_CALIBRATION_BYTES = 16 * 2**20
+MOST_BYTES = {OPTIONS: MAX_OPTIONS_BYTES, "calibration": MOST_CALIBRATION_BYTES}
+"""Of the parts that are small by their nature."""
+LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
 MAX_HEADER_BYTES = 8 * 1024
 FORM_REMEDY = (
     "Send multipart/form-data with clip, or left and right, and optionally calibration, masks and options; "
@@ -97,6 +100,12 @@ def checked_suffix(part: str, suffix: str) -> str:
     return suffix.lower()
 
 
+def check_part_size(part: str, part_bytes: int) -> None:
+    """LimitError for a part of more bytes than one of its kind can have."""
+    if part_bytes > MOST_BYTES.get(part, part_bytes):
+        raise LimitError(part, f"it is larger than {MOST_BYTES[part]} bytes.", "Send a smaller one.")
+
+
 async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: Path, limits: UploadLimits) -> Received:
     """Write the parts of a multipart body into folder.
 
@@ -154,7 +163,7 @@ class _Receiver:
         self._received.total_bytes += len(chunk)
         if self._received.total_bytes > self._limits.upload_bytes:
             problem = f"the upload is larger than {self._limits.upload_bytes} bytes."
-            raise LimitError("clip", problem, "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES.")
+            raise LimitError("clip", problem, LIMIT_REMEDY)
         if self._received.total_bytes > self._limits.room_bytes:
             raise no_room(f"The disk has room for {self._limits.room_bytes} bytes of an upload.")
         self._parser.write(chunk)
@@ -211,9 +220,7 @@ class _Receiver:
 
     def _on_part_data(self, data: bytes, start: int, end: int) -> None:
         self._part_bytes += end - start
-        limit_bytes = {OPTIONS: MAX_OPTIONS_BYTES, "calibration": MAX_CALIBRATION_BYTES}.get(self._part)
-        if limit_bytes is not None and self._part_bytes > limit_bytes:
-            raise LimitError(self._part, f"it is larger than {limit_bytes} bytes.", "Send a smaller one.")
+        check_part_size(self._part, self._part_bytes)
         piece = data[start:end]
         if self._file is None:
             self._options += piece
