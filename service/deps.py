@@ -25,7 +25,7 @@ from service.events import Feeds
 from service.intake import Intake
 from service.limits import Limiter
 from service.metrics import Metrics
-from service.problems import Problem
+from service.problems import SCENES_REMEDY, Problem
 from service.purge import Purger
 from service.renderer import Renderer
 from service.retention import Retention
@@ -100,6 +100,19 @@ def owned_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:
     if record is not None and caller.owns(record):
         return record
     raise not_found(f"There is no job {job_id[:40]!r}.", "job_id", "GET /jobs lists what there is.", caller, record)
+
+
+def owned_scene(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
+    """As owned_job(), of a scene, or of the job that is to become one; of a done job also while the queue is away."""
+    record = services.done.record(scene_id) if is_job_id(scene_id) else None
+    if record is not None and caller.owns(record):
+        return record
+    raise no_such_scene(scene_id, caller, record)
+
+
+def no_such_scene(scene_id: str, caller: Caller, record: JobRecord | None) -> Problem:
+    """not_found() of a scene."""
+    return not_found(f"There is no scene {scene_id[:40]!r}.", "scene", SCENES_REMEDY, caller, record)
 
 
 def not_found(detail: str, field: str, remedy: str, caller: Caller, record: JobRecord | None) -> Problem:

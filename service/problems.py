@@ -19,6 +19,7 @@ MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
 """Said with 423, 429 and 503, unless the problem knows better."""
 API_REMEDY = "The API is described at /openapi.json."
+SCENES_REMEDY = "GET /scenes lists what there is."
 FAULT_REMEDY = "Report it with the log's lines of this X-Request-Id."
 
 TITLES = {
@@ -109,7 +110,7 @@ def problem_of(error: Exception) -> Problem | None:
             status = 413 if isinstance(error, LimitError) else 422
             return Problem(status, error.problem, field=error.field, remedy=error.remedy)
         case SceneError():
-            return Problem(404, str(error), field="scene", remedy="GET /scenes lists what there is.")
+            return Problem(404, str(error), field="scene", remedy=SCENES_REMEDY)
         case QueueFullError():
             return Problem(429 if error.tenant else 503, error.problem, field="queue", remedy=error.remedy)
         case StoreFullError():

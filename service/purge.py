@@ -1,8 +1,8 @@
 """Removal of a job and of all that is known of it, with a receipt; and what a removal that was cut off left undone.
 
 Order: a note on disk (data_dir/purging/<job>), the files, the queue's record, the note. Whatever ends the service in
-between, the note makes the next sweep go through all of it again; and while the record is there, so does whoever asks
-once more.
+between, the note makes service/retention.py go through all of it again; and while the record is there, so does whoever
+asks once more.
 """
 
 from __future__ import annotations

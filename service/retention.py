@@ -17,8 +17,8 @@ from contract.settings import Settings
 from contract.store import Store
 from service.purge import Purger, try_to_purge
 
-SWEEP_PERIOD_S = 300.0
-"""Each sweep reads all records."""
+LOOK_PERIOD_S = 300.0
+"""Each look reads all records."""
 
 HOUR_S = 3600.0
 logger = logging.getLogger("intrasplat.service")
@@ -44,26 +44,26 @@ def kept_hours(options: JobOptions, settings: Settings) -> float | None:
 
 
 class Retention:
-    """The sweep that purges what was kept long enough. Of the services of one data directory one does it at a time;
+    """Purges what was kept long enough. Of the services of one data directory one does it at a time;
     on several machines they may do it at once, for a purge may be repeated."""
 
     def __init__(self, settings: Settings, queue: Queue, store: Store, purger: Purger) -> None:
         self._settings = settings
         self._queue = queue
         self._purger = purger
-        self._reserve = AuditLog(settings.data_dir)
+        self._audit_log = AuditLog(settings.data_dir)
         self._lock = FolderLock(store.run_dir / "retention.lock")
 
     async def run(self) -> None:
-        """Sweep every SWEEP_PERIOD_S, until cancelled."""
+        """Look every LOOK_PERIOD_S, until cancelled."""
         try:
             while True:
-                await run_in_threadpool(self._try_to_sweep)
-                await asyncio.sleep(SWEEP_PERIOD_S)
+                await run_in_threadpool(self._try_to_purge_due)
+                await asyncio.sleep(LOOK_PERIOD_S)
         finally:
             self._lock.release()
 
-    def sweep(self, now_s: float) -> int:
+    def purge_due(self, now_s: float) -> int:
         """Finish what was cut off, and purge what is due at that UNIX time; how many jobs those were."""
         self._purger.finish_cut_off()
         due = [record.job_id for record in self._queue.records(None, None) if self._is_due(record, now_s)]
@@ -78,12 +78,12 @@ class Retention:
             return False
         return ended_s + hours * HOUR_S <= now_s
 
-    def _try_to_sweep(self) -> None:
+    def _try_to_purge_due(self) -> None:
         if not self._lock.take():
             return
-        self._reserve.fill_reserve()
+        self._audit_log.fill_reserve()
         try:
-            self.sweep(time.time())
+            self.purge_due(time.time())
         except UnavailableError as error:
             logger.warning("retention waits: %s", error.problem)
         except OSError as error:

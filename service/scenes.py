@@ -18,10 +18,10 @@ from contract.queue import LISTING_LIMIT
 from contract.rendering import ExportRequest
 from contract.store import CURVE, REPORT, is_job_id
 from service.access import Caller
-from service.deps import AnyCaller, Deps, ListingLimit, Services, not_found
+from service.deps import AnyCaller, Deps, ListingLimit, Services, no_such_scene, owned_scene
 from service.problems import Problem
 from service.purge import Receipt
-from service.renders import SCENES_REMEDY, ModelTime, image_response
+from service.renders import ModelTime, image_response
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
@@ -92,7 +92,7 @@ def purge_scene(scene_id: str, services: Services, caller: AnyCaller) -> Receipt
     caller.require(KeyScope.PURGE)
     record = _known(services, scene_id)
     if record is None or not caller.owns(record):
-        raise _no_such_scene(scene_id, caller, record)
+        raise no_such_scene(scene_id, caller, record)
     return services.purger.purge(scene_id, caller)
 
 
@@ -102,9 +102,7 @@ def finished_job(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
     Raises:
         Problem: 404, there is none of that id, or it is another's; 409, the job has not come to a scene.
     """
-    record = services.done.record(scene_id) if is_job_id(scene_id) else None
-    if record is None or not caller.owns(record):
-        raise _no_such_scene(scene_id, caller, record)
+    record = owned_scene(services, caller, scene_id)
     if record.state is not JobState.DONE:
         detail = f"The job is {record.state}; there is no finished scene."
         raise Problem(409, detail, field="scene", remedy=f"See GET /jobs/{scene_id}.")
@@ -116,10 +114,6 @@ def _known(services: Deps, scene_id: str) -> JobRecord | None:
     if not is_job_id(scene_id):
         return None
     return services.queue.get(scene_id) or services.store.submission(scene_id)
-
-
-def _no_such_scene(scene_id: str, caller: Caller, record: JobRecord | None) -> Problem:
-    return not_found(f"There is no scene {scene_id[:40]!r}.", "scene", SCENES_REMEDY, caller, record)
 
 
 def _summary(services: Deps, record: JobRecord) -> SceneSummary:

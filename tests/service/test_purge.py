@@ -118,7 +118,7 @@ def test_a_live_job_is_not_purged(house: House) -> None:
 
 
 @pytest.mark.parametrize("cut_at", ["store.purge", "queue.forget"])
-@pytest.mark.parametrize("finisher", ["again", "sweep"])
+@pytest.mark.parametrize("finisher", ["again", "retention"])
 def test_a_purge_that_was_cut_off_is_finished(
     house: House, monkeypatch: pytest.MonkeyPatch, cut_at: str, finisher: str
 ) -> None:
@@ -135,11 +135,11 @@ def test_a_purge_that_was_cut_off_is_finished(
         assert house.http.delete(f"/scenes/{scene_id}").json()["verified"] is True
     else:
         _, retention = parts(house)
-        retention.sweep(time.time())
+        retention.purge_due(time.time())
         assert house.queue.get(scene_id) is not None  # so young a note may be of a purge that is under way
         note = house.store.data_dir / NOTES / scene_id
         os.utime(note, (1.0, 1.0))
-        retention.sweep(time.time())
+        retention.purge_due(time.time())
         assert not note.exists()
     assert house.queue.get(scene_id) is None
     assert traces_of(house.store.data_dir, scene_id) == []
@@ -177,10 +177,10 @@ def test_retention_purges_in_time_and_nothing_before_and_nothing_live(house: Hou
     waiting = house.upload().json()["id"]
     _, retention = parts(house)
     now_s = time.time()
-    assert retention.sweep(now_s + 0.9 * HOUR_S) == 0
-    assert retention.sweep(now_s + 1.1 * HOUR_S) == 1
+    assert retention.purge_due(now_s + 0.9 * HOUR_S) == 0
+    assert retention.purge_due(now_s + 1.1 * HOUR_S) == 1
     assert [house.queue.get(job_id) is None for job_id in (own, usual, waiting)] == [False, True, False]
-    assert retention.sweep(now_s + 3.1 * HOUR_S) == 1
+    assert retention.purge_due(now_s + 3.1 * HOUR_S) == 1
     assert [house.queue.get(job_id) is None for job_id in (own, usual, waiting)] == [True, True, False]
     assert traces_of(house.store.data_dir, own) == []
     lines = [json.loads(line) for line in (house.store.data_dir / AUDIT_FILE).read_text().splitlines()]
@@ -201,7 +201,7 @@ def test_one_job_that_cannot_be_purged_keeps_no_other(house: House, monkeypatch:
 
     monkeypatch.setattr(house.store, "purge", purge_but_one)
     _, retention = parts(house)
-    assert retention.sweep(time.time() + 2 * HOUR_S) == 1
+    assert retention.purge_due(time.time() + 2 * HOUR_S) == 1
     assert house.queue.get(other) is None
     assert house.queue.get(stuck) is not None
 

@@ -215,6 +215,8 @@ def test_what_was_shown_before_is_shown_while_the_queue_is_away_but_not_if_it_wa
         queue.is_away = True
         house.store.purge(purged)
         assert house.http.get("/render", params={"scene": kept, "t": "0.3"}).status_code == 200
+        for path in (f"/scenes/{kept}", f"/scenes/{kept}/curve", f"/scenes/{kept}/export"):
+            assert house.http.get(path).status_code == 200, path
         assert_problem(house.http.get("/render", params={"scene": purged}), 404, "scene")
         assert_problem(house.http.get("/render", params={"scene": unknown}), 503)
 
