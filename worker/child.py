@@ -16,8 +16,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pydantic import BaseModel
-
 from contract.errors import UnavailableError
 from worker.orders import Advanced, Failed, Finished, Holding, Ready, Run, Stop, Stopped, Unable, line_of, read_report
 
@@ -29,7 +27,7 @@ LONGEST_PAUSE_S = 30.0
 """Before a child that died before it was ready is started again; the pauses double."""
 
 LOOK_PERIOD_S = 0.1
-"""How soon a supervisor that waits for its child notices that it should end."""
+"""How soon a supervisor that waits for its child sees what has become of it."""
 
 LAST_WORDS_S = 0.5
 """How long what a dead child has written is waited for, should a process of its own hold its pipe open."""
@@ -52,10 +50,11 @@ class DeviceChild:
 
     def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
         self.ready: Ready | None = None
+        self.unable: Unable | None = None
         self.scenes: tuple[str, ...] = ()
         self.ended: Ended | None = None
         self._was_killed = False
-        self._reports: queue.SimpleQueue[BaseModel | Ended] = queue.SimpleQueue()
+        self._reports: queue.SimpleQueue[Advanced | Finished | Stopped | Failed | Ended] = queue.SimpleQueue()
         # A session of its own: Ctrl-C reaches the supervisor alone, which ends the child in order.
         self._process = subprocess.Popen(
             command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
@@ -77,16 +76,12 @@ class DeviceChild:
             self._process.stdin.write(line_of(order))
             self._process.stdin.flush()
 
-    def next_report(self, timeout_s: float) -> Advanced | Finished | Stopped | Failed | Unable | Ended | None:
-        """The next report, or the news of the child's end; None after timeout_s."""
-        deadline_s = time.monotonic() + timeout_s
-        while True:
-            try:
-                report = self._reports.get(timeout=max(0.0, deadline_s - time.monotonic()))
-            except queue.Empty:
-                return None
-            if isinstance(report, Advanced | Finished | Stopped | Failed | Unable | Ended):
-                return report
+    def next_report(self, timeout_s: float) -> Advanced | Finished | Stopped | Failed | Ended | None:
+        """The next report on the job, or the news of the child's end; None after timeout_s."""
+        try:
+            return self._reports.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
 
     def kill(self) -> None:
         """End it without asking, and wait until it is gone."""
@@ -110,6 +105,8 @@ class DeviceChild:
                     logger.warning("the device process printed a line of %d bytes that is no report", len(line))
                 elif isinstance(report, Ready):
                     self.ready = report
+                elif isinstance(report, Unable):
+                    self.unable = report
                 elif isinstance(report, Holding):
                     self.scenes = report.scenes
                 else:
@@ -169,6 +166,8 @@ class Keeper:
                 else:
                     end.wait(LOOK_PERIOD_S)
                 continue
+            if child.unable is not None:
+                raise UnavailableError(child.unable.problem, child.unable.remedy)
             if child.ended is not None:
                 self._bury(child, child.ended)
             elif child.ready is not None:
@@ -178,9 +177,7 @@ class Keeper:
                 logger.warning("the device process was not ready after %g s and was killed", START_LIMIT_S)
                 child.kill()
             else:
-                report = child.next_report(LOOK_PERIOD_S)
-                if isinstance(report, Unable):
-                    raise UnavailableError(report.problem, report.remedy)
+                end.wait(LOOK_PERIOD_S)
         return None
 
     def stop(self) -> None:

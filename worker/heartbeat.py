@@ -74,7 +74,7 @@ class Heartbeat:
                 self._unsent = self._urgent = False
             try:
                 order = self._queue.beat(self._claim, progress)
-            except UnavailableError:
+            except Exception:
                 with self._changed:
                     self._unsent = self._unsent or progress is not None
                 raise
@@ -90,9 +90,10 @@ class Heartbeat:
             began_s = time.monotonic()
             try:
                 self.beat()
-            except UnavailableError as error:
+            except Exception as error:  # whatever it was: without beats the claim is lost, and no order is heard
                 if not away:
-                    logger.warning("no beat gets through: %s", error.problem, extra={"job_id": self._claim.job_id})
+                    reason = error.problem if isinstance(error, UnavailableError) else type(error).__name__
+                    logger.warning("no beat gets through: %s", reason, extra={"job_id": self._claim.job_id})
                 away = True
                 earliest_s = latest_s = time.monotonic() + RETRY_PERIOD_S
             else:

@@ -366,6 +366,22 @@ def test_a_result_waits_for_a_queue_that_is_away(lane: tuple[Bench, Lane]) -> No
     assert bench.store.has_scene(record.job_id, record.attempt)
 
 
+def test_beats_go_on_after_a_fault_that_nobody_foresaw(lane: tuple[Bench, Lane]) -> None:
+    bench, queue = lane
+    stumbled = threading.Event()
+
+    def stumble(claim: Claim) -> None:
+        stumbled.set()
+        raise ValueError(claim.job_id)
+
+    queue.before["beat"] = stumble
+    job_id = bench.submit("wait")
+    bench.start()
+    eventually(stumbled.is_set)
+    queue.cancel(job_id)
+    assert bench.wait_for(job_id, *ENDED).state is JobState.CANCELLED
+
+
 def test_a_clip_that_is_gone_fails_its_job(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(consume, "STORE_PATIENCE_S", 0.0)
     lost, sound = bench.submit("publish"), bench.submit("publish")
