@@ -25,6 +25,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,7 @@ def main() -> None:
         with started_service(folder / "data", folder / "service.log") as client:
             scene = trained(client, clip, iterations=SCENE_ITERATIONS)
             rows += asyncio.run(_under_load(client.url, scene, "idle", arguments.seconds))
-            busy = client.reconstruct(*clip.files, calibration=clip.calibration, budget_s=TRAINING_BUDGET_S)
+            busy = client.reconstruct(clip.video, calibration=clip.calibration, budget_s=TRAINING_BUDGET_S)
             wait_for_stage(client, busy.id, "train")
             rows += asyncio.run(_under_load(client.url, scene, "training", arguments.seconds))
             client.cancel(busy.id)
@@ -74,7 +75,7 @@ class PhantomClip:
     """A stereo video with its calibration, as the phantom wrote them."""
 
     def __init__(self, folder: Path) -> None:
-        self.files = (folder / "stereo.webm",)
+        self.video = folder / "stereo.webm"
         self.calibration = folder / "calibration.json"
 
 
@@ -89,7 +90,7 @@ def make_clip(folder: Path) -> PhantomClip:
 
 def trained(client: Client, clip: PhantomClip, **options: Any) -> str:
     """The id of a finished scene of the clip."""
-    job = client.reconstruct(*clip.files, calibration=clip.calibration, **options)
+    job = client.reconstruct(clip.video, calibration=clip.calibration, **options)
     return client.wait(job.id).id
 
 
@@ -166,14 +167,14 @@ def _uploads(url: str, folder: Path, gib: float) -> list[Row]:
         file.write(VIDEO.read_bytes() + struct.pack(">I4sQ", 1, b"free", 16 + padding))
         for _ in range(padding // CHUNK_BYTES):
             file.write(os.urandom(CHUNK_BYTES))
-    service = _service_process()
+    service = _service_process(url)
     rows = []
     with Client(url) as client:
-        for name, resumable in (("multipart", False), ("tus", True)):
+        for name, in_pieces in (("multipart", False), ("tus", True)):
             before_mib = memory_mib(service)
             _reset_peak(service)
             start_s = time.perf_counter()
-            job = client.reconstruct(video, layout="sbs", resumable=resumable)
+            job = client.reconstruct(video, layout="sbs", in_pieces=in_pieces)
             seconds = time.perf_counter() - start_s
             peak_mib = memory_mib(service, "VmHWM")
             client.cancel(job.id)
@@ -185,10 +186,15 @@ def _uploads(url: str, folder: Path, gib: float) -> list[Row]:
     return rows
 
 
-def _service_process() -> int:
-    """The process id of the service that this run started."""
-    command = ["pgrep", "--newest", "--full", "python.* -m service$"]
-    return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+def _service_process(url: str) -> int:
+    """The process id of the service at this address, told by its environment (Linux)."""
+    sign = f"INTRASPLAT_PORT={httpx.URL(url).port}\0".encode()
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError):  # it has just ended, or is another user's
+            command = (entry / "cmdline").read_bytes() if entry.name.isdigit() else b""
+            if command.endswith(b"\0-m\0service\0") and sign in (entry / "environ").read_bytes():
+                return int(entry.name)
+    raise RuntimeError(f"no process serves {url}")
 
 
 def memory_mib(process_id: int, field: str = "VmRSS") -> float:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import itertools
 import os
 import platform
 import random
@@ -23,7 +22,9 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -31,7 +32,9 @@ from urllib.parse import urlsplit
 
 from client.api import Client
 from client.demo import started_service
+from client.errors import Conflict
 from contract.errors import IntrasplatError
+from contract.job import JobState
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 16
 ROUND_ITERATIONS = 100
@@ -55,33 +58,34 @@ def main() -> int:
         folder = Path(name)
         clip = _make_clip(folder)
         with started_service(folder / "data", folder / "service.log") as client:
-            rows, rounds, views = _soak(client.url, clip, folder / "data", arguments.minutes)
-    print(f"{rounds} rounds, {views} views, {len(rows)} samples")
+            rows, rounds, counts = _soak(client.url, clip, folder / "data", arguments.minutes)
+    print(f"{rounds} rounds, {len(rows)} samples; " + ", ".join(f"{each} {counts[each]}" for each in sorted(counts)))
     if arguments.csv:
         _write(arguments.csv, rows)
     return _judge(rows, arguments.minutes)
 
 
-def _soak(url: str, clip: Path, data_dir: Path, minutes: float) -> tuple[list[Row], int, int]:
+def _soak(url: str, clip: Path, data_dir: Path, minutes: float) -> tuple[list[Row], int, Counter[str]]:
     end = threading.Event()
     shown: list[str] = []  # the scene that is looked at now, if any
-    counts = {"views": 0}
+    counts: Counter[str] = Counter()
     threads = [threading.Thread(target=_look, args=(url, shown, end, counts)) for _ in range(2)]
     threads.append(threading.Thread(target=_look_through_socket, args=(url, shown, end, counts)))
+    rows: list[Row] = []
+    threads.append(threading.Thread(target=_sample, args=(data_dir, end, rows)))
     for thread in threads:
         thread.start()
-    rows: list[Row] = []
-    sampler = threading.Thread(target=_sample, args=(data_dir, end, rows))
-    sampler.start()
     rounds = 0
     deadline_s = time.monotonic() + 60 * minutes
-    while time.monotonic() < deadline_s:
-        _round(url, clip, rounds, shown)
-        rounds += 1
-    end.set()
-    for thread in (*threads, sampler):
-        thread.join()
-    return rows, rounds, counts["views"]
+    try:
+        while time.monotonic() < deadline_s:
+            _round(url, clip, rounds, shown)
+            rounds += 1
+    finally:
+        end.set()
+        for thread in threads:
+            thread.join()
+    return rows, rounds, counts
 
 
 def _round(url: str, clip: Path, number: int, shown: list[str]) -> None:
@@ -92,37 +96,49 @@ def _round(url: str, clip: Path, number: int, shown: list[str]) -> None:
             clip / "stereo.webm",
             calibration=clip / "calibration.json",
             iterations=ROUND_ITERATIONS,
-            resumable=number % 3 == 1,
+            in_pieces=number % 3 == 1,
         )
         shown[:] = [job.id]
-        if number % 5 == 4:
-            for seen in itertools.islice(client.watch(job.id), 5):
-                if seen.stage == "train":
-                    break
-            client.cancel(job.id)
-        for seen in client.watch(job.id):
-            last = seen
-        shown.clear()
-        if last.state == "done":
+        is_cancelled = number % 5 != 4
+        for last in client.watch(job.id):
+            if not is_cancelled and last.stage == "train":
+                is_cancelled = True
+                with suppress(Conflict):  # it was done already
+                    client.cancel(job.id)
+        if last.state is JobState.DONE:
             client.render_array(t=0.5, scene=job.id)
-            client.delete(job.id)
+        elif last.state is not JobState.CANCELLED:
+            raise RuntimeError(f"job {job.id} ended as {last.state}: {last.error}")
+        shown.clear()
+        client.delete(job.id)
 
 
-def _look(url: str, shown: list[str], end: threading.Event, counts: dict[str, int]) -> None:
-    with Client(url) as client:
+def _look(url: str, shown: list[str], end: threading.Event, counts: Counter[str]) -> None:
+    with Client(url, patience_s=0.0) as client:
         while not end.wait(VIEW_PAUSE_S):
-            with suppress(IntrasplatError, IndexError):  # there may be nothing to see yet, or no longer
+            with _counting("views", counts):
                 client.render(t=random.random(), scene=shown[0], pose=_pose(), format="jpeg")
-                counts["views"] += 1
 
 
-def _look_through_socket(url: str, shown: list[str], end: threading.Event, counts: dict[str, int]) -> None:
-    with Client(url) as client:
+def _look_through_socket(url: str, shown: list[str], end: threading.Event, counts: Counter[str]) -> None:
+    with Client(url, patience_s=0.0) as client:
         while not end.wait(VIEW_PAUSE_S):
-            with suppress(IntrasplatError, IndexError, OSError), client.stream(shown[0]) as viewer:
-                while shown and not end.wait(VIEW_PAUSE_S):
-                    viewer.render(t=random.random(), pose=_pose())
-                    counts["views"] += 1
+            with _counting("streams", counts), client.stream(scene := shown[0]) as viewer:
+                while shown == [scene] and not end.wait(VIEW_PAUSE_S):
+                    with _counting("streamed views", counts):
+                        viewer.render(t=random.random(), pose=_pose())
+
+
+@contextmanager
+def _counting(what: str, counts: Counter[str]) -> Iterator[None]:
+    """Counts what came; also the refusals by their kind: there may be nothing to see yet, or no longer."""
+    try:
+        yield
+        counts[what] += 1
+    except IndexError:
+        pass
+    except IntrasplatError as error:
+        counts[type(error).__name__] += 1
 
 
 def _break_off(url: str, clip: Path) -> None:
