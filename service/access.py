@@ -7,7 +7,8 @@ elsewhere, whatever address it has. A key that is wrong is refused everywhere.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from contract.job import LOCAL_TENANT, JobRecord
@@ -24,7 +25,14 @@ WRONG_KEYS_PER_S = 0.2
 WRONG_KEYS_AT_ONCE = 10.0
 """From one address. Keys cannot be guessed; this keeps whoever tries from filling logs and audit."""
 
-FORWARDED_HEADERS = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
+MAX_STRANGERS = 64
+"""Viewers at a time whose key has yet to come."""
+
+FORWARDED_HEADERS = frozenset(
+    {"forwarded", "via", "x-real-ip", "x-client-ip", "true-client-ip", "cf-connecting-ip", "cdn-loop"}
+)
+FORWARDED_PREFIX = "x-forwarded"
+"""X-Forwarded-For, -Host, -Proto and whatever else a proxy may say in this way."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +82,7 @@ class Access:
     def __init__(self, settings: Settings) -> None:
         self._keys = KeyFile(settings.data_dir)
         self._wrong_keys = Limiter(WRONG_KEYS_PER_S, WRONG_KEYS_AT_ONCE)
+        self._strangers = 0
         self.keys_required = settings.host not in LOOPBACK_NAMES or bool(settings.hosts)
 
     def caller(self, headers: Mapping[str, str], address: str) -> Caller | None:
@@ -87,7 +96,7 @@ class Access:
         text = _key_text(headers)
         if text is not None:
             return self.caller_of_key(text, address)
-        if self.keys_required or any(name in headers for name in FORWARDED_HEADERS):
+        if self.keys_required or _is_forwarded(headers):
             return None
         return Caller(LOCAL_TENANT, ALL_SCOPES, None, address)
 
@@ -99,10 +108,26 @@ class Access:
             raise Refusal(401, "This key is not known.", KEY_REMEDY, address=address)
         return Caller(key.tenant, key.scopes, key.key_id, address)
 
+    @contextmanager
+    def stranger(self) -> Iterator[None]:
+        """The time in which somebody is connected who has yet to say who it is; Problem 503 if too many are."""
+        if self._strangers >= MAX_STRANGERS:
+            detail = f"{MAX_STRANGERS} viewers have yet to send their keys, as many as may be."
+            raise Problem(503, detail, remedy="Come back, or send the key as a header.")
+        self._strangers += 1
+        try:
+            yield
+        finally:
+            self._strangers -= 1
+
 
 def key_missing(address: str) -> Refusal:
     """The answer to a request that needs a key and has none."""
     return Refusal(401, "A key is needed.", KEY_REMEDY, address=address)
+
+
+def _is_forwarded(headers: Mapping[str, str]) -> bool:
+    return any(name in FORWARDED_HEADERS or name.startswith(FORWARDED_PREFIX) for name in headers)
 
 
 def _key_text(headers: Mapping[str, str]) -> str | None:

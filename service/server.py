@@ -10,7 +10,7 @@ import h11
 import uvicorn
 from fastapi import FastAPI
 from uvicorn._types import ASGISendEvent
-from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from contract.settings import Settings
@@ -18,8 +18,9 @@ from service.deps import Deps
 from service.problems import MEDIA_TYPE, Problem
 
 KEEP_ALIVE_S = 15
-FIRST_REQUEST_S = 20.0
-"""A connection that has not brought the head of a request by then is closed."""
+HEAD_S = 20.0
+"""A connection that is waited on for the head of a request for longer is closed: the first, or one after an answer.
+It is looked at this often, so that it may take twice as long."""
 MAX_HEAD_BYTES = 32 * 1024
 """Of a request's line and headers together."""
 MAX_CONNECTIONS = 1024
@@ -37,11 +38,11 @@ UNREADABLE = Problem(400, "This is not a sound HTTP request.", remedy="See that 
 
 
 class HttpConnection(H11Protocol):
-    """Answers what is no HTTP with a problem document too, and does not wait forever for the first request."""
+    """Answers what is no HTTP with a problem document too, and does not wait forever for a request."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self.loop.call_later(FIRST_REQUEST_S, self._end_if_silent)
+        self.loop.call_later(HEAD_S, self._end_if_silent, None)
 
     def send_400_response(self, msg: str) -> None:
         """The answer to what h11 cannot read."""
@@ -53,10 +54,16 @@ class HttpConnection(H11Protocol):
             self.transport.write(self.conn.send(event) or b"")
         self.transport.close()
 
-    def _end_if_silent(self) -> None:
-        first_request: object = self.cycle
-        if first_request is None and self.transport.get_protocol() is self:  # and not a WebSocket by now
+    def _end_if_silent(self, answered: object) -> None:
+        """Close it if no request has begun since the last look. answered: the request that was the last one then."""
+        if self.transport.is_closing() or self.transport.get_protocol() is not self:  # a WebSocket by now
+            return
+        last: RequestResponseCycle | None = self.cycle
+        is_waiting = last is None or last.response_complete
+        if is_waiting and last is answered:
             self.transport.close()
+        else:
+            self.loop.call_later(HEAD_S, self._end_if_silent, last if is_waiting else object())
 
 
 class WebSocketConnection(WebSocketsSansIOProtocol):

@@ -22,6 +22,7 @@ from typing import Any
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from starlette.types import Message
 
 from contract.job import JobState
 from contract.keys import KeyScope
@@ -36,6 +37,8 @@ router = APIRouter()
 LENGTH_BYTES = 4
 LONGEST_MESSAGE = 16 * 1024
 """Characters; a request is some hundred."""
+AUTHORIZE_TIMEOUT_S = 5.0
+"""Who has connected without a key sends it at once."""
 SEND_TIMEOUT_S = 30.0
 """A viewer that takes so long for one view is not there any more."""
 
@@ -85,17 +88,24 @@ async def stream(websocket: WebSocket, services: Services, caller: EarlyCaller) 
     """Views one after the other; see the head of this file."""
     if caller is not None:
         caller.require(KeyScope.VIEW)  # refused before the handshake
-    await websocket.accept()
-    with services.metrics.streams.track_inprogress():
-        await _Viewer(websocket, services, may_come_in=caller is not None).serve()
+    with contextlib.ExitStack() as lobby:
+        if caller is None:
+            lobby.enter_context(services.access.stranger())
+        await websocket.accept()
+        with services.metrics.streams.track_inprogress():
+            await _Viewer(websocket, services, lobby, may_come_in=caller is not None).serve()
 
 
 class _Viewer:
-    """One connection: a task that reads, and keeps the newest request, and one that answers."""
+    """One connection: a task that reads, and keeps the newest request, and one that answers.
 
-    def __init__(self, websocket: WebSocket, services: Deps, *, may_come_in: bool) -> None:
+    lobby: where it waits until its key has come.
+    """
+
+    def __init__(self, websocket: WebSocket, services: Deps, lobby: contextlib.ExitStack, *, may_come_in: bool) -> None:
         self._websocket = websocket
         self._services = services
+        self._lobby = lobby
         self._address = address_of(websocket)
         self._caller: Callable[[], Caller] | None = self._caller_of_headers if may_come_in else None
         self._newest: dict[str, Any] | Problem | None = None
@@ -118,7 +128,7 @@ class _Viewer:
 
     async def _read(self) -> None:
         while True:
-            message = await self._websocket.receive()
+            message = await self._receive()
             if message["type"] == "websocket.disconnect":
                 return
             text = message.get("text")
@@ -130,9 +140,18 @@ class _Viewer:
             document = document_of(text)
             if self._caller is None or (isinstance(document, dict) and AUTHORIZE in document):
                 self._caller = self._authorized(document)
+                self._lobby.close()
             else:
                 self._newest = document
                 self._arrived.set()
+
+    async def _receive(self) -> Message:
+        """What the viewer sends next; its key must come at once."""
+        try:
+            async with asyncio.timeout(AUTHORIZE_TIMEOUT_S if self._caller is None else None):
+                return await self._websocket.receive()
+        except TimeoutError:
+            raise _HangUp(NOT_ALLOWED, key_missing(self._address)) from None
 
     async def _answer_all(self) -> None:
         while True:

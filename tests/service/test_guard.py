@@ -116,6 +116,8 @@ def test_too_many_requests_are_told_when_to_come_back() -> None:
         ({"hosts": ("splat.hospital",)}, {}, False),
         ({}, {"x-forwarded-for": "10.0.0.7"}, False),
         ({}, {"forwarded": "for=10.0.0.7"}, False),
+        ({}, {"x-forwarded-proto": "https"}, False),
+        ({}, {"cf-connecting-ip": "10.0.0.7"}, False),
     ],
 )
 def test_only_this_machines_user_needs_no_key(

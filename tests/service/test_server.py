@@ -6,6 +6,7 @@ import json
 import signal
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -148,3 +149,29 @@ def test_many_listeners_leave_the_service_free_for_others(live: LiveService) -> 
         listener.join()
     assert len(endings) == 60
     assert all("cancelled" in ending for ending in endings)
+
+
+@pytest.mark.parametrize("started", [b"", b"GET /healthz", b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n"])
+@pytest.mark.parametrize("first", [b"", b"Content-Length: 9\r\n"])  # a body that no route reads, and never comes
+def test_a_head_that_does_not_end_holds_no_connection(
+    live: LiveService, monkeypatch: pytest.MonkeyPatch, first: bytes, started: bytes
+) -> None:
+    monkeypatch.setattr("service.server.HEAD_S", 0.1)
+    with socket.create_connection(("127.0.0.1", live.port), timeout=PATIENCE_S) as connection:
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n" + first + b"\r\n")
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200")
+        if started:
+            connection.sendall(started)
+        while connection.recv(65536):
+            pass
+
+
+def test_a_long_answer_is_not_taken_for_a_silent_connection(live: LiveService, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.server.HEAD_S", 0.05)
+    job_id = submitted(live)
+    with httpx.stream("GET", f"{live.url}/jobs/{job_id}/events", timeout=PATIENCE_S) as stream:
+        lines = stream.iter_lines()
+        assert next(line for line in lines if line.startswith("data"))
+        time.sleep(0.3)
+        httpx.delete(f"{live.url}/jobs/{job_id}")
+        assert any("cancelled" in line for line in lines)

@@ -233,6 +233,31 @@ def test_who_does_not_is_shown_out(guarded: LiveService, first: str) -> None:
         assert closed.value.rcvd.code == 1008
 
 
+def test_who_sends_no_key_at_all_is_shown_out_too(guarded: LiveService, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.stream.AUTHORIZE_TIMEOUT_S", 0.1)
+    with viewing(guarded) as viewer:
+        assert problem(viewer)["status"] == 401
+
+
+def test_strangers_hold_few_places_and_none_of_those_with_keys(
+    guarded: LiveService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.access.MAX_STRANGERS", 1)
+    own = guarded.finished_scene("ward-3")
+    with viewing(guarded) as stranger:
+        with pytest.raises(InvalidStatus) as refused, viewing(guarded):
+            pass
+        assert refused.value.response.status_code == 503
+        with viewing(guarded, additional_headers=bearer(key(guarded))) as known:
+            ask(known, scene=own)
+            assert view(known)[0]["scene"] == own
+        ask(stranger, authorize=key(guarded))
+        ask(stranger, scene=own)
+        assert view(stranger)[0]["scene"] == own
+        with viewing(guarded):  # there is a place again
+            pass
+
+
 def test_a_wrong_key_or_one_that_may_not_see_is_refused_before_the_handshake(guarded: LiveService) -> None:
     blind = key(guarded, scopes=frozenset({KeyScope.RECONSTRUCT}))
     for text, status in (("isp_0_0", 401), (blind, 403)):
