@@ -185,6 +185,10 @@ def run_stand_in(tmp_path: Path, work: str, **more: Any) -> dict[str, Any]:
         ("raise ValueError('a file name')", "the decoder failed .ValueError."),
         ("import os; os.write(3, b'nonsense\\n' * 9)\nimport time; time.sleep(9)", "the decoder talks nonsense"),
         ("import os; os.write(3, b'x' * (5 << 20))", "the decoder talks nonsense"),
+        ("import os; os.write(3, b'[' * 100_000 + b'\\n')", "the decoder talks nonsense"),
+        ('import os; os.write(3, b\'{"pictures": Infinity, "share": 0}\\n\')', "the decoder talks nonsense"),
+        ("reports.end({'result': 3})", "the decoder talks nonsense"),
+        ("reports.end({'error': {'kind': 'input'}})", "the decoder talks nonsense"),
     ],
 )
 def test_a_decoder_that_misbehaves_is_an_error_of_its_clip(tmp_path: Path, work: str, problem: str) -> None:
@@ -202,6 +206,12 @@ def test_a_decoder_that_computes_without_end_is_ended(tmp_path: Path) -> None:
 def test_a_decoder_that_hangs_is_ended(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"made no progress for 0\.5 s"):
         run_stand_in(tmp_path, "import time; time.sleep(60)", patience=Patience(silence_s=0.5))
+
+
+def test_a_decoder_that_never_ends_its_line_is_ended(tmp_path: Path) -> None:
+    work = "import time\nwhile True: reports._stream.write(b' '); reports._stream.flush(); time.sleep(0.02)"
+    with pytest.raises(InputError, match=r"made no progress for 0\.5 s"):
+        run_stand_in(tmp_path, work, patience=Patience(silence_s=0.5))
 
 
 def test_a_decoder_that_only_pretends_to_advance_is_ended_too(tmp_path: Path) -> None:

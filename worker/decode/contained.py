@@ -29,6 +29,8 @@ POLL_S = 0.1  # how soon a stop is noticed
 PARTING_S = 5.0  # to end after the answer; what lives on could change the arrays that the worker maps
 
 PROGRAM = ("-m", "worker.decode.child")
+NONSENSE = "the decoder talks nonsense"
+MALFORMED = (ValueError, KeyError, TypeError, OverflowError, RecursionError)  # what reading a lie may raise
 REMEDY = "Export it again as H.264 in mp4, or give its frames as PNG in a zip."
 _PACKAGES = Path(__file__).resolve().parents[2]  # the folder that holds `worker` and `contract`
 _KEPT_VARIABLES = ("LD_LIBRARY_PATH", "SYSTEMROOT")  # without them some installations find no libraries
@@ -97,7 +99,10 @@ def run_contained(
         _end(process, patience.parting_s if watch.answered else 0.0)
         if process.stdout is not None:
             process.stdout.close()
-    return _result(answer, process.returncode, watch.field, allowance)
+    try:
+        return _result(answer, process.returncode, watch.field, allowance)
+    except MALFORMED:
+        raise _undecodable(watch.field, NONSENSE) from None
 
 
 def _end(process: subprocess.Popen[bytes], parting_s: float) -> None:
@@ -139,8 +144,8 @@ class _Watch:
                     self.answered = True
                     return dict(told)
                 self._note(told)
-            except (ValueError, KeyError, TypeError):
-                raise _undecodable(self.field, "the decoder talks nonsense") from None
+            except MALFORMED:
+                raise _undecodable(self.field, NONSENSE) from None
             self._check(end_s)
         return None
 
@@ -160,7 +165,7 @@ class _Watch:
             raise _undecodable(self.field, f"the decoder took more than {self._patience.longest_s:g} s")
 
     def _lines(self) -> Iterator[bytes | None]:
-        """Whole lines as they come, and None whenever POLL_S passed without any."""
+        """Whole lines as they come, and None whenever POLL_S passed, or a part came, without any."""
         assert self._process.stdout is not None
         descriptor = self._process.stdout.fileno()
         poll = select.poll()
@@ -175,8 +180,10 @@ class _Watch:
                 return
             *lines, rest = (rest + piece).split(b"\n")
             yield from lines
+            if not lines:
+                yield None
             if len(rest) > MOST_ANSWER_BYTES:
-                raise _undecodable(self.field, "the decoder talks nonsense")
+                raise _undecodable(self.field, NONSENSE)
 
 
 def _environment(folder: Path) -> dict[str, str]:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from contract.calibration import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
 from contract.camera import Intrinsics
@@ -23,7 +22,7 @@ from worker.calibration import check_calibration
 from worker.clip import ClipLimits, DepthClip, StereoClip
 from worker.clip.files import DEEPEST_FOLDER
 from worker.clip.types import RgbFrame
-from worker.decode.contained import REMEDY, private_folder, run_contained
+from worker.decode.contained import MALFORMED, REMEDY, private_folder, run_contained
 from worker.decode.guard import LIMITED_MEMORY, PROTECTIONS, Allowance
 from worker.decode.handover import DEPTH, map_array
 from worker.hooks import Hooks, Progress
@@ -98,7 +97,7 @@ def decode_clip(
         )
         try:
             return _received(told, folder, allowance)
-        except (ValueError, KeyError, TypeError, OSError, ValidationError) as error:
+        except (*MALFORMED, OSError) as error:
             problem = f"it cannot be decoded: the decoder's answer does not fit ({type(error).__name__})."
             raise InputError("clip", problem, REMEDY) from error
 

@@ -52,9 +52,12 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
 
 def _depth_arrays(clip: DepthClip, reports: Reports) -> Iterator[tuple[str, NDArray[Any]]]:
     names = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera", "frame_times_s")
-    for done, name in enumerate(names, start=1):
-        reports.share = max(reports.share, _OPENING_SHARE + (1 - _OPENING_SHARE) * done / len(names))
+    done = 0
+    for name in names:
         for frame in getattr(clip, name):
+            done += 1
+            share = done / (len(names) * clip.frame_count)
+            reports.share = max(reports.share, _OPENING_SHARE + (1 - _OPENING_SHARE) * share)
             reports.picture()  # a slow disk is no decoder that hangs
             yield name, frame
 
