@@ -20,14 +20,14 @@ class ClipHistory:
     cell           (target, point) as their texts
     job_id         of the 202; None if the caller never got one
     cancel_heard   the service confirmed that a cancel was asked for
-    killed_at_s    UNIX time of the kill
+    killed_at_s    UNIX time of the kill; None where nothing is killed
     restart_s      until everything that was killed answered again; counted where Valkey or all were killed
     """
 
     cell: tuple[str, str]
     job_id: str | None = None
     cancel_heard: bool = False
-    killed_at_s: float = 0.0
+    killed_at_s: float | None = None
     restart_s: float = 0.0
     events: list[Event] = field(default_factory=list)
 
@@ -39,12 +39,11 @@ class ClipHistory:
     @property
     def rerun_s(self) -> float | None:
         """From the kill to the start of the next attempt, if the job had to be run again."""
-        later = [
-            event.record.started_at_s
-            for event in self.events
-            if event.record.attempt > 1 and event.record.started_at_s and event.record.started_at_s > self.killed_at_s
-        ]
-        return min(later) - self.killed_at_s if later else None
+        killed_at_s = self.killed_at_s
+        if killed_at_s is None:
+            return None
+        starts_s = [event.record.started_at_s or 0.0 for event in self.events if event.record.attempt > 1]
+        return min((start_s - killed_at_s for start_s in starts_s if start_s > killed_at_s), default=None)
 
 
 def violations(history: ClipHistory, store: Store) -> list[str]:
