@@ -8,6 +8,7 @@ Every route but those of service/system.py that say nothing of anybody's work ta
 
 from __future__ import annotations
 
+from ipaddress import ip_address
 from typing import Annotated
 
 from fastapi import Depends, Query
@@ -32,6 +33,7 @@ from service.retention import Retention
 from service.sweep import Sweep
 
 UNIX_SOCKET = "unix"
+NO_ADDRESS = "unknown"
 
 
 class Deps:
@@ -66,8 +68,13 @@ Services = Annotated[Deps, Depends(_deps_of)]
 
 
 def address_of(connection: HTTPConnection) -> str:
-    """The caller's address, as far as the proxies in between are trusted to tell it."""
-    return connection.client.host if connection.client else UNIX_SOCKET
+    """The caller's address, as far as the proxies in between are trusted to tell it; no other text of theirs."""
+    if connection.client is None:
+        return UNIX_SOCKET
+    try:
+        return str(ip_address(connection.client.host.partition("%")[0]))  # without the zone, which is any text
+    except ValueError:
+        return NO_ADDRESS
 
 
 async def _caller_if_known(connection: HTTPConnection, services: Services) -> Caller | None:

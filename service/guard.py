@@ -83,6 +83,9 @@ class Guard:
         if origin is not None and origin not in self._origins and _split(origin).netloc != host:
             remedy = "Whoever runs the service admits pages from elsewhere with INTRASPLAT_CORS_ORIGINS."
             return Problem(403, f"Pages from {origin[:80]!r} may not use this service.", field="Origin", remedy=remedy)
+        if "transfer-encoding" in headers and "content-length" in headers:  # RFC 9112, 6.1: how requests are smuggled
+            close = {"Connection": "close"}
+            return Problem(400, "The body's length is told in two ways.", field="Content-Length", headers=close)
         return None
 
 

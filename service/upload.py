@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import AsyncIterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from python_multipart.exceptions import MultipartParseError
+from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
@@ -117,15 +118,13 @@ async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: 
     kind, parameters = parse_options_header(content_type)
     if kind != b"multipart/form-data" or not parameters.get(b"boundary"):
         raise Problem(400, f"The content type is {content_type[:80]!r}.", field="Content-Type", remedy=FORM_REMEDY)
-    receiver = _Receiver(parameters[b"boundary"], folder, limits)
     try:
-        async for chunk in body:
-            await run_in_threadpool(receiver.write, chunk)
-        return receiver.finish()
-    except MultipartParseError as error:
+        with closing(_Receiver(parameters[b"boundary"], folder, limits)) as receiver:
+            async for chunk in body:
+                await run_in_threadpool(receiver.write, chunk)
+            return receiver.finish()
+    except FormParserError as error:
         raise Problem(400, f"The multipart body is malformed: {error}", remedy=FORM_REMEDY) from error
-    finally:
-        receiver.close()
 
 
 class _Receiver:

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from starlette.requests import HTTPConnection
 
 from contract.keys import KeyFile
 from contract.settings import Settings
 from service.access import WRONG_KEYS_AT_ONCE, Access
+from service.deps import address_of
 from service.guard import LOOPBACK_NAMES, Guard
 from service.limits import BUCKETS_KEPT, Limiter
 from service.problems import Problem
@@ -61,6 +63,26 @@ def test_a_foreign_name_or_page_reaches_neither_a_route_nor_a_websocket(
 ) -> None:
     kind, status, _ = answer(scope, headers)
     assert (kind.endswith("http.response.start"), status) == (True, 403)
+
+
+def test_a_body_whose_length_is_told_in_two_ways_is_refused_with_its_connection() -> None:
+    """A proxy may believe one, we the other: what follows the shorter body would be a request of somebody else's."""
+    _, status, headers = answer(HTTP, {"host": "127.0.0.1", "transfer-encoding": "chunked", "content-length": "5"})
+    assert (status, headers["connection"]) == (400, "close")
+
+
+@pytest.mark.parametrize(
+    ("told", "address"),
+    [
+        (("10.0.0.7", 0), "10.0.0.7"),
+        (("2001:db8::7", 0), "2001:db8::7"),
+        (("fe80::7%Smith", 0), "fe80::7"),
+        (("Smith, ward 3", 0), "unknown"),
+        (None, "unix"),
+    ],
+)
+def test_what_a_proxy_tells_as_an_address_is_one_or_is_forgotten(told: tuple[str, int] | None, address: str) -> None:
+    assert address_of(HTTPConnection({**HTTP, "client": told})) == address
 
 
 def test_the_page_itself_may_open_a_websocket() -> None:
