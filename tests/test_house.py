@@ -40,11 +40,12 @@ def test_links_between_pages_and_files_lead_somewhere(page: Path) -> None:
     assert [each for each in relative_links(page) if not (page.parent / each).exists()] == []
 
 
-def test_the_tree_in_the_readme_names_only_what_exists() -> None:
+def names_in_the_tree() -> list[str]:
+    """What the annotated tree in the README names, as paths."""
     readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```\w*\n(.*?)^```", readme, re.DOTALL | re.MULTILINE)
     tree = next(each for each in blocks if each.startswith("contract/"))
-    missing, folder = [], ""
+    named, folder = [], ""
     for line in tree.splitlines():
         # Names end where the description begins: after two spaces, or at the end of the line.
         names = re.split(r"\s{2,}", line.strip())
@@ -52,8 +53,19 @@ def test_the_tree_in_the_readme_names_only_what_exists() -> None:
         if not line.startswith(" "):
             folder = candidates[0]
             candidates = [""]
-        missing += [folder + each for each in candidates if not (REPOSITORY / folder / each).exists()]
-    assert missing == []
+        named += [folder + each for each in candidates]
+    return named
+
+
+def test_the_tree_in_the_readme_names_only_what_exists() -> None:
+    assert [each for each in names_in_the_tree() if not (REPOSITORY / each).exists()] == []
+
+
+@pytest.mark.parametrize("package", ["contract", "worker", "service", "client"])
+def test_the_tree_in_the_readme_names_every_module(package: str) -> None:
+    modules = {f"{package}/{path.name}" for path in (REPOSITORY / package).glob("[!_]*.py")}
+    folders = {f"{package}/{path.parent.name}/" for path in (REPOSITORY / package).glob("*/__init__.py")}
+    assert sorted((modules | folders) - {*names_in_the_tree()}) == []
 
 
 def test_the_python_example_calls_only_what_the_client_offers() -> None:
