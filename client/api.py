@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import httpx
 
 from client.calls import Calls
-from client.connection import LISTENING, arguments_of, settings_of, unreachable
+from client.connection import DEFAULT_URL, LISTENING, arguments_of, settings_of, unreachable
 from client.steps import DEFAULT_PATIENCE_S, Body, Call, Listen, NextLine, Pause, Procedure, Show, Step, Steps
 from client.submission import OnUpload, prepare
 from client.viewer import Talk, Viewer
@@ -25,8 +25,6 @@ from contract.job import JobState, JobView
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-DEFAULT_URL = "http://127.0.0.1:8765"
 
 Result = TypeVar("Result")
 

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import anyio
 import httpx
 
-from client.api import DEFAULT_URL
 from client.calls import Calls
-from client.connection import LISTENING, arguments_of, settings_of, unreachable
+from client.connection import DEFAULT_URL, LISTENING, arguments_of, settings_of, unreachable
 from client.steps import DEFAULT_PATIENCE_S, Body, Call, Listen, NextLine, Pause, Procedure, Show, Step, Steps
 from client.submission import OnUpload, prepare
 from client.viewer import AsyncViewer, Talk

@@ -1,4 +1,4 @@
-"""What both clients tell httpx, and what its failures mean."""
+"""What the clients tell a connection: where, who asks, how long to wait; and what its failures mean."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import httpx
 from client.errors import UNAVAILABLE_REMEDY, Unreachable
 from client.steps import Call
 from contract.errors import InputError
+
+DEFAULT_URL = "http://127.0.0.1:8765"
 
 CONNECT_TIMEOUT_S = 5.0
 ANSWER_TIMEOUT_S = 60.0
@@ -34,8 +36,13 @@ def settings_of(url: str, api_key: str | None) -> dict[str, Any]:
     return {
         "base_url": base_url,
         "timeout": httpx.Timeout(ANSWER_TIMEOUT_S, connect=CONNECT_TIMEOUT_S),
-        "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key.strip()}"},
+        "headers": authorization(api_key),
     }
+
+
+def authorization(api_key: str | None) -> dict[str, str]:
+    """The header that says who asks; a key out of a file may end with a line break."""
+    return {} if api_key is None else {"Authorization": f"Bearer {api_key.strip()}"}
 
 
 def arguments_of(call: Call) -> dict[str, Any]:

@@ -10,7 +10,8 @@ import sys
 from pathlib import Path
 from typing import get_args
 
-from client.api import DEFAULT_URL, Client
+from client.api import Client
+from client.connection import DEFAULT_URL
 from contract.arguments import Commands, add_command, finite, positive
 from contract.errors import InputError
 from contract.exits import ExitCode

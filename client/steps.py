@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 import httpx
 
-from client.errors import ServiceUnavailable, Unreachable, error_of_answer
+from client.errors import Refusal, ServiceFault, ServiceUnavailable, Unreachable, error_of_answer
 from contract.errors import IntrasplatError
 from contract.job import JobView
 
@@ -92,8 +92,17 @@ class Procedure(Generic[Result]):
         self._advance(lambda: next(steps))
 
     def answer(self, reply: Any) -> None:
-        """What came of the step."""
-        self._advance(lambda: self._steps.send(reply))
+        """What came of the step.
+
+        Raises:
+            ServiceFault: it cannot be read. A procedure reads nothing but replies, so that is what these errors mean.
+        """
+        try:
+            self._advance(lambda: self._steps.send(reply))
+        except (ValueError, KeyError, TypeError) as error:
+            status = reply.status_code if isinstance(reply, httpx.Response) else httpx.codes.OK
+            problem = "What answers there is no intrasplat service, or one of another version."
+            raise ServiceFault(Refusal(status, problem, remedy="Correct the address.")) from error
 
     def fail(self, error: Unreachable) -> None:
         """The step could not be taken."""

@@ -6,6 +6,7 @@ Of file names only the endings are sent; they may name a patient.
 from __future__ import annotations
 
 import base64
+import contextlib
 import functools
 import json
 import uuid
@@ -131,7 +132,7 @@ def _upload(submission: Submission, part: str, before: dict[str, str], patience_
     patience, offset = Patience(patience_s), 0
     while offset < size_bytes:
         end = min(offset + PIECE_BYTES, size_bytes)
-        new_offset = yield from _append(submission, path, place, (offset, end), sent_before, patience)
+        new_offset = yield from _append(submission, part, place, (offset, end), sent_before, patience)
         if new_offset > offset:
             patience.renew()
         offset = new_offset
@@ -139,13 +140,12 @@ def _upload(submission: Submission, part: str, before: dict[str, str], patience_
 
 
 def _append(
-    submission: Submission, path: Path, place: str, span: tuple[int, int], sent_before: int, patience: Patience
+    submission: Submission, part: str, place: str, span: tuple[int, int], sent_before: int, patience: Patience
 ) -> Steps[int]:
     """Send the bytes of one span; how many the service has afterwards, which may be fewer, or more, than that."""
     start, end = span
-    body = Body(
-        end - start, functools.partial(_read, path, start, end), lambda n: submission.tell(sent_before + start + n)
-    )
+    pieces = functools.partial(_read, part, submission.paths[part], start, end)
+    body = Body(end - start, pieces, lambda n: submission.tell(sent_before + start + n))
     headers = {**TUS, "Upload-Offset": str(start), "Content-Type": TUS_CONTENT_TYPE}
     failure: IntrasplatError
     try:
@@ -185,31 +185,36 @@ def _form(submission: Submission, boundary: str) -> Body:
         yield head
         for part, path in submission.paths.items():
             yield heads[part]
-            yield from _read(path, 0, submission.sizes[part])
+            yield from _read(part, path, 0, submission.sizes[part])
             yield b"\r\n"
         yield tail
 
     return Body(length, pieces, submission.tell)
 
 
-def _read(path: Path, start: int, end: int) -> Iterator[bytes]:
+def _read(part: str, path: Path, start: int, end: int) -> Iterator[bytes]:
     """The bytes of a file from start to end, and no others, though it may have grown meanwhile."""
-    with path.open("rb") as file:
+    with _readable(part, path), path.open("rb") as file:
         file.seek(start)
         while start < end:
             piece = file.read(min(READ_BYTES, end - start))
             if not piece:
-                raise InputError("clip", f"{path} has become shorter while it was sent.", "Send it once it is whole.")
+                raise InputError(part, f"{path} has become shorter while it was sent.", "Send it once it is whole.")
             start += len(piece)
             yield piece
 
 
-def _size_of(part: str, path: Path) -> int:
+@contextlib.contextmanager
+def _readable(part: str, path: Path) -> Iterator[None]:
     try:
-        with path.open("rb"):
-            size_bytes = path.stat().st_size
+        yield
     except OSError as error:
         raise InputError(part, f"{path} cannot be read ({error.strerror}).", "Name a file that exists.") from error
+
+
+def _size_of(part: str, path: Path) -> int:
+    with _readable(part, path), path.open("rb"):
+        size_bytes = path.stat().st_size
     if size_bytes == 0:
         raise InputError(part, f"{path} is empty.", "Send a file with content.")
     return size_bytes

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 
+from client.connection import ANSWER_TIMEOUT_S, CONNECT_TIMEOUT_S, authorization
 from client.errors import Unreachable, error_of_answer
 from client.views import Image, image_of_message, view_query
 from contract.errors import IntrasplatError
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection as AsyncConnection
     from websockets.sync.client import ClientConnection as Connection
 
-CONNECT_TIMEOUT_S = 5.0
-ANSWER_TIMEOUT_S = 60.0
 LONGEST_MESSAGE_BYTES = 2**28
 """64 million pixels of depth in mm, more than any service renders; the library's own limit, 1 MiB, is for chat."""
 
@@ -31,7 +30,7 @@ class Talk:
     def __init__(self, url: str, scene: str, api_key: str | None) -> None:
         self.http_url = url
         self.url = f"ws{url.removeprefix('http')}/stream"
-        self.headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
+        self.headers = authorization(api_key)
         self._scene = scene
         self._asked = 0
 
@@ -61,7 +60,7 @@ class Talk:
             response = error.response
             headers = {name.lower(): value for name, value in response.headers.raw_items()}
             return error_of_answer(response.status_code, headers, bytes(response.body or b""))
-        return Unreachable(self.http_url, error, is_nobody_there=not isinstance(error, ConnectionClosed))
+        return Unreachable(self.http_url, error, is_nobody_there=not self._asked)
 
 
 class Viewer:
