@@ -18,7 +18,7 @@ from pathlib import Path
 from client.api import Client
 from contract.embedded import EmbeddedServer
 from contract.errors import UnavailableError
-from contract.keys import KeyFile
+from contract.keys import check_keys
 from contract.locks import FolderLock
 from contract.processes import die_with_parent, end_process, told_to_end
 from contract.settings import Settings
@@ -34,7 +34,6 @@ STEADY_S = 60.0
 
 STOP_TIMEOUT_S = 15.0
 WORKER_NAME_VARIABLE = "INTRASPLAT_WORKER_NAME"
-LOOPBACK_ADDRESSES = frozenset({"127.0.0.1", "localhost", "::1"})
 EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 """Where this machine finds itself when the service answers at all of its addresses."""
 
@@ -200,14 +199,6 @@ def run(settings: Settings, worker_count: int = 1, ready_timeout_s: float = 300.
         while not end.wait(WATCH_PERIOD_S):
             installation.watch()
         say("ending")
-
-
-def check_keys(settings: Settings) -> None:
-    """Raise UnavailableError if others could reach the service and there is no key to let the right ones in."""
-    if settings.host not in LOOPBACK_ADDRESSES and not KeyFile(settings.data_dir).list():
-        problem = f"{settings.host} can be reached from other machines, and there are no keys."
-        remedy = f"Make one first: `intrasplat keys create --tenant NAME --data-dir {settings.data_dir}`."
-        raise UnavailableError(problem, remedy)
 
 
 def check_port(host: str, port: int) -> None:

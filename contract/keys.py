@@ -23,6 +23,7 @@ from contract.durable import replace_file
 from contract.errors import InputError, UnavailableError
 from contract.job import TENANT_PATTERN
 from contract.locks import FolderLock
+from contract.settings import LOOPBACK_NAMES, Settings
 
 KEYS_FILE = "keys.json"
 KEY_PREFIX = "isp"
@@ -179,6 +180,18 @@ class KeyFile:
 
     def _write(self, keys: tuple[ApiKey, ...]) -> None:
         replace_file(self._path, _Stored(keys=keys).model_dump_json(indent=1).encode())
+
+
+def check_keys(settings: Settings) -> None:
+    """Return if there are keys, or none is needed since this machine alone can reach the service.
+
+    Raises:
+        UnavailableError: others could reach it, and there is no key to let the right ones in.
+    """
+    if settings.host not in LOOPBACK_NAMES and not KeyFile(settings.data_dir).list():
+        problem = f"{settings.host} can be reached from other machines, and there are no keys."
+        remedy = f"Make one first: `intrasplat keys create --tenant NAME --data-dir {settings.data_dir}`."
+        raise UnavailableError(problem, remedy)
 
 
 def _sha256(secret: str) -> str:

@@ -13,6 +13,8 @@ from contract.errors import InputError
 
 GIB = 2**30
 ENVIRONMENT_PREFIX = "INTRASPLAT_"
+LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
+"""A service at one of these is reached from this machine alone."""
 
 
 def default_data_dir() -> Path:

@@ -8,13 +8,12 @@ import sys
 
 from contract.errors import IntrasplatError, UnavailableError
 from contract.exits import ExitCode, exit_code_of
-from contract.keys import KeyFile
+from contract.keys import check_keys
 from contract.logs import configure
 from contract.queue_redis import RedisQueue
 from contract.settings import Settings
 from contract.store import open_store
 from service.app import create_app
-from service.guard import LOOPBACK_NAMES
 from service.renderer import ZmqRenderer
 from service.server import Server
 
@@ -25,7 +24,7 @@ def main() -> int:
     """Serve until a signal ends it."""
     try:
         settings = Settings.from_environment()
-        _check_host(settings)
+        check_keys(settings)
     except IntrasplatError as error:
         print(error, file=sys.stderr)
         return exit_code_of(error)
@@ -46,17 +45,6 @@ def main() -> int:
     with contextlib.suppress(KeyboardInterrupt):
         server.run()
     return ExitCode.OK if server.started else ExitCode.UNAVAILABLE
-
-
-def _check_host(settings: Settings) -> None:
-    """Return if the host may be served.
-
-    Raises:
-        UnavailableError: others could reach the service, and there is no key to let the right ones in.
-    """
-    if settings.host not in LOOPBACK_NAMES and not KeyFile(settings.data_dir).list():
-        problem = f"INTRASPLAT_HOST={settings.host} can be reached from elsewhere, and there are no keys."
-        raise UnavailableError(problem, "Make one first: `intrasplat keys create --tenant NAME`.")
 
 
 if __name__ == "__main__":

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 from contract.job import LOCAL_TENANT, JobRecord
 from contract.keys import ApiKey, KeyFile, KeyScope
-from contract.settings import Settings
-from service.guard import LOOPBACK_NAMES
+from contract.settings import LOOPBACK_NAMES, Settings
 from service.limits import Limiter
 from service.problems import Problem
 

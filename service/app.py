@@ -11,12 +11,12 @@ from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 
 from contract.queue import Queue
-from contract.settings import Settings
+from contract.settings import LOOPBACK_NAMES, Settings
 from contract.store import Store
 from service import jobs, reconstruct, renders, scenes, stream, system, tus
 from service.audit import install_refusal_handler
 from service.deps import Deps
-from service.guard import LOOPBACK_NAMES, Guard
+from service.guard import Guard
 from service.metrics import Measure
 from service.openapi import DescribedApp
 from service.problems import install_handlers

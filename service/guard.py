@@ -14,9 +14,9 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from contract.settings import LOOPBACK_NAMES
 from service.problems import Problem
 
-LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 ANY_HOST = "*"
 """As a host: every name is answered, for clusters that address a service by changing ones. Keys are required then."""
 

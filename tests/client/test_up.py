@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from client.up import Installation, WatchedProcess, check_keys, check_port, worker_names
+from client.up import Installation, WatchedProcess, check_port, worker_names
 from contract.errors import UnavailableError
-from contract.keys import KeyFile
 from contract.locks import FolderLock
 from contract.settings import Settings
 
@@ -108,15 +107,6 @@ def test_every_worker_has_a_name_of_its_own(tmp_path: Path) -> None:
     assert worker_names("worker-1", 3) == ["worker-1", "worker-2", "worker-3"]
     assert worker_names("theatre-2", 2) == ["theatre-2-1", "theatre-2-2"]
     assert len(Installation(Settings(data_dir=tmp_path), worker_count=3).workers) == 3
-
-
-def test_others_are_let_in_only_once_there_is_a_key(tmp_path: Path) -> None:
-    check_keys(Settings(data_dir=tmp_path))
-    abroad = Settings(data_dir=tmp_path, host="0.0.0.0")
-    with pytest.raises(UnavailableError, match="intrasplat keys create"):
-        check_keys(abroad)
-    KeyFile(tmp_path).create("ward")
-    check_keys(abroad)
 
 
 def test_a_service_at_every_address_is_found_at_loopback(tmp_path: Path) -> None:

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from contract.errors import InputError, UnavailableError
-from contract.keys import KEYS_FILE, KeyFile, KeyScope
+from contract.keys import KEYS_FILE, KeyFile, KeyScope, check_keys
+from contract.settings import Settings
 
 
 def test_a_key_is_found_by_its_text_and_by_nothing_else(tmp_path: Path) -> None:
@@ -98,3 +99,12 @@ def test_a_write_that_was_cut_off_leaves_the_old_keys_and_does_not_block_new_one
     assert KeyFile(tmp_path).list() == (key,)
     keys.create("b")
     assert [each.tenant for each in KeyFile(tmp_path).list()] == ["a", "b"]
+
+
+def test_others_are_let_in_only_once_there_is_a_key(tmp_path: Path) -> None:
+    check_keys(Settings(data_dir=tmp_path))
+    abroad = Settings(data_dir=tmp_path, host="0.0.0.0")
+    with pytest.raises(UnavailableError, match="intrasplat keys create"):
+        check_keys(abroad)
+    KeyFile(tmp_path).create("ward")
+    check_keys(abroad)

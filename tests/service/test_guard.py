@@ -11,10 +11,10 @@ import pytest
 from starlette.requests import HTTPConnection
 
 from contract.keys import KeyFile
-from contract.settings import Settings
+from contract.settings import LOOPBACK_NAMES, Settings
 from service.access import WRONG_KEYS_AT_ONCE, Access
 from service.deps import address_of
-from service.guard import LOOPBACK_NAMES, Guard
+from service.guard import Guard
 from service.limits import BUCKETS_KEPT, Limiter
 from service.problems import Problem
 
