@@ -229,6 +229,7 @@ def test_while_the_bucket_is_away_nothing_is_accepted_nor_taken_for_missing(tmp_
     host, port = server.get_host_and_port()
     with pytest.MonkeyPatch.context() as environment:
         lead_to(environment, f"http://{host}:{port}")
+        environment.setattr("contract.bucket.RETRIES", {"mode": "standard", "total_max_attempts": 1})
         boto3.resource("s3").Bucket("elsewhere").create()
         store = BucketStore(tmp_path, "s3://elsewhere")
         job_id = accepted(store).job_id

@@ -26,6 +26,7 @@ from service.audit import Audit
 from service.purge import LOG_CLEARED_AFTER_S, NOTES, Purger
 from service.retention import HOUR_S, Retention, check_retention, kept_hours
 from tests.service.house import CLIP, House, assert_problem, make_house
+from tests.service.test_tus import uploaded
 
 KEPT_FILES = {AUDIT_FILE, RESERVE_FILE}
 """What tells of a job after its purge: that it was purged."""
@@ -46,12 +47,7 @@ def traces_of(data_dir: Path, job_id: str) -> list[Path]:
 
 def upload_in_pieces(house: House) -> str:
     """A job whose clip came as a resumable upload."""
-    tus = {"Tus-Resumable": "1.0.0"}
-    metadata = {"Upload-Length": str(len(CLIP)), "Upload-Metadata": "part Y2xpcA==,suffix Lm1wNA=="}
-    path = house.http.post("/uploads", headers={**tus, **metadata}).headers["location"]
-    sending = {**tus, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
-    house.http.request("PATCH", path, headers=sending, content=CLIP)
-    job_id: str = house.http.post("/reconstruct", json={"clip": path.rsplit("/", 1)[1]}).json()["id"]
+    job_id: str = house.http.post("/reconstruct", json={"clip": uploaded(house)}).json()["id"]
     return job_id
 
 

@@ -12,7 +12,7 @@ import zmq
 
 from contract.embedded import short_socket_path
 from contract.errors import UnavailableError
-from contract.job import JobRecord, JobState
+from contract.job import JobRecord
 from contract.keys import DEFAULT_SCOPES, KeyFile, KeyScope
 from contract.queue import Claim
 from contract.queue_memory import MemoryQueue
@@ -276,29 +276,6 @@ def test_a_damaged_report_hides_no_other_scene(house: House, report: bytes) -> N
     assert listed[damaged]["error"]
 
 
-class ForgetfulQueue(MemoryQueue):
-    """Goes away just when a record is to be forgotten, once."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.is_away = True
-
-    def forget(self, job_id: str) -> bool:
-        if self.is_away:
-            self.is_away = False
-            raise UnavailableError("The queue does not answer.", "Start it.")
-        return super().forget(job_id)
-
-
-def test_a_deletion_that_the_queue_cut_short_has_removed_the_files_and_can_be_repeated(tmp_path: Path) -> None:
-    for house in make_house(tmp_path, ForgetfulQueue()):
-        scene = house.finished_scene()
-        assert_problem(house.http.delete(f"/scenes/{scene}"), 503)
-        assert [path for path in house.store.data_dir.glob("s*/*") if scene in path.name] == []
-        assert house.http.delete(f"/scenes/{scene}").status_code == 200
-        assert house.http.get(f"/jobs/{scene}").status_code == 404
-
-
 def answer_badly_then_well(socket: zmq.Socket[bytes]) -> None:
     """Two answers that cannot be read, one to each of two requests, then a sound one to the third."""
     good = WorkerReply(media_type="image/png", t=0.5).model_dump_json().encode()
@@ -324,11 +301,3 @@ def test_an_answer_that_cannot_be_read_spoils_no_later_one(house: House) -> None
     assert house.http.get("/render", params={"scene": scene}).content == b"picture"
     rude.join()
     context.term()
-
-
-def test_a_live_job_is_not_deleted_as_a_scene(house: House) -> None:
-    job_id = house.upload().json()["id"]
-    assert_problem(house.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
-    record = house.queue.get(job_id)
-    assert record is not None
-    assert record.state is JobState.QUEUED

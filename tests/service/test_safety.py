@@ -39,8 +39,12 @@ class Ward:
     http: Any
     key: str
 
+    @property
+    def headers(self) -> dict[str, str]:
+        return {"Authorization": f"Bearer {self.key}"}
+
     def request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
-        headers = {**arguments.pop("headers", {}), "Authorization": f"Bearer {self.key}"}
+        headers = {**arguments.pop("headers", {}), **self.headers}
         response: httpx.Response = self.http.request(method, path, headers=headers, **arguments)
         return response
 
@@ -59,19 +63,6 @@ def open_house(tmp_path: Path) -> Iterator[House]:
 
 def ward(house: House, tenant: str, scopes: frozenset[KeyScope] = ALL_SCOPES) -> Ward:
     return Ward(house.http, KeyFile(house.store.data_dir).create(tenant, scopes)[1])
-
-
-def finished(house: House, owner: Ward) -> str:
-    job_id = owner.upload()
-    record, claim = house.claimed()
-    assert record.job_id == job_id
-    folder = house.store.work_folder(job_id, record.attempt)
-    (folder / "manifest.json").write_text("{}")
-    (folder / "report.json").write_text('{"psnr_tissue_db": 36.2}')
-    (folder / "curve.csv").write_text("t_train_s,psnr_tissue_db\n1,30\n")
-    house.store.publish_scene(job_id, record.attempt)
-    assert house.queue.finish(claim)
-    return job_id
 
 
 def audit(house: House) -> list[dict[str, Any]]:
@@ -133,7 +124,7 @@ def test_no_route_is_without_the_question_who_calls(tmp_path: Path) -> None:
 def test_without_a_known_key_every_route_answers_401_and_tells_nothing(
     open_house: House, tmp_path: Path, key: str | None
 ) -> None:
-    job_id = finished(open_house, ward(open_house, "ward-3"))
+    job_id = open_house.finished_scene(ward(open_house, "ward-3").headers)
     headers = {} if key is None else {"X-API-Key": key}
     asked = requests_of(tmp_path / "other", job_id)
     assert len(asked) >= 14
@@ -150,7 +141,7 @@ def test_without_a_known_key_every_route_answers_401_and_tells_nothing(
 
 def test_another_tenants_job_is_answered_exactly_like_one_that_is_not_there(open_house: House, tmp_path: Path) -> None:
     mine, theirs = ward(open_house, "ward-3"), ward(open_house, "ward-4")
-    job_id = finished(open_house, mine)
+    job_id = open_house.finished_scene(mine.headers)
     missing = "f" * 32
     named = [
         (method, path)
@@ -190,7 +181,7 @@ def test_another_tenants_upload_is_not_there_either(open_house: House) -> None:
 
 @pytest.mark.parametrize("scope", list(KeyScope))
 def test_a_key_does_what_its_scope_says_and_nothing_else(open_house: House, tmp_path: Path, scope: KeyScope) -> None:
-    job_id = finished(open_house, ward(open_house, "ward-3"))
+    job_id = open_house.finished_scene(ward(open_house, "ward-3").headers)
     limited = ward(open_house, "ward-3", frozenset({scope}))
     needed = {"/metrics": KeyScope.OPERATE, "DELETE /scenes": KeyScope.PURGE}
     for method, path in requests_of(tmp_path / "other", job_id):
@@ -234,10 +225,10 @@ def test_on_loopback_no_key_is_needed_a_wrong_one_is_refused_and_a_right_one_cou
 
 def test_no_scene_is_shown_unasked_when_several_are_owned_and_none_of_others_ever(open_house: House) -> None:
     mine, theirs = ward(open_house, "ward-3"), ward(open_house, "ward-4")
-    first = finished(open_house, mine)
+    first = open_house.finished_scene(mine.headers)
     assert_problem(theirs.request("GET", "/render"), 400, "scene")
     assert mine.request("GET", "/render").headers["x-intrasplat-scene"] == first
-    finished(open_house, mine)
+    open_house.finished_scene(mine.headers)
     assert_problem(mine.request("GET", "/render"), 400, "scene")
 
 
@@ -254,7 +245,7 @@ def test_a_caller_that_asks_too_often_hears_when_to_come_back_and_others_are_ser
 
 def test_what_is_done_is_in_the_audit_and_a_view_once_a_minute(open_house: House) -> None:
     holder = ward(open_house, "ward-3")
-    done = finished(open_house, holder)
+    done = open_house.finished_scene(holder.headers)
     for _ in range(5):
         assert holder.request("GET", f"/render?scene={done}").status_code == 200
     holder.request("GET", f"/scenes/{done}")
