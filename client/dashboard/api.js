@@ -1,49 +1,89 @@
-// The service's routes that this page uses. Errors carry the problem document's words.
+// The service's routes that this page uses. What goes wrong is thrown as a Problem.
 
-export class Problem extends Error {
-  constructor(status, document) {
-    super([document.field, document.detail, document.remedy].filter(Boolean).join(" · "));
-    this.status = status;
+import { askForKey, currentKey, keyHeaders } from "./key.js";
+import { connectionLost, Problem, problemOf } from "./problem.js";
+
+/**
+ * A job as the service shows it (JobView).
+ * @typedef {{id: string, state: "queued"|"running"|"done"|"failed"|"cancelled", stage?: string, fraction?: number,
+ *   iteration?: number, psnr_db?: number, seconds_left?: number, position?: number, eta_s?: number,
+ *   error?: {problem: string, field?: string, remedy?: string}, cancel_requested: boolean, created_at_s: number}} Job
+ */
+/**
+ * What a purge removed.
+ * @typedef {{job_id: string, purged_at: string, files: Record<string, number>, bytes: Record<string, number>,
+ *   record: boolean, verified: boolean}} Receipt
+ */
+
+/**
+ * Ask the service, with the key if there is one.
+ * @param {string} path
+ * @param {RequestInit} [options]
+ * @returns {Promise<Response>}
+ */
+export async function request(path, options = {}) {
+  const sent = currentKey();
+  const headers = { ...keyHeaders(), ...options.headers };
+  let response;
+  try {
+    response = await fetch(path, { cache: "no-store", ...options, headers });
+  } catch (error) {
+    throw error.name === "AbortError" ? error : connectionLost();
+  }
+  if (response.ok) return response;
+  const problem = await problemOf(response);
+  if (problem.status === 401 && sent === currentKey()) askForKey(problem.message);
+  throw problem;
+}
+
+async function json(path, options) {
+  const response = await request(path, options);
+  try {
+    return await response.json();
+  } catch {
+    throw connectionLost();
   }
 }
 
-async function problemOf(response) {
-  const document = await response.json().catch(() => ({ detail: `the service answered ${response.status}` }));
-  return new Problem(response.status, document);
+/** @returns {Promise<Job[]>} */
+export const listJobs = () => json("/jobs");
+/** @param {string} id @returns {Promise<Job>} */
+export const getJob = (id) => json(`/jobs/${id}`);
+/** @param {string} id @returns {Promise<Job>} */
+export const cancelJob = (id) => json(`/jobs/${id}`, { method: "DELETE" });
+/** @param {string} id @returns {Promise<Job>} */
+export const retryJob = (id) => json(`/jobs/${id}/retry`, { method: "POST" });
+/** @param {string} id @returns {Promise<Receipt>} */
+export const purgeScene = (id) => json(`/scenes/${id}`, { method: "DELETE" });
+/** @param {string} id @returns {Promise<Record<string, any>>} */
+export const getReport = (id) => json(`/scenes/${id}`);
+/** @param {string} id @returns {Promise<string>} CSV */
+export const getCurve = async (id) => (await request(`/scenes/${id}/curve`)).text();
+/** @param {string} id @param {number} t @returns {Promise<Blob>} a .ply */
+export const exportScene = async (id, t) => (await request(`/scenes/${id}/export?format=ply&t=${t}`)).blob();
+
+/** @returns {Promise<string>} why nothing would be trained now, in words; empty if it would */
+export async function trouble() {
+  try {
+    await request("/readyz");
+    return "";
+  } catch (error) {
+    if (error instanceof Problem && error.status === 503) return error.document.detail ?? error.message;
+    throw error;
+  }
 }
 
-async function request(path, options = {}) {
-  const response = await fetch(path, { cache: "no-store", ...options });
-  if (!response.ok) throw await problemOf(response);
-  return response;
-}
-
-export const listJobs = async () => (await request("/jobs")).json();
-export const cancelJob = (id) => request(`/jobs/${id}`, { method: "DELETE" });
-export const deleteScene = (id) => request(`/scenes/${id}`, { method: "DELETE" });
-export const getReport = async (id) => (await request(`/scenes/${id}`)).json();
-export const isReady = async () => (await fetch("/readyz", { cache: "no-store" })).ok;
-
-/** One picture: { blob, t, warning }. */
-export async function render(query, signal) {
-  const response = await request(`/render?${new URLSearchParams(query)}`, { signal });
-  return {
-    blob: await response.blob(),
-    scene: response.headers.get("X-Intrasplat-Scene"),
-    warning: response.headers.get("X-Intrasplat-Warning") ?? "",
-  };
-}
-
-/** Send a form; onProgress gets the share sent. XMLHttpRequest, because fetch does not tell how far an upload is. */
-export function upload(form, onProgress) {
-  return new Promise((resolve, reject) => {
-    const http = new XMLHttpRequest();
-    http.open("POST", "/reconstruct");
-    http.responseType = "json";
-    http.upload.onprogress = (event) => event.lengthComputable && onProgress(event.loaded / event.total);
-    http.onerror = () => reject(new Problem(0, { detail: "the connection was lost", remedy: "Send the clip again." }));
-    http.onload = () =>
-      http.status === 202 ? resolve(http.response) : reject(new Problem(http.status, http.response ?? { detail: "it failed" }));
-    http.send(form);
+/**
+ * Make finished uploads a job.
+ * @param {Record<string, unknown>} submission upload ids by part, and options
+ * @param {string} idempotencyKey the same for every try
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<Job>}
+ */
+export const reconstruct = (submission, idempotencyKey, signal) =>
+  json("/reconstruct", {
+    method: "POST",
+    headers: { "Content-Type": "application/json", "Idempotency-Key": idempotencyKey },
+    body: JSON.stringify(submission),
+    signal,
   });
-}

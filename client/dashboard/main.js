@@ -1,20 +1,25 @@
-// The page: polls the jobs, and wires form, list, picture and report together.
+// The page: wires form, jobs, picture, curve and report together.
 
-import { getReport, isReady, listJobs } from "./api.js";
-import { makeJobList } from "./jobs.js";
-import { showReport } from "./report.js";
-import { startUploading } from "./uploading.js";
+import { getCurve, getReport } from "./api.js";
+import { drawCurve, pointsOfCsv } from "./curve.js";
+import { ClipForm } from "./form.js";
+import { JobList } from "./joblist.js";
+import { Jobs } from "./jobs.js";
+import { currentKey, keyEvents, showKeyForm } from "./key.js";
+import { baselinesOf, showReport } from "./report.js";
 import { Viewer } from "./viewer.js";
 
-const POLL_MS = 1000;
 const get = (id) => document.getElementById(id);
+const WHAT_REPORTS_ARE = "Of the scene in view: how good it is, and what was assumed.";
 
 const viewer = new Viewer({
   stage: get("stage"),
-  frame: get("frame"),
+  canvas: get("picture"),
+  badge: get("badge"),
   message: get("stage-message"),
-  warning: get("frame-warning"),
-  latency: get("latency"),
+  warning: get("picture-warning"),
+  sceneId: get("scene-id"),
+  readout: get("readout"),
   time: get("time"),
   timeValue: get("time-value"),
   layer: get("layer"),
@@ -22,47 +27,74 @@ const viewer = new Viewer({
   play: get("play"),
 });
 
-let awaited = null; // the job whose scene opens by itself when it is done
+/** @type {string | null} the job that opens by itself as soon as there is something to see of it */
+let awaited = null;
+/** @type {string | null} the scene whose report and final curve are shown */
+let reported = null;
 
-async function view(id) {
-  viewer.open(id);
-  try {
-    showReport(get("report"), id, await getReport(id));
-  } catch (error) {
-    get("report").textContent = error.message;
-  }
-  poll();
+function say(words) {
+  get("report").replaceChildren(Object.assign(document.createElement("p"), { className: "quiet", textContent: words }));
 }
 
-const showJobs = makeJobList(get("jobs"), get("no-jobs"), view, () => poll());
+function view(id, words) {
+  awaited = null;
+  reported = null;
+  viewer.open(id, words);
+  say(WHAT_REPORTS_ARE);
+  drawCurve(get("curve"), [], []);
+  showJobs();
+}
 
-function showConnection(text, kind) {
-  get("connection").textContent = text;
+async function report(id) {
+  reported = id;
+  const isStill = () => viewer.scene === id && reported === id;
+  try {
+    const found = await getReport(id);
+    if (!isStill()) return;
+    showReport(get("report"), id, found);
+    const csv = await getCurve(id).catch(() => "");
+    if (isStill()) drawCurve(get("curve"), pointsOfCsv(csv), baselinesOf(found));
+  } catch (error) {
+    if (!isStill()) return;
+    say(error.message);
+    if (error.mayPass) reported = null; // asked for again with the next news of the jobs
+  }
+}
+
+function showJobs() {
+  list.show([...jobs.byId.values()], viewer.scene);
+  const expected = jobs.byId.get(awaited);
+  if (expected?.state === "running" || expected?.state === "done") view(expected.id);
+  const viewed = jobs.byId.get(viewer.scene);
+  if (viewed?.state === "done" && reported !== viewed.id) report(viewed.id);
+  if (viewed && viewed.state !== "done") drawCurve(get("curve"), jobs.pointsOf(viewed.id), []);
+}
+
+function showConnection(words, kind) {
+  get("connection").textContent = words;
   get("connection").className = `pill ${kind}`;
 }
 
-async function poll() {
-  try {
-    const jobs = await listJobs();
-    showJobs(jobs, viewer.scene);
-    if (jobs.some((job) => job.id === awaited && job.state === "done")) {
-      const id = awaited;
-      awaited = null;
-      view(id);
-    }
-    if (viewer.scene && !jobs.some((job) => job.id === viewer.scene)) viewer.open(null);
-    const ready = await isReady();
-    showConnection(ready ? "ready" : "no worker is ready", ready ? "good" : "bad");
-  } catch {
-    showConnection("no connection", "bad");
-    viewer.refresh(); // which marks the picture as not live
-  }
-}
+const list = new JobList(
+  { list: get("jobs"), nothing: get("no-jobs"), message: get("jobs-message"), confirm: get("confirm") },
+  {
+    onView: view,
+    onChange: () => jobs.poll(),
+    onPurged: (id) => {
+      if (viewer.scene === id) view(null, "This scene is deleted.");
+      jobs.forget(id);
+    },
+  },
+);
+const jobs = new Jobs(showJobs, showConnection);
 
-startUploading(get("upload"), get("upload-message"), (job) => {
-  awaited = job.id;
-  if (!viewer.scene) get("stage-message").textContent = "The scene opens here when it is done.";
-  poll();
-});
-setInterval(poll, POLL_MS);
-poll();
+new ClipForm(
+  { form: get("upload"), message: get("upload-message"), progress: get("upload-progress"), stop: get("upload-stop") },
+  (id) => {
+    awaited = id;
+    if (!viewer.scene) viewer.open(null, "The scene opens here as soon as there is something to see.");
+    jobs.poll();
+  },
+);
+showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
+keyEvents.addEventListener("changed", () => view(null, currentKey() ? "Choose a job." : "The key is forgotten."));

@@ -1,58 +1,91 @@
 // A scene's report in plain words. Values that a report does not hold are left out.
 
+import { exportScene } from "./api.js";
+import { button, element } from "./element.js";
+
 const number = (value, digits, unit) => (Number.isFinite(value) ? `${value.toFixed(digits)} ${unit}`.trim() : null);
 const share = (value) => (Number.isFinite(value) ? `${Math.round(value * 100)} %` : null);
+
+/**
+ * What copying neighbouring frames reaches, by name.
+ * @param {Record<string, any>} report
+ * @returns {{name: string, db: number}[]}
+ */
+export function baselinesOf(report) {
+  const baselines = [
+    { name: "blending", db: report.baseline_blend_db },
+    { name: "warping", db: report.baseline_flow_db },
+  ];
+  return baselines.filter(({ db }) => Number.isFinite(db));
+}
 
 function quality(report) {
   const model = number(report.psnr_tissue_db, 2, "dB");
   if (model === null) return "Not measured: no frames were held out.";
-  const copies = [report.baseline_blend_db, report.baseline_flow_db].filter(Number.isFinite);
-  if (copies.length === 0) return `${model} on frames it never saw.`;
-  const best = Math.max(...copies);
+  const best = Math.max(...baselinesOf(report).map(({ db }) => db));
+  if (!Number.isFinite(best)) return `${model} on frames it never saw.`;
   const verdict = report.psnr_tissue_db > best ? "better" : "no better";
   return `${model} on frames it never saw; ${verdict} than copying neighbouring frames (${best.toFixed(2)} dB).`;
+}
+
+/** The one sentence to read first. */
+function verdict(report) {
+  const best = Math.max(...baselinesOf(report).map(({ db }) => db));
+  if (!Number.isFinite(report.psnr_tissue_db)) return "Its likeness is not known: trust nothing but its looks.";
+  if (report.psnr_tissue_db <= best) return "Between the frames it is no better than copying them.";
+  const count = report.warnings?.length ?? 0;
+  if (count === 0) return "Measured; nothing to distrust was found.";
+  return `Measured, with ${count === 1 ? "a warning" : `${count} warnings`}; read on.`;
+}
+
+function clip({ frame_count: frames, width, height, held_out: heldOut }) {
+  if (!Number.isFinite(frames)) return null;
+  return `${frames} frames of ${width} × ${height}, ${heldOut?.length ?? 0} held out to judge by`;
 }
 
 function rows(report) {
   return [
     ["Likeness", quality(report)],
-    ["Tissue covered", share(report.coverage)],
     ["Depth against stereo", number(report.depth_agreement_mm, 2, "mm (median difference)")],
-    ["Size", Number.isFinite(report.gaussians) ? `${report.gaussians.toLocaleString()} Gaussians` : null],
+    ["Tissue covered", share(report.coverage)],
+    ["Clip", clip(report)],
+    ["Size", Number.isFinite(report.gaussians) ? `${report.gaussians.toLocaleString("en")} Gaussians` : null],
     ["Training", number(report.seconds?.t_train_s, 1, "s")],
   ].filter(([, text]) => text !== null);
 }
 
-function list(title, texts, className) {
-  const heading = document.createElement("dt");
-  heading.textContent = title;
-  const body = document.createElement("dd");
-  const items = document.createElement("ul");
-  items.className = className;
-  for (const text of texts) {
-    const item = document.createElement("li");
-    item.textContent = text;
-    items.append(item);
-  }
-  body.append(items);
-  return [heading, body];
+function list(title, texts, kind) {
+  if (!texts?.length) return [];
+  const items = texts.map((text) => element("li", { text }));
+  return [element("dt", { text: title }), element("dd", {}, element("ul", { class: kind }, ...items))];
 }
 
-export function showReport(target, id, report) {
-  const lines = document.createElement("dl");
-  for (const [title, text] of rows(report)) {
-    const heading = document.createElement("dt");
-    heading.textContent = title;
-    const body = document.createElement("dd");
-    body.textContent = text;
-    lines.append(heading, body);
+/** Not a link: a link sends no key. */
+async function download(id, message) {
+  try {
+    const link = element("a");
+    link.href = URL.createObjectURL(await exportScene(id, 0));
+    link.download = `${id}.ply`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  } catch (error) {
+    message.textContent = error.message;
   }
-  const warnings = report.warnings ?? [];
-  if (warnings.length > 0) lines.append(...list("Warnings", warnings, "warning"));
-  const assumptions = report.assumptions ?? [];
-  if (assumptions.length > 0) lines.append(...list("Assumed", assumptions, ""));
-  const download = document.createElement("a");
-  download.href = `/scenes/${id}/export?format=ply&t=0`;
-  download.textContent = "Gaussians of the first frame (.ply)";
-  target.replaceChildren(lines, download);
+}
+
+/**
+ * @param {HTMLElement} target
+ * @param {string} id
+ * @param {Record<string, any>} report
+ */
+export function showReport(target, id, report) {
+  const lines = element("dl");
+  lines.append(element("dt", { text: "How far to trust it" }));
+  lines.append(element("dd", { class: "verdict", text: verdict(report) }));
+  lines.append(...list("Warnings", report.warnings, "warning"));
+  for (const [title, text] of rows(report)) lines.append(element("dt", { text: title }), element("dd", { text }));
+  lines.append(...list("Assumed", report.assumptions, ""));
+  const message = element("p", { class: "message bad" });
+  const save = button("Save the first frame's Gaussians (.ply)", () => download(id, message));
+  target.replaceChildren(lines, save, message);
 }

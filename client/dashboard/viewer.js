@@ -1,153 +1,120 @@
-// The picture: time, orbit, layer. At most one request is under way; the newest wish is asked for next.
+// The view of one scene: at most one picture is under way; the newest wish is asked for next, and now and then the same
+// again, which follows training, notices a purge, and keeps LIVE true.
 
-import { render } from "./api.js";
+import { listenToGestures } from "./gestures.js";
+import { Orbit } from "./orbit.js";
+import { Pace } from "./pace.js";
+import { pause } from "./pause.js";
+import { Pictures } from "./pictures.js";
+import { Screen } from "./screen.js";
+import { Timeline } from "./timeline.js";
 
-const DEGREES_A_PIXEL = 0.15;
-const MOST_YAW = 60;
-const MOST_PITCH = 60;
-const LOOP_S = 5;
-
-const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
+const AGAIN_MS = 1500;
+const AFTER_TROUBLE_MS = 700;
+/** There is nothing to show, or not to this key; a picture that was there goes. */
+const NOTHING_TO_SHOW = [401, 403, 404, 409];
 
 export class Viewer {
+  /** @param {Record<string, HTMLElement>} parts by what they are; index.html has them */
   constructor(parts) {
     this.parts = parts;
     this.scene = null;
-    this.t = 0;
-    this.layer = "rgb";
-    this.goHome();
-    this.playing = false;
-    this.busy = false;
-    this.wanted = false;
-    this.listen();
+    this.visit = 0; // counts scenes opened: what was asked for in an earlier one is not shown in this
+    this.isBusy = false;
+    this.isWanted = false;
+    this.askedAt = 0;
+    this.orbit = new Orbit();
+    this.pace = new Pace();
+    this.pictures = new Pictures();
+    this.screen = new Screen(parts);
+    this.timeline = new Timeline(parts, () => this.refresh(), () => this.isBusy);
+    this.#listen();
+    setInterval(() => this.#again(), AGAIN_MS / 3);
+    document.addEventListener("visibilitychange", () => this.refresh());
   }
 
-  open(scene) {
+  /**
+   * @param {string | null} scene
+   * @param {string} [words] to show until its picture is there
+   */
+  open(scene, words = scene ? "Rendering." : "Choose a job.") {
     this.scene = scene;
-    this.goHome();
-    this.parts.frame.hidden = true;
-    this.parts.message.hidden = false;
-    this.parts.message.textContent = scene ? "rendering" : "Choose a finished job.";
+    this.visit += 1;
+    this.pictures.giveUp(); // the other scene's
+    this.orbit.goHome();
+    this.screen.clear(scene, words);
+    this.parts.readout.textContent = "";
+    if (scene === null) this.timeline.play(false);
     this.refresh();
-  }
-
-  goHome() {
-    this.orbit = null; // the endoscope's own pose
   }
 
   refresh() {
-    this.wanted = true;
-    if (!this.busy) this.work();
+    this.isWanted = true;
+    if (!this.isBusy) this.#work();
   }
 
-  async work() {
-    this.busy = true;
-    while (this.wanted && this.scene) {
-      this.wanted = false;
-      await this.renderOnce(this.scene);
+  #again() {
+    if (this.scene && !this.isBusy && performance.now() - this.askedAt > AGAIN_MS) this.refresh();
+  }
+
+  async #work() {
+    this.isBusy = true;
+    while (this.isWanted && this.scene) {
+      this.isWanted = false;
+      await this.#showOnce(this.scene, this.visit);
     }
-    this.busy = false;
+    this.isBusy = false;
   }
 
-  async renderOnce(scene) {
-    const { stage, frame, message, warning, latency } = this.parts;
-    const started = performance.now();
+  async #showOnce(scene, visit) {
+    const began = (this.askedAt = performance.now());
+    const name = `${this.parts.layer.value}, ${this.orbit.words}`;
     try {
-      const answer = await render(this.query(scene));
-      if (scene !== this.scene || answer.scene !== this.scene) return; // never another patient's picture
-      const url = URL.createObjectURL(answer.blob);
-      const old = frame.src;
-      frame.src = url;
-      await frame.decode();
-      if (old.startsWith("blob:")) URL.revokeObjectURL(old);
-      frame.hidden = false;
-      frame.alt = `${this.layer} at t ${this.t.toFixed(3)}`;
-      stage.classList.remove("stale");
-      message.hidden = true;
-      warning.textContent = answer.warning.replaceAll(".; ", ". ");
-      latency.textContent = `${Math.round(performance.now() - started)} ms`;
+      const picture = await this.pictures.ask(this.#view(scene));
+      const bitmap = await createImageBitmap(picture.blob);
+      if (visit !== this.visit) return; // another was opened meanwhile: never its neighbour's picture
+      this.screen.show(picture, bitmap, `${name}, t ${picture.t.toFixed(3)}`);
+      this.pace.note();
+      this.#tell(name, picture, performance.now() - began);
     } catch (error) {
-      stage.classList.add("stale"); // a frozen frame must not look live
-      message.hidden = false;
-      message.textContent = `not live: ${error.message}`;
-      await new Promise((resolve) => setTimeout(resolve, 1000));
-      this.wanted = this.wanted || error.status === 503 || error.status === undefined;
+      if (visit !== this.visit) return;
+      this.#fail(error);
+      await pause(AFTER_TROUBLE_MS);
     }
   }
 
-  query(scene) {
-    const query = { scene, t: this.t.toFixed(4), layer: this.layer, format: "jpeg" };
-    if (this.orbit) {
-      const { yaw, pitch, zoom } = this.orbit;
-      query.pose = `orbit:${yaw.toFixed(2)},${pitch.toFixed(2)},${zoom.toFixed(3)}`;
-    }
-    return query;
+  #view(scene) {
+    const view = { scene, t: Number(this.timeline.t.toFixed(4)), layer: this.parts.layer.value, format: "jpeg" };
+    if (this.orbit.pose) view.pose = this.orbit.pose;
+    return view;
   }
 
-  turn(dx, dy, factor = 1) {
-    if (!this.scene) return;
-    const { yaw, pitch, zoom } = this.orbit ?? { yaw: 0, pitch: 0, zoom: 1 };
-    this.orbit = {
-      yaw: clamp(yaw - dx * DEGREES_A_PIXEL, -MOST_YAW, MOST_YAW),
-      pitch: clamp(pitch + dy * DEGREES_A_PIXEL, -MOST_PITCH, MOST_PITCH),
-      zoom: clamp(zoom * factor, 0.3, 4),
-    };
-    this.refresh();
+  #tell(name, picture, tookMs) {
+    const server = Number.isFinite(picture.totalMs) ? ` (service ${picture.totalMs.toFixed(0)} ms)` : "";
+    const rate = `${this.pace.rate.toFixed(this.pace.rate < 10 ? 1 : 0)} pictures/s`;
+    this.parts.readout.textContent = `${name} · ${tookMs.toFixed(0)} ms${server} · ${rate} · ${picture.way}`;
   }
 
-  setTime(t) {
-    this.t = t;
-    this.parts.time.value = String(t);
-    this.parts.timeValue.textContent = `t ${t.toFixed(3)}`;
-    this.refresh();
+  #fail(error) {
+    if (NOTHING_TO_SHOW.includes(error.status)) this.screen.clear(this.scene, error.message);
+    else this.screen.fail(error.message);
   }
 
-  play(playing) {
-    this.playing = playing;
-    this.parts.play.textContent = playing ? "Pause" : "Play";
-    this.parts.play.setAttribute("aria-pressed", String(playing));
-    let last = performance.now();
-    const step = (now) => {
-      if (!this.playing) return;
-      const elapsed = (now - last) / 1000 / LOOP_S;
-      if (!this.busy) {
-        last = now;
-        this.setTime((this.t + elapsed) % 1);
-      }
-      requestAnimationFrame(step);
-    };
-    if (playing) requestAnimationFrame(step);
-  }
-
-  listen() {
-    const { stage, time, layer, home, play } = this.parts;
-    stage.addEventListener("pointerdown", (event) => stage.setPointerCapture(event.pointerId));
-    stage.addEventListener("pointermove", (event) => {
-      if (stage.hasPointerCapture(event.pointerId)) this.turn(event.movementX, event.movementY);
-    });
-    stage.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.turn(0, 0, Math.exp(-event.deltaY / 800));
-    }, { passive: false });
-    stage.addEventListener("keydown", (event) => {
-      const step = { ArrowLeft: [20, 0], ArrowRight: [-20, 0], ArrowUp: [0, 20], ArrowDown: [0, -20] }[event.key];
-      if (step) {
-        event.preventDefault();
-        this.turn(...step);
-      }
-    });
-    time.addEventListener("input", () => {
-      this.play(false);
-      this.setTime(Number(time.value));
-    });
-    layer.addEventListener("change", () => {
-      this.layer = layer.value;
+  #listen() {
+    const { stage, layer, home } = this.parts;
+    const change = (work) => (...given) => {
+      if (!this.scene) return;
+      work(...given);
       this.refresh();
+    };
+    const goHome = change(() => this.orbit.goHome());
+    listenToGestures(stage, {
+      turn: change((dx, dy) => this.orbit.turn(dx, dy)),
+      approach: change((factor) => this.orbit.approach(factor)),
+      home: goHome,
+      play: () => this.timeline.play(!this.timeline.isPlaying),
     });
-    home.addEventListener("click", () => {
-      this.goHome();
-      this.refresh();
-    });
-    play.addEventListener("click", () => this.play(!this.playing));
+    layer.addEventListener("change", () => this.refresh());
+    home.addEventListener("click", goHome);
   }
 }

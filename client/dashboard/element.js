@@ -1,0 +1,33 @@
+// Elements of the page, made by script. Text is set as text, so nothing that the service sends becomes markup.
+
+/**
+ * @template {keyof HTMLElementTagNameMap} K
+ * @param {K} tag
+ * @param {{class?: string, text?: string}} [about]
+ * @param {...Node} children
+ * @returns {HTMLElementTagNameMap[K]}
+ */
+export function element(tag, about = {}, ...children) {
+  const made = document.createElement(tag);
+  if (about.class) made.className = about.class;
+  if (about.text !== undefined) made.textContent = about.text;
+  made.append(...children);
+  return made;
+}
+
+/**
+ * @param {string} text
+ * @param {() => void} onClick
+ * @param {string} [name] what it does, said in full for screen readers
+ * @returns {HTMLButtonElement}
+ */
+export function button(text, onClick, name = text) {
+  const made = element("button", { text });
+  made.type = "button";
+  made.setAttribute("aria-label", name);
+  made.addEventListener("click", onClick);
+  return made;
+}
+
+/** @param {number} ms since 1970 */
+export const clockTime = (ms) => new Date(ms).toLocaleTimeString("en-GB");

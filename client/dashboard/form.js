@@ -1,0 +1,141 @@
+// The form that sends a clip: files by picker or by drop, options, progress, and what was wrong with it.
+
+import { reconstruct } from "./api.js";
+import { insist } from "./pause.js";
+import { Upload } from "./upload.js";
+
+const PARTS = ["clip", "right", "calibration", "masks"];
+const OPTIONS = ["budget_s", "layout", "priority", "mask_polarity"];
+const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;
+
+/**
+ * Which part of a clip each dropped file is, by its name; the user sees the guess in the pickers.
+ * @param {File[]} files
+ * @returns {Map<string, File>}
+ */
+export function partsOf(files) {
+  const parts = new Map();
+  for (const file of files) {
+    if (CALIBRATION.test(file.name)) parts.set("calibration", file);
+    else if (/mask/i.test(file.name)) parts.set("masks", file);
+    else if (/right/i.test(file.name)) parts.set("right", file);
+    else parts.set(parts.has("clip") ? "right" : "clip", file);
+  }
+  return parts;
+}
+
+/** An id for one submission; not randomUUID, which browsers keep from pages without HTTPS. */
+const newKey = () => [...crypto.getRandomValues(new Uint32Array(4))].map((number) => number.toString(16)).join("-");
+
+/** @param {HTMLFormElement} form */
+function optionsOf(form) {
+  const given = new FormData(form);
+  const options = Object.fromEntries(OPTIONS.filter((name) => given.get(name)).map((name) => [name, given.get(name)]));
+  if (options.budget_s) options.budget_s = Number(options.budget_s);
+  return options;
+}
+
+export class ClipForm {
+  /**
+   * @param {{form: HTMLFormElement, message: HTMLElement, progress: HTMLElement, stop: HTMLElement}} parts
+   * @param {(id: string) => void} onJob told of the job that was made
+   */
+  constructor(parts, onJob) {
+    Object.assign(this, parts);
+    this.onJob = onJob;
+    this.submit = this.form.querySelector("[type=submit]");
+    this.form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.#send();
+    });
+    this.stop.addEventListener("click", () => this.controller?.abort());
+    this.#takeDrops();
+  }
+
+  #takeDrops() {
+    const hold = (event, isOver) => {
+      event.preventDefault(); // else the browser opens the file
+      this.form.classList.toggle("over", isOver && this.form.contains(event.target));
+    };
+    document.addEventListener("dragover", (event) => hold(event, true));
+    document.addEventListener("dragleave", (event) => hold(event, false));
+    document.addEventListener("drop", (event) => {
+      hold(event, false);
+      if (this.form.contains(event.target)) this.take([...event.dataTransfer.files]);
+    });
+  }
+
+  /** @param {File[]} files put into the pickers */
+  take(files) {
+    for (const [part, file] of partsOf(files)) {
+      const transfer = new DataTransfer();
+      transfer.items.add(file);
+      this.form.elements[part].files = transfer.files;
+    }
+  }
+
+  async #send() {
+    this.controller = new AbortController();
+    const { signal } = this.controller;
+    const uploads = this.#uploads(signal);
+    this.#show(true);
+    try {
+      await this.#sendAll(uploads);
+      this.onJob(await this.#submitAll(uploads, signal));
+      this.form.reset();
+      this.#say("");
+    } catch (error) {
+      this.#say(signal.aborted ? "Stopped. Nothing of it is kept." : error.message, "bad");
+      for (const upload of uploads) upload.discard();
+    } finally {
+      this.#show(false);
+    }
+  }
+
+  #uploads(signal) {
+    const files = PARTS.map((part) => [part, this.form.elements[part].files[0]]).filter(([, file]) => file);
+    const isPair = files.some(([part]) => part === "right");
+    return files.map(([part, file]) => new Upload(isPair && part === "clip" ? "left" : part, file, signal));
+  }
+
+  async #sendAll(uploads) {
+    const total = uploads.reduce((sum, upload) => sum + upload.file.size, 0);
+    const showProgress = () => {
+      const share = uploads.reduce((sum, upload) => sum + upload.offset, 0) / total;
+      this.progress.value = share;
+      this.#say(`Sending, ${Math.round(share * 100)} %`);
+    };
+    showProgress();
+    for (const upload of uploads) await upload.send(showProgress, (problem) => this.#wait(problem));
+  }
+
+  /** @returns {Promise<string>} the job's id */
+  async #submitAll(uploads, signal) {
+    const submission = { options: optionsOf(this.form) };
+    for (const upload of uploads) submission[upload.part] = upload.id;
+    const key = newKey();
+    const submit = async () => {
+      try {
+        return (await reconstruct(submission, key, signal)).id;
+      } catch (error) {
+        if (error.status === 503 && error.document.job_id) return error.document.job_id; // safe, and queued later
+        throw error;
+      }
+    };
+    return insist(submit, (problem) => this.#wait(problem), signal);
+  }
+
+  #wait(problem) {
+    this.#say(`${problem.message} What was sent is kept; trying again.`, "bad");
+  }
+
+  #say(text, kind = "") {
+    this.message.textContent = text;
+    this.message.className = `message ${kind}`;
+  }
+
+  #show(isSending) {
+    this.submit.disabled = isSending;
+    this.progress.hidden = this.stop.hidden = !isSending;
+  }
+}

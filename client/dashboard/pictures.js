@@ -1,0 +1,84 @@
+// Where pictures come from: the stream, and one by one from GET /render while there is no stream.
+
+import { request } from "./api.js";
+import { keyEvents } from "./key.js";
+import { connectionLost } from "./problem.js";
+import { Stream } from "./stream.js";
+
+/** @typedef {import("./stream.js").View} View */
+/** @typedef {import("./stream.js").Picture} Picture */
+
+const ANSWER_MS = 15000;
+const FIRST_RETRY_MS = 1000;
+const LONGEST_RETRY_MS = 15000;
+
+/** @param {View} view @param {AbortSignal} signal @returns {Promise<Picture>} */
+async function renderOnce(view, signal) {
+  const response = await request(`/render?${new URLSearchParams(view)}`, { signal });
+  const header = (name) => response.headers.get(`X-Intrasplat-${name}`);
+  const total = /total;dur=([\d.]+)/.exec(response.headers.get("Server-Timing") ?? "");
+  const warning = header("Warning");
+  return {
+    blob: await response.blob().catch(() => Promise.reject(connectionLost())),
+    scene: header("Scene"),
+    state: header("State"),
+    t: Number(header("T")),
+    iteration: header("Iteration") === null ? null : Number(header("Iteration")),
+    warnings: warning ? warning.split("; ") : [],
+    totalMs: total ? Number(total[1]) : NaN,
+    way: "single pictures",
+  };
+}
+
+export class Pictures {
+  constructor() {
+    this.stream = new Stream();
+    this.retryMs = FIRST_RETRY_MS;
+    this.retryAt = 0;
+    this.controller = new AbortController();
+    keyEvents.addEventListener("changed", () => {
+      this.stream.close();
+      this.retryAt = 0;
+    });
+  }
+
+  /** Wait no more for what was asked. */
+  giveUp() {
+    this.controller.abort();
+    this.stream.giveUp();
+  }
+
+  /**
+   * The picture of a view; one at a time.
+   * @param {View} view
+   * @returns {Promise<Picture>}
+   */
+  async ask(view) {
+    this.#keepOpen();
+    const picture = this.stream.isOpen ? await this.#fromStream(view) : await this.#fromRender(view);
+    if (picture.scene !== view.scene) throw new Error("The service sent another scene's picture; it is not shown.");
+    return picture;
+  }
+
+  #keepOpen() {
+    if (this.stream.isOpen) this.retryMs = FIRST_RETRY_MS;
+    if (this.stream.isOpen || this.stream.isConnecting || performance.now() < this.retryAt) return;
+    this.retryAt = performance.now() + this.retryMs;
+    this.retryMs = Math.min(LONGEST_RETRY_MS, this.retryMs * 2);
+    this.stream.connect();
+  }
+
+  async #fromRender(view) {
+    this.controller = new AbortController();
+    return renderOnce(view, AbortSignal.any([this.controller.signal, AbortSignal.timeout(ANSWER_MS)]));
+  }
+
+  async #fromStream(view) {
+    const timer = setTimeout(() => this.stream.close(), ANSWER_MS); // a line that is silent for so long is dead
+    try {
+      return await this.stream.ask(view);
+    } finally {
+      clearTimeout(timer);
+    }
+  }
+}

@@ -1,0 +1,92 @@
+// The picture and what it is worth. A picture is live only while the service keeps confirming it: whatever goes wrong,
+// the badge says so by itself after STALE_AFTER_MS, because it depends on what comes, not on somebody noticing.
+
+import { clockTime } from "./element.js";
+
+/** @typedef {import("./stream.js").Picture} Picture */
+
+const STALE_AFTER_MS = 5000;
+const LOOK_MS = 250;
+
+export class Screen {
+  /**
+   * @param {{stage: HTMLElement, canvas: HTMLCanvasElement, badge: HTMLElement, message: HTMLElement,
+   *   warning: HTMLElement, sceneId: HTMLElement}} parts
+   */
+  constructor(parts) {
+    Object.assign(this, parts);
+    this.clear(null, "Choose a job.");
+    setInterval(() => this.#look(), LOOK_MS);
+    document.addEventListener("visibilitychange", () => this.#look()); // timers sleep in hidden tabs
+  }
+
+  get hasPicture() {
+    return this.shown !== null;
+  }
+
+  /**
+   * No picture, of a scene that is to come or of none.
+   * @param {string | null} scene
+   * @param {string} words why there is none
+   */
+  clear(scene, words) {
+    this.scene = scene;
+    this.shown = null;
+    this.shownAt = 0;
+    this.trouble = "";
+    this.words = words;
+    this.canvas.width = this.canvas.height = 0; // its pixels are gone, not only hidden
+    this.sceneId.textContent = scene ?? "";
+    this.#look();
+  }
+
+  /** @param {Picture} picture @param {ImageBitmap} bitmap of it @param {string} name what it shows */
+  show(picture, bitmap, name) {
+    this.canvas.width = bitmap.width;
+    this.canvas.height = bitmap.height;
+    this.canvas.getContext("2d").drawImage(bitmap, 0, 0);
+    this.canvas.setAttribute("aria-label", name);
+    this.shown = picture;
+    this.shownAt = Date.now();
+    this.trouble = "";
+    this.#look();
+  }
+
+  /** @param {string} words why the picture, if there is one, is not live any more */
+  fail(words) {
+    this.trouble = this.words = words;
+    this.#look();
+  }
+
+  #look() {
+    const [state, badge, message] = this.#state();
+    this.stage.dataset.state = state;
+    this.canvas.hidden = this.shown === null;
+    setText(this.badge, badge);
+    this.badge.hidden = badge === "";
+    setText(this.message, message);
+    this.message.hidden = message === "";
+    const warnings = state === "stale" ? [] : (this.shown?.warnings ?? []);
+    setText(this.warning, warnings.join(" "));
+  }
+
+  /** @returns {[string, string, string]} state, badge, message over the picture */
+  #state() {
+    if (this.scene === null) return ["none", "", this.words];
+    if (this.shown === null) return ["waiting", "NO PICTURE", this.words];
+    if (this.trouble || Date.now() - this.shownAt > STALE_AFTER_MS) {
+      const reason = this.trouble || "The service does not answer.";
+      return ["stale", "STALE", `Last picture ${clockTime(this.shownAt)}. ${reason} Reconnecting.`];
+    }
+    const training = this.shown.state === "running" ? `TRAINING, iteration ${this.shown.iteration}` : "";
+    if (this.shown.warnings.length > 0) {
+      return ["extrapolated", [training, "EXTRAPOLATED"].filter(Boolean).join(" · "), ""];
+    }
+    return training ? ["training", training, ""] : ["live", "LIVE", ""];
+  }
+}
+
+/** Only where it changes, so that screen readers are told once. */
+function setText(target, text) {
+  if (target.textContent !== text) target.textContent = text;
+}

@@ -1,0 +1,93 @@
+// Pictures over one WebSocket: a view is asked for, its picture comes back, then the next.
+
+import { askForKey, currentKey } from "./key.js";
+import { connectionLost, Problem } from "./problem.js";
+
+/**
+ * What is asked for; the query of GET /render.
+ * @typedef {{scene: string, t: number, pose?: string, layer: string, format: string}} View
+ */
+/**
+ * What came.
+ * @typedef {{blob: Blob, scene: string, state: "running"|"done", t: number, iteration: number | null,
+ *   warnings: string[], totalMs: number, way: string}} Picture
+ */
+
+const LENGTH_BYTES = 4;
+
+/** @param {ArrayBuffer} message @returns {[Record<string, any>, Blob]} head and image */
+function unpack(message) {
+  const length = new DataView(message).getUint32(0);
+  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(message, LENGTH_BYTES, length)));
+  return [head, new Blob([new Uint8Array(message, LENGTH_BYTES + length)], { type: head.media_type })];
+}
+
+export class Stream {
+  constructor() {
+    this.socket = null;
+    this.number = 0;
+    this.pending = null; // the one view that is under way
+  }
+
+  get isOpen() {
+    return this.socket?.readyState === WebSocket.OPEN;
+  }
+
+  get isConnecting() {
+    return this.socket?.readyState === WebSocket.CONNECTING;
+  }
+
+  connect() {
+    this.close();
+    const socket = (this.socket = new WebSocket(new URL("/stream", location.href.replace(/^http/, "ws"))));
+    const key = currentKey();
+    socket.binaryType = "arraybuffer";
+    socket.addEventListener("open", () => key && socket.send(JSON.stringify({ authorize: key })));
+    socket.addEventListener("message", (event) => socket === this.socket && this.#take(event.data, key));
+    socket.addEventListener("close", () => socket === this.socket && this.giveUp());
+  }
+
+  /** Wait no more for what was asked; its picture is not taken when it comes. */
+  giveUp() {
+    this.#fail(connectionLost());
+  }
+
+  close() {
+    const socket = this.socket;
+    this.socket = null;
+    socket?.close();
+    this.giveUp();
+  }
+
+  /** @param {View} view @returns {Promise<Picture>} */
+  ask(view) {
+    this.giveUp();
+    const id = ++this.number;
+    return new Promise((resolve, reject) => {
+      this.pending = { id, resolve, reject };
+      this.socket.send(JSON.stringify({ ...view, id }));
+    });
+  }
+
+  #take(data, key) {
+    if (typeof data === "string") {
+      const document = JSON.parse(data);
+      const problem = new Problem(document.status, document);
+      if (problem.status === 401 && key === currentKey()) askForKey(problem.message);
+      if (document.id === undefined || document.id === null || document.id === this.pending?.id) this.#fail(problem);
+      return;
+    }
+    const [head, blob] = unpack(data);
+    if (head.id !== this.pending?.id) return; // of a view that nobody waits for any more
+    const { resolve } = this.pending;
+    this.pending = null;
+    const { scene, state, t, iteration, warnings, total_ms: totalMs } = head;
+    resolve({ blob, scene, state, t, iteration, warnings, totalMs, way: "stream" });
+  }
+
+  #fail(problem) {
+    const pending = this.pending;
+    this.pending = null;
+    pending?.reject(problem);
+  }
+}

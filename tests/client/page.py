@@ -1,0 +1,247 @@
+"""What the tests of the page stand on: a service that can end and come back, a painter, and a browser."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.by import By
+from selenium.webdriver.remote.webelement import WebElement
+from selenium.webdriver.support.ui import WebDriverWait
+
+from client.up import DASHBOARD
+from contract.embedded import short_socket_path
+from contract.job import JobFiles, JobProgress, JobRecord
+from contract.queue import Claim
+from contract.queue_memory import MemoryQueue
+from contract.rendering import MEDIA_TYPES, ExportRequest, OrbitPose, RenderRequest, WorkerAddress
+from contract.settings import Settings
+from contract.store import CURVE, MANIFEST, REPORT, Store, new_job_id
+from service.app import create_app
+from service.renderer import ZmqRenderer
+from service.server import Server
+from worker.serve import RequestServer, View
+
+CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+WAIT_S = 15.0
+LOOK_S = 0.05
+WORKER = "worker-1"
+SNAPSHOT_ITERATION = 40
+FAR_DEG = 25.0
+FAR = "This pose is far from the endoscope's: most of it is a guess."
+REPORT_TEXT = (
+    '{"psnr_tissue_db": 31.2, "baseline_blend_db": 29.0, "baseline_flow_db": 29.5, "coverage": 0.97,'
+    ' "depth_agreement_mm": 0.8, "gaussians": 31000, "warnings": ["The clip is short."],'
+    ' "assumptions": ["Bright in the masks is the instrument."], "seconds": {"t_train_s": 12.5}}'
+)
+
+
+def grey_of(job_id: str) -> int:
+    """The one shade in which a scene is painted, 16 steps or more from white and black."""
+    return 16 + int(job_id[:2], 16) * 7 // 8
+
+
+class Painter:
+    """Paints each scene in a shade of its own, and warns of what lies far off."""
+
+    def __init__(self) -> None:
+        self.pause_s = 0.0
+
+    def answer(self, request: RenderRequest | ExportRequest) -> View:
+        if isinstance(request, ExportRequest):
+            return View(b"ply\n", "application/octet-stream", request.t)
+        time.sleep(self.pause_s)
+        picture = np.full((48, 60, 3), grey_of(request.scene_id), np.uint8)
+        is_far = isinstance(request.pose, OrbitPose) and abs(request.pose.yaw_deg) > FAR_DEG
+        image = cv2.imencode(f".{request.format.value}", picture)[1].tobytes()
+        iteration = SNAPSHOT_ITERATION if request.attempt is None else None
+        return View(image, MEDIA_TYPES[request.format], request.t, (FAR,) if is_far else (), iteration)
+
+
+class Site:
+    """A service with its page on a port that stays; queue, store and worker outlive it."""
+
+    def __init__(self, data_dir: Path, endpoint: str, painter: Painter, **changes: Any) -> None:
+        self.queue, self.store, self.painter = MemoryQueue(), Store(data_dir), painter
+        self._endpoint = endpoint
+        with contextlib.closing(socket.socket()) as probe:
+            probe.bind(("127.0.0.1", 0))
+            port: int = probe.getsockname()[1]
+        settings = Settings(data_dir=data_dir, port=port, dashboard_dir=DASHBOARD, min_free_bytes=0)
+        self._settings = settings.model_copy(update=changes)
+        self.url = f"http://127.0.0.1:{port}"
+        self.announce()
+        self.start()
+
+    def start(self) -> None:
+        app = create_app(self._settings, self.queue, self.store, ZmqRenderer(self.queue, 5.0))
+        self._server = Server(app, self._settings)
+        self._thread = threading.Thread(target=self._server.run)
+        self._thread.start()
+        while not self._server.started:
+            assert self._thread.is_alive()
+            time.sleep(0.01)
+
+    def stop(self) -> None:
+        self._server.handle_exit(signal.SIGTERM, None)
+        self._thread.join()
+
+    def announce(self, job_id: str | None = None) -> None:
+        self.queue.announce(WorkerAddress(name=WORKER, endpoint=self._endpoint, device="cpu", job_id=job_id))
+
+    def queued_job(self, mark: str = "") -> str:
+        """A job whose id begins with the mark."""
+        job_id = mark + new_job_id()[len(mark) :]
+        self.queue.submit(JobRecord(job_id=job_id, files=JobFiles(clip="clip.mp4"), created_at_s=time.time()))
+        return job_id
+
+    def claim(self) -> Claim:
+        record = self.queue.claim(WORKER, WAIT_S)
+        assert record is not None
+        self.announce(record.job_id)
+        return Claim(record.job_id, record.attempt, WORKER)
+
+    def train(self, claim: Claim, iteration: int, psnr_db: float) -> None:
+        """Tell that training has come so far, of 100."""
+        progress = JobProgress(
+            stage="train", fraction=iteration / 100, iteration=iteration, iterations=100, psnr_db=psnr_db
+        )
+        self.queue.beat(claim, progress.model_copy(update={"seconds_left": 20.0}))
+
+    def finish(self, claim: Claim) -> str:
+        folder = self.store.work_folder(claim.job_id, claim.attempt)
+        (folder / MANIFEST).write_text("{}")
+        (folder / REPORT).write_text(REPORT_TEXT)
+        (folder / CURVE).write_text("t_train_s,iteration,psnr_tissue_db\n1,10,27\n2,50,30\n3,100,31.2\n")
+        self.store.publish_scene(claim.job_id, claim.attempt)
+        assert self.queue.finish(claim)
+        self.announce()
+        return claim.job_id
+
+    def scene(self, mark: str = "") -> str:
+        """A finished scene whose id begins with the mark."""
+        self.queued_job(mark)
+        return self.finish(self.claim())
+
+
+@contextmanager
+def site_at(data_dir: Path, **changes: Any) -> Iterator[Site]:
+    painter = Painter()
+    endpoint = f"ipc://{short_socket_path(Store(data_dir).run_dir, 'worker-1.sock')}"
+    with RequestServer(endpoint, painter.answer):
+        site = Site(data_dir, endpoint, painter, **changes)
+        try:
+            yield site
+        finally:
+            site.stop()
+
+
+@contextmanager
+def browser() -> Iterator[webdriver.Chrome]:
+    """Chromium without a window; skips where there is none."""
+    if CHROMIUM is None or CHROMEDRIVER is None:
+        pytest.skip("no browser: install chromium and chromedriver (Debian: chromium, chromium-driver)")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
+        options.add_argument(argument)
+    options.add_argument("--window-size=1280,800")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options, Service(CHROMEDRIVER))
+    try:
+        yield driver
+    finally:
+        driver.quit()
+
+
+class Page:
+    """The page in a browser, as somebody who looks at it and uses it would say."""
+
+    def __init__(self, driver: webdriver.Chrome, url: str) -> None:
+        self.driver = driver
+        self.url = url
+        self.log: list[str] = []
+
+    def open(self) -> None:
+        self.driver.get(self.url)
+
+    def find(self, css: str) -> WebElement:
+        return self.driver.find_element(By.CSS_SELECTOR, css)
+
+    def text(self, css: str) -> str:
+        """What can be read there, at once: an element may be made anew between finding and reading it."""
+        found: str | None = self.script("return document.querySelector(arguments[0])?.innerText", css)
+        return found or ""
+
+    def script(self, source: str, *arguments: object) -> Any:
+        return self.driver.execute_script(source, *arguments)  # type: ignore[no-untyped-call]
+
+    def until(self, what: Callable[[], object]) -> None:
+        """Wait for it."""
+        WebDriverWait(self.driver, WAIT_S, LOOK_S).until(lambda _: what(), f"state is {self.state}: {self.messages()}")
+
+    def until_text(self, css: str, part: str) -> None:
+        self.until(lambda: part in self.text(css))
+
+    def click(self, css: str) -> None:
+        """Click it as soon as it is there."""
+        self.until(lambda: self.script("return !!document.querySelector(arguments[0])", css))
+        self.script("document.querySelector(arguments[0]).click()", css)
+
+    def press(self, job_id: str, name: str) -> None:
+        """Click one of a job's buttons."""
+        self.click(f'[data-job="{job_id}"] button[aria-label^="{name}"]')
+
+    @property
+    def state(self) -> str:
+        """What the page says that its picture is."""
+        found: str = self.script("return document.querySelector('#stage').dataset.state")
+        return found
+
+    def until_state(self, state: str) -> None:
+        self.until(lambda: self.state == state)
+
+    @property
+    def shade(self) -> int:
+        """Of the picture's middle; -1: there is none."""
+        found: int = self.script(SHADE)
+        return found
+
+    @property
+    def view(self) -> str:
+        """What the picture says that it shows."""
+        found: str = self.script("return document.querySelector('#picture').getAttribute('aria-label')")
+        return found
+
+    def choose(self, name: str, *paths: Path) -> None:
+        """Files in one of the form's pickers."""
+        self.find(f'#upload [name="{name}"]').send_keys("\n".join(map(str, paths)))
+
+    def messages(self) -> dict[str, str]:
+        return {css: self.text(css) for css in ("#stage-message", "#upload-message", "#jobs", "#connection")}
+
+    def faults(self) -> list[str]:
+        """What the browser says is wrong with the page: breaches of its policy, and errors that nobody caught."""
+        entries = self.driver.get_log("browser")  # type: ignore[no-untyped-call]
+        self.log += [entry["message"] for entry in entries]
+        return [text for text in self.log if "Content Security Policy" in text or "Uncaught" in text]
+
+
+SHADE = """
+const picture = document.querySelector("#picture");
+if (picture.hidden || picture.width === 0) return -1;
+return picture.getContext("2d").getImageData(picture.width / 2, picture.height / 2, 1, 1).data[0];
+"""

@@ -1,0 +1,280 @@
+"""The page in a real browser, on a real service whose worker paints: what somebody at an operating table would see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from selenium import webdriver
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+
+from contract.job import JobError, JobState
+from contract.keys import KeyFile, KeyScope
+from tests.client.page import FAR, Page, Site, browser, grey_of, site_at
+from tests.client.town import CLIP
+
+
+@pytest.fixture(scope="module")
+def driver() -> Iterator[webdriver.Chrome]:
+    with browser() as driver:
+        yield driver
+
+
+@pytest.fixture
+def site(tmp_path: Path, driver: webdriver.Chrome) -> Iterator[Site]:
+    with site_at(tmp_path / "data") as site:
+        yield site
+
+
+@pytest.fixture
+def page(site: Site, driver: webdriver.Chrome) -> Iterator[Page]:
+    page = Page(driver, site.url)
+    page.open()
+    yield page
+    assert page.faults() == []
+    driver.get("about:blank")  # or its connections keep the service from ending
+
+
+@pytest.fixture
+def large_clip(tmp_path: Path) -> Path:
+    """A clip of several pieces: padded with a box that readers pass over."""
+    path, padding = tmp_path / "patient name.mp4", bytes(2_000_000)
+    path.write_bytes(CLIP.read_bytes() + (8 + len(padding)).to_bytes(4, "big") + b"free" + padding)
+    return path
+
+
+def test_a_clip_is_sent_and_its_job_watched_to_the_scene(site: Site, page: Page) -> None:
+    page.choose("clip", CLIP)
+    page.click("#upload [type=submit]")
+    page.until_text("#jobs", "queued")
+    page.until_text("#jobs", "next")
+    claim = site.claim()
+    site.train(claim, 20, 24.0)
+    page.until_text("#jobs", "training · 24.0 dB · 20 s left")
+    page.until_state("training")  # it opened by itself
+    assert "iteration 40" in page.text("#badge")
+    for iteration, psnr_db in ((40, 27.5), (60, 28.5)):
+        site.train(claim, iteration, psnr_db)
+        page.until_text("#jobs", f"{psnr_db} dB")
+    page.until(lambda: len(page.script("return document.querySelector('#curve polyline')?.points ?? []")) == 3)
+    site.finish(claim)
+    page.until_state("live")
+    page.until_text("#report", "31.20 dB on frames it never saw; better than copying")
+    assert "The clip is short." in page.text("#report")
+    page.until(lambda: page.script("return document.querySelectorAll('#curve .baseline').length") == 2)
+
+
+def test_what_is_dropped_finds_its_place(page: Page) -> None:
+    chosen = page.script(
+        """
+        const transfer = new DataTransfer();
+        for (const name of ["tool_masks.zip", "left.mp4", "right.mp4", "calibration.json"])
+          transfer.items.add(new File(["x"], name));
+        const target = document.querySelector("#upload");
+        target.dispatchEvent(new DragEvent("drop", { dataTransfer: transfer, bubbles: true, cancelable: true }));
+        return ["clip", "right", "masks", "calibration"].map((name) => target.elements[name].files[0]?.name);
+        """
+    )
+    assert chosen == ["left.mp4", "right.mp4", "tool_masks.zip", "calibration.json"]
+
+
+def test_a_clip_that_cannot_be_used_is_refused_in_words(page: Page, tmp_path: Path) -> None:
+    path = tmp_path / "notes.mp4"
+    path.write_text("no film")
+    page.choose("clip", path)
+    page.click("#upload [type=submit]")
+    page.until_text("#upload-message", "clip:")
+    assert page.find("#upload [type=submit]").is_enabled()
+
+
+def test_an_upload_goes_on_where_it_was_when_the_connection_is_back(site: Site, page: Page, large_clip: Path) -> None:
+    slow = {"latency": 0, "download_throughput": 10_000_000, "upload_throughput": 1_000_000}
+    page.driver.set_network_conditions(offline=False, **slow)  # type: ignore[no-untyped-call]
+    page.choose("clip", large_clip)
+    page.click("#upload [type=submit]")
+    page.until(lambda: page.script("return document.querySelector('#upload-progress').value") > 0.2)
+    page.driver.set_network_conditions(offline=True, **slow)  # type: ignore[no-untyped-call]
+    page.until_text("#upload-message", "What was sent is kept; trying again.")
+    page.driver.delete_network_conditions()  # type: ignore[no-untyped-call]
+    page.until(lambda: site.queue.records())
+    (record,) = site.queue.records()
+    assert (site.store.spool_folder(record.job_id) / record.files.clip).read_bytes() == large_clip.read_bytes()
+    names = page.script("return performance.getEntriesByType('resource').map((entry) => new URL(entry.name).pathname)")
+    assert names.count("/uploads") == 1
+    assert not any("patient" in name for name in names)
+
+
+def test_time_is_scrubbed_and_played(site: Site, page: Page) -> None:
+    page.press(site.scene(), "View")
+    page.until_state("live")
+    page.until_text("#readout", "stream")  # the WebSocket passes the page's policy
+    slider = page.find("#time")
+    slider.send_keys(Keys.END)
+    page.until(lambda: "t 1.000" in page.view)
+    slider.send_keys(Keys.HOME)
+    page.until(lambda: "t 0.000" in page.view)
+    page.click("#play")
+    page.until(lambda: "t 0.000" not in page.view)
+    assert page.text("#play") == "Pause"
+    page.click("#play")
+
+
+def test_the_view_turns_by_mouse_and_keys_and_goes_back_to_the_endoscope(site: Site, page: Page) -> None:
+    page.press(site.scene(), "View")
+    page.until_state("live")
+    stage = page.find("#stage")
+    ActionChains(page.driver).click_and_hold(stage).move_by_offset(-60, 10).release().perform()
+    page.until(lambda: "turned +9°" in page.view)
+    stage.send_keys(Keys.ARROW_UP, "+")
+    page.until(lambda: "1.10×" in page.view)
+    stage.send_keys(*[Keys.ARROW_RIGHT] * 8)
+    page.until_state("extrapolated")
+    assert page.text("#picture-warning") == FAR
+    assert "EXTRAPOLATED" in page.text("#badge")
+    page.click("#home")
+    page.until_state("live")
+    assert "endoscope's view" in page.view
+
+
+def test_a_picture_is_stale_while_the_service_is_away_and_live_when_it_is_back(site: Site, page: Page) -> None:
+    page.press(site.scene(), "View")
+    page.until_state("live")
+    site.stop()
+    try:
+        page.until_state("stale")
+        assert "STALE" in page.text("#badge")
+        assert "Last picture" in page.text("#stage-message")
+        assert "grayscale" in page.script("return getComputedStyle(document.querySelector('#picture')).filter")
+        page.until_text("#connection", "no connection")
+    finally:
+        site.start()
+    page.until_state("live")
+    page.until_text("#connection", "ready")
+    page.until_text("#readout", "stream")
+
+
+def test_a_running_job_is_told_of_again_after_the_service_was_away(site: Site, page: Page) -> None:
+    site.queued_job()
+    claim = site.claim()
+    site.train(claim, 10, 21.0)
+    page.until_text("#jobs", "21.0 dB")
+    site.stop()
+    site.train(claim, 30, 25.0)
+    site.start()
+    page.until_text("#jobs", "25.0 dB")
+
+
+def test_no_picture_of_another_scene_is_ever_shown(site: Site, page: Page) -> None:
+    site.painter.pause_s = 0.03
+    scenes = [site.scene(mark) for mark in ("00", "7f", "ff")]
+    page.until(lambda: page.script("return document.querySelectorAll('#jobs .done').length") == 3)
+    seen = page.driver.execute_async_script(SWITCHING, scenes)  # type: ignore[no-untyped-call]
+    shades = {scene: {shade for at, shade in seen if at == scene and shade >= 0} for scene in scenes}
+    assert all(shades.values()), "every scene was seen"
+    for scene, found in shades.items():
+        assert all(abs(shade - grey_of(scene)) <= 2 for shade in found), (scene, found)
+
+
+SWITCHING = """
+const [scenes, done] = arguments;
+const picture = document.querySelector("#picture");
+const seen = [];
+let frame = 0;
+const shade = () => picture.hidden || picture.width === 0 ? -1
+  : picture.getContext("2d").getImageData(picture.width / 2, picture.height / 2, 1, 1).data[0];
+const step = () => {
+  seen.push([document.querySelector("#scene-id").textContent, shade()]);
+  if (frame % 7 === 0) document.querySelector(`[data-job="${scenes[(frame / 7) % 3]}"] button`).click();
+  if (++frame < 150) requestAnimationFrame(step);
+  else done(seen);
+};
+step();
+"""
+
+
+def test_a_deleted_scene_leaves_a_receipt_and_no_picture(site: Site, page: Page) -> None:
+    scene = site.scene()
+    page.press(scene, "View")
+    page.until_state("live")
+    page.press(scene, "Delete")
+    page.until(lambda: page.find("#confirm").is_displayed())
+    page.click("#confirm [value=yes]")
+    page.until_text("#jobs-message", "is deleted for good")
+    assert "nothing is left" in page.text("#jobs-message")
+    page.until_state("none")
+    assert page.shade == -1
+    assert page.text("#jobs") == ""
+
+
+def test_a_scene_that_somebody_else_deletes_leaves_the_screen(site: Site, page: Page) -> None:
+    scene = site.scene()
+    page.press(scene, "View")
+    page.until_state("live")
+    site.queue.forget(scene)
+    site.store.purge(scene)
+    page.until(lambda: page.shade == -1)
+    page.until_text("#stage-message", "no scene")
+
+
+def test_a_job_is_cancelled_and_a_failed_one_tried_again_by_keyboard(site: Site, page: Page) -> None:
+    page.choose("clip", CLIP)
+    page.click("#upload [type=submit]")
+    page.until_text("#jobs", "queued")
+    claim = site.claim()
+    assert site.queue.fail(claim, JobError(problem="The clip is dark.", field="clip", remedy="Send a brighter one."))
+    page.until_text("#jobs", "clip: The clip is dark. Send a brighter one.")
+    job = f'[data-job="{claim.job_id}"]'
+    page.until(lambda: page.find(f'{job} button[aria-label^="Try again"]').is_displayed())
+    page.find(f'{job} button[aria-label^="Try again"]').send_keys(Keys.ENTER)
+    page.until_text("#jobs", "next")
+    page.find(f'{job} button[aria-label^="Cancel"]').send_keys(Keys.SPACE)
+    page.until_text("#jobs", "cancelled")
+    record = site.queue.get(claim.job_id)
+    assert record is not None
+    assert record.state is JobState.CANCELLED
+
+
+def test_a_key_is_asked_for_used_everywhere_and_forgotten(tmp_path: Path, driver: webdriver.Chrome) -> None:
+    with site_at(tmp_path / "data", hosts=("127.0.0.1",)) as site:
+        _, key = KeyFile(tmp_path / "data").create("local", {KeyScope.VIEW}, "page")
+        scene = site.scene()
+        page = Page(driver, site.url)
+        page.open()
+        page.until_text("#key-message", "A key is needed.")
+        page.find("#key-text").send_keys("isp_wrong", Keys.ENTER)
+        page.until_text("#key-message", "This key is not known.")
+        page.find("#key-text").send_keys(key, Keys.ENTER)
+        page.press(scene, "View")
+        page.until_state("live")
+        page.until_text("#readout", "stream")
+        page.press(scene, "Delete")
+        page.click("#confirm [value=yes]")
+        page.until_text("#jobs-message", "lacks the scope 'purge'")
+        assert page.state == "live"
+        assert key not in page.script("return document.cookie + JSON.stringify(localStorage) + location.href")
+        page.click("#forget-key")
+        page.until_text("#key-message", "A key is needed.")
+        assert page.shade == -1
+        assert page.text("#jobs") == ""
+        assert page.faults() == []
+        driver.get("about:blank")
+
+
+@pytest.mark.parametrize("width", [1280, 800])
+def test_the_viewer_fits_the_screen(site: Site, page: Page, width: int) -> None:
+    page.driver.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride", {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+    )
+    page.press(site.scene(), "View")
+    page.until_state("live")
+    page.until_text("#report", "How far to trust it")
+    bottom, right = page.script(
+        "const box = document.querySelector('.viewer').getBoundingClientRect(); return [box.bottom, box.right]"
+    )
+    assert bottom <= 800
+    assert right <= width
+    assert page.script("return document.documentElement.scrollWidth") <= width
+    assert page.find(".notice").is_displayed()
+    page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
