@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +21,7 @@ from contract.audit import (
 )
 from contract.errors import UnavailableError
 from contract.store import StoreFullError
+from tests.contract.stores import files_no_larger_than
 
 
 def entry(job_id: str = "a" * 32) -> AuditEntry:
@@ -33,19 +30,6 @@ def entry(job_id: str = "a" * 32) -> AuditEntry:
 
 def lines(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / AUDIT_FILE).read_text().splitlines()]
-
-
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Files cannot grow beyond size bytes: what a full disk looks like to a writer."""
-    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.getsignal(signal.SIGXFSZ)
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, handler)
 
 
 def test_a_line_is_appended_and_the_file_is_the_owners_alone(tmp_path: Path) -> None:
@@ -78,7 +62,7 @@ def test_a_disk_that_takes_only_half_a_line_refuses_it_and_the_next_is_whole(tmp
     log = AuditLog(tmp_path)
     log.append(entry())
     size = (tmp_path / AUDIT_FILE).stat().st_size
-    with largest_file(size + 20), pytest.raises(StoreFullError):
+    with files_no_larger_than(size + 20), pytest.raises(StoreFullError):
         log.append(entry("b" * 32))
     log.append(entry("c" * 32))
     text = (tmp_path / AUDIT_FILE).read_text().splitlines()

@@ -15,9 +15,9 @@ import pytest
 
 from contract.bucket import BucketStore
 from contract.errors import SceneError, UnavailableError
-from contract.job import JobFiles, JobRecord
 from contract.settings import Settings
 from contract.store import ABANDONED_AFTER_S, MANIFEST, SUBMISSION, Store, new_job_id, open_store
+from tests.contract.stores import accepted, received
 
 pytest.importorskip("s3fs")
 moto_server: Any = pytest.importorskip("moto.server")
@@ -61,18 +61,6 @@ def machine(tmp_path: Path, name: str) -> BucketStore:
 
 def keys(bucket: Any) -> list[str]:
     return sorted(each.key.removeprefix(PREFIX) for each in bucket.objects.all())
-
-
-def received(store: Store) -> JobRecord:
-    record = JobRecord(job_id=new_job_id(), files=JobFiles(clip="clip.mp4"), created_at_s=5.0)
-    (store.open_incoming(record.job_id) / "clip.mp4").write_bytes(b"frames")
-    return record
-
-
-def accepted(store: Store) -> JobRecord:
-    record = received(store)
-    store.accept(record)
-    return record
 
 
 def published(store: Store, job_id: str, attempt: int, content: bytes = b"tensors") -> Path:

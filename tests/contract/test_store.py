@@ -10,20 +10,14 @@ from pathlib import Path
 import pytest
 
 from contract.errors import SceneError, UnavailableError
-from contract.job import JobFiles, JobRecord
+from contract.job import JobRecord
 from contract.store import ABANDONED_AFTER_S, MANIFEST, SUBMISSION, Store, is_job_id, new_job_id
+from tests.contract.stores import accepted
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
     return Store(tmp_path / "data")
-
-
-def accepted(store: Store) -> JobRecord:
-    record = JobRecord(job_id=new_job_id(), files=JobFiles(clip="clip.mp4"), created_at_s=5.0)
-    (store.open_incoming(record.job_id) / "clip.mp4").write_bytes(b"frames")
-    store.accept(record)
-    return record
 
 
 def publish(store: Store, job_id: str, attempt: int, content: str = "{}") -> Path:

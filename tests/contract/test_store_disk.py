@@ -3,39 +3,20 @@
 from __future__ import annotations
 
 import os
-import resource
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from contract.errors import UnavailableError
-from contract.job import JobFiles, JobRecord
 from contract.store import MANIFEST, SUBMISSION, Store, StoreFullError, disk_errors, new_job_id
+from tests.contract.stores import files_no_larger_than, received
 
 NOBODY = 65534
 SMALL_BYTES = 64
 """Less than any submission has."""
-
-
-def received(store: Store) -> JobRecord:
-    record = JobRecord(job_id=new_job_id(), files=JobFiles(clip="clip.mp4"), created_at_s=5.0)
-    (store.open_incoming(record.job_id) / "clip.mp4").write_bytes(b"frames")
-    return record
-
-
-@contextmanager
-def files_no_larger_than(limit_bytes: int) -> Iterator[None]:
-    """As under a quota: a longer write fails with EFBIG."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.fixture
