@@ -7,53 +7,33 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from contract.errors import UnavailableError
-from contract.job import JobError, JobFiles, JobOptions, JobProgress, JobRecord, JobState
+from contract.job import JobError, JobProgress, JobRecord, JobState
 from contract.queue import MAX_ATTEMPTS, Claim, Order
 from contract.queue_memory import MemoryQueue
 from contract.rendering import WorkerAddress
-from contract.store import MANIFEST, RESUME, Store, new_job_id
+from contract.store import MANIFEST, RESUME, Store
+from tests.worker.jobs import STANDIN, Jobs, eventually
 from worker import child, consume, liveness
 from worker.child import Keeper
 from worker.consume import Consumer
 from worker.supervisor import address_of, announced
 
-WAIT_S = 20.0
-STANDIN = Path(__file__).with_name("standin.py")
-ENDED = (JobState.DONE, JobState.FAILED, JobState.CANCELLED)
 
-
-def eventually(holds: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + WAIT_S
-    while not holds():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-
-
-class Bench:
-    """A queue, a store and a worker in a thread, with a child process."""
+class Bench(Jobs):
+    """Jobs, and a worker in a thread, with a child process."""
 
     def __init__(self, data_dir: Path, queue: MemoryQueue | None = None, *arguments: str) -> None:
-        self.queue = queue or MemoryQueue()
-        self.store = Store(data_dir)
+        super().__init__(queue or MemoryQueue(), Store(data_dir))
         self.end = threading.Event()
         self.keeper = Keeper([sys.executable, str(STANDIN), *arguments])
         self.consumer = Consumer(self.queue, self.store, self.keeper, "worker-1.a", self.end)
         self.thread: threading.Thread | None = None
-
-    def submit(self, clip: str, **options: object) -> str:
-        files, chosen = JobFiles(clip="clip.mp4"), JobOptions.model_validate(options)
-        record = JobRecord(job_id=new_job_id(), files=files, options=chosen, created_at_s=time.time())
-        (self.store.open_incoming(record.job_id) / "clip.mp4").write_text(clip)
-        self.store.accept(record)
-        self.queue.submit(record)
-        return record.job_id
 
     def start(self) -> None:
         self.end.clear()
@@ -65,37 +45,16 @@ class Bench:
         if self.thread is not None:
             self.thread.join()
 
-    def record(self, job_id: str) -> JobRecord:
-        record = self.queue.get(job_id)
-        assert record is not None
-        return record
-
-    def wait_for(self, job_id: str, *states: JobState) -> JobRecord:
-        eventually(lambda: self.record(job_id).state in states)
-        return self.record(job_id)
-
-    def wait_for_step(self, job_id: str, attempt: int = 1) -> None:
-        """Until this attempt trains."""
-
-        def trains() -> bool:
-            record = self.record(job_id)
-            return record.attempt == attempt and record.progress is not None and record.progress.iteration > 0
-
-        eventually(trains)
-
     def outcome(self, clip: str) -> JobRecord:
         job_id = self.submit(clip)
         self.start()
-        return self.wait_for(job_id, *ENDED)
+        return self.wait_for_end(job_id)
 
     def child_id(self) -> int:
         eventually(lambda: self.keeper.live is not None)
         live = self.keeper.live
         assert live is not None
         return live.process_id
-
-    def files_of(self, job_id: str, area: str = "") -> list[Path]:
-        return [path for path in (self.store.data_dir / area).rglob("*") if path.name.startswith(job_id)]
 
     def went_on_from(self, record: JobRecord) -> str:
         folder = self.store.scene_folder(record.job_id, record.attempt)
@@ -118,7 +77,7 @@ def test_a_reconstruction_that_finishes_makes_its_job_done_and_its_scene_visible
     assert bench.store.has_scene(record.job_id, record.attempt)
     assert record.progress is not None
     assert record.progress.psnr_db == 30.0
-    assert bench.files_of(record.job_id, "work") == []
+    assert bench.files(record.job_id, "work") == []
 
 
 def test_one_child_does_many_jobs(bench: Bench) -> None:
@@ -126,7 +85,7 @@ def test_one_child_does_many_jobs(bench: Bench) -> None:
     before = None
     bench.start()
     before = bench.child_id()
-    states = [bench.wait_for(job_id, *ENDED).state for job_id in jobs]
+    states = [bench.wait_for_end(job_id).state for job_id in jobs]
     assert states == [JobState.DONE, JobState.FAILED, JobState.DONE]
     assert bench.child_id() == before
 
@@ -136,7 +95,7 @@ def test_an_input_error_fails_the_job_with_its_field_and_remedy(bench: Bench) ->
     bench.stop()
     assert record.state is JobState.FAILED
     assert record.error == JobError(problem="they cover everything.", field="masks", remedy="Invert them.")
-    assert bench.files_of(record.job_id, "work") == bench.files_of(record.job_id, "scenes") == []
+    assert bench.files(record.job_id, "work") == bench.files(record.job_id, "scenes") == []
 
 
 def test_what_a_library_prints_in_the_child_changes_nothing(bench: Bench) -> None:
@@ -155,7 +114,7 @@ def test_a_job_that_takes_every_child_down_fails_and_leaves_no_work(bench: Bench
     assert (record.state, record.attempt) == (JobState.FAILED, MAX_ATTEMPTS)
     assert record.error is not None
     assert "died" in record.error.problem
-    assert bench.files_of(record.job_id, "work") == []
+    assert bench.files(record.job_id, "work") == []
 
 
 def test_a_child_without_memory_is_named_in_the_log(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
@@ -176,7 +135,7 @@ def test_a_child_that_died_idle_is_not_held_against_the_next_job(bench: Bench) -
     bench.start()
     os.kill(bench.child_id(), signal.SIGKILL)
     record = bench.record(bench.submit("publish"))
-    record = bench.wait_for(record.job_id, *ENDED)
+    record = bench.wait_for_end(record.job_id)
     assert record.state is JobState.DONE
     assert record.attempt == record.released + 1
 
@@ -187,8 +146,8 @@ def test_cancelling_a_running_job_stops_it_and_removes_every_file_of_it(bench: B
     bench.wait_for_step(job_id)
     child_id = bench.child_id()
     bench.queue.cancel(job_id)
-    assert bench.wait_for(job_id, *ENDED).state is JobState.CANCELLED
-    assert bench.files_of(job_id) == []
+    assert bench.wait_for_end(job_id).state is JobState.CANCELLED
+    assert bench.files(job_id) == []
     assert bench.child_id() == child_id
 
 
@@ -199,9 +158,9 @@ def test_a_cancelled_job_that_does_not_stop_is_killed(bench: Bench, monkeypatch:
     bench.start()
     bench.wait_for_step(job_id)
     bench.queue.cancel(job_id)
-    assert bench.wait_for(job_id, *ENDED).state is JobState.CANCELLED
-    assert bench.files_of(job_id) == []
-    assert bench.wait_for(after, *ENDED).state is JobState.DONE
+    assert bench.wait_for_end(job_id).state is JobState.CANCELLED
+    assert bench.files(job_id) == []
+    assert bench.wait_for_end(after).state is JobState.DONE
 
 
 class Lane(MemoryQueue):
@@ -256,7 +215,7 @@ def test_a_cancel_in_the_last_moment_ends_as_cancelled_and_leaves_nothing(
     record = bench.outcome(clip)
     bench.stop()
     assert record.state is JobState.CANCELLED
-    assert bench.files_of(record.job_id) == []
+    assert bench.files(record.job_id) == []
 
 
 def test_an_attempt_that_was_thought_dead_publishes_nothing(lane: tuple[Bench, Lane]) -> None:
@@ -273,7 +232,7 @@ def test_an_attempt_that_was_thought_dead_publishes_nothing(lane: tuple[Bench, L
     eventually(lambda: bool(others) and bench.consumer.job_id is None)
     assert bench.record(job_id).owner == "worker-2.b"
     assert bench.record(job_id).state is JobState.RUNNING
-    assert bench.files_of(job_id, "scenes") == bench.files_of(job_id, "work") == []
+    assert bench.files(job_id, "scenes") == bench.files(job_id, "work") == []
     assert bench.store.fetch_clip(job_id).is_dir()
 
 
@@ -285,7 +244,7 @@ def test_a_job_that_was_taken_over_is_stopped(bench: Bench) -> None:
     assert bench.queue.claim("worker-2.b", 0.0) is not None
     eventually(lambda: bench.consumer.job_id is None)
     assert bench.record(job_id).owner == "worker-2.b"
-    assert bench.files_of(job_id, "work") == []
+    assert bench.files(job_id, "work") == []
 
 
 def test_a_worker_that_is_told_to_end_hands_its_job_back_and_any_number_of_times(bench: Bench) -> None:
@@ -297,12 +256,12 @@ def test_a_worker_that_is_told_to_end_hands_its_job_back_and_any_number_of_times
         bench.stop()
         assert bench.record(job_id).state is JobState.QUEUED
     bench.start()
-    record = bench.wait_for(job_id, *ENDED)
+    record = bench.wait_for_end(job_id)
     bench.stop()
     assert record.state is JobState.DONE
     assert bench.went_on_from(record) == "x" * polite
     assert not (bench.store.scene_folder(job_id, record.attempt) / "half").exists()
-    assert bench.files_of(job_id, "work") == []
+    assert bench.files(job_id, "work") == []
 
 
 def test_a_worker_that_is_told_to_end_does_not_wait_for_a_deaf_child(
@@ -321,7 +280,7 @@ def test_a_standard_job_makes_way_for_a_high_priority_one_and_goes_on_later(benc
     bench.start()
     bench.wait_for_step(standard)
     high = bench.submit("publish", priority="high")
-    first, second = bench.wait_for(high, *ENDED), bench.wait_for(standard, *ENDED)
+    first, second = bench.wait_for_end(high), bench.wait_for_end(standard)
     bench.stop()
     assert (first.state, second.state) == (JobState.DONE, JobState.DONE)
     assert first.finished_at_s is not None
@@ -349,7 +308,7 @@ def test_a_worker_that_must_end_while_the_queue_is_away_touches_nothing(lane: tu
     bench.stop()
     assert bench.record(job_id).state is JobState.RUNNING
     assert bench.store.fetch_clip(job_id).is_dir()
-    assert [path.name for path in bench.files_of(job_id, "work")] == [f"{job_id}.1"]
+    assert [path.name for path in bench.files(job_id, "work")] == [f"{job_id}.1"]
 
 
 def test_a_result_waits_for_a_queue_that_is_away(lane: tuple[Bench, Lane]) -> None:
@@ -379,7 +338,7 @@ def test_beats_go_on_after_a_fault_that_nobody_foresaw(lane: tuple[Bench, Lane])
     bench.start()
     eventually(stumbled.is_set)
     queue.cancel(job_id)
-    assert bench.wait_for(job_id, *ENDED).state is JobState.CANCELLED
+    assert bench.wait_for_end(job_id).state is JobState.CANCELLED
 
 
 def test_a_clip_that_is_gone_fails_its_job(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -387,8 +346,8 @@ def test_a_clip_that_is_gone_fails_its_job(bench: Bench, monkeypatch: pytest.Mon
     lost, sound = bench.submit("publish"), bench.submit("publish")
     bench.store.purge(lost)
     bench.start()
-    assert bench.wait_for(lost, *ENDED).state is JobState.FAILED
-    assert bench.wait_for(sound, *ENDED).state is JobState.DONE
+    assert bench.wait_for_end(lost).state is JobState.FAILED
+    assert bench.wait_for_end(sound).state is JobState.DONE
 
 
 def test_a_child_that_dies_at_its_start_is_not_started_in_a_hurry(
@@ -431,6 +390,6 @@ def test_the_state_of_an_attempt_goes_to_the_next(bench: Bench) -> None:
     bench.stop()
     assert (bench.store.data_dir / "work" / f"{job_id}.1" / RESUME).exists()
     bench.start()
-    record = bench.wait_for(job_id, *ENDED)
+    record = bench.wait_for_end(job_id)
     assert (record.state, record.attempt, record.released) == (JobState.DONE, 3, 1)
     assert bench.went_on_from(record) == "x"

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,22 +18,21 @@ import pytest
 from contract.embedded import EmbeddedServer
 from contract.errors import UnavailableError
 from contract.exits import ExitCode
-from contract.job import JobFiles, JobOptions, JobRecord, JobState
+from contract.job import JobState
 from contract.queue_redis import RedisQueue
 from contract.settings import Settings
-from contract.store import Store, new_job_id
+from contract.store import Store
+from tests.worker.jobs import STANDIN, WAIT_S, Jobs, eventually
 from worker.checkpoint import load_resume, load_scene
 from worker.hooks import Hooks
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf
 from worker.pipeline import ReconstructionRequest, reconstruct
 from worker.supervisor import run_supervisor
 
-WAIT_S = 40.0
 LEASE_S = 3.0
 """A beat and half of one: the worker here is never away for longer, unless it is meant to be."""
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-STANDIN = Path(__file__).with_name("standin.py")
 PROGRAM = f"""
 import functools, sys
 from contract.logs import configure
@@ -48,14 +47,13 @@ supervisor.run_supervisor(settings, told_to_end(), [sys.executable, {str(STANDIN
 """A worker as `python -m worker consume` makes one, with shorter leases and a child that needs no torch."""
 
 
-class Bench:
-    """A queue, a store and any number of workers."""
+class Bench(Jobs):
+    """Jobs, and any number of workers."""
 
     def __init__(self, data_dir: Path) -> None:
         self.server = EmbeddedServer(data_dir)
         self.server.start()
-        self.queue = RedisQueue(self.server.url, lease_s=LEASE_S)
-        self.store = Store(data_dir)
+        super().__init__(RedisQueue(self.server.url, lease_s=LEASE_S), Store(data_dir))
 
     def close(self) -> None:
         self.queue.close()
@@ -78,42 +76,9 @@ class Bench:
                 assert b"Traceback" not in errors
                 assert b"nobody caught" not in errors, errors.decode()
 
-    def submit(self, clip: str | Path, **options: object) -> str:
-        name = "clip.mp4" if isinstance(clip, str) else clip.name
-        files, chosen = JobFiles(clip=name), JobOptions.model_validate(options)
-        record = JobRecord(job_id=new_job_id(), files=files, options=chosen, created_at_s=time.time())
-        content = clip.encode() if isinstance(clip, str) else clip.read_bytes()
-        (self.store.open_incoming(record.job_id) / name).write_bytes(content)
-        self.store.accept(record)
-        self.queue.submit(record)
-        return record.job_id
-
-    def record(self, job_id: str) -> JobRecord:
-        record = self.queue.get(job_id)
-        assert record is not None
-        return record
-
     def holder(self, job_id: str) -> str:
         """Name of the worker that holds, or last held, the job."""
         return (self.record(job_id).owner or "").split(".")[0]
-
-    def wait_for_step(self, job_id: str, attempt: int = 1) -> None:
-        def trains() -> bool:
-            record = self.record(job_id)
-            return record.attempt == attempt and record.progress is not None and record.progress.iteration > 0
-
-        eventually(trains)
-
-    def wait_for_end(self, job_id: str) -> JobRecord:
-        eventually(lambda: self.record(job_id).state in (JobState.DONE, JobState.FAILED, JobState.CANCELLED))
-        return self.record(job_id)
-
-
-def eventually(holds: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + WAIT_S
-    while not holds():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
 
 
 def children_of(process: subprocess.Popen[bytes]) -> list[int]:
