@@ -10,9 +10,7 @@ import threading
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
-from pydantic import BaseModel
-
-from worker.orders import Run, line_of, read_order
+from worker.orders import DeviceReport, Run, line_of, read_order
 
 
 class Channel:
@@ -21,7 +19,7 @@ class Channel:
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
         self._lock = threading.Lock()
-        self._last: dict[type[BaseModel], BaseModel] = {}
+        self._last: dict[type[DeviceReport], DeviceReport] = {}
 
     @classmethod
     def instead_of_stdout(cls) -> Channel:
@@ -31,13 +29,13 @@ class Channel:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         return cls(os.fdopen(own, "wb"))
 
-    def send(self, message: BaseModel) -> None:
+    def send(self, message: DeviceReport) -> None:
         """Write one report. A supervisor that is gone ends this process by other means."""
         with self._lock, contextlib.suppress(BrokenPipeError):
             self._stream.write(line_of(message))
             self._stream.flush()
 
-    def send_if_new(self, message: BaseModel) -> None:
+    def send_if_new(self, message: DeviceReport) -> None:
         """Write a report unless it says what the last of its kind said; for one thread."""
         if self._last.get(type(message)) != message:
             self._last[type(message)] = message

@@ -17,7 +17,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from contract.errors import UnavailableError
-from worker.orders import Advanced, Failed, Finished, Holding, Ready, Run, Stop, Stopped, Unable, line_of, read_report
+from worker.orders import (
+    Advanced,
+    DeviceOrder,
+    Failed,
+    Finished,
+    Holding,
+    Ready,
+    Stopped,
+    Unable,
+    line_of,
+    read_report,
+)
 
 START_LIMIT_S = 240.0
 """To import torch and compile all kernels, on a slow machine whose cache is empty."""
@@ -69,7 +80,7 @@ class DeviceChild:
         """Of the process."""
         return self._process.pid
 
-    def send(self, order: Run | Stop) -> None:
+    def send(self, order: DeviceOrder) -> None:
         """Give an order; that a dead child hears none is reported by next_report."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError, ValueError):

@@ -22,7 +22,7 @@ from worker.child import DeviceChild, Ended, Keeper
 from worker.faults import describe
 from worker.heartbeat import Heartbeat
 from worker.liveness import Watch
-from worker.orders import Advanced, Failed, Finished, Run, Stop, Stopped, StopReason
+from worker.orders import Advanced, Failed, Finished, Run, Stop, Stopped
 
 CLAIM_TIMEOUT_S = 1.0
 """How soon an idle worker notices that it should end, or that its child has."""
@@ -147,9 +147,8 @@ class _Job:
             if isinstance(report, Advanced):
                 watch.hear(report.progress)
                 self._heart.report(report.progress)
-            reason = self._reason_to_stop()
-            if asked_s is None and reason is not None:
-                child.send(Stop(reason=reason))
+            if asked_s is None and self._is_to_stop():
+                child.send(Stop())
                 asked_s = time.monotonic()
             if asked_s is not None and time.monotonic() - asked_s > STOP_LIMIT_S:
                 child.kill()
@@ -158,13 +157,12 @@ class _Job:
                 child.kill()
                 return Died(f"hung in stage {watch.stage!r} and was killed", excused=asked_s is not None)
 
-    def _reason_to_stop(self) -> StopReason | None:
-        reasons: dict[Order, StopReason] = {Order.CANCEL: "cancel", Order.LOST: "lost", Order.YIELD: "yield"}
-        return reasons.get(self._heart.order, "end" if self._end.is_set() else None)
+    def _is_to_stop(self) -> bool:
+        return self._heart.order is not Order.GO_ON or self._end.is_set()
 
     def without_store(self, error: IntrasplatError) -> Failed | Died:
         """What becomes of an attempt that the store fails: another is made if this one was to stop anyway."""
-        if self._reason_to_stop() is not None:
+        if self._is_to_stop():
             return Died("waited for the store", excused=True)
         return Failed(error=describe(error), fault=type(error).__name__)
 
@@ -253,7 +251,7 @@ class _Job:
             try:
                 return work()
             except UnavailableError as error:
-                if time.monotonic() > deadline_s or self._reason_to_stop() is not None:
+                if time.monotonic() > deadline_s or self._is_to_stop():
                     raise
                 self._log.warning("waits for the store: %s", error.problem)
                 self._end.wait(UNREACHABLE_PAUSE_S)

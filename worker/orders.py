@@ -11,15 +11,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from contract.job import JobError, JobProgress, JobRecord
 from worker.hooks import Progress
-
-StopReason = Literal["cancel", "yield", "lost", "end"]
-"""cancel, lost: what was made is not wanted any more; yield, end: another attempt goes on from it."""
 
 
 class _Message(BaseModel):
@@ -39,7 +36,6 @@ class Stop(_Message):
     """Stop the job soon, its state kept in `out`; without a job it means nothing."""
 
     kind: Literal["stop"] = "stop"
-    reason: StopReason
 
 
 class Ready(_Message):
@@ -94,19 +90,19 @@ class Failed(_Message):
     """The error's kind, for the log: its text may hold the names of a caller's files."""
 
 
-DeviceOrder = Annotated[Run | Stop, Field(discriminator="kind")]
-DeviceReport = Annotated[Ready | Unable | Holding | Advanced | Finished | Stopped | Failed, Field(discriminator="kind")]
+DeviceOrder: TypeAlias = Run | Stop
+DeviceReport: TypeAlias = Ready | Unable | Holding | Advanced | Finished | Stopped | Failed
 
-_ORDERS: TypeAdapter[Run | Stop] = TypeAdapter(DeviceOrder)
-_REPORTS: TypeAdapter[Ready | Unable | Holding | Advanced | Finished | Stopped | Failed] = TypeAdapter(DeviceReport)
+_ORDERS: TypeAdapter[DeviceOrder] = TypeAdapter(Annotated[DeviceOrder, Field(discriminator="kind")])
+_REPORTS: TypeAdapter[DeviceReport] = TypeAdapter(Annotated[DeviceReport, Field(discriminator="kind")])
 
 
-def line_of(message: BaseModel) -> bytes:
+def line_of(message: DeviceOrder | DeviceReport) -> bytes:
     """The message as it goes over the wire."""
     return message.model_dump_json().encode() + b"\n"
 
 
-def read_order(line: bytes) -> Run | Stop:
+def read_order(line: bytes) -> DeviceOrder:
     """The order in a line.
 
     Raises:
@@ -115,7 +111,7 @@ def read_order(line: bytes) -> Run | Stop:
     return _ORDERS.validate_json(line)
 
 
-def read_report(line: bytes) -> Ready | Unable | Holding | Advanced | Finished | Stopped | Failed | None:
+def read_report(line: bytes) -> DeviceReport | None:
     """The report in a line; None if something else has been printed."""
     try:
         return _REPORTS.validate_json(line)

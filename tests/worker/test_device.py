@@ -103,7 +103,7 @@ def end_of_job(child: DeviceChild, stop_after: int | None = None) -> tuple[objec
             return report, advances
         advances.append(report)
         if stop_after is not None and report.progress.iteration > stop_after:
-            child.send(Stop(reason="end"))
+            child.send(Stop())
             stop_after = None
 
 
@@ -121,7 +121,7 @@ def test_a_stopped_job_goes_on_to_the_same_bits_and_the_process_does_any_number_
     assert end_of_job(device, stop_after=1)[0] == Stopped(checkpointed=True)
     assert [path.name for path in out.iterdir()] == [RESUME_FILE]
     stopped_at = load_resume(out)[1]["iteration"]
-    device.send(Stop(reason="end"))  # too late for the last job, and not meant for the next
+    device.send(Stop())  # too late for the last job, and not meant for the next
     device.send(order(clip, out, iterations=600))
     finished, advances = end_of_job(device)
     assert finished == Finished()
