@@ -15,7 +15,7 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from contract.settings import LOOPBACK_NAMES
-from service.problems import Problem
+from service.problems import LENGTH_REMEDY, Problem
 
 ANY_HOST = "*"
 """As a host: every name is answered, for clusters that address a service by changing ones. Keys are required then."""
@@ -85,7 +85,8 @@ class Guard:
             return Problem(403, f"Pages from {origin[:80]!r} may not use this service.", field="Origin", remedy=remedy)
         if "transfer-encoding" in headers and "content-length" in headers:  # RFC 9112, 6.1: how requests are smuggled
             close = {"Connection": "close"}
-            return Problem(400, "The body's length is told in two ways.", field="Content-Length", headers=close)
+            detail = "The body's length is told in two ways."
+            return Problem(400, detail, field="Content-Length", remedy=LENGTH_REMEDY, headers=close)
         return None
 
 

@@ -14,7 +14,7 @@ from contract.errors import LimitError
 from contract.settings import Settings
 from contract.store import Store
 from service.partial import promised_bytes
-from service.problems import Problem, no_room
+from service.problems import LENGTH_REMEDY, Problem, no_room
 from service.upload import LIMIT_REMEDY
 
 LEAST_BYTES = 4096
@@ -109,5 +109,5 @@ def declared_length(request: Request) -> int:
     """
     text = request.headers.get("content-length", "0")
     if not (text.isascii() and text.isdigit() and len(text) < 20):
-        raise Problem(400, f"{text[:40]!r} is not a length.", field="Content-Length")
+        raise Problem(400, f"{text[:40]!r} is not a length.", field="Content-Length", remedy=LENGTH_REMEDY)
     return int(text)

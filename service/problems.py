@@ -19,6 +19,7 @@ MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
 """Said with 423, 429 and 503, unless the problem knows better."""
 API_REMEDY = "The API is described at /openapi.json."
+LENGTH_REMEDY = "Send Content-Length once, as a number, or chunks without it."
 SCENES_REMEDY = "GET /scenes lists what there is."
 FAULT_REMEDY = "Report it with the log's lines of this X-Request-Id."
 
@@ -45,7 +46,8 @@ TITLES = {
 class Problem(Exception):
     """An answer other than the one asked for; raised anywhere below a route.
 
-    `extensions` are further members of the document, such as the job it speaks of.
+    remedy has no default, so that nobody forgets it. `extensions` are further members of the document, such as the job
+    it speaks of.
     """
 
     def __init__(
@@ -54,7 +56,7 @@ class Problem(Exception):
         detail: str,
         *,
         field: str | None = None,
-        remedy: str | None = None,
+        remedy: str | None,
         headers: Mapping[str, str] | None = None,
         extensions: Mapping[str, object] | None = None,
     ) -> None:
@@ -69,7 +71,7 @@ class Problem(Exception):
             self.headers.setdefault("Retry-After", str(RETRY_AFTER_S))
 
     def document(self) -> dict[str, object]:
-        """The problem as RFC 9457 has it, with the field at fault and the remedy where there are any."""
+        """The problem as RFC 9457 has it, with the remedy, and the field if one is at fault."""
         title = TITLES.get(self.status, "Error")
         document = {"type": "about:blank", "title": title, "status": self.status, "detail": self.detail}
         about = {"field": self.field, "remedy": self.remedy, **self.extensions}
@@ -146,5 +148,4 @@ def _problem_of_validation(error: RequestValidationError) -> Problem:
 
 
 def _problem_of_http_exception(error: HTTPException) -> Problem:
-    remedy = API_REMEDY if error.status_code in (404, 405) else None
-    return Problem(error.status_code, str(error.detail), remedy=remedy, headers=error.headers)
+    return Problem(error.status_code, str(error.detail), remedy=API_REMEDY, headers=error.headers)

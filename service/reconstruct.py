@@ -126,7 +126,8 @@ async def _receive_form(request: Request, services: Deps, caller: Caller, key: s
             received = await receive_upload(content_type, services.intake.body(request, place), folder, limits)
             return await run_in_threadpool(_accept, services, caller, job_id, received, key)
         except ClientDisconnect:
-            raise Problem(400, "The connection was closed before the upload was complete.") from None
+            detail = "The connection was closed before the upload was complete."
+            raise Problem(400, detail, remedy="Send it again.") from None
         finally:
             await run_in_threadpool(store.discard_incoming, job_id)
 

@@ -60,7 +60,7 @@ async def get_curve(scene_id: str, services: Services, caller: AnyCaller) -> Fil
     record = await run_in_threadpool(finished_job, services, caller, scene_id)
     folder = services.store.scene_folder(scene_id, record.attempt)
     if not (folder / CURVE).is_file():
-        raise Problem(404, "This scene has no curve.", field="scene_id")
+        raise Problem(404, "This scene has no curve.", field="scene_id", remedy=f"See GET /scenes/{scene_id}.")
     await services.audit.viewed(caller, scene_id)
     return FileResponse(folder / CURVE, media_type="text/csv")
 

@@ -84,7 +84,8 @@ def _marking(scope: Scope, send: Send, request_id: str, answered: _Answered) -> 
     async def marked(message: Message) -> None:
         kind = message["type"]
         if kind == "websocket.close" and answered.status is None:
-            await _refuse(Problem(404, "There is no such WebSocket."), scope, _nothing, marked)
+            problem = Problem(404, "There is no such WebSocket.", remedy="The one there is: /stream.")
+            await _refuse(problem, scope, _nothing, marked)
             return
         if kind == "websocket.accept":
             answered.status = SWITCHED

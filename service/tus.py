@@ -33,6 +33,7 @@ CONTENT_TYPE = "application/offset+octet-stream"
 MAX_OPEN_UPLOADS = 100
 """Of one tenant, unfinished or not used yet."""
 
+REST_REMEDY = "Ask how far it came (HEAD) and send what follows."
 METADATA_REMEDY = "Send `part` (clip, left, right, calibration or masks) and `suffix` (.mp4), each value in base64."
 
 
@@ -153,7 +154,7 @@ async def append_to_upload(
             _check_fits(declared_length(request), left_bytes)
             new_bytes = await _write(services.intake.body(request, place), file, left_bytes)
         except ClientDisconnect:
-            raise Problem(400, "The connection was closed; what came is kept.") from None
+            raise Problem(400, "The connection was closed; what came is kept.", remedy=REST_REMEDY) from None
         finally:
             await run_in_threadpool(close, file)
     response.headers["Upload-Offset"] = str(upload_offset + new_bytes)
@@ -184,7 +185,7 @@ def _open_at(partial: Partial, offset_bytes: int) -> RawIOBase:
         problem = "Another request is writing to this upload."
         raise Problem(423, problem, remedy="Wait for it to end, then ask how far it came: HEAD.") from None
     except FileNotFoundError:
-        raise Problem(409, "All of this upload has come, and a job has it.") from None
+        raise Problem(409, "All of this upload has come, and a job has it.", remedy="See GET /jobs.") from None
     if partial.offset_bytes == offset_bytes:
         return file
     file.close()
@@ -217,7 +218,8 @@ def _check_size(services: Deps, caller: Caller, part: str, length_bytes: int) ->
 
 def _check_fits(new_bytes: int, left_bytes: int) -> None:
     if new_bytes > left_bytes:
-        raise Problem(413, f"Only {left_bytes} bytes of the upload are left to come.", field="Upload-Length")
+        detail = f"Only {left_bytes} bytes of the upload are left to come."
+        raise Problem(413, detail, field="Upload-Length", remedy=REST_REMEDY)
 
 
 def _part_and_suffix(metadata: str) -> tuple[str, str]:
