@@ -158,6 +158,18 @@ def test_what_cannot_be_shown_is_told_with_its_id_and_the_connection_goes_on(ser
         assert view(viewer)[0]["scene"] == scene
 
 
+@pytest.mark.parametrize(
+    "text", ['{"id": "\\ud800"}', '{"id": ' + "[" * 5000 + "]" * 5000 + "}", '{"t": ' + "9" * 5000 + "}"]
+)
+def test_json_that_is_built_to_trip_its_reader_is_told_to_be_none(service: LiveService, text: str) -> None:
+    service.finished_scene()
+    with viewing(service) as viewer:
+        viewer.send(text)
+        assert problem(viewer)["status"] in (400, 422)
+        ask(viewer, id="next")
+        assert view(viewer)[0]["id"] == "next"
+
+
 def test_the_scene_may_be_left_out_while_there_is_exactly_one(service: LiveService) -> None:
     with viewing(service) as viewer:
         ask(viewer)
