@@ -30,6 +30,10 @@ PoseConvention = Literal["opengl", "llff"]
 Priority = Literal["standard", "high"]
 """high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
 
+MOST_HOLDOUT_CHARACTERS = 8000
+"""A thousand frame numbers of up to six digits, and what stands between them. A record must be small enough to go
+through a pipe to a process that does not read just now."""
+
 LOCAL_TENANT = "local"
 """Whose jobs they are where no key is asked for."""
 
@@ -81,6 +85,7 @@ class JobOptions(BaseModel):
     pose_convention: PoseConvention = Field(default="opengl", description="axes of poses_bounds.npy")
     holdout: str = Field(
         default="every8",
+        max_length=MOST_HOLDOUT_CHARACTERS,
         pattern=r"^(every8|blocks8|none|\d{1,6}(,\d{1,6})*)$",
         description="every8, blocks8, none, or frame numbers such as 1,9,17",
     )

@@ -53,6 +53,7 @@ def test_a_list_of_held_out_frames_is_kept_as_text() -> None:
         '{"iterations": 0}',
         '{"holdout": "every9"}',
         '{"holdout": []}',
+        '{"holdout": "' + "1," * 4000 + '1"}',
         '{"mask_polarity": "inside"}',
         '{"layout": "top"}',
         '{"presett": "fast"}',
