@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import resource
 from types import FrameType
 
 import h11
@@ -25,6 +26,11 @@ MAX_HEAD_BYTES = 32 * 1024
 """Of a request's line and headers together."""
 MAX_CONNECTIONS = 1024
 """Open ones, whether or not something is asked on them; service/surface.py counts requests."""
+BACKLOG = 128
+"""Connections that wait to be accepted, all of which asyncio takes at once; as many are let in to be told to come back.
+Those that come in excess are closed: it logs each one that it has no file descriptor for, and forgets none of them."""
+SPARE_FILES = 512
+"""Descriptors beside those of connections: files, queue, workers, and twice the backlog."""
 GRACE_S = 10
 """What is being answered when the service is asked to end has so long; an upload can be gone on with afterwards."""
 
@@ -42,6 +48,9 @@ class HttpConnection(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
+        assert self.limit_concurrency is not None
+        if len(self.connections) > self.limit_concurrency + BACKLOG:
+            self.transport.close()
         self.loop.call_later(HEAD_S, self._end_if_silent, None)
 
     def send_400_response(self, msg: str) -> None:
@@ -90,7 +99,8 @@ class Server(uvicorn.Server):
             server_header=False,
             timeout_keep_alive=KEEP_ALIVE_S,
             timeout_graceful_shutdown=GRACE_S,
-            limit_concurrency=MAX_CONNECTIONS,
+            limit_concurrency=room_for_connections(),
+            backlog=BACKLOG,
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,
             ws_max_size=MAX_MESSAGE_BYTES,
             ws_max_queue=MAX_WAITING_MESSAGES,
@@ -106,3 +116,13 @@ class Server(uvicorn.Server):
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         self._feeds.end()
         super().handle_exit(sig, frame)
+
+
+def room_for_connections() -> int:
+    """How many connections the files that this process may open leave room for; raises that limit if it may."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MAX_CONNECTIONS + SPARE_FILES
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    return MAX_CONNECTIONS if soft == resource.RLIM_INFINITY else min(MAX_CONNECTIONS, max(soft - SPARE_FILES, 1))

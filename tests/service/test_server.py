@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 import socket
@@ -16,7 +17,7 @@ from websockets import Origin
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from service.server import MAX_HEAD_BYTES
+from service.server import MAX_CONNECTIONS, MAX_HEAD_BYTES, SPARE_FILES, room_for_connections
 from tests.service.house import CLIP
 from tests.service.live import LiveService, live_service
 
@@ -175,3 +176,26 @@ def test_a_long_answer_is_not_taken_for_a_silent_connection(live: LiveService, m
         time.sleep(0.3)
         httpx.delete(f"{live.url}/jobs/{job_id}")
         assert any("cancelled" in line for line in lines)
+
+
+def test_connections_beyond_the_limit_are_closed_and_those_below_it_answered(
+    live: LiveService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.server.BACKLOG", 0)
+    live.server.config.limit_concurrency = 4  # read by each new connection
+    with contextlib.ExitStack() as held:
+        for _ in range(4):
+            held.enter_context(socket.create_connection(("127.0.0.1", live.port), timeout=PATIENCE_S))
+        fifth = held.enter_context(socket.create_connection(("127.0.0.1", live.port), timeout=PATIENCE_S))
+        assert fifth.recv(1) == b""
+    assert httpx.get(f"{live.url}/healthz").status_code == 200
+
+
+def test_the_files_that_a_process_may_open_bound_its_connections(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = [(1024, 524_288)]
+    monkeypatch.setattr("resource.getrlimit", lambda kind: limits[-1])
+    monkeypatch.setattr("resource.setrlimit", lambda kind, limit: limits.append(limit))
+    assert room_for_connections() == MAX_CONNECTIONS
+    assert limits[-1] == (MAX_CONNECTIONS + SPARE_FILES, 524_288)
+    limits.append((1024, 1024))
+    assert room_for_connections() == 1024 - SPARE_FILES
