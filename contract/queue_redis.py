@@ -31,7 +31,7 @@ These expire:
     {intrasplat}:forgotten:<id>         token of the call that removed it
 
 A user who may do this and nothing else:
-    ACL SETUSER intrasplat on >PASSWORD resetkeys ~{intrasplat}:* resetchannels +@all -@dangerous +bgrewriteaof
+    ACL SETUSER intrasplat on >PASSWORD ~{intrasplat}:* resetchannels +@all -@dangerous +bgrewriteaof
 
 Every change of state is one script, and every script gives the same answer when it is run twice, so the client may
 repeat a command whose reply was lost. Claiming, too, is one script; what blocks is a plain XREAD, which takes nothing.

@@ -15,7 +15,7 @@ password=$(od -An -N32 -tx1 /dev/urandom | tr -d ' \n')
 digest=$(printf %s "$password" | sha256sum | cut -d ' ' -f 1)
 {
   echo "user default on nopass nocommands +ping"
-  echo "user intrasplat on #$digest ~{intrasplat}:* &{intrasplat}:* +@all -@dangerous +bgrewriteaof"
+  echo "user intrasplat on #$digest ~{intrasplat}:* resetchannels +@all -@dangerous +bgrewriteaof"
 } >"$folder/queue.acl"
 echo "redis://intrasplat:$password@queue:6379/0" >"$folder/redis_url"
 echo "make-secrets: made $folder/queue.acl and $folder/redis_url" >&2

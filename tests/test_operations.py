@@ -7,6 +7,7 @@ from typing import get_args
 
 import yaml  # type: ignore[import-untyped]
 
+from contract import queue_redis
 from contract.bucket import LOOKED_FOR_S
 from contract.job import Priority
 from contract.queue import LEASE_S, MAX_ATTEMPTS
@@ -57,6 +58,7 @@ def test_the_access_list_is_that_of_the_containers() -> None:
     made = (REPOSITORY / "docker" / "make-secrets.sh").read_text(encoding="utf-8")
     (rights,) = re.findall(r"user intrasplat on #\S+ (.*?)\"?$", made, re.MULTILINE)
     assert rights in PAGE
+    assert rights in (queue_redis.__doc__ or "")
 
 
 def test_the_figures_are_those_of_the_code() -> None:

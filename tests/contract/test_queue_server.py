@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import shutil
 import subprocess
 import threading
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 import redis
 
+from contract import queue_redis
 from contract.errors import UnavailableError
 from contract.job import JobState
 from contract.queue import Admission, Order, Queue
@@ -31,8 +33,9 @@ from tests.contract.queues import (
     state_of,
 )
 
-USER_RULES = "on >secret-of-the-test resetkeys ~{intrasplat}:* resetchannels -@all +@all -@dangerous"
-"""As contract/queue_redis.py and docs/decisions/006-queue.md give them."""
+(USER_RIGHTS,) = re.findall(r"ACL SETUSER intrasplat on >PASSWORD (.*)", queue_redis.__doc__ or "")
+USER_RULES = f"on >secret-of-the-test {USER_RIGHTS}"
+"""As contract/queue_redis.py gives them."""
 
 
 def keys_of(client: redis.Redis) -> set[str]:
@@ -280,6 +283,7 @@ def full_course(queue: Queue) -> None:
     assert queue.forget(urgent.job_id)
     assert len(queue.workers()) == 1
     queue.withdraw("worker-1")
+    assert queue.rewrite_log()
 
 
 def test_the_documented_user_may_do_all_that_the_queue_does_and_touch_nothing_else(own: RunningServer) -> None:
