@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import queue
 import sys
@@ -10,7 +11,11 @@ import threading
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
+from pydantic import ValidationError
+
 from worker.orders import DeviceReport, Run, line_of, read_order
+
+logger = logging.getLogger("intrasplat.worker")
 
 
 class Channel:
@@ -73,7 +78,11 @@ class Orders:
     def _read(self) -> None:
         task: Task | None = None
         for line in self._stream:
-            order = read_order(line)
+            try:
+                order = read_order(line)
+            except ValidationError:  # of another version: a process that heard no further order would only seem to work
+                logger.error("an order cannot be read; restart the worker after its program was changed")
+                os._exit(1)
             if isinstance(order, Run):
                 task = Task(order)
                 self._tasks.put(task)

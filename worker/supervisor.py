@@ -109,7 +109,10 @@ def announced(queue: Queue, name: str, address: Callable[[], WorkerAddress | Non
             if now == told and (now is None or time.monotonic() < next_s):
                 continue
             with contextlib.suppress(UnavailableError):
-                queue.withdraw(name) if now is None else queue.announce(now)
+                if now is None:
+                    queue.withdraw(name)
+                else:
+                    queue.announce(now)
                 told = now
             next_s = time.monotonic() + ANNOUNCE_PERIOD_S
 
