@@ -2,9 +2,10 @@
 
     python benchmarks/bm_snapshot.py [--iterations 150]
 
-Trains `fast` on a synthetic clip of 640x512 three times, so many iterations each: alone, with a viewer who asks for one
-JPEG after the other as fast as they come, and alone again. Prints seconds of training, what a copy took the loop, what
-a view took the viewer, and when the first view was there, counted from the start of the loop. Kernels are compiled
+Trains `fast` on a synthetic clip of 640x512, so many iterations each time: alone, with a viewer who asks for one JPEG
+after the other as fast as they come, and with one who is held to the share that a worker gives to renders; the three in
+turn, --rounds times. Prints of each the median seconds of training, what a copy took the loop, what a view took to
+make, how many came a second, and when the first was there, counted from the start of the loop. Kernels are compiled
 before.
 """
 
@@ -14,6 +15,8 @@ import argparse
 import tempfile
 import threading
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -23,6 +26,7 @@ from contract.store import Store
 from worker.checkpoint import Scene
 from worker.clip import DepthClip, split_frames
 from worker.hooks import Hooks
+from worker.pace import Pace
 from worker.phantom import PhantomSettings, make_phantom
 from worker.pipeline import ReconstructionRequest, prepare, snapshot_of
 from worker.presets import PRESETS
@@ -50,21 +54,43 @@ class Figures:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--iterations", type=int, default=150, help="of each run")
+    parser.add_argument("--rounds", type=int, default=3)
     arguments = parser.parse_args()
     clip = make_phantom(CLIP).depth_clip()
     compile_kernels()
-    for watched in (False, True, False):
-        figures = trained(clip, arguments.iterations, watched)
-        line = f"{'watched' if watched else 'alone  '}  {figures.gaussians} Gaussians  training {figures.train_s:.2f} s"
-        line += f"  {len(figures.copy_ms)} copies of {median(figures.copy_ms):.1f} ms"
-        if figures.first_view_s is not None:
-            line += f"  {len(figures.view_ms)} views of {median(figures.view_ms):.0f} ms"
-            line += f"  the first after {figures.first_view_s:.2f} s"
-        print(line, flush=True)
+    trained(clip, 10, None)  # the first run reads what the others find in caches
+    paces: dict[str, Callable[[], Pace] | None] = {"alone": None, "unpaced": _Unpaced, "paced": Pace}
+    runs: dict[str, list[Figures]] = {name: [] for name in paces}
+    for _ in range(arguments.rounds):
+        for name, pace in paces.items():
+            runs[name].append(trained(clip, arguments.iterations, pace and pace()))
+    for name, figures in runs.items():
+        print(line_of(name, figures), flush=True)
 
 
-def trained(clip: DepthClip, iterations: int, watched: bool) -> Figures:
-    """One training run."""
+class _Unpaced(Pace):
+    """Lets every view begin at once."""
+
+    def rest_s(self) -> float:
+        return 0.0
+
+
+def line_of(name: str, runs: list[Figures]) -> str:
+    """What is printed of one way to be watched."""
+    train_s = median(each.train_s for each in runs)
+    line = f"{name:8} {runs[0].gaussians} Gaussians  training {train_s:.2f} s"
+    line += f"  {median(len(each.copy_ms) for each in runs):g} copies"
+    line += f" of {median(ms for each in runs for ms in each.copy_ms):.1f} ms"
+    if any(each.view_ms for each in runs):
+        a_second = median(len(each.view_ms) / each.train_s for each in runs)
+        first_s = median(each.first_view_s for each in runs if each.first_view_s is not None)
+        line += f"  {a_second:.1f} views/s of {median(ms for each in runs for ms in each.view_ms):.0f} ms"
+        line += f"  the first after {first_s:.2f} s"
+    return line
+
+
+def trained(clip: DepthClip, iterations: int, pace: Pace | None) -> Figures:
+    """One training run, with a viewer if there is a pace for one."""
     split = split_frames(clip)
     request = ReconstructionRequest(clip=Path("unused"), iterations=iterations)
     run, scale = prepare(clip, split, PRESETS["fast"], request, Stopwatch())
@@ -77,24 +103,25 @@ def trained(clip: DepthClip, iterations: int, watched: bool) -> Figures:
         figures.copy_ms.append((time.perf_counter() - start) * 1e3)
         return scene
 
-    start = time.perf_counter()
-    viewer = threading.Thread(target=watch, args=(snapshots, figures, start, end))
-    if watched:
-        viewer.start()
     hooks = Hooks(wants_snapshot=snapshots.wanted, on_snapshot=snapshots.offer)
-    train(run, Stopwatch(), lambda: float("nan"), hooks, copy)
-    figures.train_s = time.perf_counter() - start
-    end.set()
-    if watched:
-        viewer.join()
+    with ExitStack() as beside:
+        start = time.perf_counter()
+        if pace is not None:
+            beside.enter_context(pace.training())
+            viewer = threading.Thread(target=watch, args=(snapshots, pace, figures, start, end))
+            viewer.start()
+            beside.callback(viewer.join)
+            beside.callback(end.set)
+        train(run, Stopwatch(), lambda: float("nan"), hooks, copy)
+        figures.train_s = time.perf_counter() - start
     return figures
 
 
-def watch(snapshots: Snapshots, figures: Figures, began: float, end: threading.Event) -> None:
-    """Ask for one view after the other."""
+def watch(snapshots: Snapshots, pace: Pace, figures: Figures, began: float, end: threading.Event) -> None:
+    """Ask for one view after the other, and rest in between as a worker does."""
     with tempfile.TemporaryDirectory() as folder:
-        views = Views(Store(Path(folder)), snapshots)
-        while not end.is_set():
+        views = Views(Store(Path(folder)), snapshots, pace=pace)
+        while not end.wait(pace.rest_s()):
             start = time.perf_counter()
             try:
                 views.answer(RenderRequest(scene_id=JOB, t=(start - began) % 1, format=ImageFormat.JPEG))

@@ -56,6 +56,7 @@ STAGES = (
     "evaluate",
     "serve",
     "snapshot",
+    "pace",
     "views",
     "orders",
     "channel",

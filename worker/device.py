@@ -31,6 +31,7 @@ from worker.orders import (
     Unable,
     job_progress,
 )
+from worker.pace import Pace
 from worker.pipeline import ReconstructionRequest, check_device, reconstruct
 from worker.raster.cpu import compile_kernels
 from worker.serve import RequestServer
@@ -65,20 +66,22 @@ def run_device(settings: Settings) -> None:
 
 def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     device = training_device(settings.device)
-    store, snapshots = open_store(settings), Snapshots()
+    store, snapshots, pace = open_store(settings), Snapshots(), Pace()
     # What is unpacked of clips stays in the data directory, and does not outlive the next start.
     tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
     started_s = time.monotonic()
     compile_kernels()
     logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
-    views = Views(store, snapshots, settings.hot_bytes)
+    views = Views(store, snapshots, settings.hot_bytes, pace)
 
     def tell_what_is_held() -> None:
         views.forget_purged()
         channel.send_if_new(Holding(scenes=views.held))
 
     endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
-    with RequestServer(endpoint, views.answer, between=tell_what_is_held, render_secret=settings.render_secret):
+    with RequestServer(
+        endpoint, views.answer, between=tell_what_is_held, rest_s=pace.rest_s, render_secret=settings.render_secret
+    ):
         channel.send(Ready(endpoint=endpoint, device=device))
         logger.info("the device process is ready on %s", device)
         shown = ""
@@ -88,7 +91,9 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
                 snapshots.drop(shown)
             else:
                 shown = task.run.record.job_id
-                channel.send(work_on(task, device, ClipLimits.of(settings), snapshots, channel))
+                with pace.training():
+                    end = work_on(task, device, ClipLimits.of(settings), snapshots, channel)
+                channel.send(end)
 
 
 def work_on(

@@ -1,6 +1,7 @@
 """The worker's ear for renders and exports: a ZeroMQ ROUTER in a thread beside training (contract/rendering.py).
 
-One request is answered at a time, in the order they came; rendering shares the cores with training. A unix socket is
+One request is answered at a time, in the order they came; rendering shares the cores with training, and waits when it
+has had its share (worker/pace.py). A unix socket is
 guarded by the folder it lies in. TCP is encrypted, and only who knows the installation's secret is heard.
 """
 
@@ -55,7 +56,8 @@ class RequestServer:
     """Answers requests at `endpoint` by `answer`; a context manager that binds and unbinds.
 
     `answer` may raise InputError, SceneError or NotYetError, which the caller is told; anything else is logged and told
-    as a fault. `between` is called about once a second, in the same thread. render_secret is needed for tcp:// alone.
+    as a fault. `between` is called about once a second, in the same thread. `rest_s` says how long to answer nobody
+    for. render_secret is needed for tcp:// alone.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class RequestServer:
         answer: Callable[[RenderRequest | ExportRequest], View],
         *,
         between: Callable[[], None] | None = None,
+        rest_s: Callable[[], float] = lambda: 0.0,
         render_secret: str | None = None,
     ) -> None:
         if endpoint.startswith("tcp:") and render_secret is None:
@@ -76,6 +79,7 @@ class RequestServer:
         self._answer = answer
         self._between = between
         self._between_at_s = 0.0
+        self._rest_s = rest_s
         self._render_secret = render_secret
         self._end = threading.Event()
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -105,6 +109,9 @@ class RequestServer:
         assert self._socket is not None
         while not self._end.is_set():
             self._do_between()
+            if (rest_s := self._rest_s()) > 0.0:
+                self._end.wait(min(rest_s, POLL_MS / 1e3))
+                continue
             if not self._socket.poll(POLL_MS):
                 continue
             frames = self._socket.recv_multipart()

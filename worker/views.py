@@ -19,6 +19,7 @@ from contract.store import Store
 from worker.checkpoint import Scene, load_scene
 from worker.encode import encode_layer
 from worker.export import export_ply
+from worker.pace import Pace
 from worker.render import HARDLY_SEEN, ROUNDING, render_frame
 from worker.serve import NotYetError, View
 from worker.snapshot import Snapshots
@@ -38,9 +39,16 @@ class Views:
     `held` names the scenes that are in memory, the one used last at the end; it may be read from other threads.
     """
 
-    def __init__(self, store: Store, snapshots: Snapshots | None = None, hot_bytes: int = 2 * GIB) -> None:
+    def __init__(
+        self,
+        store: Store,
+        snapshots: Snapshots | None = None,
+        hot_bytes: int = 2 * GIB,
+        pace: Pace | None = None,
+    ) -> None:
         self._store = store
         self._snapshots = snapshots or Snapshots()
+        self._pace = pace or Pace()
         self._hot_bytes = hot_bytes
         self._scenes: OrderedDict[tuple[str, int], Scene] = OrderedDict()
         self.held: tuple[str, ...] = ()
@@ -54,13 +62,16 @@ class Views:
             LimitError: the image would have more than request.max_pixels.
         """
         if isinstance(request, ExportRequest):
-            return _export(self._stored(request.scene_id, request.attempt), request.t)
+            with self._pace.rendering():
+                return _export(self._stored(request.scene_id, request.attempt), request.t)
         if request.attempt is not None:
-            return _render(self._stored(request.scene_id, request.attempt), request)
-        snapshot = self._snapshots.newest(request.scene_id)
+            with self._pace.rendering():
+                return _render(self._stored(request.scene_id, request.attempt), request)
+        snapshot = self._snapshots.newest(request.scene_id)  # may wait for training, which costs that nothing
         if snapshot is None:
             raise NotYetError(f"Job {request.scene_id} has nothing to show yet.")
-        return _render(snapshot.scene, request, snapshot.iteration)
+        with self._pace.rendering():
+            return _render(snapshot.scene, request, snapshot.iteration)
 
     def forget_purged(self) -> None:
         """Let go of scenes whose folders are gone; to be called now and then."""

@@ -183,3 +183,12 @@ def test_keys_follow_from_the_secret_and_each_side_has_its_own() -> None:
     assert service_keys(SECRET) == service_keys(SECRET)
     assert len({service_keys(SECRET).public, worker_keys(SECRET).public, service_keys(SECRET + "!").public}) == 3
     assert service_keys(SECRET).secret.decode() not in repr(service_keys(SECRET))
+
+
+def test_who_asks_while_the_worker_rests_is_answered_afterwards(endpoint: str) -> None:
+    rests = [0.01, 0.02, 0.0]
+    with RequestServer(endpoint, answer, rest_s=lambda: rests.pop(0) if rests else 0.0), connected(endpoint) as socket:
+        document = WorkerRequest(request=RenderRequest(scene_id=SCENE, t=0.25)).model_dump_json().encode()
+        _, body = ask(socket, document)
+    assert body == b"image"
+    assert not rests
