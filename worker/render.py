@@ -59,6 +59,7 @@ class SceneRenderer:
         self._scene = weakref.ref(scene)
         kind = UnfusedModel if isinstance(scene.deformation, HexPlane) else FusedModel
         self._model = kind(scene.gaussians, scene.deformation, scene.intrinsics.width, scene.intrinsics.height)
+        self._is_vouched = bool(scene.seen.any())
         self._rasterizers: OrderedDict[tuple[int, int], Rasterizer] = OrderedDict()
         self._lock = Lock()
 
@@ -81,7 +82,8 @@ class SceneRenderer:
         with self._lock:
             self._model.rasterizer = self._rasterizer(intrinsics.width, intrinsics.height)
             image = self._model.render(camera, t).copy()
-            seen = self._model.blend_values(scene.seen.numpy()).copy()
+            # A second blend is half of the work, and of a snapshot, of which nothing is known, it would be 0.
+            seen = self._model.blend_values(scene.seen.numpy()).copy() if self._is_vouched else np.zeros_like(image[0])
         return image, seen
 
 
