@@ -6,14 +6,14 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import anyio
 import httpx
 
 from client.calls import Calls
 from client.connection import DEFAULT_URL, LISTENING, arguments_of, settings_of, unreachable
-from client.steps import DEFAULT_PATIENCE_S, Body, Call, Listen, NextLine, Pause, Procedure, Show, Step, Steps
+from client.steps import DEFAULT_PATIENCE_S, Body, Call, Listen, NextLine, Pause, Procedure, Result, Show, Step, Steps
 from client.submission import OnUpload, prepare
 from client.viewer import AsyncViewer, Talk
 from client.views import Image, view_query
@@ -22,8 +22,6 @@ from contract.job import JobState, JobView
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-Result = TypeVar("Result")
 
 
 class AsyncClient:
