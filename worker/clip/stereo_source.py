@@ -54,10 +54,10 @@ def open_video_clip(path: Path, layout: StereoLayout, limits: ClipLimits) -> Ste
 
 def open_tree_clip(tree: FileTree, layout: StereoLayout) -> StereoClip:
     """A folder or zip with one or two videos, or with left and right frames; StereoMIS if its calibration is there."""
-    videos = _outside_masks(tree, tree.videos())
+    videos = _outside_masks(tree.videos())
     if videos and layout != "frames":
         return _open_tree_videos(tree, videos, layout)
-    images = _outside_masks(tree, tree.images())
+    images = _outside_masks(tree.images())
     nameless = bool(images) and not any(eye_of(name) for name in images)
     if layout in ("sbs", "tb") or (layout == "auto" and nameless):
         return _packed_clip(open_images(tree, images), layout, tree.limits)
@@ -140,14 +140,14 @@ def _open_eye(path: Path, field: str, limits: ClipLimits) -> FrameSequence:
     tree = open_tree(path, field, limits)
     if tree is None:
         return open_video(path, field, limits)
-    videos = _outside_masks(tree, tree.videos())
+    videos = _outside_masks(tree.videos())
     return open_video_in(tree, videos[0]) if len(videos) == 1 else _eye_images(tree)
 
 
 def _eye_images(tree: FileTree) -> ImageSequence:
-    return open_images(tree, _outside_masks(tree, tree.images()))
+    return open_images(tree, _outside_masks(tree.images()))
 
 
-def _outside_masks(tree: FileTree, names: tuple[str, ...]) -> tuple[str, ...]:
+def _outside_masks(names: tuple[str, ...]) -> tuple[str, ...]:
     masks = {"masks", "mask"}
     return tuple(name for name in names if not masks & {part.lower() for part in PurePosixPath(name).parts[:-1]})
