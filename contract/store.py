@@ -321,14 +321,19 @@ class Store:
 
     def _folders_of(self, job_id: str) -> dict[str, list[Path]]:
         """Everything that is there of a job, by area."""
-        patterns = {"incoming": "{}", "spool": "{}", "work": "{}.*", "scenes": "{}.*"}
-        name = self._checked(job_id)
-        return {area: sorted((self.data_dir / area).glob(each.format(name))) for area, each in patterns.items()}
+        found = {area: [self._folder(area, job_id)] for area in ("incoming", "spool")}
+        found |= {
+            area: [self._folder(area, job_id, attempt) for attempt in self._attempts(area, job_id)]
+            for area in ("work", "scenes")
+        }
+        return {area: [folder for folder in folders if folder.exists()] for area, folders in found.items()}
 
     def _attempts(self, area: str, job_id: str) -> list[int]:
         """Numbers of the attempts that have a folder in the area, in order."""
-        folders = (self.data_dir / area).glob(f"{self._checked(job_id)}.*")
-        return sorted(int(folder.suffix[1:]) for folder in folders)
+        # Not by glob: Python keeps each pattern it has seen, and every job would be another.
+        beginning = f"{self._checked(job_id)}."
+        names = [entry.name for entry in os.scandir(self.data_dir / area) if entry.name.startswith(beginning)]
+        return sorted(int(name.removeprefix(beginning)) for name in names)
 
     def _number_old_scenes(self) -> None:
         """Version 0.1 kept one scene a job, in a folder without a number: it counts as made by the first attempt."""
