@@ -19,6 +19,7 @@ MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
 """Said with 423, 429 and 503, unless the problem knows better."""
 API_REMEDY = "The API is described at /openapi.json."
+ROOM_REMEDY = "Delete scenes (DELETE /scenes/{id}) or give it more room."
 LENGTH_REMEDY = "Send Content-Length once, as a number, or chunks without it."
 SCENES_REMEDY = "GET /scenes lists what there is."
 FAULT_REMEDY = "Report it with the log's lines of this X-Request-Id."
@@ -136,7 +137,7 @@ def fault() -> Problem:
 
 def no_room(detail: str) -> Problem:
     """The answer to what the disk has no room for."""
-    return Problem(507, detail, remedy="Delete scenes (DELETE /scenes/{id}) or give it more room.")
+    return Problem(507, detail, remedy=ROOM_REMEDY)
 
 
 def _problem_of_validation(error: RequestValidationError) -> Problem:

@@ -14,7 +14,7 @@ from contract.errors import UnavailableError
 from contract.keys import KeyScope
 from contract.rendering import ImageFormat, Layer
 from service.deps import AnyCaller, Deps, Services
-from service.problems import Problem
+from service.problems import ROOM_REMEDY, Problem
 from service.renderer import WORKER_REMEDY
 from service.upload import SUFFIXES
 from service.version import version
@@ -92,5 +92,5 @@ def _trouble(services: Deps) -> Problem | None:
     if not workers:
         return Problem(503, "No worker is ready yet.", field="worker", remedy=f"Wait for it. {WORKER_REMEDY}")
     if services.store.free_bytes() < services.settings.min_free_bytes:
-        return Problem(503, "The disk is nearly full.", field="disk", remedy="Delete scenes or give it more room.")
+        return Problem(503, "The disk is nearly full.", field="disk", remedy=ROOM_REMEDY)
     return None
