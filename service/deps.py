@@ -54,7 +54,7 @@ class Deps:
         self.sweep = Sweep(queue, store)
         self.feeds = Feeds(queue)
         self.done = DoneJobs(queue, store)
-        self.purger = Purger(queue, store, self.audit)
+        self.purger = Purger(queue, store, self.audit, self.done)
         self.retention = Retention(settings, queue, store, self.purger)
 
 

@@ -8,8 +8,8 @@ from contract.job import JobRecord, JobState
 from contract.queue import Queue
 from contract.store import Store
 
-REMEMBERED = 10_000
-"""Records, of about a kilobyte each."""
+REMEMBERED = 1_000
+"""Records, of a few kilobytes each."""
 
 
 class DoneJobs:
@@ -38,3 +38,8 @@ class DoneJobs:
             if len(self._records) > REMEMBERED:
                 del self._records[next(iter(self._records))]
         return record if there else None
+
+    def forget(self, job_id: str) -> None:
+        """Remember no more of a job that was purged."""
+        with self._lock:
+            self._records.pop(job_id, None)

@@ -22,6 +22,7 @@ from contract.queue import Queue
 from contract.store import Removed, Store, StoreFullError, disk_errors, is_job_id
 from service.access import Caller
 from service.audit import Audit
+from service.done import DoneJobs
 from service.partial import partials_of
 from service.problems import Problem
 
@@ -47,10 +48,11 @@ class Receipt(BaseModel):
 class Purger:
     """Removes jobs from queue and store."""
 
-    def __init__(self, queue: Queue, store: Store, audit: Audit) -> None:
+    def __init__(self, queue: Queue, store: Store, audit: Audit, done: DoneJobs) -> None:
         self._queue = queue
         self._store = store
         self._audit = audit
+        self._done = done
         self._notes = store.data_dir / NOTES
         self._log_stale_since_s: float | None = None
 
@@ -69,6 +71,7 @@ class Purger:
         removed = self._store.purge(job_id)
         self._audit.record(AuditAction.PURGED, caller, job_id, f"done ({reason})")
         self._queue.forget(job_id)
+        self._done.forget(job_id)
         self._log_stale_since_s = time.monotonic()
         self._refuse_live(job_id)
         receipt = self._receipt(job_id, removed, uploads)

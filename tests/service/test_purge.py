@@ -23,6 +23,7 @@ from contract.queue_redis import RedisQueue
 from contract.settings import Settings
 from contract.store import CURVE, MANIFEST, REPORT, Store, new_job_id
 from service.audit import Audit
+from service.done import DoneJobs
 from service.purge import LOG_CLEARED_AFTER_S, NOTES, Purger
 from service.retention import HOUR_S, Retention, check_retention, kept_hours
 from tests.service.house import CLIP, House, assert_problem, make_house
@@ -60,7 +61,7 @@ def failed_job(house: House, job_id: str) -> str:
 
 def parts(house: House) -> tuple[Purger, Retention]:
     settings = Settings(data_dir=house.store.data_dir, retention_hours=1.0)
-    purger = Purger(house.queue, house.store, Audit(AuditLog(house.store.data_dir)))
+    purger = Purger(house.queue, house.store, Audit(AuditLog(house.store.data_dir)), DoneJobs(house.queue, house.store))
     return purger, Retention(settings, house.queue, house.store, purger)
 
 
@@ -240,7 +241,7 @@ def valkey(tmp_path: Path) -> Iterator[EmbeddedServer]:
 
 def test_a_purge_leaves_no_key_in_the_queues_server_that_names_the_job(valkey: EmbeddedServer, tmp_path: Path) -> None:
     queue, store = RedisQueue(valkey.url), Store(tmp_path / "data")
-    purger = Purger(queue, store, Audit(AuditLog(store.data_dir)))
+    purger = Purger(queue, store, Audit(AuditLog(store.data_dir)), DoneJobs(queue, store))
     kept, purged = new_job_id(), new_job_id()
     for job_id in (kept, purged):
         files = JobFiles(clip="clip.mp4")
