@@ -16,6 +16,7 @@ const STAGES = {
   motion: "following the tissue",
   start: "starting the model",
   train: "training",
+  finish: "cleaning up",
   score: "scoring",
   publishing: "publishing",
 };

@@ -66,7 +66,10 @@ function showJobs() {
   const expected = jobs.byId.get(awaited);
   if (expected?.state === "running" || expected?.state === "done") view(expected.id);
   const viewed = jobs.byId.get(viewer.scene);
-  if (viewed?.state === "done" && reported !== viewed.id) report(viewed.id);
+  if (viewed?.state === "done" && reported !== viewed.id) {
+    viewer.refresh(); // what is shown may be of its training still
+    report(viewed.id);
+  }
   if (viewed && viewed.state !== "done") drawCurve(get("curve"), jobs.pointsOf(viewed.id), []);
 }
 

@@ -78,11 +78,8 @@ export class Screen {
       const reason = this.trouble || "The service does not answer.";
       return ["stale", "STALE", `Last picture ${clockTime(this.shownAt)}. ${reason} Reconnecting.`];
     }
-    const training = this.shown.state === "running" ? `TRAINING, iteration ${this.shown.iteration}` : "";
-    if (this.shown.warnings.length > 0) {
-      return ["extrapolated", [training, "EXTRAPOLATED"].filter(Boolean).join(" · "), ""];
-    }
-    return training ? ["training", training, ""] : ["live", "LIVE", ""];
+    if (this.shown.state === "running") return ["training", `TRAINING, iteration ${this.shown.iteration}`, ""];
+    return this.shown.warnings.length > 0 ? ["extrapolated", "EXTRAPOLATED", ""] : ["live", "LIVE", ""];
   }
 }
 

@@ -11,6 +11,7 @@ import { Timeline } from "./timeline.js";
 
 const AGAIN_MS = 1500;
 const AFTER_TROUBLE_MS = 700;
+const NOT_YET = "Its first picture comes when training begins.";
 /** There is nothing to show, or not to this key; a picture that was there goes. */
 const NOTHING_TO_SHOW = [401, 403, 404, 409];
 
@@ -68,7 +69,7 @@ export class Viewer {
 
   async #showOnce(scene, visit) {
     const began = (this.askedAt = performance.now());
-    const name = `${this.parts.layer.value}, ${this.orbit.words}`;
+    const name = `${this.parts.layer.selectedOptions[0].text}, ${this.orbit.words}`;
     try {
       const picture = await this.pictures.ask(this.#view(scene));
       const bitmap = await createImageBitmap(picture.blob);
@@ -91,13 +92,14 @@ export class Viewer {
 
   #tell(name, picture, tookMs) {
     const server = Number.isFinite(picture.totalMs) ? ` (service ${picture.totalMs.toFixed(0)} ms)` : "";
-    const rate = `${this.pace.rate.toFixed(this.pace.rate < 10 ? 1 : 0)} pictures/s`;
-    this.parts.readout.textContent = `${name} · ${tookMs.toFixed(0)} ms${server} · ${rate} · ${picture.way}`;
+    const rate = this.pace.rate >= 1 ? ` · ${this.pace.rate.toFixed(0)} pictures/s` : "";
+    this.parts.readout.textContent = `${name} · ${tookMs.toFixed(0)} ms${server}${rate} · ${picture.way}`;
   }
 
   #fail(error) {
+    const isNotYet = error.status === 503 && error.document.field === "scene" && !this.screen.hasPicture;
     if (NOTHING_TO_SHOW.includes(error.status)) this.screen.clear(this.scene, error.message);
-    else this.screen.fail(error.message);
+    else this.screen.fail(isNotYet ? NOT_YET : error.message);
   }
 
   #listen() {

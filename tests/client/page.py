@@ -25,9 +25,10 @@ from selenium.webdriver.support.ui import WebDriverWait
 from client.up import DASHBOARD
 from contract.embedded import short_socket_path
 from contract.job import JobFiles, JobProgress, JobRecord
+from contract.pose import OrbitPose
 from contract.queue import Claim
 from contract.queue_memory import MemoryQueue
-from contract.rendering import MEDIA_TYPES, ExportRequest, OrbitPose, RenderRequest, WorkerAddress
+from contract.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
 from contract.settings import Settings
 from contract.store import CURVE, MANIFEST, REPORT, Store, new_job_id
 from service.app import create_app
@@ -187,7 +188,7 @@ class Page:
         return found or ""
 
     def script(self, source: str, *arguments: object) -> Any:
-        return self.driver.execute_script(source, *arguments)  # type: ignore[no-untyped-call]
+        return self.driver.execute_script(source, *arguments)
 
     def until(self, what: Callable[[], object]) -> None:
         """Wait for it."""

@@ -91,13 +91,13 @@ def test_a_clip_that_cannot_be_used_is_refused_in_words(page: Page, tmp_path: Pa
 
 def test_an_upload_goes_on_where_it_was_when_the_connection_is_back(site: Site, page: Page, large_clip: Path) -> None:
     slow = {"latency": 0, "download_throughput": 10_000_000, "upload_throughput": 1_000_000}
-    page.driver.set_network_conditions(offline=False, **slow)  # type: ignore[no-untyped-call]
+    page.driver.set_network_conditions(offline=False, **slow)
     page.choose("clip", large_clip)
     page.click("#upload [type=submit]")
     page.until(lambda: page.script("return document.querySelector('#upload-progress').value") > 0.2)
-    page.driver.set_network_conditions(offline=True, **slow)  # type: ignore[no-untyped-call]
+    page.driver.set_network_conditions(offline=True, **slow)
     page.until_text("#upload-message", "What was sent is kept; trying again.")
-    page.driver.delete_network_conditions()  # type: ignore[no-untyped-call]
+    page.driver.delete_network_conditions()
     page.until(lambda: site.queue.records())
     (record,) = site.queue.records()
     assert (site.store.spool_folder(record.job_id) / record.files.clip).read_bytes() == large_clip.read_bytes()
@@ -170,7 +170,7 @@ def test_no_picture_of_another_scene_is_ever_shown(site: Site, page: Page) -> No
     site.painter.pause_s = 0.03
     scenes = [site.scene(mark) for mark in ("00", "7f", "ff")]
     page.until(lambda: page.script("return document.querySelectorAll('#jobs .done').length") == 3)
-    seen = page.driver.execute_async_script(SWITCHING, scenes)  # type: ignore[no-untyped-call]
+    seen = page.driver.execute_async_script(SWITCHING, scenes)
     shades = {scene: {shade for at, shade in seen if at == scene and shade >= 0} for scene in scenes}
     assert all(shades.values()), "every scene was seen"
     for scene, found in shades.items():
