@@ -22,7 +22,7 @@ from contract.rendering import ExportRequest, RenderRequest, WorkerReply, Worker
 CONNECT_TIMEOUT_S = 2.0
 """A worker that listens is connected to in milliseconds; one that has just died is tried for no longer than this."""
 
-IN_FLIGHT = 4
+IN_FLIGHT = 2
 """Requests handed to a worker at a time: it has the next one at hand. Who gives up waiting here is not rendered for."""
 
 LAST_ANSWERS_S = 0.05
