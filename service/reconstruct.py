@@ -222,11 +222,13 @@ def _finished(services: Deps, caller: Caller, part: str, upload_id: str) -> Part
 def _taken_before(services: Deps, job_ids: set[str | None], options: JobOptions) -> JobRecord:
     """The job that has the uploads, if they all went into one and nothing else is wanted of it now."""
     job_id = next(job_id for job_id in job_ids if job_id is not None)
-    record = services.queue.get(job_id) or services.store.submission(job_id)
+    known = services.queue.get(job_id)
+    record = known or services.store.submission(job_id)
     if len(job_ids) > 1 or record is None or record.options != options:
         detail = f"An upload was used for the job {job_id} already."
         raise Problem(409, detail, remedy="Upload it again.", extensions={"job_id": job_id})
-    return _enqueue(services, record)
+    # A clip that was accepted is never refused for want of room in a queue that has lost its record.
+    return known or services.queue.submit(record)
 
 
 def _give(partials: Mapping[str, Partial], job_id: str) -> None:

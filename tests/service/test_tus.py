@@ -246,3 +246,15 @@ def test_only_so_many_uploads_may_be_open(house: House, monkeypatch: pytest.Monk
     monkeypatch.setattr("service.tus.MAX_OPEN_UPLOADS", 2)
     assert [create(house).status_code for _ in range(3)] == [201, 201, 429]
     assert all(is_job_id(folder.name) for folder in house.spooled())
+
+
+def test_an_accepted_upload_outlives_a_queue_that_forgot_its_job_and_is_full(tmp_path: Path) -> None:
+    for house in make_house(tmp_path, max_queued=1):
+        upload_id = uploaded(house)
+        job_id = house.http.post("/reconstruct", json={"clip": upload_id}).json()["id"]
+        house.queue.cancel(job_id)
+        house.queue.forget(job_id)  # as a server does that was started on an empty disk
+        assert house.upload().status_code == 202  # and fills the queue
+        again = house.http.post("/reconstruct", json={"clip": upload_id})
+        assert (again.status_code, again.json()["id"]) == (202, job_id)
+        assert house.store.submission(job_id) is not None
