@@ -5,7 +5,7 @@ The clip's text is a list of words, one for each attempt; the last stands for al
     publish    advance, write a scene, finish            wait     advance until told to stop, keep the state
     fail       fail with an InputError's fields          deaf     advance for ever
     noise      print what is no report, then publish     hang     advance once, then say nothing for ever
-    slow       advance for three seconds, then publish   exit     end with status 3
+    slow       advance for two seconds, then publish     exit     end with status 3
     SIGKILL, SIGSEGV, ...   die of that signal
 
 The words "unable" and "dies", as arguments of the program, spoil its start.
@@ -65,7 +65,7 @@ def run(word: str, out: Path, stop: threading.Event) -> None:
     if word in ("publish", "noise", "slow"):
         if word == "noise":
             print("a library's chatter\n{}", flush=True)
-        for step in range(1, 31 if word == "slow" else 1):
+        for step in range(1, 21 if word == "slow" else 1):
             advance(step)
             time.sleep(0.1)
         publish(out)

@@ -29,8 +29,8 @@ from worker.phantom import PhantomSettings, make_phantom, write_endonerf
 from worker.pipeline import ReconstructionRequest, reconstruct
 from worker.supervisor import run_supervisor
 
-LEASE_S = 3.0
-"""A beat and half of one: the worker here is never away for longer, unless it is meant to be."""
+LEASE_S = 6.0
+"""Three beats, and three times as long as standin.py takes for a `slow` job, which ends while its worker sleeps."""
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PROGRAM = f"""
