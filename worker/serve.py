@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from zmq.auth.thread import ThreadAuthenticator
 
 from contract.curve import service_keys, worker_keys
-from contract.errors import InputError, IntrasplatError, SceneError
+from contract.errors import InputError, IntrasplatError, SceneError, UnavailableError
 from contract.rendering import ExportRequest, RenderRequest, ReplyError, WorkerReply, WorkerRequest
 
 POLL_MS = 50
@@ -94,13 +94,22 @@ class RequestServer:
         if self.endpoint.startswith("tcp:"):
             assert self._render_secret is not None
             self._gate = _encrypt(self._socket, self._render_secret)
-        self._socket.bind(_bound(self.endpoint))
+        try:
+            self._socket.bind(_bound(self.endpoint))
+        except zmq.ZMQError as error:
+            self._socket.close()
+            self._let_go()
+            problem = f"Renders cannot be answered at {self.endpoint} ({error.strerror})."
+            raise UnavailableError(problem, "Free the address, or set another INTRASPLAT_RENDER_ENDPOINT.") from error
         self._thread.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
         self._end.set()
         self._thread.join()
+        self._let_go()
+
+    def _let_go(self) -> None:
         if self._gate is not None:
             self._gate.stop()
         self._context.term()

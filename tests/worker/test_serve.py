@@ -14,7 +14,7 @@ import zmq
 
 from contract.curve import CurveKeys, service_keys, worker_keys
 from contract.embedded import short_socket_path
-from contract.errors import InputError, SceneError
+from contract.errors import InputError, SceneError, UnavailableError
 from contract.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
 from worker.serve import LONGEST_REQUEST_BYTES, NotYetError, RequestServer, View
 
@@ -192,3 +192,12 @@ def test_who_asks_while_the_worker_rests_is_answered_afterwards(endpoint: str) -
         _, body = ask(socket, document)
     assert body == b"image"
     assert not rests
+
+
+def test_an_address_that_is_taken_is_an_error_with_a_remedy(tcp_endpoint: str) -> None:
+    with (
+        RequestServer(tcp_endpoint, answer, render_secret=SECRET),
+        pytest.raises(UnavailableError, match="INTRASPLAT_RENDER_ENDPOINT"),
+        RequestServer(tcp_endpoint, answer, render_secret=SECRET),
+    ):
+        pass
