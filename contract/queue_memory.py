@@ -23,6 +23,7 @@ from contract.queue import (
     Order,
     QueueFigures,
     check_admission,
+    correct_end_s,
     estimate_end_s,
     event_order,
     worker_died,
@@ -159,7 +160,7 @@ class MemoryQueue:
             position = waiting.index(job_id) if job_id in waiting else None
             own_s = ran_s.get(job_id, 0.0)
             eta_s = estimate_end_s(list(self._durations_s), position, own_s, list(ran_s.values()), len(self.workers()))
-            return Standing(position=position, eta_s=eta_s)
+            return Standing(position=position, eta_s=correct_end_s(record, eta_s))
 
     def records(self, tenant: str | None = None, limit: int | None = LISTING_LIMIT) -> list[JobRecord]:
         with self._changed:

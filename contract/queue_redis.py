@@ -70,6 +70,7 @@ from contract.queue import (
     Order,
     QueueFigures,
     check_admission,
+    correct_end_s,
     estimate_end_s,
     event_order,
     worker_died,
@@ -209,7 +210,7 @@ class RedisQueue:
         durations_s = [float(duration) for duration in durations]
         workers = len(self.workers())
         eta_s = estimate_end_s(durations_s, position, ran_s.get(job_id, 0.0), list(ran_s.values()), workers)
-        return Standing(position=position, eta_s=eta_s)
+        return Standing(position=position, eta_s=correct_end_s(record, eta_s))
 
     def records(self, tenant: str | None = None, limit: int | None = LISTING_LIMIT) -> list[JobRecord]:
         index = INDEX if tenant is None else f"{PREFIX}tenant:{tenant}:index"

@@ -18,7 +18,9 @@ from contract.queue import WORKER_TTL_S, Queue
 from contract.rendering import ExportRequest, RenderRequest, ReplyError, WorkerAddress, WorkerReply
 from service.connection import Answer, Connection, Reached, WorkerGoneError
 
-WORKER_REMEDY = "Start one with `intrasplat up`, or `python -m worker consume`."
+WORKER_REMEDY = (
+    "Ask again in some seconds; if it stays so, start one with `intrasplat up` or `python -m worker consume`."
+)
 ADDRESSES_VALID_S = 1.0
 """How long the list of live workers is used before the queue is asked again, beside the renders that go on."""
 

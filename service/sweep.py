@@ -80,7 +80,12 @@ class Sweep:
                     continue
             record = self._queue.get(job_id)
             if record is None:
-                self._recover(job_id)
+                try:
+                    self._recover(job_id)
+                except UnavailableError as error:
+                    self._queue.ping()  # if it is the queue that is away, no other job can be settled either
+                    logger.warning("an accepted clip cannot be queued: %s", error.problem, extra={"job_id": job_id})
+                    self._unsettled = True
             elif record.state is JobState.CANCELLED:  # its canceller or its worker died before it removed the clip
                 self._store.purge(job_id)
 

@@ -351,7 +351,7 @@ def chosen(run: Run, clip: DepthClip, bases: int) -> tuple[str, ...]:
         return ()
     stride = fusion_for(preset, clip.intrinsics).stride
     return (
-        f"A Gaussian was started on every {stride}. pixel each way: nearest to {preset.points_per_image} an image.",
+        f"Gaussians were started {stride} pixels apart each way: nearest to {preset.points_per_image} an image.",
         f"Motion has {bases} bases: one for about {FRAMES_A_BASIS} training frames.",
     )
 

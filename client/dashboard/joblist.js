@@ -54,7 +54,10 @@ export class JobList {
     /** @type {Map<string, {item: HTMLElement, bar: HTMLProgressElement, words: HTMLElement, key: string}>} */
     this.rows = new Map();
     this.confirm.querySelector("[value=no]").addEventListener("click", () => this.confirm.close());
-    this.confirm.querySelector("[value=yes]").addEventListener("click", () => this.#purge(this.confirm.dataset.job));
+    this.confirm.querySelector("[value=yes]").addEventListener("click", () => {
+      this.confirm.close();
+      this.onYes();
+    });
   }
 
   /** @param {Job[]} jobs @param {string | null} chosen the one in view */
@@ -117,22 +120,23 @@ export class JobList {
     if (job.state === "done") add("View", () => this.onView(job.id));
     if (job.state === "failed") add("Try again", () => this.#do(() => retryJob(job.id)));
     if (job.state === "queued" || job.state === "running") {
-      add("Cancel", () => this.#do(() => cancelJob(job.id)));
+      add("Cancel", () => this.#ask("Cancel job", `Cancel ${name}? Its clip is removed.`, () => this.#do(() => cancelJob(job.id))));
       buttons.at(-1).disabled = job.cancel_requested;
     } else {
-      add("Delete", () => this.#ask(job.id, name));
+      add("Delete", () => this.#ask("Delete", `Delete the clip and the scene of ${name} for good?`, () => this.#purge(job.id)));
     }
     return buttons;
   }
 
-  #ask(id, name) {
-    this.confirm.dataset.job = id;
-    this.confirm.querySelector("p").textContent = `Delete the clip and the scene of ${name} for good?`;
+  /** Ask before what cannot be taken back. @param {string} yes @param {string} question @param {() => void} onYes */
+  #ask(yes, question, onYes) {
+    this.onYes = onYes;
+    this.confirm.querySelector("[value=yes]").textContent = yes;
+    this.confirm.querySelector("p").textContent = question;
     this.confirm.showModal();
   }
 
   #purge(id) {
-    this.confirm.close();
     this.#do(async () => {
       const receipt = await purgeScene(id);
       this.onPurged(id);

@@ -79,7 +79,7 @@ export class Screen {
       return ["stale", "STALE", `Last picture ${clockTime(this.shownAt)}. ${reason} Reconnecting.`];
     }
     if (this.shown.state === "running") return ["training", `TRAINING, iteration ${this.shown.iteration}`, ""];
-    return this.shown.warnings.length > 0 ? ["extrapolated", "EXTRAPOLATED", ""] : ["live", "LIVE", ""];
+    return this.shown.warnings.length > 0 ? ["extrapolated", "EXTRAPOLATED", ""] : ["live", "CURRENT", ""];
   }
 }
 

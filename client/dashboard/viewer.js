@@ -1,5 +1,5 @@
 // The view of one scene: at most one picture is under way; the newest wish is asked for next, and now and then the same
-// again, which follows training, notices a purge, and keeps LIVE true.
+// again, which follows training, notices a purge, and keeps CURRENT true.
 
 import { listenToGestures } from "./gestures.js";
 import { Orbit } from "./orbit.js";

@@ -230,6 +230,8 @@ def test_a_job_is_cancelled_and_a_failed_one_tried_again_by_keyboard(site: Site,
     page.find(f'{job} button[aria-label^="Try again"]').send_keys(Keys.ENTER)
     page.until_text("#jobs", "next")
     page.find(f'{job} button[aria-label^="Cancel"]').send_keys(Keys.SPACE)
+    page.until(lambda: page.find("#confirm").is_displayed())
+    page.find("#confirm [value=yes]").send_keys(Keys.SPACE)
     page.until_text("#jobs", "cancelled")
     record = site.queue.get(claim.job_id)
     assert record is not None

@@ -130,3 +130,31 @@ def test_a_server_on_the_path_comes_first(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv("PATH", str(tmp_path))
     assert find_server().path == program
     assert find_server().origin == "PATH"
+
+
+def test_a_log_is_read_by_the_server_that_wrote_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = EmbeddedServer(tmp_path)
+    first.start()
+    first.stop()
+    elsewhere = tmp_path / "bin"
+    elsewhere.mkdir()
+    newcomer = elsewhere / "valkey-server"
+    newcomer.write_text("#!/bin/sh\nexit 7\n")
+    newcomer.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{elsewhere}:/usr/bin:/bin")
+    assert find_server().path == newcomer
+    again = EmbeddedServer(tmp_path)
+    again.start()
+    again.stop()
+
+
+def test_a_log_of_a_newer_server_is_named_as_what_is_in_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "valkey-server"
+    program.write_text("#!/bin/sh\necho 'Bad file format reading the log: redis-check-aof --fix'\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    with pytest.raises(UnavailableError, match="written by another server") as refused:
+        EmbeddedServer(tmp_path / "data").start()
+    assert "--fix" not in str(refused.value)

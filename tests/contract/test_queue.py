@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from contract.job import JobState
+from contract.job import JobOptions, JobState
 from contract.queue import (
     EVENTS_KEPT,
     MAX_ATTEMPTS,
@@ -305,6 +305,12 @@ def test_the_end_of_a_job_is_estimated_from_those_that_were_done(queue: Queue) -
     usual_s = done.finished_at_s - done.started_at_s
     assert queue.standing(waiting.job_id).eta_s == pytest.approx(usual_s, abs=1e-4)
     assert queue.standing(last.job_id).eta_s == pytest.approx(2 * usual_s, abs=1e-4)
+    budget_s = 60.0
+    generous = queue.submit(job().model_copy(update={"options": JobOptions(budget_s=budget_s, priority="high")}))
+    assert queue.standing(generous.job_id).eta_s == budget_s
+    _, claim = claimed(queue)
+    queue.beat(claim, TRAINING)
+    assert queue.standing(generous.job_id).eta_s == TRAINING.seconds_left
 
 
 def test_the_figures_count_what_waits_runs_and_has_ended(queue: Queue) -> None:

@@ -178,3 +178,24 @@ def test_the_files_of_a_cancelled_job_go_even_if_its_worker_died(
             time.sleep(0.02)
         assert house.store.submission(job_id) is None
         assert house.store.scene_attempts(job_id) == []
+
+
+def test_a_job_that_cannot_be_queued_is_not_in_the_way_of_others(tmp_path: Path) -> None:
+    class PickyQueue(MemoryQueue):
+        refused = ""
+
+        def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
+            if record.job_id == self.refused:
+                raise UnavailableError("The queue's record of this job cannot be read.", "Submit it anew.")
+            return super().submit(record, admission)
+
+    queue = PickyQueue()
+    for house in make_house(tmp_path, queue):
+        jobs = [house.upload().json()["id"] for _ in range(3)]
+        for job_id in jobs:
+            queue.cancel(job_id)
+            queue.forget(job_id)
+        queue.refused = jobs[1]
+        Sweep(queue, house.store).settle()
+        assert {record.job_id for record in queue.records()} == {jobs[0], jobs[2]}
+        assert house.store.submission(jobs[1]) is not None
