@@ -90,8 +90,10 @@ def test_a_server_that_is_still_busy_is_adopted_and_not_started_twice(tmp_path: 
     heir = EmbeddedServer(tmp_path)
     process_id = redis.Redis.from_url(heir.url).info("server")["process_id"]
     os.kill(process_id, signal.SIGSTOP)
-    threading.Timer(0.3, os.kill, (process_id, signal.SIGCONT)).start()
+    waking = threading.Timer(0.3, os.kill, (process_id, signal.SIGCONT))
+    waking.start()
     heir.start()
+    waking.join()
     assert heir.process_id is None
     assert redis.Redis.from_url(heir.url).info("server")["process_id"] == process_id
     heir.stop()

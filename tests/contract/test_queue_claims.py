@@ -88,8 +88,10 @@ def test_beats_keep_a_job_for_longer_than_its_lease(queues: MakeQueue) -> None:
 
 
 def test_a_waiting_claim_hears_of_a_new_job_and_of_a_lease_that_runs_out(hasty: Queue) -> None:
-    threading.Timer(0.1, lambda: hasty.submit(job())).start()
+    submitting = threading.Timer(0.1, lambda: hasty.submit(job()))
+    submitting.start()
     first = hasty.claim("worker-1", 10.0)
+    submitting.join()
     second = hasty.claim("worker-2", 10.0)
     assert first is not None
     assert second is not None

@@ -99,8 +99,10 @@ def test_a_queue_that_was_emptied_while_a_worker_waits_goes_on(served: RedisQueu
         served.submit(job())
 
     assert served.claim("worker-1", 0.0) is None
-    threading.Timer(0.1, empty_and_submit).start()
+    emptying = threading.Timer(0.1, empty_and_submit)
+    emptying.start()
     assert served.claim("worker-1", 10.0) is not None
+    emptying.join()
 
 
 # Damaged records
