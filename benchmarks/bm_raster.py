@@ -18,7 +18,6 @@ import csv
 import math
 import os
 import platform
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +26,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from bm_train import commit
 from numba import njit
 from numpy.typing import NDArray
 
@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="leave out the costs against pixels and Gaussians")
     arguments = parser.parse_args()
     load_1min = os.getloadavg()[0]
-    machine = {"cpu": _cpu_model(), "threads": THREADS, "commit": _commit(), "load_1min": round(load_1min, 2)}
+    machine = {"cpu": _cpu_model(), "threads": THREADS, "commit": commit(), "load_1min": round(load_1min, 2)}
     print(", ".join(f"{name} {value}" for name, value in machine.items()))
     print(f"kernels compiled or loaded in {compile_kernels():.1f} s")
     rows = [*_peak_rows()]
@@ -284,11 +284,6 @@ def _cpu_model() -> str:
     information = Path("/proc/cpuinfo")
     names = [line for line in information.read_text().splitlines() if line.startswith("model name")]
     return names[0].split(":")[1].strip() if names else platform.processor() or platform.machine()
-
-
-def _commit() -> str:
-    answer = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    return answer.stdout.strip() or "unknown"
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ import argparse
 import asyncio
 import csv
 import os
-import platform
 import random
 import struct
 import subprocess
@@ -26,11 +25,13 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
+from bm_train import commit, machine
 
 from client.api import Client
 from client.demo import started_service
@@ -52,8 +53,8 @@ def main() -> None:
     parser.add_argument("--upload-gib", type=float, default=1.0, help="0: no uploads")
     parser.add_argument("--csv", type=Path, help="file that gets a row a figure")
     arguments = parser.parse_args()
-    machine = {"cores": os.cpu_count(), "machine": platform.machine(), "commit": _commit()}
-    print(", ".join(f"{name} {value}" for name, value in machine.items()))
+    origin = {"machine": machine(), "commit": commit()}
+    print(f"{origin['machine']}, commit {origin['commit']}")
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="intrasplat-load-") as name:
         folder = Path(name)
@@ -68,24 +69,24 @@ def main() -> None:
             if arguments.upload_gib:
                 rows += _uploads(client.url, folder, arguments.upload_gib)
     if arguments.csv:
-        _write(arguments.csv, [{**machine, **row} for row in rows])
+        _write(arguments.csv, [{**origin, **row} for row in rows])
 
 
+@dataclass(frozen=True)
 class PhantomClip:
     """A stereo video with its calibration, as the phantom wrote them."""
 
-    def __init__(self, folder: Path) -> None:
-        self.video = folder / "stereo.webm"
-        self.calibration = folder / "calibration.json"
+    video: Path
+    calibration: Path
 
 
-def make_clip(folder: Path) -> PhantomClip:
-    """A synthetic stereo clip of WIDTH x HEIGHT an eye."""
-    size = ("--frames", str(FRAMES), "--width", str(WIDTH), "--height", str(HEIGHT))
+def make_clip(folder: Path, width: int = WIDTH, height: int = HEIGHT, frames: int = FRAMES) -> PhantomClip:
+    """A synthetic stereo clip of width x height an eye."""
+    size = ("--frames", str(frames), "--width", str(width), "--height", str(height))
     out = folder / "clip"
     command = [sys.executable, "-m", "worker", "phantom", *size, "--out", str(out)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    return PhantomClip(out)
+    return PhantomClip(out / "stereo.webm", out / "calibration.json")
 
 
 def trained(client: Client, clip: PhantomClip, **options: Any) -> str:
@@ -207,11 +208,6 @@ def memory_mib(process_id: int, field: str = "VmRSS") -> float:
 
 def _reset_peak(process_id: int) -> None:
     Path(f"/proc/{process_id}/clear_refs").write_text("5")
-
-
-def _commit() -> str:
-    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    return found.stdout.strip() or "unknown"
 
 
 def _write(path: Path, rows: list[Row]) -> None:

@@ -13,11 +13,8 @@ from __future__ import annotations
 
 import argparse
 import csv
-import os
-import platform
 import random
 import socket
-import subprocess
 import sys
 import tempfile
 import threading
@@ -29,6 +26,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 from urllib.parse import urlsplit
+
+from bm_service import PhantomClip, make_clip
+from bm_train import commit, machine
 
 from client.api import Client
 from client.demo import started_service
@@ -53,10 +53,10 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--csv", type=Path, help="file that gets the samples")
     arguments = parser.parse_args()
-    print(f"cores {os.cpu_count()}, {platform.machine()}, commit {_commit()}, {arguments.minutes:g} minutes")
+    print(f"{machine()}, commit {commit()}, {arguments.minutes:g} minutes")
     with tempfile.TemporaryDirectory(prefix="intrasplat-soak-") as name:
         folder = Path(name)
-        clip = _make_clip(folder)
+        clip = make_clip(folder, WIDTH, HEIGHT, FRAMES)
         with started_service(folder / "data", folder / "service.log") as client:
             rows, rounds, counts = _soak(client.url, clip, folder / "data", arguments.minutes)
     print(f"{rounds} rounds, {len(rows)} samples; " + ", ".join(f"{each} {counts[each]}" for each in sorted(counts)))
@@ -65,7 +65,7 @@ def main() -> int:
     return _judge(rows, arguments.minutes)
 
 
-def _soak(url: str, clip: Path, data_dir: Path, minutes: float) -> tuple[list[Row], int, Counter[str]]:
+def _soak(url: str, clip: PhantomClip, data_dir: Path, minutes: float) -> tuple[list[Row], int, Counter[str]]:
     end = threading.Event()
     shown: list[str] = []  # the scene that is looked at now, if any
     counts: Counter[str] = Counter()
@@ -88,13 +88,13 @@ def _soak(url: str, clip: Path, data_dir: Path, minutes: float) -> tuple[list[Ro
     return rows, rounds, counts
 
 
-def _round(url: str, clip: Path, number: int, shown: list[str]) -> None:
+def _round(url: str, clip: PhantomClip, number: int, shown: list[str]) -> None:
     with Client(url) as client:
         if number % 3 == 2:
             _break_off(url, clip)
         job = client.reconstruct(
-            clip / "stereo.webm",
-            calibration=clip / "calibration.json",
+            clip.video,
+            calibration=clip.calibration,
             iterations=ROUND_ITERATIONS,
             in_pieces=number % 3 == 1,
         )
@@ -141,10 +141,10 @@ def _counting(what: str, counts: Counter[str]) -> Iterator[None]:
         counts[type(error).__name__] += 1
 
 
-def _break_off(url: str, clip: Path) -> None:
+def _break_off(url: str, clip: PhantomClip) -> None:
     """An upload that ends in the middle."""
     address = urlsplit(url)
-    body = (clip / "stereo.webm").read_bytes()
+    body = clip.video.read_bytes()
     head = (
         f"POST /reconstruct HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Type: multipart/form-data; boundary=x\r\n"
         f"Content-Length: {len(body) + 500}\r\n\r\n--x\r\n"
@@ -212,18 +212,6 @@ def _judge(rows: list[Row], minutes: float) -> int:
             grown += mark != "ok"
             print(f"{process:13} {measure:8} {before:9.1f} -> {after:9.1f}  {100 * rise:+6.2f} %  {mark}")
     return 1 if grown else 0
-
-
-def _make_clip(folder: Path) -> Path:
-    size = ("--frames", str(FRAMES), "--width", str(WIDTH), "--height", str(HEIGHT))
-    command = [sys.executable, "-m", "worker", "phantom", *size, "--out", str(folder / "clip")]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    return folder / "clip"
-
-
-def _commit() -> str:
-    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    return found.stdout.strip() or "unknown"
 
 
 def _write(path: Path, rows: list[Row]) -> None:

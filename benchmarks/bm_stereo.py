@@ -11,12 +11,12 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import subprocess
 import time
 from pathlib import Path
 
 import cv2
 import numpy as np
+from bm_train import commit
 from numpy.typing import NDArray
 
 from worker.calibration import RectifiedClip, load_calibration, rectify
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("INTRASPLAT_DATA", "../shared/data")))
     parser.add_argument("--repeats", type=int, default=3, help="timed runs a clip; the fastest is printed")
     arguments = parser.parse_args()
-    print(f"machine {platform.processor() or platform.machine()}, {os.cpu_count()} cores; commit {_commit()}")
+    print(f"machine {platform.processor() or platform.machine()}, {os.cpu_count()} cores; commit {commit()}")
     missing = [name for name in ("d4d_stereo", "d4d_endonerf", "surgt_raw") if not (arguments.data / name).exists()]
     if missing:
         print(f"nothing measured: {arguments.data} lacks {', '.join(missing)}")
@@ -101,11 +101,6 @@ def _print_rows(clip: RectifiedClip, correction_px: float) -> None:
         dy = np.abs(matches[:, 3] - matches[:, 1])
         inliers = np.abs(matches[:, 3] - matches[:, 1] - shift.shift_px) < 2.0
         print(f"  median |dy| {label}: {np.median(dy[inliers]):.3f} px (target 0.5) over {inliers.sum()} matches")
-
-
-def _commit() -> str:
-    answer = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    return answer.stdout.strip() or "unknown"
 
 
 if __name__ == "__main__":

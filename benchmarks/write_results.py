@@ -187,7 +187,7 @@ def _service_tables(rows: list[Row]) -> list[str]:
     if uploads:
         tables += [_UPLOADS, _table(["", "seconds", "before, MiB", "peak, MiB"], uploads)]
     first = rows[0]
-    return [*tables, f"\n{first['cores']} cores, {first['machine']}, commit {first['commit']}.\n"]
+    return [*tables, f"\n{first['machine']}, commit {first['commit']}.\n"]
 
 
 if __name__ == "__main__":

@@ -16,10 +16,9 @@ from contract.keys import KeyScope
 from contract.pose import parse_pose
 from contract.rendering import MEDIA_TYPES, ImageFormat, IntrinsicsOverride, Layer, RenderRequest, ReplyError
 from contract.settings import Settings
-from contract.store import is_job_id
 from service.access import Caller
 from service.connection import Answer
-from service.deps import AnyCaller, Deps, Services, not_found
+from service.deps import AnyCaller, Deps, Services, owned_scene
 from service.problems import Problem
 from service.version import version
 
@@ -31,7 +30,6 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
 }
 STATUS_OF_REPLY = {"input": 422, "scene": 404, "not-yet": 503, "internal": 500}
 NOT_YET_RETRY_S = "1"
-SCENES_REMEDY = "GET /scenes lists what there is."
 
 ModelTime = Annotated[
     float, Query(ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip")
@@ -117,9 +115,7 @@ async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown
 def _find(services: Deps, caller: Caller, scene: str | None) -> Shown:
     if scene is None:
         return _only(services, caller)
-    record = services.done.record(scene) if is_job_id(scene) else None
-    if record is None or not caller.owns(record):
-        raise not_found(f"There is no scene {scene[:40]!r}.", "scene", SCENES_REMEDY, caller, record)
+    record = owned_scene(services, caller, scene)
     if record.state is JobState.DONE:
         return Shown(scene, record.attempt)
     if record.state is JobState.RUNNING:

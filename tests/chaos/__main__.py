@@ -10,7 +10,6 @@ import itertools
 import platform
 import random
 import statistics
-import subprocess
 import sys
 import tempfile
 import threading
@@ -19,6 +18,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
+from benchmarks.bm_train import commit, machine
 from contract.queue import BEAT_PERIOD_S, LEASE_S
 from tests.chaos.campaign import CELLS, NO_MATTER, Outcome, run_kill
 from tests.chaos.history import RERUN_WITHIN_S, ClipHistory, orphans
@@ -139,7 +139,7 @@ def _table(outcomes: list[Outcome], left: list[Path], seconds: float, options: a
         "# kill -9, everywhere",
         "",
         f"Command: `python -m tests.chaos --kills {options.kills} --houses {options.houses} --seed {options.seed}` "
-        f"(`make chaos`), commit {_commit()}, {platform.machine()}, Python {platform.python_version()}, "
+        f"(`make chaos`), commit {commit()}, {machine()}, Python {platform.python_version()}, "
         f"{options.houses} installations side by side, {seconds / 60:.1f} min. The trainer is a stand-in that takes "
         "half a second; service, queue, supervisor and store are the real ones.",
         "",
@@ -167,11 +167,6 @@ def _cell(outcomes: list[Outcome]) -> str:
     again = [outcome.history.rerun_s for outcome in outcomes if outcome.history.rerun_s is not None]
     times = f", {max(again):.1f} s ({statistics.median(again):.1f})" if again else ""
     return f"{len(outcomes)} / {len(again)}{times}"
-
-
-def _commit() -> str:
-    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    return found.stdout.strip() or "unknown"
 
 
 if __name__ == "__main__":

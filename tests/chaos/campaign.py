@@ -137,16 +137,22 @@ def watch(house: House, history: ClipHistory) -> None:
     """Until the job has ended, and a moment longer, so that a second ending would be seen."""
     if history.job_id is None:
         return
-    deadline_s = time.monotonic() + ENDED_WITHIN_S
+    record = wait_until_ended(house, history.job_id, ENDED_WITHIN_S)
+    time.sleep(SECOND_ENDING_S if record is not None and record.state is JobState.DONE else TIDIED_WITHIN_S)
+    history.events = house.queue.events(history.job_id)
+
+
+def wait_until_ended(house: House, job_id: str, timeout_s: float) -> JobRecord | None:
+    """The record of the job that has ended, or after timeout_s as it was last seen; None if it never was."""
+    deadline_s = time.monotonic() + timeout_s
     record: JobRecord | None = None
     while time.monotonic() < deadline_s:
         with suppress(UnavailableError):
-            record = house.queue.get(history.job_id)
+            record = house.queue.get(job_id)
             if record is not None and record.state in TERMINAL_STATES:
                 break
         time.sleep(0.05)
-    time.sleep(SECOND_ENDING_S if record is not None and record.state is JobState.DONE else TIDIED_WITHIN_S)
-    history.events = house.queue.events(history.job_id)
+    return record
 
 
 def _clip_of_its_own(name: str) -> bytes:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from contract.job import TERMINAL_STATES, JobState
 from contract.queue import LEASE_S
-from tests.chaos.campaign import Caller, watch
+from tests.chaos.campaign import Caller, wait_until_ended, watch
 from tests.chaos.history import ClipHistory, orphans, violations
 from tests.chaos.house import House, children_of
 from tests.chaos.points import Point
@@ -56,7 +56,9 @@ def zombie(folder: Path, port: int, point: Point) -> Finding:
             os.kill(process_id, signal.SIGSTOP)
         stopped_s = time.time()
         house.points.let_go()  # which the sleepers hear of only when they wake
-        _wait_until_ended(house, caller.job_id)
+        record = wait_until_ended(house, caller.job_id, SETTLED_WITHIN_S)
+        if record is None or record.state not in TERMINAL_STATES:
+            raise TimeoutError(f"job {caller.job_id} was not taken over within {SETTLED_WITHIN_S:g} s")
         taken_over_s = time.time() - stopped_s
         time.sleep(max(0.0, SLEEP_S - taken_over_s))
         for process_id in sleepers:
@@ -111,13 +113,3 @@ def _family_of(process_id: int, house: House) -> list[int]:
         if supervisor is not None and process_id in (supervisor, *children_of(supervisor)):
             return [supervisor, *children_of(supervisor)]
     raise AssertionError(f"process {process_id} belongs to no worker")
-
-
-def _wait_until_ended(house: House, job_id: str) -> None:
-    deadline_s = time.monotonic() + SETTLED_WITHIN_S
-    while time.monotonic() < deadline_s:
-        record = house.queue.get(job_id)
-        if record is not None and record.state in TERMINAL_STATES:
-            return
-        time.sleep(0.05)
-    raise TimeoutError(f"job {job_id} was not taken over within {SETTLED_WITHIN_S:g} s")
