@@ -1,6 +1,6 @@
 """The `intrasplat` command.
 
-reconstruct, render, phantom and doctor work on this machine, in a process of the worker's (`python -m worker ...`);
+reconstruct, render, phantom, evaluate and doctor work on this machine, in a process of the worker's (`python -m worker ...`);
 up starts a service and keys opens it to others; submit, watch, fetch, jobs, cancel, retry and delete talk to one.
 """
 
@@ -27,6 +27,7 @@ LOCAL_COMMANDS = {
     "reconstruct": "train a scene from a clip, on this machine",
     "render": "render images of a scene that is on this machine",
     "phantom": "make a synthetic stereo clip of tissue",
+    "evaluate": "measure presets on clips, and draw speed against accuracy",
     "doctor": "say what is installed, what would be used, what is missing",
 }
 

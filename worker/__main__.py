@@ -1,6 +1,6 @@
 """`python -m worker COMMAND`: everything that happens on this machine, without a service, and the service's worker.
 
-`intrasplat reconstruct|render|phantom|doctor` end here with the same arguments. Modules that bring torch along are
+`intrasplat reconstruct|render|phantom|evaluate|doctor` end here with the same arguments. Modules that bring torch along are
 imported by the command that needs them, so that --help and doctor answer at once, and doctor even without torch.
 """
 
@@ -62,6 +62,7 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     _add_reconstruct(commands)
     _add_render(commands)
     _add_phantom(commands, wanted="phantom" in argv[:1])
+    _add_evaluate(commands, wanted="evaluate" in argv[:1])
     add_command(commands, "consume", "claim jobs from the queue and serve renders, until a signal ends it", _consume)
     add_command(commands, "device", "what consume starts for itself: train and render as it is told on stdin", _device)
     add_command(commands, "doctor", "say what is installed, what would be used, what is missing", _doctor)
@@ -136,6 +137,14 @@ def _add_phantom(commands: Commands, wanted: bool) -> None:
     parser = add_command(commands, "phantom", "make a synthetic stereo clip of tissue, with its truth", _phantom)
     if wanted:
         from worker.phantom import add_cli_arguments
+
+        add_cli_arguments(parser)
+
+
+def _add_evaluate(commands: Commands, wanted: bool) -> None:
+    parser = add_command(commands, "evaluate", "measure presets on clips, and draw speed against accuracy", _evaluate)
+    if wanted:
+        from worker.evaluate.command import add_cli_arguments
 
         add_cli_arguments(parser)
 
@@ -248,6 +257,12 @@ def _targets(options: argparse.Namespace, frame_count: int) -> list[tuple[float,
 
 def _phantom(options: argparse.Namespace) -> int:
     from worker.phantom import run_cli
+
+    return run_cli(options)
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from worker.evaluate.command import run_cli
 
     return run_cli(options)
 

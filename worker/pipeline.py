@@ -50,10 +50,11 @@ class ReconstructionRequest:
 
     preset is a name, or a preset of the caller's own. budget_s and iterations exclude each other; without either the
     preset decides. accepted_at_s is the Unix time at which the clip was accepted, for t_post_s; None means now.
-    limits are what this machine accepts; None means what its memory allows.
+    limits are what this machine accepts; None means what its memory allows. clip is a path, or a clip with depth that
+    is in memory already and is neither decoded nor matched.
     """
 
-    clip: Path
+    clip: Path | DepthClip
     right: Path | None = None
     layout: Layout = "auto"
     calibration: Path | None = None
@@ -163,12 +164,15 @@ def report_stage(hooks: Hooks, stage: str, share: float) -> None:
 
 def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: dict[str, float]) -> DepthClip:
     """Decode, and for stereo input rectify and match: the left frames with depth."""
+    if isinstance(request.clip, DepthClip):
+        return request.clip
+    path = request.clip
     report_stage(hooks, "decode", 0.0)
     decoded = timed(
         seconds,
         "decode_s",
         lambda: decode_clip(
-            request.clip,
+            path,
             request.right,
             layout=request.layout,
             calibration=request.calibration,

@@ -52,13 +52,18 @@ class Frame:
     warnings: tuple[str, ...]
 
 
+def model_of(scene: Scene) -> FusedModel:
+    """The scene's Gaussians and their motion in the form that the kernels render."""
+    kind = UnfusedModel if isinstance(scene.deformation, HexPlane) else FusedModel
+    return kind(scene.gaussians, scene.deformation, scene.intrinsics.width, scene.intrinsics.height)
+
+
 class SceneRenderer:
     """A scene ready to be rendered. Serialises its callers: the kernels share buffers."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = weakref.ref(scene)
-        kind = UnfusedModel if isinstance(scene.deformation, HexPlane) else FusedModel
-        self._model = kind(scene.gaussians, scene.deformation, scene.intrinsics.width, scene.intrinsics.height)
+        self._model = model_of(scene)
         self._is_vouched = bool(scene.seen.any())
         self._rasterizers: OrderedDict[tuple[int, int], Rasterizer] = OrderedDict()
         self._lock = Lock()

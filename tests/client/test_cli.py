@@ -165,7 +165,7 @@ def test_every_help_tells_the_exit_codes(
     assert "isp_secret" not in told
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "render", "phantom", "doctor"])
+@pytest.mark.parametrize("command", ["reconstruct", "render", "phantom", "evaluate", "doctor"])
 def test_local_commands_have_help_too(command: str) -> None:
     assert "exit codes" in run_here(Path.cwd(), command, "--help").stdout
 

@@ -124,6 +124,16 @@ class Phantom:
         linear, fragments = self._draw_tissue(frame, pose, intrinsics or self.settings.intrinsics)
         return to_srgb(_through_lens(linear)), fragments.depth_mm
 
+    def atlas_xy(self, frame: float, world_from_camera: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
+        """[H, W, 2] which material point each pixel shows, instrument aside: its place (x, y) on the atlas in texels,
+        the same in every frame and from every pose; -1 where no tissue is modelled."""
+        pose = self.world_from_camera(frame) if world_from_camera is None else world_from_camera
+        triangles = self.surface.triangles
+        fragments = rasterize_mesh(self.surface.vertices_mm(frame), triangles, pose, self.settings.intrinsics)
+        places = interpolate(fragments, triangles, self.surface.atlas_xy)
+        places[fragments.triangle < 0] = -1
+        return places
+
     def world_from_camera(self, frame: float) -> NDArray[np.float64]:
         """Pose [4, 4] of the endoscope's left eye, mm; the identity at frame 0."""
         return endoscope_pose(frame, self.settings.period_frames, self.settings.moving_camera)

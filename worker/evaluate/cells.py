@@ -1,0 +1,119 @@
+"""What is measured: a grid of cells, each of them one reconstruction.
+
+A series is a preset, or a preset with some of its numbers changed: `fast:bases=9,points_per_image=20000`. Every grid,
+that of capacity too, is a list of series.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from contract.errors import InputError
+from worker.presets import PRESETS, Preset, preset_named
+
+OURS = ("instant", "fast", "quality")
+PUBLISHED_METHOD = ("paper", "paper-released", "without_mapf", "pfs", "hexplane")
+DEFAULT_SERIES = tuple(name for name in (*OURS, *PUBLISHED_METHOD) if name in PRESETS)
+DEFAULT_HOLDOUTS = ("every8", "blocks8")
+GRID_BASES = (3, 5, 9, 17, 33)
+GRID_POINTS = (10_000, 20_000, 40_000, 80_000)
+"""Bases and Gaussians an image of the grid that the automatic choice is compared with."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One reconstruction: exactly one of budget_s and iterations is given."""
+
+    clip: str
+    series: str
+    holdout: str
+    seed: int
+    budget_s: float | None = None
+    iterations: int | None = None
+
+    @property
+    def limit(self) -> str:
+        """How long it trains, in words."""
+        return f"{self.iterations} iterations" if self.iterations else f"{self.budget_s:g} s"
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """What its row is found by; the values of rows.KEY."""
+        return (self.clip, self.holdout, self.series, str(self.seed), self.limit)
+
+
+def plan(
+    clips: Sequence[str],
+    series: Sequence[str],
+    holdouts: Sequence[str],
+    seeds: Sequence[int],
+    budgets_s: Sequence[float] = (),
+    iterations: Sequence[int] = (),
+) -> list[Cell]:
+    """Every combination, clip by clip so that each is opened once; without budgets and iterations as the presets say.
+
+    Raises:
+        InputError: a series is not known.
+    """
+    presets = {name: preset_of(name) for name in series}
+    cells = []
+    for clip in clips:
+        for holdout in holdouts:
+            for seed in seeds:
+                for name, preset in presets.items():
+                    fixed = list(iterations)
+                    timed = list(budgets_s)
+                    if not fixed and not timed:  # the preset's own; iterations before seconds, as in a reconstruction
+                        fixed = [preset.iterations] if preset.iterations else []
+                        timed = [preset.budget_s] if preset.budget_s and not fixed else []
+                    cells += [Cell(clip, name, holdout, seed, budget_s=each) for each in timed]
+                    cells += [Cell(clip, name, holdout, seed, iterations=each) for each in fixed]
+    return cells
+
+
+def preset_of(series: str) -> Preset:
+    """The preset that a series names, with its changes made.
+
+    Raises:
+        InputError: there is no such preset, or no such plain number in it.
+    """
+    name, _, changes = series.partition(":")
+    preset = preset_named(name)
+    for change in filter(None, changes.split(",")):
+        field, _, text = change.partition("=")
+        if not hasattr(preset, field) or dataclasses.is_dataclass(getattr(preset, field)):
+            plain = [each.name for each in dataclasses.fields(Preset)]
+            problem = f"{change!r} in {series!r} changes no plain value of a preset."
+            raise InputError("--series", problem, f"Use FIELD=VALUE with one of: {', '.join(plain)}.")
+        values: dict[str, Any] = {field: _value(series, text, getattr(preset, field))}
+        preset = dataclasses.replace(preset, **values)
+    return preset
+
+
+def base_of(series: str) -> str:
+    """The preset that a series is a variant of."""
+    return series.partition(":")[0]
+
+
+def capacity_grid(preset: str) -> list[str]:
+    """The preset, whose capacity is chosen for the scene, and its variants with fixed capacities."""
+    fixed = [f"{preset}:bases={bases},points_per_image={points}" for bases in GRID_BASES for points in GRID_POINTS]
+    return [preset, *fixed]
+
+
+def _value(series: str, text: str, current: object) -> object:
+    """text as a value of the current one's type."""
+    if text == "none":
+        return None
+    try:
+        if isinstance(current, bool):
+            return {"true": True, "false": False}[text]
+        if isinstance(current, str):
+            return text
+        return float(text) if isinstance(current, float) else int(text)
+    except (KeyError, ValueError):
+        problem = f"{text!r} in {series!r} is no value in place of {current!r}."
+        raise InputError("--series", problem, "Give a number, true, false or none.") from None

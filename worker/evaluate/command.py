@@ -1,0 +1,175 @@
+"""`intrasplat evaluate`: measures the cells that have no row yet, then draws and sums up what there is."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any, get_args
+
+from contract.arguments import count, positive
+from contract.errors import InputError
+from contract.exits import ExitCode
+from contract.job import JobProgress, Layout, MaskPolarity, PoseConvention
+from contract.progress_bar import ProgressBar
+from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, OURS, Cell, capacity_grid, plan
+from worker.evaluate.charts import draw_all
+from worker.evaluate.measure import Bench
+from worker.evaluate.rows import Results, write_rows
+from worker.evaluate.sources import source_of
+from worker.evaluate.summary import SUMMARY_FIELDS, Sooner, capacities, groups_of, orderings, sooner
+from worker.hooks import Hooks, Progress
+
+SUMMARY = "summary.csv"
+
+
+def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of `evaluate`; run_cli reads them."""
+    parser.add_argument(
+        "clips", nargs="*", metavar="CLIP", help="a path, phantom:MOTION[:WxH][:FRAMESframes][:seedN], or d4d_endonerf"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="rows, summary and charts; goes on there"
+    )
+    parser.add_argument(
+        "--series",
+        nargs="+",
+        default=list(DEFAULT_SERIES),
+        help="presets, or presets with changes such as fast:bases=9,tracks=false (default: all)",
+    )
+    parser.add_argument("--holdout", nargs="+", default=list(DEFAULT_HOLDOUTS), help="(default: %(default)s)")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N", help="(default: 0)")
+    limit = parser.add_mutually_exclusive_group()
+    limit.add_argument("--budget-s", nargs="+", type=positive, default=[], metavar="S", help="seconds of training")
+    limit.add_argument("--iterations", nargs="+", type=count, default=[], metavar="N", help="instead of the preset's")
+    parser.add_argument(
+        "--grid", action="store_true", help="of each series, the grid of fixed capacities beside its own choice"
+    )
+    parser.add_argument("--redraw", action="store_true", help="measure nothing; sum up and draw the rows in DIR")
+    for name in ("calibration", "masks"):
+        parser.add_argument(f"--{name}", type=Path, metavar="F", help="of the clips that are paths")
+    parser.add_argument("--layout", choices=get_args(Layout), default="auto")
+    parser.add_argument("--mask-polarity", choices=get_args(MaskPolarity), default="auto")
+    parser.add_argument("--pose-convention", choices=get_args(PoseConvention), default="opengl")
+
+
+def run_cli(options: argparse.Namespace) -> int:
+    """Measures what is asked for and has no row; returns the exit code.
+
+    Raises:
+        InputError: a clip, a series or an option is not known.
+        Cancelled: a signal came; what was measured until then is kept.
+    """
+    out: Path = options.out
+    if options.redraw == bool(options.clips):
+        remedy = "Name one or more clips, or say --redraw alone."
+        raise InputError("CLIP", "either clips are measured or rows redrawn.", remedy)
+    results = Results(out)
+    if options.clips:
+        bench, cells = _asked(options)
+        waiting = [cell for cell in cells if not results.has(cell.key)]
+        print(f"{len(cells)} cells, {len(cells) - len(waiting)} of them have their rows already")
+        measure_all(bench, waiting, results)
+    if not results.runs:
+        raise InputError("--out", f"{out} holds no rows.", "Name clips to measure.")
+    conclude(results, out)
+    return ExitCode.OK
+
+
+def measure_all(bench: Bench, cells: Sequence[Cell], results: Results) -> None:
+    """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM."""
+    interrupted = threading.Event()
+    handle = _setting(interrupted)
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for place, cell in enumerate(cells):
+            with ProgressBar(sys.stderr) as bar:
+                show = _reporter(bar, place, len(cells))
+                row, curve = bench.measure(cell, Hooks(on_progress=show, should_stop=interrupted.is_set))
+            results.add(row, curve)
+            print(f"{' '.join(cell.key)}: {_outcome(row)}", flush=True)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def conclude(results: Results, out: Path) -> None:
+    """summary.csv and the charts, and the claims in words."""
+    groups = groups_of(results.runs)
+    write_rows(out / SUMMARY, SUMMARY_FIELDS, [group.summary() for group in groups])
+    charts = draw_all(results, out)
+    for ours in OURS:
+        for found in sooner(results.curves, ours):
+            print(in_words(found))
+    for ordering in orderings(groups):
+        print(
+            f"{', '.join(ordering.place)}: the paper's ablation, {' > '.join(ordering.scores_db)}: {ordering.verdict}"
+        )
+    for choice in capacities(groups):
+        chosen, best = choice.chosen, choice.best
+        print(
+            f"{', '.join(chosen.place)}: {chosen.series} chooses {choice.difference_db:+.2f} dB "
+            f"(deviation {choice.deviation_db:.2f}, {choice.seeds} seeds) from {best.series}, "
+            f"{chosen.median('scene_bytes') / 1e6:.1f} MB beside {best.median('scene_bytes') / 1e6:.1f} MB"
+        )
+    print(f"{out / SUMMARY}; charts: {', '.join(charts) or 'none'}")
+
+
+def in_words(found: Sooner) -> str:
+    """The headline of one place."""
+    theirs = f"{found.theirs}'s final {found.target_db:.2f} dB ({found.their_s:.0f} s)"
+    where = f"{found.clip}, {found.holdout}: {found.ours}"
+    if found.our_s is None:
+        return f"{where} does not reach {theirs}"
+    return (
+        f"{where} reaches {theirs} after {found.our_s:.1f} s, {found.times_in_seconds:.1f} times sooner, and in "
+        f"{found.times_in_iterations:.1f} times fewer iterations"
+    )
+
+
+def _asked(options: argparse.Namespace) -> tuple[Bench, list[Cell]]:
+    """Where the clips come from, and every cell of the grid."""
+    names = ("calibration", "masks", "layout", "mask_polarity", "pose_convention")
+    of_paths: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    sources = [source_of(argument, of_paths) for argument in options.clips]
+    series = options.series
+    if options.grid:
+        series = [variant for name in series for variant in capacity_grid(name)]
+    clips = [source.name for source in sources]
+    cells = plan(clips, series, options.holdout, options.seeds, options.budget_s, options.iterations)
+    return Bench({source.name: source for source in sources}), cells
+
+
+def _reporter(bar: ProgressBar, place: int, total: int) -> Callable[[Progress], None]:
+    """Shows how much of all cells is done; of a cell, training counts."""
+    trained = 0.0
+
+    def show(now: Progress) -> None:
+        nonlocal trained
+        trained = max(trained, now.fraction if now.stage == "train" else 0.0)
+        share = min(1.0, (place + trained) / total)
+        bar.show(JobProgress(stage=f"{place + 1}/{total}", fraction=share, psnr_db=now.psnr_db))
+
+    return show
+
+
+def _outcome(row: dict[str, object]) -> str:
+    if row.get("error"):
+        return str(row["error"])
+    score = row["psnr_tissue_db"]
+    shown = "no frames held out" if score is None else f"{score:.2f} dB"
+    return (
+        f"{shown}, {row['t_train_s']:.1f} s, {row['gaussians']} Gaussians, {int(str(row['scene_bytes'])) / 1e6:.1f} MB"
+    )
+
+
+def _setting(event: threading.Event) -> Callable[[int, FrameType | None], None]:
+    def handle(number: int, frame: FrameType | None) -> None:
+        event.set()
+        signal.signal(number, signal.default_int_handler)  # the second one ends it at once
+
+    return handle

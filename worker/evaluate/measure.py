@@ -1,0 +1,169 @@
+"""One cell becomes a row and a curve: trained by `reconstruct` itself, then judged as it lies on disk.
+
+Symbols: N Gaussians, T frames.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from contract.errors import Cancelled
+from contract.report import Report
+from contract.store import CURVE, REPORT
+from worker.checkpoint import Scene, load_scene
+from worker.evaluate.cells import Cell, preset_of
+from worker.evaluate.rows import KEY, commit, machine
+from worker.evaluate.sources import OpenClip, Source, open_source
+from worker.evaluate.truth import ShownScene, Truth
+from worker.hooks import Hooks
+from worker.metrics import psnr_tissue
+from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.raster.cpu import camera_vector
+from worker.render import model_of
+from worker.targets import camera_in_units
+
+UNTIMED_RENDERS, TIMED_RENDERS = 5, 40
+"""Renders at different times, of which the median counts; the first fill caches."""
+LONGEST_ERROR = 300
+
+Values = dict[str, object]
+
+
+@dataclass
+class Bench:
+    """Opens clips and measures cells on them; the clip and truth used last are kept for the next cell."""
+
+    sources: Mapping[str, Source]
+    _open: dict[tuple[str, str], OpenClip] = field(default_factory=dict)
+    _truth: dict[tuple[str, str], Truth] = field(default_factory=dict)
+
+    def measure(self, cell: Cell, hooks: Hooks) -> tuple[Values, list[Values]]:
+        """The row and the curve of a cell; a failure's row says why in `error` and has no curve.
+
+        Raises:
+            Cancelled: hooks.should_stop said so.
+        """
+        source = self.sources[cell.clip]
+        row: Values = {
+            **dict(zip(KEY, cell.key, strict=True)),
+            "load_1min": os.getloadavg()[0],
+            "command": command_of(cell, source),
+        }
+        row |= {"machine": machine(), "commit": commit()}
+        try:
+            values, curve = self._measured(cell, source, hooks)
+        except (Cancelled, KeyboardInterrupt):
+            raise
+        except Exception as error:  # whatever a method breaks on is a result of its own
+            problem = " ".join(str(error).split())
+            return {**row, "error": f"{type(error).__name__}: {problem}"[:LONGEST_ERROR]}, []
+        return {**row, **values}, curve
+
+    def _measured(self, cell: Cell, source: Source, hooks: Hooks) -> tuple[Values, list[Values]]:
+        place = (cell.clip, cell.holdout)
+        if place not in self._open:
+            self._open.clear()
+            self._truth.clear()
+            self._open[place] = open_source(source, cell.holdout, hooks)
+        opened = self._open[place]
+        request = ReconstructionRequest(
+            clip=opened.clip,
+            holdout=cell.holdout,
+            preset=preset_of(cell.series),
+            budget_s=cell.budget_s,
+            iterations=cell.iterations,
+            seed=cell.seed,
+            accepted_at_s=time.time() - sum(opened.seconds.values()),
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder)
+            report = reconstruct(request, out, hooks)
+            with (out / CURVE).open(newline="") as file:
+                curve: list[Values] = [dict(point) for point in csv.DictReader(file)]
+            scene = load_scene(out)
+            kept = [path for path in out.iterdir() if path.name not in (REPORT, CURVE)]
+            scene_bytes = sum(path.stat().st_size for path in kept)
+        values = _reported(report, opened) | _size(scene) | _speed(scene, report)
+        values |= {"scene_bytes": scene_bytes, "stored_psnr_tissue_db": _stored_db(scene, opened, report)}
+        return values | self._true(place, opened, scene, report), curve
+
+    def _true(self, place: tuple[str, str], opened: OpenClip, scene: Scene, report: Report) -> Values:
+        """The scores against the truth, for a clip that has one."""
+        if opened.phantom is None or not report.held_out:
+            return {}
+        if place not in self._truth:
+            unused = {*report.held_out, *report.repeated}
+            train = [frame for frame in range(report.frame_count) if frame not in unused]
+            self._truth[place] = Truth(opened.phantom, opened.clip, train, report.held_out)
+        return dataclasses.asdict(self._truth[place].score(ShownScene(scene)))
+
+
+def command_of(cell: Cell, source: Source) -> str:
+    """The command line that measures this cell."""
+    limit = f"--iterations {cell.iterations}" if cell.iterations else f"--budget-s {cell.budget_s:g}"
+    given = [
+        f"--{name.replace('_', '-')} {value}"
+        for name, value in source.options.items()
+        if name != "clip" and source.argument == str(source.options.get("clip"))
+    ]
+    parts = ["intrasplat evaluate", source.argument, *given, f"--series {cell.series}"]
+    return " ".join([*parts, f"--holdout {cell.holdout}", f"--seeds {cell.seed}", limit])
+
+
+def render_ms(scene: Scene) -> float:
+    """Median milliseconds of an image at the clip's size, deformation included, at times spread over the clip."""
+    model = model_of(scene)
+    camera = camera_vector(camera_in_units(scene.intrinsics, scene.world_from_camera[0], scene.units_per_mm))
+    took: list[float] = []
+    for t in np.random.default_rng(0).permutation(np.linspace(0, 1, UNTIMED_RENDERS + TIMED_RENDERS, endpoint=False)):
+        start = time.perf_counter()
+        model.render(camera, float(t))
+        took.append(time.perf_counter() - start)
+    return 1000 * float(np.median(took[UNTIMED_RENDERS:]))
+
+
+def _reported(report: Report, opened: OpenClip) -> Values:
+    """What the quality report has of it; seconds by stage as JSON."""
+    same = ("psnr_tissue_db", "psnr_paper_db", "ssim", "depth_agreement_mm", "coverage", "train_psnr_tissue_db")
+    seconds = {name: round(value, 3) for name, value in {**opened.seconds, **report.seconds}.items()}
+    return {name: getattr(report, name) for name in (*same, "iterations", "width", "height")} | {
+        "copy_blend_db": report.baseline_blend_db,
+        "copy_flow_db": report.baseline_flow_db,
+        "t_train_s": report.seconds["t_train_s"],
+        "t_post_s": report.seconds["t_post_s"],
+        "seconds": json.dumps(seconds),
+        "bases": report.bases,
+    }
+
+
+def _size(scene: Scene) -> Values:
+    """N, and how many numbers the model has for each; what the confidence layer keeps is not the model's."""
+    floats = sum(tensor.numel() for name, tensor in scene.tensors().items() if name != "seen")
+    return {"gaussians": len(scene.gaussians), "floats_a_gaussian": floats / len(scene.gaussians)}
+
+
+def _speed(scene: Scene, report: Report) -> Values:
+    median_ms = render_ms(scene)
+    step_ms = 1000 * report.seconds["optimise_s"] / report.iterations
+    return {"step_ms": step_ms, "render_ms": median_ms, "render_fps": 1000 / median_ms}
+
+
+def _stored_db(scene: Scene, opened: OpenClip, report: Report) -> float | None:
+    """Mean psnr_tissue of the held-out frames, rendered from what lies on disk."""
+    shown, clip = ShownScene(scene), opened.clip
+    scores = [
+        psnr_tissue(shown.view(frame, clip.world_from_camera[frame]).rgb, clip.rgb[frame], clip.tissue[frame])
+        for frame in report.held_out
+    ]
+    known = [score for score in scores if score == score]  # NaN where there is no tissue
+    return float(np.mean(known)) if known else None

@@ -1,0 +1,111 @@
+"""runs.csv and curves.csv: a row a run, kept as soon as the run has ended, and which commit and machine it is of.
+
+A run is found by KEY. Both files are written whole and renamed, the curve before the run, so that after any
+interruption a run either has its row and its curve or is measured again.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+Row = dict[str, str]
+
+RUNS, CURVES = "runs.csv", "curves.csv"
+KEY = ("clip", "holdout", "series", "seed", "limit")
+SCORES = ("psnr_tissue_db", "psnr_paper_db", "ssim", "depth_agreement_mm", "coverage", "train_psnr_tissue_db")
+COPIES = ("copy_blend_db", "copy_flow_db")
+TRUTH = (
+    "psnr_view10_db", "psnr_view15_db", "psnr_hidden_db", "depth_error_mm", "motion_error_mm", "motion_mm",
+)  # fmt: skip
+SIZE = ("iterations", "gaussians", "bases", "floats_a_gaussian", "scene_bytes", "stored_psnr_tissue_db")
+SPEED = ("t_train_s", "t_post_s", "seconds", "step_ms", "render_ms", "render_fps", "width", "height", "load_1min")
+ORIGIN = ("machine", "commit", "command", "error")
+RUN_FIELDS = (*KEY, *SCORES, *COPIES, *TRUTH, *SIZE, *SPEED, *ORIGIN)
+"""docs/results/index.md says what each column means; empty means not measured."""
+CURVE_FIELDS = (*KEY, "t_train_s", "iteration", "psnr_tissue_db")
+
+
+def key_of(row: Mapping[str, str]) -> tuple[str, ...]:
+    """What names a run."""
+    return tuple(row[name] for name in KEY)
+
+
+class Results:
+    """The runs and curves of a folder, as they are now."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.runs = read_rows(folder / RUNS)
+        kept = {key_of(row) for row in self.runs}
+        self.curves = [row for row in read_rows(folder / CURVES) if key_of(row) in kept]
+
+    def has(self, key: tuple[str, ...]) -> bool:
+        """Whether the run has a row, of success or of failure."""
+        return any(key_of(row) == key for row in self.runs)
+
+    def add(self, run: Mapping[str, object], curve: Sequence[Mapping[str, object]]) -> None:
+        """Keep a run and its curve."""
+        key = {name: run[name] for name in KEY}
+        self.curves += [_texts({**key, **point}, CURVE_FIELDS) for point in curve]
+        self.runs.append(_texts(run, RUN_FIELDS))
+        self._folder.mkdir(parents=True, exist_ok=True)
+        write_rows(self._folder / CURVES, CURVE_FIELDS, self.curves)
+        write_rows(self._folder / RUNS, RUN_FIELDS, self.runs)
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The rows of a CSV file; none where there is no file. Columns an older file lacks are empty."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [{name: value or "" for name, value in row.items() if name} for row in csv.DictReader(file)]
+
+
+def write_rows(path: Path, fields: Iterable[str], rows: Iterable[Mapping[str, object]]) -> None:
+    """The whole file or none of it."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    with aside.open("w", newline="") as file:
+        writer = csv.DictWriter(file, tuple(fields), restval="", extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        file.flush()
+        os.fsync(file.fileno())
+    aside.replace(path)
+
+
+def machine() -> str:
+    """Processor, cores and date: the figures are of this machine on this day."""
+    name = platform.processor() or platform.machine()
+    if Path("/proc/cpuinfo").exists():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        models = [line.split(":", 1)[1].strip() for line in lines if "model name" in line]
+        name = models[0] if models else name
+    return f"{name}, {os.cpu_count()} cores, {time.strftime('%Y-%m-%d')}"
+
+
+def commit() -> str:
+    """The commit measured, with + where the tree has changes; "unknown" outside a repository."""
+    command = ["git", "describe", "--always", "--dirty=+"]
+    folder = Path(__file__).parent
+    try:
+        found = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout.strip()
+    except OSError:
+        found = ""
+    return found or "unknown"
+
+
+def _texts(row: Mapping[str, object], fields: Sequence[str]) -> Row:
+    return {name: _text(row.get(name)) for name in fields}
+
+
+def _text(value: object) -> str:
+    """Empty for None and NaN; floats with six significant digits."""
+    if value is None or value != value:  # NaN alone differs from itself
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,128 @@
+"""What a clip's name means on the command line, and the clip itself.
+
+PATH                                        anything `reconstruct` reads
+phantom:MOTION[:WxH][:FRAMESframes][:seedN] synthetic tissue with true depth, 320x256, 64 frames, seed 0
+d4d_endonerf, d4d_stereo                    the recordings found under INTRASPLAT_DATA; rows name them d4d-a
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from contract.errors import InputError
+from worker.clip import DepthClip
+from worker.hooks import Hooks
+from worker.phantom import MOTIONS, Phantom, PhantomSettings, make_phantom
+from worker.pipeline import ReconstructionRequest, depth_clip_of
+
+DATA_VARIABLE = "INTRASPLAT_DATA"
+PHANTOM_WIDTH, PHANTOM_HEIGHT = 320, 256
+_STEREO: Mapping[str, Any] = {"calibration": "calibration.json", "masks": "tool_masks.zip"}
+RECORDINGS: Mapping[str, tuple[str, str, Mapping[str, Any]]] = {
+    "d4d_endonerf": ("d4d-a", "d4d_endonerf", {}),
+    "d4d_stereo": ("d4d-a-stereo", "d4d_stereo/stereo_sbs.mp4", _STEREO),
+}
+"""By name: what rows call it, its file, and the files beside it that `reconstruct` needs. A patient's recording is not
+named by its own name anywhere."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A clip that can be opened. argument is what the command line says, name what rows say.
+
+    phantom  how to draw it; None for a recording
+    options  of the ReconstructionRequest: path, calibration, masks and so on
+    """
+
+    name: str
+    argument: str
+    phantom: PhantomSettings | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class OpenClip:
+    """A clip with depth; phantom knows its truth, seconds what decoding and stereo took."""
+
+    clip: DepthClip
+    phantom: Phantom | None
+    seconds: Mapping[str, float]
+
+
+def source_of(argument: str, options: Mapping[str, Any] | None = None) -> Source:
+    """The source that an argument names; options (calibration, masks, layout, ...) are for paths.
+
+    Raises:
+        InputError: there is no such motion or file.
+    """
+    if argument.startswith("phantom:"):
+        settings = _phantom_settings(argument)
+        return Source(_phantom_name(settings), argument, settings)
+    if argument in RECORDINGS and not Path(argument).exists():
+        return _recording(argument)
+    if not Path(argument).exists():
+        remedy = f"Give a path, phantom:MOTION ({', '.join(MOTIONS)}), or one of {', '.join(RECORDINGS)}."
+        raise InputError("CLIP", f"there is no {argument!r}.", remedy)
+    return Source(Path(argument).stem, argument, None, {"clip": Path(argument), **(options or {})})
+
+
+def data_folder() -> Path:
+    """Where recordings are looked for."""
+    return Path(os.environ.get(DATA_VARIABLE, "../shared/data"))
+
+
+def open_source(source: Source, holdout: str, hooks: Hooks) -> OpenClip:
+    """Draw or decode the clip. Stereo measures the frames that are not held out, so a clip belongs to its holdout.
+
+    Raises:
+        InputError: the clip or its calibration cannot be used.
+    """
+    if source.phantom is not None:
+        phantom = make_phantom(source.phantom)
+        return OpenClip(phantom.depth_clip(), phantom, {})
+    seconds: dict[str, float] = {}
+    clip = depth_clip_of(ReconstructionRequest(holdout=holdout, **source.options), hooks, seconds)
+    return OpenClip(clip, None, seconds)
+
+
+def _recording(argument: str) -> Source:
+    name, file, beside = RECORDINGS[argument]
+    path = data_folder() / file
+    if not path.exists():
+        problem = f"{argument} is not under {data_folder()}."
+        raise InputError("CLIP", problem, f"Set {DATA_VARIABLE} to the folder that holds it, or leave it out.")
+    return Source(name, argument, None, {"clip": path, **{key: path.parent / each for key, each in beside.items()}})
+
+
+def _phantom_settings(argument: str) -> PhantomSettings:
+    values: dict[str, Any] = {"width": PHANTOM_WIDTH, "height": PHANTOM_HEIGHT}
+    _, motion, *parts = argument.split(":")
+    for part in parts:
+        if match := re.fullmatch(r"(\d+)x(\d+)", part):
+            values |= {"width": int(match[1]), "height": int(match[2])}
+        elif match := re.fullmatch(r"(\d+)frames", part):
+            values["frames"] = int(match[1])
+        elif match := re.fullmatch(r"seed(\d+)", part):
+            values["seed"] = int(match[1])
+        else:
+            problem = f"{part!r} in {argument!r} is not known."
+            raise InputError("CLIP", problem, "Write phantom:MOTION[:WxH][:FRAMESframes][:seedN].")
+    return PhantomSettings(motion=motion, **values)  # type: ignore[arg-type]  # it refuses what is no motion
+
+
+def _phantom_name(settings: PhantomSettings) -> str:
+    """phantom-MOTION and what differs from the usual clip."""
+    usual = PhantomSettings()
+    parts = ["phantom", settings.motion]
+    if (settings.width, settings.height) != (PHANTOM_WIDTH, PHANTOM_HEIGHT):
+        parts.append(f"{settings.width}x{settings.height}")
+    if settings.frames != usual.frames:
+        parts.append(f"{settings.frames}frames")
+    if settings.seed != usual.seed:
+        parts.append(f"seed{settings.seed}")
+    return "-".join(parts)

@@ -1,0 +1,85 @@
+"""How the charts look: told apart in print and by the colour-blind, and the same bytes from the same rows.
+
+Colours are those of Okabe and Ito (2008); every series has a mark of its own as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from worker.evaluate.cells import base_of
+
+PANEL_INCHES = (5.4, 3.5)
+PNG_DPI = 130
+GREY = "#666666"
+FAINT = "#bbbbbb"
+SETTINGS = {
+    "font.family": "DejaVu Sans",  # it comes with matplotlib: the same everywhere
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": GREY,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "svg.hashsalt": "intrasplat",
+}
+
+
+@dataclass(frozen=True)
+class Look:
+    colour: str
+    marker: str
+
+
+_LOOKS = {
+    "instant": Look("#E69F00", "^"),
+    "fast": Look("#0072B2", "o"),
+    "quality": Look("#009E73", "s"),
+    "paper": Look("#D55E00", "D"),
+    "paper-released": Look("#CC79A7", "v"),
+    "without_mapf": Look("#56B4E9", "<"),
+    "pfs": Look("#8C7A00", "P"),
+    "hexplane": Look("#000000", "X"),
+    "paper-wide": Look("#7F7F7F", ">"),
+}
+"""pfs has Okabe and Ito's yellow darkened: on white it is too light for a line."""
+BASES_LOOKS = (
+    Look("#E69F00", "^"), Look("#56B4E9", "v"), Look("#009E73", "s"), Look("#D55E00", "D"), Look("#CC79A7", "P"),
+)  # fmt: skip
+"""Of the grid's numbers of bases, in rising order; the automatic choice looks like its preset."""
+
+
+def look_of(series: str) -> Look:
+    """The look of a preset's series; variants look like their preset."""
+    return _LOOKS.get(base_of(series), Look(GREY, "h"))
+
+
+def figure_of(rows: int, columns: int, legend_inches: float = 0.8) -> tuple[Any, Any]:
+    """A figure with rows x columns panels, [rows][columns] axes, and room for a legend below."""
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    height = PANEL_INCHES[1] * rows + legend_inches
+    room = ConstrainedLayoutEngine(rect=(0, legend_inches / height, 1, 1 - legend_inches / height))
+    figure = Figure(figsize=(PANEL_INCHES[0] * columns, height), layout=room)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def add_legend(figure: Any, handles: Sequence[Any]) -> None:
+    """One legend for all panels, at the foot."""
+    figure.legend(handles=list(handles), loc="lower center", ncols=min(6, len(handles)), fontsize=8.5)
+
+
+def save(figure: Any, folder: Path, name: str) -> None:
+    """name.png and name.svg; nothing in them depends on the day or the machine."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / f"{name}.png", dpi=PNG_DPI, metadata={"Software": None})
+    figure.savefig(folder / f"{name}.svg", metadata={"Date": None, "Creator": None})

@@ -1,0 +1,197 @@
+"""What only synthetic clips can tell: other poses, what the instrument hides, true depth, motion in 3D.
+
+Symbols: T frames, H W pixels, M material points of frame 0.
+
+Whatever is judged is a Shown: a scene, or the phantom itself, which scores as well as anything can.
+
+view   a held-out frame's moment from a pose YAW or PITCH degrees off, about the point at median depth on frame 0's
+       axis (contract/pose.py). Judged are the pixels whose material point some training frame showed as tissue.
+hidden the endoscope's own picture of a held-out frame behind the instrument, on the same condition.
+depth  median |z - truth| over tissue of held-out frames.
+motion of what a pixel of frame 0 shows: the displacements of the Gaussians it is blended of, each from its own centre
+       at frame 0 to that at frame i, blended with the same weights. Gaussians a pixel hardly shows hardly count, and
+       none has to be declared the nearest. The end-point error is its distance to the true displacement of the
+       material point that the pixel shows, the median over tissue pixels of frame 0 and held-out frames. A model
+       without motion scores the median displacement itself, motion_mm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.pose import OrbitPose, world_from_camera
+from worker.checkpoint import Scene
+from worker.clip import DepthClip
+from worker.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
+from worker.phantom import Phantom
+from worker.quality import View, sample_frames
+from worker.raster.cpu import camera_vector
+from worker.render import model_of
+from worker.targets import camera_in_units, solid_depth_mm
+
+Pose = NDArray[np.float64]
+
+ANGLES_DEG = (10.0, 15.0)
+DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+"""Yaw and pitch of the views, in turn from frame to frame."""
+JUDGED_FRAMES = 8
+"""Held-out frames looked at, evenly spread."""
+TRACK_STRIDE_PX = 4
+SEEN_CELL_TEXELS = 4
+"""A material point counts as seen if a training frame showed one within the same square of the tissue's texture, about
+three pixels wide."""
+
+
+class Shown(Protocol):
+    """What can be judged against the truth."""
+
+    def view(self, frame: int, pose: Pose) -> View:
+        """The tissue at a frame from world_from_camera [4, 4] in mm, with the clip's intrinsics."""
+        ...
+
+    def motion_mm(self, frame: int) -> NDArray[np.floating]:
+        """[H, W, 3] world: where what each pixel of frame 0 shows has gone at `frame`; NaN where nothing is shown."""
+        ...
+
+
+@dataclass(frozen=True)
+class TruthScores:
+    """NaN where there was nothing to judge; dB over pixels of all judged frames, mm medians (see above)."""
+
+    psnr_view10_db: float
+    psnr_view15_db: float
+    psnr_hidden_db: float
+    depth_error_mm: float
+    motion_error_mm: float
+    motion_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Expected:
+    """A picture and the pixels it is judged on."""
+
+    frame: int
+    pose: Pose
+    rgb: NDArray[np.float32]
+    judged: NDArray[np.bool_]
+
+
+class Truth:
+    """The truth of a phantom for one split of its frames, drawn once and compared with many scenes."""
+
+    def __init__(self, phantom: Phantom, clip: DepthClip, train: Sequence[int], held_out: Sequence[int]) -> None:
+        self._phantom, self._clip = phantom, clip
+        self._judged_frames = sample_frames(held_out, JUDGED_FRAMES)
+        self._seen = _seen_cells(phantom, clip, train)
+        pivot_mm = float(
+            np.median([np.median(clip.depth_mm[i][clip.tissue[i] & (clip.depth_mm[i] > 0)]) for i in train])
+        )
+        self._views = {angle: list(self._off_axis(angle, pivot_mm)) for angle in ANGLES_DEG}
+        self._hidden = [self._behind_instrument(frame) for frame in self._judged_frames]
+
+    def score(self, shown: Shown) -> TruthScores:
+        """How near the shown is to the truth."""
+        view10, view15 = (_mean_psnr(shown, self._views[angle]) for angle in ANGLES_DEG)
+        error_mm, moved_mm = self._motion(shown)
+        return TruthScores(view10, view15, _mean_psnr(shown, self._hidden), self._depth(shown), error_mm, moved_mm)
+
+    def _off_axis(self, angle_deg: float, pivot_mm: float) -> Iterable[_Expected]:
+        for place, frame in enumerate(self._judged_frames):
+            yaw, pitch = DIRECTIONS[place % len(DIRECTIONS)]
+            orbit = OrbitPose(yaw_deg=yaw * angle_deg, pitch_deg=pitch * angle_deg, zoom=1.0)
+            pose = np.array(world_from_camera(orbit, pivot_mm), np.float64)
+            rgb, _ = self._phantom.render(frame, pose)
+            yield _Expected(frame, pose, rgb, self._was_seen(frame, pose))
+
+    def _behind_instrument(self, frame: int) -> _Expected:
+        pose = self._phantom.world_from_camera(frame)
+        rgb, _ = self._phantom.render(frame, pose)
+        return _Expected(frame, pose, rgb, self._was_seen(frame, pose) & ~self._clip.tissue[frame])
+
+    def _was_seen(self, frame: int, pose: Pose) -> NDArray[np.bool_]:
+        """[H, W] whether the material point a pixel shows was tissue in some training frame."""
+        row, column, shows = _cells(self._phantom.atlas_xy(frame, pose))
+        return shows & self._seen[row, column]
+
+    def _depth(self, shown: Shown) -> float:
+        errors = []
+        for frame in self._judged_frames:
+            view = shown.view(frame, self._phantom.world_from_camera(frame))
+            errors.append(depth_errors_mm(view.depth_mm, self._clip.depth_mm[frame], self._clip.tissue[frame]))
+        return depth_agreement_mm(errors)
+
+    def _motion(self, shown: Shown) -> tuple[float, float]:
+        """Medians of the end-point error and of the true displacement, mm."""
+        tracks = self._phantom.trajectories(TRACK_STRIDE_PX)
+        row, column = tracks.pixels.T
+        tissue = self._clip.tissue[0][row, column]
+        row, column, points_mm = row[tissue], column[tissue], tracks.points_mm[:, tissue]
+        errors, moves = [np.empty(0)], [np.empty(0)]
+        for frame in self._judged_frames:
+            truth_mm = points_mm[frame] - points_mm[0]
+            distance = np.linalg.norm(shown.motion_mm(frame)[row, column] - truth_mm, axis=1)
+            shows = np.isfinite(distance)
+            errors.append(distance[shows])
+            moves.append(np.linalg.norm(truth_mm[shows], axis=1))
+        return _median(np.concatenate(errors)), _median(np.concatenate(moves))
+
+
+class ShownScene:
+    """A stored scene as it is rendered."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._model = scene, model_of(scene)
+
+    def view(self, frame: int, pose: Pose) -> View:
+        image = self._image(frame, pose)
+        depth_mm = solid_depth_mm(image[3], image[4], self._scene.units_per_mm)
+        return View(image[:3].transpose(1, 2, 0), depth_mm, image[4])
+
+    def motion_mm(self, frame: int) -> NDArray[np.floating]:
+        start, end = (self._model.deformed_mean(each / self._scene.frame_count) for each in (0, frame))
+        alpha = self._image(0, self._scene.world_from_camera[0])[4]
+        moved_mm = (end - start) / np.float32(self._scene.units_per_mm)
+        blended = np.stack([self._model.blend_values(np.ascontiguousarray(axis)).copy() for axis in moved_mm], -1)
+        solid = (alpha >= COVERED_ALPHA)[..., None]
+        return np.where(solid, blended / np.maximum(alpha, COVERED_ALPHA)[..., None], np.nan)
+
+    def _image(self, frame: int, pose: Pose) -> NDArray[np.float32]:
+        """R G B Z A [5, H, W], a copy."""
+        scene = self._scene
+        camera = camera_vector(camera_in_units(scene.intrinsics, pose, scene.units_per_mm))
+        return self._model.render(camera, frame / scene.frame_count).copy()
+
+
+def _seen_cells(phantom: Phantom, clip: DepthClip, train: Sequence[int]) -> NDArray[np.bool_]:
+    """Which squares of the tissue's texture some training frame shows as tissue."""
+    rows, columns = (size // SEEN_CELL_TEXELS + 1 for size in phantom.surface.atlas.shape)
+    seen = np.zeros((rows, columns), np.bool_)
+    for frame in train:
+        row, column, shows = _cells(phantom.atlas_xy(frame))
+        visible = shows & clip.tissue[frame]
+        seen[row[visible], column[visible]] = True
+    return seen
+
+
+def _cells(atlas_xy: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
+    """Row and column of each pixel's square of the texture [H, W], and whether the pixel shows any."""
+    shows = atlas_xy[..., 0] >= 0
+    cell = np.where(shows[..., None], np.rint(atlas_xy) // SEEN_CELL_TEXELS, 0).astype(np.intp)
+    return cell[..., 1], cell[..., 0], shows
+
+
+def _mean_psnr(shown: Shown, expected: Sequence[_Expected]) -> float:
+    """Mean over frames of the PSNR on judged pixels, dB; NaN if no frame has any."""
+    scores = [psnr_tissue(shown.view(each.frame, each.pose).rgb, each.rgb, each.judged) for each in expected]
+    known = [score for score in scores if not math.isnan(score)]
+    return float(np.mean(known)) if known else math.nan
+
+
+def _median(values: NDArray[np.floating]) -> float:
+    return float(np.median(values)) if values.size else math.nan
