@@ -1,0 +1,289 @@
+"""Where a method breaks, and whether it says so: one cell is one clip spoilt in one way, trained and judged by truth.
+
+Symbols: T frames of the clean clip, S frames of the given one, H W pixels.
+
+A cell is harmed when it scores more than LARGEST_LOSS_DB below the clean cell of the same series and seed, or its
+depth errs by LARGEST_DEPTH_LOSS_MM more. A harmed cell is `told` if its report has a kind of warning that the clean
+cell's has not, else `silent`: that is the defect. `refused` and `diverged` end in an error that says why, `crashed`
+in one that nobody foresaw.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.errors import Cancelled, InputError, TrainingDiverged
+from contract.report import Report
+from worker.clip import DepthClip, FrameSplit, split_frames
+from worker.evaluate.cells import preset_of
+from worker.evaluate.conditions import (
+    CLEAN,
+    CLEAN_STEREO,
+    CONDITIONS,
+    CleanClip,
+    Given,
+    Recording,
+    clean_clip,
+    clean_given,
+    write_recording,
+)
+from worker.evaluate.rows import Row, commit, machine, read_rows, write_rows
+from worker.hooks import Hooks
+from worker.metrics import psnr_tissue
+from worker.phantom import PhantomSettings
+from worker.pipeline import ReconstructionRequest, depth_clip_of, prepare, report_of, scene_of, view_function
+from worker.quality import View
+from worker.targets import solid_depth_mm
+from worker.train import Run, Stopwatch, train
+
+STABILITY = "stability.csv"
+KEY = ("condition", "severity", "series", "seed", "iterations", "width", "height", "frames")
+VERDICT = ("outcome", "loss_db", "depth_loss_mm")
+FIELDS = (
+    *KEY, "level", *VERDICT, "psnr_db", "depth_error_mm", "reported_db", "seconds", "new_warnings", "warnings",
+    "error", "machine", "commit",
+)  # fmt: skip
+"""psnr_db and depth_error_mm (mean) are against the truth, reported_db is what the report says of itself."""
+LARGEST_LOSS_DB = 3.0
+"""Twice the squared error: nobody would call that the same quality."""
+LARGEST_DEPTH_LOSS_MM = 2.0
+"""About the width of a grasper's jaw."""
+NO_EXPLANATION = "copying the neighbouring frames scores more"
+"""A warning with these words speaks of an alternative, not of what is wrong: it tells nothing that counts here."""
+SEPARATOR = " | "
+_NUMBER = re.compile(r"[-+]?\d+(\.\d+)?")
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What the cells of a run share: the clean clip's size and how long they train."""
+
+    width: int = 160
+    height: int = 128
+    frames: int = 32
+    iterations: int = 150
+
+    def settings(self, seed: int) -> PhantomSettings:
+        """The clean clip of a seed: each seed has tissue of its own."""
+        return PhantomSettings(width=self.width, height=self.height, frames=self.frames, seed=seed)
+
+
+@dataclass(frozen=True)
+class StabilityCell:
+    """One clip, one method."""
+
+    condition: str
+    severity: int
+    series: str
+    seed: int
+
+    def key(self, grid: Grid) -> tuple[str, ...]:
+        """What its row is found by; the values of KEY."""
+        return tuple(str(value) for value in (*dataclasses.astuple(self), *_shared(grid)))
+
+    @property
+    def clean(self) -> StabilityCell:
+        """The cell that it is compared with."""
+        return StabilityCell(_clean_name(self.condition), 0, self.series, self.seed)
+
+
+def plan(
+    conditions: Sequence[str], severities: Sequence[int], series: Sequence[str], seeds: Sequence[int]
+) -> list[StabilityCell]:
+    """Every combination, the clean cells they are compared with first. InputError for a name that is not known."""
+    unknown = [name for name in conditions if name not in CONDITIONS]
+    if unknown:
+        raise InputError("--conditions", f"there is no {unknown[0]!r}.", f"Use some of: {', '.join(CONDITIONS)}.")
+    for name in series:
+        preset_of(name)
+    cells: dict[StabilityCell, None] = {}
+    for seed in seeds:
+        for method in series:
+            spoilt = [StabilityCell(name, severity, method, seed) for name in conditions for severity in severities]
+            cells |= dict.fromkeys([each.clean for each in spoilt]) | dict.fromkeys(spoilt)
+    return list(cells)
+
+
+@dataclass
+class Atlas:
+    """The rows of a folder, each kept as soon as its cell is measured."""
+
+    folder: Path
+    grid: Grid
+    rows: list[Row] = field(default_factory=list)
+    _clean: dict[int, CleanClip] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.rows = read_rows(self.folder / STABILITY)
+
+    def missing(self, cells: Sequence[StabilityCell]) -> list[StabilityCell]:
+        """The cells without a row."""
+        there = {tuple(row[name] for name in KEY) for row in self.rows}
+        return [cell for cell in cells if cell.key(self.grid) not in there]
+
+    def measure(self, cell: StabilityCell, hooks: Hooks) -> Row:
+        """Train and judge a cell, and keep its row.
+
+        Raises:
+            Cancelled: hooks.should_stop said so.
+        """
+        if cell.seed not in self._clean:
+            self._clean.clear()  # one at a time: cells come seed by seed
+            self._clean[cell.seed] = clean_clip(self.grid.settings(cell.seed))
+        row = measured(cell, self._clean[cell.seed], self.grid, hooks)
+        key = cell.clean.key(self.grid)
+        clean = next((each for each in self.rows if tuple(each[name] for name in KEY) == key), None)
+        row |= verdict(row, row if cell == cell.clean else clean)
+        self.rows.append(row)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_rows(self.folder / STABILITY, FIELDS, self.rows)
+        return row
+
+
+def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: Hooks) -> Row:
+    """The row of a cell, without its verdict; a failure's row says why in `error`."""
+    condition = CONDITIONS.get(cell.condition)
+    row = dict(zip(KEY, cell.key(grid), strict=True)) | {name: "" for name in FIELDS if name not in KEY}
+    row |= {"machine": machine(), "commit": commit()}
+    row["level"] = "" if condition is None else f"{condition.levels[cell.severity - 1]:g}"
+    start = time.perf_counter()
+    try:
+        given = (
+            clean_given(clean, stereo=cell.condition == CLEAN_STEREO)
+            if condition is None
+            else condition.apply(clean, cell.severity, cell.seed)
+        )
+        start = time.perf_counter()  # drawing the clip is not the method's work
+        row |= _reconstructed(given, cell, grid, hooks)
+    except Cancelled:
+        raise
+    except Exception as error:  # whatever a method breaks on is a result of its own
+        row["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    return row | {"seconds": f"{time.perf_counter() - start:.2f}"}
+
+
+def verdict(row: Row, clean: Row | None) -> dict[str, str]:
+    """outcome, loss_db and depth_loss_mm of a row beside its clean cell's; unknown where that has failed."""
+    if row["error"]:
+        kinds = {InputError.__name__: "refused", "LimitError": "refused", TrainingDiverged.__name__: "diverged"}
+        return {"outcome": kinds.get(row["error"].partition(":")[0], "crashed"), "loss_db": "", "depth_loss_mm": ""}
+    if clean is None or clean["error"] or not (row["psnr_db"] and clean["psnr_db"]):
+        return {"outcome": "unknown", "loss_db": "", "depth_loss_mm": ""}
+    loss_db = float(clean["psnr_db"]) - float(row["psnr_db"])
+    depth_loss_mm = math.inf  # no depth where there was some
+    if row["depth_error_mm"] and clean["depth_error_mm"]:
+        depth_loss_mm = float(row["depth_error_mm"]) - float(clean["depth_error_mm"])
+    new = new_warnings(row["warnings"].split(SEPARATOR), clean["warnings"].split(SEPARATOR))
+    harmed = loss_db > LARGEST_LOSS_DB or depth_loss_mm > LARGEST_DEPTH_LOSS_MM
+    outcome = "held" if not harmed else "told" if new else "silent"
+    return {
+        "outcome": outcome,
+        "loss_db": f"{loss_db:.2f}",
+        "depth_loss_mm": f"{depth_loss_mm:.2f}",
+        "new_warnings": SEPARATOR.join(new),
+    }
+
+
+def new_warnings(warnings: Sequence[str], clean: Sequence[str]) -> list[str]:
+    """The warnings of a kind that the clean cell has not; two that differ in their numbers alone are of one kind."""
+    known = {_NUMBER.sub("#", each) for each in clean}
+    telling = [each for each in warnings if each and NO_EXPLANATION not in each]
+    return [each for each in telling if _NUMBER.sub("#", each) not in known]
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A time that is judged: model time t, the given frame whose pose is taken, the clean frame that is the truth."""
+
+    t: float
+    frame: int
+    truth: int
+
+
+def moments_of(given: Given, split: FrameSplit, frame_count: int) -> list[Moment]:
+    """The held-out frames; where none are held out, half-way between given frames; of a single frame, itself."""
+    if split.held_out:
+        return [Moment(frame / frame_count, frame, given.source[frame]) for frame in split.held_out]
+    found = []
+    for frame, (here, after) in enumerate(zip(given.source, given.source[1:], strict=False)):
+        between = (here + after) // 2
+        found.append(Moment((frame + (between - here) / max(after - here, 1)) / frame_count, frame, between))
+    return found or [Moment(0.0, 0, given.source[0])]
+
+
+def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Hooks) -> Row:
+    """Reconstruct as `reconstruct` does, and judge by the truth as well as by the report."""
+    with tempfile.TemporaryDirectory() as folder:
+        request = ReconstructionRequest(Path(folder), iterations=grid.iterations, seed=cell.seed)
+        clip = _decoded(given, request, Path(folder), hooks)
+    split = split_frames(clip)
+    preset = preset_of(cell.series)
+    clock = Stopwatch()
+    run, scale = prepare(clip, split, preset, request, clock, hooks)
+    train(run, clock, lambda: math.nan, hooks)
+    scene = scene_of(run, clip, split, scale, cell.seed)
+    report = report_of(run, clip, split, scene, request, {}, view_function(run, scale), time.time())
+    psnr_db, depth_error_mm = _judged(given, run, scale, moments_of(given, split, clip.frame_count))
+    return {
+        "psnr_db": _text(psnr_db),
+        "depth_error_mm": _text(depth_error_mm),
+        "reported_db": _text(report.psnr_tissue_db),
+        "warnings": SEPARATOR.join(_one_line(report)),
+    }
+
+
+def _decoded(given: Given, request: ReconstructionRequest, folder: Path, hooks: Hooks) -> DepthClip:
+    if not isinstance(given.clip, Recording):
+        return given.clip
+    files = write_recording(given.clip, folder)
+    asked = dataclasses.replace(request, clip=files.clip, calibration=files.calibration)
+    return depth_clip_of(asked, hooks, {})
+
+
+def _judged(given: Given, run: Run, scale: float, moments: Sequence[Moment]) -> tuple[float, float]:
+    """Mean psnr in dB and mean |z - truth| in mm over the moments' scored pixels; NaN where there is none."""
+    scores, errors_mm = [], []
+    for moment in moments:
+        view = _view(run, scale, moment)
+        truth, scored = given.depth_mm[moment.truth], given.scored[moment.truth]
+        scores.append(psnr_tissue(view.rgb, given.rgb[moment.truth], scored))
+        both = scored & (truth > 0) & (view.depth_mm > 0)
+        errors_mm.append(np.abs(view.depth_mm[both] - truth[both]))
+    return _mean(scores), _mean(np.concatenate(errors_mm))
+
+
+def _view(run: Run, scale: float, moment: Moment) -> View:
+    image = run.model.render(run.frames.cameras[moment.frame], moment.t).copy()
+    return View(image[:3].transpose(1, 2, 0), solid_depth_mm(image[3], image[4], scale), image[4])
+
+
+def _clean_name(condition: str) -> str:
+    return condition if condition in (CLEAN, CLEAN_STEREO) else CONDITIONS[condition].clean_name
+
+
+def _shared(grid: Grid) -> tuple[int, ...]:
+    return grid.iterations, grid.width, grid.height, grid.frames
+
+
+def _one_line(report: Report) -> Iterator[str]:
+    return (" ".join(each.replace(SEPARATOR, " ").split()) for each in report.warnings)
+
+
+def _mean(values: Sequence[float] | NDArray[np.floating]) -> float:
+    known = [float(each) for each in values if not math.isnan(each)]
+    return float(np.mean(known)) if known else math.nan
+
+
+def _text(value: float | None) -> str:
+    """Empty for what is not known."""
+    return "" if value is None or math.isnan(value) else f"{value:.3f}"
