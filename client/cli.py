@@ -1,7 +1,8 @@
 """The `intrasplat` command.
 
-reconstruct, render, phantom, evaluate and doctor work on this machine, in a process of the worker's (`python -m worker ...`);
-up starts a service and keys opens it to others; submit, watch, fetch, jobs, cancel, retry and delete talk to one.
+reconstruct, render, phantom, evaluate, stability and doctor work on this machine, in a process of the worker's
+(`python -m worker ...`); up starts a service and keys opens it to others; submit, watch, fetch, jobs, cancel, retry and
+delete talk to one.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ LOCAL_COMMANDS = {
     "render": "render images of a scene that is on this machine",
     "phantom": "make a synthetic stereo clip of tissue",
     "evaluate": "measure presets on clips, and draw speed against accuracy",
+    "stability": "spoil synthetic clips, and draw where presets break and whether they say so",
     "doctor": "say what is installed, what would be used, what is missing",
 }
 

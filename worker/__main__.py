@@ -1,7 +1,8 @@
 """`python -m worker COMMAND`: everything that happens on this machine, without a service, and the service's worker.
 
-`intrasplat reconstruct|render|phantom|evaluate|doctor` end here with the same arguments. Modules that bring torch along are
-imported by the command that needs them, so that --help and doctor answer at once, and doctor even without torch.
+`intrasplat reconstruct|render|phantom|evaluate|stability|doctor` end here with the same arguments. Modules that bring
+torch along are imported by the command that needs them, so that --help and doctor answer at once, and doctor even
+without torch.
 """
 
 from __future__ import annotations
@@ -63,6 +64,7 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     _add_render(commands)
     _add_phantom(commands, wanted="phantom" in argv[:1])
     _add_evaluate(commands, wanted="evaluate" in argv[:1])
+    _add_stability(commands, wanted="stability" in argv[:1])
     add_command(commands, "consume", "claim jobs from the queue and serve renders, until a signal ends it", _consume)
     add_command(commands, "device", "what consume starts for itself: train and render as it is told on stdin", _device)
     add_command(commands, "doctor", "say what is installed, what would be used, what is missing", _doctor)
@@ -145,6 +147,15 @@ def _add_evaluate(commands: Commands, wanted: bool) -> None:
     parser = add_command(commands, "evaluate", "measure presets on clips, and draw speed against accuracy", _evaluate)
     if wanted:
         from worker.evaluate.command import add_cli_arguments
+
+        add_cli_arguments(parser)
+
+
+def _add_stability(commands: Commands, wanted: bool) -> None:
+    summary = "spoil synthetic clips in many ways, and draw where presets break and whether they say so"
+    parser = add_command(commands, "stability", summary, _stability)
+    if wanted:
+        from worker.evaluate.stability_command import add_cli_arguments
 
         add_cli_arguments(parser)
 
@@ -263,6 +274,12 @@ def _phantom(options: argparse.Namespace) -> int:
 
 def _evaluate(options: argparse.Namespace) -> int:
     from worker.evaluate.command import run_cli
+
+    return run_cli(options)
+
+
+def _stability(options: argparse.Namespace) -> int:
+    from worker.evaluate.stability_command import run_cli
 
     return run_cli(options)
 

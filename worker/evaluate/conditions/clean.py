@@ -69,9 +69,9 @@ def clean_of(phantom: Phantom) -> CleanClip:
 
 
 def given(clean: CleanClip, clip: DepthClip | Recording | None = None, **truth: NDArray[np.generic]) -> Given:
-    """The clean clip, or `clip` in its place; judged on the clean clip's tissue, frame by frame.
+    """The clean clip, or `clip` in its place; judged on the whole picture, also behind the instrument.
 
     truth: rgb, depth_mm or scored, where they differ from the clean clip's.
     """
-    parts = {"rgb": clean.rgb, "depth_mm": clean.depth_mm, "scored": clean.clip.tissue, **truth}
+    parts = {"rgb": clean.rgb, "depth_mm": clean.depth_mm, "scored": clean.depth_mm > 0, **truth}
     return Given(clip or clean.clip, source=tuple(range(clean.clip.frame_count)), **parts)  # type: ignore[arg-type]

@@ -24,19 +24,19 @@ WAG_DEG, WAG_PERIODS = 12.0, 1.5  # a large instrument turns to and fro about wh
 
 
 def tools_over_frame(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """A second instrument over `level` of the picture, wagging; masked rightly. Judged on the tissue it leaves."""
+    """A second instrument over `level` of the picture, wagging; masked rightly. Judged where it is not."""
     clip = clean.clip
     frames, height, width = clip.tissue.shape
     start = random.uniform(0, 2 * np.pi)
     covered = np.stack([_beyond(start + _wag(index, frames), level, height, width) for index in range(frames)])
     spoilt = _with_steel(clean, covered, random)
-    return given(clean, spoilt, scored=clip.tissue & ~covered)
+    return given(clean, spoilt, scored=(clean.depth_mm > 0) & ~covered)
 
 
 def hidden_at_start(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
     """A masked instrument hides a disc of `level` of the picture in frame 0 and shrinks to nothing by half-time.
 
-    Judged on all tissue, also where it is still hidden: every place of it is seen in the end.
+    Judged also where it still hides the tissue: every place of it is seen in the end.
     """
     frames, height, width = clean.clip.tissue.shape
     column, row = random.uniform(0.4, 0.6) * width, random.uniform(0.4, 0.6) * height
@@ -77,7 +77,7 @@ def inverted_masks(clean: CleanClip, level: float, random: np.random.Generator) 
         left, right = (np.where(steel, np.array(STEEL, np.uint8), eye) for eye in (frame.left, frame.right))
         return dataclasses.replace(frame, left=left, right=right, tissue=~(frame.tissue & ~covered[index]))
 
-    return given(clean, recording_of(clean.phantom, spoil), scored=clean.clip.tissue & ~covered)
+    return given(clean, recording_of(clean.phantom, spoil), scored=(clean.depth_mm > 0) & ~covered)
 
 
 def _wag(index: int, frames: int) -> float:

@@ -110,7 +110,7 @@ def black_border(clean: CleanClip, level: float, random: np.random.Generator) ->
         depth_confidence=np.where(border, np.uint8(0), clean.clip.depth_confidence),
         tissue=clean.clip.tissue | border,
     )
-    return given(clean, spoilt, scored=clean.clip.tissue & ~border)
+    return given(clean, spoilt, scored=(clean.depth_mm > 0) & ~border)
 
 
 def grey_scale(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
@@ -125,10 +125,12 @@ def grey_scale(clean: CleanClip, level: float, random: np.random.Generator) -> G
 
 def _line(length_px: float, angle: float) -> NDArray[np.float32]:
     """A kernel of a straight smear; sums to 1."""
-    half = max(1, int(np.ceil(length_px / 2)))
-    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-    for along in np.linspace(-length_px / 2, length_px / 2, 8 * half + 1):
-        kernel[round(half + along * np.sin(angle)), round(half + along * np.cos(angle))] += 1
+    half = int(np.ceil(length_px / 2)) + 1
+    offset = np.arange(-half, half + 1)
+    kernel = np.zeros((offset.size, offset.size))
+    for along in np.linspace(-length_px / 2, length_px / 2, 8 * half + 1):  # each point shared by its four neighbours
+        row, column = (np.maximum(0, 1 - np.abs(offset - along * way)) for way in (np.sin(angle), np.cos(angle)))
+        kernel += np.outer(row, column)
     return np.asarray(kernel / kernel.sum(), dtype=np.float32)
 
 

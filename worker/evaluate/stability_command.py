@@ -1,0 +1,98 @@
+"""`intrasplat stability`: spoils synthetic clips, measures the cells that have no row yet, and draws the atlas."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from contract.arguments import count
+from contract.errors import InputError
+from contract.exits import ExitCode
+from contract.job import JobProgress
+from contract.processes import told_to_end
+from contract.progress_bar import ProgressBar
+from worker.evaluate.atlas import count_outcomes, draw_map, places_of, series_in, told_table
+from worker.evaluate.conditions import CONDITIONS, SEVERITIES
+from worker.evaluate.rows import Row
+from worker.evaluate.stability import Atlas, Grid, StabilityCell, plan
+from worker.hooks import Hooks
+
+DEFAULT_SERIES = ("fast", "paper", "pfs", "hexplane", "without_mapf")
+TABLE = "stability.md"
+
+
+def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of `stability`; run_cli reads them."""
+    grid = Grid()
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="rows, table and maps; goes on there")
+    parser.add_argument(
+        "--conditions", nargs="+", default=list(CONDITIONS), metavar="NAME", help=f"of {', '.join(CONDITIONS)} (all)"
+    )
+    parser.add_argument("--series", nargs="+", default=list(DEFAULT_SERIES), help="presets (default: %(default)s)")
+    parser.add_argument(
+        "--severities", nargs="+", type=int, choices=SEVERITIES, default=list(SEVERITIES), help="(default: all)"
+    )
+    parser.add_argument("--seeds", type=count, default=1, metavar="N", help="seeds 0 to N - 1 (default: 1)")
+    parser.add_argument("--iterations", type=count, default=grid.iterations, metavar="N", help="(default: %(default)s)")
+    parser.add_argument("--frames", type=count, default=grid.frames, metavar="N", help="(default: %(default)s)")
+    size = f"{grid.width}x{grid.height}"
+    parser.add_argument("--size", type=_size, default=size, metavar="WxH", help="pixels (default: %(default)s)")
+    parser.add_argument("--redraw", action="store_true", help="measure nothing; draw the rows in DIR")
+
+
+def run_cli(options: argparse.Namespace) -> int:
+    """Measures what is asked for and has no row; returns the exit code.
+
+    Raises:
+        InputError: a condition or series is not known, or there is nothing to draw.
+        Cancelled: a signal came; what was measured until then is kept.
+    """
+    width, height = options.size
+    atlas = Atlas(options.out, Grid(width, height, options.frames, options.iterations))
+    if not options.redraw:
+        cells = plan(options.conditions, options.severities, options.series, range(options.seeds))
+        waiting = atlas.missing(cells)
+        print(f"{len(cells)} cells, {len(cells) - len(waiting)} of them have their rows already")
+        measure_all(atlas, waiting)
+    if not atlas.rows:
+        raise InputError("--out", f"{options.out} holds no rows.", "Leave --redraw out.")
+    draw_all(atlas.rows, options.out)
+    return ExitCode.OK
+
+
+def measure_all(atlas: Atlas, cells: Sequence[StabilityCell]) -> None:
+    """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM."""
+    end = told_to_end()
+    for place, cell in enumerate(cells):
+        with ProgressBar(sys.stderr) as bar:
+            bar.show(JobProgress(stage=f"{place + 1}/{len(cells)}", fraction=place / len(cells)))
+            row = atlas.measure(cell, Hooks(should_stop=end.is_set))
+        print(_line(row), flush=True)
+
+
+def draw_all(rows: Sequence[Row], folder: Path) -> None:
+    """The maps and the table of all methods that have rows."""
+    tables = []
+    for series in series_in(rows):
+        places = places_of(rows, series)
+        name = draw_map(places, series, folder)
+        tables.append(told_table(places, series))
+        counted = ", ".join(f"{number} {outcome}" for outcome, number in count_outcomes(places).items())
+        print(f"{series}: {counted or 'clean clips only'}; {folder / name}.png")
+    (folder / TABLE).write_text("\n".join(tables), encoding="utf-8")
+
+
+def _line(row: Row) -> str:
+    name = f"{row['condition']} {row['severity']} ({row['level'] or 'clean'}), {row['series']}, seed {row['seed']}"
+    if row["error"]:
+        return f"{name}: {row['outcome']}: {row['error']}"
+    return f"{name}: {row['outcome']}, {row['psnr_db']} dB, {row['loss_db'] or '?'} lost, {row['seconds']} s"
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, cross, height = text.partition("x")
+    if not (cross and width.isdigit() and height.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text!r} is no size such as 160x128")
+    return int(width), int(height)
