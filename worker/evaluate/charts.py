@@ -1,15 +1,17 @@
 """The charts, drawn from rows alone: a row of panels a clip, a column a way of holding out.
 
 curves  held-out psnr_tissue against seconds of training
-pareto  its end against the seconds it took, a mark's area the scene's bytes; the front joins what nothing beats in both
+pareto  its end against the seconds it took; the front joins what nothing is both sooner and better than
 frames  its end against images rendered a second
 knee    of the grid of capacities: its end against the scene's bytes, and where the automatic choice lies
 
-What was not measured is named in its panel. Copying the neighbouring frames is dashed everywhere.
+The area of the disc behind a mark is the scene's size on disk; a small scene's is hidden by its mark. What was not
+measured is named over its panel. Copying the neighbouring frames is dashed everywhere.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,27 +19,22 @@ from typing import Any
 
 from worker.evaluate.cells import DEFAULT_SERIES, base_of, preset_of
 from worker.evaluate.published import LABEL, RESULTS, Published
-from worker.evaluate.rows import Results, Row
-from worker.evaluate.style import (
-    BASES_LOOKS,
-    FAINT,
-    GREY,
-    SETTINGS,
-    Look,
-    add_legend,
-    figure_of,
-    look_of,
-    save,
-)
-from worker.evaluate.summary import Group, capacities, groups_of
+from worker.evaluate.rows import Results, Row, key_of
+from worker.evaluate.style import BASES_LOOKS, FAINT, GREY, SETTINGS, Look, figure_of, look_of, save
+from worker.evaluate.summary import Group, Place, capacities, groups_of
 
-AREA_A_MEGABYTE = 6.0
-"""Points squared; a scene of 33 MB is a mark of 16 points across, one of 2 MB of 4."""
-LEAST_AREA = 9.0
-REAL_CLIP = "d4d-a"
+AREA_A_MEGABYTE, MARK_AREA = 5.0, 30.0
+"""Points squared: a scene of 33 MB has a disc of 14 points across; one of less than 6 MB is behind its mark."""
+LEGEND_MEGABYTES = (10, 50)
+SHOWN_BELOW_WORST_DB = 6.0
+"""Curves begin far below where they end; what lies this far under the worst end is cut off."""
+MOST_FINE_TICKS = 500
+"""An axis that spans more than this factor has ticks at powers of ten alone: others would run into each other."""
+REAL_CLIP, PAPERS_HOLDOUT = "d4d-a", "every8"
 """Published figures stand beside the real clip alone, held out as the papers do."""
-PAPERS_HOLDOUT = "every8"
 DECIBEL = "held-out psnr_tissue, dB"
+
+Points = list[tuple[float, float]]
 
 
 def draw_all(results: Results, folder: Path) -> list[str]:
@@ -45,102 +42,101 @@ def draw_all(results: Results, folder: Path) -> list[str]:
     import matplotlib as mpl
 
     groups = groups_of(results.runs)
-    presets = [group for group in groups if group.series == base_of(group.series)]
+    choices = [each.chosen for each in capacities(groups)]
+    presets = [group for group in groups if group.series == base_of(group.series) and group not in choices]
     drawn = []
     with mpl.rc_context(SETTINGS):
         if any(group.rows for group in presets):
-            _draw(presets, lambda axis, here: _curves(axis, here, results.curves), folder, "curves")
+            points = _points_by_run(results.curves)
+            _draw(presets, lambda axis, here: _curves(axis, here, points), folder, "curves")
             _draw(presets, _pareto, folder, "pareto")
             _draw([group for group in presets if group.clip == presets[0].clip], _pareto, folder, "pareto-first-clip")
             _draw(presets, _frames, folder, "frames")
             drawn += ["curves", "pareto", "pareto-first-clip", "frames"]
-        if capacities(groups):
-            _draw_knee(groups, folder)
+        if choices:
+            _draw_knee(groups, choices, folder)
             drawn.append("knee")
     return drawn
 
 
 def _draw(groups: Sequence[Group], draw_panel: Callable[[Any, Sequence[Group]], None], folder: Path, name: str) -> None:
     """One panel a place, the legend of all series below."""
-    clips, holdouts = _grid(groups)
-    figure, axes = figure_of(len(clips), len(holdouts))
-    for clip, axis_row in zip(clips, axes, strict=True):
-        for holdout, axis in zip(holdouts, axis_row, strict=True):
-            here = [group for group in groups if group.place == (clip, holdout)]
-            axis.set_title(_title(clip, holdout, here))
-            axis.set_ylabel(DECIBEL)
-            draw_panel(axis, here)
-            _copies(axis, here)
-            _name_missing(axis, here)
-    series = list(dict.fromkeys(group.series for group in groups if group.rows))
-    with_published = name != "curves" and (REAL_CLIP, PAPERS_HOLDOUT) in {group.place for group in groups}
-    add_legend(figure, _handles(series, name != "curves", with_published))
+    places = _places(groups)
+    figure, axes = figure_of(len(places), _columns(places), _handles(groups, name))
+    for place, axis in zip(places, axes, strict=True):
+        here = [group for group in groups if group.place == place]
+        _name(axis, place, here, _missing(here))
+        draw_panel(axis, here)
+        _copies(axis, here)
+        _finish(axis)
+        if name == "curves":
+            _cut_below(axis, here)
     save(figure, folder, name)
 
 
-def _curves(axis: Any, groups: Sequence[Group], curves: Sequence[Row]) -> None:
+def _points_by_run(curves: Sequence[Row]) -> dict[tuple[str, ...], Points]:
+    """Seconds and decibels of every run's curve, by the run's key."""
+    points: dict[tuple[str, ...], Points] = {}
+    for row in curves:
+        points.setdefault(key_of(row), []).append((float(row["t_train_s"]), float(row["psnr_tissue_db"])))
+    return {key: sorted(each) for key, each in points.items()}
+
+
+def _curves(axis: Any, groups: Sequence[Group], points: dict[tuple[str, ...], Points]) -> None:
     """Every run of a group, the one that ends in the middle drawn strongly."""
-    axis.set_xscale("log")
     axis.set_xlabel("seconds of training (log)")
     for group in groups:
-        runs = {row["seed"]: float(row["psnr_tissue_db"] or "nan") for row in group.rows}
-        ranked = sorted(runs, key=lambda seed: runs[seed])
         look = look_of(group.series)
-        for seed in ranked:
-            points = [
-                (float(row["t_train_s"]), float(row["psnr_tissue_db"]))
-                for row in curves
-                if (row["clip"], row["holdout"], row["series"], row["limit"], row["seed"])
-                == (*group.place, group.series, group.limit, seed)
-            ]
-            if not points:
-                continue
-            is_middle = seed == ranked[len(ranked) // 2]
-            seconds, decibels = zip(*sorted(points), strict=True)
+        runs = sorted((points[key_of(row)] for row in group.rows if key_of(row) in points), key=lambda run: run[-1][1])
+        for place, run in enumerate(runs):
+            is_middle = place == len(runs) // 2
             style = {"marker": look.marker, "markersize": 4.5, "linewidth": 1.6} if is_middle else {"alpha": 0.35}
-            axis.plot(seconds, decibels, color=look.colour, zorder=3 if is_middle else 2, **style)
-    _plain_ticks(axis.xaxis)
+            axis.plot(*zip(*run, strict=True), color=look.colour, zorder=3 if is_middle else 2, **style)
+            if is_middle:
+                _name_limit(axis, group, groups, run[-1], (3, 4))
 
 
 def _pareto(axis: Any, groups: Sequence[Group]) -> None:
-    axis.set_xscale("log")
     axis.set_xlabel("seconds of training (log)")
     _marks(axis, groups, "t_train_s")
     _front(axis, groups)
     if groups and groups[0].place == (REAL_CLIP, PAPERS_HOLDOUT):
         _published(axis, lambda each: each.train_s)
-    _plain_ticks(axis.xaxis)
 
 
 def _frames(axis: Any, groups: Sequence[Group]) -> None:
-    axis.set_xscale("log")
     axis.set_xlabel("images rendered a second, at the clip's size (log)")
     _marks(axis, groups, "render_fps")
     if groups and groups[0].place == (REAL_CLIP, PAPERS_HOLDOUT):
         _published(axis, lambda each: each.fps)
-    _plain_ticks(axis.xaxis)
 
 
 def _marks(axis: Any, groups: Sequence[Group], across: str) -> None:
-    """A mark a group at its medians, its area the scene's bytes; the limit beside it if the series has several."""
+    """A mark a group at its medians, and behind it a disc whose area is the scene's size."""
     for group in groups:
         x, y = group.median(across), group.median("psnr_tissue_db")
         if math.isnan(x) or math.isnan(y):
             continue
         look = look_of(group.series)
-        area = max(LEAST_AREA, AREA_A_MEGABYTE * group.median("scene_bytes") / 1e6)
-        axis.scatter(
-            x, y, s=area, c=look.colour, marker=look.marker, alpha=0.85, edgecolors="white", linewidths=0.6, zorder=3
-        )
-        if len({each.limit for each in groups if each.series == group.series}) > 1:
-            offset = 3 + math.sqrt(area) / 2
-            axis.annotate(group.limit, (x, y), (offset, -3), textcoords="offset points", fontsize=7, color=GREY)
+        area = AREA_A_MEGABYTE * group.median("scene_bytes") / 1e6
+        axis.scatter(x, y, s=area, c=look.colour, alpha=0.25, linewidths=0, zorder=2)
+        axis.scatter(x, y, s=MARK_AREA, c=look.colour, marker=look.marker, edgecolors="white", linewidths=0.5, zorder=4)
+        _name_limit(axis, group, groups, (x, y), (2 + math.sqrt(max(area, MARK_AREA)) / 2, -3))
+
+
+def _name_limit(
+    axis: Any, group: Group, groups: Sequence[Group], place: tuple[float, float], offset: tuple[float, float]
+) -> None:
+    """The limit beside a mark, if its series was run with several."""
+    if len({each.limit for each in groups if each.series == group.series}) > 1:
+        colour = look_of(group.series).colour
+        axis.annotate(group.limit, place, offset, textcoords="offset points", fontsize=7, color=colour, zorder=5)
 
 
 def _front(axis: Any, groups: Sequence[Group]) -> None:
     """Joins the groups that no other beats in both seconds and decibels."""
     points = sorted((group.median("t_train_s"), group.median("psnr_tissue_db")) for group in groups if group.rows)
-    front: list[tuple[float, float]] = []
+    front: Points = []
     for x, y in points:
         if not math.isnan(y) and (not front or y > front[-1][1]):
             front.append((x, y))
@@ -149,123 +145,135 @@ def _front(axis: Any, groups: Sequence[Group]) -> None:
 
 
 def _published(axis: Any, across: Callable[[Published], float | None]) -> None:
-    for each in RESULTS:
-        x = across(each)
-        if each.data != "EndoNeRF" or x is None:
+    """Hollow marks, joined to nothing; their names stand above and below in turn."""
+    for place, each in enumerate(each for each in RESULTS if each.data == "EndoNeRF"):
+        x, y = across(each), each.psnr_paper_db
+        if x is None:
             continue
-        axis.scatter(x, each.psnr_paper_db, s=45, facecolors="none", edgecolors=GREY, linewidths=1.0, zorder=2)
-        axis.annotate(
-            each.method, (x, each.psnr_paper_db), (0, -11), textcoords="offset points", ha="center", fontsize=7,
-            color=GREY,
-        )  # fmt: skip
+        axis.scatter(x, y, s=45, facecolors="none", edgecolors=GREY, linewidths=1.0, zorder=2)
+        text: dict[str, Any] = {"ha": "center", "fontsize": 7, "color": GREY, "zorder": 5}
+        axis.annotate(each.method, (x, y), (0, (6, -12)[place % 2]), textcoords="offset points", **text)
 
 
 def _copies(axis: Any, groups: Sequence[Group]) -> None:
     """Dashed: what copying the neighbouring frames scores, blended and by optical flow."""
-    for name, what, dashes in (("copy_blend_db", "blend", (5, 3)), ("copy_flow_db", "flow", (2, 2))):
+    both = (("copy_blend_db", "blend", (5, 3), 1, "right"), ("copy_flow_db", "flow", (2, 2), 0, "left"))
+    for name, what, dashes, side, aligned in both:
         known = [group.median(name) for group in groups if not math.isnan(group.median(name))]
-        if not known:
-            continue
-        axis.axhline(known[0], color=GREY, linewidth=1.0, dashes=dashes, zorder=1)
-        axis.annotate(
-            f"copying: {what}", (0, known[0]), (4, 2), xycoords=("axes fraction", "data"),
-            textcoords="offset points", fontsize=7, color=GREY,
-        )  # fmt: skip
+        if known:
+            axis.axhline(known[0], color=GREY, linewidth=1.0, dashes=dashes, zorder=1)
+            text: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "fontsize": 7, "color": GREY, "ha": aligned}
+            axis.annotate(f"copying: {what}", (side, known[0]), (4 - 8 * side, 2), textcoords="offset points", **text)
 
 
-def _name_missing(axis: Any, groups: Sequence[Group]) -> None:
-    """Says in the panel which series have no figure here, and which failed."""
+def _missing(groups: Sequence[Group]) -> str:
+    """Which series have no figure here, and which failed."""
     failed = [group.series for group in groups if group.errors and not group.rows]
-    present = {group.series for group in groups}
-    missing = [series for series in DEFAULT_SERIES if series not in present]
-    lines = [f"{word}: {', '.join(names)}" for word, names in (("failed", failed), ("missing", missing)) if names]
-    axis.text(
-        0.99,
-        0.02,
-        "\n".join(lines),
-        transform=axis.transAxes,
-        ha="right",
-        va="bottom",
-        fontsize=7,
-        color=GREY,
-        wrap=True,
-    )
+    missing = [series for series in DEFAULT_SERIES if series not in {group.series for group in groups}]
+    named = (("failed", failed), ("missing", missing))
+    return "; ".join(f"{word}: {', '.join(names)}" for word, names in named if names)
 
 
-def _draw_knee(groups: Sequence[Group], folder: Path) -> None:
+def _draw_knee(groups: Sequence[Group], choices: Sequence[Group], folder: Path) -> None:
     """A line a number of bases over the numbers of Gaussians; a star where the automatic choice lies."""
-    from matplotlib.lines import Line2D
-
-    choices = [each.chosen for each in capacities(groups)]
-    clips, holdouts = _grid(choices)
-    figure, axes = figure_of(len(clips), len(holdouts))
-    shown: dict[int, Look] = {}
-    for axis, place in ((axes[i][j], (a, b)) for i, a in enumerate(clips) for j, b in enumerate(holdouts)):
-        axis.set_title(_title(*place, [group for group in groups if group.place == place]))
-        axis.set_ylabel(DECIBEL)
+    bases = {each.series: preset_of(each.series).bases for each in groups if each.series != base_of(each.series)}
+    looks = dict(zip(sorted(set(bases.values())), itertools.cycle(BASES_LOOKS), strict=False))
+    places = _places(choices)
+    figure, axes = figure_of(len(places), _columns(places), _knee_handles(looks))
+    for place, axis in zip(places, axes, strict=True):
+        here = [group for group in groups if group.place == place]
+        _name(axis, place, here, "")
         axis.set_xlabel("scene on disk, MB (log)")
-        axis.set_xscale("log")
         for chosen in (each for each in choices if each.place == place):
-            grid = [each for each in groups if each.place == place and base_of(each.series) == chosen.series]
-            lines: dict[int, list[Group]] = {}
-            for group in grid:
-                if group.series != chosen.series and group.limit == chosen.limit and group.rows:
-                    lines.setdefault(preset_of(group.series).bases, []).append(group)
-            for number, bases in enumerate(sorted(lines)):
-                shown[bases] = BASES_LOOKS[number % len(BASES_LOOKS)]
-                _knee_line(axis, lines[bases], shown[bases])
-            x, y = chosen.median("scene_bytes") / 1e6, chosen.median("psnr_tissue_db")
-            axis.scatter(x, y, s=170, marker="*", c=look_of(chosen.series).colour, edgecolors="white", zorder=4)
-        _copies(axis, [each for each in groups if each.place == place])
-        _plain_ticks(axis.xaxis)
-    handles = [
-        Line2D([], [], color=look.colour, marker=look.marker, label=f"{bases} bases")
-        for bases, look in sorted(shown.items())
-    ]
-    star: dict[str, Any] = {"marker": "*", "markersize": 12, "linestyle": "none"}
-    add_legend(figure, [*handles, Line2D([], [], color=look_of("fast").colour, label="automatic choice", **star)])
+            variants = [
+                each
+                for each in here
+                if each.rows and each.limit == chosen.limit and base_of(each.series) == chosen.series
+            ]
+            for number, look in looks.items():
+                points = [_size_and_score(each) for each in variants if bases.get(each.series) == number]
+                if points:
+                    line: dict[str, Any] = {"marker": look.marker, "markersize": 5, "linewidth": 1.3}
+                    axis.plot(*zip(*sorted(points), strict=True), color=look.colour, **line)
+            star = {"s": 170, "marker": "*", "edgecolors": "white", "zorder": 4}
+            axis.scatter(*_size_and_score(chosen), c=look_of(chosen.series).colour, **star)
+        _copies(axis, here)
+        _finish(axis)
     save(figure, folder, "knee")
 
 
-def _knee_line(axis: Any, groups: Sequence[Group], look: Look) -> None:
-    points = sorted((group.median("scene_bytes") / 1e6, group.median("psnr_tissue_db")) for group in groups)
-    axis.plot(*zip(*points, strict=True), color=look.colour, marker=look.marker, markersize=5, linewidth=1.3)
+def _size_and_score(group: Group) -> tuple[float, float]:
+    """Megabytes and decibels."""
+    return group.median("scene_bytes") / 1e6, group.median("psnr_tissue_db")
 
 
-def _handles(series: Sequence[str], with_areas: bool, with_published: bool) -> list[Any]:
-    """The legend's entries."""
+def _knee_handles(looks: dict[int, Look]) -> list[Any]:
     from matplotlib.lines import Line2D
 
+    handles = [Line2D([], [], color=x.colour, marker=x.marker, label=f"{bases} bases") for bases, x in looks.items()]
+    star: dict[str, Any] = {"marker": "*", "markersize": 12, "linestyle": "none"}
+    return [*handles, Line2D([], [], color=look_of("fast").colour, label="automatic choice", **star)]
+
+
+def _handles(groups: Sequence[Group], name: str) -> list[Any]:
+    """The legend's entries: every series, and what else the chart shows."""
+    from matplotlib.lines import Line2D
+
+    line = "-" if name == "curves" else "none"
+    looks = {each: look_of(each) for each in dict.fromkeys(group.series for group in groups if group.rows)}
     handles = [
-        Line2D([], [], color=look_of(name).colour, marker=look_of(name).marker, label=name,
-               linestyle="none" if with_areas else "-")
-        for name in series
-    ]  # fmt: skip
-    if with_areas:
-        for megabytes in (2, 30, 100):
-            size = math.sqrt(AREA_A_MEGABYTE * megabytes)
-            handles.append(Line2D([], [], color=FAINT, marker="o", markersize=size, linestyle="none",
-                                  label=f"{megabytes} MB"))  # fmt: skip
-    if with_published:
-        handles.append(Line2D([], [], color=GREY, marker="o", markerfacecolor="none", linestyle="none", label=LABEL))
+        Line2D([], [], color=look.colour, marker=look.marker, label=series, linestyle=line)
+        for series, look in looks.items()
+    ]
+    if name == "curves":
+        return handles
+    if name != "frames":
+        handles.append(Line2D([], [], color=GREY, linewidth=1.0, label="front"))
+    for megabytes in LEGEND_MEGABYTES:
+        disc: dict[str, Any] = {"marker": "o", "markersize": math.sqrt(AREA_A_MEGABYTE * megabytes)}
+        handles.append(Line2D([], [], color=FAINT, linestyle="none", label=f"{megabytes} MB", **disc))
+    if (REAL_CLIP, PAPERS_HOLDOUT) in _places(groups):
+        hollow: dict[str, Any] = {"marker": "o", "markerfacecolor": "none"}
+        handles.append(Line2D([], [], color=GREY, linestyle="none", label=LABEL, **hollow))
     return handles
 
 
-def _grid(groups: Sequence[Group]) -> tuple[list[str], list[str]]:
-    """Clips and ways of holding out, in the order of the rows."""
-    return list(dict.fromkeys(each.clip for each in groups)), list(dict.fromkeys(each.holdout for each in groups))
+def _places(groups: Sequence[Group]) -> list[Place]:
+    """Clips with their ways of holding out, clip by clip; a place without any row keeps its panel."""
+    clips, holdouts = (list(dict.fromkeys(each)) for each in zip(*(group.place for group in groups), strict=True))
+    return [(clip, holdout) for clip in clips for holdout in holdouts]
 
 
-def _title(clip: str, holdout: str, groups: Sequence[Group]) -> str:
+def _columns(places: Sequence[Place]) -> int:
+    """A column a way of holding out; two where there is only one way."""
+    holdouts = len({holdout for _, holdout in places})
+    return holdouts if holdouts > 1 else min(2, len(places))
+
+
+def _name(axis: Any, place: Place, groups: Sequence[Group], missing: str) -> None:
+    """Title, what is missing below it, and the axes that all charts share."""
     sizes = {(row["width"], row["height"]) for group in groups for row in group.rows if row["width"]}
     size = ", ".join(f"{width}x{height}" for width, height in sorted(sizes))
-    return ", ".join(filter(None, (clip, holdout, size)))
+    axis.set_title(", ".join(filter(None, (*place, size))), pad=14)
+    axis.text(0, 1.015, missing, transform=axis.transAxes, fontsize=7, color=GREY)
+    axis.set_ylabel(DECIBEL)
+    axis.set_xscale("log")
 
 
-def _plain_ticks(axis: Any) -> None:
-    """1, 2, 5, 10 instead of powers of ten."""
+def _finish(axis: Any) -> None:
+    """Room around what is drawn, and plain numbers on the logarithmic axis instead of powers of ten."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    axis.set_major_locator(LogLocator(base=10, subs=(1, 2, 5)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axis.margins(x=0.09, y=0.1)
+    low, high = axis.get_xlim()
+    axis.xaxis.set_major_locator(LogLocator(base=10, subs=(1, 2, 5) if high < MOST_FINE_TICKS * low else (1,)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _cut_below(axis: Any, groups: Sequence[Group]) -> None:
+    """Leave out the beginnings of curves that lie far below where all of them end."""
+    ends = [score for score in (group.median("psnr_tissue_db") for group in groups) if not math.isnan(score)]
+    low, high = axis.get_ylim()
+    if ends:
+        axis.set_ylim(max(low, min(ends) - SHOWN_BELOW_WORST_DB), high)

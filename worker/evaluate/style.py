@@ -5,6 +5,7 @@ Colours are those of Okabe and Ito (2008); every series has a mark of its own as
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,8 @@ from typing import Any
 from worker.evaluate.cells import base_of
 
 PANEL_INCHES = (5.4, 3.5)
+LEGEND_ROW_INCHES = 0.24
+LEGEND_ENTRIES = 3  # a row of the legend and column of panels
 PNG_DPI = 130
 GREY = "#666666"
 FAINT = "#bbbbbb"
@@ -62,20 +65,21 @@ def look_of(series: str) -> Look:
     return _LOOKS.get(base_of(series), Look(GREY, "h"))
 
 
-def figure_of(rows: int, columns: int, legend_inches: float = 0.8) -> tuple[Any, Any]:
-    """A figure with rows x columns panels, [rows][columns] axes, and room for a legend below."""
+def figure_of(panels: int, columns: int, handles: Sequence[Any]) -> tuple[Any, list[Any]]:
+    """A figure with its legend at the foot, and the axes of its panels, row by row."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+    rows, entries = math.ceil(panels / columns), min(LEGEND_ENTRIES * columns, len(handles))
+    legend_inches = LEGEND_ROW_INCHES * (math.ceil(len(handles) / entries) + 1)
     height = PANEL_INCHES[1] * rows + legend_inches
     room = ConstrainedLayoutEngine(rect=(0, legend_inches / height, 1, 1 - legend_inches / height))
     figure = Figure(figsize=(PANEL_INCHES[0] * columns, height), layout=room)
-    return figure, figure.subplots(rows, columns, squeeze=False)
-
-
-def add_legend(figure: Any, handles: Sequence[Any]) -> None:
-    """One legend for all panels, at the foot."""
-    figure.legend(handles=list(handles), loc="lower center", ncols=min(6, len(handles)), fontsize=8.5)
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for unused in axes[panels:]:
+        unused.axis("off")
+    figure.legend(handles=list(handles), loc="lower center", ncols=entries, fontsize=8.5, labelspacing=0.8)
+    return figure, axes[:panels]
 
 
 def save(figure: Any, folder: Path, name: str) -> None:
