@@ -66,6 +66,18 @@ def test_ssim_agrees_with_scikit_image() -> None:
     assert ssim(rendered, truth, np.ones((H, W), dtype=np.bool_)) == pytest.approx(expected.mean(), abs=1e-6)
 
 
+def test_psnr_agrees_with_scikit_image() -> None:
+    peak_signal_noise_ratio = pytest.importorskip("skimage.metrics").peak_signal_noise_ratio
+    rendered, truth, tissue = pictures()
+    first, second = np.clip(rendered, 0, 1).astype(np.float64), truth / 255
+    assert psnr_tissue(rendered, truth, tissue) == pytest.approx(
+        peak_signal_noise_ratio(second[tissue], first[tissue], data_range=1.0), abs=1e-4
+    )
+    shown = (np.rint(first * 255).astype(np.uint8), truth)
+    zeroed = [np.where(tissue[..., None], picture, 0).astype(np.uint8) for picture in shown]
+    assert psnr_paper(rendered, truth, tissue) == pytest.approx(peak_signal_noise_ratio(zeroed[1], zeroed[0]), abs=1e-4)
+
+
 def test_equal_pictures_score_best_whatever_the_instrument_shows() -> None:
     _, truth, tissue = pictures()
     rendered = truth.copy()

@@ -11,8 +11,9 @@ depth  median |z - truth| over tissue of held-out frames.
 motion of what a pixel of frame 0 shows: the displacements of the Gaussians it is blended of, each from its own centre
        at frame 0 to that at frame i, blended with the same weights. Gaussians a pixel hardly shows hardly count, and
        none has to be declared the nearest. The end-point error is its distance to the true displacement of the
-       material point that the pixel shows, the median over tissue pixels of frame 0 and held-out frames. A model
-       without motion scores the median displacement itself, motion_mm.
+       material point that the pixel shows; the median over tissue pixels of frame 0 and held-out frames, and over
+       those alone that have moved by MOVING_MM or more. In a pull most tissue rests: a model without any motion has a
+       small median, but over what moves it scores the median displacement itself, moving_mm.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 JUDGED_FRAMES = 8
 """Held-out frames looked at, evenly spread."""
 TRACK_STRIDE_PX = 4
+MOVING_MM = 1.0
+"""A point that has gone less far counts as resting; stereo's own noise is a few tenths."""
 SEEN_CELL_TEXELS = 4
 """A material point counts as seen if a training frame showed one within the same square of the tissue's texture, about
 three pixels wide."""
@@ -62,14 +65,15 @@ class Shown(Protocol):
 
 @dataclass(frozen=True)
 class TruthScores:
-    """NaN where there was nothing to judge; dB over pixels of all judged frames, mm medians (see above)."""
+    """NaN where there was nothing to judge; dB are means over the judged frames, mm medians (see above)."""
 
     psnr_view10_db: float
     psnr_view15_db: float
     psnr_hidden_db: float
     depth_error_mm: float
     motion_error_mm: float
-    motion_mm: float
+    moving_error_mm: float
+    moving_mm: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +102,7 @@ class Truth:
     def score(self, shown: Shown) -> TruthScores:
         """How near the shown is to the truth."""
         view10, view15 = (_mean_psnr(shown, self._views[angle]) for angle in ANGLES_DEG)
-        error_mm, moved_mm = self._motion(shown)
-        return TruthScores(view10, view15, _mean_psnr(shown, self._hidden), self._depth(shown), error_mm, moved_mm)
+        return TruthScores(view10, view15, _mean_psnr(shown, self._hidden), self._depth(shown), *self._motion(shown))
 
     def _off_axis(self, angle_deg: float, pivot_mm: float) -> Iterable[_Expected]:
         for place, frame in enumerate(self._judged_frames):
@@ -126,8 +129,8 @@ class Truth:
             errors.append(depth_errors_mm(view.depth_mm, self._clip.depth_mm[frame], self._clip.tissue[frame]))
         return depth_agreement_mm(errors)
 
-    def _motion(self, shown: Shown) -> tuple[float, float]:
-        """Medians of the end-point error and of the true displacement, mm."""
+    def _motion(self, shown: Shown) -> tuple[float, float, float]:
+        """Medians in mm: end-point error of all, of what moves, and how far that has moved."""
         tracks = self._phantom.trajectories(TRACK_STRIDE_PX)
         row, column = tracks.pixels.T
         tissue = self._clip.tissue[0][row, column]
@@ -139,7 +142,9 @@ class Truth:
             shows = np.isfinite(distance)
             errors.append(distance[shows])
             moves.append(np.linalg.norm(truth_mm[shows], axis=1))
-        return _median(np.concatenate(errors)), _median(np.concatenate(moves))
+        error_mm, moved_mm = np.concatenate(errors), np.concatenate(moves)
+        moving = moved_mm >= MOVING_MM
+        return _median(error_mm), _median(error_mm[moving]), _median(moved_mm[moving])
 
 
 class ShownScene:

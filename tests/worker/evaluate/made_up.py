@@ -1,0 +1,29 @@
+"""Rows that nobody measured, for what is computed and drawn from rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from worker.evaluate.rows import CURVE_FIELDS, RUN_FIELDS, Row
+
+
+def run_row(series: str, psnr_tissue_db: float, *, seed: int = 0, limit: str = "60 s", **values: object) -> Row:
+    """A run's row with a score, a size and a speed."""
+    known: dict[str, object] = {
+        "clip": "d4d-a", "holdout": "every8", "series": series, "seed": seed, "limit": limit,
+        "psnr_tissue_db": psnr_tissue_db, "copy_blend_db": 40.2, "copy_flow_db": 41.9, "t_train_s": 60.0,
+        "render_fps": 70.0, "scene_bytes": 2_000_000, "iterations": 3000, "width": 640, "height": 512, **values,
+    }  # fmt: skip
+    return {name: str(known.get(name, "")) for name in RUN_FIELDS}
+
+
+def failed_row(series: str) -> Row:
+    """A run that ended in an error."""
+    return run_row(series, 0.0, error="TrainingDiverged: no more") | {"psnr_tissue_db": "", "t_train_s": ""}
+
+
+def curve_rows(run: Row, points: Sequence[tuple[float, int, float]]) -> list[Row]:
+    """The run's curve: seconds, iterations, dB."""
+    names = CURVE_FIELDS[-3:]
+    return [{**{name: run[name] for name in CURVE_FIELDS[:-3]}, **dict(zip(names, map(str, each), strict=True))}
+            for each in points]  # fmt: skip

@@ -1,0 +1,77 @@
+"""Charts are drawn from the rows alone, and tell what is missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import pytest
+
+from tests.worker.evaluate.made_up import curve_rows, failed_row, run_row
+from worker.evaluate.charts import draw_all
+from worker.evaluate.published import LABEL
+from worker.evaluate.rows import CURVE_FIELDS, CURVES, RUN_FIELDS, RUNS, Results, write_rows
+
+
+def results_in(folder: Path) -> Results:
+    """Two presets and one that failed at two places, one of them without `paper`; and a clip where all failed."""
+    fast = [run_row("fast", 39.0 + seed / 10, seed=seed) for seed in range(3)]
+    paper = run_row("paper", 38.0, limit="3000 iterations", t_train_s=240.0, scene_bytes=140_000_000)
+    blocks = run_row("fast", 33.0, holdout="blocks8")
+    failed = [failed_row("hexplane"), failed_row("fast") | {"clip": "other"}]
+    curves = [row for run in (*fast, blocks) for row in curve_rows(run, [(5.0, 200, 35.0), (60.0, 2900, 39.0)])]
+    write_rows(folder / RUNS, RUN_FIELDS, [*fast, paper, blocks, *failed])
+    write_rows(folder / CURVES, CURVE_FIELDS, [*curves, *curve_rows(paper, [(240.0, 3000, 38.0)])])
+    return Results(folder)
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    import matplotlib as mpl
+
+    folder = tmp_path_factory.mktemp("charts")
+    with mpl.rc_context({"svg.fonttype": "none"}):  # text stays text
+        assert draw_all(results_in(folder), folder) == ["curves", "pareto", "pareto-first-clip", "frames"]
+    return folder
+
+
+@pytest.mark.parametrize("name", ["curves", "pareto", "pareto-first-clip", "frames"])
+def test_every_chart_is_drawn_as_png_and_svg(name: str, drawn: Path) -> None:
+    picture = cv2.imread(str(drawn / f"{name}.png"))
+    assert picture is not None
+    assert picture.std() > 1, "something is on it"
+    assert (drawn / f"{name}.svg").read_text().startswith("<?xml")
+
+
+def test_the_same_rows_give_the_same_bytes(drawn: Path, tmp_path: Path) -> None:
+    import matplotlib as mpl
+
+    with mpl.rc_context({"svg.fonttype": "none"}):
+        draw_all(results_in(tmp_path), tmp_path)
+    for name in ("pareto.svg", "curves.svg", "curves.png"):
+        assert (tmp_path / name).read_bytes() == (drawn / name).read_bytes()
+
+
+def test_a_chart_names_what_is_missing_what_failed_and_what_others_published(drawn: Path) -> None:
+    text = (drawn / "pareto.svg").read_text()
+    assert "failed: hexplane; missing:" in text
+    assert "failed: fast; missing:" in text, "a clip where everything failed keeps its panel"
+    assert text.count(LABEL) == 1
+    assert text.count(">copying: flow<") == 2
+
+
+def test_a_grid_of_capacities_is_drawn_as_its_knee_alone(tmp_path: Path) -> None:
+    rows = [run_row("fast", 30.0)]
+    rows += [
+        run_row(f"fast:bases={bases},points_per_image={points}", 29.0, scene_bytes=bases * points * 40)
+        for bases in (3, 9)
+        for points in (10_000, 20_000)
+    ]
+    write_rows(tmp_path / RUNS, RUN_FIELDS, rows)
+    assert draw_all(Results(tmp_path), tmp_path) == ["knee"]
+
+
+@pytest.mark.parametrize("rows", [[], [failed_row("fast")]], ids=["none", "failed"])
+def test_without_a_run_that_ended_well_nothing_is_drawn(rows: list[dict[str, str]], tmp_path: Path) -> None:
+    write_rows(tmp_path / RUNS, RUN_FIELDS, rows)
+    assert draw_all(Results(tmp_path), tmp_path) == []

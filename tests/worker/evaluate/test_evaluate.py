@@ -1,0 +1,122 @@
+"""The command, from clips to rows and charts; what is done stays done."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from contract.errors import Cancelled
+from contract.exits import ExitCode
+from worker.__main__ import main
+from worker.evaluate.cells import Cell, plan
+from worker.evaluate.command import SUMMARY, measure_all
+from worker.evaluate.measure import Bench, Values
+from worker.evaluate.rows import CURVES, RUN_FIELDS, RUNS, Results, read_rows
+from worker.evaluate.sources import source_of
+from worker.hooks import Hooks
+
+CLIP = "phantom:pull:96x80:12frames"
+NAME = "phantom-pull-96x80-12frames"
+
+
+def evaluate(out: Path, *options: str) -> int:
+    return main(["evaluate", CLIP, "--out", str(out), "--iterations", "12", "--holdout", "every8", *options])
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("evaluate")
+    assert evaluate(out, "--series", "fast", "hexplane") == ExitCode.OK
+    return out
+
+
+def test_a_run_becomes_a_row_with_every_figure(measured: Path) -> None:
+    fast, hexplane = read_rows(measured / RUNS)
+    assert (fast["clip"], fast["series"], fast["limit"], hexplane["series"]) == (
+        NAME,
+        "fast",
+        "12 iterations",
+        "hexplane",
+    )
+    empty = {name for name in RUN_FIELDS if not fast[name]}
+    assert empty == {"error"}
+    assert float(fast["stored_psnr_tissue_db"]) == pytest.approx(float(fast["psnr_tissue_db"]), abs=0.3)
+    assert float(fast["psnr_tissue_db"]) > 15
+    assert 0 <= float(fast["motion_error_mm"]) < 20
+    assert fast["command"] == (f"intrasplat evaluate {CLIP} --series fast --holdout every8 --seeds 0 --iterations 12")
+
+
+def test_a_curve_ends_where_its_run_does(measured: Path) -> None:
+    fast, _ = read_rows(measured / RUNS)
+    last = [row for row in read_rows(measured / CURVES) if row["series"] == "fast"][-1]
+    assert (last["iteration"], fast["iterations"]) == ("12", "12")
+    assert float(last["psnr_tissue_db"]) == pytest.approx(float(fast["psnr_tissue_db"]), abs=1e-3)
+
+
+def test_what_has_its_row_is_not_measured_again(measured: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (measured / RUNS).read_bytes()
+    assert evaluate(measured, "--series", "fast", "hexplane") == ExitCode.OK
+    assert "2 of them have their rows already" in capsys.readouterr().out
+    assert (measured / RUNS).read_bytes() == before
+
+
+def test_rows_alone_are_enough_to_draw(measured: Path, tmp_path: Path) -> None:
+    for name in (RUNS, CURVES):
+        (tmp_path / name).write_bytes((measured / name).read_bytes())
+    assert main(["evaluate", "--redraw", "--out", str(tmp_path)]) == ExitCode.OK
+    assert {"pareto.png", "curves.svg", "frames.png", SUMMARY} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_cell_that_fails_is_a_row_that_says_why(tmp_path: Path) -> None:
+    assert main(["evaluate", CLIP, "--series", "fast", "--holdout", "99", "--out", str(tmp_path)]) == ExitCode.OK
+    (row,) = read_rows(tmp_path / RUNS)
+    assert row["error"].startswith("InputError: options.holdout: frame 99 is not in a clip of 12 frames")
+    assert read_rows(tmp_path / CURVES) == []
+
+
+class InterruptedAfterOne(Bench):
+    """Ctrl-C comes when the first cell has been measured."""
+
+    def measure(self, cell: Cell, hooks: Hooks) -> tuple[Values, list[Values]]:
+        found = super().measure(cell, hooks)
+        signal.raise_signal(signal.SIGINT)
+        return found
+
+
+def test_what_was_measured_before_an_interruption_is_kept_and_the_rest_goes_on(tmp_path: Path) -> None:
+    source = source_of(CLIP)
+    cells: Sequence[Cell] = plan([source.name], ["fast"], ["every8"], [0, 1], iterations=[3])
+    with pytest.raises(Cancelled):
+        measure_all(InterruptedAfterOne({source.name: source}), cells, Results(tmp_path))
+    kept = Results(tmp_path)
+    assert [kept.has(cell.key) for cell in cells] == [True, False]
+    measure_all(Bench({source.name: source}), [cell for cell in cells if not kept.has(cell.key)], kept)
+    assert [row["seed"] for row in Results(tmp_path).runs] == ["0", "1"]
+
+
+def test_a_curve_whose_run_has_no_row_is_forgotten(measured: Path, tmp_path: Path) -> None:
+    lines = (measured / RUNS).read_text().splitlines(keepends=True)
+    (tmp_path / RUNS).write_text("".join(lines[:2]))
+    (tmp_path / CURVES).write_bytes((measured / CURVES).read_bytes())
+    assert {row["series"] for row in Results(tmp_path).curves} == {"fast"}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["phantom:dancing"],
+        ["phantom:pull:huge"],
+        ["nowhere.mp4"],
+        [CLIP, "--series", "slow"],
+        [CLIP, "--redraw"],
+        [],
+        ["--redraw"],
+    ],
+    ids=" ".join,
+)
+def test_what_cannot_be_meant_is_refused_before_anything_is_measured(arguments: list[str], tmp_path: Path) -> None:
+    assert main(["evaluate", *arguments, "--out", str(tmp_path)]) == ExitCode.BAD_INPUT
+    assert list(tmp_path.iterdir()) == []

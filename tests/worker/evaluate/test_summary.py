@@ -1,0 +1,84 @@
+"""Claims are computed from rows, and from nothing else."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from tests.worker.evaluate.made_up import curve_rows, failed_row, run_row
+from worker.evaluate.summary import capacities, groups_of, orderings, reach, sooner
+
+RISING = [(2.0, 100, 30.0), (8.0, 400, 34.0), (32.0, 1600, 36.0)]
+
+
+def test_a_curve_reaches_a_score_between_its_samples_in_logarithms() -> None:
+    assert reach(RISING, 32.0) == pytest.approx((4.0, 200.0))
+    assert reach(RISING, 36.0) == pytest.approx((32.0, 1600.0))
+    assert reach(RISING, 29.0) == (2.0, 100.0), "before its first sample nothing is known"
+    assert reach(RISING, 36.1) == (math.inf, math.inf)
+
+
+def test_a_curve_that_falls_again_counts_from_when_it_was_there_first() -> None:
+    assert reach([*RISING, (40.0, 2000, 33.0)], 34.0) == pytest.approx((8.0, 400.0))
+
+
+def test_the_headline_compares_medians_over_seeds_at_the_rivals_final_score() -> None:
+    curves = []
+    for seed, final_db in enumerate((33.9, 34.0, 35.0)):
+        curves += curve_rows(run_row("paper", final_db, seed=seed), [(10.0, 100, 20.0), (240.0, 3000, final_db)])
+    for seed in range(3):
+        curves += curve_rows(run_row("fast", 36.0, seed=seed), RISING)
+    (found,) = sooner(curves)
+    assert (found.target_db, found.their_s, found.their_iterations) == (34.0, 240.0, 3000.0)
+    assert found.times_in_seconds == pytest.approx(30.0)
+    assert found.times_in_iterations == pytest.approx(7.5)
+
+
+def test_of_several_lengths_the_one_that_is_there_soonest_counts() -> None:
+    curves = curve_rows(run_row("paper", 33.0), [(240.0, 3000, 33.0)])
+    curves += curve_rows(run_row("fast", 36.0, limit="60 s"), [(20.0, 900, 32.0), (60.0, 2800, 36.0)])
+    curves += curve_rows(run_row("fast", 33.5, limit="10 s"), [(5.0, 200, 32.0), (10.0, 400, 34.0)])
+    (found,) = sooner(curves)
+    assert found.our_limit == "10 s"
+
+
+def test_what_never_gets_there_is_said_not_to() -> None:
+    curves = curve_rows(run_row("paper", 39.0), [(240.0, 3000, 39.0)]) + curve_rows(run_row("fast", 36.0), RISING)
+    (found,) = sooner(curves)
+    assert (found.our_s, found.times_in_seconds, found.times_in_iterations) == (None, None, None)
+    assert sooner(curve_rows(run_row("fast", 36.0), RISING)) == [], "without the rival there is no headline"
+
+
+def test_a_summary_holds_medians_spread_and_what_failed() -> None:
+    rows = [run_row("fast", score, seed=seed) for seed, score in enumerate((36.0, 36.4, 36.1))]
+    fast, hexplane = (group.summary() for group in groups_of([*rows, failed_row("hexplane")]))
+    assert (fast["psnr_tissue_db"], fast["spread_db"], fast["seeds"], fast["failed"]) == ("36.1", "0.400", 3, 0)
+    assert (hexplane["psnr_tissue_db"], hexplane["seeds"], hexplane["failed"]) == ("", 0, 1)
+
+
+def test_the_automatic_choice_is_compared_seed_by_seed_with_the_best_of_the_grid() -> None:
+    rows = [run_row("fast", score, seed=seed) for seed, score in enumerate((30.0, 31.0))]
+    rows += [run_row("fast:bases=9", score, seed=seed) for seed, score in enumerate((30.1, 31.3))]
+    rows += [run_row("fast:bases=3", score, seed=seed) for seed, score in enumerate((29.0, 29.0))]
+    rows += [run_row("fast:bases=33", 40.0, limit="9 s"), run_row("paper:bases=3", 40.0)]
+    (found,) = capacities(groups_of(rows))
+    assert found.best.series == "fast:bases=9"
+    assert found.seeds == 2
+    assert found.difference_db == pytest.approx(-0.2)
+    assert found.deviation_db == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("scores", "verdict"),
+    [
+        ({"paper": 38.0, "without_mapf": 37.0, "hexplane": 36.0, "pfs": 35.0}, "confirmed"),
+        ({"paper": 38.0, "pfs": 37.0, "hexplane": 36.0, "without_mapf": 35.0}, "FDM first, as in the paper; 3 of 6"),
+        ({"pfs": 38.0, "paper": 37.0, "without_mapf": 36.0, "hexplane": 35.0}, "contradicted: pfs first; 3 of 6"),
+        ({"paper": 38.0, "pfs": 37.0}, "not decided: without_mapf, hexplane missing"),
+    ],
+)
+def test_the_papers_ablation_is_confirmed_or_contradicted_in_words(scores: dict[str, float], verdict: str) -> None:
+    (found,) = orderings(groups_of([run_row(series, score) for series, score in scores.items()]))
+    assert found.verdict.startswith(verdict)
+    assert list(found.scores_db) == sorted(scores, key=lambda series: -scores[series])
