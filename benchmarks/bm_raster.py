@@ -38,8 +38,9 @@ from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera
 from worker.raster.cpu import Rasterizer, Target, camera_vector, compile_kernels
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.project import LOG2E
-from worker.raster.cpu.simd import LANES, fma, lane_sum, load, splat
+from worker.raster.cpu.simd import fma, lane_sum, load, splat
 from worker.raster.cpu.threads import THREADS, run
+from worker.raster.cpu.vectors import LANES
 
 WIDTH, HEIGHT, GRID_STEP_PX = 640, 512, 3.0
 SPREAD, OPACITY, DEPTH = 0.6, 0.88, 60.0

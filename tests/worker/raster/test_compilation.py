@@ -64,6 +64,7 @@ import numba, numpy
 from worker.raster.cpu.harmonics import C0
 from worker.raster.cpu import bins, Rasterizer
 print(numba.config.CACHE_DIR, Rasterizer(8, 8).statistics.sum())
-assert bins.most_rows(numpy.zeros((1, 2), numpy.int16), numpy.zeros(2, numpy.int64), numpy.zeros(1, numpy.int32)) == 0
+none, scratch = numpy.zeros((0, 12), numpy.float32), (numpy.zeros(0, numpy.int32), numpy.zeros(0, numpy.uint32))
+assert bins.depth_order(none, none[:, 0].copy(), *scratch, *scratch)[0] == 0
 """
 """Compiles one small kernel, so that the folder is really used."""

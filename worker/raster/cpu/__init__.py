@@ -1,6 +1,6 @@
 """The CPU backend: Numba kernels on explicit vectors, one thread a core; obeys the contract of worker/raster.
 
-simd -> project -> bins -> blend -> rasterizer (buffers and calls) -> autograd (rasterize);
+vectors -> simd -> bins -> project -> blend -> rasterizer (buffers and calls) -> autograd (rasterize);
 update, harmonics -> motion -> model (the fused training step) -> compilation.
 """
 

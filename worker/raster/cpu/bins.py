@@ -1,15 +1,16 @@
 """Which splats touch which tile, in depth order.
 
 A tile is LANES pixels wide and TILE_ROWS tall: as narrow as a vector, tall to keep the number of tiles a splat touches
-low. A slot is one (splat, tile) pair with its range of rows; the slots of a splat are consecutive, so the gradients the
-blend writes a slot are summed without atomics and in a fixed order.
+low. A slot is one (splat, tile) pair with its range of rows. Slots have two orders, and so two numbers:
 
-    slot_start, slot_count [N]   slots of splat g: slot_count[g] of them from slot_start[g]
-    slot_splat, slot_tile  [M]   the splat and the tile of a slot
-    slot_rows              [M, 2] first and end row inside the tile, exact for the ellipse within the tile's columns
-    tile_start [tiles + 1], tile_slots [M]   the slots of a tile, nearest splat first
+    by splat   slot_start, slot_count [N]: those of splat g are slot_count[g] from slot_start[g];
+               slot_tile [M]; slot_rows [M]: top << 8 | end, rows inside the tile, exact within the tile's columns;
+               slot_place [M]: the slot's number in the other order
+    by tile    tile_start [tiles + 1]; entries [M, 2]: splat and rows, nearest splat first
 
-Each thread has a region of the M places for the slots of its splats, so one pass over the splats is enough.
+The blend walks the second order and writes its gradients there, one after the other; each Gaussian then adds up its
+own through slot_place, without atomics and in a fixed order. Each thread has a region of the M places for the slots of
+its splats, so one pass over the splats is enough.
 """
 
 from __future__ import annotations
@@ -19,81 +20,64 @@ import math
 import numpy as np
 from numba import njit
 
-from worker.raster.cpu.project import LOG2E
-from worker.raster.cpu.simd import LANES
+from worker.raster.cpu.vectors import LANES
 
 TILE_ROWS = 32
-"""Rows of a tile. 8 x 32 pixels x 6 planes of float32 are 6 kB: they and the tile's alphas stay in L1 and L2."""
-ROUNDING = 1e-3
+"""Rows of a tile. 8 x 32 pixels x 5 planes of float32 are 5 kB: they and the tile's alphas stay in L1 and L2."""
+EXTENT = 5
+"""What project tells of the ellipse of a splat, a dx^2 + 2 b dx dy + c dy^2 = r: its half-width in pixels, dx where it
+is lowest, -b / c, r / c and (ac - b^2) / c^2."""
+ROUNDING = np.float32(2e-3)
 """Pixels by which row bounds are widened, against rounding; the exact test is made on every pixel anyway."""
+_ZERO, _HALF = np.float32(0.0), np.float32(0.5)
+_RADIX_BITS = 11
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _rows(splats, g, extent2, first_x, last_x):  # type: ignore[no-untyped-def]
-    """Image rows [top, end) that the ellipse covers between the pixel centres first_x and last_x; end <= top if none.
+def _rows(extent, g, first_dx, last_dx, y):  # type: ignore[no-untyped-def]
+    """Image rows [top, end) that the ellipse covers between two columns of pixel centres; end <= top if none.
 
-    Solves k_xx dx^2 + k_xy dx dy + k_yy dy^2 = extent2 for dy; the upper branch is concave in dx, so its maximum over
-    the columns is at the ellipse's own extreme point clamped to them.
+    The lower branch -b / c dx + sqrt(r / c - (ac - b^2) / c^2 dx^2) is concave in dx, so its maximum over the columns
+    is at the ellipse's own extreme point clamped to them; the upper one is its mirror image.
     """
-    a = -2.0 / LOG2E * splats[g, 2]
-    b = -1.0 / LOG2E * splats[g, 3]
-    c = -2.0 / LOG2E * splats[g, 4]
-    det = a * c - b * b
-    if not (det > 0.0):
-        return 0, 0
-    reach = math.sqrt(extent2 * c / det)
-    mx, my = float(splats[g, 0]), float(splats[g, 1])
-    low, high = max(first_x - mx, -reach), min(last_x - mx, reach)
+    width, extreme, lean, height2, fall = extent[g, 0], extent[g, 1], extent[g, 2], extent[g, 3], extent[g, 4]
+    low, high = max(first_dx, -width), min(last_dx, width)
     if low > high:
         return 0, 0
-    extreme = -b / a * math.sqrt(extent2 * a / det)
     at = min(max(extreme, low), high)
-    bottom = (-b * at + math.sqrt(max(0.0, extent2 * c - det * at * at))) / c
+    bottom = lean * at + math.sqrt(max(_ZERO, height2 - fall * at * at))
     at = min(max(-extreme, low), high)
-    top = (-b * at - math.sqrt(max(0.0, extent2 * c - det * at * at))) / c
-    return math.ceil(my + top - 0.5 - ROUNDING), math.floor(my + bottom - 0.5 + ROUNDING) + 1
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _columns(splats, g, extent2, tiles_x):  # type: ignore[no-untyped-def]
-    """Range of tile columns the ellipse may touch."""
-    a = -2.0 / LOG2E * splats[g, 2]
-    b = -1.0 / LOG2E * splats[g, 3]
-    c = -2.0 / LOG2E * splats[g, 4]
-    reach = math.sqrt(extent2 * c / max(a * c - b * b, 1e-30))
-    first = math.floor((splats[g, 0] - reach - 0.5) / LANES)
-    last = math.floor((splats[g, 0] + reach - 0.5) / LANES)
-    return max(first, 0), min(last, tiles_x - 1)
+    top = lean * at - math.sqrt(max(_ZERO, height2 - fall * at * at))
+    return math.ceil(y + top - _HALF - ROUNDING), math.floor(y + bottom - _HALF + ROUNDING) + 1
 
 
 @njit(cache=True, nogil=True)
 def fill_slots(  # type: ignore[no-untyped-def]
-    thread, threads, splats, radius2, height, tiles_x,
-    slot_start, slot_count, slot_splat, slot_tile, slot_rows, region_end,
-):  # fmt: skip
+    thread, threads, splats, radius2, extent, height, tiles_x, slot_start, slot_count, slot_tile, slot_rows, region_end
+):
     """Write the slots of the thread's share of splats into its region, an equal share of the slot arrays.
 
     region_end [threads]: where they end, or would: beyond the region nothing is written, and the caller makes room.
     """
-    region = slot_splat.shape[0] // threads
+    region = slot_tile.shape[0] // threads
     slot, full = thread * region, (thread + 1) * region
     count = splats.shape[0]
     for g in range(count * thread // threads, count * (thread + 1) // threads):
         slot_start[g] = slot
-        first, last = 0, -1
-        if radius2[g] >= 0.0:
-            first, last = _columns(splats, g, radius2[g], tiles_x)
+        first, last, x, y = 0, -1, splats[g, 0], splats[g, 1]
+        if radius2[g] >= _ZERO:
+            first = max(math.floor((x - extent[g, 0] - _HALF) / np.float32(LANES)), 0)
+            last = min(math.floor((x + extent[g, 0] - _HALF) / np.float32(LANES)), tiles_x - 1)
         for column in range(first, last + 1):
-            top, end = _rows(splats, g, radius2[g], column * LANES + 0.5, column * LANES + LANES - 0.5)
+            first_dx = np.float32(column * LANES) + _HALF - x
+            top, end = _rows(extent, g, first_dx, first_dx + np.float32(LANES - 1), y)
             top, end = max(top, 0), min(end, height)
             if top >= end:
                 continue
             for band in range(top // TILE_ROWS, (end - 1) // TILE_ROWS + 1):
                 if slot < full:
-                    slot_splat[slot] = g
                     slot_tile[slot] = band * tiles_x + column
-                    slot_rows[slot, 0] = max(top - band * TILE_ROWS, 0)
-                    slot_rows[slot, 1] = min(end - band * TILE_ROWS, TILE_ROWS)
+                    slot_rows[slot] = max(top - band * TILE_ROWS, 0) << 8 | min(end - band * TILE_ROWS, TILE_ROWS)
                 slot += 1
         slot_count[g] = slot - slot_start[g]
     region_end[thread] = slot
@@ -101,40 +85,40 @@ def fill_slots(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def depth_order(splats, radius2, order, keys, other_order, other_keys):  # type: ignore[no-untyped-def]
-    """Write the visible splats into order, nearest first, ties by index; return how many there are.
+    """Sort the visible splats, nearest first, ties by index; return how many there are and whether they are in order.
 
-    Radix sort, 3 x 11 bits of the float's own bits (depths are positive). order, keys, other_* are scratch [N].
+    (Else they are in other_order.) Radix sort on the float's own bits above the nearest one's (depths are positive):
+    as many passes as the range of depths has digits. order, keys, other_* are scratch [N].
     """
-    visible = 0
-    for g in range(splats.shape[0]):
-        if radius2[g] >= 0.0:
-            order[visible] = g
-            visible += 1
+    visible, nearest, farthest = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
     depth = splats[:, 9].copy().view(np.uint32)
+    for g in range(splats.shape[0]):
+        if radius2[g] >= _ZERO:
+            order[visible], keys[visible] = g, depth[g]
+            nearest, farthest = min(nearest, depth[g]), max(farthest, depth[g])
+            visible += 1
     for i in range(visible):
-        keys[i] = depth[order[i]]
-    for shift in (0, 11, 22):
-        cursor = np.zeros(2049, np.int64)
+        keys[i] -= nearest
+    digits, shift, is_first = (1 << _RADIX_BITS) - 1, 0, True
+    while visible > 0 and (farthest - nearest) >> shift > 0:
+        cursor = np.zeros(digits + 2, np.int64)
         for i in range(visible):
-            cursor[((keys[i] >> shift) & 2047) + 1] += 1
-        for bucket in range(2048):
-            cursor[bucket + 1] += cursor[bucket]
+            cursor[((keys[i] >> shift) & digits) + 1] += 1
+        for digit in range(digits):
+            cursor[digit + 1] += cursor[digit]
         for i in range(visible):
-            bucket = (keys[i] >> shift) & 2047
-            at = cursor[bucket]
-            cursor[bucket] = at + 1
-            other_order[at] = order[i]
-            other_keys[at] = keys[i]
-        order, other_order = other_order, order
-        keys, other_keys = other_keys, keys
-    for i in range(visible):  # an odd number of passes: the result is in the other buffer
-        other_order[i] = order[i]
-    return visible
+            digit = (keys[i] >> shift) & digits
+            at = cursor[digit]
+            cursor[digit] = at + 1
+            other_order[at], other_keys[at] = order[i], keys[i]
+        order, other_order, keys, other_keys = other_order, order, other_keys, keys
+        shift, is_first = shift + _RADIX_BITS, not is_first
+    return visible, is_first
 
 
 @njit(cache=True, nogil=True)
 def sort_into_tiles(  # type: ignore[no-untyped-def]
-    order, visible, slot_start, slot_count, slot_tile, region_end, tile_start, tile_slots
+    order, visible, slot_start, slot_count, slot_tile, slot_rows, region_end, tile_start, entries, slot_place
 ):
     """Counting sort of the slots by tile, splats taken in depth order."""
     tile_start[:] = 0
@@ -149,18 +133,7 @@ def sort_into_tiles(  # type: ignore[no-untyped-def]
         g = order[i]
         for slot in range(slot_start[g], slot_start[g] + slot_count[g]):
             tile = slot_tile[slot]
-            tile_slots[cursor[tile]] = slot
-            cursor[tile] += 1
-
-
-@njit(cache=True, nogil=True)
-def most_rows(slot_rows, tile_start, tile_slots):  # type: ignore[no-untyped-def]
-    """Rows of all slots of the fullest tile."""
-    most = 0
-    for tile in range(tile_start.shape[0] - 1):
-        rows = 0
-        for i in range(tile_start[tile], tile_start[tile + 1]):
-            slot = tile_slots[i]
-            rows += slot_rows[slot, 1] - slot_rows[slot, 0]
-        most = max(most, rows)
-    return most
+            place = cursor[tile]
+            cursor[tile] = place + 1
+            entries[place, 0], entries[place, 1] = g, slot_rows[slot]
+            slot_place[slot] = place

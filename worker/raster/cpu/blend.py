@@ -8,9 +8,14 @@ Symbols, for one pixel and its splats i = 0, 1, ... nearest first:
     dL/dalpha_i = T_i (s_i - B_i),  B_{i-1} = alpha_i s_i + (1 - alpha_i) B_i,  B_last = 0
 so going back to front needs no division, and dL/dpower_i = w_i (s_i - B_i). The forward pass leaves alpha and w of
 every row it visited in ``trail``; the loss needs only the pixel's own colour, so no gradient image ever exists.
-Derivation: docs/rasterizer.md.
+Down a column of pixels power2 is quadratic, so alpha goes from row to row by a ratio, and the ratio by a constant: two
+products instead of an exponential. Derivations: docs/rasterizer.md.
 
-A tile's planes lie in ``planes``, PLANE floats apart: T (later B and g_A), then R G B Z (later g_R g_G g_B g_Z).
+A tile is done in four steps. Its entries (bins.py) are gathered as records, one after the other in memory; they are
+blended; the loss is taken; and they are walked back. A record is RECORD floats: alpha and ratio of its first row, one
+a lane, then BEND (the ratio's own), COLOUR (r, g, b, z), PLACE (dx of the first lane, dy of the first row). Its rows
+[top, end) and its entry are in ``spans``. The planes lie in ``planes``, PLANE floats apart: T (later B - g_A), then
+R G B Z (later g_R g_G g_B g_Z).
 """
 
 from __future__ import annotations
@@ -20,8 +25,10 @@ from numba import njit
 
 from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from worker.raster.cpu.bins import TILE_ROWS
+from worker.raster.cpu.project import GRADIENT
 from worker.raster.cpu.simd import (
-    LANES,
+    all_less,
+    claim,
     exp2,
     fma,
     iota,
@@ -31,96 +38,138 @@ from worker.raster.cpu.simd import (
     load_bytes,
     minimum,
     splat,
+    spread,
     store,
+    store_sums,
     where_less,
 )
+from worker.raster.cpu.vectors import LANES
 
-PLANE = TILE_ROWS * LANES
-PLANES = 6
+PLANE = TILE_ROWS * LANES + 16
+"""Not a power of two, lest the same pixel of two planes have addresses that a processor takes for each other."""
+PLANES = 5
+BEND, COLOUR, PLACE, RECORD = 2 * LANES, 2 * LANES + 1, 2 * LANES + 5, 2 * LANES + 8
+MOST_ROWS = 16
+"""Rows of a record: the products' rounding grows with their square, to 1e-5 of alpha after sixteen."""
 RENDER, LOSS, COTANGENT = 0, 1, 2
 """Modes: images only; images never, gradients of the built-in loss; gradients of given image cotangents."""
 STATISTICS = 4
 """Sums a tile reports: colour loss, depth loss, squared colour error (of channels), |1 - A| over tissue."""
 
-_CUT = np.float32(np.log2(MIN_ALPHA))
+_CUT = np.float32(MIN_ALPHA)
 _CAP = np.float32(MAX_ALPHA)
+_DEEP = np.float32(-60.0)  # below this power2, products may leave float32's range: such rows are single records
 _STOP = np.float32(MIN_TRANSMITTANCE)
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
-_CHECK_EVERY = 32  # splats between two looks at whether the whole tile is opaque
+_CHECK_EVERY = 32  # records between two looks at whether the whole tile is opaque
 
 
 @njit(cache=True, nogil=True)
 def blend(  # type: ignore[no-untyped-def]
-    thread, threads, mode, width, height, tiles_x, splats, slot_splat, slot_rows, tile_start, tile_slots,
-    trail, planes, slots, statistics, target, weight, inverse_depth, loss_settings, image,
+    thread, threads, next_tile, mode, width, height, tiles_x, splats, tile_start, entries,
+    records, spans, trail, planes, slots, statistics, target, weight, inverse_depth, loss_settings, image,
 ):  # fmt: skip
-    """Composite every tile; tiles are dealt to the threads in turn.
+    """Composite every tile. Threads take tiles as they come: what a tile gives does not depend on who computes it.
 
-    trail [threads, 2 * rows * LANES] and planes [threads, PLANES * PLANE]: scratch.
-    slots [M, 10]: written in modes LOSS and COTANGENT (GRADIENT of project.py). statistics [tiles, STATISTICS]: LOSS.
+    next_tile int64 [1]: 0 at the start. records, spans, trail, planes [threads, ...]: scratch (see above).
+    slots [M * GRADIENT]: written in modes LOSS and COTANGENT, in the order of entries (GRADIENT of project.py).
+    statistics [tiles, STATISTICS]: LOSS.
     target [3, H, stride] uint8, weight [H, stride] uint8 (255 = tissue), inverse_depth [H, stride] float32 (0 = none):
     LOSS, flattened, stride = tiles_x * LANES. loss_settings float32 [5]: colour weight a channel, depth weight,
     1 / width of the quadratic zone of the colour and of the depth loss, 1 for normalised depth else 0.
     image [5, H, stride] flattened: R G B Z A, written in RENDER, read as cotangents in COTANGENT.
     """
-    tiles = tile_start.shape[0] - 1
-    size = height * tiles_x * LANES
-    for tile in range(thread, tiles, threads):
+    tiles, stride = tile_start.shape[0] - 1, tiles_x * LANES
+    size, keep = height * stride, mode != RENDER
+    records, spans, trail, planes = records[thread], spans[thread], trail[thread], planes[thread]
+    tile = claim(next_tile)
+    while tile < tiles:
         row0, column0 = tile // tiles_x * TILE_ROWS, tile % tiles_x * LANES
-        rows = min(TILE_ROWS, height - row0)
+        rows, origin = min(TILE_ROWS, height - row0), row0 * stride + column0
         first, end = tile_start[tile], tile_start[tile + 1]
-        visited = _forward(
-            first, end, row0, column0, width, rows, mode != RENDER,
-            splats, slot_splat, slot_rows, tile_slots, trail[thread], planes[thread],
-        )  # fmt: skip
-        origin, stride = row0 * tiles_x * LANES + column0, tiles_x * LANES
+        count = _gather(first, end, row0, column0, splats, entries, records, spans)
+        _clear(planes, column0, width, rows)
+        visited = _forward(count, rows, keep, records, spans, trail, planes)
         if mode == RENDER:
-            _write(planes[thread], image, origin, stride, size, rows)
-            continue
-        if mode == LOSS:
+            _write(planes, image, origin, stride, size, rows)
+        elif mode == LOSS:
             _loss(
-                planes[thread], statistics[tile], target, weight, inverse_depth, loss_settings,
-                origin, stride, size, rows,
+                planes, statistics[tile], target, weight, inverse_depth, loss_settings, origin, stride, size, rows
             )  # fmt: skip
         else:
-            _read_cotangents(planes[thread], image, origin, stride, size, rows)
-        for i in range(visited, end):  # behind the opaque front: no gradient
-            slots[tile_slots[i], :] = _ZERO
-        _backward(
-            first, visited, row0, column0,
-            splats, slot_splat, slot_rows, tile_slots, trail[thread], planes[thread], slots,
-        )  # fmt: skip
+            _read_cotangents(planes, image, origin, stride, size, rows)
+        if keep:
+            _backward(visited, records, spans, trail, planes, slots)
+            seen = spans[visited - 1, 2] + 1 if visited > 0 else first
+            slots[seen * GRADIENT : end * GRADIENT] = _ZERO  # behind the opaque front: no gradient
+        tile = claim(next_tile)
 
 
 @njit(cache=True, nogil=True)
-def _forward(  # type: ignore[no-untyped-def]
-    first, end, row0, column0, width, rows, keep, splats, slot_splat, slot_rows, tile_slots, trail, planes
-):
-    """Blend the tile's slots [first, end) into planes; return the end of those visited before the tile was opaque."""
-    zero, cut, cap, stop = splat(_ZERO), splat(_CUT), splat(_CAP), splat(_STOP)
+def _gather(first, end, row0, column0, splats, entries, records, spans):  # type: ignore[no-untyped-def]
+    """Write the entries [first, end) of a tile as records; return how many records."""
     lanes = iota()
-    inside = where_less(lanes + splat(np.float32(column0)), splat(np.float32(width)), splat(_ONE), zero)
-    for row in range(rows):
-        store(planes, row * LANES, inside)
-    for at in range(PLANE, 5 * PLANE, LANES):
-        store(planes, at, zero)
-    at = 0
+    at = count = 0
     for i in range(first, end):
-        slot = tile_slots[i]
-        g = slot_splat[slot]
-        dx = lanes + splat(np.float32(column0) + _HALF - splats[g, 0])
-        k_xx = splat(splats[g, 2])
-        red, green, blue, depth = splat(splats[g, 6]), splat(splats[g, 7]), splat(splats[g, 8]), splat(splats[g, 9])
-        dy = np.float32(row0 + slot_rows[slot, 0]) + _HALF - splats[g, 1]
-        for row in range(slot_rows[slot, 0], slot_rows[slot, 1]):
+        g, rows = entries[i, 0], entries[i, 1]
+        top, bottom = np.int64(rows >> np.uint32(8)), np.int64(rows & np.uint32(255))
+        x = np.float32(column0) + _HALF - splats[g, 0]
+        y = np.float32(row0) + _HALF - splats[g, 1]
+        k_xx, k_xy, k_yy = splats[g, 2], splats[g, 3], splats[g, 4]
+        dx = lanes + splat(x)
+        along = fma(dx, splat(k_xx) * dx, splat(splats[g, 5]))
+        lean = splat(k_xy) * dx
+        dy, end_dy = y + np.float32(top), y + np.float32(bottom - 1)
+        head = fma(lean, splat(dy), along) + splat(k_yy * dy * dy)
+        foot = fma(lean, splat(end_dy), along) + splat(k_yy * end_dy * end_dy)
+        stretch = MOST_ROWS if all_less(splat(_DEEP), minimum(head, foot)) else 1
+        while top < bottom:
+            dy = y + np.float32(top)
+            store(records, at, exp2(fma(lean, splat(dy), along) + splat(k_yy * dy * dy)))
+            store(records, at + LANES, exp2(lean + splat(k_yy * (dy + dy + _ONE))))
+            records[at + BEND] = splats[g, 10]
+            records[at + COLOUR], records[at + COLOUR + 1] = splats[g, 6], splats[g, 7]
+            records[at + COLOUR + 2], records[at + COLOUR + 3] = splats[g, 8], splats[g, 9]
+            records[at + PLACE], records[at + PLACE + 1] = x, dy
+            spans[count, 0], spans[count, 1], spans[count, 2] = top, min(top + stretch, bottom), i
+            top += stretch
+            at += RECORD
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _clear(planes, column0, width, rows):  # type: ignore[no-untyped-def]
+    """Nothing blended yet: T = 1 inside the image, 0 beside it."""
+    zero = splat(_ZERO)
+    inside = where_less(iota() + splat(np.float32(column0)), splat(np.float32(width)), splat(_ONE), zero)
+    for row in range(rows):
+        p = row * LANES
+        store(planes, p, inside)
+        for k in range(1, 5):
+            store(planes, p + k * PLANE, zero)
+
+
+@njit(cache=True, nogil=True)
+def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[no-untyped-def]
+    """Blend the records into planes; return how many were visited before the tile was opaque."""
+    zero, cut, cap, stop = splat(_ZERO), splat(_CUT), splat(_CAP), splat(_STOP)
+    at = 0
+    for i in range(count):
+        record = i * RECORD
+        alpha_raw, ratio, bend = load(records, record), load(records, record + LANES), spread(records, record + BEND)
+        red, green = spread(records, record + COLOUR), spread(records, record + COLOUR + 1)
+        blue, depth = spread(records, record + COLOUR + 2), spread(records, record + COLOUR + 3)
+        for row in range(spans[i, 0], spans[i, 1]):
             p = row * LANES
-            power = fma(dx, fma(dx, k_xx, splat(splats[g, 3] * dy)), splat(splats[g, 5] + splats[g, 4] * dy * dy))
             transmittance = load(planes, p)
-            alpha = where_less(power, cut, zero, minimum(exp2(power), cap))
+            alpha = where_less(alpha_raw, cut, zero, minimum(alpha_raw, cap))
             alpha = where_less(transmittance, stop, zero, alpha)
             weight = alpha * transmittance
+            alpha_raw = alpha_raw * ratio
+            ratio = ratio * bend
             store(planes, p, transmittance - weight)
             store(planes, p + PLANE, fma(weight, red, load(planes, p + PLANE)))
             store(planes, p + 2 * PLANE, fma(weight, green, load(planes, p + 2 * PLANE)))
@@ -130,38 +179,33 @@ def _forward(  # type: ignore[no-untyped-def]
                 store(trail, at, alpha)
                 store(trail, at + LANES, weight)
                 at += 2 * LANES
-            dy += _ONE
-        if (i - first) % _CHECK_EVERY == _CHECK_EVERY - 1:
+        if i % _CHECK_EVERY == _CHECK_EVERY - 1:
             clearest = zero
             for row in range(rows):
                 transmittance = load(planes, row * LANES)
                 clearest = where_less(clearest, transmittance, transmittance, clearest)
             if lane_max(clearest) < _STOP:
                 return i + 1
-    return end
+    return count
 
 
 @njit(cache=True, nogil=True)
-def _backward(  # type: ignore[no-untyped-def]
-    first, end, row0, column0, splats, slot_splat, slot_rows, tile_slots, trail, planes, slots
-):
-    """Gradients of the slots [first, end), back to front; planes hold g_R g_G g_B g_Z at 1..4, g_A at 5, B at 0."""
-    zero, cap = splat(_ZERO), splat(_CAP)
+def _backward(count, records, spans, trail, planes, slots):  # type: ignore[no-untyped-def]
+    """Gradients of the first count records, back to front; planes hold B - g_A, then g_R g_G g_B g_Z."""
+    zero, cap, one = splat(_ZERO), splat(_CAP), splat(_ONE)
     lanes = iota()
+    v_red, v_green, v_blue, v_depth = zero, zero, zero, zero
+    moment, moment_y, moment_yy = zero, zero, zero
     at = 0
-    for i in range(first, end):
-        slot = tile_slots[i]
-        at += (slot_rows[slot, 1] - slot_rows[slot, 0]) * 2 * LANES
-    for i in range(end - 1, first - 1, -1):
-        slot = tile_slots[i]
-        g = slot_splat[slot]
-        dx = lanes + splat(np.float32(column0) + _HALF - splats[g, 0])
-        red, green, blue, depth = splat(splats[g, 6]), splat(splats[g, 7]), splat(splats[g, 8]), splat(splats[g, 9])
-        top, bottom = slot_rows[slot, 0], slot_rows[slot, 1]
+    for i in range(count):
+        at += (spans[i, 1] - spans[i, 0]) * 2 * LANES
+    for i in range(count - 1, -1, -1):
+        record = i * RECORD
+        red, green = spread(records, record + COLOUR), spread(records, record + COLOUR + 1)
+        blue, depth = spread(records, record + COLOUR + 2), spread(records, record + COLOUR + 3)
+        top, bottom = spans[i, 0], spans[i, 1]
         at -= (bottom - top) * 2 * LANES
-        v_red, v_green, v_blue, v_depth = zero, zero, zero, zero
-        moment, moment_y, moment_yy = zero, zero, zero
-        dy = np.float32(row0 + top) + _HALF - splats[g, 1]
+        dy = spread(records, record + PLACE + 1)
         trace = at
         for row in range(top, bottom):
             p = row * LANES
@@ -170,24 +214,26 @@ def _backward(  # type: ignore[no-untyped-def]
             g_red, g_green = load(planes, p + PLANE), load(planes, p + 2 * PLANE)
             g_blue, g_depth = load(planes, p + 3 * PLANE), load(planes, p + 4 * PLANE)
             behind = load(planes, p)
-            score = fma(g_red, red, fma(g_green, green, load(planes, p + 5 * PLANE)))
-            score = fma(g_blue, blue, fma(g_depth, depth, score)) - behind
+            score = fma(g_red, red, g_green * green) + (fma(g_blue, blue, g_depth * depth) - behind)
             store(planes, p, fma(alpha, score, behind))
             v_red, v_green = fma(weight, g_red, v_red), fma(weight, g_green, v_green)
             v_blue, v_depth = fma(weight, g_blue, v_blue), fma(weight, g_depth, v_depth)
             v_power = where_less(alpha, cap, weight * score, zero)
             moment = moment + v_power
-            along = v_power * splat(dy)
-            moment_y = moment_y + along
-            moment_yy = fma(along, splat(dy), moment_yy)
-            dy += _ONE
+            below = v_power * dy
+            moment_y = moment_y + below
+            moment_yy = fma(below, dy, moment_yy)
+            dy = dy + one
+        if i > 0 and spans[i - 1, 2] == spans[i, 2]:
+            continue  # the record before belongs to the same slot
+        dx = lanes + spread(records, record + PLACE)
         moment_x = moment * dx
-        slots[slot, 0], slots[slot, 1], slots[slot, 2] = lane_sum(v_red), lane_sum(v_green), lane_sum(v_blue)
-        slots[slot, 3] = lane_sum(v_depth)
-        slots[slot, 4] = lane_sum(moment)
-        slots[slot, 5], slots[slot, 6] = lane_sum(moment_x), lane_sum(moment_y)
-        slots[slot, 7], slots[slot, 8] = lane_sum(moment_x * dx), lane_sum(moment_y * dx)
-        slots[slot, 9] = lane_sum(moment_yy)
+        slot = np.int64(spans[i, 2]) * GRADIENT
+        store_sums(slots, slot, v_red, v_green, v_blue, v_depth)
+        store_sums(slots, slot + 4, moment, moment_x, moment_y, moment_x * dx)
+        store_sums(slots, slot + 8, moment_y * dx, moment_yy, zero, zero)
+        v_red, v_green, v_blue, v_depth = zero, zero, zero, zero
+        moment, moment_y, moment_yy = zero, zero, zero
 
 
 @njit(cache=True, nogil=True)
@@ -206,9 +252,9 @@ def _read_cotangents(planes, image, origin, stride, size, rows):  # type: ignore
     """The image's cotangents into the planes' places for g; B starts at 0."""
     for row in range(rows):
         p, q = row * LANES, origin + row * stride
-        for k in range(5):
+        for k in range(4):
             store(planes, p + (k + 1) * PLANE, load(image, q + k * size))
-        store(planes, p, splat(_ZERO))
+        store(planes, p, splat(_ZERO) - load(image, q + 4 * size))
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -256,9 +302,8 @@ def _loss(  # type: ignore[no-untyped-def]
         # d(1/D)/dZ with D = Z (paper) or Z / A; d(1/D)/dA = 1 / Z in the second case.
         store(planes, p + 4 * PLANE, (zero - slope) * inverse / divisor)
         if normalised:
-            store(planes, p + 5 * PLANE, slope / divisor)
+            store(planes, p, zero - slope / divisor)
         else:
-            store(planes, p + 5 * PLANE, zero)
-        store(planes, p, zero)
+            store(planes, p, zero)
     statistics[0], statistics[1] = lane_sum(l1), lane_sum(depth_l1)
     statistics[2], statistics[3] = lane_sum(squared), lane_sum(holes)

@@ -7,23 +7,42 @@ time), opacity_logit [N], colour [3, N]. A splat is a Gaussian on the image, SPL
     5     lo = log2(opacity), so that alpha = 2**power2
     6 7 8 colour
     9     camera z
-Arithmetic is float64 a Gaussian (it is a twentieth of the step), storage float32.
+    10    2**(2 k_yy): by this factor the ratio of alpha from row to row changes from row to row
+Arithmetic is float64 on LANES Gaussians at once, storage float32; exponentials have float32's precision.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numba import njit
 
 from worker.raster import EPS2D, LIMIT, MIN_ALPHA, NEAR
+from worker.raster.cpu.bins import EXTENT
+from worker.raster.cpu.simd import (
+    exp2,
+    lane_sum,
+    load,
+    load_strided,
+    log2,
+    maximum,
+    minimum,
+    narrow,
+    splat,
+    sqrt,
+    store,
+    store_strided,
+    where_less,
+    widen,
+)
+from worker.raster.cpu.vectors import LANES
 
 SPLAT = 12
-"""Floats a splat record holds; ten are used, twelve keep records on 16-byte boundaries."""
-GRADIENT = 10
-"""Sums the blend returns for one splat: dL/d(r, g, b, z), then the moments 1, x, y, xx, xy, yy of dL/dpower."""
+"""Floats a splat record holds; eleven are used, twelve keep records on 16-byte boundaries."""
+GRADIENT = 12
+"""Floats the blend returns for a slot: dL/d(r, g, b, z), the moments 1, x, y, xx, xy, yy of dL/dpower, two spare."""
 LOG2E = 1.4426950408889634
+_LN2 = 0.6931471805599453
+_LARGEST = 1e300
 
 
 @njit(cache=True, nogil=True)
@@ -60,16 +79,22 @@ def _onto(m, a):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _rows_of(state, first, g):  # type: ignore[no-untyped-def]
-    """Three consecutive rows of the state at Gaussian g."""
-    return float(state[first, g]), float(state[first + 1, g]), float(state[first + 2, g])
+def _rows_of(state, first, i):  # type: ignore[no-untyped-def]
+    """Three consecutive rows of the state at the Gaussians from i."""
+    return widen(load(state[first], i)), widen(load(state[first + 1], i)), widen(load(state[first + 2], i))
 
 
 @njit(cache=True, nogil=True)
-def _quaternion(state, g):  # type: ignore[no-untyped-def]
-    """Unit quaternion wxyz of Gaussian g and 1 / the length it was stored with."""
-    q0, q1, q2, q3 = float(state[3, g]), float(state[4, g]), float(state[5, g]), float(state[6, g])
-    n = 1.0 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+def _exp(x):  # type: ignore[no-untyped-def]
+    return widen(exp2(narrow(x * LOG2E)))
+
+
+@njit(cache=True, nogil=True)
+def _quaternion(state, i):  # type: ignore[no-untyped-def]
+    """Unit quaternions wxyz of the Gaussians from i and 1 / the lengths they were stored with."""
+    q0 = widen(load(state[3], i))
+    q1, q2, q3 = _rows_of(state, 4, i)
+    n = 1.0 / sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     return (q0 * n, q1 * n, q2 * n, q3 * n), n
 
 
@@ -119,141 +144,196 @@ def _limits(camera):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _clamped(x, y, z, limits):  # type: ignore[no-untyped-def]
-    """u and v."""
-    return min(max(x / z, limits[0]), limits[1]), min(max(y / z, limits[2]), limits[3])
+def _held(ratio, low, high):  # type: ignore[no-untyped-def]
+    """ratio within [low, high]."""
+    return minimum(maximum(ratio, low), high)
 
 
 @njit(cache=True, nogil=True)
-def project(thread, threads, camera, state, opacity_logit, colour, splats, radius2):  # type: ignore[no-untyped-def]
-    """Fill splats [N, SPLAT] and radius2 [N]: 2 ln(opacity / MIN_ALPHA), the squared Mahalanobis radius; -1 if culled.
+def project(  # type: ignore[no-untyped-def]
+    thread, threads, camera, state, opacity_logit, colour, splats, radius2, extent
+):
+    """Fill splats [N * SPLAT], extent [N * EXTENT] (bins.py) and radius2 [N]: 2 ln(opacity / MIN_ALPHA), the squared
+    Mahalanobis radius; -1 if culled, and then the others hold nothing of use.
 
     camera: float64 [18] = fx, fy, cx, cy, W, H, camera_from_world row-major [3, 4].
     """
     fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
     w, shift = _pose(camera)
+    zero = widen(splat(np.float32(0.0)))
     limits = _limits(camera)
-    count = state.shape[1]
-    for g in range(count * thread // threads, count * (thread + 1) // threads):
-        radius2[g] = -1.0
-        mean = _rows_of(state, 0, g)
-        z = _dot(w[2], mean) + shift[2]
-        opacity = 1.0 / (1.0 + math.exp(-float(opacity_logit[g])))
-        if not (z > NEAR and opacity >= MIN_ALPHA):
-            continue
-        x, y = _dot(w[0], mean) + shift[0], _dot(w[1], mean) + shift[1]
-        q, _ = _quaternion(state, g)
+    low_u, high_u, low_v, high_v = zero + limits[0], zero + limits[1], zero + limits[2], zero + limits[3]
+    vectors = state.shape[1] // LANES
+    for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
+        i = k * LANES
+        mean = _rows_of(state, 0, i)
+        x, y, z = _dot(w[0], mean) + shift[0], _dot(w[1], mean) + shift[1], _dot(w[2], mean) + shift[2]
+        q, _ = _quaternion(state, i)
         r = _rotation(q)
-        s0, s1, s2 = _rows_of(state, 7, g)
-        scale = (math.exp(s0), math.exp(s1), math.exp(s2))
+        s0, s1, s2 = _rows_of(state, 7, i)
+        scale = (_exp(s0), _exp(s1), _exp(s2))
         # A = J W (2 x 3), then K = A R S (2 x 3), cov2d = K K^T + EPS2D I.
-        u, v = _clamped(x, y, z, limits)
-        k0 = _each(_through(_sum(fx / z, w[0], -fx / z * u, w[2]), r), scale)
-        k1 = _each(_through(_sum(fy / z, w[1], -fy / z * v, w[2]), r), scale)
+        inverse_z = 1.0 / z
+        u, v = _held(x * inverse_z, low_u, high_u), _held(y * inverse_z, low_v, high_v)
+        j0, j1 = fx * inverse_z, fy * inverse_z
+        k0 = _each(_through(_sum(j0, w[0], zero - j0 * u, w[2]), r), scale)
+        k1 = _each(_through(_sum(j1, w[1], zero - j1 * v, w[2]), r), scale)
         cxx, cxy, cyy = _dot(k0, k0) + EPS2D, _dot(k0, k1), _dot(k1, k1) + EPS2D
         det = cxx * cyy - cxy * cxy
-        if not (det > 0.0 and math.isfinite(det)):
-            continue
-        extent2 = 2.0 * math.log(opacity / MIN_ALPHA)
-        mx, my = fx * x / z + cx, fy * y / z + cy
-        reach_x, reach_y = math.sqrt(extent2 * cxx), math.sqrt(extent2 * cyy)
-        if mx + reach_x < 0.5 or mx - reach_x > width - 0.5 or my + reach_y < 0.5 or my - reach_y > height - 0.5:
-            continue
-        radius2[g] = extent2
-        splats[g, 0], splats[g, 1] = mx, my
-        splats[g, 2] = -0.5 * LOG2E * cyy / det
-        splats[g, 3] = LOG2E * cxy / det
-        splats[g, 4] = -0.5 * LOG2E * cxx / det
-        splats[g, 5] = math.log2(opacity)
-        splats[g, 6], splats[g, 7], splats[g, 8] = colour[0, g], colour[1, g], colour[2, g]
-        splats[g, 9] = z
+        inverse_det = 1.0 / det
+        log2_opacity = zero - log2(1.0 + _exp(zero - widen(load(opacity_logit, i))))
+        extent2 = 2.0 * _LN2 * (log2_opacity - np.log2(MIN_ALPHA))
+        mx, my = j0 * x + cx, j1 * y + cy
+        reach_x, reach_y = sqrt(extent2 * cxx), sqrt(extent2 * cyy)
+
+        visible = where_less(zero, det, extent2, zero - 1.0)
+        visible = where_less(det, zero + _LARGEST, visible, zero - 1.0)
+        visible = where_less(zero + NEAR, z, visible, zero - 1.0)
+        visible = where_less(mx + reach_x, zero + 0.5, zero - 1.0, visible)
+        visible = where_less(zero + (width - 0.5), mx - reach_x, zero - 1.0, visible)
+        visible = where_less(my + reach_y, zero + 0.5, zero - 1.0, visible)
+        visible = where_less(zero + (height - 0.5), my - reach_y, zero - 1.0, visible)
+        store(radius2, i, narrow(visible))
+
+        k_yy = -0.5 * LOG2E * cxx * inverse_det
+        at = i * SPLAT
+        store_strided(splats, at, SPLAT, narrow(mx))
+        store_strided(splats, at + 1, SPLAT, narrow(my))
+        store_strided(splats, at + 2, SPLAT, narrow(-0.5 * LOG2E * cyy * inverse_det))
+        store_strided(splats, at + 3, SPLAT, narrow(LOG2E * cxy * inverse_det))
+        store_strided(splats, at + 4, SPLAT, narrow(k_yy))
+        store_strided(splats, at + 5, SPLAT, narrow(log2_opacity))
+        for channel in range(3):
+            store_strided(splats, at + 6 + channel, SPLAT, load(colour[channel], i))
+        store_strided(splats, at + 9, SPLAT, narrow(z))
+        store_strided(splats, at + 10, SPLAT, exp2(narrow(2.0 * k_yy)))
+        # The conic's a, b, c are cyy, -cxy, cxx over det, and ac - b^2 is 1 / det.
+        at, inverse_cxx = i * EXTENT, 1.0 / cxx
+        store_strided(extent, at, EXTENT, narrow(reach_x))
+        store_strided(extent, at + 1, EXTENT, narrow(cxy / cyy * reach_y))
+        store_strided(extent, at + 2, EXTENT, narrow(cxy * inverse_cxx))
+        store_strided(extent, at + 3, EXTENT, narrow(extent2 * det * inverse_cxx))
+        store_strided(extent, at + 4, EXTENT, narrow(det * inverse_cxx * inverse_cxx))
+
+
+@njit(cache=True, nogil=True)
+def _more(total, a, visible):  # type: ignore[no-untyped-def]
+    """total + a, triples of wides, in the lanes where visible >= 0."""
+    zero = widen(splat(np.float32(0.0)))
+    culled = widen(visible)
+    return (
+        total[0] + where_less(culled, zero, zero, a[0]),
+        total[1] + where_less(culled, zero, zero, a[1]),
+        total[2] + where_less(culled, zero, zero, a[2]),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _gather_sums(first, slot_start, slot_count, slot_place, slots, sums):  # type: ignore[no-untyped-def]
+    """Sum the blend's gradients of LANES Gaussians over their slots into sums [LANES * GRADIENT]."""
+    for lane in range(LANES):
+        head = tail = splat(np.float32(0.0))
+        start = slot_start[first + lane]
+        for slot in range(start, start + slot_count[first + lane]):
+            place = np.int64(slot_place[slot]) * GRADIENT
+            head, tail = head + load(slots, place), tail + load(slots, place + GRADIENT - LANES)
+        store(sums, lane * GRADIENT + GRADIENT - LANES, tail)
+        store(sums, lane * GRADIENT, head)
 
 
 @njit(cache=True, nogil=True)
 def project_backward(  # type: ignore[no-untyped-def]
-    thread, threads, camera, state, opacity_logit, radius2, slot_start, slot_count, slots,
+    thread, threads, camera, state, opacity_logit, radius2, slot_start, slot_count, slot_place, slots,
     v_state, v_opacity_logit, v_colour, v_mean2d_norm, v_pose,
 ):  # fmt: skip
     """Sum the blend's gradients of each Gaussian over its tiles and carry them back to its parameters.
 
-    slots [M, GRADIENT], those of Gaussian g the slot_count[g] from slot_start[g]. Every v_* row is written (zeros for
-    culled Gaussians). v_mean2d_norm [N]: |dL/dmean2d| in normalised device coordinates (x times W / 2, y times H / 2),
-    the unit in which densification thresholds are published. v_pose [threads, 12]: the thread's share of
-    dL/d camera_from_world. With G = dL/dconic: dL/dcov2d = -conic G conic; dL/dSigma = A^T dL/dcov2d A.
+    slots [M * GRADIENT], those of Gaussian g at slot_place[slot_start[g]] and the slot_count[g] - 1 that follow. Every
+    v_* row is written (zeros for culled Gaussians). v_mean2d_norm [N]: |dL/dmean2d| in normalised device coordinates
+    (x times W / 2, y times H / 2), the unit in which densification thresholds are published. v_pose [threads, 12]: the
+    thread's share of dL/d camera_from_world.
+
+    With G = dL/dconic: dL/dcov2d = -conic G conic; dL/dSigma = A^T dL/dcov2d A.
     One long function, because each step of this chain needs most of what the steps before it computed.
     """
     fx, fy, width, height = camera[0], camera[1], camera[4], camera[5]
     w, shift = _pose(camera)
+    none, zero = splat(np.float32(0.0)), widen(splat(np.float32(0.0)))
     limits = _limits(camera)
-    v_pose[thread, :] = 0.0
-    total = np.zeros(GRADIENT)
-    count = state.shape[1]
-    for g in range(count * thread // threads, count * (thread + 1) // threads):
-        if radius2[g] < 0.0 or slot_count[g] == 0:
-            v_state[:, g] = 0.0
-            v_colour[:, g] = 0.0
-            v_opacity_logit[g] = 0.0
-            v_mean2d_norm[g] = 0.0
-            continue
-        total[:] = 0.0
-        for slot in range(slot_start[g], slot_start[g] + slot_count[g]):
-            for k in range(GRADIENT):
-                total[k] += slots[slot, k]
-        v_colour[0, g], v_colour[1, g], v_colour[2, g] = total[0], total[1], total[2]
-        odds = math.exp(-float(opacity_logit[g]))
-        v_opacity_logit[g] = total[4] * odds / (1.0 + odds)  # times 1 - opacity, exact also where opacity rounds to 1
+    low_u, high_u, low_v, high_v = zero + limits[0], zero + limits[1], zero + limits[2], zero + limits[3]
+    pose_x = pose_y = pose_z = pose_t = (zero, zero, zero)
+    sums = np.empty(LANES * GRADIENT, np.float32)
+    vectors = state.shape[1] // LANES
+    for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
+        i = k * LANES
+        _gather_sums(i, slot_start, slot_count, slot_place, slots, sums)
+        visible = load(radius2, i)
+        store(v_colour[0], i, load_strided(sums, 0, GRADIENT))
+        store(v_colour[1], i, load_strided(sums, 1, GRADIENT))
+        store(v_colour[2], i, load_strided(sums, 2, GRADIENT))
+        odds = _exp(zero - widen(load(opacity_logit, i)))
+        # times 1 - opacity, exact also where opacity rounds to 1
+        store(v_opacity_logit, i, narrow(widen(load_strided(sums, 4, GRADIENT)) * odds / (1.0 + odds)))
 
         # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + EPS2D I.
-        mean = _rows_of(state, 0, g)
+        mean = _rows_of(state, 0, i)
         x, y, z = _dot(w[0], mean) + shift[0], _dot(w[1], mean) + shift[1], _dot(w[2], mean) + shift[2]
-        q, n = _quaternion(state, g)
+        inverse_z = 1.0 / z
+        q, n = _quaternion(state, i)
         r = _rotation(q)
-        s0, s1, s2 = _rows_of(state, 7, g)
-        variance = (math.exp(2.0 * s0), math.exp(2.0 * s1), math.exp(2.0 * s2))
-        u, v = _clamped(x, y, z, limits)
-        j0, j1 = fx / z, fy / z
-        a0, a1 = _sum(j0, w[0], -j0 * u, w[2]), _sum(j1, w[1], -j1 * v, w[2])
+        s0, s1, s2 = _rows_of(state, 7, i)
+        variance = (_exp(2.0 * s0), _exp(2.0 * s1), _exp(2.0 * s2))
+        ratio_x, ratio_y = x * inverse_z, y * inverse_z
+        u, v = _held(ratio_x, low_u, high_u), _held(ratio_y, low_v, high_v)
+        j0, j1 = fx * inverse_z, fy * inverse_z
+        a0, a1 = _sum(j0, w[0], zero - j0 * u, w[2]), _sum(j1, w[1], zero - j1 * v, w[2])
         b0, b1 = _through(a0, r), _through(a1, r)
         t0, t1 = _each(b0, variance), _each(b1, variance)
         cxx, cxy, cyy = _dot(t0, b0) + EPS2D, _dot(t0, b1), _dot(t1, b1) + EPS2D
         inverse_det = 1.0 / (cxx * cyy - cxy * cxy)
-        ka, kb, kc = cyy * inverse_det, -cxy * inverse_det, cxx * inverse_det
+        ka, kb, kc = cyy * inverse_det, zero - cxy * inverse_det, cxx * inverse_det
 
-        v_mx, v_my = ka * total[5] + kb * total[6], kb * total[5] + kc * total[6]
-        v_mean2d_norm[g] = 0.5 * math.sqrt(v_mx * v_mx * width * width + v_my * v_my * height * height)
-        g00, g01, g11 = -0.5 * total[7], -0.5 * total[8], -0.5 * total[9]  # dL/dconic, symmetric halves
+        m_x, m_y = widen(load_strided(sums, 5, GRADIENT)), widen(load_strided(sums, 6, GRADIENT))
+        v_mx, v_my = ka * m_x + kb * m_y, kb * m_x + kc * m_y
+        on_image = v_mx * v_mx * (0.25 * width * width) + v_my * v_my * (0.25 * height * height)
+        store(v_mean2d_norm, i, where_less(visible, none, none, narrow(sqrt(on_image))))
+        g00 = -0.5 * widen(load_strided(sums, 7, GRADIENT))  # dL/dconic, symmetric halves
+        g01 = -0.5 * widen(load_strided(sums, 8, GRADIENT))
+        g11 = -0.5 * widen(load_strided(sums, 9, GRADIENT))
         h00, h01 = ka * g00 + kb * g01, ka * g01 + kb * g11
         h10, h11 = kb * g00 + kc * g01, kb * g01 + kc * g11
-        c00, c01, c11 = -(h00 * ka + h01 * kb), -(h00 * kb + h01 * kc), -(h10 * kb + h11 * kc)
+        c00, c01, c11 = zero - (h00 * ka + h01 * kb), zero - (h00 * kb + h01 * kc), zero - (h10 * kb + h11 * kc)
 
         # dL/dB = 2 dL/dcov2d B S^2 =: E; dL/dlog s_k = b_k . e_k, the sum over both rows of column k.
         e0, e1 = _sum(2 * c00, t0, 2 * c01, t1), _sum(2 * c01, t0, 2 * c11, t1)
-        v_state[7, g] = b0[0] * e0[0] + b1[0] * e1[0]
-        v_state[8, g] = b0[1] * e0[1] + b1[1] * e1[1]
-        v_state[9, g] = b0[2] * e0[2] + b1[2] * e1[2]
+        by_scale = _each(b0, e0), _each(b1, e1)
+        for c in range(3):
+            store(v_state[7 + c], i, where_less(visible, none, none, narrow(by_scale[0][c] + by_scale[1][c])))
 
         # dL/dR = A^T E, then through R(q / |q|).
         p = (_sum(a0[0], e0, a1[0], e1), _sum(a0[1], e0, a1[1], e1), _sum(a0[2], e0, a1[2], e1))
-        v_state[3, g], v_state[4, g], v_state[5, g], v_state[6, g] = _quaternion_gradient(q, n, p)
+        v_quaternion = _quaternion_gradient(q, n, p)
+        for c in range(4):
+            store(v_state[3 + c], i, where_less(visible, none, none, narrow(v_quaternion[c])))
 
         # dL/dA = E R^T =: F, then to the camera point through A = diag(j) (W_xy - (u, v) W_z).
         f0, f1 = _onto(r, e0), _onto(r, e1)
         v_x, v_y = j0 * v_mx, j1 * v_my
-        v_z = total[3] - (x * v_x + y * v_y + _dot(f0, a0) + _dot(f1, a1)) / z
-        if limits[0] < x / z < limits[1]:
-            v_u = -j0 * _dot(f0, w[2])
-            v_x += v_u / z
-            v_z -= v_u * x / (z * z)
-        if limits[2] < y / z < limits[3]:
-            v_v = -j1 * _dot(f1, w[2])
-            v_y += v_v / z
-            v_z -= v_v * y / (z * z)
-        v_state[0, g], v_state[1, g], v_state[2, g] = _through((v_x, v_y, v_z), w)
-        pose = v_pose[thread]
-        for k in range(3):
-            pose[k] += v_x * mean[k] + j0 * f0[k]
-            pose[4 + k] += v_y * mean[k] + j1 * f1[k]
-            pose[8 + k] += v_z * mean[k] - j0 * u * f0[k] - j1 * v * f1[k]
-        pose[3] += v_x
-        pose[7] += v_y
-        pose[11] += v_z
+        v_z = widen(load_strided(sums, 3, GRADIENT)) - (x * v_x + y * v_y + _dot(f0, a0) + _dot(f1, a1)) * inverse_z
+        v_u = zero - j0 * _dot(f0, w[2])
+        v_v = zero - j1 * _dot(f1, w[2])
+        v_u = where_less(low_u, ratio_x, where_less(ratio_x, high_u, v_u, zero), zero) * inverse_z
+        v_v = where_less(low_v, ratio_y, where_less(ratio_y, high_v, v_v, zero), zero) * inverse_z
+        v_x, v_y, v_z = v_x + v_u, v_y + v_v, v_z - v_u * ratio_x - v_v * ratio_y
+        v_mean = _through((v_x, v_y, v_z), w)
+        for c in range(3):
+            store(v_state[c], i, where_less(visible, none, none, narrow(v_mean[c])))
+        # dL/d camera_from_world: what reaches x, y, z times the mean, and J^T dL/dA.
+        j0_u, j1_v = j0 * u, j1 * v
+        to_x, to_y = _sum(v_x, mean, j0, f0), _sum(v_y, mean, j1, f1)
+        to_z = _sum(v_z, mean, zero - 1.0, _sum(j0_u, f0, j1_v, f1))
+        pose_x, pose_y = _more(pose_x, to_x, visible), _more(pose_y, to_y, visible)
+        pose_z, pose_t = _more(pose_z, to_z, visible), _more(pose_t, (v_x, v_y, v_z), visible)
+    for c in range(3):
+        v_pose[thread, c], v_pose[thread, 4 + c] = lane_sum(pose_x[c]), lane_sum(pose_y[c])
+        v_pose[thread, 8 + c], v_pose[thread, 4 * c + 3] = lane_sum(pose_z[c]), lane_sum(pose_t[c])

@@ -13,12 +13,19 @@ from numpy.typing import NDArray
 
 from worker.raster import Camera
 from worker.raster.cpu import bins, project
-from worker.raster.cpu.blend import COTANGENT, LOSS, PLANE, PLANES, RENDER, STATISTICS, blend
-from worker.raster.cpu.simd import LANES
+from worker.raster.cpu.blend import COTANGENT, LOSS, PLANE, PLANES, RECORD, RENDER, STATISTICS, blend
 from worker.raster.cpu.threads import THREADS, run
+from worker.raster.cpu.vectors import LANES
 
 Floats = NDArray[np.float32]
 _NO_LOSS = np.zeros(5, np.float32)
+
+
+def _aligned(rows: int, columns: int) -> Floats:
+    """Zeros whose rows begin where cache lines begin, if columns is a multiple of 16: no vector straddles two."""
+    raw = np.zeros(rows * columns + 16, np.float32)
+    start = -(raw.ctypes.data // 4) % 16
+    return raw[start : start + rows * columns].reshape(rows, columns)
 
 
 def padded(count: int) -> int:
@@ -64,10 +71,12 @@ class Rasterizer:
         self.stride = self.tiles_x * LANES
         self.image = np.zeros(5 * height * self.stride, np.float32)
         self.statistics = np.zeros((self.tiles, STATISTICS), np.float32)
-        self._planes = np.zeros((THREADS, PLANES * PLANE), np.float32)
-        self._trail = np.zeros((THREADS, 0), np.float32)
+        self._planes = _aligned(THREADS, PLANES * PLANE)
+        self._trail, self._records = _aligned(THREADS, 0), _aligned(THREADS, 0)
+        self._spans = np.zeros((THREADS, 0, 3), np.int32)
         self._tile_start = np.zeros(self.tiles + 1, np.int64)
         self._region_end = np.zeros(THREADS, np.int64)
+        self._next_tile = np.zeros(1, np.int64)
         self._no_target = Target(np.zeros(1, np.uint8), np.zeros(1, np.uint8), np.zeros(1, np.float32))
         self._allocate_gaussians(0)
         self._allocate_slots(0)
@@ -77,6 +86,7 @@ class Rasterizer:
         self.radius2 = np.full(count, -1.0, np.float32)
         self.slot_start = np.zeros(count, np.int64)
         self._slot_count = np.zeros(count, np.int32)
+        self._extent = np.zeros((count, bins.EXTENT), np.float32)
         self._order = np.zeros((2, count), np.int32)
         self._keys = np.zeros((2, count), np.uint32)
         self.gradients = Gradients(
@@ -88,11 +98,11 @@ class Rasterizer:
         )
 
     def _allocate_slots(self, capacity: int) -> None:
-        self._slot_splat = np.zeros(capacity, np.int32)
         self._slot_tile = np.zeros(capacity, np.int32)
-        self._slot_rows = np.zeros((capacity, 2), np.int16)
-        self._tile_slots = np.zeros(capacity, np.int32)
-        self._slots = np.zeros((capacity, project.GRADIENT), np.float32)
+        self._slot_rows = np.zeros(capacity, np.uint32)
+        self._slot_place = np.zeros(capacity, np.int32)
+        self._entries = np.zeros((capacity, 2), np.uint32)
+        self._slots = np.zeros(capacity * project.GRADIENT, np.float32)
 
     def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
         """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N]."""
@@ -106,7 +116,10 @@ class Rasterizer:
         if self.splats.shape[0] != count:
             self._allocate_gaussians(count)
         self._camera, self._state, self._opacity_logit = camera, state, opacity_logit
-        run(project.project, camera, state, opacity_logit, colour, self.splats, self.radius2)
+        run(
+            project.project, camera, state, opacity_logit, colour, self.splats.reshape(-1), self.radius2,
+            self._extent.reshape(-1),
+        )  # fmt: skip
 
     def bin(self) -> None:
         """Second third: the slots of every splat."""
@@ -118,37 +131,42 @@ class Rasterizer:
     def _filled(self) -> bool:
         """Write the slots; False where a thread's region is too small for its own."""
         run(
-            bins.fill_slots, self.splats, self.radius2, self.height, self.tiles_x, self.slot_start, self._slot_count,
-            self._slot_splat, self._slot_tile, self._slot_rows, self._region_end,
+            bins.fill_slots, self.splats, self.radius2, self._extent, self.height, self.tiles_x,
+            self.slot_start, self._slot_count, self._slot_tile, self._slot_rows, self._region_end,
         )  # fmt: skip
-        return int(self._region_slots.max()) <= len(self._slot_splat) // THREADS
+        return int(self._region_slots.max()) <= len(self._slot_tile) // THREADS
 
     @property
     def _region_slots(self) -> NDArray[np.int64]:
         """[THREADS] slots of each thread's splats."""
-        region = len(self._slot_splat) // THREADS
+        region = len(self._slot_tile) // THREADS
         return np.asarray(self._region_end - region * np.arange(THREADS))
 
     def sort(self) -> None:
         """Last third: the slots of every tile, nearest first."""
         order, keys = self._order, self._keys
-        visible = bins.depth_order(self.splats, self.radius2, order[0], keys[0], order[1], keys[1])
+        visible, is_first = bins.depth_order(self.splats, self.radius2, order[0], keys[0], order[1], keys[1])
         bins.sort_into_tiles(
-            order[1], visible, self.slot_start, self._slot_count, self._slot_tile, self._region_end,
-            self._tile_start, self._tile_slots,
+            order[0 if is_first else 1], visible, self.slot_start, self._slot_count, self._slot_tile, self._slot_rows,
+            self._region_end, self._tile_start, self._entries, self._slot_place,
         )  # fmt: skip
 
-    def _reserve_trail(self) -> None:
-        """Room for the alphas and weights of the fullest tile, one such room a thread."""
-        rows = bins.most_rows(self._slot_rows, self._tile_start, self._tile_slots)
-        if self._trail.shape[1] < rows * 2 * LANES:
-            self._trail = np.zeros((THREADS, rows * 2 * LANES * 5 // 4), np.float32)
+    def _reserve(self) -> None:
+        """Room for what a thread keeps of the fullest tile; untouched memory costs nothing."""
+        most = int(np.diff(self._tile_start).max()) * bins.TILE_ROWS
+        if self._spans.shape[1] < most:
+            most = most * 5 // 4
+            self._spans = np.zeros((THREADS, most, 3), np.int32)
+            self._records = _aligned(THREADS, most * RECORD)
+            self._trail = _aligned(THREADS, most * 2 * LANES)
 
     def blend(self, mode: int, target: Target, loss_settings: Floats, image: Floats) -> None:
         """The kernel in one of its modes (blend.py)."""
+        self._reserve()
+        self._next_tile[0] = 0
         run(
-            blend, mode, self.width, self.height, self.tiles_x, self.splats, self._slot_splat, self._slot_rows,
-            self._tile_start, self._tile_slots, self._trail, self._planes, self._slots, self.statistics,
+            blend, self._next_tile, mode, self.width, self.height, self.tiles_x, self.splats, self._tile_start,
+            self._entries, self._records, self._spans, self._trail, self._planes, self._slots, self.statistics,
             target.rgb, target.weight, target.inverse_depth, loss_settings, image,
         )  # fmt: skip
 
@@ -165,13 +183,11 @@ class Rasterizer:
 
     def loss_backward(self, target: Target, loss_settings: Floats) -> Gradients:
         """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums a tile."""
-        self._reserve_trail()
         self.blend(LOSS, target, loss_settings, self.image)
         return self.carry_back()
 
     def cotangent_backward(self, cotangents: Floats) -> Gradients:
         """Gradients of sum(cotangents * image), cotangents [5, H, W]."""
-        self._reserve_trail()
         padded_cotangents = np.zeros((5, self.height, self.stride), np.float32)
         padded_cotangents[:, :, : self.width] = cotangents
         self.blend(COTANGENT, self._no_target, _NO_LOSS, padded_cotangents.ravel())
@@ -182,7 +198,7 @@ class Rasterizer:
         out = self.gradients
         run(
             project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,
-            self.slot_start, self._slot_count, self._slots,
+            self.slot_start, self._slot_count, self._slot_place, self._slots,
             out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
         )  # fmt: skip
         return out

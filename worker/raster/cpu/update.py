@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from worker.raster.cpu.simd import LANES, exp2, fma, load, splat, sqrt, store, where_less
+from worker.raster.cpu.simd import exp2, fma, load, splat, sqrt, store, where_less
+from worker.raster.cpu.vectors import LANES
 
 CHANNELS, ROWS = 10, 13
 BETA1, BETA2 = np.float32(0.9), np.float32(0.999)
@@ -47,9 +48,9 @@ def adam(thread, threads, value, gradient, first, second, rate, eps):  # type: i
 def deform_shared(thread, threads, canonical, weight, basis, first, last, state):  # type: ignore[no-untyped-def]
     """state [ROWS, N] = canonical + sum over j in [first, last) of basis[j] weight[j]; weight [B, C, N], C <= ROWS."""
     vectors = canonical.shape[1] // LANES
-    for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
-        i = k * LANES
-        for c in range(ROWS):
+    for c in range(ROWS):  # outermost, for a processor follows a few streams of memory, not a hundred
+        for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
+            i = k * LANES
             total = load(canonical[c], i)
             if c < weight.shape[1]:
                 for j in range(first, last):
