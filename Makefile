@@ -18,7 +18,12 @@ NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do \
 	"$$each" -c '$(NEW_ENOUGH)' 2>/dev/null && { echo "$$each"; break; }; done)
 
-.PHONY: help setup demo test check bench chaos sbom clean
+# What `make evaluate` measures, hours of it: rows are kept as they finish, and the same command goes on
+CLIPS ?= d4d_endonerf phantom:still phantom:breathing phantom:pull phantom:cut
+GRID_CLIPS ?= phantom:still:640x512 phantom:breathing:640x512 phantom:pull:640x512 phantom:cut:640x512
+EVALUATE := $(BIN)/intrasplat evaluate
+
+.PHONY: help setup demo test check bench evaluate capacity chaos sbom clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -56,6 +61,16 @@ bench: setup ## every benchmarks/bm_*.py, one after the other
 	@set -e; for each in benchmarks/bm_*.py; do \
 		[ -e "$$each" ] || { echo "bench: benchmarks/ holds no bm_*.py" >&2; exit 1; }; \
 		echo "== $$each"; $(BIN)/python "$$each"; done
+
+evaluate: setup ## every preset on every clip, and the charts; hours, and it goes on where it was (CLIPS="phantom:pull ...")
+	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out docs/results
+	@$(EVALUATE) $(CLIPS) --series fast --budget-s 6 15 --seeds 0 1 2 --out docs/results
+	@$(EVALUATE) $(CLIPS) --series rivals --out docs/results
+	@$(BIN)/python benchmarks/write_results.py
+
+capacity: setup ## a grid of fixed capacities beside the automatic choice; hours, and it goes on where it was
+	@$(EVALUATE) $(GRID_CLIPS) --series fast --grid --holdout every8 --iterations 600 --seeds 0 1 2 3 4 --out docs/results/capacity
+	@$(BIN)/python benchmarks/write_results.py
 
 chaos: setup ## kill every part of a running service at every point, and count what was lost; ARGS narrows it
 	@$(BIN)/python -m tests.chaos $(ARGS)

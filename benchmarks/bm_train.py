@@ -13,14 +13,14 @@ import argparse
 import csv
 import json
 import os
-import platform
 import resource
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from worker.evaluate.rows import commit, machine
 
 FIELDS = (
     "run", "clip", "preset", "holdout", "limit", "psnr_tissue_db", "psnr_paper_db", "ssim", "train_psnr_tissue_db",
@@ -126,25 +126,6 @@ def append(path: Path, row: dict[str, object], fields: tuple[str, ...] = FIELDS)
         if fresh:
             writer.writeheader()
         writer.writerow(row)
-
-
-def machine() -> str:
-    """Processor, cores and date: the figures are of this machine on this day."""
-    name = platform.processor() or platform.machine()
-    if Path("/proc/cpuinfo").exists():
-        models = [
-            line.split(":", 1)[1].strip()
-            for line in Path("/proc/cpuinfo").read_text().splitlines()
-            if "model name" in line
-        ]
-        name = models[0] if models else name
-    return f"{name}, {os.cpu_count()} cores, {time.strftime('%Y-%m-%d')}"
-
-
-def commit() -> str:
-    """The commit measured, with + where the tree has changes."""
-    command = ["git", "describe", "--always", "--dirty=+"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""docs/results/index.md from the CSV files beside it, so that no figure there is typed by hand.
+"""docs/results/index.md from the CSV files beside it, so that no figure there is typed by hand; README's chart, too.
 
     python benchmarks/write_results.py
 
-Reads docs/results/{train,ablation,raster,service}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of
-bm_soak.py); what is missing is left out.
+Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), {train,ablation,raster,service}.csv,
+stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 from statistics import median
+
+from evaluation_page import sections, write_readme
 
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
 Row = dict[str, str]
@@ -79,7 +81,7 @@ _SOAK = """
 
 
 def main() -> None:
-    parts = [_INTRODUCTION]
+    parts = [_INTRODUCTION, *sections(RESULTS)]
     if rows := _read("train.csv"):
         parts += [_TRAIN, _train_table(rows)]
     if rows := _read("ablation.csv"):
@@ -97,6 +99,7 @@ def main() -> None:
     if (RESULTS / "soak.txt").exists():
         parts += [_SOAK, f"\n```\n{(RESULTS / 'soak.txt').read_text().strip()}\n```\n"]
     (RESULTS / "index.md").write_text("".join(parts))
+    write_readme(RESULTS.parent.parent / "README.md", RESULTS)
 
 
 def _read(name: str) -> list[Row]:

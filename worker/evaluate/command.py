@@ -39,7 +39,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "--series",
         nargs="+",
         default=list(DEFAULT_SERIES),
-        help="presets, or presets with changes such as fast:bases=9,tracks=false (default: all)",
+        help="presets, also ours or rivals, or presets with changes such as fast:bases=9,tracks=false (default: all)",
     )
     parser.add_argument("--holdout", nargs="+", default=list(DEFAULT_HOLDOUTS), help="(default: %(default)s)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N", help="(default: 0)")

@@ -38,11 +38,11 @@ def key_of(row: Mapping[str, str]) -> tuple[str, ...]:
 
 
 class Results:
-    """The runs and curves of a folder, as they are now."""
+    """The runs and curves of a folder, as they are now; columns that an older file lacks are empty."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self.runs = read_rows(folder / RUNS)
+        self.runs = [_texts(row, RUN_FIELDS) for row in read_rows(folder / RUNS)]
         kept = {key_of(row) for row in self.runs}
         self.curves = [row for row in read_rows(folder / CURVES) if key_of(row) in kept]
 
@@ -61,7 +61,7 @@ class Results:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The rows of a CSV file; none where there is no file. Columns an older file lacks are empty."""
+    """The rows of a CSV file; none where there is no file."""
     if not path.exists():
         return []
     with path.open(newline="") as file:

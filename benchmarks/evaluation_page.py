@@ -1,0 +1,309 @@
+"""The part of docs/results/index.md, and of README.md, that `intrasplat evaluate` has the rows for.
+
+Every sentence with a figure in it is made from rows; the others hold whatever the rows say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from statistics import median
+
+from worker.evaluate.cells import DEFAULT_SERIES, GRID_BASES, GRID_POINTS, OURS, base_of
+from worker.evaluate.published import ABLATION, ONE_MINUTE, RESULTS, Published
+from worker.evaluate.rows import Results, Row
+from worker.evaluate.summary import Capacity, Group, Sooner, capacities, groups_of, orderings, sooner
+
+CAPACITY = "capacity"
+"""The folder beside runs.csv that holds the grid of capacities."""
+MARKS = ("<!-- evaluation -->", "<!-- /evaluation -->")
+"""What stands between them in README.md is written anew."""
+
+_CHARTS = {
+    "curves": """
+### Quality over time
+
+![Held-out psnr_tissue against seconds of training, one panel a clip and way of holding out](curves.png)
+
+Each line is one run, the strong one the seed that ends in the middle; the clock counts what
+[conventions](../conventions.md) call `t_train_s`, so neither compilation nor the scoring of held-out frames. Dashed is
+what copying the neighbouring frames scores: where a curve stays below, a copy is the better picture from the
+endoscope's own pose, and has no other pose, no depth and nothing behind the instrument.
+""",
+    "pareto": """
+### Seconds against decibels
+
+![Final psnr_tissue against seconds of training; discs are the scenes' sizes, hollow marks are published](pareto.png)
+
+A mark is the median of all seeds, its disc the scene on disk, and the line joins what nothing is both sooner and better
+than. The hollow marks are what papers print for other clips on other hardware, in `psnr_paper`, which is higher: they
+say where the field stands, and no distance from them to ours is a measurement.
+""",
+    "frames": """
+### Images a second against decibels
+
+![Final psnr_tissue against images rendered a second at the clip's size](frames.png)
+
+Each image is deformed, projected and blended at its own time, the median of forty, with the machine's other work
+beside it; encoding and sending come on top. `hexplane` has no kernels of its own here and moves its Gaussians in torch,
+so its speed says more about that than about the method.
+""",
+}
+_INTRODUCTION = """
+## Speed against accuracy
+
+`make evaluate` ([runs.csv](runs.csv), a row a run with its command; [curves.csv](curves.csv);
+[summary.csv](summary.csv), medians over seeds). `intrasplat evaluate --redraw --out docs/results` draws all charts anew
+from the rows; PNG and SVG lie beside this page. {count}
+"""
+_TRUTH = """
+### What copying cannot do
+
+Synthetic clips know the truth ([truth.py](../../worker/evaluate/truth.py) defines each column). Views are 10 and 15
+degrees off the endoscope's, judged where a training frame saw the tissue; `hidden` is behind the instrument. `motion`
+is the median end-point error over all tissue, `moving` that over what has moved by 1 mm or more, beside how far it has:
+a model that does not move at all would score that.
+"""
+_ABLATION = """
+### The paper's ablation, on our clips
+
+Median psnr_tissue after each preset's own number of iterations; the first row is what the paper prints (`psnr_paper`,
+its own clips). Differences of a tenth of a decibel are within what another seed gives.
+"""
+_PARSIMONY = """
+### No more than a scene needs
+
+Floats are those of the model for each Gaussian; bytes those of the scene on disk; `loss` is what storing it costs
+against the model as it was trained, in dB; `spread` is the best seed less the worst. Rates, iterations and start differ
+between presets as well, so a row is not the effect of its size alone: the grid of capacities varies nothing else.
+"""
+_CAPACITY = """
+### The automatic choice against a grid of fixed ones
+
+`make capacity` ([capacity/runs.csv](capacity/runs.csv)): {bases} bases x {points} points an image, everything
+else equal, the same number of iterations.
+
+![Held-out psnr_tissue against the scene's bytes for every fixed capacity, and the automatic choice](capacity/knee.png)
+
+The star is what the preset chooses by itself, from training frames alone; each line adds Gaussians at a fixed number of
+bases. The best of the grid is picked by the very frames it is scored on, so that it is flattered and the choice is not.
+"""
+
+
+def sections(folder: Path) -> list[str]:
+    """Markdown of everything that has rows in folder; nothing without rows."""
+    results = Results(folder)
+    groups = [group for group in groups_of(results.runs) if group.series == base_of(group.series)]
+    parts = []
+    if any(group.rows for group in groups):
+        parts += [_INTRODUCTION.format(count=_counted(results.runs)), _headline(sooner(results.curves))]
+        parts += [text for name, text in _CHARTS.items() if (folder / f"{name}.png").exists()]
+        parts += [_truth(groups), _ablation(groups), _PARSIMONY, _parsimony(groups), _published()]
+    grid = Results(folder / CAPACITY)
+    if found := capacities(groups_of(grid.runs)):
+        parts += [
+            _CAPACITY.format(bases=_listed(GRID_BASES), points=_listed(GRID_POINTS)),
+            _capacity(found),
+            _origin(grid.runs),
+        ]
+    return [*parts, _origin(results.runs)] if results.runs else parts
+
+
+def write_readme(readme: Path, folder: Path) -> None:
+    """Put the chart and the headline between the marks; without rows the README stays as it is."""
+    results = Results(folder)
+    found, chart = sooner(results.curves), folder / "pareto-first-clip.png"
+    text = readme.read_text()
+    if not found or not chart.exists() or any(mark not in text for mark in MARKS):
+        return
+    place = chart.relative_to(readme.parent)
+    picture = f"![Seconds of training against held-out decibels, for every preset]({place})"
+    caption = (
+        f"*Held-out frames of `{found[0].clip}`, medians of all seeds; a disc's area is the scene's size on disk; "
+        "dashed is copying the neighbouring frames; hollow is published, on other hardware and data.*"
+    )
+    page = f"[All charts and figures]({folder.relative_to(readme.parent)}/index.md)"
+    before, rest = text.split(MARKS[0])
+    after = rest.split(MARKS[1])[1]
+    body = "\n\n".join((MARKS[0], picture, caption, f"{_claim(found)} {page}.", MARKS[1]))
+    readme.write_text(f"{before}{body}{after}")
+
+
+def _claim(found: Sequence[Sooner]) -> str:
+    """The headline in one sentence for each way of holding out."""
+    sentences = []
+    for holdout in dict.fromkeys(each.holdout for each in found):
+        here = [each for each in found if each.holdout == holdout]
+        reached = [each for each in here if each.times_in_seconds and each.times_in_iterations]
+        ours, theirs = here[0].ours, here[0].theirs
+        said = f"With {holdout}, `{ours}` becomes as good as `{theirs}` ends on {len(reached)} of {len(here)} clips"
+        if reached:
+            seconds = _span(each.times_in_seconds or math.nan for each in reached)
+            iterations = _span(each.times_in_iterations or math.nan for each in reached)
+            said += f": {seconds} times sooner in seconds, {iterations} times in iterations"
+        sentences.append(f"{said}.")
+    return " ".join(sentences)
+
+
+def _headline(found: Sequence[Sooner]) -> str:
+    header = ["clip", "held out", "dB that paper ends with", "paper, s", "iterations", "fast, s", "iterations",
+              "times sooner, s", "iterations", "with"]  # fmt: skip
+    rows = [
+        [each.clip, each.holdout, f"{each.target_db:.2f}", f"{each.their_s:.0f}", f"{each.their_iterations:.0f}",
+         _number(each.our_s, 1), _number(each.our_iterations, 0), _number(each.times_in_seconds, 1),
+         _number(each.times_in_iterations, 1), each.our_limit or "not reached"]
+        for each in found
+    ]  # fmt: skip
+    if not rows:
+        return ""
+    method = (
+        "Medians over seeds, on the same machine and kernels; between two samples of a curve the moment is "
+        "interpolated, the logarithm of time being linear in dB."
+    )
+    return f"\n### How much sooner\n\n{_claim(found)} {method}\n{_table(header, rows)}"
+
+
+def _truth(groups: Sequence[Group]) -> str:
+    names = {"psnr_view10_db": 1, "psnr_view15_db": 1, "psnr_hidden_db": 1, "depth_error_mm": 2, "motion_error_mm": 2,
+             "moving_error_mm": 2, "moving_mm": 2}  # fmt: skip
+    known = [group for group in groups if not math.isnan(group.median("psnr_view10_db"))]
+    header = ["clip", "held out", "series", "limit", "view 10°, dB", "15°, dB", "hidden, dB", "depth, mm", "motion, mm",
+              "moving, mm", "moved by, mm"]  # fmt: skip
+    rows = [
+        [
+            *group.place,
+            group.series,
+            group.limit,
+            *(_number(group.median(name), digits) for name, digits in names.items()),
+        ]
+        for group in known
+    ]
+    return _TRUTH + _table(header, rows) if rows else ""
+
+
+def _ablation(groups: Sequence[Group]) -> str:
+    found = orderings(groups)
+    rows = [["*published*", "EndoNeRF", *(f"*{score:.2f}*" for score in ABLATION.values()), ""]]
+    for each in found:
+        scores = [_number(each.scores_db.get(name, math.nan), 2) for name in ABLATION]
+        rows.append([*each.place, *scores, each.verdict])
+    if not found:
+        return ""
+    decided = [each for each in found if not each.missing]
+    confirmed = sum(each.agreeing == each.pairs for each in decided)
+    first = sum(next(iter(each.scores_db)) == "paper" for each in decided)
+    said = (
+        f"Of {len(decided)} places where all four were run, {confirmed} confirm the paper's whole order and {first} "
+        "have FDM with MAPF first, as the paper has."
+    )
+    return f"{_ABLATION}\n{said}\n{_table(['clip', 'held out', *ABLATION, 'the order'], rows)}"
+
+
+def _parsimony(groups: Sequence[Group]) -> str:
+    """A row a clip, series and limit; size and speed are those of the first way of holding out."""
+    clips, holdouts = (list(dict.fromkeys(each)) for each in zip(*(group.place for group in groups), strict=True))
+    found = {(group.clip, group.series, group.limit, group.holdout): group for group in groups}
+    rows = []
+    for clip in clips:
+        keys = dict.fromkeys(key[:3] for key in found if key[0] == clip)
+        for key in keys:
+            here = [found.get((*key, holdout)) for holdout in holdouts]
+            rows.append([*key, *_size(next(each for each in here if each)), *map(_score, here)])
+        absent = [series for series in DEFAULT_SERIES if series not in {key[1] for key in keys}]
+        rows += [[clip, series, "missing", *[""] * (len(_SIZES) + len(holdouts))] for series in absent]
+    header = ["clip", "series", "limit", *_SIZES, *(f"{holdout}, dB" for holdout in holdouts)]
+    return _table(header, rows)
+
+
+_SIZES = ("Gaussians", "bases", "floats", "MB", "loss", "t_train_s", "step, ms", "images/s", "seeds")
+
+
+def _size(group: Group) -> list[str]:
+    loss = group.median("psnr_tissue_db") - group.median("stored_psnr_tissue_db")
+    return [
+        *(_number(group.median(name), 0) for name in ("gaussians", "bases", "floats_a_gaussian")),
+        _number(group.median("scene_bytes") / 1e6, 2),
+        _number(loss, 3),
+        *(_number(group.median(name), 1) for name in ("t_train_s", "step_ms")),
+        _number(group.median("render_fps"), 0),
+        str(len(group.rows)),
+    ]
+
+
+def _score(group: Group | None) -> str:
+    """`38.07 (spread 0.11; training frames +0.92)`; or why there is none."""
+    if group is None:
+        return "missing"
+    if not group.rows:
+        return f"failed: {group.errors[0]}"
+    found, trained = group.median("psnr_tissue_db"), group.median("train_psnr_tissue_db")
+    spread = f"spread {group.summary()['spread_db']}" if len(group.rows) > 1 else ""
+    gap = "" if math.isnan(trained) else f"training frames {trained - found:+.2f}"
+    said = "; ".join(filter(None, (spread, gap)))
+    return f"{_number(found, 2)} ({said})" if said else _number(found, 2)
+
+
+def _published() -> str:
+    def cells(rows: Iterable[Published], table: str) -> list[list[str]]:
+        return [
+            [table, each.data, each.method, f"{each.psnr_paper_db:.2f}", f"{each.train_s:.0f}", _number(each.fps, 2)]
+            for each in rows
+        ]
+
+    said = (
+        "\n### Published figures\n\nYang et al., Deform3DGS, MICCAI 2024, one NVIDIA RTX A5000: other hardware, other "
+        "data, `psnr_paper`. Nothing here was measured by us.\n"
+    )
+    rows = cells(RESULTS, "1") + cells(ONE_MINUTE, "2: about a minute each")
+    return said + _table(["table", "data", "method", "psnr_paper", "training, s", "images/s"], rows)
+
+
+def _capacity(found: Sequence[Capacity]) -> str:
+    header = ["clip", "held out", "preset", "limit", "chosen, dB", "best of the grid", "its dB", "difference",
+              "deviation", "seeds", "chosen, MB", "best, MB"]  # fmt: skip
+    rows = [
+        [*each.chosen.place, each.chosen.series, each.chosen.limit, _number(each.chosen.median("psnr_tissue_db"), 2),
+         each.best.series.partition(":")[2], _number(each.best.median("psnr_tissue_db"), 2),
+         f"{each.difference_db:+.2f}", f"{each.deviation_db:.2f}", str(each.seeds),
+         _number(each.chosen.median("scene_bytes") / 1e6, 2), _number(each.best.median("scene_bytes") / 1e6, 2)]
+        for each in found
+    ]  # fmt: skip
+    within = sum(each.difference_db >= -0.1 for each in found)
+    smaller = sum(each.chosen.median("scene_bytes") <= each.best.median("scene_bytes") for each in found)
+    said = f"\nWithin 0.1 dB of the best or above it: {within} of {len(found)}; at no more bytes: {smaller}.\n"
+    return said + _table(header, rows)
+
+
+def _counted(runs: Sequence[Row]) -> str:
+    failed = sum(bool(row["error"]) for row in runs)
+    presets = {row["series"] for row in runs}
+    ours = ", ".join(f"`{name}`" for name in OURS if name in presets)
+    return (
+        f"{len(runs)} runs, {failed} of them failed; ours are {ours}, all others the published method and its rivals."
+    )
+
+
+def _origin(runs: Sequence[Row]) -> str:
+    machines, commits = (", ".join(sorted({row[name] for row in runs if row[name]})) for name in ("machine", "commit"))
+    loads = [float(row["load_1min"]) for row in runs if row["load_1min"]]
+    load = f"; load before a run {min(loads):.1f} to {max(loads):.1f}, median {median(loads):.1f}" if loads else ""
+    return f"\nMeasured on {machines}, commits {commits} (+: with changes not yet committed){load}.\n"
+
+
+def _listed(values: Sequence[int]) -> str:
+    return f"{', '.join(map(str, values[:-1]))} or {values[-1]}"
+
+
+def _span(values: Iterable[float]) -> str:
+    found = sorted(values)
+    return f"{found[0]:.1f}" if len(found) == 1 else f"{found[0]:.1f} to {found[-1]:.1f}"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "–" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = ["", "| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows]) + "\n"

@@ -1,0 +1,58 @@
+"""The page of results says what the rows say, and names what they lack."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.evaluation_page import CAPACITY, MARKS, sections, write_readme
+from tests.worker.evaluate.made_up import curve_rows, failed_row, run_row
+from worker.evaluate.rows import CURVE_FIELDS, CURVES, RUN_FIELDS, RUNS, write_rows
+
+
+def results(folder: Path) -> Path:
+    """`fast` on two clips, `paper` on one of them, a rival that failed, and a grid of one capacity."""
+    paper = run_row("paper", 38.0, limit="3000 iterations")
+    fast, other = run_row("fast", 39.0), run_row("fast", 30.0, clip="phantom-pull", psnr_view10_db=27.5, moving_mm=4.2)
+    (folder / CAPACITY).mkdir(parents=True)
+    write_rows(folder / RUNS, RUN_FIELDS, [paper, fast, other, failed_row("hexplane")])
+    curves = curve_rows(paper, [(240.0, 3000, 38.0)]) + curve_rows(fast, [(6.0, 200, 36.0), (12.0, 400, 38.0)])
+    write_rows(folder / CURVES, CURVE_FIELDS, curves)
+    write_rows(folder / CAPACITY / RUNS, RUN_FIELDS, [run_row("fast", 30.0), run_row("fast:bases=9", 30.05)])
+    return folder
+
+
+def test_the_page_makes_its_claims_from_rows(tmp_path: Path) -> None:
+    page = "".join(sections(results(tmp_path / "results")))
+    assert "on 1 of 1 clips: 20.0 times sooner in seconds, 7.5 times in iterations" in page
+    assert "| phantom-pull | every8 | fast | 60 s | 27.5 |" in page
+    assert "Within 0.1 dB of the best or above it: 1 of 1" in page
+    assert "4 runs, 1 of them failed" in page
+
+
+def test_the_page_says_what_failed_and_what_is_missing(tmp_path: Path) -> None:
+    page = "".join(sections(results(tmp_path / "results")))
+    assert "failed: TrainingDiverged: no more" in page
+    assert "| phantom-pull | paper | missing |" in page
+    assert "not decided: without_mapf, hexplane, pfs missing" in page
+
+
+def test_without_rows_there_is_nothing_to_say(tmp_path: Path) -> None:
+    assert sections(tmp_path) == []
+
+
+def test_the_readme_is_written_between_its_marks_alone_and_only_if_there_is_a_chart(tmp_path: Path) -> None:
+    folder, readme = results(tmp_path / "docs"), tmp_path / "README.md"
+    first, last = MARKS
+    readme.write_text(f"before\n{first}\nold\n{last}\nafter\n")
+    write_readme(readme, folder)
+    assert "old" in readme.read_text()
+    (folder / "pareto-first-clip.png").touch()
+    write_readme(readme, folder)
+    text = readme.read_text()
+    assert text.startswith(f"before\n{first}\n")
+    assert text.endswith(f"{last}\nafter\n")
+    assert "old" not in text
+    assert "](docs/pareto-first-clip.png)" in text
+    assert "20.0 times sooner" in text
+    write_readme(readme, folder)
+    assert readme.read_text() == text, "twice is as good as once"
