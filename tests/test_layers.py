@@ -50,6 +50,7 @@ STAGES = (
     "train",
     "render",
     "encode",
+    "doubts",
     "quality",
     "pipeline",
     "phantom",

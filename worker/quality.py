@@ -19,6 +19,7 @@ from contract.report import FrameScore, Report
 from worker.baselines import CopyBaselines
 from worker.clip import FrameSplit
 from worker.clip.types import DepthClip
+from worker.doubts import course_doubts, picture_doubts
 from worker.fusion import CLEAR_CONFIDENCE
 from worker.metrics import coverage, depth_agreement_mm, depth_errors_mm, psnr_paper, psnr_tissue, ssim
 
@@ -187,7 +188,7 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[str]:
     smooth = _share_of_tissue(clip, sampled, lambda index: _roughness(clip.rgb[index]) < SMOOTH_LEVELS)
     if smooth > LARGEST_SMOOTH_SHARE:
         found.append(f"{smooth:.0%} of the tissue has no texture, so stereo and motion are guessed there.")
-    return found + _brightness_warnings(clip, sampled)
+    return found + _brightness_warnings(clip, sampled) + picture_doubts(clip, sampled) + course_doubts(clip, train)
 
 
 def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) -> list[str]:

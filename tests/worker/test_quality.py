@@ -186,7 +186,7 @@ def _without_depth(clip: DepthClip) -> None:
 
 
 def _without_texture(clip: DepthClip) -> None:
-    clip.rgb[:] = 120
+    clip.rgb[:] = np.random.default_rng(6).integers(59, 62, clip.rgb.shape)
 
 
 def _growing_dark(clip: DepthClip) -> None:
