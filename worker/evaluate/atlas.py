@@ -32,8 +32,8 @@ MEANINGS = {
 }
 FULL_COLOUR_DB = 10.0
 """Losses from here on look alike: none of them is of use."""
-COLOURS = "cividis_r"  # of even steps to the eye, for the colour-blind as well; light is good
-DARK_FROM = 0.55  # of the scale, from where white writing is read better
+COLOURS = "Blues"  # one hue, light to dark: read in print and by the colour-blind
+DARK_FROM = 0.6  # of the scale, from where white writing is read better
 ROW_INCHES, COLUMN_INCHES, LABEL_INCHES = 0.3, 1.0, 3.6
 LONGEST_TOLD = 150
 
@@ -158,7 +158,7 @@ def _figures(place: Place) -> str:
     if math.isnan(place.loss_db):
         return place.outcome
     harmed_in_depth = place.depth_loss_mm > LARGEST_DEPTH_LOSS_MM
-    return f"{place.loss_db:.1f}" + (f", {place.depth_loss_mm:.0f} mm" if harmed_in_depth else "")
+    return f"{place.loss_db:z.1f}" + (f", {place.depth_loss_mm:.0f} mm" if harmed_in_depth else "")
 
 
 def _in_words(place: Place | None) -> str:

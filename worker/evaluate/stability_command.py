@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -64,12 +65,17 @@ def run_cli(options: argparse.Namespace) -> int:
 
 def measure_all(atlas: Atlas, cells: Sequence[StabilityCell]) -> None:
     """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     end = told_to_end()
-    for place, cell in enumerate(cells):
-        with ProgressBar(sys.stderr) as bar:
-            bar.show(JobProgress(stage=f"{place + 1}/{len(cells)}", fraction=place / len(cells)))
-            row = atlas.measure(cell, Hooks(should_stop=end.is_set))
-        print(_line(row), flush=True)
+    try:
+        for place, cell in enumerate(cells):
+            with ProgressBar(sys.stderr) as bar:
+                bar.show(JobProgress(stage=f"{place + 1}/{len(cells)}", fraction=place / len(cells)))
+                row = atlas.measure(cell, Hooks(should_stop=end.is_set))
+            print(_line(row), flush=True)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def draw_all(rows: Sequence[Row], folder: Path) -> None:

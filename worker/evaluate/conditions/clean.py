@@ -16,6 +16,8 @@ from worker.phantom import Phantom, PhantomSettings, make_phantom
 
 REFERENCE_WIDTH = 640
 """Lengths in the table of conditions are pixels of a picture this wide, so that every size suffers alike."""
+SEEN_SHARE = 0.25
+"""Of the frames: where a pixel shows tissue less often, nobody can ask what the instrument hides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,11 @@ class CleanClip:
     def px(self) -> float:
         """Pixels of this clip in one of a picture REFERENCE_WIDTH wide."""
         return self.clip.intrinsics.width / REFERENCE_WIDTH
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """[T, H, W] pixels with tissue that the clip shows often enough to know what the instrument hides there."""
+        return np.asarray((self.clip.tissue.mean(axis=0) >= SEEN_SHARE) & (self.depth_mm > 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +76,10 @@ def clean_of(phantom: Phantom) -> CleanClip:
 
 
 def given(clean: CleanClip, clip: DepthClip | Recording | None = None, **truth: NDArray[np.generic]) -> Given:
-    """The clean clip, or `clip` in its place; judged on the whole picture, also behind the instrument.
+    """The clean clip, or `clip` in its place; judged where the clean clip shows tissue in SEEN_SHARE of its frames or
+    more, and there also in frames in which the instrument hides it.
 
     truth: rgb, depth_mm or scored, where they differ from the clean clip's.
     """
-    parts = {"rgb": clean.rgb, "depth_mm": clean.depth_mm, "scored": clean.depth_mm > 0, **truth}
+    parts = {"rgb": clean.rgb, "depth_mm": clean.depth_mm, "scored": clean.seen, **truth}
     return Given(clip or clean.clip, source=tuple(range(clean.clip.frame_count)), **parts)  # type: ignore[arg-type]

@@ -30,7 +30,7 @@ def tools_over_frame(clean: CleanClip, level: float, random: np.random.Generator
     start = random.uniform(0, 2 * np.pi)
     covered = np.stack([_beyond(start + _wag(index, frames), level, height, width) for index in range(frames)])
     spoilt = _with_steel(clean, covered, random)
-    return given(clean, spoilt, scored=(clean.depth_mm > 0) & ~covered)
+    return given(clean, spoilt, scored=clean.seen & ~covered)
 
 
 def hidden_at_start(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
@@ -77,7 +77,7 @@ def inverted_masks(clean: CleanClip, level: float, random: np.random.Generator) 
         left, right = (np.where(steel, np.array(STEEL, np.uint8), eye) for eye in (frame.left, frame.right))
         return dataclasses.replace(frame, left=left, right=right, tissue=~(frame.tissue & ~covered[index]))
 
-    return given(clean, recording_of(clean.phantom, spoil), scored=(clean.depth_mm > 0) & ~covered)
+    return given(clean, recording_of(clean.phantom, spoil), scored=clean.seen & ~covered)
 
 
 def _wag(index: int, frames: int) -> float:

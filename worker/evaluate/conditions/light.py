@@ -110,7 +110,7 @@ def black_border(clean: CleanClip, level: float, random: np.random.Generator) ->
         depth_confidence=np.where(border, np.uint8(0), clean.clip.depth_confidence),
         tissue=clean.clip.tissue | border,
     )
-    return given(clean, spoilt, scored=(clean.depth_mm > 0) & ~border)
+    return given(clean, spoilt, scored=clean.seen & ~border)
 
 
 def grey_scale(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
