@@ -128,6 +128,11 @@ def test_aligned_eyes_give_no_warning() -> None:
     assert abs(clip.measurements["vertical_misalignment_px"]) < 0.1
 
 
+def test_what_no_picture_can_confirm_is_named_as_an_assumption() -> None:
+    clip = estimate_depth(clip_of([draw_pair(slanted())]))
+    assert any(f"baseline of {BASELINE_MM:g} mm" in each for each in clip.assumptions)
+
+
 def test_a_misalignment_beyond_eight_pixels_is_refused() -> None:
     with pytest.raises(InputError, match=r"differ by 14\.\d px") as error:
         estimate_depth(clip_of([draw_pair(slanted(), row_shift_px=14.0)]))

@@ -68,7 +68,7 @@ def estimate_depth(
         intrinsics=clip.intrinsics,
         world_from_camera=np.tile(np.eye(4), (clip.frame_count, 1, 1)),
         frame_times_s=clip.frame_times_s,
-        assumptions=clip.assumptions,
+        assumptions=(*clip.assumptions, _scale_assumption(clip)),
         warnings=clip.warnings + _warnings(shift, valid_share),
         measurements={
             "vertical_misalignment_px": shift.shift_px,
@@ -188,6 +188,11 @@ def _warnings(shift: RowShift, valid_share: float) -> tuple[str, ...]:
     if valid_share < WARN_VALID_SHARE:
         found.append(f"only {valid_share:.0%} of tissue has stereo depth")
     return tuple(found)
+
+
+def _scale_assumption(clip: RectifiedClip) -> str:
+    """What no picture can confirm: a wrong baseline scales every distance, and nothing else changes."""
+    return f"scale: the calibration's baseline of {clip.baseline_mm:.4g} mm; every distance is as right as it is"
 
 
 def _check_stop(hooks: Hooks) -> None:
