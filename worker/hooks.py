@@ -31,15 +31,22 @@ def _show_nobody(scene: Any, iteration: int) -> None:
     del scene, iteration
 
 
+def _judge_no_further(frame: int, view: Any) -> None:
+    del frame, view
+
+
 @dataclass(frozen=True)
 class Hooks:
     """on_progress is called at least once a second while work goes on; should_stop is asked between steps.
 
     wants_snapshot is asked between steps of training; if it says so, on_snapshot is given the model as it is then, a
-    Scene of worker/checkpoint.py, and how many iterations made it. Neither changes what training comes to.
+    Scene of worker/checkpoint.py, and how many iterations made it. on_held_out is given each held-out frame that is
+    rendered to be scored while training goes on: its number and the View of worker/quality.py; training's clock stands
+    still meanwhile. None of these changes what training comes to.
     """
 
     on_progress: Callable[[Progress], None] = _ignore
     should_stop: Callable[[], bool] = _never
     wants_snapshot: Callable[[], bool] = _never
     on_snapshot: Callable[[Any, int], None] = _show_nobody
+    on_held_out: Callable[[int, Any], None] = _judge_no_further

@@ -102,7 +102,7 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
         train(
             run,
             clock,
-            evaluate=lambda: held_out_psnr(clip, split, view_of),
+            evaluate=lambda: held_out_psnr(clip, split, view_of, hooks),
             hooks=hooks,
             copy_scene=lambda: snapshot_of(run, clip, split, scale, request.seed),
         )
@@ -271,9 +271,16 @@ def reporting(run: Run, view_of: Callable[[int], View], split: FrameSplit, hooks
     return reported
 
 
-def held_out_psnr(clip: DepthClip, split: FrameSplit, view_of: Callable[[int], View]) -> float:
+def held_out_psnr(
+    clip: DepthClip, split: FrameSplit, view_of: Callable[[int], View], hooks: Hooks | None = None
+) -> float:
     """Mean psnr_tissue over at most sixteen held-out frames, evenly spread; NaN without any."""
-    scores = [psnr_tissue(view_of(i).rgb, clip.rgb[i], clip.tissue[i]) for i in sample_frames(split.held_out, 16)]
+    scores = []
+    for index in sample_frames(split.held_out, 16):
+        view = view_of(index)
+        if hooks is not None:
+            hooks.on_held_out(index, view)
+        scores.append(psnr_tissue(view.rgb, clip.rgb[index], clip.tissue[index]))
     known = [score for score in scores if not math.isnan(score)]  # a frame without tissue has no score
     return float(np.mean(known)) if known else math.nan
 

@@ -1,6 +1,6 @@
 """The charts, drawn from rows alone: a row of panels a clip, a column a way of holding out.
 
-curves  held-out psnr_tissue against seconds of training
+curves  held-out psnr_tissue against seconds of training; curves-ssim, curves-depth: SSIM, median depth error
 pareto  its end against the seconds it took; the front joins what nothing is both sooner and better than
 frames  its end against images rendered a second
 knee    of the grid of capacities: its end against the scene's bytes, and where the automatic choice lies
@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,12 @@ MOST_FINE_TICKS = 500
 REAL_CLIP, PAPERS_HOLDOUT = "d4d-a", "every8"
 """Published figures stand beside the real clip alone, held out as the papers do."""
 DECIBEL = "held-out psnr_tissue, dB"
+OVER_TIME = {
+    "curves": ("psnr_tissue_db", DECIBEL),
+    "curves-ssim": ("ssim", "held-out SSIM"),
+    "curves-depth": ("depth_agreement_mm", "median depth error, mm"),
+}
+"""By chart: the column of curves.csv, and what it is called."""
 
 Points = list[tuple[float, float]]
 
@@ -47,12 +54,14 @@ def draw_all(results: Results, folder: Path) -> list[str]:
     drawn = []
     with mpl.rc_context(SETTINGS):
         if any(group.rows for group in presets):
-            points = _points_by_run(results.curves)
-            _draw(presets, lambda axis, here: _curves(axis, here, points), folder, "curves")
+            for name, (column, _) in OVER_TIME.items():
+                if points := _points_by_run(results.curves, column):
+                    _draw(presets, partial(_curves, points=points), folder, name)
+                    drawn.append(name)
             _draw(presets, _pareto, folder, "pareto")
             _draw([group for group in presets if group.clip == presets[0].clip], _pareto, folder, "pareto-first-clip")
             _draw(presets, _frames, folder, "frames")
-            drawn += ["curves", "pareto", "pareto-first-clip", "frames"]
+            drawn += ["pareto", "pareto-first-clip", "frames"]
         if choices:
             _draw_knee(groups, choices, folder)
             drawn.append("knee")
@@ -66,19 +75,22 @@ def _draw(groups: Sequence[Group], draw_panel: Callable[[Any, Sequence[Group]], 
     for place, axis in zip(places, axes, strict=True):
         here = [group for group in groups if group.place == place]
         _name(axis, place, here, _missing(here))
+        axis.set_ylabel(OVER_TIME.get(name, ("", DECIBEL))[1])
         draw_panel(axis, here)
-        _copies(axis, here)
+        if name not in OVER_TIME or name == "curves":
+            _copies(axis, here)
         _finish(axis)
         if name == "curves":
             _cut_below(axis, here)
     save(figure, folder, name)
 
 
-def _points_by_run(curves: Sequence[Row]) -> dict[tuple[str, ...], Points]:
-    """Seconds and decibels of every run's curve, by the run's key."""
+def _points_by_run(curves: Sequence[Row], column: str) -> dict[tuple[str, ...], Points]:
+    """Seconds and a score of every run's curve, by the run's key."""
     points: dict[tuple[str, ...], Points] = {}
     for row in curves:
-        points.setdefault(key_of(row), []).append((float(row["t_train_s"]), float(row["psnr_tissue_db"])))
+        if row[column]:
+            points.setdefault(key_of(row), []).append((float(row["t_train_s"]), float(row[column])))
     return {key: sorted(each) for key, each in points.items()}
 
 
@@ -184,6 +196,7 @@ def _draw_knee(groups: Sequence[Group], choices: Sequence[Group], folder: Path) 
         here = [group for group in groups if group.place == place]
         _name(axis, place, here, "")
         axis.set_xlabel("scene on disk, MB (log)")
+        axis.set_ylabel(DECIBEL)
         for chosen in (each for each in choices if each.place == place):
             variants = [
                 each
@@ -219,13 +232,13 @@ def _handles(groups: Sequence[Group], name: str) -> list[Any]:
     """The legend's entries: every series, and what else the chart shows."""
     from matplotlib.lines import Line2D
 
-    line = "-" if name == "curves" else "none"
+    line = "-" if name in OVER_TIME else "none"
     looks = {each: look_of(each) for each in dict.fromkeys(group.series for group in groups if group.rows)}
     handles = [
         Line2D([], [], color=look.colour, marker=look.marker, label=series, linestyle=line)
         for series, look in looks.items()
     ]
-    if name == "curves":
+    if name in OVER_TIME:
         return handles
     if name != "frames":
         handles.append(Line2D([], [], color=GREY, linewidth=1.0, label="front"))
@@ -256,7 +269,6 @@ def _name(axis: Any, place: Place, groups: Sequence[Group], missing: str) -> Non
     size = ", ".join(f"{width}x{height}" for width, height in sorted(sizes))
     axis.set_title(", ".join(filter(None, (*place, size))), pad=14)
     axis.text(0, 1.015, missing, transform=axis.transAxes, fontsize=7, color=GREY)
-    axis.set_ylabel(DECIBEL)
     axis.set_xscale("log")
 
 

@@ -8,26 +8,30 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import math
 import os
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from contract.errors import Cancelled
 from contract.report import Report
 from contract.store import CURVE, REPORT
 from worker.checkpoint import Scene, load_scene
+from worker.clip import DepthClip
 from worker.evaluate.cells import Cell, preset_of
 from worker.evaluate.rows import KEY, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
 from worker.evaluate.truth import ShownScene, Truth
 from worker.hooks import Hooks
-from worker.metrics import psnr_tissue
+from worker.metrics import depth_agreement_mm, depth_errors_mm, psnr_tissue, ssim
 from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.quality import View
 from worker.raster.cpu import camera_vector
 from worker.render import model_of
 from worker.targets import camera_in_units
@@ -85,9 +89,10 @@ class Bench:
             seed=cell.seed,
             accepted_at_s=time.time() - sum(opened.seconds.values()),
         )
+        on_the_way = _OnTheWay(opened.clip)
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder)
-            report = reconstruct(request, out, hooks)
+            report = reconstruct(request, out, dataclasses.replace(hooks, on_held_out=on_the_way.judge))
             with (out / CURVE).open(newline="") as file:
                 curve: list[Values] = [dict(point) for point in csv.DictReader(file)]
             scene = load_scene(out)
@@ -95,6 +100,9 @@ class Bench:
             scene_bytes = sum(path.stat().st_size for path in kept)
         values = _reported(report, opened) | _size(scene) | _speed(scene, report)
         values |= {"scene_bytes": scene_bytes, "stored_psnr_tissue_db": _stored_db(scene, opened, report)}
+        curve = [point | scores for point, scores in zip(curve, on_the_way.scores(), strict=True)]
+        if curve:  # its end is scored on all held-out frames of the model as it is kept
+            curve[-1] |= {"ssim": report.ssim, "depth_agreement_mm": report.depth_agreement_mm}
         return values | self._true(place, opened, scene, report), curve
 
     def _true(self, place: tuple[str, str], opened: OpenClip, scene: Scene, report: Report) -> Values:
@@ -106,6 +114,32 @@ class Bench:
             train = [frame for frame in range(report.frame_count) if frame not in unused]
             self._truth[place] = Truth(opened.phantom, opened.clip, train, report.held_out)
         return dataclasses.asdict(self._truth[place].score(ShownScene(scene)))
+
+
+class _OnTheWay:
+    """SSIM and depth agreement of the held-out frames each time they are scored while training goes on."""
+
+    def __init__(self, clip: DepthClip) -> None:
+        self._clip, self._last = clip, -1
+        self._ssim: list[list[float]] = []
+        self._errors_mm: list[list[NDArray[np.float32]]] = []
+
+    def judge(self, frame: int, view: View) -> None:
+        """Frames come in rising order; one that does not rise begins the next scoring."""
+        if frame <= self._last or not self._ssim:
+            self._ssim.append([])
+            self._errors_mm.append([])
+        self._last = frame
+        truth, tissue = self._clip.rgb[frame], self._clip.tissue[frame]
+        self._ssim[-1].append(ssim(view.rgb, truth, tissue))
+        self._errors_mm[-1].append(depth_errors_mm(view.depth_mm, self._clip.depth_mm[frame], tissue))
+
+    def scores(self) -> list[Values]:
+        """One pair a scoring."""
+        return [
+            {"ssim": _mean_of_known(found), "depth_agreement_mm": depth_agreement_mm(errors)}
+            for found, errors in zip(self._ssim, self._errors_mm, strict=True)
+        ]
 
 
 def command_of(cell: Cell, source: Source) -> str:
@@ -165,5 +199,10 @@ def _stored_db(scene: Scene, opened: OpenClip, report: Report) -> float | None:
         psnr_tissue(shown.view(frame, clip.world_from_camera[frame]).rgb, clip.rgb[frame], clip.tissue[frame])
         for frame in report.held_out
     ]
-    known = [score for score in scores if score == score]  # NaN where there is no tissue
+    return _mean_of_known(scores)
+
+
+def _mean_of_known(scores: Sequence[float]) -> float | None:
+    """A frame without tissue has no score: NaN."""
+    known = [score for score in scores if not math.isnan(score)]
     return float(np.mean(known)) if known else None

@@ -29,7 +29,7 @@ SPEED = ("t_train_s", "t_post_s", "seconds", "step_ms", "render_ms", "render_fps
 ORIGIN = ("machine", "commit", "command", "error")
 RUN_FIELDS = (*KEY, *SCORES, *COPIES, *TRUTH, *SIZE, *SPEED, *ORIGIN)
 """docs/results/index.md says what each column means; empty means not measured."""
-CURVE_FIELDS = (*KEY, "t_train_s", "iteration", "psnr_tissue_db")
+CURVE_FIELDS = (*KEY, "t_train_s", "iteration", "psnr_tissue_db", "ssim", "depth_agreement_mm")
 
 
 def key_of(row: Mapping[str, str]) -> tuple[str, ...]:
@@ -44,7 +44,7 @@ class Results:
         self._folder = folder
         self.runs = [_texts(row, RUN_FIELDS) for row in read_rows(folder / RUNS)]
         kept = {key_of(row) for row in self.runs}
-        self.curves = [row for row in read_rows(folder / CURVES) if key_of(row) in kept]
+        self.curves = [_texts(row, CURVE_FIELDS) for row in read_rows(folder / CURVES) if key_of(row) in kept]
 
     def has(self, key: tuple[str, ...]) -> bool:
         """Whether the run has a row, of success or of failure."""

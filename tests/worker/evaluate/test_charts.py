@@ -12,6 +12,8 @@ from worker.evaluate.charts import draw_all
 from worker.evaluate.published import LABEL
 from worker.evaluate.rows import CURVE_FIELDS, CURVES, RUN_FIELDS, RUNS, Results, write_rows
 
+CHARTS = ["curves", "curves-ssim", "curves-depth", "pareto", "pareto-first-clip", "frames"]
+
 
 def results_in(folder: Path) -> Results:
     """Two presets and one that failed at two places, one of them without `paper`; and a clip where all failed."""
@@ -31,11 +33,11 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("charts")
     with mpl.rc_context({"svg.fonttype": "none"}):  # text stays text
-        assert draw_all(results_in(folder), folder) == ["curves", "pareto", "pareto-first-clip", "frames"]
+        assert draw_all(results_in(folder), folder) == CHARTS
     return folder
 
 
-@pytest.mark.parametrize("name", ["curves", "pareto", "pareto-first-clip", "frames"])
+@pytest.mark.parametrize("name", CHARTS)
 def test_every_chart_is_drawn_as_png_and_svg(name: str, drawn: Path) -> None:
     picture = cv2.imread(str(drawn / f"{name}.png"))
     assert picture is not None

@@ -53,7 +53,8 @@ def test_a_curve_ends_where_its_run_does(measured: Path) -> None:
     fast, _ = read_rows(measured / RUNS)
     last = [row for row in read_rows(measured / CURVES) if row["series"] == "fast"][-1]
     assert (last["iteration"], fast["iterations"]) == ("12", "12")
-    assert float(last["psnr_tissue_db"]) == pytest.approx(float(fast["psnr_tissue_db"]), abs=1e-3)
+    for score in ("psnr_tissue_db", "ssim", "depth_agreement_mm"):
+        assert float(last[score]) == pytest.approx(float(fast[score]), abs=1e-3)
 
 
 def test_what_has_its_row_is_not_measured_again(measured: Path, capsys: pytest.CaptureFixture[str]) -> None:
