@@ -37,6 +37,11 @@ LONGEST_FLICKER = 3
 """Frames: no instrument leaves the picture and is back so soon."""
 LEAST_INSTRUMENT = 0.02
 """Share of the picture; less may be an instrument's tip that comes and goes."""
+SURE = 128
+"""Of depth_confidence's 255: what stereo itself doubts is told of elsewhere."""
+DEPTH_JUMP, LARGEST_JUMPING_SHARE = 0.1, 0.03
+"""Of the depth from frame to frame, and of the tissue: 0.012 at most in clean clips, 0.05 with gross errors on 0.05."""
+MOST_PAIRS = 8
 LARGEST_JITTER = 0.003
 """Of the picture's width: how far poses that jump to and fro move the tissue in it, 2 px of 640."""
 LARGEST_ROUGHNESS = 1.0
@@ -83,7 +88,7 @@ def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
             f"{flickering} frames have no mask although those before and after have: their instrument is modelled as "
             "if it were tissue."
         )
-    return found + _pose_doubts(clip, train)
+    return found + _depth_doubts(clip, train) + _pose_doubts(clip, train)
 
 
 def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[str]:
@@ -109,6 +114,25 @@ def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[str]:
     return [
         f"The tissue's colour changes during the clip ({('red', 'blue')[worst]} over green from {low:.2f} to "
         f"{high:.2f}): the white balance drifts, or blood comes in; the model shows it as motion of colour."
+    ]
+
+
+def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
+    """No tissue comes a tenth nearer within a frame; where depth does, on much of the tissue, it is wrong."""
+    wanted = set(train)
+    first = [index for index in train if index + 1 in wanted]
+    jumps, total = 0, 0
+    for index in first[:: -(-len(first) // MOST_PAIRS) or 1]:
+        pair = slice(index, index + 2)
+        sure = (clip.tissue[pair] & (clip.depth_confidence[pair] >= SURE)).all(axis=0)
+        before, after = clip.depth_mm[index][sure], clip.depth_mm[index + 1][sure]
+        jumps += int((np.abs(after - before) > DEPTH_JUMP * before).sum())
+        total += before.size
+    if jumps <= LARGEST_JUMPING_SHARE * total:
+        return []
+    return [
+        f"Depth jumps by more than {DEPTH_JUMP:.0%} from one frame to the next on {jumps / total:.0%} of the tissue: "
+        "much of it is wrong, and so are distances in this scene."
     ]
 
 

@@ -56,6 +56,8 @@ def test_a_real_clip_is_not_doubted() -> None:
         ("hidden_at_start", 5, "in the first frame that later ones show"),
         ("masks_missing", 3, "have no mask although those before and after have"),
         ("noisy_poses", 3, "poses jump to and fro"),
+        ("depth_outliers", 2, "Depth jumps by more than 10%"),
+        ("depth_noise", 4, "Depth jumps by more than 10%"),
     ],
 )
 def test_what_harms_a_scene_is_told(clean: CleanClip, condition: str, severity: int, said: str) -> None:
@@ -70,7 +72,8 @@ def test_what_harms_a_scene_is_told(clean: CleanClip, condition: str, severity: 
     ("condition", "severity"),
     [
         ("smoke", 1), ("grey_scale", 5), ("highlights", 5), ("tools", 5), ("moving_camera", 5), ("black_border", 5),
-        ("depth_holes", 5), ("defocus", 1), ("white_balance", 2), ("few_frames", 5),
+        ("depth_holes", 5), ("depth_noise", 1), ("depth_outliers", 1), ("fast_pull", 5), ("cutting", 5),
+        ("defocus", 1), ("white_balance", 2), ("few_frames", 5),
     ],
 )  # fmt: skip
 def test_what_does_no_harm_is_not(clean: CleanClip, condition: str, severity: int) -> None:

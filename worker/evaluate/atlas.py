@@ -40,10 +40,14 @@ LONGEST_TOLD = 150
 
 @dataclass(frozen=True)
 class Place:
-    """All seeds of a condition at a severity by one method; depth_loss_mm and loss_db are means, NaN if unknown."""
+    """All seeds of a condition at a severity by one method; depth_loss_mm and loss_db are means, NaN if unknown.
+
+    spread_db is the largest loss less the smallest; 0 for one seed.
+    """
 
     outcome: str
     loss_db: float
+    spread_db: float
     depth_loss_mm: float
     told: str
 
@@ -120,12 +124,18 @@ def _place(rows: Sequence[Row]) -> Place:
     told = worst["error"].partition(": ")[2] or worst["new_warnings"].split(SEPARATOR)[0]
     if len(told) > LONGEST_TOLD:
         told = told[:LONGEST_TOLD].rpartition(" ")[0] + " ..."
-    return Place(worst["outcome"], _mean(rows, "loss_db"), _mean(rows, "depth_loss_mm"), told.replace("|", "/"))
+    losses_db, depth_losses_mm = _known(rows, "loss_db"), _known(rows, "depth_loss_mm")
+    return Place(
+        outcome=worst["outcome"],
+        loss_db=float(np.mean(losses_db)) if losses_db else math.nan,
+        spread_db=max(losses_db) - min(losses_db) if losses_db else 0.0,
+        depth_loss_mm=float(np.mean(depth_losses_mm)) if depth_losses_mm else math.nan,
+        told=told.replace("|", "/"),
+    )
 
 
-def _mean(rows: Sequence[Row], name: str) -> float:
-    known = [float(row[name]) for row in rows if row[name]]
-    return float(np.mean(known)) if known else math.nan
+def _known(rows: Sequence[Row], name: str) -> list[float]:
+    return [float(row[name]) for row in rows if row[name]]
 
 
 def _loss(place: Place | None) -> float:
@@ -164,7 +174,8 @@ def _figures(place: Place) -> str:
 def _in_words(place: Place | None) -> str:
     if place is None:
         return ""
-    figures = "" if math.isnan(place.loss_db) else f" {_figures(place)}"
+    spread = f" (spread {place.spread_db:.1f})" if place.spread_db else ""
+    figures = "" if math.isnan(place.loss_db) else f" {_figures(place)}{spread}"
     return (f"**{place.outcome}**" if place.outcome in ("silent", "crashed") else place.outcome) + figures
 
 

@@ -22,6 +22,11 @@ from worker.hooks import Hooks
 
 DEFAULT_SERIES = ("fast", "paper", "pfs", "hexplane", "without_mapf")
 TABLE = "stability.md"
+TABLE_TITLE = """# What the user is told
+
+Decibels lost against the clean clip (over several seeds their mean, and the spread), millimetres of depth where those
+are the harm. In bold what is a defect; what was not measured is empty.
+"""
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,7 +92,7 @@ def draw_all(rows: Sequence[Row], folder: Path) -> None:
         tables.append(told_table(places, series))
         counted = ", ".join(f"{number} {outcome}" for outcome, number in count_outcomes(places).items())
         print(f"{series}: {counted or 'clean clips only'}; {folder / name}.png")
-    (folder / TABLE).write_text("\n".join(tables), encoding="utf-8")
+    (folder / TABLE).write_text("\n".join([TABLE_TITLE, *tables]), encoding="utf-8")
 
 
 def _line(row: Row) -> str:

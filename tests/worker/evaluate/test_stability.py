@@ -143,7 +143,8 @@ ROWS = [
 
 def test_a_place_of_the_map_has_the_mean_loss_and_the_worst_outcome_of_its_seeds() -> None:
     places = places_of(ROWS, "fast")
-    assert (places["smoke", 1].outcome, places["smoke", 1].loss_db) == ("silent", 2.5)
+    smoke = places["smoke", 1]
+    assert (smoke.outcome, smoke.loss_db, smoke.spread_db) == ("silent", 2.5, 3.0)
     assert count_outcomes(places) == {
         "silent": 1, "crashed": 1, "unknown": 1, "diverged": 1, "told": 1, "refused": 1,
     }  # fmt: skip
@@ -169,7 +170,7 @@ def test_the_table_says_what_the_user_is_told() -> None:
         next(line for line in table.splitlines() if CONDITIONS[name].title in line)
         for name in ("smoke", "inverted_masks")
     )
-    assert "**silent** 2.5" in smoke
+    assert "**silent** 2.5 (spread 3.0)" in smoke
     assert smoke.endswith("| Even the dark tissue is pale |")
     assert inverted.endswith("| masks: they look inverted. |")
 
