@@ -21,8 +21,8 @@ KEY = ("clip", "holdout", "series", "seed", "limit")
 SCORES = ("psnr_tissue_db", "psnr_paper_db", "ssim", "depth_agreement_mm", "coverage", "train_psnr_tissue_db")
 COPIES = ("copy_blend_db", "copy_flow_db")
 TRUTH = (
-    "psnr_view10_db", "psnr_view15_db", "psnr_hidden_db", "depth_error_mm", "motion_error_mm", "moving_error_mm",
-    "moving_mm",
+    "psnr_view10_db", "psnr_view15_db", "psnr_baked10_db", "psnr_baked15_db", "bound10_db", "bound15_db",
+    "psnr_hidden_db", "depth_error_mm", "motion_error_mm", "moving_error_mm", "moving_mm",
 )  # fmt: skip
 SIZE = ("iterations", "gaussians", "bases", "floats_a_gaussian", "scene_bytes", "stored_psnr_tissue_db")
 SPEED = ("t_train_s", "t_post_s", "seconds", "step_ms", "render_ms", "render_fps", "width", "height", "load_1min")

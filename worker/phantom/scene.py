@@ -110,18 +110,20 @@ class Phantom:
         frame: float,
         world_from_camera: NDArray[np.float64] | None = None,
         intrinsics: Intrinsics | None = None,
+        eye_mm: NDArray[np.float64] | None = None,
     ) -> tuple[Image32, NDArray[np.float32]]:
         """The tissue without instrument and noise from any viewpoint, best within 15 degrees of the endoscope's.
 
         Args:
             frame: any real number in [0, T); model time t is frame / T.
             world_from_camera: [4, 4] mm; the endoscope's left eye when left out. The lamp stays in the endoscope.
+            eye_mm: [3] world; mirrored light is drawn as it is seen from there, from the camera itself when left out.
 
         Returns:
             rgb [H, W, 3] float32 in [0, 1] and depth_mm [H, W] float32, both 0 where no tissue is modelled.
         """
         pose = self.world_from_camera(frame) if world_from_camera is None else world_from_camera
-        linear, fragments = self._draw_tissue(frame, pose, intrinsics or self.settings.intrinsics)
+        linear, fragments = self._draw_tissue(frame, pose, intrinsics or self.settings.intrinsics, eye_mm)
         return to_srgb(_through_lens(linear)), fragments.depth_mm
 
     def atlas_xy(self, frame: float, world_from_camera: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
@@ -203,7 +205,11 @@ class Phantom:
         )
 
     def _draw_tissue(
-        self, frame: float, pose: NDArray[np.float64], intrinsics: Intrinsics
+        self,
+        frame: float,
+        pose: NDArray[np.float64],
+        intrinsics: Intrinsics,
+        eye_mm: NDArray[np.float64] | None = None,
     ) -> tuple[Image32, Fragments]:
         vertices, normals = self.surface.vertices_and_normals(frame)
         triangles = self.surface.triangles
@@ -228,7 +234,7 @@ class Phantom:
             film[..., 2][hit],
             tissue_finish(),
             self._lamp(frame),
-            pose[:3, 3],
+            pose[:3, 3] if eye_mm is None else eye_mm,
         )
         return lit, fragments
 
