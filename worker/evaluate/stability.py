@@ -11,6 +11,7 @@ in one that nobody foresaw.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import re
 import tempfile
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 from contract.errors import Cancelled, InputError, TrainingDiverged
 from contract.report import Report
-from worker.clip import DepthClip, FrameSplit, split_frames
+from worker.checkpoint import Scene, load_scene
 from worker.evaluate.cells import preset_of
 from worker.evaluate.conditions import (
     CLEAN,
@@ -41,10 +42,10 @@ from worker.evaluate.rows import Row, commit, machine, read_rows, write_rows
 from worker.hooks import Hooks
 from worker.metrics import psnr_tissue
 from worker.phantom import PhantomSettings
-from worker.pipeline import ReconstructionRequest, depth_clip_of, prepare, report_of, scene_of, view_function
-from worker.quality import View
-from worker.targets import solid_depth_mm
-from worker.train import Run, Stopwatch, train
+from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.raster.cpu import camera_vector
+from worker.render import model_of
+from worker.targets import camera_in_units, solid_depth_mm
 
 STABILITY = "stability.csv"
 KEY = ("condition", "severity", "series", "seed", "iterations", "width", "height", "frames")
@@ -210,30 +211,30 @@ class Moment:
     truth: int
 
 
-def moments_of(given: Given, split: FrameSplit, frame_count: int) -> list[Moment]:
+def moments_of(given: Given, held_out: Sequence[int], frame_count: int) -> list[Moment]:
     """The held-out frames; where none are held out, half-way between given frames; of a single frame, itself."""
-    if split.held_out:
-        return [Moment(frame / frame_count, frame, given.source[frame]) for frame in split.held_out]
+    if held_out:
+        return [Moment(frame / frame_count, frame, given.source[frame]) for frame in held_out]
     found = []
-    for frame, (here, after) in enumerate(zip(given.source, given.source[1:], strict=False)):
+    for frame, (here, after) in enumerate(itertools.pairwise(given.source)):
         between = (here + after) // 2
         found.append(Moment((frame + (between - here) / max(after - here, 1)) / frame_count, frame, between))
     return found or [Moment(0.0, 0, given.source[0])]
 
 
 def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Hooks) -> Row:
-    """Reconstruct as `reconstruct` does, and judge by the truth as well as by the report."""
+    """What `reconstruct` makes of the clip, judged by the truth and as it judges itself."""
     with tempfile.TemporaryDirectory() as folder:
-        request = ReconstructionRequest(Path(folder), iterations=grid.iterations, seed=cell.seed)
-        clip = _decoded(given, request, Path(folder), hooks)
-    split = split_frames(clip)
-    preset = preset_of(cell.series)
-    clock = Stopwatch()
-    run, scale = prepare(clip, split, preset, request, clock, hooks)
-    train(run, clock, lambda: math.nan, hooks)
-    scene = scene_of(run, clip, split, scale, cell.seed)
-    report = report_of(run, clip, split, scene, request, {}, view_function(run, scale), time.time())
-    psnr_db, depth_error_mm = _judged(given, run, scale, moments_of(given, split, clip.frame_count))
+        asked = (
+            write_recording(given.clip, Path(folder, "clip"))
+            if isinstance(given.clip, Recording)
+            else ReconstructionRequest(given.clip)
+        )
+        preset = preset_of(cell.series)
+        request = dataclasses.replace(asked, preset=preset, iterations=grid.iterations, seed=cell.seed)
+        report = reconstruct(request, Path(folder, "scene"), hooks)
+        scene = load_scene(Path(folder, "scene"))
+    psnr_db, depth_error_mm = _judged(given, scene, moments_of(given, report.held_out, report.frame_count))
     return {
         "psnr_db": _text(psnr_db),
         "depth_error_mm": _text(depth_error_mm),
@@ -242,29 +243,19 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Hooks) 
     }
 
 
-def _decoded(given: Given, request: ReconstructionRequest, folder: Path, hooks: Hooks) -> DepthClip:
-    if not isinstance(given.clip, Recording):
-        return given.clip
-    files = write_recording(given.clip, folder)
-    asked = dataclasses.replace(request, clip=files.clip, calibration=files.calibration)
-    return depth_clip_of(asked, hooks, {})
-
-
-def _judged(given: Given, run: Run, scale: float, moments: Sequence[Moment]) -> tuple[float, float]:
+def _judged(given: Given, scene: Scene, moments: Sequence[Moment]) -> tuple[float, float]:
     """Mean psnr in dB and mean |z - truth| in mm over the moments' scored pixels; NaN where there is none."""
+    model, scale = model_of(scene), scene.units_per_mm
     scores, errors_mm = [], []
     for moment in moments:
-        view = _view(run, scale, moment)
+        camera = camera_in_units(scene.intrinsics, scene.world_from_camera[moment.frame], scale)
+        image = model.render(camera_vector(camera), moment.t)
+        depth_mm = solid_depth_mm(image[3], image[4], scale)
         truth, scored = given.depth_mm[moment.truth], given.scored[moment.truth]
-        scores.append(psnr_tissue(view.rgb, given.rgb[moment.truth], scored))
-        both = scored & (truth > 0) & (view.depth_mm > 0)
-        errors_mm.append(np.abs(view.depth_mm[both] - truth[both]))
+        scores.append(psnr_tissue(image[:3].transpose(1, 2, 0), given.rgb[moment.truth], scored))
+        both = scored & (truth > 0) & (depth_mm > 0)
+        errors_mm.append(np.abs(depth_mm[both] - truth[both]))
     return _mean(scores), _mean(np.concatenate(errors_mm))
-
-
-def _view(run: Run, scale: float, moment: Moment) -> View:
-    image = run.model.render(run.frames.cameras[moment.frame], moment.t).copy()
-    return View(image[:3].transpose(1, 2, 0), solid_depth_mm(image[3], image[4], scale), image[4])
 
 
 def _clean_name(condition: str) -> str:
