@@ -99,7 +99,7 @@ class Bench:
             kept = [path for path in out.iterdir() if path.name not in (REPORT, CURVE)]
             scene_bytes = sum(path.stat().st_size for path in kept)
         values = _reported(report, opened) | _size(scene) | _speed(scene, report)
-        values |= {"scene_bytes": scene_bytes, "stored_psnr_tissue_db": _stored_db(scene, opened, report)}
+        values |= {"scene_bytes": scene_bytes, **_stored(scene, opened, report, on_the_way.last_db)}
         curve = [point | scores for point, scores in zip(curve, on_the_way.scores(), strict=True)]
         if curve:  # its end is scored on all held-out frames of the model as it is kept
             curve[-1] |= {"ssim": report.ssim, "depth_agreement_mm": report.depth_agreement_mm}
@@ -117,9 +117,13 @@ class Bench:
 
 
 class _OnTheWay:
-    """SSIM and depth agreement of the held-out frames each time they are scored while training goes on."""
+    """SSIM and depth agreement of the held-out frames each time they are scored while training goes on.
+
+    last_db is the psnr_tissue of each frame of the last scoring: of the model as training left it.
+    """
 
     def __init__(self, clip: DepthClip) -> None:
+        self.last_db: dict[int, float] = {}
         self._clip, self._last = clip, -1
         self._ssim: list[list[float]] = []
         self._errors_mm: list[list[NDArray[np.float32]]] = []
@@ -127,10 +131,12 @@ class _OnTheWay:
     def judge(self, frame: int, view: View) -> None:
         """Frames come in rising order; one that does not rise begins the next scoring."""
         if frame <= self._last or not self._ssim:
+            self.last_db.clear()
             self._ssim.append([])
             self._errors_mm.append([])
         self._last = frame
         truth, tissue = self._clip.rgb[frame], self._clip.tissue[frame]
+        self.last_db[frame] = psnr_tissue(view.rgb, truth, tissue)
         self._ssim[-1].append(ssim(view.rgb, truth, tissue))
         self._errors_mm[-1].append(depth_errors_mm(view.depth_mm, self._clip.depth_mm[frame], tissue))
 
@@ -192,14 +198,17 @@ def _speed(scene: Scene, report: Report) -> Values:
     return {"step_ms": step_ms, "render_ms": median_ms, "render_fps": 1000 / median_ms}
 
 
-def _stored_db(scene: Scene, opened: OpenClip, report: Report) -> float | None:
-    """Mean psnr_tissue of the held-out frames, rendered from what lies on disk."""
+def _stored(scene: Scene, opened: OpenClip, report: Report, trained_db: Mapping[int, float]) -> Values:
+    """Mean psnr_tissue of the held-out frames rendered from what lies on disk, and what that is below the model as
+    training left it, on the frames that were scored then: the price of rounding, and of strays taken out."""
     shown, clip = ShownScene(scene), opened.clip
-    scores = [
-        psnr_tissue(shown.view(frame, clip.world_from_camera[frame]).rgb, clip.rgb[frame], clip.tissue[frame])
+    stored_db = {
+        frame: psnr_tissue(shown.view(frame, clip.world_from_camera[frame]).rgb, clip.rgb[frame], clip.tissue[frame])
         for frame in report.held_out
-    ]
-    return _mean_of_known(scores)
+    }
+    losses = [trained_db[frame] - stored_db[frame] for frame in trained_db]
+    scores = list(stored_db.values())
+    return {"stored_psnr_tissue_db": _mean_of_known(scores), "stored_loss_db": _mean_of_known(losses)}
 
 
 def _mean_of_known(scores: Sequence[float]) -> float | None:

@@ -24,7 +24,15 @@ TRUTH = (
     "psnr_view10_db", "psnr_view15_db", "psnr_baked10_db", "psnr_baked15_db", "bound10_db", "bound15_db",
     "psnr_hidden_db", "depth_error_mm", "motion_error_mm", "moving_error_mm", "moving_mm",
 )  # fmt: skip
-SIZE = ("iterations", "gaussians", "bases", "floats_a_gaussian", "scene_bytes", "stored_psnr_tissue_db")
+SIZE = (
+    "iterations",
+    "gaussians",
+    "bases",
+    "floats_a_gaussian",
+    "scene_bytes",
+    "stored_psnr_tissue_db",
+    "stored_loss_db",
+)
 SPEED = ("t_train_s", "t_post_s", "seconds", "step_ms", "render_ms", "render_fps", "width", "height", "load_1min")
 ORIGIN = ("machine", "commit", "command", "error")
 RUN_FIELDS = (*KEY, *SCORES, *COPIES, *TRUTH, *SIZE, *SPEED, *ORIGIN)

@@ -44,6 +44,7 @@ def test_a_run_becomes_a_row_with_every_figure(measured: Path) -> None:
     empty = {name for name in RUN_FIELDS if not fast[name]}
     assert empty == {"error"}
     assert float(fast["stored_psnr_tissue_db"]) == pytest.approx(float(fast["psnr_tissue_db"]), abs=0.3)
+    assert abs(float(fast["stored_loss_db"])) < 0.3
     assert float(fast["psnr_tissue_db"]) > 15
     assert 0 <= float(fast["motion_error_mm"]) < 20
     assert fast["command"] == (f"intrasplat evaluate {CLIP} --series fast --holdout every8 --seeds 0 --iterations 12")
