@@ -70,9 +70,9 @@ _TRUTH = """
 Synthetic clips know the truth ([truth.py](../../worker/evaluate/truth.py) defines each column). Views are 10 and 15
 degrees off the endoscope's, judged where a training frame saw the tissue. Highlights lie elsewhere for every eye, and a
 clip from one place cannot tell where: `bound` is what a perfect shape with the colours the endoscope sees would score,
-`baked` is the score against exactly that. `hidden` is behind the instrument. `motion` is the median end-point error over
-all tissue, `moving` that over what has moved by 1 mm or more, beside how far it has: a model that does not move at all
-would score that.
+`baked` is the score against exactly that. `hidden` is behind the instrument. `motion` is the median end-point error
+over all tissue, `moving` that over what has moved by 1 mm or more, beside how far it has: a model that does not move at
+all would score that.
 """
 _ABLATION = """
 ### The paper's ablation, on our clips
@@ -85,8 +85,8 @@ _PARSIMONY = """
 
 Floats are those of the model for each Gaussian; bytes those of the scene on disk; `loss` is what storing it costs on
 held-out frames against the model as training left it, in dB; `spread` is the best seed less the worst. Rates,
-iterations and start differ between presets as well, so a row is not the effect of its size alone: the grid of capacities
-varies nothing else.
+iterations and start differ between presets as well, so a row is not the effect of its size alone: the grid of
+capacities varies nothing else.
 """
 _CAPACITY = """
 ### The automatic choice against a grid of fixed ones
