@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import median
 
 from worker.evaluate.cells import DEFAULT_SERIES, GRID_BASES, GRID_POINTS, OURS, base_of
+from worker.evaluate.charts import clip_alone
 from worker.evaluate.published import ABLATION, ONE_MINUTE, RESULTS, Published
 from worker.evaluate.rows import Results, Row
 from worker.evaluate.summary import Capacity, Group, Sooner, capacities, groups_of, orderings, sooner
@@ -123,14 +124,15 @@ def sections(folder: Path) -> list[str]:
 def write_readme(readme: Path, folder: Path) -> None:
     """Put the chart and the headline between the marks; without rows the README stays as it is."""
     results = Results(folder)
-    found, chart = sooner(results.curves), folder / "pareto-first-clip.png"
+    found, chart = sooner(results.curves), folder / "pareto-one-clip.png"
     text = readme.read_text()
     if not found or not chart.exists() or any(mark not in text for mark in MARKS):
         return
     place = chart.relative_to(readme.parent)
     picture = f"![Seconds of training against held-out decibels, for every preset]({place})"
+    clip = clip_alone(groups_of(results.runs))
     caption = (
-        f"*Held-out frames of `{found[0].clip}`, medians of all seeds; a disc's area is the scene's size on disk; "
+        f"*Held-out frames of `{clip}`, medians of all seeds; a disc's area is the scene's size on disk; "
         "dashed is copying the neighbouring frames; hollow is published, on other hardware and data.*"
     )
     page = f"[All charts and figures]({folder.relative_to(readme.parent)}/index.md)"

@@ -59,13 +59,19 @@ def draw_all(results: Results, folder: Path) -> list[str]:
                     _draw(presets, partial(_curves, points=points), folder, name)
                     drawn.append(name)
             _draw(presets, _pareto, folder, "pareto")
-            _draw([group for group in presets if group.clip == presets[0].clip], _pareto, folder, "pareto-first-clip")
+            _draw([group for group in presets if group.clip == clip_alone(presets)], _pareto, folder, "pareto-one-clip")
             _draw(presets, _frames, folder, "frames")
-            drawn += ["pareto", "pareto-first-clip", "frames"]
+            drawn += ["pareto", "pareto-one-clip", "frames"]
         if choices:
             _draw_knee(groups, choices, folder)
             drawn.append("knee")
     return drawn
+
+
+def clip_alone(groups: Sequence[Group]) -> str:
+    """The clip of the chart that shows one alone: the real one if it was measured, else the first."""
+    clips = [group.clip for group in groups if group.rows]
+    return REAL_CLIP if REAL_CLIP in clips else clips[0]
 
 
 def _draw(groups: Sequence[Group], draw_panel: Callable[[Any, Sequence[Group]], None], folder: Path, name: str) -> None:
@@ -233,10 +239,12 @@ def _handles(groups: Sequence[Group], name: str) -> list[Any]:
     from matplotlib.lines import Line2D
 
     line = "-" if name in OVER_TIME else "none"
-    looks = {each: look_of(each) for each in dict.fromkeys(group.series for group in groups if group.rows)}
+    known = {series: place for place, series in enumerate(DEFAULT_SERIES)}
+    series = sorted({group.series for group in groups if group.rows}, key=lambda each: (known.get(each, 99), each))
+    looks = {each: look_of(each) for each in series}
     handles = [
-        Line2D([], [], color=look.colour, marker=look.marker, label=series, linestyle=line)
-        for series, look in looks.items()
+        Line2D([], [], color=look.colour, marker=look.marker, label=each, linestyle=line)
+        for each, look in looks.items()
     ]
     if name in OVER_TIME:
         return handles

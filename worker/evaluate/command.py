@@ -16,7 +16,7 @@ from contract.errors import InputError
 from contract.exits import ExitCode
 from contract.job import JobProgress, Layout, MaskPolarity, PoseConvention
 from contract.progress_bar import ProgressBar
-from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, OURS, Cell, capacity_grid, plan
+from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
 from worker.evaluate.measure import Bench
 from worker.evaluate.rows import Results, write_rows
@@ -49,6 +49,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--grid", action="store_true", help="of each series, the grid of fixed capacities beside its own choice"
     )
+    parser.add_argument("--again", action="store_true", help="measure anew what failed")
     parser.add_argument("--redraw", action="store_true", help="measure nothing; sum up and draw the rows in DIR")
     for name in ("calibration", "masks"):
         parser.add_argument(f"--{name}", type=Path, metavar="F", help="of the clips that are paths")
@@ -69,6 +70,8 @@ def run_cli(options: argparse.Namespace) -> int:
         remedy = "Name one or more clips, or say --redraw alone."
         raise InputError("CLIP", "either clips are measured or rows redrawn.", remedy)
     results = Results(out)
+    if options.again:
+        results.forget_failed()
     if options.clips:
         bench, cells = _asked(options)
         waiting = [cell for cell in cells if not results.has(cell.key)]
@@ -102,9 +105,8 @@ def conclude(results: Results, out: Path) -> None:
     groups = groups_of(results.runs)
     write_rows(out / SUMMARY, SUMMARY_FIELDS, [group.summary() for group in groups])
     charts = draw_all(results, out)
-    for ours in OURS:
-        for found in sooner(results.curves, ours):
-            print(in_words(found))
+    for found in sooner(results.curves):
+        print(in_words(found))
     for ordering in orderings(groups):
         print(
             f"{', '.join(ordering.place)}: the paper's ablation, {' > '.join(ordering.scores_db)}: {ordering.verdict}"

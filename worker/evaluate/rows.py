@@ -58,6 +58,10 @@ class Results:
         """Whether the run has a row, of success or of failure."""
         return any(key_of(row) == key for row in self.runs)
 
+    def forget_failed(self) -> None:
+        """Let what failed be measured again; the files keep those rows until something is added."""
+        self.runs = [row for row in self.runs if not row["error"]]
+
     def add(self, run: Mapping[str, object], curve: Sequence[Mapping[str, object]]) -> None:
         """Keep a run and its curve."""
         key = {name: run[name] for name in KEY}

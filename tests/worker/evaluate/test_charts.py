@@ -12,7 +12,7 @@ from worker.evaluate.charts import draw_all
 from worker.evaluate.published import LABEL
 from worker.evaluate.rows import CURVE_FIELDS, CURVES, RUN_FIELDS, RUNS, Results, write_rows
 
-CHARTS = ["curves", "curves-ssim", "curves-depth", "pareto", "pareto-first-clip", "frames"]
+CHARTS = ["curves", "curves-ssim", "curves-depth", "pareto", "pareto-one-clip", "frames"]
 
 
 def results_in(folder: Path) -> Results:

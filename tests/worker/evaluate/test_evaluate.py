@@ -14,7 +14,7 @@ from worker.__main__ import main
 from worker.evaluate.cells import Cell, plan
 from worker.evaluate.command import SUMMARY, measure_all
 from worker.evaluate.measure import Bench, Values
-from worker.evaluate.rows import CURVES, RUN_FIELDS, RUNS, Results, read_rows
+from worker.evaluate.rows import CURVES, KEY, RUN_FIELDS, RUNS, Results, read_rows
 from worker.evaluate.sources import source_of
 from worker.hooks import Hooks
 
@@ -77,6 +77,17 @@ def test_a_cell_that_fails_is_a_row_that_says_why(tmp_path: Path) -> None:
     (row,) = read_rows(tmp_path / RUNS)
     assert row["error"].startswith("InputError: options.holdout: frame 99 is not in a clip of 12 frames")
     assert read_rows(tmp_path / CURVES) == []
+
+
+def test_what_failed_is_measured_again_only_if_asked_to(tmp_path: Path) -> None:
+    source = source_of(CLIP)
+    (cell,) = plan([source.name], ["fast"], ["every8"], [0], iterations=[12])
+    failed = {**dict(zip(KEY, cell.key, strict=True)), "error": "RuntimeError: the disk was full"}
+    Results(tmp_path).add(failed, [])
+    assert evaluate(tmp_path, "--series", "fast") == ExitCode.OK
+    assert [row["error"] for row in read_rows(tmp_path / RUNS)] == ["RuntimeError: the disk was full"]
+    assert evaluate(tmp_path, "--series", "fast", "--again") == ExitCode.OK
+    assert [row["error"] for row in read_rows(tmp_path / RUNS)] == [""]
 
 
 class InterruptedAfterOne(Bench):

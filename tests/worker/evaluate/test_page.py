@@ -46,13 +46,13 @@ def test_the_readme_is_written_between_its_marks_alone_and_only_if_there_is_a_ch
     readme.write_text(f"before\n{first}\nold\n{last}\nafter\n")
     write_readme(readme, folder)
     assert "old" in readme.read_text()
-    (folder / "pareto-first-clip.png").touch()
+    (folder / "pareto-one-clip.png").touch()
     write_readme(readme, folder)
     text = readme.read_text()
     assert text.startswith(f"before\n{first}\n")
     assert text.endswith(f"{last}\nafter\n")
     assert "old" not in text
-    assert "](docs/pareto-first-clip.png)" in text
+    assert "](docs/pareto-one-clip.png)" in text
     assert "20.0 times sooner" in text
     write_readme(readme, folder)
     assert readme.read_text() == text, "twice is as good as once"
