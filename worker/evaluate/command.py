@@ -5,16 +5,15 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any, get_args
 
 from contract.arguments import count, positive
 from contract.errors import InputError
 from contract.exits import ExitCode
 from contract.job import JobProgress, Layout, MaskPolarity, PoseConvention
+from contract.processes import told_to_end
 from contract.progress_bar import ProgressBar
 from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
@@ -85,14 +84,13 @@ def run_cli(options: argparse.Namespace) -> int:
 
 def measure_all(bench: Bench, cells: Sequence[Cell], results: Results) -> None:
     """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM."""
-    interrupted = threading.Event()
-    handle = _setting(interrupted)
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    end = told_to_end()
     try:
         for place, cell in enumerate(cells):
             with ProgressBar(sys.stderr) as bar:
                 show = _reporter(bar, place, len(cells))
-                row, curve = bench.measure(cell, Hooks(on_progress=show, should_stop=interrupted.is_set))
+                row, curve = bench.measure(cell, Hooks(on_progress=show, should_stop=end.is_set))
             results.add(row, curve)
             print(f"{' '.join(cell.key)}: {_outcome(row)}", flush=True)
     finally:
@@ -114,9 +112,9 @@ def conclude(results: Results, out: Path) -> None:
     for choice in capacities(groups):
         chosen, best = choice.chosen, choice.best
         print(
-            f"{', '.join(chosen.place)}: {chosen.series} chooses {choice.difference_db:+.2f} dB "
-            f"(deviation {choice.deviation_db:.2f}, {choice.seeds} seeds) from {best.series}, "
-            f"{chosen.median('scene_bytes') / 1e6:.1f} MB beside {best.median('scene_bytes') / 1e6:.1f} MB"
+            f"{', '.join(chosen.place)}: what {chosen.series} chooses lies {choice.difference_db:+.2f} dB (deviation "
+            f"{choice.deviation_db:.2f}, {choice.seeds} seeds) from the best of the grid, {best.series}, with "
+            f"{chosen.median('scene_bytes') / 1e6:.2f} MB beside {best.median('scene_bytes') / 1e6:.2f} MB"
         )
     print(f"{out / SUMMARY}; charts: {', '.join(charts) or 'none'}")
 
@@ -142,6 +140,8 @@ def _asked(options: argparse.Namespace) -> tuple[Bench, list[Cell]]:
     if options.grid:
         series = [variant for name in series for variant in capacity_grid(name)]
     clips = [source.name for source in sources]
+    for twice in {name for name in clips if clips.count(name) > 1}:
+        raise InputError("CLIP", f"rows would call two clips {twice!r}.", "Give the files names of their own.")
     cells = plan(clips, series, options.holdout, options.seeds, options.budget_s, options.iterations)
     return Bench({source.name: source for source in sources}), cells
 
@@ -167,11 +167,3 @@ def _outcome(row: dict[str, object]) -> str:
     return (
         f"{shown}, {row['t_train_s']:.1f} s, {row['gaussians']} Gaussians, {int(str(row['scene_bytes'])) / 1e6:.1f} MB"
     )
-
-
-def _setting(event: threading.Event) -> Callable[[int, FrameType | None], None]:
-    def handle(number: int, frame: FrameType | None) -> None:
-        event.set()
-        signal.signal(number, signal.default_int_handler)  # the second one ends it at once
-
-    return handle

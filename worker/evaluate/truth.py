@@ -103,6 +103,7 @@ class Truth:
         self._phantom, self._clip = phantom, clip
         self._judged_frames = sample_frames(held_out, JUDGED_FRAMES)
         self._seen = _seen_cells(phantom, clip, train)
+        self._tracks = phantom.trajectories(TRACK_STRIDE_PX)
         pivot_mm = float(
             np.median([np.median(clip.depth_mm[i][clip.tissue[i] & (clip.depth_mm[i] > 0)]) for i in train])
         )
@@ -158,10 +159,9 @@ class Truth:
 
     def _motion(self, shown: Shown) -> tuple[float, float, float]:
         """Medians in mm: end-point error of all, of what moves, and how far that has moved."""
-        tracks = self._phantom.trajectories(TRACK_STRIDE_PX)
-        row, column = tracks.pixels.T
+        row, column = self._tracks.pixels.T
         tissue = self._clip.tissue[0][row, column]
-        row, column, points_mm = row[tissue], column[tissue], tracks.points_mm[:, tissue]
+        row, column, points_mm = row[tissue], column[tissue], self._tracks.points_mm[:, tissue]
         errors, moves = [np.empty(0)], [np.empty(0)]
         for frame in self._judged_frames:
             truth_mm = points_mm[frame] - points_mm[0]

@@ -124,6 +124,7 @@ def test_a_curve_whose_run_has_no_row_is_forgotten(measured: Path, tmp_path: Pat
         ["phantom:pull:huge"],
         ["nowhere.mp4"],
         [CLIP, "--series", "slow"],
+        [CLIP, CLIP],
         [CLIP, "--redraw"],
         [],
         ["--redraw"],
