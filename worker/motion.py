@@ -1,8 +1,8 @@
 """Motion known before training: optical flow from the first training frame, lifted to 3D by stereo depth.
 
 Dense flow (DIS) from the reference to every training frame, checked forward against backward, gives each reference
-pixel a track; the tracks' displacements are smoothed where they are trusted and fitted by a deformation's bases.
-Held-out frames are never read.
+pixel a track; its displacements and changes of colour are smoothed where they are trusted and fitted by a
+deformation's bases. Held-out frames are never read.
 
 Symbols: K training frames, h w pixels of the coarse grid on which flow is computed, N points, B bases.
 """
@@ -31,6 +31,8 @@ ROUND_TRIP_PX = 1.0
 """Forward and backward flow disagreeing by this much, in px of the coarse grid, halve a track's confidence or worse."""
 SMOOTH_PX = 4.0
 """Standard deviation, in px of the coarse grid, over which trusted displacements are averaged: depth is noisy."""
+COLOUR_SMOOTH_PX = 2.0
+"""The same for changes of colour: light falls in smaller patches than tissue moves."""
 STEADINESS = 0.02
 """Weight of a difference between neighbouring bases against one fully trusted frame; it carries motion across gaps."""
 RIDGE = 1e-3
@@ -41,14 +43,16 @@ POINTS_AT_ONCE = 4096
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Displacement of reference pixels to every training frame.
+    """Displacement of reference pixels to every training frame, and how their colour changed on the way.
 
     displacement_mm [K, h, w, 3]  camera frame of the reference (world), mm; smoothed
+    colour          [K, h, w, 3]  colour there less colour here, RGB in [0, 1]; smoothed
     confidence      [K, h, w]     in [0, 1]; 0 where the track is lost, hidden or without depth
     step_px                       clip pixels between neighbouring cells of the grid
     """
 
     displacement_mm: Floats
+    colour: Floats
     confidence: Floats
     step_px: int
 
@@ -61,7 +65,7 @@ def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], 
     """
     step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // LEAST_SIDE_PX))
     reference = _Coarse(clip, train[0], step)
-    displacement = np.zeros((len(train), *reference.grey.shape, 3), np.float32)
+    displacement, colour = np.zeros((2, len(train), *reference.grey.shape, 3), np.float32)
     confidence = np.zeros((len(train), *reference.grey.shape), np.float32)
     confidence[0] = reference.trust
 
@@ -72,24 +76,25 @@ def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], 
             target = _Coarse(clip, train[place], step)
             forward = flow_solver.calc(reference.grey, target.grey, None if forward is None else forward.copy())
             backward = flow_solver.calc(target.grey, reference.grey, -forward)
-            displacement[place], confidence[place] = _lift(reference, target, forward, backward)
+            displacement[place], colour[place], confidence[place] = _lift(reference, target, forward, backward)
             on_progress((done + 1) / len(places))
 
     # Two halves on any machine: which flow starts which must not depend on the number of cores.
     middle = (len(train) + 1) // 2
     with one_opencv_thread(), ThreadPoolExecutor(2) as pool:
         list(pool.map(follow, (range(1, middle), range(middle, len(train)))))
-    return Tracks(displacement, confidence, step)
+    return Tracks(displacement, colour, confidence, step)
 
 
 class _Coarse:
-    """A frame on the coarse grid: grey, camera points (world, mm), and how far depth and mask can be trusted."""
+    """A frame on the coarse grid: colour, grey, camera points (world, mm), and how far to trust depth and mask."""
 
     def __init__(self, clip: DepthClip, index: int, step: int) -> None:
         height, width = clip.tissue.shape[1:]
         size = (width // step, height // step)
         grey = cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY)
         self.grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        self.rgb = cv2.resize(clip.rgb[index], size, interpolation=cv2.INTER_AREA) / np.float32(255)
         rows, columns = np.mgrid[0 : size[1], 0 : size[0]] * step + step // 2
         pixels = (rows * width + columns).ravel()
         depth_mm = clip.depth_mm[index].ravel()[pixels]
@@ -100,8 +105,8 @@ class _Coarse:
         self.trust = np.where(usable, confidence, 0).reshape(rows.shape).astype(np.float32)
 
 
-def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
-    """Displacement (mm) and confidence of every reference cell, given the flows there and back."""
+def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats) -> tuple[Floats, Floats, Floats]:
+    """Displacement (mm), change of colour and confidence of every reference cell, given the flows there and back."""
     rows, columns = np.mgrid[0 : forward.shape[0], 0 : forward.shape[1]].astype(np.float32)
     x, y = columns + forward[..., 0], rows + forward[..., 1]
 
@@ -113,12 +118,17 @@ def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats
     trust = at_target(target.trust)
     agree = 1 / (1 + (np.square(round_trip).sum(-1) / ROUND_TRIP_PX**2) ** 2)
     confidence = reference.trust * trust * (trust > 0.5) * agree
-    weighted = at_target(target.points_mm * target.trust[..., None]) / np.maximum(trust, 1e-3)[..., None]
-    displacement = (weighted - reference.points_mm) * confidence[..., None]
-    # Normalised convolution: only trusted neighbours are averaged.
-    weight = cv2.GaussianBlur(confidence, (0, 0), SMOOTH_PX)
-    smooth = cv2.GaussianBlur(displacement, (0, 0), SMOOTH_PX) / np.maximum(weight, 1e-4)[..., None]
-    return smooth.astype(np.float32), np.minimum(confidence, 1).astype(np.float32)
+    point_mm = at_target(target.points_mm * target.trust[..., None]) / np.maximum(trust, 1e-3)[..., None]
+    displacement = _averaged(np.subtract(point_mm, reference.points_mm), confidence, SMOOTH_PX)
+    colour = _averaged(np.subtract(at_target(target.rgb), reference.rgb), confidence, COLOUR_SMOOTH_PX)
+    return displacement, colour, np.minimum(confidence, 1).astype(np.float32)
+
+
+def _averaged(values: Floats, confidence: Floats, over_px: float) -> Floats:
+    """Normalised convolution: a Gaussian mean [h, w, 3] in which only trusted neighbours count."""
+    weight = cv2.GaussianBlur(confidence, (0, 0), over_px)
+    mean = cv2.GaussianBlur(values * confidence[..., None], (0, 0), over_px) / np.maximum(weight, 1e-4)[..., None]
+    return np.asarray(mean, np.float32)
 
 
 def fit_tracks(
@@ -134,7 +144,8 @@ def fit_tracks(
         width: of the clip, px.
 
     Returns:
-        weights [N, B, 3] in mm; support [N], the mean confidence of the point's track.
+        weights [N, B, 6], of the displacement in mm and of the colour; support [N], the mean confidence of the
+        point's track.
     """
     row = np.minimum(pixels // width // tracks.step_px, tracks.confidence.shape[1] - 1)
     column = np.minimum(pixels % width // tracks.step_px, tracks.confidence.shape[2] - 1)
@@ -142,14 +153,15 @@ def fit_tracks(
     difference = np.diff(np.eye(bases), axis=0)
     prior = STEADINESS * difference.T @ difference + RIDGE * np.eye(bases)
     outer = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    weights = np.zeros((len(pixels), bases, 3), np.float32)
+    weights = np.zeros((len(pixels), bases, 6), np.float32)
     support = np.zeros(len(pixels), np.float32)
     for first in range(0, len(pixels), POINTS_AT_ONCE):
         some = slice(first, first + POINTS_AT_ONCE)
         confidence = tracks.confidence[:, row[some], column[some]].astype(np.float64)  # [K, points]
-        displacement = tracks.displacement_mm[:, row[some], column[some]] * confidence[..., None]
+        changes = [values[:, row[some], column[some]] for values in (tracks.displacement_mm, tracks.colour)]
+        trusted = np.concatenate(changes, axis=-1) * confidence[..., None]
         normal = (confidence.T @ outer).reshape(-1, bases, bases) + prior
-        right = np.tensordot(displacement, basis, (0, 0)).transpose(0, 2, 1)
+        right = np.tensordot(trusted, basis, (0, 0)).transpose(0, 2, 1)
         weights[some] = np.linalg.solve(normal, right)
         support[some] = confidence.mean(0)
     return weights, support

@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-BETA1, BETA2 = 0.9, 0.999
-
 
 @dataclass(frozen=True)
 class Rate:
@@ -26,7 +24,10 @@ class Rate:
 
 @dataclass(frozen=True)
 class Rates:
-    """One rate a parameter group. motion_* are those of the deformation's weights for its four kinds of channel."""
+    """One rate a parameter group. motion_* are those of the deformation's weights for its four kinds of channel.
+
+    beta1, beta2  decay of Adam's two moments a step; as published unless a preset says otherwise
+    """
 
     mean: Rate
     quaternion: Rate
@@ -39,6 +40,8 @@ class Rates:
     motion_log_scale: Rate
     motion_colour: Rate
     eps: float = 1e-15
+    beta1: float = 0.9
+    beta2: float = 0.999
 
 
 @dataclass(frozen=True)
@@ -56,15 +59,30 @@ class StepRates:
     motion_log_scale: float
     motion_colour: float
     eps: float
+    beta1: float = 0.9
+    beta2: float = 0.999
+
+
+@dataclass(frozen=True)
+class AdamStep:
+    """One step of Adam as the kernels take it: both bias corrections are folded into size and floor.
+
+    m <- beta1 m + (1 - beta1) g;  v <- beta2 v + (1 - beta2) g^2;  value <- value - size m / (sqrt(v) + floor)
+    """
+
+    size: float
+    floor: float
+    beta1: float
+    beta2: float
 
 
 def rates_at(rates: Rates, progress: float) -> StepRates:
     """Every group's rate at progress in [0, 1]."""
-    values = {name: getattr(rates, name).at(progress) for name in StepRates.__dataclass_fields__ if name != "eps"}
-    return StepRates(**values, eps=rates.eps)
+    found = {name: getattr(rates, name) for name in StepRates.__dataclass_fields__}
+    return StepRates(**{name: each.at(progress) if isinstance(each, Rate) else each for name, each in found.items()})
 
 
-def adam_step_size(rate: float, eps: float, count: int) -> tuple[float, float]:
-    """Rate and eps of Adam's count-th step (from 1) with both bias corrections folded in (Kingma and Ba 2015)."""
-    second = math.sqrt(1.0 - BETA2**count)
-    return rate * second / (1.0 - BETA1**count), eps * second
+def adam_step(rate: float, rates: StepRates, count: int) -> AdamStep:
+    """Adam's count-th step (from 1) at this rate (Kingma and Ba 2015)."""
+    second = math.sqrt(1.0 - rates.beta2**count)
+    return AdamStep(rate * second / (1.0 - rates.beta1**count), rates.eps * second, rates.beta1, rates.beta2)

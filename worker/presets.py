@@ -89,19 +89,22 @@ _PAPER = Preset(
     budget_s=None,
 )
 
-# Found on d4d_endonerf and on synthetic clips (docs/decisions): the published rates of motion are some thirty times too
-# slow for a run of hundreds of steps, and colour that moves with time is worth a decibel on wet tissue.
+# Found on d4d_endonerf and on synthetic clips (docs/decisions/005 and 015): the published rates of motion are some
+# thirty times too slow for a run of hundreds of steps, and Adam's moments remember too long, for successive steps see
+# frames from all over the clip.
 _FAST_RATES = Rates(
-    mean=Rate(1.6e-3, 1.6e-5),
-    quaternion=Rate(1e-2, 1e-3),
-    log_scale=Rate(2e-2, 2e-3),
-    opacity=Rate(5e-2, 5e-3),
-    colour=Rate(2.5e-2, 2e-3),
+    mean=Rate(1.6e-3, 5e-5),
+    quaternion=Rate(1e-2, 3e-3),
+    log_scale=Rate(2e-2, 6e-3),
+    opacity=Rate(5e-2, 1.5e-2),
+    colour=Rate(2.5e-2, 6e-3),
     sh_rest=Rate(0.0),
-    motion_mean=Rate(1.5e-2, 5e-4),
-    motion_quaternion=Rate(5e-2, 1.7e-3),
-    motion_log_scale=Rate(5e-2, 1.7e-3),
-    motion_colour=Rate(5e-2, 1.7e-3),
+    motion_mean=Rate(1.5e-2, 1.5e-3),
+    motion_quaternion=Rate(5e-2, 5e-3),
+    motion_log_scale=Rate(5e-2, 5e-3),
+    motion_colour=Rate(5e-2, 5e-3),
+    beta1=0.3,
+    beta2=0.95,
 )
 
 _FAST = Preset(
@@ -112,13 +115,13 @@ _FAST = Preset(
     bases=33,
     tracks=True,
     start_width=None,
-    opacity=0.8,
-    spread=0.6,
+    opacity=0.9,
+    spread=0.5,
     sh_degree=0,
     sh_every=0,
     order="epochs",
     rates=_FAST_RATES,
-    loss=LossSettings(),
+    loss=LossSettings(colour_zone=0.1),
     densify=None,
     iterations=None,
     budget_s=60.0,

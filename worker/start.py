@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 from contract.camera import Intrinsics
 from worker.clip import DepthClip
 from worker.deformation import FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
+from worker.deformation.base import CHANNELS, MEAN
 from worker.fusion import FusionSettings, PointCloud
-from worker.gaussians import Gaussians, initial_gaussians
+from worker.gaussians import SH_C0, Gaussians, initial_gaussians
 from worker.model import Model
 from worker.motion import Tracks, fit_tracks
 from worker.presets import Preset
 from worker.raster.cpu.model import FusedModel
 from worker.unfused import UnfusedModel
 
-FRAMES_A_BASIS, MIN_BASES = 5, 3
+FRAMES_A_BASIS, MIN_BASES = 3, 3
 """Training frames a shared basis stands for, and the fewest bases (docs/decisions/004)."""
 MIN_STRIDE = 2
 """Pixels between the points of a grid at the least: a Gaussian a pixel is noise, not surface."""
@@ -85,15 +86,17 @@ def _follow_tracks(
     train: Sequence[int],
     scale: float,
 ) -> Gaussians:
-    """Fill motion's weights from optical-flow tracks; returns the Gaussians with each canonical mean moved so that it
-    passes through its point at the time of the frame it was taken from."""
+    """Fill motion's weights from optical-flow tracks; returns the Gaussians with each canonical mean and colour shifted
+    so that they pass through their point and its colour at the time of the frame it was taken from."""
     basis = np.stack([motion.basis(float(clip.t[i])).double().numpy() for i in range(clip.frame_count)])
     pixels = _reference_pixels(cloud, clip, train[0])
     weights, _ = fit_tracks(tracks, basis[list(train)], pixels, clip.intrinsics.width)
-    weights *= scale
-    motion.weight[:, :3] = torch.from_numpy(weights).permute(0, 2, 1)
-    moved = np.einsum("nbc,nb->nc", weights, basis[cloud.frame])
-    return dataclasses.replace(gaussians, mean=gaussians.mean - torch.from_numpy(moved.astype(np.float32)))
+    weights *= np.repeat(np.array([scale, 1 / SH_C0], np.float32), 3)
+    by_channel = torch.from_numpy(weights).permute(0, 2, 1)
+    motion.weight[:, MEAN], motion.weight[:, CHANNELS:] = by_channel[:, :3], by_channel[:, 3:]
+    moved = torch.from_numpy(np.einsum("nbc,nb->nc", weights, basis[cloud.frame]).astype(np.float32))
+    colour = torch.cat([gaussians.sh[:, :1] - moved[:, None, 3:], gaussians.sh[:, 1:]], 1)
+    return dataclasses.replace(gaussians, mean=gaussians.mean - moved[:, :3], sh=colour)
 
 
 def _reference_pixels(cloud: PointCloud, clip: DepthClip, reference: int) -> NDArray[np.intp]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from contract.errors import TrainingDiverged
 from worker.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation, restore
 from worker.gaussians import Gaussians
-from worker.optimize import BETA1, BETA2, StepRates, adam_step_size
+from worker.optimize import AdamStep, StepRates, adam_step
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.motion import Motion
 from worker.raster.cpu.rasterizer import Floats
@@ -84,9 +84,9 @@ class AutogradMotion:
         v_state[:] = v_canonical.T.numpy()
         if rates.motion_mean == 0.0:
             return
-        size, floor = adam_step_size(rates.motion_mean, rates.eps, iteration)
+        adam = adam_step(rates.motion_mean, rates, iteration)
         for name, gradient in zip(self._parameters, gradients, strict=True):
-            _adam(self._parameters[name].detach(), gradient, self._moments[name], size, floor)
+            _adam(self._parameters[name].detach(), gradient, self._moments[name], adam)
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         """Keep these columns, in this order; moments start at 0 where fresh. Shared parameters keep theirs."""
@@ -124,9 +124,9 @@ def _deformed(deformation: Deformation, canonical: Tensor, t: float) -> Tensor:
     return torch.cat([moved.mean, moved.quaternion, moved.log_scale, moved.sh[:, 0]], dim=1)
 
 
-def _adam(value: Tensor, gradient: Tensor, moments: Tensor, size: float, floor: float) -> None:
-    """One step of Adam in place; size and floor as adam_step_size gives them. moments [2, ...]."""
+def _adam(value: Tensor, gradient: Tensor, moments: Tensor, adam: AdamStep) -> None:
+    """One step of Adam in place; moments [2, ...]."""
     first, second = moments
-    first.lerp_(gradient, 1 - BETA1)
-    second.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
-    value.addcdiv_(first, second.sqrt().add_(floor), value=-size)
+    first.lerp_(gradient, 1 - adam.beta1)
+    second.mul_(adam.beta2).addcmul_(gradient, gradient, value=1 - adam.beta2)
+    value.addcdiv_(first, second.sqrt().add_(adam.floor), value=-adam.size)

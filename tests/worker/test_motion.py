@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import cast
 
 import numpy as np
@@ -42,7 +43,8 @@ def basis_of(clip: DepthClip, bases: int) -> NDArray[np.float64]:
 
 def bare(displacement_mm: NDArray[np.floating], confidence: NDArray[np.floating]) -> Tracks:
     """Tracks of one row of pixels: displacement [K, N, 3], confidence [K, N]."""
-    return Tracks(displacement_mm[:, None].astype(np.float32), confidence[:, None].astype(np.float32), 1)
+    displacement = displacement_mm[:, None].astype(np.float32)
+    return Tracks(displacement, np.zeros_like(displacement), confidence[:, None].astype(np.float32), 1)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +70,7 @@ def test_fitted_tracks_also_hold_at_frames_they_never_saw(motion: Motion) -> Non
     basis = basis_of(clip, 9)
     pixels = cast(NDArray[np.intp], truth.pixels[:, 0] * WIDTH + truth.pixels[:, 1])
     weights, support = fit_tracks(track(clip, TRAIN), basis[TRAIN], pixels, WIDTH)
-    fitted = np.einsum("tb,nbc->tnc", basis, weights)
+    fitted = np.einsum("tb,nbc->tnc", basis, weights[..., :3])
     moved = truth.points_mm - truth.points_mm[0]
     # where the instrument never passes and the flow never fails
     followed = (support > TRUSTED) & on_tissue(clip, truth)
@@ -86,6 +88,7 @@ def test_held_out_frames_are_never_looked_at() -> None:
     found = track(clip, TRAIN)
     np.testing.assert_array_equal(found.displacement_mm, expected.displacement_mm)
     np.testing.assert_array_equal(found.confidence, expected.confidence)
+    np.testing.assert_array_equal(found.colour, expected.colour)
 
 
 def test_a_still_clip_does_not_move() -> None:
@@ -116,15 +119,27 @@ def test_a_large_clip_is_followed_on_a_coarser_grid(width: int, step: int) -> No
     assert tracks.confidence.shape == (2, height // step, width // step)
     every_pixel = np.arange(width * height)
     weights, support = fit_tracks(tracks, np.eye(2), every_pixel, width)
-    assert weights.shape == (width * height, 2, 3)
+    assert weights.shape == (width * height, 2, 6)
     assert support[0] == pytest.approx(tracks.confidence[:, 0, 0].mean())
     assert support[-1] == pytest.approx(tracks.confidence[:, -1, -1].mean())
+
+
+def test_light_that_fades_is_told_from_motion() -> None:
+    clip, _ = phantom("still")
+    fading = np.linspace(1.0, 0.8, clip.frame_count)[:, None, None, None]
+    dimmed = dataclasses.replace(clip, rgb=(clip.rgb * fading).astype(np.uint8))
+    tracks = track(dimmed, TRAIN)
+    trusted = tracks.confidence[-1] > TRUSTED
+    expected = clip.rgb[0] / 255.0 * (fading[TRAIN[-1]] - 1)
+    assert trusted.mean() > 0.5
+    assert np.median(np.abs(tracks.colour[-1] - expected)[trusted]) < 0.01
+    assert np.median(np.linalg.norm(tracks.displacement_mm[-1], axis=-1)[trusted]) < 0.1
 
 
 def test_tracks_nobody_trusts_move_nothing(rng: np.random.Generator) -> None:
     basis = rng.random((6, 4))
     weights, support = fit_tracks(bare(rng.normal(0, 5, (6, 3, 3)), np.zeros((6, 3))), basis, np.arange(3), 3)
-    assert_close(weights, np.zeros((3, 4, 3)))
+    assert_close(weights, np.zeros((3, 4, 6)))
     assert not support.any()
 
 
@@ -135,7 +150,7 @@ def test_motion_the_bases_can_show_is_found_again(rng: np.random.Generator) -> N
     steady = np.linspace(0, 4, 5)[:, None, None] * rng.normal(0, 1, (1, 7, 3))  # [B, N, 3], drifts evenly
     displacement = np.einsum("kb,bnc->knc", basis, steady)
     weights, _ = fit_tracks(bare(displacement, np.ones((40, 7))), basis, np.arange(7), 7)
-    fitted = np.einsum("kb,nbc->knc", basis, weights)
+    fitted = np.einsum("kb,nbc->knc", basis, weights[..., :3])
     assert_close(fitted, displacement, relative=0.02)
 
 

@@ -391,4 +391,4 @@ def test_a_strided_array_is_no_vector_memory() -> None:
     strided = np.zeros((16, 2), np.float32)[:, 0]
     dense = np.zeros(16, np.float32)
     with pytest.raises(TypingError, match="C-contiguous"):
-        update.adam(0, 1, strided, dense, dense, dense, np.float32(1), np.float32(1))
+        update.adam(0, 1, strided, dense, dense, dense, *[np.float32(1)] * 4)

@@ -5,7 +5,7 @@ N Gaussians (padded to whole vectors), rows of N floats; canonical and state [13
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from worker.deformation import Deformation
 from worker.gaussians import Gaussians
-from worker.optimize import StepRates, adam_step_size
+from worker.optimize import StepRates, adam_step
 from worker.raster.cpu import harmonics, update
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
 from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, Target, padded
@@ -134,12 +134,12 @@ class FusedModel:
         groups = ((0, 3, rates.mean), (3, 7, rates.quaternion), (7, 10, rates.log_scale), (10, 13, rates.colour))
         for first, last, rate in groups:
             rows = slice(first, last)
-            _adam(canonical[rows], gradients.state[rows], moments[:, rows], rate, rates.eps, iteration)
+            _adam(canonical[rows], gradients.state[rows], moments[:, rows], rate, rates, iteration)
         opacity_moments = self._moments["opacity_logit"]
-        _adam(self.opacity_logit, gradients.opacity_logit, opacity_moments, rates.opacity, rates.eps, iteration)
+        _adam(self.opacity_logit, gradients.opacity_logit, opacity_moments, rates.opacity, rates, iteration)
         if sh_degree > 0:
             rest, used = self._moments["sh_rest"], slice(0, (sh_degree + 1) ** 2 - 1)
-            _adam(self.sh_rest[used], self._v_rest[used], rest[:, used], rates.sh_rest, rates.eps, iteration)
+            _adam(self.sh_rest[used], self._v_rest[used], rest[:, used], rates.sh_rest, rates, iteration)
 
     def take(self, columns: NDArray[np.int64], fresh: NDArray[np.bool_]) -> None:
         """Keep these Gaussians, in this order (repeats are copies); Adam's moments start at 0 where fresh."""
@@ -186,12 +186,11 @@ def _centre(camera: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(-pose[:, :3].T @ pose[:, 3])
 
 
-def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, eps: float, iteration: int) -> None:
+def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, rates: StepRates, iteration: int) -> None:
     if rate == 0.0:
         return
-    size, floor = adam_step_size(rate, eps, iteration)
     flat = [_flat(each) for each in (value, gradient, moments[0], moments[1])]
-    run(update.adam, *flat, np.float32(size), np.float32(floor))
+    run(update.adam, *flat, *map(np.float32, astuple(adam_step(rate, rates, iteration))))
 
 
 def _flat(array: Floats) -> Floats:

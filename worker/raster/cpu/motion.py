@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from worker.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
-from worker.optimize import StepRates, adam_step_size
+from worker.optimize import StepRates, adam_step
 from worker.raster.cpu import update
 from worker.raster.cpu.rasterizer import Floats
 from worker.raster.cpu.threads import run
@@ -88,9 +88,12 @@ class LinearMotion:
         bases, channels, _ = self.weight.shape
         rate, eps = np.zeros((2, bases, channels), np.float32)
         for j in range(first, last):
-            size, floor = adam_step_size(1.0, rates.eps, int(self.steps[j]))
-            rate[j], eps[j] = channel_rates[:channels] * size, floor
-        run(update.update_shared, self.weight, self.first, self.second, v_state, values, first, last, rate, eps)
+            adam = adam_step(1.0, rates, int(self.steps[j]))
+            rate[j], eps[j] = channel_rates[:channels] * adam.size, adam.floor
+        run(
+            update.update_shared, self.weight, self.first, self.second, v_state, values, first, last, rate, eps,
+            np.float32(rates.beta1), np.float32(rates.beta2),
+        )  # fmt: skip
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         self.weight = np.ascontiguousarray(self.weight[:, :, columns])
@@ -122,10 +125,10 @@ class FdmMotion:
         run(update.deform_fdm, canonical, self.weight, self.centre, self.width, np.float32(t), quartic, state)
 
     def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
-        size, floor = adam_step_size(rates.motion_mean, rates.eps, iteration)
+        adam = adam_step(rates.motion_mean, rates, iteration)
         run(
             update.update_fdm, self.weight, self.centre, self.width, self.first, self.second, v_state,
-            np.float32(t), self.form == "quartic", np.float32(size), np.float32(floor),
+            np.float32(t), self.form == "quartic", *map(np.float32, dataclasses.astuple(adam)),
         )  # fmt: skip
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:

@@ -15,8 +15,6 @@ from worker.raster.cpu.simd import exp2, fma, load, splat, sqrt, store, where_le
 from worker.raster.cpu.vectors import LANES
 
 CHANNELS, ROWS = 10, 13
-BETA1, BETA2 = np.float32(0.9), np.float32(0.999)
-_REST1, _REST2 = np.float32(0.1), np.float32(0.001)
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _HALF_LOG2E = np.float32(0.5 * 1.4426950408889634)
 _LOG2E = np.float32(1.4426950408889634)
@@ -27,21 +25,21 @@ QUARTIC_FLOOR = np.float32(1e-4)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _adam(value, first, second, i, gradient, rate, eps):  # type: ignore[no-untyped-def]
+def _adam(value, first, second, i, gradient, rate, eps, beta1, beta2):  # type: ignore[no-untyped-def]
     """One Adam step on LANES parameters at value[i]; first and second are the moments."""
-    m = fma(splat(BETA1), load(first, i), splat(_REST1) * gradient)
-    v = fma(splat(BETA2), load(second, i), splat(_REST2) * gradient * gradient)
+    m = fma(splat(beta1), load(first, i), splat(_ONE - beta1) * gradient)
+    v = fma(splat(beta2), load(second, i), splat(_ONE - beta2) * gradient * gradient)
     store(first, i, m)
     store(second, i, v)
     store(value, i, load(value, i) - rate * m / (sqrt(v) + eps))
 
 
 @njit(cache=True, nogil=True)
-def adam(thread, threads, value, gradient, first, second, rate, eps):  # type: ignore[no-untyped-def]
+def adam(thread, threads, value, gradient, first, second, rate, eps, beta1, beta2):  # type: ignore[no-untyped-def]
     """Adam on flat arrays whose length is a multiple of LANES."""
     vectors = value.shape[0] // LANES
     for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
-        _adam(value, first, second, k * LANES, load(gradient, k * LANES), splat(rate), splat(eps))
+        _adam(value, first, second, k * LANES, load(gradient, k * LANES), splat(rate), splat(eps), beta1, beta2)
 
 
 @njit(cache=True, nogil=True)
@@ -60,7 +58,7 @@ def deform_shared(thread, threads, canonical, weight, basis, first, last, state)
 
 @njit(cache=True, nogil=True)
 def update_shared(  # type: ignore[no-untyped-def]
-    thread, threads, weight, first_moment, second_moment, v_state, basis, first, last, rate, eps
+    thread, threads, weight, first_moment, second_moment, v_state, basis, first, last, rate, eps, beta1, beta2
 ):
     """Adam on the weights of the bases [first, last); rate, eps [B, C]. dL/dw_j = dL/dpsi basis_j."""
     vectors = v_state.shape[1] // LANES
@@ -72,7 +70,7 @@ def update_shared(  # type: ignore[no-untyped-def]
             for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
                 i = k * LANES
                 gradient = value * load(v_state[c], i)
-                _adam(weight[j, c], first_moment[j, c], second_moment[j, c], i, gradient, step, floor)
+                _adam(weight[j, c], first_moment[j, c], second_moment[j, c], i, gradient, step, floor, beta1, beta2)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -119,8 +117,9 @@ def deform_fdm(thread, threads, canonical, weight, centre, width, t, quartic, st
 
 @njit(cache=True, nogil=True)
 def update_fdm(  # type: ignore[no-untyped-def]
-    thread, threads, weight, centre, width, first_moment, second_moment, v_state, t, quartic, rate, eps
-):
+    thread, threads, weight, centre, width, first_moment, second_moment, v_state, t, quartic, rate, eps,
+    beta1, beta2,
+):  # fmt: skip
     """Adam on weight, centre and width of every basis; moments [3, 10, B, N]."""
     vectors = v_state.shape[1] // LANES
     time, step, floor = splat(t), splat(rate), splat(eps)
@@ -132,6 +131,8 @@ def update_fdm(  # type: ignore[no-untyped-def]
                 value, by_centre, by_width = _basis(time, load(centre[c, j], i), load(width[c, j], i), quartic)
                 gradient = gradient * value
                 scaled = gradient * load(weight[c, j], i)
-                _adam(weight[c, j], first_moment[0, c, j], second_moment[0, c, j], i, gradient, step, floor)
-                _adam(centre[c, j], first_moment[1, c, j], second_moment[1, c, j], i, scaled * by_centre, step, floor)
-                _adam(width[c, j], first_moment[2, c, j], second_moment[2, c, j], i, scaled * by_width, step, floor)
+                to_centre, to_width = scaled * by_centre, scaled * by_width
+                m, v = first_moment, second_moment
+                _adam(weight[c, j], m[0, c, j], v[0, c, j], i, gradient, step, floor, beta1, beta2)
+                _adam(centre[c, j], m[1, c, j], v[1, c, j], i, to_centre, step, floor, beta1, beta2)
+                _adam(width[c, j], m[2, c, j], v[2, c, j], i, to_width, step, floor, beta1, beta2)
