@@ -48,6 +48,7 @@ class Bench:
     """Opens clips and measures cells on them; the clip and truth used last are kept for the next cell."""
 
     sources: Mapping[str, Source]
+    _commit: str = field(default_factory=commit)  # of the code as it was loaded; the tree may go on while this runs
     _open: dict[tuple[str, str], OpenClip] = field(default_factory=dict)
     _truth: dict[tuple[str, str], Truth] = field(default_factory=dict)
 
@@ -63,7 +64,7 @@ class Bench:
             "load_1min": os.getloadavg()[0],
             "command": command_of(cell, source),
         }
-        row |= {"machine": machine(), "commit": commit()}
+        row |= {"machine": machine(), "commit": self._commit}
         try:
             values, curve = self._measured(cell, source, hooks)
         except (Cancelled, KeyboardInterrupt):
@@ -100,8 +101,9 @@ class Bench:
             scene_bytes = sum(path.stat().st_size for path in kept)
         values = _reported(report, opened) | _size(scene) | _speed(scene, report)
         values |= {"scene_bytes": scene_bytes, **_stored(scene, opened, report, on_the_way.last_db)}
-        curve = [point | scores for point, scores in zip(curve, on_the_way.scores(), strict=True)]
-        if curve:  # its end is scored on all held-out frames of the model as it is kept
+        if curve:  # else there was no tissue to score
+            curve = [point | scores for point, scores in zip(curve, on_the_way.scores(), strict=True)]
+            # its end is scored on all held-out frames of the model as it is kept
             curve[-1] |= {"ssim": report.ssim, "depth_agreement_mm": report.depth_agreement_mm}
         return values | self._true(place, opened, scene, report), curve
 
