@@ -1,16 +1,23 @@
-"""Which splats touch which tile, in depth order.
+"""Which splats touch which tile, in depth order, and where the gradients of a splat are summed.
 
 A tile is LANES pixels wide and TILE_ROWS tall: as narrow as a vector, tall to keep the number of tiles a splat touches
-low. A slot is one (splat, tile) pair with its range of rows. Slots have two orders, and so two numbers:
+low. A slot is one (splat, tile) pair with its range of rows.
 
-    by splat   slot_start, slot_count [N]: those of splat g are slot_count[g] from slot_start[g];
-               slot_tile [M]; slot_rows [M]: top << 8 | end, rows inside the tile, exact within the tile's columns;
-               slot_place [M]: the slot's number in the other order
-    by tile    tile_start [tiles + 1]; entries [M, 2]: splat and rows, nearest splat first
+    slot_start, slot_count [N]   slots of splat g: slot_count[g] from slot_start[g];  slot_info [M]: tile and rows
+    tile_start [tiles + 1], entries [M]   the slots of a tile, nearest splat first: splat and rows
 
-The blend walks the second order and writes its gradients there, one after the other; each Gaussian then adds up its
-own through slot_place, without atomics and in a fixed order. Each thread has a region of the M places for the slots of
-its splats, so one pass over the splats is enough.
+Rows [top, end) inside the tile are exact for the ellipse within the tile's columns; (top, end - 1) are the low
+2 x ROW_BITS bits of slot_info and entries, and the rest is the tile or the splat: with half the memory, sorting takes
+half the time.
+
+A block is BLOCK_TILES tiles side by side, blended one after the other by one thread. A splat has a home, GRADIENT
+floats, for each block it may touch, and each of its tiles adds its gradients there: few places, still in the cache when
+the next tile comes; no atomics; and always the same order of addition, whichever thread took the block.
+
+    homes [N, 4]   first home, number of homes, offset and step: the home in a block is
+                   offset + step x (the block's row) + (the block's column)
+
+Each thread has a region of the M slots and one of the homes for its splats, so one pass over the splats is enough.
 """
 
 from __future__ import annotations
@@ -20,67 +27,93 @@ import math
 import numpy as np
 from numba import njit
 
+from worker.raster.cpu.simd import ceil, floor, iota, maximum, minimum, splat, sqrt, store
 from worker.raster.cpu.vectors import LANES
 
-TILE_ROWS = 32
-"""Rows of a tile. 8 x 32 pixels x 5 planes of float32 are 5 kB: they and the tile's alphas stay in L1 and L2."""
-EXTENT = 5
+ROW_BITS = 6
+TILE_ROWS = 1 << ROW_BITS
+"""Rows of a tile. 8 x 64 pixels x 5 planes of float32 are 10 kB: they and the tile's alphas stay in L1 and L2."""
+BLOCK_TILES = 16
+GRADIENT = 12
+"""Floats of a home: dL/d(r, g, b, z), the moments 1, x, y, xx, xy, yy of dL/dpower, two spare."""
+EXTENT = 6
 """What project tells of the ellipse of a splat, a dx^2 + 2 b dx dy + c dy^2 = r: its half-width in pixels, dx where it
-is lowest, -b / c, r / c and (ac - b^2) / c^2."""
+is lowest, -b / c, r / c, (ac - b^2) / c^2, and its half-height."""
+MOST_GAUSSIANS = 1 << (32 - 2 * ROW_BITS)
+"""A million: more would not fit beside the rows in an entry. As many tiles are an image of 23000 x 23000."""
 ROUNDING = np.float32(2e-3)
 """Pixels by which row bounds are widened, against rounding; the exact test is made on every pixel anyway."""
-_ZERO, _HALF = np.float32(0.0), np.float32(0.5)
+_ZERO, _HALF, _WIDTH = np.float32(0.0), np.float32(0.5), np.float32(LANES)
 _RADIX_BITS = 11
+_INFO_SHIFT = np.uint32(2 * ROW_BITS)
+_ROWS_MASK = np.uint32((1 << 2 * ROW_BITS) - 1)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _rows(extent, g, first_dx, last_dx, y):  # type: ignore[no-untyped-def]
-    """Image rows [top, end) that the ellipse covers between two columns of pixel centres; end <= top if none.
+def _rows(extent, g, x, y, column, bounds):  # type: ignore[no-untyped-def]
+    """Image rows [top, end) that the ellipse covers in LANES columns of tiles from this one on: bounds [2 * LANES].
 
-    The lower branch -b / c dx + sqrt(r / c - (ac - b^2) / c^2 dx^2) is concave in dx, so its maximum over the columns
-    is at the ellipse's own extreme point clamped to them; the upper one is its mirror image.
+    The lower branch -b / c dx + sqrt(r / c - (ac - b^2) / c^2 dx^2) is concave in dx, so its maximum over a column's
+    pixel centres is at the ellipse's own extreme point clamped to them; the upper one is its mirror image.
     """
-    width, extreme, lean, height2, fall = extent[g, 0], extent[g, 1], extent[g, 2], extent[g, 3], extent[g, 4]
-    low, high = max(first_dx, -width), min(last_dx, width)
-    if low > high:
-        return 0, 0
-    at = min(max(extreme, low), high)
-    bottom = lean * at + math.sqrt(max(_ZERO, height2 - fall * at * at))
-    at = min(max(-extreme, low), high)
-    top = lean * at - math.sqrt(max(_ZERO, height2 - fall * at * at))
-    return math.ceil(y + top - _HALF - ROUNDING), math.floor(y + bottom - _HALF + ROUNDING) + 1
+    zero, width, extreme = splat(_ZERO), splat(extent[g, 0]), splat(extent[g, 1])
+    lean, height2, fall = splat(extent[g, 2]), splat(extent[g, 3]), splat(extent[g, 4])
+    first_dx = (iota() + splat(np.float32(column))) * splat(_WIDTH) + splat(_HALF - x)
+    low, high = maximum(first_dx, zero - width), minimum(first_dx + splat(_WIDTH - np.float32(1)), width)
+    at = minimum(maximum(extreme, low), high)
+    bottom = lean * at + sqrt(maximum(zero, height2 - fall * at * at))
+    at = minimum(maximum(zero - extreme, low), high)
+    top = lean * at - sqrt(maximum(zero, height2 - fall * at * at))
+    store(bounds, 0, ceil(top + splat(y - _HALF - ROUNDING)))
+    store(bounds, LANES, floor(bottom + splat(y + _HALF + ROUNDING)))
 
 
 @njit(cache=True, nogil=True)
 def fill_slots(  # type: ignore[no-untyped-def]
-    thread, threads, splats, radius2, extent, height, tiles_x, slot_start, slot_count, slot_tile, slot_rows, region_end
-):
-    """Write the slots of the thread's share of splats into its region, an equal share of the slot arrays.
+    thread, threads, splats, radius2, extent, height, tiles_x, home_capacity,
+    slot_start, slot_count, slot_info, homes, region_end,
+):  # fmt: skip
+    """Write the slots of the thread's share of splats into its region, an equal share of slot_info; number its homes.
 
-    region_end [threads]: where they end, or would: beyond the region nothing is written, and the caller makes room.
+    home_capacity: homes of all threads. region_end [threads, 2]: where slots and homes end, or would: beyond the region
+    nothing is written, and the caller makes room.
     """
-    region = slot_tile.shape[0] // threads
+    region = slot_info.shape[0] // threads
     slot, full = thread * region, (thread + 1) * region
-    count = splats.shape[0]
+    home = home_capacity // threads * thread
+    count, last_row = splats.shape[0], np.float32(height - 1)
+    bounds = np.empty(2 * LANES, np.float32)
     for g in range(count * thread // threads, count * (thread + 1) // threads):
-        slot_start[g] = slot
-        first, last, x, y = 0, -1, splats[g, 0], splats[g, 1]
-        if radius2[g] >= _ZERO:
-            first = max(math.floor((x - extent[g, 0] - _HALF) / np.float32(LANES)), 0)
-            last = min(math.floor((x + extent[g, 0] - _HALF) / np.float32(LANES)), tiles_x - 1)
+        slot_start[g], slot_count[g], homes[g, 0], homes[g, 1] = slot, 0, home, 0
+        if not radius2[g] >= _ZERO:
+            continue
+        x, y, reach_x, reach_y = splats[g, 0], splats[g, 1], extent[g, 0], extent[g, 5]
+        first = max(math.floor((x - reach_x - _HALF) / _WIDTH), 0)
+        last = min(math.floor((x + reach_x - _HALF) / _WIDTH), tiles_x - 1)
+        highest = int(max(y - reach_y - _HALF, _ZERO)) >> ROW_BITS
+        lowest = int(min(y + reach_y + _HALF, last_row)) >> ROW_BITS
+        top_most, bottom_most = highest << ROW_BITS, min((lowest + 1) << ROW_BITS, height)
         for column in range(first, last + 1):
-            first_dx = np.float32(column * LANES) + _HALF - x
-            top, end = _rows(extent, g, first_dx, first_dx + np.float32(LANES - 1), y)
-            top, end = max(top, 0), min(end, height)
+            lane = (column - first) % LANES
+            if lane == 0:
+                _rows(extent, g, x, y, column, bounds)
+            top, end = max(int(bounds[lane]), top_most), min(int(bounds[LANES + lane]), bottom_most)
             if top >= end:
                 continue
-            for band in range(top // TILE_ROWS, (end - 1) // TILE_ROWS + 1):
+            for band in range(top >> ROW_BITS, ((end - 1) >> ROW_BITS) + 1):
                 if slot < full:
-                    slot_tile[slot] = band * tiles_x + column
-                    slot_rows[slot] = max(top - band * TILE_ROWS, 0) << 8 | min(end - band * TILE_ROWS, TILE_ROWS)
+                    above = band << ROW_BITS
+                    rows = max(top - above, 0) << ROW_BITS | min(end - 1 - above, TILE_ROWS - 1)
+                    slot_info[slot] = (band * tiles_x + column) << 2 * ROW_BITS | rows
                 slot += 1
         slot_count[g] = slot - slot_start[g]
-    region_end[thread] = slot
+        if slot_count[g] > 0:
+            first_block, last_block = first // BLOCK_TILES, last // BLOCK_TILES
+            step = last_block - first_block + 1
+            homes[g, 1] = step * (lowest - highest + 1)
+            homes[g, 2], homes[g, 3] = home - step * highest - first_block, step
+            home += homes[g, 1]
+    region_end[thread, 0], region_end[thread, 1] = slot, home
 
 
 @njit(cache=True, nogil=True)
@@ -118,22 +151,22 @@ def depth_order(splats, radius2, order, keys, other_order, other_keys):  # type:
 
 @njit(cache=True, nogil=True)
 def sort_into_tiles(  # type: ignore[no-untyped-def]
-    order, visible, slot_start, slot_count, slot_tile, slot_rows, region_end, tile_start, entries, slot_place
+    order, visible, slot_start, slot_count, slot_info, region_end, tile_start, entries
 ):
     """Counting sort of the slots by tile, splats taken in depth order."""
     tile_start[:] = 0
-    region = slot_tile.shape[0] // region_end.shape[0]
+    region = slot_info.shape[0] // region_end.shape[0]
     for thread in range(region_end.shape[0]):
-        for slot in range(thread * region, region_end[thread]):
-            tile_start[slot_tile[slot] + 1] += 1
+        for slot in range(thread * region, region_end[thread, 0]):
+            tile_start[(slot_info[slot] >> _INFO_SHIFT) + np.uint32(1)] += 1
     for tile in range(tile_start.shape[0] - 1):
         tile_start[tile + 1] += tile_start[tile]
     cursor = tile_start[:-1].copy()
     for i in range(visible):
         g = order[i]
+        splat_bits = np.uint32(g) << _INFO_SHIFT
         for slot in range(slot_start[g], slot_start[g] + slot_count[g]):
-            tile = slot_tile[slot]
-            place = cursor[tile]
-            cursor[tile] = place + 1
-            entries[place, 0], entries[place, 1] = g, slot_rows[slot]
-            slot_place[slot] = place
+            info = slot_info[slot]
+            place = cursor[info >> _INFO_SHIFT]
+            cursor[info >> _INFO_SHIFT] = place + 1
+            entries[place] = splat_bits | info & _ROWS_MASK

@@ -14,8 +14,8 @@ products instead of an exponential. Derivations: docs/rasterizer.md.
 A tile is done in four steps. Its entries (bins.py) are gathered as records, one after the other in memory; they are
 blended; the loss is taken; and they are walked back. A record is RECORD floats: alpha and ratio of its first row, one
 a lane, then BEND (the ratio's own), COLOUR (r, g, b, z), PLACE (dx of the first lane, dy of the first row). Its rows
-[top, end) and its entry are in ``spans``. The planes lie in ``planes``, PLANE floats apart: T (later B - g_A), then
-R G B Z (later g_R g_G g_B g_Z).
+[top, end) and the home of its splat are in ``spans``. The planes lie in ``planes``, PLANE floats apart: T (later
+B - g_A), then R G B Z (later g_R g_G g_B g_Z).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ import numpy as np
 from numba import njit
 
 from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from worker.raster.cpu.bins import TILE_ROWS
-from worker.raster.cpu.project import GRADIENT
+from worker.raster.cpu.bins import BLOCK_TILES, GRADIENT, ROW_BITS, TILE_ROWS
 from worker.raster.cpu.simd import (
+    add_sums,
     all_less,
     claim,
     exp2,
@@ -40,7 +40,6 @@ from worker.raster.cpu.simd import (
     splat,
     spread,
     store,
-    store_sums,
     where_less,
 )
 from worker.raster.cpu.vectors import LANES
@@ -68,53 +67,59 @@ _CHECK_EVERY = 32  # records between two looks at whether the whole tile is opaq
 
 @njit(cache=True, nogil=True)
 def blend(  # type: ignore[no-untyped-def]
-    thread, threads, next_tile, mode, width, height, tiles_x, splats, tile_start, entries,
-    records, spans, trail, planes, slots, statistics, target, weight, inverse_depth, loss_settings, image,
+    thread, threads, next_block, mode, width, height, tiles_x, splats, tile_start, entries, homes,
+    records, spans, trail, planes, sums, statistics, target, weight, inverse_depth, loss_settings, image,
 ):  # fmt: skip
-    """Composite every tile. Threads take tiles as they come: what a tile gives does not depend on who computes it.
+    """Composite every tile. Threads take blocks as they come: what a block gives does not depend on who computes it.
 
-    next_tile int64 [1]: 0 at the start. records, spans, trail, planes [threads, ...]: scratch (see above).
-    slots [M * GRADIENT]: written in modes LOSS and COTANGENT, in the order of entries (GRADIENT of project.py).
-    statistics [tiles, STATISTICS]: LOSS.
+    next_block int64 [1]: 0 at the start. records, spans, trail, planes [threads, ...]: scratch (see above).
+    sums [homes * GRADIENT] (bins.py): added to in modes LOSS and COTANGENT. statistics [tiles, STATISTICS]: LOSS.
     target [3, H, stride] uint8, weight [H, stride] uint8 (255 = tissue), inverse_depth [H, stride] float32 (0 = none):
     LOSS, flattened, stride = tiles_x * LANES. loss_settings float32 [5]: colour weight a channel, depth weight,
     1 / width of the quadratic zone of the colour and of the depth loss, 1 for normalised depth else 0.
     image [5, H, stride] flattened: R G B Z A, written in RENDER, read as cotangents in COTANGENT.
     """
-    tiles, stride = tile_start.shape[0] - 1, tiles_x * LANES
-    size, keep = height * stride, mode != RENDER
+    blocks_x, stride, keep = -(-tiles_x // BLOCK_TILES), tiles_x * LANES, mode != RENDER
+    blocks, size = (tile_start.shape[0] - 1) // tiles_x * blocks_x, height * stride
     records, spans, trail, planes = records[thread], spans[thread], trail[thread], planes[thread]
-    tile = claim(next_tile)
-    while tile < tiles:
-        row0, column0 = tile // tiles_x * TILE_ROWS, tile % tiles_x * LANES
-        rows, origin = min(TILE_ROWS, height - row0), row0 * stride + column0
-        first, end = tile_start[tile], tile_start[tile + 1]
-        count = _gather(first, end, row0, column0, splats, entries, records, spans)
-        _clear(planes, column0, width, rows)
-        visited = _forward(count, rows, keep, records, spans, trail, planes)
-        if mode == RENDER:
-            _write(planes, image, origin, stride, size, rows)
-        elif mode == LOSS:
-            _loss(
-                planes, statistics[tile], target, weight, inverse_depth, loss_settings, origin, stride, size, rows
+    block = claim(next_block)
+    while block < blocks:
+        band, block_x = block // blocks_x, block % blocks_x
+        row0 = band * TILE_ROWS
+        rows = min(TILE_ROWS, height - row0)
+        for column in range(block_x * BLOCK_TILES, min((block_x + 1) * BLOCK_TILES, tiles_x)):
+            tile, column0 = band * tiles_x + column, column * LANES
+            origin = row0 * stride + column0
+            count = _gather(
+                tile_start[tile], tile_start[tile + 1], row0, column0, band, block_x, splats, entries, homes,
+                records, spans,
             )  # fmt: skip
-        else:
-            _read_cotangents(planes, image, origin, stride, size, rows)
-        if keep:
-            _backward(visited, records, spans, trail, planes, slots)
-            seen = spans[visited - 1, 2] + 1 if visited > 0 else first
-            slots[seen * GRADIENT : end * GRADIENT] = _ZERO  # behind the opaque front: no gradient
-        tile = claim(next_tile)
+            _clear(planes, column0, width, rows)
+            visited = _forward(count, rows, keep, records, spans, trail, planes)
+            if mode == RENDER:
+                _write(planes, image, origin, stride, size, rows)
+            elif mode == LOSS:
+                _loss(
+                    planes, statistics[tile], target, weight, inverse_depth, loss_settings, origin, stride, size, rows
+                )  # fmt: skip
+            else:
+                _read_cotangents(planes, image, origin, stride, size, rows)
+            if keep:
+                _backward(visited, records, spans, trail, planes, sums)
+        block = claim(next_block)
 
 
 @njit(cache=True, nogil=True)
-def _gather(first, end, row0, column0, splats, entries, records, spans):  # type: ignore[no-untyped-def]
+def _gather(  # type: ignore[no-untyped-def]
+    first, end, row0, column0, band, block_x, splats, entries, homes, records, spans
+):
     """Write the entries [first, end) of a tile as records; return how many records."""
     lanes = iota()
     at = count = 0
     for i in range(first, end):
-        g, rows = entries[i, 0], entries[i, 1]
-        top, bottom = np.int64(rows >> np.uint32(8)), np.int64(rows & np.uint32(255))
+        entry = np.int64(entries[i])
+        g = np.uint64(entry >> 2 * ROW_BITS)
+        top, bottom = entry >> ROW_BITS & TILE_ROWS - 1, (entry & TILE_ROWS - 1) + 1
         x = np.float32(column0) + _HALF - splats[g, 0]
         y = np.float32(row0) + _HALF - splats[g, 1]
         k_xx, k_xy, k_yy = splats[g, 2], splats[g, 3], splats[g, 4]
@@ -125,6 +130,7 @@ def _gather(first, end, row0, column0, splats, entries, records, spans):  # type
         head = fma(lean, splat(dy), along) + splat(k_yy * dy * dy)
         foot = fma(lean, splat(end_dy), along) + splat(k_yy * end_dy * end_dy)
         stretch = MOST_ROWS if all_less(splat(_DEEP), minimum(head, foot)) else 1
+        home = homes[g, 2] + homes[g, 3] * band + block_x
         while top < bottom:
             dy = y + np.float32(top)
             store(records, at, exp2(fma(lean, splat(dy), along) + splat(k_yy * dy * dy)))
@@ -133,7 +139,7 @@ def _gather(first, end, row0, column0, splats, entries, records, spans):  # type
             records[at + COLOUR], records[at + COLOUR + 1] = splats[g, 6], splats[g, 7]
             records[at + COLOUR + 2], records[at + COLOUR + 3] = splats[g, 8], splats[g, 9]
             records[at + PLACE], records[at + PLACE + 1] = x, dy
-            spans[count, 0], spans[count, 1], spans[count, 2] = top, min(top + stretch, bottom), i
+            spans[count, 0], spans[count, 1], spans[count, 2] = top, min(top + stretch, bottom), home
             top += stretch
             at += RECORD
             count += 1
@@ -190,9 +196,9 @@ def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[
 
 
 @njit(cache=True, nogil=True)
-def _backward(count, records, spans, trail, planes, slots):  # type: ignore[no-untyped-def]
+def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-untyped-def]
     """Gradients of the first count records, back to front; planes hold B - g_A, then g_R g_G g_B g_Z."""
-    zero, cap, one = splat(_ZERO), splat(_CAP), splat(_ONE)
+    zero, cap = splat(_ZERO), splat(_CAP)
     lanes = iota()
     v_red, v_green, v_blue, v_depth = zero, zero, zero, zero
     moment, moment_y, moment_yy = zero, zero, zero
@@ -205,7 +211,7 @@ def _backward(count, records, spans, trail, planes, slots):  # type: ignore[no-u
         blue, depth = spread(records, record + COLOUR + 2), spread(records, record + COLOUR + 3)
         top, bottom = spans[i, 0], spans[i, 1]
         at -= (bottom - top) * 2 * LANES
-        dy = spread(records, record + PLACE + 1)
+        sum_1, sum_2, sum_3 = zero, zero, zero
         trace = at
         for row in range(top, bottom):
             p = row * LANES
@@ -219,19 +225,22 @@ def _backward(count, records, spans, trail, planes, slots):  # type: ignore[no-u
             v_red, v_green = fma(weight, g_red, v_red), fma(weight, g_green, v_green)
             v_blue, v_depth = fma(weight, g_blue, v_blue), fma(weight, g_depth, v_depth)
             v_power = where_less(alpha, cap, weight * score, zero)
-            moment = moment + v_power
-            below = v_power * dy
-            moment_y = moment_y + below
-            moment_yy = fma(below, dy, moment_yy)
-            dy = dy + one
+            sum_1 = sum_1 + v_power
+            sum_2 = sum_2 + sum_1
+            sum_3 = sum_3 + sum_2
+        # k rows from the record's end, sum_2 = sum k v and sum_3 = sum k (k + 1) / 2 v; dy = end_dy - k.
+        end_dy = spread(records, record + PLACE + 1) + splat(np.float32(bottom - top))
+        lowered = end_dy * sum_1 - sum_2
+        moment, moment_y = moment + sum_1, moment_y + lowered
+        moment_yy = moment_yy + fma(end_dy, lowered - sum_2, sum_3 + sum_3 - sum_2)
         if i > 0 and spans[i - 1, 2] == spans[i, 2]:
             continue  # the record before belongs to the same slot
         dx = lanes + spread(records, record + PLACE)
         moment_x = moment * dx
-        slot = np.int64(spans[i, 2]) * GRADIENT
-        store_sums(slots, slot, v_red, v_green, v_blue, v_depth)
-        store_sums(slots, slot + 4, moment, moment_x, moment_y, moment_x * dx)
-        store_sums(slots, slot + 8, moment_y * dx, moment_yy, zero, zero)
+        home = np.int64(spans[i, 2]) * GRADIENT
+        add_sums(sums, home, v_red, v_green, v_blue, v_depth)
+        add_sums(sums, home + 4, moment, moment_x, moment_y, moment_x * dx)
+        add_sums(sums, home + 8, moment_y * dx, moment_yy, zero, zero)
         v_red, v_green, v_blue, v_depth = zero, zero, zero, zero
         moment, moment_y, moment_yy = zero, zero, zero
 

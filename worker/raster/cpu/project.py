@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from worker.raster import EPS2D, LIMIT, MIN_ALPHA, NEAR
-from worker.raster.cpu.bins import EXTENT
+from worker.raster.cpu.bins import EXTENT, GRADIENT
 from worker.raster.cpu.simd import (
     exp2,
     lane_sum,
@@ -38,8 +38,6 @@ from worker.raster.cpu.vectors import LANES
 
 SPLAT = 12
 """Floats a splat record holds; eleven are used, twelve keep records on 16-byte boundaries."""
-GRADIENT = 12
-"""Floats the blend returns for a slot: dL/d(r, g, b, z), the moments 1, x, y, xx, xy, yy of dL/dpower, two spare."""
 LOG2E = 1.4426950408889634
 _LN2 = 0.6931471805599453
 _LARGEST = 1e300
@@ -214,6 +212,7 @@ def project(  # type: ignore[no-untyped-def]
         store_strided(extent, at + 2, EXTENT, narrow(cxy * inverse_cxx))
         store_strided(extent, at + 3, EXTENT, narrow(extent2 * det * inverse_cxx))
         store_strided(extent, at + 4, EXTENT, narrow(det * inverse_cxx * inverse_cxx))
+        store_strided(extent, at + 5, EXTENT, narrow(reach_y))
 
 
 @njit(cache=True, nogil=True)
@@ -229,26 +228,26 @@ def _more(total, a, visible):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _gather_sums(first, slot_start, slot_count, slot_place, slots, sums):  # type: ignore[no-untyped-def]
-    """Sum the blend's gradients of LANES Gaussians over their slots into sums [LANES * GRADIENT]."""
+def _add_homes(first, homes, sums, totals):  # type: ignore[no-untyped-def]
+    """The blend's gradients of LANES Gaussians, summed over their homes, into totals [LANES * GRADIENT]."""
     for lane in range(LANES):
         head = tail = splat(np.float32(0.0))
-        start = slot_start[first + lane]
-        for slot in range(start, start + slot_count[first + lane]):
-            place = np.int64(slot_place[slot]) * GRADIENT
-            head, tail = head + load(slots, place), tail + load(slots, place + GRADIENT - LANES)
-        store(sums, lane * GRADIENT + GRADIENT - LANES, tail)
-        store(sums, lane * GRADIENT, head)
+        start = np.int64(homes[first + lane, 0])
+        for home in range(start, start + homes[first + lane, 1]):
+            head = head + load(sums, home * GRADIENT)
+            tail = tail + load(sums, home * GRADIENT + GRADIENT - LANES)
+        store(totals, lane * GRADIENT + GRADIENT - LANES, tail)
+        store(totals, lane * GRADIENT, head)
 
 
 @njit(cache=True, nogil=True)
 def project_backward(  # type: ignore[no-untyped-def]
-    thread, threads, camera, state, opacity_logit, radius2, slot_start, slot_count, slot_place, slots,
+    thread, threads, camera, state, opacity_logit, radius2, homes, sums,
     v_state, v_opacity_logit, v_colour, v_mean2d_norm, v_pose,
 ):  # fmt: skip
-    """Sum the blend's gradients of each Gaussian over its tiles and carry them back to its parameters.
+    """Sum the blend's gradients of each Gaussian over its homes (bins.py) and carry them back to its parameters.
 
-    slots [M * GRADIENT], those of Gaussian g at slot_place[slot_start[g]] and the slot_count[g] - 1 that follow. Every
+    sums [homes * GRADIENT]. Every
     v_* row is written (zeros for culled Gaussians). v_mean2d_norm [N]: |dL/dmean2d| in normalised device coordinates
     (x times W / 2, y times H / 2), the unit in which densification thresholds are published. v_pose [threads, 12]: the
     thread's share of dL/d camera_from_world.
@@ -262,18 +261,18 @@ def project_backward(  # type: ignore[no-untyped-def]
     limits = _limits(camera)
     low_u, high_u, low_v, high_v = zero + limits[0], zero + limits[1], zero + limits[2], zero + limits[3]
     pose_x = pose_y = pose_z = pose_t = (zero, zero, zero)
-    sums = np.empty(LANES * GRADIENT, np.float32)
+    totals = np.empty(LANES * GRADIENT, np.float32)
     vectors = state.shape[1] // LANES
     for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
         i = k * LANES
-        _gather_sums(i, slot_start, slot_count, slot_place, slots, sums)
+        _add_homes(i, homes, sums, totals)
         visible = load(radius2, i)
-        store(v_colour[0], i, load_strided(sums, 0, GRADIENT))
-        store(v_colour[1], i, load_strided(sums, 1, GRADIENT))
-        store(v_colour[2], i, load_strided(sums, 2, GRADIENT))
+        store(v_colour[0], i, load_strided(totals, 0, GRADIENT))
+        store(v_colour[1], i, load_strided(totals, 1, GRADIENT))
+        store(v_colour[2], i, load_strided(totals, 2, GRADIENT))
         odds = _exp(zero - widen(load(opacity_logit, i)))
         # times 1 - opacity, exact also where opacity rounds to 1
-        store(v_opacity_logit, i, narrow(widen(load_strided(sums, 4, GRADIENT)) * odds / (1.0 + odds)))
+        store(v_opacity_logit, i, narrow(widen(load_strided(totals, 4, GRADIENT)) * odds / (1.0 + odds)))
 
         # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + EPS2D I.
         mean = _rows_of(state, 0, i)
@@ -293,13 +292,13 @@ def project_backward(  # type: ignore[no-untyped-def]
         inverse_det = 1.0 / (cxx * cyy - cxy * cxy)
         ka, kb, kc = cyy * inverse_det, zero - cxy * inverse_det, cxx * inverse_det
 
-        m_x, m_y = widen(load_strided(sums, 5, GRADIENT)), widen(load_strided(sums, 6, GRADIENT))
+        m_x, m_y = widen(load_strided(totals, 5, GRADIENT)), widen(load_strided(totals, 6, GRADIENT))
         v_mx, v_my = ka * m_x + kb * m_y, kb * m_x + kc * m_y
         on_image = v_mx * v_mx * (0.25 * width * width) + v_my * v_my * (0.25 * height * height)
         store(v_mean2d_norm, i, where_less(visible, none, none, narrow(sqrt(on_image))))
-        g00 = -0.5 * widen(load_strided(sums, 7, GRADIENT))  # dL/dconic, symmetric halves
-        g01 = -0.5 * widen(load_strided(sums, 8, GRADIENT))
-        g11 = -0.5 * widen(load_strided(sums, 9, GRADIENT))
+        g00 = -0.5 * widen(load_strided(totals, 7, GRADIENT))  # dL/dconic, symmetric halves
+        g01 = -0.5 * widen(load_strided(totals, 8, GRADIENT))
+        g11 = -0.5 * widen(load_strided(totals, 9, GRADIENT))
         h00, h01 = ka * g00 + kb * g01, ka * g01 + kb * g11
         h10, h11 = kb * g00 + kc * g01, kb * g01 + kc * g11
         c00, c01, c11 = zero - (h00 * ka + h01 * kb), zero - (h00 * kb + h01 * kc), zero - (h10 * kb + h11 * kc)
@@ -319,7 +318,7 @@ def project_backward(  # type: ignore[no-untyped-def]
         # dL/dA = E R^T =: F, then to the camera point through A = diag(j) (W_xy - (u, v) W_z).
         f0, f1 = _onto(r, e0), _onto(r, e1)
         v_x, v_y = j0 * v_mx, j1 * v_my
-        v_z = widen(load_strided(sums, 3, GRADIENT)) - (x * v_x + y * v_y + _dot(f0, a0) + _dot(f1, a1)) * inverse_z
+        v_z = widen(load_strided(totals, 3, GRADIENT)) - (x * v_x + y * v_y + _dot(f0, a0) + _dot(f1, a1)) * inverse_z
         v_u = zero - j0 * _dot(f0, w[2])
         v_v = zero - j1 * _dot(f1, w[2])
         v_u = where_less(low_u, ratio_x, where_less(ratio_x, high_u, v_u, zero), zero) * inverse_z

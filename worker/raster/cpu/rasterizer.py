@@ -75,18 +75,21 @@ class Rasterizer:
         self._trail, self._records = _aligned(THREADS, 0), _aligned(THREADS, 0)
         self._spans = np.zeros((THREADS, 0, 3), np.int32)
         self._tile_start = np.zeros(self.tiles + 1, np.int64)
-        self._region_end = np.zeros(THREADS, np.int64)
-        self._next_tile = np.zeros(1, np.int64)
+        self._region_end = np.zeros((THREADS, 2), np.int64)
+        self._next_block = np.zeros(1, np.int64)
         self._no_target = Target(np.zeros(1, np.uint8), np.zeros(1, np.uint8), np.zeros(1, np.float32))
         self._allocate_gaussians(0)
-        self._allocate_slots(0)
+        self._allocate_slots(0, 0)
 
     def _allocate_gaussians(self, count: int) -> None:
+        if count > bins.MOST_GAUSSIANS:
+            raise ValueError(f"{count} Gaussians; these kernels number at most {bins.MOST_GAUSSIANS}")
         self.splats = np.zeros((count, project.SPLAT), np.float32)
         self.radius2 = np.full(count, -1.0, np.float32)
-        self.slot_start = np.zeros(count, np.int64)
+        self.slot_start = np.zeros(count, np.int32)
         self._slot_count = np.zeros(count, np.int32)
         self._extent = np.zeros((count, bins.EXTENT), np.float32)
+        self._homes = np.zeros((count, 4), np.int32)
         self._order = np.zeros((2, count), np.int32)
         self._keys = np.zeros((2, count), np.uint32)
         self.gradients = Gradients(
@@ -97,12 +100,10 @@ class Rasterizer:
             np.zeros((THREADS, 12)),
         )
 
-    def _allocate_slots(self, capacity: int) -> None:
-        self._slot_tile = np.zeros(capacity, np.int32)
-        self._slot_rows = np.zeros(capacity, np.uint32)
-        self._slot_place = np.zeros(capacity, np.int32)
-        self._entries = np.zeros((capacity, 2), np.uint32)
-        self._slots = np.zeros(capacity * project.GRADIENT, np.float32)
+    def _allocate_slots(self, slots: int, homes: int) -> None:
+        """Room for so many a thread."""
+        self._slot_info, self._entries = np.zeros((2, THREADS * slots), np.uint32)
+        self._sums = np.zeros(THREADS * homes * bins.GRADIENT, np.float32)
 
     def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
         """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N]."""
@@ -122,33 +123,35 @@ class Rasterizer:
         )  # fmt: skip
 
     def bin(self) -> None:
-        """Second third: the slots of every splat."""
+        """Second third: the slots and homes of every splat."""
         if not self._filled():
-            most = int(self._region_slots.max())
-            self._allocate_slots(THREADS * (most + most // 4))
+            self._allocate_slots(*(self._needed() * 5 // 4).tolist())
             self._filled()
 
     def _filled(self) -> bool:
         """Write the slots; False where a thread's region is too small for its own."""
         run(
             bins.fill_slots, self.splats, self.radius2, self._extent, self.height, self.tiles_x,
-            self.slot_start, self._slot_count, self._slot_tile, self._slot_rows, self._region_end,
+            len(self._sums) // bins.GRADIENT, self.slot_start, self._slot_count, self._slot_info, self._homes,
+            self._region_end,
         )  # fmt: skip
-        return int(self._region_slots.max()) <= len(self._slot_tile) // THREADS
+        return bool((self._needed() <= self._regions()).all())
 
-    @property
-    def _region_slots(self) -> NDArray[np.int64]:
-        """[THREADS] slots of each thread's splats."""
-        region = len(self._slot_tile) // THREADS
-        return np.asarray(self._region_end - region * np.arange(THREADS))
+    def _regions(self) -> NDArray[np.int64]:
+        """Slots and homes that a thread has room for."""
+        return np.array([len(self._slot_info), len(self._sums) // bins.GRADIENT]) // THREADS
+
+    def _needed(self) -> NDArray[np.int64]:
+        """Slots and homes of the thread that has most."""
+        return np.asarray((self._region_end - self._regions() * np.arange(THREADS)[:, None]).max(0))
 
     def sort(self) -> None:
         """Last third: the slots of every tile, nearest first."""
         order, keys = self._order, self._keys
         visible, is_first = bins.depth_order(self.splats, self.radius2, order[0], keys[0], order[1], keys[1])
         bins.sort_into_tiles(
-            order[0 if is_first else 1], visible, self.slot_start, self._slot_count, self._slot_tile, self._slot_rows,
-            self._region_end, self._tile_start, self._entries, self._slot_place,
+            order[0 if is_first else 1], visible, self.slot_start, self._slot_count, self._slot_info, self._region_end,
+            self._tile_start, self._entries,
         )  # fmt: skip
 
     def _reserve(self) -> None:
@@ -160,14 +163,22 @@ class Rasterizer:
             self._records = _aligned(THREADS, most * RECORD)
             self._trail = _aligned(THREADS, most * 2 * LANES)
 
+    def _empty_homes(self) -> None:
+        """Zeros in what the gradients are added to."""
+        _, region = self._regions()
+        for thread, (_, end) in enumerate(self._region_end):
+            self._sums[thread * region * bins.GRADIENT : end * bins.GRADIENT] = 0
+
     def blend(self, mode: int, target: Target, loss_settings: Floats, image: Floats) -> None:
         """The kernel in one of its modes (blend.py)."""
         self._reserve()
-        self._next_tile[0] = 0
+        if mode != RENDER:
+            self._empty_homes()
+        self._next_block[0] = 0
         run(
-            blend, self._next_tile, mode, self.width, self.height, self.tiles_x, self.splats, self._tile_start,
-            self._entries, self._records, self._spans, self._trail, self._planes, self._slots, self.statistics,
-            target.rgb, target.weight, target.inverse_depth, loss_settings, image,
+            blend, self._next_block, mode, self.width, self.height, self.tiles_x, self.splats, self._tile_start,
+            self._entries, self._homes, self._records, self._spans, self._trail, self._planes, self._sums,
+            self.statistics, target.rgb, target.weight, target.inverse_depth, loss_settings, image,
         )  # fmt: skip
 
     def render(self) -> Floats:
@@ -198,7 +209,7 @@ class Rasterizer:
         out = self.gradients
         run(
             project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,
-            self.slot_start, self._slot_count, self._slot_place, self._slots,
+            self._homes, self._sums,
             out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
         )  # fmt: skip
         return out

@@ -6,12 +6,12 @@
     load_strided(row, i, step)  row[i], row[i + step], ...             store_strided(row, i, step, v)
     splat(x)                    x in every lane                        iota()               0, 1, 2, ...
     widen(v), narrow(w)         between vector and wide
-    fma(a, b, c)                a * b + c                              sqrt(x)
+    fma(a, b, c)                a * b + c                              sqrt(x), floor(x), ceil(x)
     exp2(x)                     2**x, |relative error| < 2e-7 for -126 <= x <= 126
     log2(x)                     base-2 logarithm of a wide, |error| < 1e-9
     minimum(a, b), maximum(a, b), where_less(a, b, x, y) = x where a < b, else y;  all_less(a, b) whether in every lane
     lane_sum(v), lane_max(v)    over the lanes, always in the same order
-    store_sums(row, i, a, b, c, d)   the four lane sums into row[i : i + 4]
+    add_sums(row, i, a, b, c, d)     the four lane sums added to row[i : i + 4]
     claim(counter)              counter[0]++, for threads that share work
 
 Arrays are 1-D, C-contiguous, of float32 and not indexed from their end; a kernel with any other is refused when it is
@@ -215,6 +215,26 @@ def sqrt(typing: Any, x: Any) -> Any:
 
 
 @intrinsic
+def floor(typing: Any, x: Any) -> Any:
+    """The largest whole number not above x."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _call(builder, x, "floor", args[0])
+
+    return x(x), generate
+
+
+@intrinsic
+def ceil(typing: Any, x: Any) -> Any:
+    """The smallest whole number not below x."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _call(builder, x, "ceil", args[0])
+
+    return x(x), generate
+
+
+@intrinsic
 def minimum(typing: Any, a: Any, b: Any) -> Any:
     """The smaller of a and b, lane by lane (no NaN expected)."""
 
@@ -330,8 +350,8 @@ def lane_max(typing: Any, value: Any) -> Any:
 
 
 @intrinsic
-def store_sums(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """The lane sums of a, b, c, d into array[index : index + 4]; a third of the instructions of four lane_sum."""
+def add_sums(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """Add the lane sums of a, b, c, d to array[index : index + 4]; a third of the instructions of four lane_sum."""
     _check_dense(array)
 
     def paired(builder: Any, left: Any, right: Any) -> Any:
@@ -347,7 +367,10 @@ def store_sums(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: A
             low, high = (_shuffled(builder, total, total, list(range(at, at + width))) for at in (0, width))
             total = builder.fadd(low, high)
         address = _address(context, builder, signature.args[0], args[0], args[1])
-        builder.store(total, builder.bitcast(address, ir.VectorType(_FLOAT, 4).as_pointer())).align = 4
+        place = builder.bitcast(address, ir.VectorType(_FLOAT, 4).as_pointer())
+        before = builder.load(place)
+        before.align = 4
+        builder.store(builder.fadd(before, total), place).align = 4
         return context.get_dummy_value()
 
     return types.void(array, types.intp, vector, vector, vector, vector), generate
