@@ -4,7 +4,7 @@ Symbols: N Gaussians, T frames, C = 10 channels, B bases. Gaussians are in optim
 poses in mm.
 
     directory/
-    ├── scene.safetensors   every tensor: gaussians.*, deformation.*, seen
+    ├── scene.safetensors   "exact": every tensor, gaussians.*, deformation.*, seen; "compact": those of compact.py
     └── manifest.json       format, camera, poses, times, settings; shape and type of each tensor, SHA-256 of each file
     resume.safetensors      one file: tensors, and in its header the loop's state as JSON and a SHA-256 over both
 
@@ -31,12 +31,16 @@ from torch import Tensor
 from contract.camera import Intrinsics
 from contract.errors import SceneError
 from contract.store import RESUME
+from worker.compact import read
 from worker.deformation import Deformation, restore
 from worker.gaussians import Gaussians
 
 FORMAT = "intrasplat-scene"
-FORMAT_VERSION = 1
-"""Raised when an older reader would misread what is written."""
+FORMAT_VERSION = 2
+"""Raised when an older reader would misread what is written. Version 1 knew exact tensors only and is still read."""
+READ_VERSIONS = (1, FORMAT_VERSION)
+EXACT, COMPACT = "exact", "compact"
+RESUME_VERSION = 1
 SCENE_FILE = "scene.safetensors"
 MANIFEST_FILE = "manifest.json"
 RESUME_FILE = RESUME
@@ -54,6 +58,8 @@ class Scene:
     preset, seed, settings  how it was trained; settings is JSON
     trained_t               model times of the training frames
     seen                    [N] float32 in [0, 1]: share of training frames that saw each Gaussian x stereo confidence
+    stored                  the tensors of compact.py that gave gaussians, deformation and seen, and that stand for them
+                            on disk; None: their own tensors do
     """
 
     gaussians: Gaussians
@@ -67,13 +73,14 @@ class Scene:
     seen: Tensor
     seed: int = 0
     settings: dict[str, Any] = field(default_factory=dict)
+    stored: Mapping[str, Tensor] | None = None
 
     @property
     def frame_count(self) -> int:
         return int(self.world_from_camera.shape[0])
 
     def tensors(self) -> dict[str, Tensor]:
-        """Every stored tensor by its name in the file, on the CPU."""
+        """Every tensor of the model by its name in an exact file, on the CPU."""
         named = {f"gaussians.{name}": each for name, each in self.gaussians.tensors().items()}
         moving = self.deformation.parameters() | self.deformation.constants()
         named |= {f"deformation.{name}": each for name, each in moving.items()}
@@ -82,8 +89,13 @@ class Scene:
 
     @property
     def byte_count(self) -> int:
-        """Bytes of all tensors: the scene's size on disk but for a header of some kB."""
+        """Bytes of the model's tensors in memory."""
         return sum(each.numel() * each.element_size() for each in self.tensors().values())
+
+    @property
+    def file_bytes(self) -> int:
+        """Bytes of scene.safetensors."""
+        return len(save(dict(self.stored or self.tensors())))
 
 
 def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> None:
@@ -95,15 +107,16 @@ def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> 
     Raises:
         SceneError: a tensor is not finite, or the tensors do not belong together; nothing is written.
     """
-    tensors = scene.tensors()
-    _check_finite(tensors)
+    _check_finite(scene.tensors())
     _check_counts(scene)
+    tensors = dict(scene.stored or scene.tensors())
     directory.mkdir(parents=True, exist_ok=True)
     data = save(tensors)
     files = {SCENE_FILE: data} | {name: (directory / _plain(name)).read_bytes() for name in beside}
     manifest = {
         "format": FORMAT,
         "version": FORMAT_VERSION,
+        "coding": EXACT if scene.stored is None else COMPACT,
         "deformation": scene.deformation.kind,
         "gaussians": len(scene.gaussians),
         "intrinsics": scene.intrinsics.model_dump(),
@@ -136,8 +149,8 @@ def load_scene(directory: Path) -> Scene:
         data = {name: _read_checked(directory / _plain(name), expected) for name, expected in manifest["files"].items()}
         tensors = _parse(data[SCENE_FILE], directory / SCENE_FILE)
         _check_declared(tensors, manifest["tensors"])
-        _check_finite(tensors)
         scene = _scene_of(manifest, tensors)
+        _check_finite(scene.tensors())
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise SceneError(f"The scene in {directory} does not fit its manifest: {error!r}.") from error
     _check_counts(scene)
@@ -154,7 +167,7 @@ def save_resume(directory: Path, tensors: Mapping[str, Tensor], state: Mapping[s
     directory.mkdir(parents=True, exist_ok=True)
     named = {name: each.detach().cpu().contiguous() for name, each in tensors.items()}
     text = json.dumps(dict(state), sort_keys=True)
-    header = {"state": text, "version": str(FORMAT_VERSION), "sha256": _digest(named, text)}
+    header = {"state": text, "version": str(RESUME_VERSION), "sha256": _digest(named, text)}
     _write(directory / RESUME_FILE, save(named, metadata=header))
 
 
@@ -168,8 +181,8 @@ def load_resume(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     data = _read(path)
     tensors = _parse(data, path)
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__", {})
-    if header.get("version") != str(FORMAT_VERSION):
-        raise SceneError(f"{path} is of version {header.get('version')}, this program reads {FORMAT_VERSION}.")
+    if header.get("version") != str(RESUME_VERSION):
+        raise SceneError(f"{path} is of version {header.get('version')}, this program reads {RESUME_VERSION}.")
     if header.get("sha256") != _digest(tensors, header.get("state", "")):
         raise SceneError(f"{path} is damaged: its contents do not match their hash.")
     state: dict[str, Any] = json.loads(header["state"])
@@ -177,26 +190,48 @@ def load_resume(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _scene_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> Scene:
-    def under(prefix: str) -> dict[str, Tensor]:
-        return {name.removeprefix(prefix): each for name, each in tensors.items() if name.startswith(prefix)}
-
+    gaussians, deformation, seen = _model_of(manifest, tensors)
     poses = np.array(manifest["world_from_camera"], dtype=np.float64)
     times_s = np.array(manifest["frame_times_s"], dtype=np.float64)
     if poses.shape != (len(times_s), 4, 4) or not np.isfinite(poses).all():
         raise ValueError(f"world_from_camera has shape {poses.shape} for {len(times_s)} frames")
     return Scene(
-        gaussians=Gaussians(**under("gaussians.")),
-        deformation=restore(manifest["deformation"], under("deformation.")),
+        gaussians=gaussians,
+        deformation=deformation,
         intrinsics=Intrinsics.model_validate(manifest["intrinsics"]),
         world_from_camera=poses,
         frame_times_s=times_s,
         units_per_mm=float(manifest["units_per_mm"]),
         preset=str(manifest["preset"]),
         trained_t=tuple(float(t) for t in manifest["trained_t"]),
-        seen=tensors["seen"],
+        seen=seen,
         seed=int(manifest["seed"]),
         settings=dict(manifest["settings"]),
+        stored=tensors if _coding(manifest) == COMPACT else None,
     )
+
+
+def _coding(manifest: dict[str, Any]) -> str:
+    coding = str(manifest["coding"]) if manifest["version"] > 1 else EXACT
+    if coding not in (EXACT, COMPACT):
+        raise ValueError(f"coding {coding!r} is neither {EXACT} nor {COMPACT}")
+    return coding
+
+
+def _model_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> tuple[Gaussians, Deformation, Tensor]:
+    """Gaussians, motion and seen of either coding."""
+
+    def under(prefix: str) -> dict[str, Tensor]:
+        return {name.removeprefix(prefix): each for name, each in tensors.items() if name.startswith(prefix)}
+
+    if _coding(manifest) == EXACT:
+        deformation = restore(manifest["deformation"], under("deformation."))
+        return Gaussians(**under("gaussians.")), deformation, tensors["seen"]
+    _check_finite(tensors)
+    gaussians, shared, seen = read(tensors).model()
+    if shared.kind != manifest["deformation"] or len(gaussians) != manifest["gaussians"]:
+        raise ValueError(f"{len(gaussians)} Gaussians of kind {shared.kind} are not those the manifest speaks of")
+    return gaussians, shared, seen
 
 
 def _check_counts(scene: Scene) -> None:
@@ -242,9 +277,10 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise SceneError(f"{path} is damaged: {error}.") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise SceneError(f"{path} is not the manifest of a scene.")
-    if manifest.get("version") != FORMAT_VERSION:
+    if manifest.get("version") not in READ_VERSIONS:
         raise SceneError(
-            f"{path} is of version {manifest.get('version')}, this program reads version {FORMAT_VERSION}."
+            f"{path} is of version {manifest.get('version')}, this program reads versions "
+            f"{' and '.join(map(str, READ_VERSIONS))}."
         )
     return manifest
 

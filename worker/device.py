@@ -33,6 +33,7 @@ from worker.orders import (
 )
 from worker.pace import Pace
 from worker.pipeline import ReconstructionRequest, check_device, reconstruct
+from worker.rangecoder import compile_coder
 from worker.raster.cpu import compile_kernels
 from worker.serve import RequestServer
 from worker.snapshot import Snapshots
@@ -71,6 +72,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
     started_s = time.monotonic()
     compile_kernels()
+    compile_coder()
     logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, pace)
 

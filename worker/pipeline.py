@@ -31,10 +31,13 @@ from worker.densify import Densifier
 from worker.fusion import fuse
 from worker.hooks import Hooks, Progress
 from worker.metrics import psnr_tissue
+from worker.model import Model
 from worker.motion import track
 from worker.presets import Preset, preset_named
 from worker.quality import Training, View, build_report, measure, sample_frames
+from worker.rangecoder import compile_coder
 from worker.raster.cpu import compile_kernels
+from worker.shrink import Shrunk, model_of, shrink
 from worker.start import FRAMES_A_BASIS, bases_of, fusion_for, start_model
 from worker.stereo import estimate_depth
 from worker.targets import TrainingFrames, solid_depth_mm, units_per_mm
@@ -92,6 +95,7 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
     clip = depth_clip_of(request, hooks, seconds)
     split = split_frames(clip, request.holdout)
     seconds["compile_s"] = compile_kernels(lambda share: report_stage(hooks, "compile", share))
+    seconds["compile_s"] += compile_coder()
     clock = Stopwatch()
     run, scale = prepare(clip, split, preset, request, clock, hooks, seconds)
     resumed_s = resume(out_dir, run)
@@ -109,8 +113,11 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
         seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
         hooks.on_progress(Progress("finish", 0.0, run.iteration, run.iterations))
         scene = timed(seconds, "finish_s", lambda: scene_of(run, clip, split, scale, request.seed))
-        scored = reporting(run, view_of, split, hooks)
-        report = report_of(run, clip, split, scene, request, seconds, scored, accepted_at_s)
+        shrunk = timed(seconds, "shrink_s", lambda: shrink(scene, clip, run.frames))
+        scene = shrunk.scene if shrunk else scene
+        stored_view_of = view_function(run, scale, model_of(scene)) if shrunk else view_of
+        scored = reporting(run, stored_view_of, split, hooks)
+        report = report_of(run, clip, split, scene, request, seconds, scored, accepted_at_s, shrunk)
     except Cancelled:
         save_run(out_dir, run, seconds.get("t_train_s", clock.elapsed_s))
         raise
@@ -245,11 +252,11 @@ def resume(out_dir: Path, run: Run) -> float | None:
         raise InputError("--out", problem, "Give the options it was started with, or name a new folder.") from error
 
 
-def view_function(run: Run, scale: float) -> Callable[[int], View]:
-    """Renders frame i from the endoscope's pose, in mm."""
+def view_function(run: Run, scale: float, model: Model | None = None) -> Callable[[int], View]:
+    """Renders frame i from the endoscope's pose, in mm, of this model instead of the run's own if there is one."""
 
     def view_of(index: int) -> View:
-        image = run.model.render(run.frames.cameras[index], float(run.frames.t[index])).copy()
+        image = (model or run.model).render(run.frames.cameras[index], float(run.frames.t[index])).copy()
         return View(image[:3].transpose(1, 2, 0), solid_depth_mm(image[3], image[4], scale), image[4])
 
     return view_of
@@ -319,6 +326,7 @@ def report_of(
     seconds: dict[str, float],
     view_of: Callable[[int], View],
     accepted_at_s: float,
+    shrunk: Shrunk | None = None,
 ) -> Report:
     """Score the held-out frames beside the copy baselines and say what to distrust.
 
@@ -337,10 +345,11 @@ def report_of(
         iterations=run.iteration,
         gaussians=len(scene.gaussians),
         bases=bases_of(scene.deformation),
-        scene_bytes=scene.byte_count,
+        scene_bytes=scene.file_bytes,
         units_per_mm=scene.units_per_mm,
         seconds=seconds,
-        assumptions=chosen(run, clip, bases_of(scene.deformation)),
+        assumptions=(*chosen(run, clip, bases_of(scene.deformation)), *(shrunk.words if shrunk else ())),
+        measurements=shrunk.measurements if shrunk else {},
         warnings=training_warnings(run, request),
         versions={
             "intrasplat": version("intrasplat"),

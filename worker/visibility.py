@@ -34,7 +34,7 @@ def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
     pulled wide at the times nobody sees them, and from another pose they hang over the tissue like a veil.
     """
     unseen = np.flatnonzero(~_ever_on_tissue(model, clip, frames))
-    widest = _widest(model, unseen, [float(frames.t[index]) for index in _spread(frames.indices, SAMPLED_FRAMES)])
+    widest = _widest(model, unseen, [float(frames.t[index]) for index in spread(frames.indices, SAMPLED_FRAMES)])
     kept = np.ones(model.count, np.bool_)
     kept[unseen] = widest <= WIDEST_UNSEEN
     if kept.all() or not kept.any():
@@ -70,7 +70,7 @@ def seen_share(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray
     """[N] in [0, 1]: share of training frames in which a Gaussian's centre lay on visible tissue, times the stereo
     confidence of that pixel."""
     trusted = np.zeros(model.count, np.float64)
-    sampled = _spread(frames.indices, SAMPLED_FRAMES)
+    sampled = spread(frames.indices, SAMPLED_FRAMES)
     for index in sampled:
         image = model.render(frames.cameras[index], float(frames.t[index]))
         surface = image[3] / np.maximum(image[4], 1e-6)
@@ -94,7 +94,8 @@ def _pixels(
     return inside, row[inside].astype(np.intp), column[inside].astype(np.intp), z[inside]
 
 
-def _spread(indices: Sequence[int], count: int) -> list[int]:
+def spread(indices: Sequence[int], count: int) -> list[int]:
+    """At most count of the indices, evenly spread, the first and the last among them."""
     places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
     return [indices[place] for place in places]
 

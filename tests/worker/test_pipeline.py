@@ -14,16 +14,19 @@ import pytest
 
 from contract.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
 from contract.report import Report
-from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, bits, phantom_clip, prepared_on, trained, view
+from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared_on, trained, view
 from worker.checkpoint import RESUME_FILE, load_resume, load_scene
 from worker.clip import DepthClip, open_clip, split_frames
 from worker.hooks import Hooks, Progress
-from worker.metrics import coverage
+from worker.metrics import coverage, psnr_tissue
 from worker.optimize import Rate
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
 from worker.pipeline import ReconstructionRequest, reconstruct, scene_of
 from worker.presets import PRESETS
+from worker.raster.cpu import camera_vector
 from worker.render import render_frame
+from worker.shrink import TOLERANCE_DB, model_of, shrink
+from worker.targets import camera_in_units
 
 SCENE_FILES = {"manifest.json", "scene.safetensors", "report.json", "curve.csv"}
 ITERATIONS = 20
@@ -312,4 +315,24 @@ def test_the_pipeline_and_the_loop_make_the_same_model(clip: Path, tmp_path: Pat
     split = split_frames(opened)
     run(clip, tmp_path)
     loop = trained(prepared_on(opened, split, "fast", iterations=ITERATIONS))
-    assert tensor_bits(tmp_path) == bits(loop, opened, split)
+    shrunk = shrink(scene_of(loop, opened, split, loop.frames.scale, loop.seed), opened, loop.frames)
+    assert shrunk is not None
+    assert tensor_bits(tmp_path) == {name: each.numpy().tobytes() for name, each in shrunk.scene.tensors().items()}
+
+
+def test_what_is_stored_is_what_was_scored_and_the_report_tells_its_price(clip: Path, tmp_path: Path) -> None:
+    report = run(clip, tmp_path)
+    opened, scene = open_clip(clip), load_scene(tmp_path)
+    assert isinstance(opened, DepthClip)
+    model = model_of(scene)
+    for score in report.frames:
+        pose = scene.world_from_camera[score.frame]
+        camera = camera_vector(camera_in_units(scene.intrinsics, pose, scene.units_per_mm))
+        image = model.render(camera, float(opened.t[score.frame]))[:3].transpose(1, 2, 0)
+        expected = psnr_tissue(image, opened.rgb[score.frame], opened.tissue[score.frame])
+        assert score.psnr_tissue_db == pytest.approx(expected, abs=1e-6)
+    assert report.scene_bytes == (tmp_path / "scene.safetensors").stat().st_size
+    assert report.scene_bytes < 0.25 * scene.byte_count
+    assert 0 <= report.measurements["stored_loss_db"] <= TOLERANCE_DB
+    assert any("All scores are of the stored scene" in each for each in report.assumptions)
+    assert report.seconds["shrink_s"] > 0

@@ -1,0 +1,87 @@
+"""What a stored scene costs and what it loses: bytes against decibels, on frames that training saw and on others.
+
+    python benchmarks/bm_compact.py CLIP ... [--iterations 1200] [--tolerances 0.05 0.1 0.14 0.2 0.4 0.8] [--csv FILE]
+
+Trains `fast` on each clip for so many iterations, then stores the result at one tolerance after the other. Prints and
+appends a row each: megabytes of the floats, of the compact file and of the manifest, the step, what was lost on the
+judged training frames and on all held-out ones, and the seconds to shrink, store and load.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+from bm_train import append
+
+from worker.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
+from worker.clip import DepthClip, open_clip, split_frames
+from worker.evaluate.rows import commit, machine
+from worker.hooks import Hooks
+from worker.pipeline import ReconstructionRequest, held_out_psnr, prepare, scene_of, view_function
+from worker.presets import PRESETS
+from worker.shrink import model_of, shrink
+from worker.train import Stopwatch, train
+
+FIELDS = (
+    "clip", "iterations", "gaussians", "bases", "held_out_db", "tolerance_db", "step", "train_loss_db",
+    "held_out_loss_db", "float_mb", "scene_mb", "manifest_mb", "shrink_s", "load_s", "machine", "commit",
+)  # fmt: skip
+TOLERANCES_DB = (0.05, 0.1, 0.14, 0.2, 0.4, 0.8)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("clips", nargs="+", type=Path, help="folders in the EndoNeRF layout")
+    parser.add_argument("--iterations", type=int, default=1200)
+    parser.add_argument("--tolerances", nargs="+", type=float, default=TOLERANCES_DB)
+    parser.add_argument("--csv", type=Path, help="append the rows here")
+    arguments = parser.parse_args()
+    for clip in arguments.clips:
+        for row in rows_of(clip, arguments.iterations, arguments.tolerances):
+            print("  ".join(f"{name} {row[name]}" for name in FIELDS[:-2]), flush=True)
+            if arguments.csv:
+                append(arguments.csv, row, FIELDS)
+
+
+def rows_of(path: Path, iterations: int, tolerances_db: list[float]) -> list[dict[str, object]]:
+    """One training run, stored at each tolerance."""
+    clip = open_clip(path)
+    if not isinstance(clip, DepthClip):
+        raise SystemExit(f"{path} has no depth; give a folder in the EndoNeRF layout.")
+    split = split_frames(clip)
+    run, scale = prepare(clip, split, PRESETS["fast"], ReconstructionRequest(path, iterations=iterations), Stopwatch())
+    train(run, Stopwatch(), lambda: float("nan"), Hooks())
+    scene = scene_of(run, clip, split, scale, 0)
+    exact_db = held_out_psnr(clip, split, view_function(run, scale))
+    rows: list[dict[str, object]] = []
+    for tolerance_db in tolerances_db:
+        start = time.perf_counter()
+        shrunk = shrink(scene, clip, run.frames, tolerance_db)
+        shrink_s = time.perf_counter() - start
+        if shrunk is None:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            save_scene(Path(folder), shrunk.scene)
+            start = time.perf_counter()
+            loaded = load_scene(Path(folder))
+            load_s = time.perf_counter() - start
+            scene_bytes, manifest_bytes = ((Path(folder) / name).stat().st_size for name in (SCENE_FILE, MANIFEST_FILE))
+        stored_db = held_out_psnr(clip, split, view_function(run, scale, model_of(loaded)))
+        rows.append(
+            {
+                "clip": path.name, "iterations": iterations, "gaussians": len(loaded.gaussians),
+                "bases": len(shrunk.scene.deformation.constants()["centre"]), "held_out_db": f"{exact_db:.2f}",
+                "tolerance_db": tolerance_db, "step": f"{shrunk.step:.3g}", "train_loss_db": f"{shrunk.loss_db:.3f}",
+                "held_out_loss_db": f"{exact_db - stored_db:.3f}", "float_mb": f"{scene.byte_count / 1e6:.2f}",
+                "scene_mb": f"{scene_bytes / 1e6:.3f}", "manifest_mb": f"{manifest_bytes / 1e6:.3f}",
+                "shrink_s": f"{shrink_s:.2f}", "load_s": f"{load_s:.2f}", "machine": machine(), "commit": commit(),
+            }
+        )  # fmt: skip
+    return rows
+
+
+if __name__ == "__main__":
+    main()

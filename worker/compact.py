@@ -1,0 +1,363 @@
+"""A scene's numbers as few bytes: each as coarse as the picture allows, then packed by the range coder.
+
+Symbols: N Gaussians, C channels (10, or 13 with colour), B bases, R = B - 1 patterns of motion a channel, K rows.
+
+What is lost is decided by `effect`: the mean squared change of the picture that a change of 1 in a number makes.
+
+1. What changes nothing: a channel's mean over the trained times moves from the motion into the canonical state;
+   quaternions get length 1; red, green and blue become a brightness and two differences.
+2. Motion becomes coefficients of R patterns a channel: the principal components of all Gaussians' motions, as the
+   trained times see them. Errors of equal size in any coefficient then weigh the same in time.
+3. Every number is divided by its step and rounded. A step is a channel's own, so that all channels' errors weigh the
+   same in the picture, times a power of two a Gaussian, for its place, its shape and its colour.
+4. Gaussians are put in order along a curve through the picture; of a row that neighbours share, every second number is
+   replaced by its difference from the mean of the two beside it, then every second of those left, and so on.
+
+Steps 2 to 4 are what the decoder undoes; docs/scene-file.md describes the file for other readers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from worker.deformation import CHANNELS, SharedBasis
+from worker.deformation.shared import CHANNELS_WITH_COLOUR
+from worker.gaussians import Gaussians
+from worker.rangecoder import PARTS, decode, encode
+
+Reals = NDArray[np.float64]
+Whole = NDArray[np.int64]
+Level = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
+"""Of the Gaussians left at a level: those that stay, those between them, and the ones that stay right of these."""
+
+STATE = 14
+"""Numbers of a Gaussian at rest: mean 0:3, quaternion 3:7, log-scale 7:10, colour 10:13, opacity logit."""
+PLACE, SHAPE, COLOUR, OPACITY = slice(0, 3), slice(3, 10), slice(10, 13), 13
+GROUP_OF = np.array([0] * 3 + [1] * 7 + [2] * 4)
+"""Which power belongs to each number of the state: of place, shape or colour."""
+PLAIN = 3
+"""Group of the last columns, the powers and seen, whose steps are 1."""
+COARSEST, FINEST = -3, 4
+"""Powers of two by which a Gaussian's precision may differ from the mean: what the trained frames hardly show may be
+seen from elsewhere, so it keeps an eighth."""
+LEAST_EFFECT = 1e-3
+"""A channel that the frames do not show at all is stored as if they showed it so much. Rotations have 0.02, places
+0.3."""
+SEEN_LEVELS = 63
+RIDGE = 0.01
+"""Of the bases' mean strength, added to each: motion that no trained time shows keeps a tenth of the precision."""
+LARGEST_STORED = 2**28
+MOST_NUMBERS = 2**28
+"""Numbers a file may unpack to, 1 GiB of them: far beyond any scene, within any machine."""
+CURVE_BITS = 16
+_OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
+"""Orthonormal: brightness, red - blue, magenta - green."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A scene in its new coordinates and order, to be rounded at any step.
+
+    state    [N, STATE]  means over the trained times
+    motion   [N, C, R]   coefficients of the patterns
+    pattern  [C, R, B]   weights of each pattern
+    power    [N, 3]      of two: precision of place, shape and colour
+    effect   [STATE]     root mean squared change of the picture by errors of 2**-power in all Gaussians
+    seen     [N]         in [0, 1]
+    basis                its centre and width are kept, its weight is not read
+    """
+
+    state: Reals
+    motion: Reals
+    pattern: Reals
+    power: Whole
+    effect: Reals
+    seen: Reals
+    basis: SharedBasis
+
+
+@dataclass(frozen=True, eq=False)
+class Compact:
+    """A scene in whole numbers.
+
+    table    [N, K] int32     columns: STATE, then R motion coefficients a channel, then the 3 powers, then seen
+    step     [STATE] float32  of the state at power 0
+    pattern  [C, R, B] float32  weights of one unit of a motion coefficient at power 0
+    centre, width  [B] float32  of the bases
+    """
+
+    table: NDArray[np.int32]
+    step: NDArray[np.float32]
+    pattern: NDArray[np.float32]
+    centre: Tensor
+    width: Tensor
+
+    def model(self) -> tuple[Gaussians, SharedBasis, Tensor]:
+        """Gaussians, motion and seen [N], as floats."""
+        count = len(self.table)
+        channels, patterns, bases = self.pattern.shape
+        values, power, seen = np.split(self.table, [-4, -1], axis=1)
+        scale = np.exp2(-power[:, GROUP_OF].astype(np.float32))  # exact
+        state = values[:, :STATE] * scale * self.step
+        weight = np.empty((count, channels, bases), np.float32)
+        for channel in range(channels):
+            first = STATE + channel * patterns
+            weight[:, channel] = (values[:, first : first + patterns] * scale[:, channel, None]) @ self.pattern[channel]
+        mixing = _OPPONENT.astype(np.float32)
+        state[:, COLOUR] = state[:, COLOUR] @ mixing
+        if channels == CHANNELS_WITH_COLOUR:
+            weight[:, COLOUR] = np.einsum("nob,oi->nib", weight[:, COLOUR], mixing)
+        held = torch.from_numpy(np.ascontiguousarray(state, np.float32))
+        gaussians = Gaussians(
+            mean=held[:, PLACE].contiguous(),
+            quaternion=held[:, 3:7].contiguous(),
+            log_scale=held[:, 7:10].contiguous(),
+            opacity_logit=held[:, OPACITY].contiguous(),
+            sh=held[:, None, COLOUR].contiguous(),
+        )
+        share = torch.from_numpy(seen[:, 0].astype(np.float32) / np.float32(SEEN_LEVELS))
+        return gaussians, SharedBasis(torch.from_numpy(weight), self.centre, self.width), share
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What is stored: the table, differenced where that helps, level by level, and coded; the rest as it is."""
+        table, levels = self.table.astype(np.int64), _levels(len(self.table))
+        differences = table.copy()
+        for columns, power in _groups(table, self.pattern.shape):
+            for even, odd, right in levels:
+                differences[np.ix_(odd, columns)] -= _between(table[:, columns], power, even, odd, right)
+        shared = _digits(differences) < _digits(table)
+        stored = np.where(shared, differences, table)[_coarse_first(levels)]
+        codes = [torch.from_numpy(np.frombuffer(code, np.uint8).copy()) for code in encode(stored.astype(np.int32))]
+        return {
+            "count": torch.tensor([len(table)]),
+            "step": torch.from_numpy(self.step),
+            "pattern": torch.from_numpy(self.pattern),
+            "centre": self.centre,
+            "width": self.width,
+            "shared": torch.from_numpy(shared.astype(np.uint8)),
+            **{f"code.{part}": code for part, code in enumerate(codes)},
+        }
+
+
+def prepare(
+    gaussians: Gaussians, deformation: SharedBasis, seen: Tensor, effect: Reals, trained_t: Sequence[float]
+) -> Prepared:
+    """The change of coordinates, which loses nothing.
+
+    Args:
+        seen: [N] in [0, 1].
+        effect: [STATE, N], of each number: an error e in it adds effect * e**2 / N to the picture's mean squared error.
+        trained_t: model times of the training frames, at least one.
+    """
+    order = np.argsort(_along_curve(gaussians.mean.double().numpy()), kind="stable")
+    state = _state_of(gaussians)[order]
+    weight = deformation.weight.double().numpy()[order]
+    effect = effect[:, order].copy()
+    channels = weight.shape[1]
+    values = np.stack([deformation.basis(t).double().numpy() for t in trained_t])  # [T, B]
+    mean = weight @ values.mean(0)
+    state[:, :channels] += mean
+    weight = weight - mean[:, :, None]  # the bases sum to 1
+    length = np.linalg.norm(state[:, 3:7], axis=1)
+    length[length == 0] = 1
+    state[:, 3:7] /= length[:, None]
+    weight[:, 3:7] /= length[:, None, None]
+    effect[3:7] *= length**2
+    state[:, COLOUR] = state[:, COLOUR] @ _OPPONENT.T
+    effect[COLOUR] = effect[COLOUR].mean(0)
+    if channels == CHANNELS_WITH_COLOUR:
+        weight[:, COLOUR] = np.einsum("oi,nib->nob", _OPPONENT, weight[:, COLOUR])
+
+    power = np.stack([_power(effect[group]) for group in (PLACE, SHAPE, COLOUR)], axis=1)
+    scale = np.exp2(power)[:, GROUP_OF]
+    root = np.maximum(np.sqrt(effect.sum(1) / (scale**2).sum(0)), LEAST_EFFECT)
+    motion, pattern = _patterns(weight, values, scale)
+    share = np.clip(seen.double().numpy(), 0, 1)[order]
+    return Prepared(state, motion, pattern, power, root, share, deformation)
+
+
+def round_to(prepared: Prepared, step: float) -> Compact:
+    """Every number as a multiple of its step.
+
+    Args:
+        step: change of the picture, 1 from black to white, by one step of a mean Gaussian's number in all Gaussians.
+
+    Raises:
+        ValueError: numbers would need more digits than the coder takes.
+    """
+    channels = prepared.pattern.shape[0]
+    steps = step / prepared.effect
+    units = np.exp2(prepared.power)[:, GROUP_OF] / steps  # [N, STATE]
+    columns = [
+        np.rint(prepared.state * units),
+        np.rint(prepared.motion * units[:, :channels, None]).reshape(len(units), -1),
+        prepared.power,
+        np.rint(prepared.seen[:, None] * SEEN_LEVELS),
+    ]
+    table = np.concatenate(columns, axis=1)
+    if not np.abs(table).max() <= LARGEST_STORED:
+        raise ValueError(f"a step of {step:g} makes numbers as large as {np.abs(table).max():g}")
+    pattern = np.ascontiguousarray(prepared.pattern * steps[:channels, None, None], np.float32)
+    basis = prepared.basis
+    return Compact(table.astype(np.int32), steps.astype(np.float32), pattern, basis.centre, basis.width)
+
+
+def read(tensors: Mapping[str, Tensor]) -> Compact:
+    """What Compact.tensors gave.
+
+    Raises:
+        ValueError: tensors are missing, do not fit together, or unpack to more than MOST_NUMBERS.
+    """
+    count, step, pattern, centre, width, shared = (
+        _checked(tensors, name, kind, dimensions)
+        for name, kind, dimensions in (
+            ("count", torch.int64, 1),
+            ("step", torch.float32, 1),
+            ("pattern", torch.float32, 3),
+            ("centre", torch.float32, 1),
+            ("width", torch.float32, 1),
+            ("shared", torch.uint8, 1),
+        )
+    )
+    codes = [_checked(tensors, f"code.{part}", torch.uint8, 1).numpy().tobytes() for part in range(PARTS)]
+    channels, patterns, bases = pattern.shape
+    columns = STATE + channels * patterns + 4
+    if count.shape != (1,) or step.shape != (STATE,) or shared.shape != (columns,):
+        raise ValueError(f"count, step and shared do not fit {channels} channels of {patterns} patterns")
+    if patterns != bases - 1 or channels not in (CHANNELS, CHANNELS_WITH_COLOUR):
+        raise ValueError(f"{patterns} patterns in {channels} channels do not fit {bases} bases")
+    rows = int(count[0])
+    if rows < 1 or rows * max(columns, channels * bases) > MOST_NUMBERS:
+        raise ValueError(f"{rows} Gaussians of {columns} numbers are not to be unpacked; at most {MOST_NUMBERS} are")
+    table = np.empty((rows, columns), np.int64)
+    table[_coarse_first(_levels(rows))] = decode(codes, rows, columns)
+    _undo_differences(table, shared.numpy().astype(bool), pattern.shape)
+    if np.abs(table).max() > LARGEST_STORED:
+        raise ValueError(f"a number exceeds {LARGEST_STORED}")
+    return Compact(table.astype(np.int32), step.numpy(), pattern.numpy(), centre, width)
+
+
+def _checked(tensors: Mapping[str, Tensor], name: str, kind: torch.dtype, dimensions: int) -> Tensor:
+    if name not in tensors or tensors[name].dtype != kind or tensors[name].ndim != dimensions:
+        raise ValueError(f"{name} is missing or of another type or shape")
+    return tensors[name]
+
+
+def _undo_differences(table: Whole, shared: NDArray[np.bool_], shape: Sequence[int]) -> None:
+    """Differences to numbers, in place, coarse levels first."""
+    levels = _levels(len(table))
+    for columns, power in _groups(table, shape):
+        columns = columns[shared[columns]]
+        part = table[:, columns]
+        for even, odd, right in reversed(levels):
+            part[odd] += _between(part, power, even, odd, right)
+        table[:, columns] = part
+
+
+def _groups(table: Whole, shape: Sequence[int]) -> Iterator[tuple[NDArray[np.intp], Whole]]:
+    """Columns that share a power, and that power [N]; the powers' own columns come first, their power is 0.
+
+    Raises:
+        ValueError: a power or a share lies outside its range, once they are there.
+    """
+    channels, patterns, _ = shape
+    group = np.concatenate([GROUP_OF, np.repeat(GROUP_OF[:channels], patterns), np.full(4, PLAIN)])
+    yield np.flatnonzero(group == PLAIN), np.zeros(len(table), np.int64)
+    power, seen = table[:, -4:-1], table[:, -1]
+    if power.min() < COARSEST or power.max() > FINEST or seen.min() < 0 or seen.max() > SEEN_LEVELS:
+        raise ValueError("a power or a share lies outside its range")
+    for which in range(PLAIN):
+        yield np.flatnonzero(group == which), power[:, which].copy()
+
+
+def _between(
+    part: Whole, power: Whole, even: NDArray[np.intp], odd: NDArray[np.intp], right: NDArray[np.intp]
+) -> Whole:
+    """The rounded mean of the two beside each odd Gaussian, in its own step."""
+    shift = (FINEST + 1 - power[odd])[:, None]
+    left, far = (part[side] << (FINEST - power[side])[:, None] for side in (even[: len(odd)], right))
+    mean: Whole = (left + far + (1 << (shift - 1))) >> shift
+    return mean
+
+
+def _levels(count: int) -> list[Level]:
+    """Fine to coarse: every second Gaussian of those left lies between two others (the last one perhaps beside one)."""
+    levels, left = [], np.arange(count)
+    while len(left) > 1:
+        even, odd = left[::2], left[1::2]
+        levels.append((even, odd, np.append(even[1:], even[-1])[: len(odd)]))
+        left = even
+    return levels
+
+
+def _coarse_first(levels: Sequence[Level]) -> NDArray[np.intp]:
+    """Gaussians in the order they are told: the one that is left, then level by level those between."""
+    return np.concatenate([np.zeros(1, np.intp), *(odd for _, odd, _ in reversed(levels))])
+
+
+def _digits(table: Whole) -> Reals:
+    """About the digits each column takes."""
+    digits: Reals = np.log2(1.0 + np.abs(table)).sum(0)
+    return digits
+
+
+def _state_of(gaussians: Gaussians) -> Reals:
+    columns = [
+        gaussians.mean,
+        gaussians.quaternion,
+        gaussians.log_scale,
+        gaussians.sh[:, 0],
+        gaussians.opacity_logit[:, None],
+    ]
+    state: Reals = torch.cat(columns, 1).double().numpy()
+    return state
+
+
+def _power(effect: Reals) -> Whole:
+    """[N] powers of two nearest to each Gaussian's root mean effect over that of all; effect [channels, N]."""
+    mean = effect.mean(1, keepdims=True)
+    relative = np.mean(effect / np.where(mean > 0, mean, 1), axis=0)
+    nearest = np.rint(np.log2(np.maximum(relative, 1e-12)) / 2)
+    power: Whole = np.clip(nearest, COARSEST, FINEST).astype(np.int64)
+    return power
+
+
+def _patterns(weight: Reals, values: Reals, scale: Reals) -> tuple[Reals, Reals]:
+    """Coefficients [N, C, R] and patterns [C, R, B] of weights [N, C, B] whose mean over the times is 0.
+
+    values [T, B] of the bases at the trained times; scale [N, C or more], precision of each Gaussian's channel.
+    """
+    bases = values.shape[1]
+    strength = values.T @ values / len(values)
+    strength += RIDGE * np.trace(strength) / bases * np.eye(bases)
+    root = np.linalg.cholesky(strength)  # errors of equal size after it weigh the same over the trained times
+    coefficients, patterns = [], []
+    for channel in range(weight.shape[1]):
+        seen = weight[:, channel] @ root
+        scaled = seen * scale[:, channel, None]
+        _, components = np.linalg.eigh(scaled.T @ scaled)
+        kept = components[:, :0:-1]  # the weakest is nothing: the mean over time has been taken out
+        coefficients.append(seen @ kept)
+        patterns.append(np.linalg.solve(root.T, kept).T)
+    return np.stack(coefficients, 1), np.stack(patterns)
+
+
+def _along_curve(mean: Reals) -> Whole:
+    """[N] places along a Hilbert curve through the picture of the first frame's camera; mean [N, 3] in units."""
+    direction = mean[:, :2] / np.maximum(mean[:, 2:], 1.0)
+    direction -= direction.min(0)
+    size = 1 << CURVE_BITS
+    x, y = (direction * ((size - 1) / max(direction.max(), 1e-12))).astype(np.int64).T
+    place = np.zeros(len(mean), np.int64)
+    for bit in range(CURVE_BITS - 1, -1, -1):
+        right, up = x >> bit & 1, y >> bit & 1
+        place += (3 * right ^ up) << 2 * bit
+        x, y = np.where(right & ~up, size - 1 - x, x), np.where(right & ~up, size - 1 - y, y)
+        x, y = np.where(up, x, y), np.where(up, y, x)
+    return place

@@ -1,0 +1,284 @@
+"""Whole numbers as few bytes: an adaptive binary range coder, as LZMA's, with models that follow a table's rows.
+
+Symbols: N Gaussians, K rows of whole numbers, one of each a Gaussian; a table is [N, K].
+
+A number is told in bits: how many binary digits its magnitude has (that many ones, then a zero), its sign, and the
+digits below the leading one, from the top. Each bit has a probability that adapts, but for the sign and the third digit
+onwards, which cost a bit each. The probabilities are chosen by row, and within it by how large, for their rows, the
+numbers just told of this Gaussian and the same row's of the Gaussians before were: where there is motion, there is
+much of it. Everything is integer arithmetic, so a table has one coding on every machine; docs/scene-file.md has it for
+whoever writes another reader.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from worker.raster.cpu.cache import use_kernel_cache
+
+Table = NDArray[np.int32]
+
+PARTS = 4
+"""A table is coded as so many tables, of neighbouring rows each, that share nothing and so may be read at once."""
+LARGEST = 2**30 - 1
+"""Magnitudes have at most 30 digits."""
+BUCKETS = 12
+"""Sets of probabilities a row, by activity."""
+MODELS = 33 + 31 + 2 * 31
+"""Of a set: digits told so far, the second digit by their number, the third by their number and the second."""
+SECOND, THIRD = 33, 33 + 31
+ONE = 1 << 16
+"""Probabilities of a 0 are shares of this, each the mean of a quick and a slow estimate."""
+QUICK, SLOW = 4, 7
+DEAREST_BITS = 10
+"""What a bit costs at most: estimates stop at 15 and 127 of ONE, and log2(ONE / 71) is 9.9."""
+AVERAGE = 16
+"""Activity of a number as large as its row's average."""
+MOST_ACTIVE = 6 * AVERAGE
+_LOW, _RANGE, _HELD, _PENDING, _PLACE = range(5)
+_TOP = np.uint64(1 << 24)
+_FULL = np.uint64(0xFFFFFFFF)
+_BYTE = np.uint64(8)
+
+use_kernel_cache()
+
+
+def encode(table: Table) -> list[bytes]:
+    """The table's PARTS codes.
+
+    Raises:
+        ValueError: a number's magnitude exceeds LARGEST.
+    """
+    largest = max(abs(int(table.min())), abs(int(table.max()))) if table.size else 0
+    if largest > LARGEST:
+        raise ValueError(f"numbers up to {largest} cannot be coded")
+    most_bits = DEAREST_BITS * (largest.bit_length() + 1) + largest.bit_length()
+
+    def coded(part: Table) -> bytes:
+        out = np.zeros(64 + part.size * most_bits // 8, np.uint8)  # pages that stay untouched take no memory
+        return out[: _encode(np.ascontiguousarray(part), out)].tobytes()
+
+    with ThreadPoolExecutor(PARTS) as pool:
+        return list(pool.map(coded, np.array_split(table, PARTS, axis=1)))
+
+
+def decode(codes: list[bytes], count: int, rows: int) -> Table:
+    """The table [count, rows] of these codes.
+
+    Raises:
+        ValueError: not PARTS codes, or one that ends too soon, too late, or holds what no encoder writes.
+    """
+    if len(codes) != PARTS:
+        raise ValueError(f"there are {len(codes)} codes instead of {PARTS}")
+    table = np.zeros((count, rows), np.int32)
+    parts = np.array_split(table, PARTS, axis=1)
+    with ThreadPoolExecutor(PARTS) as pool:
+        wanted = pool.map(
+            lambda each: _decode(np.frombuffer(each[0], np.uint8), each[1]), zip(codes, parts, strict=True)
+        )
+        for code, size in zip(codes, wanted, strict=True):
+            if size != len(code):
+                raise ValueError(f"a code of {len(code)} bytes does not end where its numbers do")
+    return table
+
+
+def compile_coder() -> float:
+    """Compile the coder for this processor, or load it from the cache; returns seconds."""
+    start = time.perf_counter()
+    decode(encode(np.zeros((1, PARTS), np.int32)), 1, PARTS)
+    return time.perf_counter() - start
+
+
+@njit(cache=True, nogil=True)
+def _encode(table, out):  # type: ignore[no-untyped-def]
+    """Code a table into out; returns the bytes written."""
+    count, rows = table.shape
+    models, average, nearby = _start(rows)
+    state = np.zeros(5, np.uint64)
+    state[_RANGE], state[_PENDING] = _FULL, 1
+    for n in range(count):
+        here = AVERAGE
+        for k in range(rows):
+            number = table[n, k]
+            magnitude = abs(number)
+            set_ = models[k, _bucket((here + nearby[k]) >> 1)]
+            digits = 0
+            while magnitude >> digits:
+                _tell(state, out, set_[digits], 1)
+                digits += 1
+            _tell(state, out, set_[digits], 0)
+            if digits:
+                _tell_plain(state, out, number < 0)
+            for digit in range(digits - 2, -1, -1):
+                bit = (magnitude >> digit) & 1
+                model = _digit_model(digits, digit, magnitude)
+                if model:
+                    _tell(state, out, set_[model], bit)
+                else:
+                    _tell_plain(state, out, bit)
+            here = _follow(magnitude, here, average, nearby, k)
+    for _ in range(5):
+        _shift(state, out)
+    return state[_PLACE]
+
+
+@njit(cache=True, nogil=True)
+def _decode(code, table):  # type: ignore[no-untyped-def]
+    """Read a table from its code; returns the bytes that the coder of this table has written, or -1."""
+    count, rows = table.shape
+    models, average, nearby = _start(rows)
+    state = np.zeros(5, np.uint64)
+    state[_RANGE] = _FULL
+    for _ in range(5):
+        _take(state, code)
+    for n in range(count):
+        here = AVERAGE
+        for k in range(rows):
+            set_ = models[k, _bucket((here + nearby[k]) >> 1)]
+            digits = 0
+            while digits < 31 and _ask(state, code, set_[digits]):
+                digits += 1
+            if digits > 30 or state[_PLACE] > np.uint64(len(code)):
+                return -1
+            magnitude = 1 if digits else 0
+            negative = digits > 0 and _ask_plain(state, code)
+            for digit in range(digits - 2, -1, -1):
+                model = _digit_model(digits, digit, magnitude << (digit + 1))
+                bit = _ask(state, code, set_[model]) if model else _ask_plain(state, code)
+                magnitude = 2 * magnitude + bit
+            table[n, k] = -magnitude if negative else magnitude
+            here = _follow(magnitude, here, average, nearby, k)
+    return np.int64(state[_PLACE])
+
+
+@njit(cache=True, nogil=True)
+def _start(rows):  # type: ignore[no-untyped-def]
+    """Probabilities [rows, BUCKETS, MODELS, 2], each row's average magnitude (of 256) and activity so far."""
+    models = np.full((rows, BUCKETS, MODELS, 2), ONE // 2, np.int32)
+    return models, np.full(rows, 256, np.int64), np.full(rows, AVERAGE, np.int64)
+
+
+@njit(cache=True, nogil=True)
+def _bucket(activity):  # type: ignore[no-untyped-def]
+    """0 below 3, then one more at 4, 6, 9, 13, ...: each threshold half as much again."""
+    bucket, threshold = 0, 3
+    while bucket < BUCKETS - 1 and activity >= threshold:
+        bucket += 1
+        threshold += threshold >> 1
+    return bucket
+
+
+@njit(cache=True, nogil=True)
+def _digit_model(digits, digit, magnitude):  # type: ignore[no-untyped-def]
+    """Which model tells the digit below the leading one; 0: none. magnitude: right in the digits above this one."""
+    if digit == digits - 2:
+        return SECOND + digits
+    if digit == digits - 3:
+        return THIRD + 2 * digits + ((magnitude >> (digits - 2)) & 1)
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def _follow(magnitude, here, average, nearby, k):  # type: ignore[no-untyped-def]
+    """After a number: its row's average and activity; returns the Gaussian's activity."""
+    average[k] += ((magnitude << 8) - average[k]) >> 5
+    activity = min((magnitude << 12) // (average[k] + AVERAGE), MOST_ACTIVE)
+    nearby[k] += (activity - nearby[k]) >> 2
+    return here + ((activity - here) >> 2)
+
+
+@njit(cache=True, nogil=True)
+def _adapt(model, bit):  # type: ignore[no-untyped-def]
+    if bit:
+        model[0] -= model[0] >> QUICK
+        model[1] -= model[1] >> SLOW
+    else:
+        model[0] += (ONE - model[0]) >> QUICK
+        model[1] += (ONE - model[1]) >> SLOW
+
+
+@njit(cache=True, nogil=True)
+def _bound(state, model):  # type: ignore[no-untyped-def]
+    """Where the range is cut: a 0 takes what is below."""
+    return (state[_RANGE] >> np.uint64(16)) * np.uint64((model[0] + model[1]) >> 1)
+
+
+@njit(cache=True, nogil=True)
+def _tell(state, out, model, bit):  # type: ignore[no-untyped-def]
+    _cut(state, out, _bound(state, model), bit)
+    _adapt(model, bit)
+
+
+@njit(cache=True, nogil=True)
+def _tell_plain(state, out, bit):  # type: ignore[no-untyped-def]
+    _cut(state, out, state[_RANGE] >> np.uint64(1), bit)
+
+
+@njit(cache=True, nogil=True)
+def _cut(state, out, bound, bit):  # type: ignore[no-untyped-def]
+    if bit:
+        state[_LOW] += bound
+        state[_RANGE] -= bound
+    else:
+        state[_RANGE] = bound
+    while state[_RANGE] < _TOP:
+        state[_RANGE] <<= _BYTE
+        _shift(state, out)
+
+
+@njit(cache=True, nogil=True)
+def _shift(state, out):  # type: ignore[no-untyped-def]
+    """Move low's top byte out, once it is known whether a carry comes; until then 255s are only counted."""
+    low = state[_LOW]
+    if low < np.uint64(0xFF000000) or low > _FULL:
+        carry = low >> np.uint64(32)
+        while state[_PENDING]:
+            out[state[_PLACE]] = np.uint8((state[_HELD] + carry) & np.uint64(255))
+            state[_PLACE] += np.uint64(1)
+            state[_PENDING] -= np.uint64(1)
+            state[_HELD] = np.uint64(255)
+        state[_HELD] = (low >> np.uint64(24)) & np.uint64(255)
+    state[_PENDING] += np.uint64(1)
+    state[_LOW] = (low & np.uint64(0x00FFFFFF)) << _BYTE
+
+
+@njit(cache=True, nogil=True)
+def _ask(state, code, model):  # type: ignore[no-untyped-def]
+    bit = _which(state, code, _bound(state, model))
+    _adapt(model, bit)
+    return bit
+
+
+@njit(cache=True, nogil=True)
+def _ask_plain(state, code):  # type: ignore[no-untyped-def]
+    return _which(state, code, state[_RANGE] >> np.uint64(1))
+
+
+@njit(cache=True, nogil=True)
+def _which(state, code, bound):  # type: ignore[no-untyped-def]
+    """1 where the code lies above the cut; low holds how far above the range's start it lies."""
+    bit = 0
+    if state[_LOW] >= bound:
+        state[_LOW] -= bound
+        state[_RANGE] -= bound
+        bit = 1
+    else:
+        state[_RANGE] = bound
+    while state[_RANGE] < _TOP:
+        state[_RANGE] <<= _BYTE
+        _take(state, code)
+    return bit
+
+
+@njit(cache=True, nogil=True)
+def _take(state, code):  # type: ignore[no-untyped-def]
+    """The next byte into low; behind the end there are zeros."""
+    place = state[_PLACE]
+    byte = np.uint64(code[place]) if place < np.uint64(len(code)) else np.uint64(0)
+    state[_LOW] = ((state[_LOW] << _BYTE) | byte) & _FULL
+    state[_PLACE] = place + np.uint64(1)
