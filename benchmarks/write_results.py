@@ -2,8 +2,9 @@
 
     python benchmarks/write_results.py
 
-Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), {train,ablation,raster,service}.csv,
-stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
+Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
+stability`), {train,ablation,raster,service}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py);
+what is missing is left out.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 from statistics import median
 
 from evaluation_page import sections, write_readme
+from stability_page import stability_sections
 
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
 Row = dict[str, str]
@@ -81,7 +83,7 @@ _SOAK = """
 
 
 def main() -> None:
-    parts = [_INTRODUCTION, *sections(RESULTS)]
+    parts = [_INTRODUCTION, *sections(RESULTS), *stability_sections(RESULTS)]
     if rows := _read("train.csv"):
         parts += [_TRAIN, _train_table(rows)]
     if rows := _read("ablation.csv"):
