@@ -2,13 +2,17 @@
 
     python benchmarks/bm_raster.py [--scene FOLDER] [--repeats 31] [--csv docs/results/raster.csv] [--quick]
 
-The standard scene is 640x512 with a Gaussian on every third pixel each way (36,423), 0.6 of the grid's step wide,
+The standard scene is 640x512 with a Gaussian every 2.86 pixels each way (40,096), 0.6 of the grid's step wide,
 opacity 0.88, on a curved surface at depth 60: every pixel is covered, as after fusion. A step is deformation,
 projection, binning, sorting, blend with loss and gradients, their way back to the parameters, and Adam; with shared
 bases (17, colour moving) and with the paper's FDM (17 bases a Gaussian and channel). Then the same against the number
 of pixels, Gaussians held, and against the number of Gaussians, pixels held. Figures are medians in ms, the least beside
-them for busy machines; parts are timed inside whole runs. --scene measures a stored scene instead. The machine's peak
-is that of two small kernels on the same vectors.
+them for busy machines (--cpu-time for very busy ones); parts are timed inside whole runs. --scene measures a stored
+scene instead.
+
+The machine's peak is that of two small kernels on the same vectors. The floor of a work is the multiply-adds it cannot
+do without at that peak, plus the bytes it cannot but move at theirs, as if no lane of a vector ever idled and nothing
+were moved twice; beside it stands what share of the least time it is.
 """
 
 from __future__ import annotations
@@ -37,18 +41,31 @@ from worker.optimize import StepRates
 from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera
 from worker.raster.cpu import Rasterizer, Target, camera_vector, compile_kernels
 from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion
 from worker.raster.cpu.project import LOG2E
 from worker.raster.cpu.simd import fma, lane_sum, load, splat
 from worker.raster.cpu.threads import THREADS, run
 from worker.raster.cpu.vectors import LANES
 
-WIDTH, HEIGHT, GRID_STEP_PX = 640, 512, 3.0
+WIDTH, HEIGHT, GRID_STEP_PX = 640, 512, 2.86
 SPREAD, OPACITY, DEPTH = 0.6, 0.88, 60.0
 BASES = 17
 TIME = 0.4
 RATES = StepRates(*[1e-7] * 11)  # so small that the scene stays what it is
-TARGET_MS = {"render": 25.0, "step": 50.0}
+TARGET_MS = {"render": 1000 / 60, "step": 25.0}
+PAIR_FMA = {"render": 8, "step": 8 + 15}
+"""Multiply-adds (or single products and sums) for a pixel and a Gaussian it blends: alpha and its ratio, w, T and four
+channels; on the way back the score, B, four channels, dL/dpower and three moments."""
+GAUSSIAN_FMA = {"render": 300, "step": 1000}
+"""Those of a Gaussian's projection, and its way back."""
+MOVES = {"render": 1, "step": 1 + 6}
+"""Times a parameter is moved: read to deform; by Adam, it and both moments read and written."""
+PIXEL_BYTES = {"render": 5 * 4, "step": 3 + 1 + 4}
+"""The image written; the target read."""
 PARTS = {"place": "project", "bin": "bin", "sort": "sort", "blend": "blend", "carry_back": "project_backward"}
+
+
+Row = dict[str, Any]
 
 
 def main() -> None:
@@ -57,23 +74,29 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=31, help="timed runs a figure")
     parser.add_argument("--csv", type=Path, help="file that gets a row a figure")
     parser.add_argument("--quick", action="store_true", help="leave out the costs against pixels and Gaussians")
+    parser.add_argument("--cpu-time", action="store_true", help="time on the processor, not on the clock: one thread")
     arguments = parser.parse_args()
+    if arguments.cpu_time:
+        if THREADS != 1:
+            parser.error(f"--cpu-time is that of one thread; there are {THREADS}: set INTRASPLAT_THREADS=1")
+        time.perf_counter = time.thread_time
     load_1min = os.getloadavg()[0]
     machine = {"cpu": _cpu_model(), "threads": THREADS, "commit": commit(), "load_1min": round(load_1min, 2)}
     print(", ".join(f"{name} {value}" for name, value in machine.items()))
     print(f"kernels compiled or loaded in {compile_kernels():.1f} s")
-    rows = [*_peak_rows()]
+    peaks = _peak_rows()
+    rows = [*peaks]
     if arguments.scene:
-        rows += _stored(arguments.scene, arguments.repeats)
+        rows += _stored(arguments.scene, arguments.repeats, peaks[-1])
     else:
-        rows += _standard(arguments.repeats)
+        rows += _standard(arguments.repeats, peaks[-1])
         if not arguments.quick:
-            rows += _against_sizes(arguments.repeats)
+            rows += _against_sizes(arguments.repeats, peaks[-1])
     if arguments.csv:
         _write(arguments.csv, [{**machine, **row} for row in rows])
 
 
-def _standard(repeats: int) -> list[dict[str, Any]]:
+def _standard(repeats: int, peak: Row) -> list[Row]:
     gaussians, camera = grid_scene(WIDTH, HEIGHT, GRID_STEP_PX)
     count = len(gaussians)
     rows = []
@@ -81,30 +104,32 @@ def _standard(repeats: int) -> list[dict[str, Any]]:
         ("shared, 17 bases, 13 channels", SharedBasis.initial(count, bases=BASES, colour=True)),
         ("fdm, 17 bases", FlexibleDeformation.initial(count, bases=BASES)),
     ):
-        rows += measure(f"standard: {label}", gaussians, deformation, camera, repeats)
+        rows += measure(f"standard: {label}", gaussians, deformation, camera, repeats, peak)
     return rows
 
 
-def _stored(folder: Path, repeats: int) -> list[dict[str, Any]]:
+def _stored(folder: Path, repeats: int, peak: Row) -> list[Row]:
     scene = load_scene(folder)
     camera_from_world = np.linalg.inv(scene.world_from_camera[0])
     camera_from_world[:3, 3] *= scene.units_per_mm
     k = scene.intrinsics
     camera = Camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, camera_from_world)
-    return measure(f"{folder.name}: {scene.deformation.kind}", scene.gaussians, scene.deformation, camera, repeats)
+    return measure(
+        f"{folder.name}: {scene.deformation.kind}", scene.gaussians, scene.deformation, camera, repeats, peak
+    )
 
 
-def _against_sizes(repeats: int) -> list[dict[str, Any]]:
+def _against_sizes(repeats: int, peak: Row) -> list[Row]:
     """Four sizes of image with the same Gaussians on them, then four numbers of Gaussians on the same image."""
     rows = []
     for width, height in ((160, 128), (320, 256), (640, 512), (1280, 1024)):
         gaussians, camera = grid_scene(width, height, GRID_STEP_PX * width / WIDTH)
         shared = SharedBasis.initial(len(gaussians), bases=BASES, colour=True)
-        rows += measure(f"pixels: {width}x{height}", gaussians, shared, camera, repeats, parts=False)
+        rows += measure(f"pixels: {width}x{height}", gaussians, shared, camera, repeats, peak, parts=False)
     for step_px in (6.0, 4.0, 3.0, 2.0):
         gaussians, camera = grid_scene(WIDTH, HEIGHT, step_px)
         shared = SharedBasis.initial(len(gaussians), bases=BASES, colour=True)
-        rows += measure(f"Gaussians: {len(gaussians)}", gaussians, shared, camera, repeats, parts=False)
+        rows += measure(f"Gaussians: {len(gaussians)}", gaussians, shared, camera, repeats, peak, parts=False)
     return rows
 
 
@@ -128,8 +153,15 @@ def grid_scene(width: int, height: int, step_px: float) -> tuple[Gaussians, Came
 
 
 def measure(
-    name: str, gaussians: Gaussians, deformation: Deformation, camera: Camera, repeats: int, *, parts: bool = True
-) -> list[dict[str, Any]]:
+    name: str,
+    gaussians: Gaussians,
+    deformation: Deformation,
+    camera: Camera,
+    repeats: int,
+    peak: Row,
+    *,
+    parts: bool = True,
+) -> list[Row]:
     """Median ms of a render and of a step, printed with their parts, as rows."""
     model = FusedModel(gaussians, deformation, camera.width, camera.height)
     view, target = camera_vector(camera), _target(model.rasterizer)
@@ -147,12 +179,29 @@ def measure(
         total_ms, least_ms, part_ms = _timed(model, call, repeats)
         aim = f" (target {TARGET_MS[work]:.0f})" if name.startswith("standard: shared") else ""
         shares = f": {_listed(part_ms, total_ms)}" if parts else ""
-        print(f"  {work:6} {total_ms:7.2f} ms{aim}, least {least_ms:.2f}{shares}")
+        floor_ms = _floor_ms(work, model, blended, peak)
+        pace = f", {1e3 / total_ms:.0f} frames/s" if work == "render" else ""
+        floor = f"floor {floor_ms:.1f}, {floor_ms / least_ms:.0%} reached"
+        print(f"  {work:6} {total_ms:7.2f} ms{aim}{pace}, least {least_ms:.2f}, {floor}{shares}")
         row = {"name": name, "work": work, "gaussians": len(gaussians), "blended": round(blended, 1)}
         row |= {"width": camera.width, "height": camera.height, "ms": round(total_ms, 2)}
-        row["least_ms"] = round(least_ms, 2)
+        row |= {"least_ms": round(least_ms, 2), "floor_ms": round(floor_ms, 2)}
         rows.append(row | {f"{part}_ms": round(value, 2) for part, value in part_ms.items()})
     return rows
+
+
+def _floor_ms(work: str, model: FusedModel, blended: float, peak: Row) -> float:
+    """Multiply-adds and bytes of a work over the machine's peaks, one after the other."""
+    pixels = model.rasterizer.width * model.rasterizer.height
+    moved = model.canonical.nbytes + model.opacity_logit.nbytes
+    if isinstance(model.motion, LinearMotion):
+        alive = np.abs(model.motion.export(0).basis(TIME).numpy()) >= NEGLIGIBLE
+        moved += model.motion.weight[alive].nbytes
+    elif isinstance(model.motion, FdmMotion):
+        moved += 3 * model.motion.weight.nbytes
+    multiply_adds = PAIR_FMA[work] * blended * pixels + GAUSSIAN_FMA[work] * model.count
+    moved_bytes = MOVES[work] * moved + PIXEL_BYTES[work] * pixels
+    return 1e3 * float(multiply_adds / (1e9 * peak["gfma_per_s"]) + moved_bytes / (1e9 * peak["gb_per_s"]))
 
 
 def _timed(model: FusedModel, call: Callable[[], object], repeats: int) -> tuple[float, float, dict[str, float]]:
@@ -244,7 +293,7 @@ def _read(thread, threads, values, out):  # type: ignore[no-untyped-def]
     out[thread] = lane_sum(a + b + c + d)
 
 
-def _peak_rows() -> list[dict[str, Any]]:
+def _peak_rows() -> list[Row]:
     """Multiply-adds and bytes a second of one thread and of all, printed."""
     out = np.zeros(THREADS, np.float32)
     values = np.ones(1 << 26, np.float32)  # 256 MiB: far beyond the caches
@@ -272,7 +321,7 @@ def _fastest(call: Callable[..., object], *arguments: Any) -> float:
     return min(seconds[1:])
 
 
-def _write(path: Path, rows: list[dict[str, Any]]) -> None:
+def _write(path: Path, rows: list[Row]) -> None:
     columns = list(dict.fromkeys(name for row in rows for name in row))
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
