@@ -14,9 +14,9 @@ _INTRODUCTION = f"""
 `intrasplat stability --out docs/results` ([{STABILITY}]({STABILITY})) spoils a synthetic clip in many ways, five
 severities each, reconstructs it and judges it by the truth. Harmed is what loses more than {LARGEST_LOSS_DB:g} dB to
 the clean clip, or {LARGEST_DEPTH_LOSS_MM:g} mm of depth. Silent is the defect: harmed, and the report has no warning
-that the clean clip's has not. What the user is told of each stands in [stability.md](stability.md), how it is judged in
-[decision 016](../decisions/016-stability.md). Each method is compared with itself on the clean clip, so a map shows what
-a mishap costs a method and not which method is better.
+that the clean clip's has not. What the user is told of each stands in [stability.md](stability.md), how it is judged
+in [decision 016](../decisions/016-stability.md). Each method is compared with itself on the clean clip, so a map shows
+what a mishap costs a method and not which method is better.
 
 | | {" | ".join(WORST_FIRST)} | map |
 |---|{"---|" * len(WORST_FIRST)}---|

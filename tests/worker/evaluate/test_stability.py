@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.stability_page import stability_sections
 from contract.errors import Cancelled, InputError
 from contract.exits import ExitCode
 from worker.__main__ import main
 from worker.evaluate.atlas import count_outcomes, draw_map, places_of, told_table
 from worker.evaluate.conditions import CLEAN, CLEAN_STEREO, CONDITIONS, clean_clip
-from worker.evaluate.rows import Row, read_rows
+from worker.evaluate.rows import Row, read_rows, write_rows
 from worker.evaluate.stability import (
     FIELDS,
     KEY,
@@ -187,3 +188,13 @@ def test_the_command_draws_what_is_there_and_refuses_what_is_not(
     assert "2 cells, 2 of them" in capsys.readouterr().out
     assert (tmp_path / "stability-fast.png").exists()
     assert "fast" in (tmp_path / "stability.md").read_text()
+
+
+def test_the_page_of_results_counts_how_the_places_ended(tmp_path: Path) -> None:
+    assert stability_sections(tmp_path) == []
+    write_rows(tmp_path / STABILITY, FIELDS, ROWS)
+    page = "".join(stability_sections(tmp_path))
+    assert "| fast | 1 | 1 | 1 | 1 | 1 | 1 | 0 |  |" in page
+    assert "stability-fast.png" not in page
+    draw_map(places_of(ROWS, "fast"), "fast", tmp_path)
+    assert "[stability-fast.png](stability-fast.png)" in "".join(stability_sections(tmp_path))
