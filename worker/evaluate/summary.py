@@ -173,7 +173,7 @@ def capacities(groups: Sequence[Group]) -> list[Capacity]:
         if chosen.series != base_of(chosen.series) or not of_chosen:
             continue
         grid = [
-            (fmean(group.by_seed("psnr_tissue_db").values()), group)
+            (fmean(group.by_seed("psnr_tissue_db").values()), -group.median("scene_bytes"), group)
             for group in groups
             if (*group.place, group.limit) == (*chosen.place, chosen.limit)
             and group.series != chosen.series
@@ -182,7 +182,7 @@ def capacities(groups: Sequence[Group]) -> list[Capacity]:
         ]
         if not grid:
             continue
-        best = max(grid, key=lambda each: each[0])[1]
+        best = max(grid, key=lambda each: each[:2])[2]  # of equals the smallest
         of_best = best.by_seed("psnr_tissue_db")
         pairs = [of_chosen[seed] - of_best[seed] for seed in of_chosen if seed in of_best]
         if pairs:
