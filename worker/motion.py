@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -64,7 +65,8 @@ def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], 
     raises ends the work and is raised here.
     """
     step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // LEAST_SIDE_PX))
-    reference = _Coarse(clip, train[0], step)
+    grid = _Grid(clip, step)
+    reference = _Coarse(clip, train[0], grid)
     displacement, colour = np.zeros((2, len(train), *reference.grey.shape, 3), np.float32)
     confidence = np.zeros((len(train), *reference.grey.shape), np.float32)
     confidence[0] = reference.trust
@@ -73,7 +75,7 @@ def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], 
         flow_solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         forward: Floats | None = None
         for done, place in enumerate(places):  # in order of time: the last flow starts the next
-            target = _Coarse(clip, train[place], step)
+            target = _Coarse(clip, train[place], grid)
             forward = flow_solver.calc(reference.grey, target.grey, None if forward is None else forward.copy())
             backward = flow_solver.calc(target.grey, reference.grey, -forward)
             displacement[place], colour[place], confidence[place] = _lift(reference, target, forward, backward)
@@ -86,23 +88,37 @@ def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], 
     return Tracks(displacement, colour, confidence, step)
 
 
+class _Grid:
+    """The coarse grid: which pixels it samples and where they look. h w cells, step pixels apart."""
+
+    def __init__(self, clip: DepthClip, step: int) -> None:
+        height, width = clip.tissue.shape[1:]
+        self.step, self.size = step, (width // step, height // step)
+        rows, columns = np.mgrid[0 : self.size[1], 0 : self.size[0]] * step + step // 2
+        pixels = (rows * width + columns).ravel()
+        rays = unproject(pixels, np.ones(pixels.size, np.float32), clip.intrinsics, np.eye(4))
+        self.rays = rays.reshape(*rows.shape, 3).astype(np.float32)
+        """[h, w, 3] points at depth 1 in the camera's frame."""
+
+    def sample(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The cells' middle pixels of an image: [h, w]; a view."""
+        return values[self.step // 2 :: self.step, self.step // 2 :: self.step][: self.size[1], : self.size[0]]
+
+
 class _Coarse:
     """A frame on the coarse grid: colour, grey, camera points (world, mm), and how far to trust depth and mask."""
 
-    def __init__(self, clip: DepthClip, index: int, step: int) -> None:
-        height, width = clip.tissue.shape[1:]
-        size = (width // step, height // step)
+    def __init__(self, clip: DepthClip, index: int, grid: _Grid) -> None:
         grey = cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY)
-        self.grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        self.rgb = cv2.resize(clip.rgb[index], size, interpolation=cv2.INTER_AREA) / np.float32(255)
-        rows, columns = np.mgrid[0 : size[1], 0 : size[0]] * step + step // 2
-        pixels = (rows * width + columns).ravel()
-        depth_mm = clip.depth_mm[index].ravel()[pixels]
-        usable = clip.tissue[index].ravel()[pixels] & (depth_mm > 0)
-        points = unproject(pixels, np.where(usable, depth_mm, 1.0), clip.intrinsics, clip.world_from_camera[index])
-        self.points_mm = points.reshape(*rows.shape, 3).astype(np.float32)
-        confidence = clip.depth_confidence[index].ravel()[pixels] / np.float32(255)
-        self.trust = np.where(usable, confidence, 0).reshape(rows.shape).astype(np.float32)
+        self.grey = cv2.resize(grey, grid.size, interpolation=cv2.INTER_AREA)
+        self.rgb = cv2.resize(clip.rgb[index], grid.size, interpolation=cv2.INTER_AREA) / np.float32(255)
+        depth_mm = grid.sample(clip.depth_mm[index])
+        usable = grid.sample(clip.tissue[index]) & (depth_mm > 0)
+        pose = clip.world_from_camera[index].astype(np.float32)
+        camera_mm = grid.rays * np.where(usable, depth_mm, np.float32(1))[..., None]
+        self.points_mm: Floats = camera_mm @ pose[:3, :3].T + pose[:3, 3]
+        confidence = grid.sample(clip.depth_confidence[index]) / np.float32(255)
+        self.trust = np.where(usable, confidence, np.float32(0))
 
 
 def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats) -> tuple[Floats, Floats, Floats]:
@@ -155,13 +171,17 @@ def fit_tracks(
     outer = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
     weights = np.zeros((len(pixels), bases, 6), np.float32)
     support = np.zeros(len(pixels), np.float32)
-    for first in range(0, len(pixels), POINTS_AT_ONCE):
+
+    def fit(first: int) -> None:
         some = slice(first, first + POINTS_AT_ONCE)
-        confidence = tracks.confidence[:, row[some], column[some]].astype(np.float64)  # [K, points]
+        confidence = tracks.confidence[:, row[some], column[some]]  # [K, points]
         changes = [values[:, row[some], column[some]] for values in (tracks.displacement_mm, tracks.colour)]
         trusted = np.concatenate(changes, axis=-1) * confidence[..., None]
         normal = (confidence.T @ outer).reshape(-1, bases, bases) + prior
-        right = np.tensordot(trusted, basis, (0, 0)).transpose(0, 2, 1)
+        right = (basis.T @ trusted.reshape(len(basis), -1)).reshape(bases, -1, 6).transpose(1, 0, 2)
         weights[some] = np.linalg.solve(normal, right)
         support[some] = confidence.mean(0)
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(fit, range(0, len(pixels), POINTS_AT_ONCE)))
     return weights, support
