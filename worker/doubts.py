@@ -31,6 +31,8 @@ FEWEST_FRAMES_SEEN = 2
 """Of the frames looked at: one alone may be an accident."""
 LARGEST_COLOUR_DRIFT = 0.25
 """Range of the median red over green, or blue over green, over its mean."""
+BLOOD_RATIO, LARGEST_FLOODED_SHARE = 3.0, 0.1
+"""Red over green of blood, and by how much its share of the tissue may change: by 0.005 in clean clips."""
 LARGEST_REPEATED_SHARE = 0.1
 LARGEST_HIDDEN_SHARE = 0.4
 LONGEST_FLICKER = 3
@@ -105,6 +107,13 @@ def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[str]:
 
 
 def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[str]:
+    """Blood that comes in, or else a white balance that drifts."""
+    flooded = float(np.ptp([_blood_share(clip, index) for index in frames]))
+    if flooded > LARGEST_FLOODED_SHARE:
+        return [
+            f"Blood covers {flooded:.0%} more of the tissue in some frames than in others: what it hides there is not "
+            "seen, and it has no texture to follow."
+        ]
     ratios = np.array([_colour_ratios(clip, index) for index in frames])
     drift = np.ptp(ratios, axis=0) / np.maximum(ratios.mean(axis=0), 1e-6)
     if drift.max() <= LARGEST_COLOUR_DRIFT:
@@ -113,7 +122,7 @@ def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[str]:
     low, high = ratios[:, worst].min(), ratios[:, worst].max()
     return [
         f"The tissue's colour changes during the clip ({('red', 'blue')[worst]} over green from {low:.2f} to "
-        f"{high:.2f}): the white balance drifts, or blood comes in; the model shows it as motion of colour."
+        f"{high:.2f}): the white balance drifts, and the model shows it."
     ]
 
 
@@ -164,6 +173,12 @@ def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
 
 def _darkest(clip: DepthClip, index: int) -> float:
     return float(np.percentile(clip.rgb[index][clip.tissue[index]].min(axis=1), DARK_PERCENTILE))
+
+
+def _blood_share(clip: DepthClip, index: int) -> float:
+    """Share of the tissue that is as red as blood."""
+    pixels = clip.rgb[index][clip.tissue[index]].astype(np.float32)
+    return float((pixels[:, 0] > BLOOD_RATIO * np.maximum(pixels[:, 1], 1)).mean())
 
 
 def _colour_ratios(clip: DepthClip, index: int) -> tuple[float, float]:
