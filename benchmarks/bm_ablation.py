@@ -35,8 +35,8 @@ FIELDS = (
 _FAST, _PAPER = PRESETS["fast"], PRESETS["paper"]
 
 
-def _rates(**rates: Rate) -> Preset:
-    return dataclasses.replace(_FAST, rates=dataclasses.replace(_FAST.rates, **rates))
+def _rates(**rates: Rate | float) -> Preset:
+    return dataclasses.replace(_FAST, rates=dataclasses.replace(_FAST.rates, **rates))  # type: ignore[arg-type]
 
 
 _PUBLISHED_MOTION = _PAPER.rates.motion_mean
@@ -50,6 +50,9 @@ CHANGES: dict[str, Preset] = {
     "published rates of colour and shape": _rates(
         colour=_PAPER.rates.colour, log_scale=_PAPER.rates.log_scale, quaternion=_PAPER.rates.quaternion
     ),
+    "Adam's moments as published": _rates(beta1=_PAPER.rates.beta1, beta2=_PAPER.rates.beta2),
+    "plain L1 of colour": dataclasses.replace(_FAST, loss=dataclasses.replace(_FAST.loss, colour_zone=0.0)),
+    "opacity 0.8, spread 0.6": dataclasses.replace(_FAST, opacity=0.8, spread=0.6),
     "9 bases at most": dataclasses.replace(_FAST, bases=9),
     "20 k points": dataclasses.replace(_FAST, points_per_image=20_000),
     "80 k points": dataclasses.replace(_FAST, points_per_image=80_000),
