@@ -173,8 +173,9 @@ def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
 
 def _pixels(clip: DepthClip, index: int) -> NDArray[np.uint8]:
     """Colours [M, 3] of the tissue of every other row and column: enough to count; all of it where that is little."""
-    sparse = clip.rgb[index][::2, ::2][clip.tissue[index][::2, ::2]]
-    return sparse if len(sparse) else clip.rgb[index][clip.tissue[index]]
+    rgb, tissue = clip.rgb[index], clip.tissue[index]
+    sparse: NDArray[np.uint8] = rgb[::2, ::2][tissue[::2, ::2]]
+    return sparse if len(sparse) else np.asarray(rgb[tissue])
 
 
 def _darkest(clip: DepthClip, index: int) -> float:
