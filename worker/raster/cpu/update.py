@@ -18,6 +18,7 @@ CHANNELS, ROWS = 10, 13
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _HALF_LOG2E = np.float32(0.5 * 1.4426950408889634)
 _LOG2E = np.float32(1.4426950408889634)
+_STRETCH = 64  # vectors
 MIN_WIDTH = np.float32(1e-3)
 """Smallest |sigma| of a basis, in model time."""
 QUARTIC_FLOOR = np.float32(1e-4)
@@ -102,17 +103,21 @@ def _basis(t, centre, width, quartic):  # type: ignore[no-untyped-def]
 def deform_fdm(thread, threads, canonical, weight, centre, width, t, quartic, state):  # type: ignore[no-untyped-def]
     """state [ROWS, N] = canonical + FDM at t; weight, centre, width [10, B, N] (Deform3DGS, equations 3 and 4)."""
     vectors = canonical.shape[1] // LANES
+    first, last = vectors * thread // threads, vectors * (thread + 1) // threads
     time = splat(t)
-    for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
-        i = k * LANES
-        for c in range(CHANNELS, ROWS):
-            store(state[c], i, load(canonical[c], i))
-        for c in range(CHANNELS):
-            total = load(canonical[c], i)
+    for c in range(CHANNELS, ROWS):
+        for k in range(first, last):
+            store(state[c], k * LANES, load(canonical[c], k * LANES))
+    for c in range(CHANNELS):
+        for start in range(first, last, _STRETCH):  # the sums stay in the cache, and few streams of memory are followed
+            end = min(start + _STRETCH, last)
+            for k in range(start, end):
+                store(state[c], k * LANES, load(canonical[c], k * LANES))
             for j in range(weight.shape[1]):
-                value, _, _ = _basis(time, load(centre[c, j], i), load(width[c, j], i), quartic)
-                total = fma(load(weight[c, j], i), value, total)
-            store(state[c], i, total)
+                for k in range(start, end):
+                    i = k * LANES
+                    value, _, _ = _basis(time, load(centre[c, j], i), load(width[c, j], i), quartic)
+                    store(state[c], i, fma(load(weight[c, j], i), value, load(state[c], i)))
 
 
 @njit(cache=True, nogil=True)
