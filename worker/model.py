@@ -48,16 +48,15 @@ class Model(Protocol):
         """[N] whether the last frame could see each Gaussian: in front of the camera, in the image, not too faint."""
         ...
 
-    def render(self, camera: NDArray[np.float64], t: float) -> Floats:
-        """R G B Z A, [5, H, W], Z = sum(w z) in units; a view that the next render overwrites."""
+    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
+        """R G B Z A, [5, H, W], Z = sum(w z) in units; a view that the next render overwrites.
+
+        With values [N], a number a Gaussian, they are blended as colour is, and [6, H, W] ends with them.
+        """
         ...
 
     def deformed_mean(self, t: float) -> Floats:
         """Centres at time t, [3, N] in units, as a copy."""
-        ...
-
-    def blend_values(self, values: Floats) -> Floats:
-        """A number a Gaussian [N], blended as colour was in the last render: [H, W]; a view."""
         ...
 
     def step(

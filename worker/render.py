@@ -86,10 +86,10 @@ class SceneRenderer:
         camera = camera_vector(camera_in_units(intrinsics, world_from_camera, scene.units_per_mm))
         with self._lock:
             self._model.rasterizer = self._rasterizer(intrinsics.width, intrinsics.height)
-            image = self._model.render(camera, t).copy()
-            # A second blend is half of the work, and of a snapshot, of which nothing is known, it would be 0.
-            seen = self._model.blend_values(scene.seen.numpy()).copy() if self._is_vouched else np.zeros_like(image[0])
-        return image, seen
+            # Of a snapshot nothing is known yet: nothing is blended, and 0 is shown.
+            image = self._model.render(camera, t, scene.seen.numpy() if self._is_vouched else None).copy()
+        seen = image[5] if self._is_vouched else np.zeros_like(image[0])
+        return image[:5], seen
 
 
 _renderers: weakref.WeakKeyDictionary[Scene, SceneRenderer] = weakref.WeakKeyDictionary()

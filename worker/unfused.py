@@ -32,10 +32,10 @@ class UnfusedModel(FusedModel):
     def _motion_of(self, deformation: Deformation, columns: int) -> Motion:
         return AutogradMotion(deformation, self.count, columns)
 
-    def render(self, camera: NDArray[np.float64], t: float) -> Floats:
-        """R G B Z A, [5, H, W]; a view that the next render overwrites."""
+    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
+        """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
         with torch.no_grad():  # no step follows: keep no graph
-            return super().render(camera, t)
+            return super().render(camera, t, values)
 
     def deformed_mean(self, t: float) -> Floats:
         """Centres at time t, [3, N] in units, as a copy."""

@@ -13,9 +13,9 @@ products instead of an exponential. Derivations: docs/rasterizer.md.
 
 A tile is done in four steps. Its entries (bins.py) are gathered as records, one after the other in memory; they are
 blended; the loss is taken; and they are walked back. A record is RECORD floats: alpha and ratio of its first row, one
-a lane, then BEND (the ratio's own), COLOUR (r, g, b, z), PLACE (dx of the first lane, dy of the first row). Its rows
-[top, end) and the home of its splat are in ``spans``. The planes lie in ``planes``, PLANE floats apart: T (later
-B - g_A), then R G B Z (later g_R g_G g_B g_Z).
+a lane, then BEND (the ratio's own), COLOUR (r, g, b, z), PLACE (dx of the first lane, dy of the first row) and VALUE.
+Its rows [top, end) and the home of its splat are in ``spans``. The planes lie in ``planes``, PLANE floats apart: T
+(later B - g_A), R G B Z (later g_R g_G g_B g_Z) and the value, blended only where no gradient is asked for.
 """
 
 from __future__ import annotations
@@ -46,8 +46,9 @@ from worker.raster.cpu.vectors import LANES
 
 PLANE = TILE_ROWS * LANES + 16
 """Not a power of two, lest the same pixel of two planes have addresses that a processor takes for each other."""
-PLANES = 5
-BEND, COLOUR, PLACE, RECORD = 2 * LANES, 2 * LANES + 1, 2 * LANES + 5, 2 * LANES + 8
+PLANES = 6
+BEND, COLOUR, PLACE, VALUE = 2 * LANES, 2 * LANES + 1, 2 * LANES + 5, 2 * LANES + 7
+RECORD = 2 * LANES + 8
 MOST_ROWS = 16
 """Rows of a record: the products' rounding grows with their square, to 1e-5 of alpha after sixteen."""
 RENDER, LOSS, COTANGENT = 0, 1, 2
@@ -77,7 +78,8 @@ def blend(  # type: ignore[no-untyped-def]
     target [3, H, stride] uint8, weight [H, stride] uint8 (255 = tissue), inverse_depth [H, stride] float32 (0 = none):
     LOSS, flattened, stride = tiles_x * LANES. loss_settings float32 [5]: colour weight a channel, depth weight,
     1 / width of the quadratic zone of the colour and of the depth loss, 1 for normalised depth else 0.
-    image [5, H, stride] flattened: R G B Z A, written in RENDER, read as cotangents in COTANGENT.
+    image [6, H, stride] flattened: R G B Z A and the blended value, written in RENDER; the first five are read as
+    cotangents in COTANGENT.
     """
     blocks_x, stride, keep = -(-tiles_x // BLOCK_TILES), tiles_x * LANES, mode != RENDER
     blocks, size = (tile_start.shape[0] - 1) // tiles_x * blocks_x, height * stride
@@ -139,6 +141,7 @@ def _gather(  # type: ignore[no-untyped-def]
             records[at + COLOUR], records[at + COLOUR + 1] = splats[g, 6], splats[g, 7]
             records[at + COLOUR + 2], records[at + COLOUR + 3] = splats[g, 8], splats[g, 9]
             records[at + PLACE], records[at + PLACE + 1] = x, dy
+            records[at + VALUE] = splats[g, 11]
             spans[count, 0], spans[count, 1], spans[count, 2] = top, min(top + stretch, bottom), home
             top += stretch
             at += RECORD
@@ -154,7 +157,7 @@ def _clear(planes, column0, width, rows):  # type: ignore[no-untyped-def]
     for row in range(rows):
         p = row * LANES
         store(planes, p, inside)
-        for k in range(1, 5):
+        for k in range(1, PLANES):
             store(planes, p + k * PLANE, zero)
 
 
@@ -168,6 +171,7 @@ def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[
         alpha_raw, ratio, bend = load(records, record), load(records, record + LANES), spread(records, record + BEND)
         red, green = spread(records, record + COLOUR), spread(records, record + COLOUR + 1)
         blue, depth = spread(records, record + COLOUR + 2), spread(records, record + COLOUR + 3)
+        value = spread(records, record + VALUE)
         for row in range(spans[i, 0], spans[i, 1]):
             p = row * LANES
             transmittance = load(planes, p)
@@ -185,6 +189,8 @@ def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[
                 store(trail, at, alpha)
                 store(trail, at + LANES, weight)
                 at += 2 * LANES
+            else:
+                store(planes, p + 5 * PLANE, fma(weight, value, load(planes, p + 5 * PLANE)))
         if i % _CHECK_EVERY == _CHECK_EVERY - 1:
             clearest = zero
             for row in range(rows):
@@ -247,13 +253,14 @@ def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-un
 
 @njit(cache=True, nogil=True)
 def _write(planes, image, origin, stride, size, rows):  # type: ignore[no-untyped-def]
-    """R G B Z A of the tile into the image."""
+    """R G B Z A and the value of the tile into the image."""
     one = splat(_ONE)
     for row in range(rows):
         p, q = row * LANES, origin + row * stride
         for k in range(4):
             store(image, q + k * size, load(planes, p + (k + 1) * PLANE))
         store(image, q + 4 * size, one - load(planes, p))
+        store(image, q + 5 * size, load(planes, p + 5 * PLANE))
 
 
 @njit(cache=True, nogil=True)

@@ -88,19 +88,15 @@ class FusedModel:
             run(harmonics.colour_from_sh, sh_degree, _centre(camera), self.state, self.sh_rest, self.colour)
         self.rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
 
-    def render(self, camera: NDArray[np.float64], t: float) -> Floats:
-        """R G B Z A, [5, H, W]; a view that the next render overwrites."""
+    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
+        """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
         self.project(camera, t, self.sh_degree)
-        return self.rasterizer.render()
+        return self.rasterizer.render(values)
 
     def deformed_mean(self, t: float) -> Floats:
         """Centres at time t, [3, N] in units, as a copy."""
         self.motion.deform(self.canonical, t, self.state)
         return self.state[:3, : self.count].copy()
-
-    def blend_values(self, values: Floats) -> Floats:
-        """A number a Gaussian [N], blended as colour was in the last render: [H, W]; a view."""
-        return self.rasterizer.blend_values(values)
 
     def step(
         self,

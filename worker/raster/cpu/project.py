@@ -8,6 +8,7 @@ time), opacity_logit [N], colour [3, N]. A splat is a Gaussian on the image, SPL
     6 7 8 colour
     9     camera z
     10    2**(2 k_yy): by this factor the ratio of alpha from row to row changes from row to row
+    11    a value of the caller's that is blended as colour is, at first 0
 Arithmetic is float64 on LANES Gaussians at once, storage float32; exponentials have float32's precision.
 """
 
@@ -37,7 +38,7 @@ from worker.raster.cpu.simd import (
 from worker.raster.cpu.vectors import LANES
 
 SPLAT = 12
-"""Floats a splat record holds; eleven are used, twelve keep records on 16-byte boundaries."""
+"""Floats a splat record holds."""
 LOG2E = 1.4426950408889634
 _LN2 = 0.6931471805599453
 _LARGEST = 1e300
@@ -205,6 +206,7 @@ def project(  # type: ignore[no-untyped-def]
             store_strided(splats, at + 6 + channel, SPLAT, load(colour[channel], i))
         store_strided(splats, at + 9, SPLAT, narrow(z))
         store_strided(splats, at + 10, SPLAT, exp2(narrow(2.0 * k_yy)))
+        store_strided(splats, at + 11, SPLAT, splat(np.float32(0.0)))
         # The conic's a, b, c are cyy, -cxy, cxx over det, and ac - b^2 is 1 / det.
         at, inverse_cxx = i * EXTENT, 1.0 / cxx
         store_strided(extent, at, EXTENT, narrow(reach_x))

@@ -69,7 +69,7 @@ class Rasterizer:
         self.tiles_x, tiles_y = -(-width // LANES), -(-height // bins.TILE_ROWS)
         self.tiles = self.tiles_x * tiles_y
         self.stride = self.tiles_x * LANES
-        self.image = np.zeros(5 * height * self.stride, np.float32)
+        self.image = np.zeros(6 * height * self.stride, np.float32)
         self.statistics = np.zeros((self.tiles, STATISTICS), np.float32)
         self._planes = _aligned(THREADS, PLANES * PLANE)
         self._trail, self._records = _aligned(THREADS, 0), _aligned(THREADS, 0)
@@ -181,16 +181,16 @@ class Rasterizer:
             self.statistics, target.rgb, target.weight, target.inverse_depth, loss_settings, image,
         )  # fmt: skip
 
-    def render(self) -> Floats:
-        """R G B Z A of the projected splats, [5, H, W]; a view of a buffer the next render overwrites."""
-        self.blend(RENDER, self._no_target, _NO_LOSS, self.image)
-        return self.image.reshape(5, self.height, self.stride)[:, :, : self.width]
+    def render(self, values: Floats | None = None) -> Floats:
+        """R G B Z A of the projected splats, [5, H, W]; a view of a buffer the next render overwrites.
 
-    def blend_values(self, values: Floats) -> Floats:
-        """A number a Gaussian, blended as colour is, [H, W], for the splats last projected; overwrites their red."""
-        self.splats[: len(values), 6] = values
-        blended: Floats = self.render()[0]
-        return blended
+        With values [<= N], a number a Gaussian, they are blended as colour is, and [6, H, W] ends with them.
+        """
+        if values is not None:
+            self.splats[: len(values), 11] = values
+        self.blend(RENDER, self._no_target, _NO_LOSS, self.image)
+        planes = 5 if values is None else 6
+        return self.image.reshape(6, self.height, self.stride)[:planes, :, : self.width]
 
     def loss_backward(self, target: Target, loss_settings: Floats) -> Gradients:
         """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums a tile."""
