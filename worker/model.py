@@ -55,6 +55,10 @@ class Model(Protocol):
         """
         ...
 
+    def blend_values(self, values: Floats) -> Floats:
+        """Further values [N], blended as colour was in the last render: [H, W]; a view."""
+        ...
+
     def deformed_mean(self, t: float) -> Floats:
         """Centres at time t, [3, N] in units, as a copy."""
         ...

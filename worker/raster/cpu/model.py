@@ -93,6 +93,11 @@ class FusedModel:
         self.project(camera, t, self.sh_degree)
         return self.rasterizer.render(values)
 
+    def blend_values(self, values: Floats) -> Floats:
+        """Further values [N], blended as colour was in the last render: [H, W]; a view."""
+        blended: Floats = self.rasterizer.render(values)[5]
+        return blended
+
     def deformed_mean(self, t: float) -> Floats:
         """Centres at time t, [3, N] in units, as a copy."""
         self.motion.deform(self.canonical, t, self.state)
