@@ -46,6 +46,7 @@ STAGES = (
     "checkpoint",
     "export",
     "presets",
+    "capacity",
     "start",
     "targets",
     "visibility",

@@ -38,7 +38,7 @@ from worker.quality import Training, View, build_report, measure, sample_frames
 from worker.rangecoder import compile_coder
 from worker.raster.cpu import compile_kernels
 from worker.shrink import Shrunk, model_of, shrink
-from worker.start import FRAMES_A_BASIS, bases_of, fusion_for, start_model
+from worker.start import bases_of, fusion_for, settled, start_model
 from worker.stereo import estimate_depth
 from worker.targets import TrainingFrames, solid_depth_mm, units_per_mm
 from worker.train import Run, Stopwatch, iterations_within, load_run, save_run, train
@@ -220,6 +220,7 @@ def prepare(
             seconds, "motion_s", lambda: track(clip, split.train, lambda share: report_stage(hooks, "motion", share))
         )
     report_stage(hooks, "start", 0.0)
+    preset, chosen = timed(seconds, "capacity_s", lambda: settled(preset, tracks, clip, split.train))
     model = timed(
         seconds, "start_s", lambda: start_model(cloud, tracks, clip, split.train, preset, scale, request.seed)
     )
@@ -228,7 +229,7 @@ def prepare(
     fixed = request.iterations or (None if request.budget_s else preset.iterations)
     budget_s = request.budget_s or preset.budget_s
     asked = f"{fixed} iterations" if fixed else f"{budget_s} s"
-    run = Run(model, frames, preset, fixed or 1, request.seed, asked, densifier=densifier)
+    run = Run(model, frames, preset, fixed or 1, request.seed, asked, densifier=densifier, chosen=chosen)
     if fixed is None:
         assert budget_s is not None
         run.iterations = 1000  # any length: calibration needs a place in the schedule, not its end
@@ -348,7 +349,7 @@ def report_of(
         scene_bytes=scene.file_bytes,
         units_per_mm=scene.units_per_mm,
         seconds=seconds,
-        assumptions=(*chosen(run, clip, bases_of(scene.deformation)), *(shrunk.words if shrunk else ())),
+        assumptions=(*run.chosen, *(shrunk.words if shrunk else ())),
         measurements=shrunk.measurements if shrunk else {},
         warnings=training_warnings(run, request),
         versions={
@@ -362,18 +363,6 @@ def report_of(
     if report.psnr_tissue_db is not None and run.curve:
         run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=report.psnr_tissue_db)
     return report
-
-
-def chosen(run: Run, clip: DepthClip, bases: int) -> tuple[str, ...]:
-    """How large a model was taken, and why, in words."""
-    preset = run.preset
-    if preset.deformation != "shared" or preset.points_per_image is None:
-        return ()
-    stride = fusion_for(preset, clip.intrinsics).stride
-    return (
-        f"Gaussians were started {stride} pixels apart each way: nearest to {preset.points_per_image} an image.",
-        f"Motion has {bases} bases: one for about {FRAMES_A_BASIS} training frames.",
-    )
 
 
 def training_warnings(run: Run, request: ReconstructionRequest) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ class Preset:
     fusion           which points become Gaussians
     points_per_image "fill" fusion takes the grid stride that comes nearest to this many points a frame
     deformation      "shared", "fdm", "fdm-quartic", "pfs", "hexplane"
-    bases            B of the deformation; the most of it for "shared", which takes one for every few frames
+    bases            B of the deformation; None: as many as the scene's motion needs ("shared" alone)
     tracks           whether optical-flow tracks start the motion ("shared" only)
     start_width      sigma at the start, model time; None where the deformation places its own
     opacity, spread  of a Gaussian at the start; spread is its standard deviation over the distance to its neighbours
@@ -38,7 +38,7 @@ class Preset:
     fusion: FusionSettings
     points_per_image: int | None
     deformation: Literal["shared", "fdm", "fdm-quartic", "pfs", "hexplane"]
-    bases: int
+    bases: int | None
     tracks: bool
     start_width: float | None
     opacity: float
@@ -112,7 +112,7 @@ _FAST = Preset(
     fusion=FusionSettings(mode="fill"),
     points_per_image=40_000,
     deformation="shared",
-    bases=33,
+    bases=None,
     tracks=True,
     start_width=None,
     opacity=0.9,

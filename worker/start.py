@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from contract.camera import Intrinsics
+from worker.capacity import choose_bases, errors_by_bases, grid_error
 from worker.clip import DepthClip
 from worker.deformation import FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
 from worker.deformation.base import CHANNELS, MEAN
@@ -22,8 +23,6 @@ from worker.presets import Preset
 from worker.raster.cpu.model import FusedModel
 from worker.unfused import UnfusedModel
 
-FRAMES_A_BASIS, MIN_BASES = 3, 3
-"""Training frames a shared basis stands for, and the fewest bases (docs/decisions/004)."""
 MIN_STRIDE = 2
 """Pixels between the points of a grid at the least: a Gaussian a pixel is noise, not surface."""
 
@@ -36,6 +35,22 @@ def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
     return dataclasses.replace(preset.fusion, stride=max(MIN_STRIDE, stride))
 
 
+def settled(
+    preset: Preset, tracks: Tracks | None, clip: DepthClip, train: Sequence[int]
+) -> tuple[Preset, tuple[str, ...]]:
+    """The preset with what it leaves to the scene settled (docs/decisions/014), and why, in words for the report."""
+    words = []
+    stride = fusion_for(preset, clip.intrinsics).stride
+    if preset.fusion.mode == "fill" and preset.points_per_image is not None:
+        words.append(f"Gaussians were started {stride} pixels apart: nearest to {preset.points_per_image} an image.")
+    if preset.bases is None:
+        errors = errors_by_bases(tracks, clip, train) if tracks is not None else {}
+        choice = choose_bases(errors, grid_error(clip, train[0], stride), len(train))
+        preset = dataclasses.replace(preset, bases=choice.count)
+        words.append(f"Motion has {choice.count} bases: {choice.reason}.")
+    return preset, tuple(words)
+
+
 def start_model(
     cloud: PointCloud,
     tracks: Tracks | None,
@@ -46,7 +61,7 @@ def start_model(
     seed: int,
 ) -> Model:
     """Gaussians at the cloud's points (mm, scaled to optimiser units) with the preset's motion: as the tracks have it
-    where the motion is "shared" and there are tracks, else at rest."""
+    where the motion is "shared" and there are tracks, else at rest. The preset must be settled."""
     gaussians = initial_gaussians(
         cloud.points_mm * np.float32(scale),
         cloud.rgb,
@@ -56,13 +71,14 @@ def start_model(
     gaussians = dataclasses.replace(gaussians, log_scale=gaussians.log_scale + math.log(preset.spread))
     width, height = clip.intrinsics.width, clip.intrinsics.height
     count = len(gaussians)
+    assert preset.bases is not None
     if preset.deformation == "hexplane":
         bounds = torch.stack([gaussians.mean.amin(0), gaussians.mean.amax(0)])
         return UnfusedModel(gaussians, HexPlane.initial(bounds, seed=seed), width, height)
     if preset.deformation == "pfs":
         return FusedModel(gaussians, PolynomialFourier.initial(count, weights=preset.bases), width, height)
     if preset.deformation == "shared":
-        bases = min(len(train), max(MIN_BASES, min(preset.bases, math.ceil(len(train) / FRAMES_A_BASIS))))
+        bases = min(len(train), preset.bases)
         shared = SharedBasis.initial(count, bases=bases, colour=True, times=[float(clip.t[i]) for i in train])
         if tracks is not None:
             gaussians = _follow_tracks(gaussians, shared, cloud, tracks, clip, train, scale)

@@ -72,6 +72,7 @@ class Run:
     iterations   of the whole schedule; iteration: those done
     asked        the length that was asked for, in words; a stored run goes on only with its own
     densifier    its statistics; None where the preset has no densification
+    chosen       what was left to the scene, how it was settled and why, in words
     """
 
     model: Model
@@ -82,6 +83,7 @@ class Run:
     asked: str = ""
     iteration: int = 0
     densifier: Densifier | None = None
+    chosen: tuple[str, ...] = ()
     curve: list[CurvePoint] = field(default_factory=list)
 
 

@@ -16,7 +16,7 @@ from worker.fusion import PointCloud, fuse
 from worker.model import Model
 from worker.motion import track
 from worker.presets import PRESETS, Preset
-from worker.start import MIN_STRIDE, bases_of, fusion_for, start_model
+from worker.start import MIN_STRIDE, bases_of, fusion_for, settled, start_model
 from worker.targets import units_per_mm
 
 TIMES = (0.0, 0.31, 11 / 12)
@@ -31,6 +31,7 @@ def started(clip: DepthClip, preset: Preset, train: list[int] | None = None) -> 
     scale = units_per_mm(clip, frames)
     cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0)
     tracks = track(clip, frames) if preset.tracks and len(frames) > 1 else None
+    preset, _ = settled(preset, tracks, clip, frames)
     return start_model(cloud, tracks, clip, frames, preset, scale, seed=0), cloud, scale
 
 

@@ -194,7 +194,7 @@ def _missing(groups: Sequence[Group]) -> str:
 
 def _draw_knee(groups: Sequence[Group], choices: Sequence[Group], folder: Path) -> None:
     """A line a number of bases over the numbers of Gaussians; a star where the automatic choice lies."""
-    bases = {each.series: preset_of(each.series).bases for each in groups if each.series != base_of(each.series)}
+    bases = {each.series: preset_of(each.series).bases or 0 for each in groups if each.series != base_of(each.series)}
     looks = dict(zip(sorted(set(bases.values())), itertools.cycle(BASES_LOOKS), strict=False))
     places = _places(choices)
     figure, axes = figure_of(len(places), _columns(places), _knee_handles(looks))

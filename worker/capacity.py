@@ -1,0 +1,152 @@
+"""How large a model the scene needs: how many bases its motion, and where Gaussians stand closer than elsewhere.
+
+Both are decided before training, from training frames alone, by the squared error of the picture each is expected to
+leave, in squared grey levels (of 255) a channel of a tissue pixel.
+
+Symbols: K training frames, n sampled cells of the tracks' grid, B bases, N points, s pixels between points.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.clip import DepthClip
+from worker.deformation import SharedBasis
+from worker.motion import RIDGE, STEADINESS, Tracks
+
+Reals = NDArray[np.float64]
+
+BASES = (3, 5, 9, 13, 17, 25, 33)
+"""Numbers of bases to choose from."""
+FRAMES_A_BASIS = 3
+"""Training frames a basis stands for where nothing could be followed."""
+WORTH_DB = 0.25
+"""More bases have to lower the expected error of the picture by more than this."""
+CELLS = 500
+"""Tracks on which bases are tried."""
+FEWEST_CELLS = 30
+FEWEST_FRAMES = 8
+"""Below either, leaving frames out says nothing."""
+LEAVE_OUT_EVERY, FIRST_LEFT_OUT = 4, 2
+TRUSTED = 0.3
+"""Mean confidence a track needs to be tried on."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A number and why, in words for the report."""
+
+    count: int
+    reason: str
+
+
+# bases --------------------------------------------------------------------------------------------------------------
+
+
+def errors_by_bases(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> dict[int, float]:
+    """What each number of bases would leave in frames it was not fitted to: B -> error, squared grey levels.
+
+    Every fourth training frame is left out, the tracks of the others are fitted by three quarters of B bases, and the
+    fit is compared with the tracks in those left out: displacement, as the grey levels by which it changes the picture
+    where the track starts, and colour. Empty where too little could be followed.
+    """
+    if len(train) < FEWEST_FRAMES:
+        return {}
+    series, confidence = _series(tracks, clip, train[0])
+    if series.shape[1] < FEWEST_CELLS:
+        return {}
+    left_out = np.zeros(len(train), np.bool_)
+    left_out[FIRST_LEFT_OUT::LEAVE_OUT_EVERY] = True
+    times = np.array([float(clip.t[index]) for index in train])
+    share = 1 - left_out.mean()
+    return {
+        bases: _left_out_error(series, confidence, times, left_out, max(2, round(share * bases)))
+        for bases in BASES
+        if bases <= len(train)
+    }
+
+
+def choose_bases(errors: dict[int, float], floor: float, frames: int) -> Choice:
+    """The fewest bases whose expected error, on top of the floor that the Gaussians leave, is within WORTH_DB of the
+    least; errors as from errors_by_bases, frames the number of training frames."""
+    if not errors:
+        bases = min(frames, max(BASES[0], -(-frames // FRAMES_A_BASIS)))
+        reason = f"one for about {FRAMES_A_BASIS} training frames, for too little could be followed to tell"
+        return Choice(bases, reason)
+    allowed = (min(errors.values()) + floor) * 10 ** (WORTH_DB / 10)
+    bases = min(each for each, error in errors.items() if error + floor <= allowed)
+    best = min(errors, key=lambda each: errors[each])
+    told = sorted({min(errors), bases, best})
+    left = ", ".join(f"{each} leave {math.sqrt(errors[each] + floor):.1f}" for each in told)
+    return Choice(bases, f"the fewest within {WORTH_DB} dB of the best; in frames left out {left} of 255 grey levels")
+
+
+def grid_error(clip: DepthClip, index: int, stride: int) -> float:
+    """Mean squared error a channel, in squared grey levels, of the frame's tissue shown by points stride px apart."""
+    height, width = clip.tissue.shape[1:]
+    few = (max(1, round(width / stride)), max(1, round(height / stride)))
+    tissue = clip.tissue[index].astype(np.float32)
+    weight = np.maximum(cv2.resize(tissue, few, interpolation=cv2.INTER_AREA), 1e-6)
+    image = clip.rgb[index].astype(np.float32)
+    mean = cv2.resize(image * tissue[..., None], few, interpolation=cv2.INTER_AREA) / weight[..., None]
+    missed = (cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR) - image)[clip.tissue[index]]
+    return float(np.square(missed).mean()) if missed.size else 0.0
+
+
+def _series(tracks: Tracks, clip: DepthClip, reference: int) -> tuple[Reals, Reals]:
+    """[K, n, 6] what has to be followed along n tracks, in grey levels, three of displacement and three of colour, and
+    [K, n] its confidence."""
+    frames, height, width = tracks.confidence.shape
+    step, k, pose = tracks.step_px, clip.intrinsics, clip.world_from_camera[reference]
+    rows, columns = np.divmod(np.arange(height * width), width)
+    pixels = (rows * step + step // 2) * k.width + columns * step + step // 2
+    depth_mm = clip.depth_mm[reference].reshape(-1)[pixels]
+    trusted = np.flatnonzero((tracks.confidence.mean(0).reshape(-1) > TRUSTED) & (depth_mm > 0))
+    some = trusted[np.linspace(0, len(trusted) - 1, min(CELLS, len(trusted))).round().astype(np.intp)]
+    confidence = tracks.confidence.reshape(frames, -1)[:, some].astype(np.float64)
+
+    z = depth_mm[some].astype(np.float64)
+    right, down, away = pose[:3, :3].T  # camera axes in the world
+    across = (columns[some] * step + step // 2 + 0.5 - k.cx) / k.fx
+    along = (rows[some] * step + step // 2 + 0.5 - k.cy) / k.fy
+    px_per_mm = np.stack(
+        [
+            k.fx / z[:, None] * (right - across[:, None] * away),
+            k.fy / z[:, None] * (down - along[:, None] * away),
+        ],
+        axis=1,
+    )  # [n, 2, 3]
+    grey_per_mm = _slopes(clip.rgb[reference], (width, height), step).reshape(-1, 3, 2)[some] @ px_per_mm
+    displacement_mm = tracks.displacement_mm.reshape(frames, -1, 3)[:, some]
+    shifted = np.einsum("ncd,knd->knc", grey_per_mm, displacement_mm)
+    colour = 255 * tracks.colour.reshape(frames, -1, 3)[:, some]
+    return np.concatenate([shifted, colour], axis=2), confidence
+
+
+def _slopes(rgb: NDArray[np.uint8], size: tuple[int, int], step: int) -> Reals:
+    """[h, w, 3, 2] grey levels a clip pixel to the right and down, on the tracks' grid of (w, h) cells."""
+    small = cv2.resize(rgb[: size[1] * step, : size[0] * step], size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    slopes = [cv2.Scharr(small, cv2.CV_32F, int(axis == 0), int(axis == 1)) / (32 * step) for axis in range(2)]
+    return np.stack(slopes, axis=-1).astype(np.float64)
+
+
+def _left_out_error(series: Reals, confidence: Reals, times: Reals, left_out: NDArray[np.bool_], bases: int) -> float:
+    """Mean squared error a channel in the frames left out, of the series fitted to the others as motion.py fits."""
+    shared = SharedBasis.initial(1, bases=bases, times=times[~left_out].tolist())
+    basis = np.stack([shared.basis(float(t)).double().numpy() for t in times])
+    fitted, trust = basis[~left_out], confidence[~left_out]
+    difference = np.diff(np.eye(bases), axis=0)
+    prior = STEADINESS * difference.T @ difference + RIDGE * np.eye(bases)
+    outer = (fitted[:, :, None] * fitted[:, None, :]).reshape(len(fitted), -1)
+    normal = (trust.T @ outer).reshape(-1, bases, bases) + prior
+    right = np.tensordot(series[~left_out] * trust[..., None], fitted, (0, 0)).transpose(0, 2, 1)
+    weights = np.linalg.solve(normal, right)  # [n, B, 6]
+    missed = series[left_out] - np.einsum("kb,nbc->knc", basis[left_out], weights)
+    weight = confidence[left_out]
+    return float((missed**2 * weight[..., None]).sum() / max(3 * weight.sum(), 1e-9))
