@@ -28,7 +28,10 @@ FRAMES_A_BASIS = 3
 """Training frames a basis stands for where nothing could be followed."""
 WORTH_DB = 0.25
 """More bases have to lower the expected error of the picture by more than this."""
-CELLS = 500
+TRAINED_SHARE = 0.1
+"""Gaussians that are trained leave about a tenth of the squared error of a grid of colours as fine as they start:
+they place and shape themselves. Measured on a still clip at 2 to 4 pixels, where 0.04 to 0.14 were left."""
+CELLS = 1000
 """Tracks on which bases are tried."""
 FEWEST_CELLS = 30
 FEWEST_FRAMES = 8
@@ -87,8 +90,11 @@ def choose_bases(errors: dict[int, float], floor: float, frames: int) -> Choice:
     return Choice(bases, f"the fewest within {WORTH_DB} dB of the best; in frames left out {left} of 255 grey levels")
 
 
-def grid_error(clip: DepthClip, index: int, stride: int) -> float:
-    """Mean squared error a channel, in squared grey levels, of the frame's tissue shown by points stride px apart."""
+def floor_error(clip: DepthClip, index: int, stride: int) -> float:
+    """What Gaussians that start stride px apart leave of the frame's tissue, whatever moves: squared grey levels.
+
+    TRAINED_SHARE of the error of a grid of mean colours with linear interpolation between them.
+    """
     height, width = clip.tissue.shape[1:]
     few = (max(1, round(width / stride)), max(1, round(height / stride)))
     tissue = clip.tissue[index].astype(np.float32)
@@ -96,7 +102,7 @@ def grid_error(clip: DepthClip, index: int, stride: int) -> float:
     image = clip.rgb[index].astype(np.float32)
     mean = cv2.resize(image * tissue[..., None], few, interpolation=cv2.INTER_AREA) / weight[..., None]
     missed = (cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR) - image)[clip.tissue[index]]
-    return float(np.square(missed).mean()) if missed.size else 0.0
+    return TRAINED_SHARE * float(np.square(missed).mean()) if missed.size else 0.0
 
 
 def _series(tracks: Tracks, clip: DepthClip, reference: int) -> tuple[Reals, Reals]:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from contract.camera import Intrinsics
-from worker.capacity import choose_bases, errors_by_bases, grid_error
+from worker.capacity import choose_bases, errors_by_bases, floor_error
 from worker.clip import DepthClip
 from worker.deformation import FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
 from worker.deformation.base import CHANNELS, MEAN
@@ -45,7 +45,7 @@ def settled(
         words.append(f"Gaussians were started {stride} pixels apart: nearest to {preset.points_per_image} an image.")
     if preset.bases is None:
         errors = errors_by_bases(tracks, clip, train) if tracks is not None else {}
-        choice = choose_bases(errors, grid_error(clip, train[0], stride), len(train))
+        choice = choose_bases(errors, floor_error(clip, train[0], stride), len(train))
         preset = dataclasses.replace(preset, bases=choice.count)
         words.append(f"Motion has {choice.count} bases: {choice.reason}.")
     return preset, tuple(words)
