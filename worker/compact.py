@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,7 +66,7 @@ class Prepared:
     """A scene in its new coordinates and order, to be rounded at any step.
 
     state    [N, STATE]  means over the trained times
-    motion   [N, C, R]   coefficients of the patterns
+    motion   [N, C, R]   coefficients of the patterns, float32
     pattern  [C, R, B]   weights of each pattern
     power    [N, 3]      of two: precision of place, shape and colour
     effect   [STATE]     root mean squared change of the picture by errors of 2**-power in all Gaussians
@@ -74,7 +75,7 @@ class Prepared:
     """
 
     state: Reals
-    motion: Reals
+    motion: NDArray[np.float32]
     pattern: Reals
     power: Whole
     effect: Reals
@@ -112,7 +113,7 @@ class Compact:
         mixing = _OPPONENT.astype(np.float32)
         state[:, COLOUR] = state[:, COLOUR] @ mixing
         if channels == CHANNELS_WITH_COLOUR:
-            weight[:, COLOUR] = np.einsum("nob,oi->nib", weight[:, COLOUR], mixing)
+            weight[:, COLOUR] = mixing.T @ weight[:, COLOUR]
         held = torch.from_numpy(np.ascontiguousarray(state, np.float32))
         gaussians = Gaussians(
             mean=held[:, PLACE].contiguous(),
@@ -127,20 +128,23 @@ class Compact:
     def tensors(self) -> dict[str, Tensor]:
         """What is stored: the table, differenced where that helps, level by level, and coded; the rest as it is."""
         table, levels = self.table.astype(np.int64), _levels(len(self.table))
-        differences = table.copy()
+        stored, shared = self.table[_coarse_first(levels)], np.zeros(table.shape[1], np.uint8)
         for columns, power in _groups(table, self.pattern.shape):
+            part = table[:, columns]
+            differences = part.copy()
             for even, odd, right in levels:
-                differences[np.ix_(odd, columns)] -= _between(table[:, columns], power, even, odd, right)
-        shared = _digits(differences) < _digits(table)
-        stored = np.where(shared, differences, table)[_coarse_first(levels)]
-        codes = [torch.from_numpy(np.frombuffer(code, np.uint8).copy()) for code in encode(stored.astype(np.int32))]
+                differences[odd] -= _between(part, power, even, odd, right)
+            helped = np.abs(differences).sum(0) < np.abs(part).sum(0)
+            shared[columns] = helped
+            stored[:, columns[helped]] = differences[:, helped][_coarse_first(levels)]
+        codes = [torch.from_numpy(np.frombuffer(code, np.uint8).copy()) for code in encode(stored)]
         return {
             "count": torch.tensor([len(table)]),
             "step": torch.from_numpy(self.step),
             "pattern": torch.from_numpy(self.pattern),
             "centre": self.centre,
             "width": self.width,
-            "shared": torch.from_numpy(shared.astype(np.uint8)),
+            "shared": torch.from_numpy(shared),
             **{f"code.{part}": code for part, code in enumerate(codes)},
         }
 
@@ -157,22 +161,22 @@ def prepare(
     """
     order = np.argsort(_along_curve(gaussians.mean.double().numpy()), kind="stable")
     state = _state_of(gaussians)[order]
-    weight = deformation.weight.double().numpy()[order]
+    weight = deformation.weight.numpy()[order]
     effect = effect[:, order].copy()
     channels = weight.shape[1]
     values = np.stack([deformation.basis(t).double().numpy() for t in trained_t])  # [T, B]
-    mean = weight @ values.mean(0)
+    mean = weight @ values.mean(0).astype(np.float32)
     state[:, :channels] += mean
-    weight = weight - mean[:, :, None]  # the bases sum to 1
+    weight -= mean[:, :, None]  # the bases sum to 1
     length = np.linalg.norm(state[:, 3:7], axis=1)
     length[length == 0] = 1
     state[:, 3:7] /= length[:, None]
-    weight[:, 3:7] /= length[:, None, None]
+    weight[:, 3:7] /= length[:, None, None].astype(np.float32)
     effect[3:7] *= length**2
     state[:, COLOUR] = state[:, COLOUR] @ _OPPONENT.T
     effect[COLOUR] = effect[COLOUR].mean(0)
     if channels == CHANNELS_WITH_COLOUR:
-        weight[:, COLOUR] = np.einsum("oi,nib->nob", _OPPONENT, weight[:, COLOUR])
+        weight[:, COLOUR] = _OPPONENT.astype(np.float32) @ weight[:, COLOUR]
 
     power = np.stack([_power(effect[group]) for group in (PLACE, SHAPE, COLOUR)], axis=1)
     scale = np.exp2(power)[:, GROUP_OF]
@@ -194,18 +198,20 @@ def round_to(prepared: Prepared, step: float) -> Compact:
     channels = prepared.pattern.shape[0]
     steps = step / prepared.effect
     units = np.exp2(prepared.power)[:, GROUP_OF] / steps  # [N, STATE]
-    columns = [
-        np.rint(prepared.state * units),
-        np.rint(prepared.motion * units[:, :channels, None]).reshape(len(units), -1),
+    motion = prepared.motion * units[:, :channels, None].astype(np.float32)
+    parts: list[NDArray[Any]] = [
+        prepared.state * units,
+        motion.reshape(len(units), -1),
         prepared.power,
-        np.rint(prepared.seen[:, None] * SEEN_LEVELS),
+        prepared.seen[:, None] * SEEN_LEVELS,
     ]
-    table = np.concatenate(columns, axis=1)
-    if not np.abs(table).max() <= LARGEST_STORED:
-        raise ValueError(f"a step of {step:g} makes numbers as large as {np.abs(table).max():g}")
+    largest = max(float(np.abs(part).max(initial=0)) for part in parts)
+    if not largest <= LARGEST_STORED:
+        raise ValueError(f"a step of {step:g} makes numbers as large as {largest:g}")
+    table: NDArray[np.int32] = np.concatenate([np.rint(part).astype(np.int32) for part in parts], axis=1)
     pattern = np.ascontiguousarray(prepared.pattern * steps[:channels, None, None], np.float32)
     basis = prepared.basis
-    return Compact(table.astype(np.int32), steps.astype(np.float32), pattern, basis.centre, basis.width)
+    return Compact(table, steps.astype(np.float32), pattern, basis.centre, basis.width)
 
 
 def read(tensors: Mapping[str, Tensor]) -> Compact:
@@ -301,12 +307,6 @@ def _coarse_first(levels: Sequence[Level]) -> NDArray[np.intp]:
     return np.concatenate([np.zeros(1, np.intp), *(odd for _, odd, _ in reversed(levels))])
 
 
-def _digits(table: Whole) -> Reals:
-    """About the digits each column takes."""
-    digits: Reals = np.log2(1.0 + np.abs(table)).sum(0)
-    return digits
-
-
 def _state_of(gaussians: Gaussians) -> Reals:
     columns = [
         gaussians.mean,
@@ -328,7 +328,7 @@ def _power(effect: Reals) -> Whole:
     return power
 
 
-def _patterns(weight: Reals, values: Reals, scale: Reals) -> tuple[Reals, Reals]:
+def _patterns(weight: NDArray[np.float32], values: Reals, scale: Reals) -> tuple[NDArray[np.float32], Reals]:
     """Coefficients [N, C, R] and patterns [C, R, B] of weights [N, C, B] whose mean over the times is 0.
 
     values [T, B] of the bases at the trained times; scale [N, C or more], precision of each Gaussian's channel.
@@ -337,15 +337,16 @@ def _patterns(weight: Reals, values: Reals, scale: Reals) -> tuple[Reals, Reals]
     strength = values.T @ values / len(values)
     strength += RIDGE * np.trace(strength) / bases * np.eye(bases)
     root = np.linalg.cholesky(strength)  # errors of equal size after it weigh the same over the trained times
-    coefficients, patterns = [], []
+    coefficients = np.empty((*weight.shape[:2], bases - 1), np.float32)
+    patterns = np.empty((weight.shape[1], bases - 1, bases))
     for channel in range(weight.shape[1]):
-        seen = weight[:, channel] @ root
-        scaled = seen * scale[:, channel, None]
-        _, components = np.linalg.eigh(scaled.T @ scaled)
+        seen = weight[:, channel] @ root.astype(np.float32)
+        scaled = seen * scale[:, channel, None].astype(np.float32)
+        _, components = np.linalg.eigh((scaled.T @ scaled).astype(np.float64))
         kept = components[:, :0:-1]  # the weakest is nothing: the mean over time has been taken out
-        coefficients.append(seen @ kept)
-        patterns.append(np.linalg.solve(root.T, kept).T)
-    return np.stack(coefficients, 1), np.stack(patterns)
+        coefficients[:, channel] = seen @ kept.astype(np.float32)
+        patterns[channel] = np.linalg.solve(root.T, kept).T
+    return coefficients, patterns
 
 
 def _along_curve(mean: Reals) -> Whole:

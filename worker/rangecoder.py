@@ -37,10 +37,9 @@ ONE = 1 << 16
 QUICK, SLOW = 4, 7
 DEAREST_BITS = 10
 """What a bit costs at most: estimates stop at 15 and 127 of ONE, and log2(ONE / 71) is 9.9."""
-AVERAGE = 16
+AVERAGE = 64
 """Activity of a number as large as its row's average."""
 MOST_ACTIVE = 6 * AVERAGE
-_LOW, _RANGE, _HELD, _PENDING, _PLACE = range(5)
 _TOP = np.uint64(1 << 24)
 _FULL = np.uint64(0xFFFFFFFF)
 _BYTE = np.uint64(8)
@@ -99,32 +98,33 @@ def _encode(table, out):  # type: ignore[no-untyped-def]
     """Code a table into out; returns the bytes written."""
     count, rows = table.shape
     models, average, nearby = _start(rows)
-    state = np.zeros(5, np.uint64)
-    state[_RANGE], state[_PENDING] = _FULL, 1
+    # Low; the range; the byte held back, as a carry may come; that and the 255s behind it, counted; bytes written.
+    # Plain numbers that are handed around: an array of them would be slower.
+    state = np.uint64(0), _FULL, np.uint64(0), 1, 0
     for n in range(count):
         here = AVERAGE
         for k in range(rows):
             number = table[n, k]
             magnitude = abs(number)
-            set_ = models[k, _bucket((here + nearby[k]) >> 1)]
+            set_ = models[k, _bucket((3 * here + nearby[k]) >> 2)]
             digits = 0
             while magnitude >> digits:
-                _tell(state, out, set_[digits], 1)
+                state = _tell(state, out, set_[digits], 1)
                 digits += 1
-            _tell(state, out, set_[digits], 0)
+            state = _tell(state, out, set_[digits], 0)
             if digits:
-                _tell_plain(state, out, number < 0)
+                state = _tell_plain(state, out, number < 0)
             for digit in range(digits - 2, -1, -1):
                 bit = (magnitude >> digit) & 1
                 model = _digit_model(digits, digit, magnitude)
                 if model:
-                    _tell(state, out, set_[model], bit)
+                    state = _tell(state, out, set_[model], bit)
                 else:
-                    _tell_plain(state, out, bit)
+                    state = _tell_plain(state, out, bit)
             here = _follow(magnitude, here, average, nearby, k)
     for _ in range(5):
-        _shift(state, out)
-    return state[_PLACE]
+        state = _shift(state, out)
+    return state[4]
 
 
 @njit(cache=True, nogil=True)
@@ -132,28 +132,35 @@ def _decode(code, table):  # type: ignore[no-untyped-def]
     """Read a table from its code; returns the bytes that the coder of this table has written, or -1."""
     count, rows = table.shape
     models, average, nearby = _start(rows)
-    state = np.zeros(5, np.uint64)
-    state[_RANGE] = _FULL
+    state = np.uint64(0), _FULL, np.int64(0)  # how far the code lies above the range's start; the range; bytes read
     for _ in range(5):
-        _take(state, code)
+        state = _take(state, code)
     for n in range(count):
         here = AVERAGE
         for k in range(rows):
-            set_ = models[k, _bucket((here + nearby[k]) >> 1)]
+            set_ = models[k, _bucket((3 * here + nearby[k]) >> 2)]
             digits = 0
-            while digits < 31 and _ask(state, code, set_[digits]):
+            while digits < 31:
+                state, bit = _ask(state, code, set_[digits])
+                if not bit:
+                    break
                 digits += 1
-            if digits > 30 or state[_PLACE] > np.uint64(len(code)):
+            if digits > 30 or state[2] > len(code):
                 return -1
-            magnitude = 1 if digits else 0
-            negative = digits > 0 and _ask_plain(state, code)
+            magnitude, negative = 0, 0
+            if digits:
+                magnitude = 1
+                state, negative = _ask_plain(state, code)
             for digit in range(digits - 2, -1, -1):
                 model = _digit_model(digits, digit, magnitude << (digit + 1))
-                bit = _ask(state, code, set_[model]) if model else _ask_plain(state, code)
+                if model:
+                    state, bit = _ask(state, code, set_[model])
+                else:
+                    state, bit = _ask_plain(state, code)
                 magnitude = 2 * magnitude + bit
             table[n, k] = -magnitude if negative else magnitude
             here = _follow(magnitude, here, average, nearby, k)
-    return np.int64(state[_PLACE])
+    return state[2]
 
 
 @njit(cache=True, nogil=True)
@@ -165,8 +172,8 @@ def _start(rows):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _bucket(activity):  # type: ignore[no-untyped-def]
-    """0 below 3, then one more at 4, 6, 9, 13, ...: each threshold half as much again."""
-    bucket, threshold = 0, 3
+    """0 below 14, then one more at 21, 31, 46, ...: each threshold half as much again."""
+    bucket, threshold = 0, 14
     while bucket < BUCKETS - 1 and activity >= threshold:
         bucket += 1
         threshold += threshold >> 1
@@ -186,10 +193,10 @@ def _digit_model(digits, digit, magnitude):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _follow(magnitude, here, average, nearby, k):  # type: ignore[no-untyped-def]
     """After a number: its row's average and activity; returns the Gaussian's activity."""
-    average[k] += ((magnitude << 8) - average[k]) >> 5
-    activity = min((magnitude << 12) // (average[k] + AVERAGE), MOST_ACTIVE)
-    nearby[k] += (activity - nearby[k]) >> 2
-    return here + ((activity - here) >> 2)
+    average[k] += ((magnitude << 8) - average[k]) >> 7
+    activity = min((magnitude << 14) // (average[k] + AVERAGE), MOST_ACTIVE)
+    nearby[k] += (activity - nearby[k]) >> 3
+    return here + ((activity - here) >> 3)
 
 
 @njit(cache=True, nogil=True)
@@ -203,82 +210,82 @@ def _adapt(model, bit):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _bound(state, model):  # type: ignore[no-untyped-def]
-    """Where the range is cut: a 0 takes what is below."""
-    return (state[_RANGE] >> np.uint64(16)) * np.uint64((model[0] + model[1]) >> 1)
+def _bound(width, model):  # type: ignore[no-untyped-def]
+    """Where a range is cut: a 0 takes what is below."""
+    return (width >> np.uint64(16)) * np.uint64((model[0] + model[1]) >> 1)
 
 
 @njit(cache=True, nogil=True)
 def _tell(state, out, model, bit):  # type: ignore[no-untyped-def]
-    _cut(state, out, _bound(state, model), bit)
+    state = _cut(state, out, _bound(state[1], model), bit)
     _adapt(model, bit)
+    return state
 
 
 @njit(cache=True, nogil=True)
 def _tell_plain(state, out, bit):  # type: ignore[no-untyped-def]
-    _cut(state, out, state[_RANGE] >> np.uint64(1), bit)
+    return _cut(state, out, state[1] >> np.uint64(1), bit)
 
 
 @njit(cache=True, nogil=True)
 def _cut(state, out, bound, bit):  # type: ignore[no-untyped-def]
+    low, width, held, pending, place = state
     if bit:
-        state[_LOW] += bound
-        state[_RANGE] -= bound
+        low += bound
+        width -= bound
     else:
-        state[_RANGE] = bound
-    while state[_RANGE] < _TOP:
-        state[_RANGE] <<= _BYTE
-        _shift(state, out)
+        width = bound
+    while width < _TOP:
+        low, width, held, pending, place = _shift((low, width << _BYTE, held, pending, place), out)
+    return low, width, held, pending, place
 
 
 @njit(cache=True, nogil=True)
 def _shift(state, out):  # type: ignore[no-untyped-def]
     """Move low's top byte out, once it is known whether a carry comes; until then 255s are only counted."""
-    low = state[_LOW]
+    low, width, held, pending, place = state
     if low < np.uint64(0xFF000000) or low > _FULL:
         carry = low >> np.uint64(32)
-        while state[_PENDING]:
-            out[state[_PLACE]] = np.uint8((state[_HELD] + carry) & np.uint64(255))
-            state[_PLACE] += np.uint64(1)
-            state[_PENDING] -= np.uint64(1)
-            state[_HELD] = np.uint64(255)
-        state[_HELD] = (low >> np.uint64(24)) & np.uint64(255)
-    state[_PENDING] += np.uint64(1)
-    state[_LOW] = (low & np.uint64(0x00FFFFFF)) << _BYTE
+        while pending:
+            out[place] = np.uint8((held + carry) & np.uint64(255))
+            place += 1
+            pending -= 1
+            held = np.uint64(255)
+        held = (low >> np.uint64(24)) & np.uint64(255)
+    return (low & np.uint64(0x00FFFFFF)) << _BYTE, width, held, pending + 1, place
 
 
 @njit(cache=True, nogil=True)
 def _ask(state, code, model):  # type: ignore[no-untyped-def]
-    bit = _which(state, code, _bound(state, model))
+    state, bit = _which(state, code, _bound(state[1], model))
     _adapt(model, bit)
-    return bit
+    return state, bit
 
 
 @njit(cache=True, nogil=True)
 def _ask_plain(state, code):  # type: ignore[no-untyped-def]
-    return _which(state, code, state[_RANGE] >> np.uint64(1))
+    return _which(state, code, state[1] >> np.uint64(1))
 
 
 @njit(cache=True, nogil=True)
 def _which(state, code, bound):  # type: ignore[no-untyped-def]
-    """1 where the code lies above the cut; low holds how far above the range's start it lies."""
+    """The new state, and 1 where the code lies above the cut."""
+    above, width, place = state
     bit = 0
-    if state[_LOW] >= bound:
-        state[_LOW] -= bound
-        state[_RANGE] -= bound
+    if above >= bound:
+        above -= bound
+        width -= bound
         bit = 1
     else:
-        state[_RANGE] = bound
-    while state[_RANGE] < _TOP:
-        state[_RANGE] <<= _BYTE
-        _take(state, code)
-    return bit
+        width = bound
+    while width < _TOP:
+        above, width, place = _take((above, width << _BYTE, place), code)
+    return (above, width, place), bit
 
 
 @njit(cache=True, nogil=True)
 def _take(state, code):  # type: ignore[no-untyped-def]
-    """The next byte into low; behind the end there are zeros."""
-    place = state[_PLACE]
-    byte = np.uint64(code[place]) if place < np.uint64(len(code)) else np.uint64(0)
-    state[_LOW] = ((state[_LOW] << _BYTE) | byte) & _FULL
-    state[_PLACE] = place + np.uint64(1)
+    """The next byte; behind the end there are zeros."""
+    above, width, place = state
+    byte = np.uint64(code[place]) if place < len(code) else np.uint64(0)
+    return ((above << _BYTE) | byte) & _FULL, width, place + 1
