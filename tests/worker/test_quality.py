@@ -151,6 +151,7 @@ def test_a_view_that_is_not_finite_stops_the_scene(broken: str) -> None:
         (scores(29.0), scores(), BELOW, "copying the neighbouring frames scores more: blending at 30.0 dB and warping"),
         (scores(30.5), scores(31.0), BELOW, "scores more: warping (optical flow) at 31.0 dB"),
         (scores(20.0), scores(20.0), BELOW, "only 20.0 dB: do not rely on this scene"),
+        (scores(23.2), scores(25.1), BELOW, "Held-out frames are reproduced at only 23.2 dB"),
         (scores(31.5), scores(37.0), BELOW, "score 5.5 dB less than trained ones"),
         (scores(covered=0.9), scores(), BELOW, "10.0% of the tissue uncovered"),
         (scores(depth_agreement_mm=4.0), scores(), BELOW, "differ by 4.0 mm (median) at a depth of 60 mm"),
@@ -163,7 +164,18 @@ def test_a_view_that_is_not_finite_stops_the_scene(broken: str) -> None:
             "held-out frames 2 (25.0 dB)",
         ),
     ],
-    ids=["blend", "flow", "failed", "gap", "holes", "depth", "no depth", "nothing held out", "one frame"],
+    ids=[
+        "blend",
+        "flow",
+        "failed",
+        "failed between",
+        "gap",
+        "holes",
+        "depth",
+        "no depth",
+        "nothing held out",
+        "one frame",
+    ],
 )
 def test_every_failure_is_told(held_out: Scores, trained: Scores, baselines: CopyBaselines, said: str) -> None:
     assert any(said in each for each in score_warnings(held_out, trained, baselines))
