@@ -47,8 +47,8 @@ the picture is larger, and cost time and bytes in proportion.
 _RASTER = """
 ## Splatting on the CPU
 
-`python benchmarks/bm_raster.py --csv docs/results/raster.csv` ([raster.csv](raster.csv)): 640x512, 36,423 Gaussians on
-a 3-pixel grid, medians in ms.
+`python benchmarks/bm_raster.py --csv docs/results/raster.csv` ([raster.csv](raster.csv)): 640x512, 40,096 Gaussians on
+a grid of 2.86 pixels, medians in ms.
 """
 _SCENE = """
 The model that `intrasplat reconstruct CLIP --iterations 600 --out s600` ends with on `d4d-a`:
