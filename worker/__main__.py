@@ -100,7 +100,10 @@ def _add_reconstruct(commands: Commands) -> None:
         help="frames kept from training to measure quality on (default: every8); LIST such as 1,9,17",
     )
     parser.add_argument(
-        "--preset", choices=get_args(PresetName), default="fast", help="fast, ours, is the default; paper, as published"
+        "--preset",
+        choices=get_args(PresetName),
+        default="fast",
+        help="ours: instant, fast (default), quality; paper: as published",
     )
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-s", type=positive, metavar="S", help="seconds of training (default: the preset's)")

@@ -1,4 +1,4 @@
-"""What distinguishes the ways of training: `fast`, ours; `paper` and its variants, as published; the rivals.
+"""What distinguishes the ways of training: `instant`, `fast`, `quality`, ours; `paper` and its variants; the rivals.
 
 A preset is data only; train.py reads it. Rates are in optimiser units (median depth 60).
 """
@@ -110,7 +110,7 @@ _FAST_RATES = Rates(
 _FAST = Preset(
     name="fast",
     fusion=FusionSettings(mode="fill"),
-    points_per_image=40_000,
+    points_per_image=80_000,
     deformation="shared",
     bases=None,
     tracks=True,
@@ -131,7 +131,9 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
     {
         preset.name: preset
         for preset in (
+            replace(_FAST, name="instant", points_per_image=40_000, budget_s=6.0),
             _FAST,
+            replace(_FAST, name="quality", budget_s=240.0),
             _PAPER,
             replace(_PAPER, name="paper-released", deformation="fdm-quartic"),
             replace(_PAPER, name="paper-wide", start_width=0.6 / 16),
@@ -141,7 +143,8 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
         )
     }
 )
-"""Every preset by its name; `paper-wide` starts FDM's bases as wide as 0.6 of their spacing."""
+"""Every preset by its name. `instant` and `quality` are `fast` for less and for more time; `paper-wide` starts FDM's
+bases as wide as 0.6 of their spacing."""
 
 
 def preset_named(name: str) -> Preset:

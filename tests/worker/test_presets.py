@@ -30,9 +30,9 @@ def test_a_preset_is_found_under_its_own_name(name: str) -> None:
 
 def test_an_unknown_preset_is_refused_with_those_there_are() -> None:
     with pytest.raises(InputError) as refused:
-        preset_named("quality")
+        preset_named("best")
     assert refused.value.field == "options.preset"
-    assert "'quality'" in refused.value.problem
+    assert "'best'" in refused.value.problem
     assert all(name in refused.value.remedy for name in PRESETS)
 
 
@@ -45,6 +45,14 @@ def test_a_preset_has_a_length_of_its_own(name: str) -> None:
 @pytest.mark.parametrize(("name", "fields"), VARIANTS.items())
 def test_a_rival_differs_from_the_paper_in_what_it_is_named_for_alone(name: str, fields: set[str]) -> None:
     assert differing(PRESETS[name], PRESETS["paper"]) == fields
+
+
+def test_ours_differ_in_time_and_in_how_many_gaussians_it_pays_for() -> None:
+    instant, fast, quality = (PRESETS[name] for name in ("instant", "fast", "quality"))
+    for other in (instant, quality):
+        assert differing(other, fast) <= {"points_per_image", "budget_s"}
+    budgets = [preset.budget_s or 0.0 for preset in (instant, fast, quality)]
+    assert budgets == sorted(set(budgets))
 
 
 def test_the_paper_is_trained_as_published() -> None:
