@@ -1,0 +1,113 @@
+"""A model is as large as its scene needs, and the report says why."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.worker.phantoms import phantom_clip, prepared_on
+from worker.capacity import BASES, FEWEST_FRAMES, WORTH_DB, choose_bases, errors_by_bases, floor_error
+from worker.clip import DepthClip, split_frames
+from worker.motion import Tracks, track
+from worker.phantom import Motion
+from worker.presets import PRESETS
+from worker.start import bases_of, settled
+
+FAST = PRESETS["fast"]
+FRAMES = 40
+
+
+@cache
+def followed(motion: Motion) -> tuple[DepthClip, list[int], Tracks]:
+    clip = phantom_clip(motion, frames=FRAMES)
+    train = split_frames(clip).train
+    return clip, train, track(clip, train)
+
+
+def bases_for(motion: Motion) -> int:
+    clip, train, tracks = followed(motion)
+    bases = settled(FAST, tracks, clip, train)[0].bases
+    assert bases is not None
+    return bases
+
+
+def faster(clip: DepthClip, every: int) -> DepthClip:
+    """Every so many frames of the clip: the same tissue, moving so many times as fast."""
+    per_frame = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera", "frame_times_s")
+    return dataclasses.replace(clip, **{name: getattr(clip, name)[::every] for name in per_frame})
+
+
+def test_a_still_clip_gets_the_fewest_bases() -> None:
+    assert bases_for("still") == BASES[0]
+
+
+@pytest.mark.parametrize("motion", ["breathing", "pull", "cut"])
+def test_a_clip_that_moves_gets_more(motion: Motion) -> None:
+    assert bases_for(motion) > BASES[0]
+
+
+def test_faster_motion_never_gets_fewer_bases_for_as_many_frames() -> None:
+    clip = phantom_clip("breathing", frames=2 * FRAMES)
+    chosen = []
+    for every in (1, 2):
+        quicker = faster(clip, every)
+        frames = list(range(FRAMES))
+        chosen.append(settled(FAST, track(quicker, frames), quicker, frames)[0].bases or 0)
+    assert chosen[0] <= chosen[1]
+
+
+def test_held_out_frames_are_never_read() -> None:
+    clip, train, tracks = followed("breathing")
+    held_out = sorted(set(range(clip.frame_count)) - set(train))
+    poisoned = dataclasses.replace(clip, rgb=clip.rgb.copy(), tissue=clip.tissue.copy(), depth_mm=clip.depth_mm.copy())
+    poisoned.rgb[held_out], poisoned.tissue[held_out], poisoned.depth_mm[held_out] = 255, False, np.nan
+    assert errors_by_bases(track(poisoned, train), poisoned, train) == errors_by_bases(tracks, clip, train)
+    assert settled(FAST, tracks, poisoned, train) == settled(FAST, tracks, clip, train)
+
+
+def test_the_choice_is_the_fewest_within_the_tolerance_of_the_best() -> None:
+    errors = {3: 100.0, 5: 30.0, 9: 20.4, 17: 20.0, 33: 21.0}
+    assert choose_bases(errors, 0.0, 60).count == 9
+    assert choose_bases({**errors, 9: 20.0 * 10 ** (WORTH_DB / 10) + 0.1}, 0.0, 60).count == 17
+
+
+def test_the_less_the_gaussians_can_show_the_fewer_bases_are_worth_it() -> None:
+    errors = {3: 100.0, 5: 30.0, 9: 20.4, 17: 20.0, 33: 21.0}
+    counts = [choose_bases(errors, floor, 60).count for floor in (0.0, 100.0, 300.0, 3000.0)]
+    assert counts == sorted(counts, reverse=True)
+    assert counts[-1] == 3
+
+
+def test_gaussians_farther_apart_leave_more_of_the_picture() -> None:
+    clip, train, _ = followed("still")
+    left = [floor_error(clip, train[0], stride) for stride in (1, 2, 3, 4, 6)]
+    assert left == sorted(left)
+    assert left[0] == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize("frames", [1, 2, FEWEST_FRAMES - 1])
+def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: int) -> None:
+    clip = phantom_clip(frames=frames)
+    train = list(range(frames))
+    preset, words = settled(FAST, track(clip, train) if frames > 1 else None, clip, train)
+    assert preset.bases is not None
+    assert 1 <= preset.bases <= frames
+    assert any("too little could be followed" in each for each in words)
+
+
+@pytest.mark.parametrize("bases", [3, 9, 33])
+def test_a_fixed_number_is_kept_to(bases: int) -> None:
+    clip, train, tracks = followed("breathing")
+    fixed = dataclasses.replace(FAST, bases=bases)
+    assert settled(fixed, tracks, clip, train)[0] == fixed
+
+
+def test_the_report_is_told_what_was_chosen() -> None:
+    clip = phantom_clip()
+    run = prepared_on(clip, split_frames(clip))
+    bases = bases_of(run.model.export()[1])
+    assert any(each.startswith(f"Motion has {bases} bases: ") for each in run.chosen)
+    assert prepared_on(clip, split_frames(clip)).chosen == run.chosen
