@@ -278,14 +278,16 @@ def _capacity(found: Sequence[Capacity]) -> str:
     rows = [
         [*each.chosen.place, each.chosen.series, each.chosen.limit, _number(each.chosen.median("psnr_tissue_db"), 2),
          each.best.series.partition(":")[2], _number(each.best.median("psnr_tissue_db"), 2),
-         f"{each.difference_db:+.2f}", f"{each.deviation_db:.2f}", str(each.seeds),
+         f"{each.difference_db:+.2f}", _number(each.deviation_db, 2), str(each.seeds),
          _number(each.chosen.median("scene_bytes") / 1e6, 2), _number(each.best.median("scene_bytes") / 1e6, 2)]
         for each in found
     ]  # fmt: skip
-    within = sum(each.difference_db >= -0.1 for each in found)
-    smaller = sum(each.chosen.median("scene_bytes") <= each.best.median("scene_bytes") for each in found)
-    said = f"\nWithin 0.1 dB of the best or above it: {within} of {len(found)}; at no more bytes: {smaller}.\n"
-    return said + _table(header, rows)
+    within = [each for each in found if each.difference_db >= -0.1]
+    smaller = sum(each.chosen.median("scene_bytes") <= each.best.median("scene_bytes") for each in within)
+    said = (
+        f"\nWithin 0.1 dB of the best or above it: {len(within)} of {len(found)}, of them {smaller} at no more bytes."
+    )
+    return f"{said}\n{_table(header, rows)}"
 
 
 def _counted(runs: Sequence[Row]) -> str:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from statistics import fmean, median
+from statistics import fmean, median, stdev
 
 from worker.evaluate.cells import base_of
 from worker.evaluate.published import ABLATION
@@ -70,8 +70,8 @@ def groups_of(runs: Sequence[Row]) -> list[Group]:
 class Sooner:
     """How soon `ours` reaches the final psnr_tissue of `theirs` at a place; None where it does not.
 
-    All figures are medians over seeds. our_limit is the length, of those that were run, with which it is reached
-    soonest.
+    All figures are medians over seeds; theirs of the longest runs they were given. our_limit is the length, of those
+    that were run, with which it is reached soonest.
     """
 
     clip: str
@@ -103,14 +103,13 @@ def sooner(curves: Sequence[Row], ours: str = "fast", theirs: str = "paper") -> 
     runs = _curves_by_run(curves)
     found = []
     for place in dict.fromkeys((clip, holdout) for clip, holdout, *_ in runs):
-        ends = [points[-1] for key, points in runs.items() if key[:3] == (*place, theirs)]
-        limits = dict.fromkeys(key[4] for key in runs if key[:3] == (*place, ours))
-        if not ends or not limits:
+        of_theirs, of_ours = (_by_limit(runs, (*place, series)) for series in (theirs, ours))
+        if not of_theirs or not of_ours:
             continue
-        their_s, their_iterations, target_db = (median(values) for values in zip(*ends, strict=True))
+        ends = [_median_end(alike) for alike in of_theirs.values()]
+        their_s, their_iterations, target_db = max(ends, key=lambda end: end[1])
         crossings = []
-        for limit in limits:
-            alike = [points for key, points in runs.items() if key[:3] == (*place, ours) and key[4] == limit]
+        for limit, alike in of_ours.items():
             reached = [reach(points, target_db) for points in alike]
             crossings.append((median(s for s, _ in reached), median(n for _, n in reached), limit))
         our_s, our_iterations, limit = min(crossings)
@@ -150,11 +149,28 @@ def _curves_by_run(curves: Sequence[Row]) -> dict[tuple[str, str, str, str, str]
     return {key: sorted(points) for key, points in runs.items()}
 
 
+def _by_limit(
+    runs: Mapping[tuple[str, str, str, str, str], list[Point]], series: tuple[str, str, str]
+) -> dict[str, list[list[Point]]]:
+    """The curves of all seeds of a series at a place, by their length."""
+    found: dict[str, list[list[Point]]] = {}
+    for key, points in runs.items():
+        if key[:3] == series:
+            found.setdefault(key[4], []).append(points)
+    return found
+
+
+def _median_end(alike: Sequence[Sequence[Point]]) -> Point:
+    seconds, iterations, psnr_db = (median(values) for values in zip(*(points[-1] for points in alike), strict=True))
+    return seconds, iterations, psnr_db
+
+
 @dataclass(frozen=True)
 class Capacity:
     """The automatic choice beside the best of the grid at a place.
 
-    difference_db is the mean over seeds of chosen - best, each seed with itself; deviation_db its standard deviation.
+    difference_db is the mean over seeds of chosen - best, each seed with itself; deviation_db the standard deviation of
+    these differences, estimated from the seeds there are; NaN of one.
     The best is the grid's highest mean of the same held-out frames, so that it is flattered and the choice is not.
     """
 
@@ -186,9 +202,8 @@ def capacities(groups: Sequence[Group]) -> list[Capacity]:
         of_best = best.by_seed("psnr_tissue_db")
         pairs = [of_chosen[seed] - of_best[seed] for seed in of_chosen if seed in of_best]
         if pairs:
-            mean = fmean(pairs)
-            deviation = math.sqrt(fmean((pair - mean) ** 2 for pair in pairs))
-            found.append(Capacity(chosen, best, len(pairs), mean, deviation))
+            deviation_db = stdev(pairs) if len(pairs) > 1 else math.nan
+            found.append(Capacity(chosen, best, len(pairs), fmean(pairs), deviation_db))
     return found
 
 
