@@ -28,6 +28,10 @@ FRAMES_A_BASIS = 3
 """Training frames a basis stands for where nothing could be followed."""
 WORTH_DB = 0.25
 """More bases have to lower the expected error of the picture by more than this."""
+COARSEST = 4
+"""Points are at most so many times as far apart as in the finest grid: what is flat at first may be lit later."""
+MOST_POINTS = 80_000
+"""An image, where the scene decides: the finest grid that was measured."""
 TRAINED_SHARE = 0.1
 """Gaussians that are trained leave about a tenth of the squared error of a grid of colours as fine as they start:
 they place and shape themselves. Measured on a still clip at 2 to 4 pixels, where 0.04 to 0.14 were left."""
@@ -88,6 +92,20 @@ def choose_bases(errors: dict[int, float], floor: float, frames: int) -> Choice:
     told = sorted({min(errors), bases, best})
     left = ", ".join(f"{each} leave {math.sqrt(errors[each] + floor):.1f}" for each in told)
     return Choice(bases, f"the fewest within {WORTH_DB} dB of the best; in frames left out {left} of 255 grey levels")
+
+
+def choose_stride(clip: DepthClip, index: int, finest: int, least_error: float) -> Choice:
+    """Pixels between points: the most, up to COARSEST times the finest, whose expected error is within WORTH_DB of the
+    finest's; least_error is what the motion leaves whatever the points, squared grey levels."""
+    errors = {stride: floor_error(clip, index, stride) for stride in range(finest, COARSEST * finest + 1)}
+    allowed = (errors[finest] + least_error) * 10 ** (WORTH_DB / 10)
+    stride = max(each for each, error in errors.items() if error + least_error <= allowed)
+    left = ", ".join(
+        f"{each} would leave {math.sqrt(errors[each] + least_error):.1f}"
+        for each in (stride, stride + 1)
+        if each in errors
+    )
+    return Choice(stride, f"the most within {WORTH_DB} dB of {finest}; of 255 grey levels {left}")
 
 
 def floor_error(clip: DepthClip, index: int, stride: int) -> float:

@@ -211,16 +211,16 @@ def prepare(
     """Fuse points, start the model, and settle how many iterations are made; seconds by stage go into `seconds`."""
     hooks, seconds = hooks or Hooks(), {} if seconds is None else seconds
     scale = units_per_mm(clip, split.train)
-    fusion = fusion_for(preset, clip.intrinsics)
-    report_stage(hooks, "fusion", 0.0)
-    cloud = timed(seconds, "fusion_s", lambda: fuse(clip, split.train, fusion, seed=request.seed))
     tracks = None
     if preset.tracks and len(split.train) > 1:
         tracks = timed(
             seconds, "motion_s", lambda: track(clip, split.train, lambda share: report_stage(hooks, "motion", share))
         )
-    report_stage(hooks, "start", 0.0)
+    report_stage(hooks, "fusion", 0.0)
     preset, chosen = timed(seconds, "capacity_s", lambda: settled(preset, tracks, clip, split.train))
+    fusion = fusion_for(preset, clip.intrinsics)
+    cloud = timed(seconds, "fusion_s", lambda: fuse(clip, split.train, fusion, seed=request.seed))
+    report_stage(hooks, "start", 0.0)
     model = timed(
         seconds, "start_s", lambda: start_model(cloud, tracks, clip, split.train, preset, scale, request.seed)
     )

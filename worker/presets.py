@@ -22,7 +22,8 @@ class Preset:
     """One way of training.
 
     fusion           which points become Gaussians
-    points_per_image "fill" fusion takes the grid stride that comes nearest to this many points a frame
+    points_per_image "fill" fusion takes the grid stride that comes nearest to this many points a frame; None: as far
+                     apart as the scene's detail allows
     deformation      "shared", "fdm", "fdm-quartic", "pfs", "hexplane"
     bases            B of the deformation; None: as many as the scene's motion needs ("shared" alone)
     tracks           whether optical-flow tracks start the motion ("shared" only)

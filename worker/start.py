@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from contract.camera import Intrinsics
-from worker.capacity import choose_bases, errors_by_bases, floor_error
+from worker.capacity import MOST_POINTS, choose_bases, choose_stride, errors_by_bases, floor_error
 from worker.clip import DepthClip
 from worker.deformation import FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
 from worker.deformation.base import CHANNELS, MEAN
@@ -31,8 +31,11 @@ def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
     """The preset's fusion; "fill" with the stride whose grid comes nearest to points_per_image points."""
     if preset.points_per_image is None or preset.fusion.mode != "fill":
         return preset.fusion
-    stride = round(math.sqrt(intrinsics.width * intrinsics.height / preset.points_per_image))
-    return dataclasses.replace(preset.fusion, stride=max(MIN_STRIDE, stride))
+    return dataclasses.replace(preset.fusion, stride=_stride_for(preset.points_per_image, intrinsics))
+
+
+def _stride_for(points: int, intrinsics: Intrinsics) -> int:
+    return max(MIN_STRIDE, round(math.sqrt(intrinsics.width * intrinsics.height / points)))
 
 
 def settled(
@@ -40,12 +43,19 @@ def settled(
 ) -> tuple[Preset, tuple[str, ...]]:
     """The preset with what it leaves to the scene settled (docs/decisions/014), and why, in words for the report."""
     words = []
-    stride = fusion_for(preset, clip.intrinsics).stride
-    if preset.fusion.mode == "fill" and preset.points_per_image is not None:
-        words.append(f"Gaussians were started {stride} pixels apart: nearest to {preset.points_per_image} an image.")
+    left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
+    errors = errors_by_bases(tracks, clip, train) if tracks is not None and left_open else {}
+    fusion = fusion_for(preset, clip.intrinsics)
+    if fusion.mode == "fill" and preset.points_per_image is not None:
+        words.append(f"Gaussians start {fusion.stride} pixels apart: nearest to {preset.points_per_image} an image.")
+    elif fusion.mode == "fill":
+        finest = _stride_for(MOST_POINTS, clip.intrinsics)
+        choice = choose_stride(clip, train[0], finest, min(errors.values(), default=0.0))
+        fusion = dataclasses.replace(fusion, stride=choice.count)
+        preset = dataclasses.replace(preset, fusion=fusion)
+        words.append(f"Gaussians start {choice.count} pixels apart: {choice.reason}.")
     if preset.bases is None:
-        errors = errors_by_bases(tracks, clip, train) if tracks is not None else {}
-        choice = choose_bases(errors, floor_error(clip, train[0], stride), len(train))
+        choice = choose_bases(errors, floor_error(clip, train[0], fusion.stride), len(train))
         preset = dataclasses.replace(preset, bases=choice.count)
         words.append(f"Motion has {choice.count} bases: {choice.reason}.")
     return preset, tuple(words)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import cache
 
 import numpy as np
 import pytest
 
 from tests.worker.phantoms import phantom_clip, prepared_on
-from worker.capacity import BASES, FEWEST_FRAMES, WORTH_DB, choose_bases, errors_by_bases, floor_error
+from worker.capacity import BASES, COARSEST, FEWEST_FRAMES, WORTH_DB, choose_bases, errors_by_bases, floor_error
 from worker.clip import DepthClip, split_frames
 from worker.motion import Tracks, track
 from worker.phantom import Motion
 from worker.presets import PRESETS
-from worker.start import bases_of, settled
+from worker.start import MIN_STRIDE, bases_of, fusion_for, settled
 
 FAST = PRESETS["fast"]
 FRAMES = 40
@@ -86,6 +87,23 @@ def test_gaussians_farther_apart_leave_more_of_the_picture() -> None:
     left = [floor_error(clip, train[0], stride) for stride in (1, 2, 3, 4, 6)]
     assert left == sorted(left)
     assert left[0] == pytest.approx(0, abs=1e-3)
+
+
+def test_a_flat_picture_gets_points_farther_apart() -> None:
+    clip, train, tracks = followed("still")
+    open_grid = dataclasses.replace(FAST, points_per_image=None)
+    flat = dataclasses.replace(clip, rgb=np.full_like(clip.rgb, 130))
+    detailed, smooth = (settled(open_grid, tracks, each, train)[0].fusion.stride for each in (clip, flat))
+    assert detailed == MIN_STRIDE
+    assert smooth == COARSEST * MIN_STRIDE
+
+
+@pytest.mark.parametrize("points", [100, 500, 2000])
+def test_a_fixed_number_of_points_is_kept_to(points: int) -> None:
+    clip, train, tracks = followed("still")
+    fixed, _ = settled(dataclasses.replace(FAST, points_per_image=points), tracks, clip, train)
+    assert fixed.points_per_image == points
+    assert fusion_for(fixed, clip.intrinsics).stride == max(MIN_STRIDE, round(math.sqrt(96 * 80 / points)))
 
 
 @pytest.mark.parametrize("frames", [1, 2, FEWEST_FRAMES - 1])

@@ -110,8 +110,8 @@ def test_the_report_tells_what_was_done(clip: Path, tmp_path: Path) -> None:
     assert [stage for i, stage in enumerate(each.stage for each in told) if i == 0 or told[i - 1].stage != stage] == [
         "decode",
         "compile",
-        "fusion",
         "motion",
+        "fusion",
         "start",
         "train",
         "finish",

@@ -29,9 +29,9 @@ def camera(width: int, height: int) -> Intrinsics:
 def started(clip: DepthClip, preset: Preset, train: list[int] | None = None) -> tuple[Model, PointCloud, float]:
     frames = train or list(range(clip.frame_count))
     scale = units_per_mm(clip, frames)
-    cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0)
     tracks = track(clip, frames) if preset.tracks and len(frames) > 1 else None
     preset, _ = settled(preset, tracks, clip, frames)
+    cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0)
     return start_model(cloud, tracks, clip, frames, preset, scale, seed=0), cloud, scale
 
 
