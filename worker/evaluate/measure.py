@@ -10,6 +10,7 @@ import dataclasses
 import json
 import math
 import os
+import shlex
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -67,7 +68,7 @@ class Bench:
         row |= {"machine": machine(), "commit": self._commit}
         try:
             values, curve = self._measured(cell, source, hooks)
-        except (Cancelled, KeyboardInterrupt):
+        except Cancelled:
             raise
         except Exception as error:  # whatever a method breaks on is a result of its own
             problem = " ".join(str(error).split())
@@ -100,7 +101,7 @@ class Bench:
             kept = [path for path in out.iterdir() if path.name not in (REPORT, CURVE)]
             scene_bytes = sum(path.stat().st_size for path in kept)
         values = _reported(report, opened) | _size(scene) | _speed(scene, report)
-        values |= {"scene_bytes": scene_bytes, **_stored(scene, opened, report, on_the_way.last_db)}
+        values |= {"scene_bytes": scene_bytes, "stored_loss_db": _stored_loss_db(report, on_the_way.last_db)}
         if curve:  # else there was no tissue to score
             curve = [point | scores for point, scores in zip(curve, on_the_way.scores(), strict=True)]
             # its end is scored on all held-out frames of the model as it is kept
@@ -151,15 +152,15 @@ class _OnTheWay:
 
 
 def command_of(cell: Cell, source: Source) -> str:
-    """The command line that measures this cell."""
-    limit = f"--iterations {cell.iterations}" if cell.iterations else f"--budget-s {cell.budget_s:g}"
-    given = [
-        f"--{name.replace('_', '-')} {value}"
-        for name, value in source.options.items()
-        if name != "clip" and source.argument == str(source.options.get("clip"))
-    ]
-    parts = ["intrasplat evaluate", source.argument, *given, f"--series {cell.series}"]
-    return " ".join([*parts, f"--holdout {cell.holdout}", f"--seeds {cell.seed}", limit])
+    """The command line that measures this cell, as a shell reads it."""
+    limit = {"--iterations": cell.iterations} if cell.iterations else {"--budget-s": f"{cell.budget_s:g}"}
+    is_path = source.argument == str(source.options.get("clip"))
+    given = {
+        f"--{name.replace('_', '-')}": value for name, value in source.options.items() if is_path and name != "clip"
+    }
+    own = {"--series": cell.series, "--holdout": cell.holdout, "--seeds": cell.seed, **limit, "--out": "DIR"}
+    options = [str(part) for option in {**given, **own}.items() for part in option]
+    return shlex.join(["intrasplat", "evaluate", source.argument, *options])
 
 
 def render_ms(scene: Scene) -> float:
@@ -200,17 +201,13 @@ def _speed(scene: Scene, report: Report) -> Values:
     return {"step_ms": step_ms, "render_ms": median_ms, "render_fps": 1000 / median_ms}
 
 
-def _stored(scene: Scene, opened: OpenClip, report: Report, trained_db: Mapping[int, float]) -> Values:
-    """Mean psnr_tissue of the held-out frames rendered from what lies on disk, and what that is below the model as
-    training left it, on the frames that were scored then: the price of rounding, and of strays taken out."""
-    shown, clip = ShownScene(scene), opened.clip
-    stored_db = {
-        frame: psnr_tissue(shown.view(frame, clip.world_from_camera[frame]).rgb, clip.rgb[frame], clip.tissue[frame])
-        for frame in report.held_out
-    }
-    losses = [trained_db[frame] - stored_db[frame] for frame in trained_db]
-    scores = list(stored_db.values())
-    return {"stored_psnr_tissue_db": _mean_of_known(scores), "stored_loss_db": _mean_of_known(losses)}
+def _stored_loss_db(report: Report, trained_db: Mapping[int, float]) -> float | None:
+    """What held-out frames of the stored scene score below those of the model as training left it, on the frames that
+    were scored then: the price of rounding, and of strays taken out. The report's own scores are of the stored scene.
+    """
+    stored_db = {each.frame: each.psnr_tissue_db for each in report.frames}
+    known = {frame: score for frame, score in stored_db.items() if score is not None and frame in trained_db}
+    return _mean_of_known([trained_db[frame] - score for frame, score in known.items()])
 
 
 def _mean_of_known(scores: Sequence[float]) -> float | None:
