@@ -75,7 +75,7 @@ def draw_map(places: Places, series: str, folder: Path) -> str:
     from matplotlib.figure import Figure
 
     shown = [name for name in CONDITIONS if any(key[0] == name for key in places)] or list(CONDITIONS)
-    name = f"stability-{_plain(series)}"
+    name = map_name(series)
     size = (LABEL_INCHES + COLUMN_INCHES * (len(SEVERITIES) + 0.6), 1.9 + ROW_INCHES * len(shown))
     with mpl.rc_context(SETTINGS | {"axes.grid": False}):
         figure = Figure(figsize=size, layout="constrained")
@@ -96,20 +96,23 @@ def draw_map(places: Places, series: str, folder: Path) -> str:
     return name
 
 
+def map_name(series: str) -> str:
+    """What the files of a method's map are called, without their ending."""
+    return "stability-" + "".join(each if each.isalnum() or each in "-_" else "-" for each in series)
+
+
 def told_table(places: Places, series: str) -> str:
-    """Markdown: of each condition, how every severity ended, and what the user is told of the worst."""
+    """Markdown: of each condition, how each severity ended, and what the user is told at the highest one measured."""
     lines = [
-        f"| {series} | severity 1 | 2 | 3 | 4 | 5 | what the user is told of the worst |",
+        f"| {series} | severity 1 | 2 | 3 | 4 | 5 | what the user is told at the highest |",
         "|---|---|---|---|---|---|---|",
     ]
     for name, condition in CONDITIONS.items():
         here = [places.get((name, severity)) for severity in SEVERITIES]
-        if not any(here):
-            continue
-        worst = next((place for place in reversed(here) if place is not None), None)
-        told = worst.told if worst is not None else ""
-        cells = [_in_words(place) for place in here]
-        lines.append(f"| {condition.title} | {' | '.join(cells)} | {told or 'nothing'} |")
+        measured = [place for place in here if place is not None]
+        if measured:
+            cells = " | ".join(_in_words(place) for place in here)
+            lines.append(f"| {condition.title} | {cells} | {measured[-1].told or 'nothing'} |")
     return "\n".join(lines) + "\n"
 
 
@@ -196,8 +199,3 @@ def _handles(places: Places) -> list[Any]:
         if outcome in used
     ]
     return [*handles, Patch(facecolor="white", edgecolor=GREY, hatch="////", label="not measured")]
-
-
-def _plain(series: str) -> str:
-    """A series' name as a part of a file's."""
-    return "".join(each if each.isalnum() or each in "-_" else "-" for each in series)
