@@ -83,7 +83,7 @@ def choose_bases(errors: dict[int, float], floor: float, frames: int) -> Choice:
     """The fewest bases whose expected error, on top of the floor that the Gaussians leave, is within WORTH_DB of the
     least; errors as from errors_by_bases, frames the number of training frames."""
     if not errors:
-        bases = min(frames, max(BASES[0], -(-frames // FRAMES_A_BASIS)))
+        bases = min(frames, max(BASES[0], min(BASES[-1], -(-frames // FRAMES_A_BASIS))))
         reason = f"one for about {FRAMES_A_BASIS} training frames, for too little could be followed to tell"
         return Choice(bases, reason)
     allowed = (min(errors.values()) + floor) * 10 ** (WORTH_DB / 10)

@@ -116,6 +116,11 @@ def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: 
     assert any("too little could be followed" in each for each in words)
 
 
+@pytest.mark.parametrize(("frames", "bases"), [(1, 1), (2, 2), (12, 4), (1000, 33)])
+def test_where_nothing_could_be_followed_bases_come_by_the_frames_up_to_the_most(frames: int, bases: int) -> None:
+    assert choose_bases({}, 10.0, frames).count == bases
+
+
 @pytest.mark.parametrize("bases", [3, 9, 33])
 def test_a_fixed_number_is_kept_to(bases: int) -> None:
     clip, train, tracks = followed("breathing")
