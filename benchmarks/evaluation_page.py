@@ -28,9 +28,10 @@ _CHARTS = {
 ![Held-out psnr_tissue against seconds of training, one panel a clip and way of holding out](curves.png)
 
 Each line is one run, the strong one the seed that ends in the middle; the clock counts what
-[conventions](../conventions.md) call `t_train_s`, so neither compilation nor the scoring of held-out frames. Dashed is
-what copying the neighbouring frames scores: where a curve stays below, a copy is the better picture from the
-endoscope's own pose, and has no other pose, no depth and nothing behind the instrument.
+[conventions](../conventions.md) call `t_train_s`, so neither compilation nor the scoring of held-out frames nor, after
+the last step, storing (`finish_s` and `shrink_s` of the column `seconds`). A curve ends with the score of the stored
+scene. Dashed is what copying the neighbouring frames scores: where a curve stays below, a copy is the better picture
+from the endoscope's own pose, and has no other pose, no depth and nothing behind the instrument.
 
 ![Held-out SSIM against seconds of training](curves-ssim.png)
 
@@ -45,8 +46,9 @@ true depth on synthetic clips, stereo's on recorded ones, so that there it shows
 ![Final psnr_tissue against seconds of training; discs are the scenes' sizes, hollow marks are published](pareto.png)
 
 A mark is the median of all seeds, its disc the scene on disk, and the line joins what nothing is both sooner and better
-than. The hollow marks are what papers print for other clips on other hardware, in `psnr_paper`, which is higher: they
-say where the field stands, and no distance from them to ours is a measurement.
+than. `hexplane` has no kernels of its own here and moves its Gaussians in torch, so its seconds say more about that
+than about the method. The hollow marks are what papers print for other clips on other hardware, in `psnr_paper`, which
+is higher: they say where the field stands, and no distance from them to ours is a measurement.
 """,
     "frames": """
 ### Images a second against decibels
@@ -54,8 +56,7 @@ say where the field stands, and no distance from them to ours is a measurement.
 ![Final psnr_tissue against images rendered a second at the clip's size](frames.png)
 
 Each image is deformed, projected and blended at its own time, the median of forty, with the machine's other work
-beside it; encoding and sending come on top. `hexplane` has no kernels of its own here and moves its Gaussians in torch,
-so its speed says more about that than about the method.
+beside it; encoding and sending come on top. `hexplane` is slow for the reason given above.
 """,
 }
 _INTRODUCTION = """
@@ -84,10 +85,11 @@ its own clips). Differences of a tenth of a decibel are within what another seed
 _PARSIMONY = """
 ### No more than a scene needs
 
-Floats are those of the model for each Gaussian; bytes those of the scene on disk; `loss` is what storing it costs on
-held-out frames against the model as training left it, in dB; `spread` is the best seed less the worst. Rates,
-iterations and start differ between presets as well, so a row is not the effect of its size alone: the grid of
-capacities varies nothing else.
+Floats are those of the model for each Gaussian; bytes those of the scene on disk: ours in whole numbers
+([decision 012](../decisions/012-compact-scenes.md)), the published method and its rivals as floats, as published.
+`loss` is what storing it costs on held-out frames against the model as training left it, in dB; `spread` is the best
+seed less the worst. Sizes, seconds and loss are those with {holdout}. Rates, iterations and start differ between
+presets as well, so a row is not the effect of its size alone: the grid of capacities varies nothing else.
 """
 _CAPACITY = """
 ### The automatic choice against a grid of fixed ones
@@ -110,15 +112,15 @@ def sections(folder: Path) -> list[str]:
     if any(group.rows for group in groups):
         parts += [_INTRODUCTION.format(count=_counted(results.runs)), _headline(sooner(results.curves))]
         parts += [text for name, text in _CHARTS.items() if (folder / f"{name}.png").exists()]
-        parts += [_truth(groups), _ablation(groups), _PARSIMONY, _parsimony(groups), _published()]
+        parts += [_truth(groups), _ablation(groups), _parsimony(groups), _published()]
     grid = Results(folder / CAPACITY)
     if found := capacities(groups_of(grid.runs)):
         parts += [
             _CAPACITY.format(bases=_listed(GRID_BASES), points=_listed(GRID_POINTS)),
             _capacity(found),
-            _origin(grid.runs),
+            origin(grid.runs),
         ]
-    return [*parts, _origin(results.runs)] if results.runs else parts
+    return [*parts, origin(results.runs)] if results.runs else parts
 
 
 def write_readme(readme: Path, folder: Path) -> None:
@@ -174,7 +176,7 @@ def _headline(found: Sequence[Sooner]) -> str:
         "interpolated, the logarithm of time being linear in dB. Samples are scored on at most sixteen of the held-out "
         "frames, ends on all."
     )
-    return f"\n### How much sooner\n\n{_claim(found)} {method}\n{_table(header, rows)}"
+    return f"\n### How much sooner\n\n{_claim(found)} {method}\n{table(header, rows)}"
 
 
 def _truth(groups: Sequence[Group]) -> str:
@@ -193,7 +195,7 @@ def _truth(groups: Sequence[Group]) -> str:
         ]
         for group in known
     ]
-    return _TRUTH + _table(header, rows) if rows else ""
+    return _TRUTH + table(header, rows) if rows else ""
 
 
 def _ablation(groups: Sequence[Group]) -> str:
@@ -211,11 +213,11 @@ def _ablation(groups: Sequence[Group]) -> str:
         f"Of {len(decided)} places where all four were run, {confirmed} confirm the paper's whole order and {first} "
         "have FDM with MAPF first, as the paper has."
     )
-    return f"{_ABLATION}\n{said}\n{_table(['clip', 'held out', *ABLATION, 'the order'], rows)}"
+    return f"{_ABLATION}\n{said}\n{table(['clip', 'held out', *ABLATION, 'the order'], rows)}"
 
 
 def _parsimony(groups: Sequence[Group]) -> str:
-    """A row a clip, series and limit; size and speed are those of the first way of holding out."""
+    """A row a clip, series and limit; sizes and seconds are those of the first way of holding out."""
     clips, holdouts = (list(dict.fromkeys(each)) for each in zip(*(group.place for group in groups), strict=True))
     found = {(group.clip, group.series, group.limit, group.holdout): group for group in groups}
     rows = []
@@ -227,7 +229,7 @@ def _parsimony(groups: Sequence[Group]) -> str:
         absent = [series for series in DEFAULT_SERIES if series not in {key[1] for key in keys}]
         rows += [[clip, series, "missing", *[""] * (len(_SIZES) + len(holdouts))] for series in absent]
     header = ["clip", "series", "limit", *_SIZES, *(f"{holdout}, dB" for holdout in holdouts)]
-    return _table(header, rows)
+    return _PARSIMONY.format(holdout=f"`{holdouts[0]}`") + table(header, rows)
 
 
 _SIZES = ("Gaussians", "bases", "floats", "MB", "loss", "t_train_s", "step, ms", "images/s", "seeds")
@@ -269,7 +271,7 @@ def _published() -> str:
         "data, `psnr_paper`. Nothing here was measured by us.\n"
     )
     rows = cells(RESULTS, "1") + cells(ONE_MINUTE, "2: about a minute each")
-    return said + _table(["table", "data", "method", "psnr_paper", "training, s", "images/s"], rows)
+    return said + table(["table", "data", "method", "psnr_paper", "training, s", "images/s"], rows)
 
 
 def _capacity(found: Sequence[Capacity]) -> str:
@@ -287,7 +289,7 @@ def _capacity(found: Sequence[Capacity]) -> str:
     said = (
         f"\nWithin 0.1 dB of the best or above it: {len(within)} of {len(found)}, of them {smaller} at no more bytes."
     )
-    return f"{said}\n{_table(header, rows)}"
+    return f"{said}\n{table(header, rows)}"
 
 
 def _counted(runs: Sequence[Row]) -> str:
@@ -299,9 +301,10 @@ def _counted(runs: Sequence[Row]) -> str:
     )
 
 
-def _origin(runs: Sequence[Row]) -> str:
+def origin(runs: Sequence[Row]) -> str:
+    """On which machines rows were measured, with which commits, and beside how much other work where they tell."""
     machines, commits = (", ".join(sorted({row[name] for row in runs if row[name]})) for name in ("machine", "commit"))
-    loads = [float(row["load_1min"]) for row in runs if row["load_1min"]]
+    loads = [float(row["load_1min"]) for row in runs if row.get("load_1min")]
     load = f"; load before a run {min(loads):.1f} to {max(loads):.1f}, median {median(loads):.1f}" if loads else ""
     return f"\nMeasured on {machines}, commits {commits} (+: with changes not yet committed){load}.\n"
 
@@ -319,6 +322,7 @@ def _number(value: float | None, digits: int) -> str:
     return "–" if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
     lines = ["", "| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows]) + "\n"

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.errors import Cancelled, InputError, TrainingDiverged
+from contract.errors import Cancelled, InputError
 from contract.report import Report
 from worker.checkpoint import Scene, load_scene
 from worker.evaluate.cells import preset_of
@@ -176,7 +176,7 @@ def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: Hooks) ->
 def verdict(row: Row, clean: Row | None) -> dict[str, str]:
     """outcome, loss_db and depth_loss_mm of a row beside its clean cell's; unknown where that has failed."""
     if row["error"]:
-        kinds = {InputError.__name__: "refused", "LimitError": "refused", TrainingDiverged.__name__: "diverged"}
+        kinds = {"InputError": "refused", "LimitError": "refused", "TrainingDiverged": "diverged"}
         return {"outcome": kinds.get(row["error"].partition(":")[0], "crashed"), "loss_db": "", "depth_loss_mm": ""}
     if clean is None or clean["error"] or not (row["psnr_db"] and clean["psnr_db"]):
         return {"outcome": "unknown", "loss_db": "", "depth_loss_mm": ""}
