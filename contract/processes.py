@@ -9,7 +9,10 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
+_ENDING = (signal.SIGINT, signal.SIGTERM)
 _PR_SET_PDEATHSIG = 1
 
 
@@ -25,9 +28,20 @@ def told_to_end() -> threading.Event:
     # A handler interrupts the main thread anywhere, also where that holds the lock that end.set() takes: it would wait
     # for itself. Only a SimpleQueue may be written to all the same.
     threading.Thread(target=wait, name="signals", daemon=True).start()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _ENDING:
         signal.signal(number, lambda *_: signals.put(None))
     return end
+
+
+@contextmanager
+def heeding_signals() -> Iterator[threading.Event]:
+    """told_to_end() as long as the with statement lasts; afterwards signals do what they did before."""
+    before = {number: signal.getsignal(number) for number in _ENDING}
+    try:
+        yield told_to_end()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def end_process(process: subprocess.Popen[bytes], timeout_s: float) -> None:

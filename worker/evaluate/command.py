@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from contract.arguments import count, positive
 from contract.errors import InputError
 from contract.exits import ExitCode
 from contract.job import JobProgress, Layout, MaskPolarity, PoseConvention
-from contract.processes import told_to_end
+from contract.processes import heeding_signals
 from contract.progress_bar import ProgressBar
 from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
@@ -84,18 +83,13 @@ def run_cli(options: argparse.Namespace) -> int:
 
 def measure_all(bench: Bench, cells: Sequence[Cell], results: Results) -> None:
     """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    end = told_to_end()
-    try:
+    with heeding_signals() as end:
         for place, cell in enumerate(cells):
             with ProgressBar(sys.stderr) as bar:
                 show = _reporter(bar, place, len(cells))
                 row, curve = bench.measure(cell, Hooks(on_progress=show, should_stop=end.is_set))
             results.add(row, curve)
             print(f"{' '.join(cell.key)}: {_outcome(row)}", flush=True)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def conclude(results: Results, out: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from contract.arguments import count
 from contract.errors import InputError
 from contract.exits import ExitCode
 from contract.job import JobProgress
-from contract.processes import told_to_end
+from contract.processes import heeding_signals
 from contract.progress_bar import ProgressBar
 from worker.evaluate.atlas import count_outcomes, draw_map, places_of, series_in, told_table
 from worker.evaluate.conditions import CONDITIONS, SEVERITIES
@@ -71,17 +70,12 @@ def run_cli(options: argparse.Namespace) -> int:
 
 def measure_all(atlas: Atlas, cells: Sequence[StabilityCell]) -> None:
     """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    end = told_to_end()
-    try:
+    with heeding_signals() as end:
         for place, cell in enumerate(cells):
             with ProgressBar(sys.stderr) as bar:
                 bar.show(JobProgress(stage=f"{place + 1}/{len(cells)}", fraction=place / len(cells)))
                 row = atlas.measure(cell, Hooks(should_stop=end.is_set))
             print(_line(row), flush=True)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def draw_all(rows: Sequence[Row], folder: Path) -> None:
