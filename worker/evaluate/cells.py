@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from contract.errors import InputError
 from worker.presets import PRESETS, Preset, preset_named
@@ -83,17 +83,20 @@ def preset_of(series: str) -> Preset:
     """The preset that a series names, with its changes made.
 
     Raises:
-        InputError: there is no such preset, or no such plain number in it.
+        InputError: there is no such preset, no such plain value in it, or it makes no use of one.
     """
     name, _, changes = series.partition(":")
     preset = preset_named(name)
     for change in filter(None, changes.split(",")):
         field, _, text = change.partition("=")
-        if not hasattr(preset, field) or dataclasses.is_dataclass(getattr(preset, field)):
-            plain = [each.name for each in dataclasses.fields(Preset)]
+        plain = _plain_fields()
+        if field not in plain:
             problem = f"{change!r} in {series!r} changes no plain value of a preset."
             raise InputError("--series", problem, f"Use FIELD=VALUE with one of: {', '.join(plain)}.")
-        values: dict[str, Any] = {field: _value(series, text, getattr(preset, field))}
+        if field == "points_per_image" and preset.fusion.mode != "fill":
+            problem = f"{name!r} does not choose how many points an image gives, so {change!r} would change nothing."
+            raise InputError("--series", problem, "Leave it out.")
+        values: dict[str, Any] = {field: _value(series, field, text, getattr(preset, field))}
         preset = dataclasses.replace(preset, **values)
     return preset
 
@@ -109,16 +112,25 @@ def capacity_grid(preset: str) -> list[str]:
     return [preset, *fixed]
 
 
-def _value(series: str, text: str, current: object) -> object:
+def _plain_fields() -> list[str]:
+    """The fields of a preset that are numbers, words or switches in every preset, but for its name."""
+    names = [each.name for each in dataclasses.fields(Preset) if each.name != "name"]
+    return [name for name in names if not any(dataclasses.is_dataclass(getattr(x, name)) for x in PRESETS.values())]
+
+
+def _value(series: str, field: str, text: str, current: object) -> object:
     """text as a value of the current one's type."""
-    if text == "none":
-        return None
+    kind = get_type_hints(Preset)[field]
+    words = get_args(kind) if get_origin(kind) is Literal else ()
     try:
+        if text == "none" and type(None) in get_args(kind):
+            return None
         if isinstance(current, bool):
             return {"true": True, "false": False}[text]
-        if isinstance(current, str):
-            return text
-        return float(text) if isinstance(current, float) else int(text)
+        if words:
+            return words[words.index(text)]
+        return float(text) if float in (kind, *get_args(kind)) else int(text)
     except (KeyError, ValueError):
         problem = f"{text!r} in {series!r} is no value in place of {current!r}."
-        raise InputError("--series", problem, "Give a number, true, false or none.") from None
+        known = ", ".join(words) or "a number, true, false or, where there need not be any, none"
+        raise InputError("--series", problem, f"Give {known}.") from None
