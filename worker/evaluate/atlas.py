@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from worker.evaluate.conditions import CLEAN, CLEAN_STEREO, CONDITIONS, SEVERITIES
+from worker.evaluate.conditions import CONDITIONS, SEVERITIES
 from worker.evaluate.rows import Row
 from worker.evaluate.stability import LARGEST_DEPTH_LOSS_MM, LARGEST_LOSS_DB, SEPARATOR
 from worker.evaluate.style import GREY, SETTINGS, save
@@ -118,7 +118,7 @@ def told_table(places: Places, series: str) -> str:
 
 def count_outcomes(places: Places) -> dict[str, int]:
     """How many places ended in each way, the worst first; ways that none ended in are left out."""
-    spoilt = [place.outcome for key, place in places.items() if key[0] not in (CLEAN, CLEAN_STEREO)]
+    spoilt = [place.outcome for (_, severity), place in places.items() if severity in SEVERITIES]
     return {outcome: spoilt.count(outcome) for outcome in WORST_FIRST if outcome in spoilt}
 
 

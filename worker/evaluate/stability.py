@@ -3,9 +3,10 @@
 Symbols: T frames of the clean clip, S frames of the given one, H W pixels.
 
 A cell is harmed when it scores more than LARGEST_LOSS_DB below the clean cell of the same series and seed, or its
-depth errs by LARGEST_DEPTH_LOSS_MM more. A harmed cell is `told` if its report has a kind of warning that the clean
-cell's has not, else `silent`: that is the defect. `refused` and `diverged` end in an error that says why, `crashed`
-in one that nobody foresaw.
+depth errs by LARGEST_DEPTH_LOSS_MM more. The clean cell has severity 0: the clean clip, or the condition's own motion
+where that is calm. A harmed cell is `told` if its report has a kind of warning that the clean cell's has not, else
+`silent`: that is the defect. `refused` and `diverged` end in an error that says why, `crashed` in one that nobody
+foresaw.
 """
 
 from __future__ import annotations
@@ -156,7 +157,7 @@ def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: Hooks) ->
     condition = CONDITIONS.get(cell.condition)
     row = dict(zip(KEY, cell.key(grid), strict=True)) | {name: "" for name in FIELDS if name not in KEY}
     row |= {"machine": machine(), "commit": commit()}
-    row["level"] = "" if condition is None else f"{condition.levels[cell.severity - 1]:g}"
+    row["level"] = "" if condition is None else f"{condition.level(cell.severity):g}"
     start = time.perf_counter()
     try:
         given = (

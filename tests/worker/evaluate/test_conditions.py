@@ -102,6 +102,15 @@ def test_shares_are_what_the_table_says(severity: int) -> None:
     assert unmasked == pytest.approx(level("masks_missing"), abs=0.05)
 
 
+@pytest.mark.parametrize("name", ["fast_pull", "cutting"])
+def test_a_motion_of_its_own_is_compared_with_itself_when_it_is_calm(name: str) -> None:
+    def way(severity: int) -> float:
+        return float(np.abs(np.diff(spoilt(name, severity).depth_mm, axis=0)).mean())
+
+    assert way(0) < way(1) < way(5)
+    assert CONDITIONS[name].clean_name == name
+
+
 def test_depth_noise_has_the_deviation_of_its_level() -> None:
     error = clip_of(spoilt("depth_noise", 3)).depth_mm / clean().clip.depth_mm - 1
     assert error.std() == pytest.approx(0.05, rel=0.05)

@@ -82,6 +82,8 @@ def test_the_plan_puts_each_clean_clip_before_what_is_compared_with_it() -> None
     for cell in cells:
         assert cells.index(cell.clean) <= cells.index(cell)
     assert {cell.clean.condition for cell in cells if cell.condition == "misrectified"} == {CLEAN_STEREO}
+    calm, pulled = plan(["fast_pull"], [3], ["fast"], [0])
+    assert (calm.condition, calm.severity, calm.clean, pulled.clean) == ("fast_pull", 0, calm, calm)
     with pytest.raises(InputError, match="fog"):
         plan(["fog"], [1], ["fast"], [0])
     with pytest.raises(InputError, match="faster"):

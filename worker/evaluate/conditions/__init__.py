@@ -30,6 +30,8 @@ class Condition:
     title   with the unit of its levels
     levels  of severity 1 to 5
     stereo  whether it is written as stereo files and read, rectified and matched; its clean cell is then, too
+    calm    where the tissue moves in a way of its own, the level of severity 0, which does no harm: what another motion
+            scores says nothing about this one. Else None: severity 0 is the clean clip
     """
 
     name: str
@@ -37,19 +39,29 @@ class Condition:
     spoil: Spoiler
     levels: tuple[float, ...]
     stereo: bool = False
+    calm: float | None = None
 
     @property
     def clean_name(self) -> str:
-        """The clean condition that it is compared with."""
+        """The condition whose severity 0 it is compared with."""
+        if self.calm is not None:
+            return self.name
         return CLEAN_STEREO if self.stereo else CLEAN
 
+    def level(self, severity: int) -> float:
+        """The level of a severity from 1 to 5, or of 0 where there is a calm one."""
+        if severity == 0:
+            assert self.calm is not None
+            return self.calm
+        return self.levels[severity - 1]
+
     def apply(self, clean: CleanClip, severity: int, seed: int) -> Given:
-        """The clip of a severity from 1 to 5; the same arguments give the same clip.
+        """The clip of a severity, as level() has them; the same arguments give the same clip.
 
         What is drawn at random does not depend on the severity, so that a higher one is the same mishap, but worse.
         """
         random = np.random.default_rng([seed, zlib.crc32(self.name.encode())])
-        return self.spoil(clean, self.levels[severity - 1], random)
+        return self.spoil(clean, self.level(severity), random)
 
 
 def clean_given(clean: CleanClip, *, stereo: bool) -> Given:
@@ -81,8 +93,8 @@ def _conditions() -> dict[str, Condition]:
         Condition("few_frames", "few frames, number", timing.few_frames, (16, 8, 4, 2, 1)),
         Condition("dropped_frames", "frames lost, share", timing.dropped_frames, (0.1, 0.25, 0.4, 0.55, 0.7)),
         Condition("duplicated_frames", "frames repeated, share", timing.duplicated_frames, (0.1, 0.25, 0.4, 0.55, 0.7)),
-        Condition("fast_pull", "fast pull, px a frame", scenes.fast_pull, (10, 20, 40, 60, 80)),
-        Condition("cutting", "cut opens within frames", scenes.cutting, (128, 64, 32, 16, 8)),
+        Condition("fast_pull", "fast pull, px a frame", scenes.fast_pull, (10, 20, 40, 60, 80), calm=2),
+        Condition("cutting", "cut opens within frames", scenes.cutting, (128, 64, 32, 16, 8), calm=1024),
         Condition("moving_camera", "camera swings, poses right, degrees", scenes.moving_camera, (2, 5, 10, 15, 20)),
         Condition("noisy_poses", "camera swings, poses wrong, mm", scenes.noisy_poses, (0.1, 0.25, 0.5, 1, 2)),
         Condition("no_texture", "texture lost, share", scenes.no_texture, (0.5, 0.75, 0.9, 0.97, 1), True),
