@@ -17,9 +17,9 @@ ways, {len(SEVERITIES)} severities each, reconstructs it and judges it by the tr
 {LARGEST_LOSS_DB:g} dB to the clean clip, or {LARGEST_DEPTH_LOSS_MM:g} mm of depth. Silent is the defect: harmed, and
 the report has no warning that the clean clip's has not. What the user is told of each stands in
 [stability.md](stability.md), how it is judged in [decision 016](../decisions/016-stability.md). Each method is compared
-with itself on the clean clip, so a map shows what a mishap costs a method and not which method is better; where the
-scene is another (pull, cut, texture, size), the difference between the scenes is in it, too. Not every place has been
-measured for every method, so counts compare within a row.
+with itself on the clean clip (a pull and a cut with the same motion, calm), so a map shows what a mishap costs a method
+and not which method is better: one that has hardly learnt loses little. Not every place has been measured for every
+method, so counts compare within a row.
 
 | | measured | {" | ".join(WORST_FIRST)} | map |
 |---|{"---|" * len(WORST_FIRST)}---|---|

@@ -24,8 +24,8 @@ TABLE = "stability.md"
 TABLE_TITLE = """# What the user is told
 
 Decibels lost against the clean clip (over several seeds their mean, and the spread), millimetres of depth where those
-are the harm. In bold what is a defect; what was not measured is empty. Where the scene is another (pull, cut, texture,
-size) the loss is also that scene's own: below zero it is easier to reproduce than the clean clip.
+are the harm. In bold what is a defect; what was not measured is empty. Where the tissue or the picture is another
+(texture, size) that is in the loss, too: below zero it is easier to reproduce than the clean clip.
 """
 
 
