@@ -118,8 +118,10 @@ def _row(case: Case, report: dict[str, object], usage: resource.struct_rusage, l
 
 
 def append(path: Path, row: dict[str, object], fields: tuple[str, ...] = FIELDS) -> None:
-    """Add the row to the CSV, with a header if the file is new."""
+    """Add the row to the CSV, with a header if the file is new; a file of other columns is refused."""
     fresh = not path.exists()
+    if not fresh and path.read_text().splitlines()[:1] != [",".join(fields)]:
+        raise SystemExit(f"{path} has other columns than {', '.join(fields)}: move it away first.")
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, fields)

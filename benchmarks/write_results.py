@@ -87,9 +87,9 @@ def main() -> None:
     parts = [_INTRODUCTION, *sections(RESULTS), *stability_sections(RESULTS)]
     if rows := _read(STABILITY):
         parts.append(origin(rows))
-    if rows := _read("train.csv"):
+    if rows := _latest(_read("train.csv"), "run"):
         parts += [_TRAIN.format(passing=_passing(rows)), _train_table(rows)]
-    if rows := _read("ablation.csv"):
+    if rows := _latest(_read("ablation.csv"), "change", "clip", "holdout", "seed"):
         parts += [_ABLATION, _ablation_table(rows), origin(rows)]
     if rows := _read("raster.csv"):
         parts += [_RASTER, _raster_table(rows)]
@@ -113,6 +113,11 @@ def _read(name: str) -> list[Row]:
         return []
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def _latest(rows: list[Row], *key: str) -> list[Row]:
+    """Of rows that were appended, the last of each key, so that no median mixes what two commits came to."""
+    return list({tuple(row[name] for name in key): row for row in rows}.values())
 
 
 def _number(text: str, digits: int) -> str:
