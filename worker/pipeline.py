@@ -86,7 +86,8 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
         Cancelled: hooks.should_stop said so.
     """
     accepted_at_s = request.accepted_at_s or time.time()
-    preset = request.preset if isinstance(request.preset, Preset) else preset_named(request.preset)
+    named = request.preset
+    preset = named if isinstance(named, Preset) else preset_named(named, request.budget_s)
     check_options(request)
     check_device(request.device)
     out_dir.mkdir(parents=True, exist_ok=True)

@@ -54,6 +54,10 @@ class Preset:
     budget_s: float | None
 
 
+FEW_POINTS, MANY_POINTS = 40_000, 80_000
+PAYS_FROM_S = 9.0
+"""From this budget on, twice the points are worth the time they take (docs/decisions/015)."""
+
 _PAPER_ITERATIONS = 3000
 _PAPER_DECAY = (1.6e-3, 5.06e-5)
 """1.6e-3 falling log-linearly to a hundredth over 4000 steps, of which 3000 are made: 1.6e-3 * 0.01**(3000 / 4000)."""
@@ -111,7 +115,7 @@ _FAST_RATES = Rates(
 _FAST = Preset(
     name="fast",
     fusion=FusionSettings(mode="fill"),
-    points_per_image=80_000,
+    points_per_image=MANY_POINTS,
     deformation="shared",
     bases=None,
     tracks=True,
@@ -132,7 +136,7 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
     {
         preset.name: preset
         for preset in (
-            replace(_FAST, name="instant", points_per_image=40_000, budget_s=6.0),
+            replace(_FAST, name="instant", points_per_image=FEW_POINTS, budget_s=6.0),
             _FAST,
             replace(_FAST, name="quality", budget_s=240.0),
             _PAPER,
@@ -148,12 +152,15 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
 bases as wide as 0.6 of their spacing."""
 
 
-def preset_named(name: str) -> Preset:
-    """The preset of this name.
+def preset_named(name: str, budget_s: float | None = None) -> Preset:
+    """The preset of this name; one of ours with as many points as pay within budget_s, if that is given.
 
     Raises:
         InputError: there is none.
     """
     if name not in PRESETS:
         raise InputError("options.preset", f"there is no preset {name!r}.", f"Use one of: {', '.join(PRESETS)}.")
-    return PRESETS[name]
+    preset = PRESETS[name]
+    if budget_s is None or preset.points_per_image is None:
+        return preset
+    return replace(preset, points_per_image=FEW_POINTS if budget_s < PAYS_FROM_S else MANY_POINTS)

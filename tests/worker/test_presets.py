@@ -55,6 +55,12 @@ def test_ours_differ_in_time_and_in_how_many_gaussians_it_pays_for() -> None:
     assert budgets == sorted(set(budgets))
 
 
+def test_little_time_is_not_spent_on_many_gaussians() -> None:
+    assert differing(preset_named("fast", budget_s=6.0), PRESETS["instant"]) == {"budget_s"}
+    assert preset_named("instant", budget_s=60.0).points_per_image == PRESETS["fast"].points_per_image
+    assert preset_named("paper", budget_s=6.0) == PRESETS["paper"]
+
+
 def test_the_paper_is_trained_as_published() -> None:
     paper = PRESETS["paper"]
     assert (paper.deformation, paper.bases, paper.start_width) == ("fdm", 17, 0.01)

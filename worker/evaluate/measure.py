@@ -32,6 +32,7 @@ from worker.evaluate.truth import ShownScene, Truth
 from worker.hooks import Hooks
 from worker.metrics import depth_agreement_mm, depth_errors_mm, psnr_tissue, ssim
 from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.presets import PRESETS
 from worker.quality import View
 from worker.raster.cpu import camera_vector
 from worker.render import model_of
@@ -85,7 +86,7 @@ class Bench:
         request = ReconstructionRequest(
             clip=opened.clip,
             holdout=cell.holdout,
-            preset=preset_of(cell.series),
+            preset=cell.series if cell.series in PRESETS else preset_of(cell.series),
             budget_s=cell.budget_s,
             iterations=cell.iterations,
             seed=cell.seed,
