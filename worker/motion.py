@@ -148,7 +148,7 @@ def _averaged(values: Floats, confidence: Floats, over_px: float) -> Floats:
 
 
 def fit_tracks(
-    tracks: Tracks, basis: NDArray[np.float64], pixels: NDArray[np.intp], width: int
+    tracks: Tracks, basis: NDArray[np.float64], pixels: NDArray[np.intp], width: int, *, share_px: int = 1
 ) -> tuple[Floats, Floats]:
     """Weights of the bases for points of the reference frame, by weighted least squares over the training frames.
 
@@ -158,19 +158,22 @@ def fit_tracks(
         basis: [K, B] value of every basis at every training time.
         pixels: [N] flat pixel indices (row * width + column) of the points in the reference frame.
         width: of the clip, px.
+        share_px: points in the same square of this many pixels get the same weights, those of its first pixel.
 
     Returns:
         weights [N, B, 6], of the displacement in mm and of the colour; support [N], the mean confidence of the
         point's track.
     """
-    row = np.minimum(pixels // width // tracks.step_px, tracks.confidence.shape[1] - 1)
-    column = np.minimum(pixels % width // tracks.step_px, tracks.confidence.shape[2] - 1)
+    rows, columns = (place // share_px * share_px for place in np.divmod(pixels, width))
+    shared, member = np.unique(rows * width + columns, return_inverse=True)
+    row = np.minimum(shared // width // tracks.step_px, tracks.confidence.shape[1] - 1)
+    column = np.minimum(shared % width // tracks.step_px, tracks.confidence.shape[2] - 1)
     bases = basis.shape[1]
     difference = np.diff(np.eye(bases), axis=0)
     prior = STEADINESS * difference.T @ difference + RIDGE * np.eye(bases)
     outer = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    weights = np.zeros((len(pixels), bases, 6), np.float32)
-    support = np.zeros(len(pixels), np.float32)
+    weights = np.zeros((len(shared), bases, 6), np.float32)
+    support = np.zeros(len(shared), np.float32)
 
     def fit(first: int) -> None:
         some = slice(first, first + POINTS_AT_ONCE)
@@ -183,5 +186,5 @@ def fit_tracks(
         support[some] = confidence.mean(0)
 
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(fit, range(0, len(pixels), POINTS_AT_ONCE)))
-    return weights, support
+        list(pool.map(fit, range(0, len(shared), POINTS_AT_ONCE)))
+    return weights[member], support[member]

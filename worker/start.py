@@ -23,6 +23,8 @@ from worker.presets import Preset
 from worker.raster.cpu.model import FusedModel
 from worker.unfused import UnfusedModel
 
+SHARE_PX = 4
+"""Points within such a square start with one motion: tracks are smooth over more, and fewer systems are solved."""
 MIN_STRIDE = 2
 """Pixels between the points of a grid at the least: a Gaussian a pixel is noise, not surface."""
 
@@ -116,7 +118,7 @@ def _follow_tracks(
     so that they pass through their point and its colour at the time of the frame it was taken from."""
     basis = np.stack([motion.basis(float(clip.t[i])).double().numpy() for i in range(clip.frame_count)])
     pixels = _reference_pixels(cloud, clip, train[0])
-    weights, _ = fit_tracks(tracks, basis[list(train)], pixels, clip.intrinsics.width)
+    weights, _ = fit_tracks(tracks, basis[list(train)], pixels, clip.intrinsics.width, share_px=SHARE_PX)
     weights *= np.repeat(np.array([scale, 1 / SH_C0], np.float32), 3)
     by_channel = torch.from_numpy(weights).permute(0, 2, 1)
     motion.weight[:, MEAN], motion.weight[:, CHANNELS:] = by_channel[:, :3], by_channel[:, 3:]

@@ -154,6 +154,14 @@ def test_motion_the_bases_can_show_is_found_again(rng: np.random.Generator) -> N
     assert_close(fitted, displacement, relative=0.02)
 
 
+def test_points_of_one_square_share_the_fit_of_its_first_pixel(rng: np.random.Generator) -> None:
+    displacement, confidence = rng.normal(0, 1, (9, 6, 3)), rng.random((9, 6))
+    basis, pixels = rng.random((9, 3)), np.array([5, 0, 1, 3])
+    alone, _ = fit_tracks(bare(displacement, confidence), basis, np.array([3, 0, 0, 3]), 6)
+    shared, _ = fit_tracks(bare(displacement, confidence), basis, pixels, 6, share_px=3)
+    np.testing.assert_array_equal(shared, alone)
+
+
 def test_a_gap_of_untrusted_frames_is_bridged() -> None:
     times = np.linspace(0, 1, 40, endpoint=False)
     shared = SharedBasis.initial(1, bases=9)

@@ -76,7 +76,8 @@ def test_with_tracks_each_gaussian_passes_through_its_point_at_the_time_it_was_s
     for index in np.unique(cloud.frame):
         chosen = cloud.frame == index
         placed = model.deformed_mean(float(clip.t[index])).T
-        assert_close(placed[chosen], cloud.points_mm[chosen] * scale, relative=1e-5, name=f"points of frame {index}")
+        # bases below a thousandth are left out of a step
+        assert_close(placed[chosen], cloud.points_mm[chosen] * scale, relative=1e-4, name=f"points of frame {index}")
         moved = np.maximum(moved, np.linalg.norm(placed - model.deformed_mean(0.0).T, axis=1))
     assert len(np.unique(cloud.frame)) > 1
     assert np.linalg.norm(model.deformed_mean(0.4) - model.deformed_mean(0.0), axis=0).mean() / scale > 0.2  # mm
