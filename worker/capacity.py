@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from worker.clip import DepthClip
 from worker.deformation import SharedBasis
-from worker.motion import RIDGE, STEADINESS, Tracks
+from worker.motion import Tracks, fit_series
 
 Reals = NDArray[np.float64]
 
@@ -164,13 +164,7 @@ def _left_out_error(series: Reals, confidence: Reals, times: Reals, left_out: ND
     """Mean squared error a channel in the frames left out, of the series fitted to the others as motion.py fits."""
     shared = SharedBasis.initial(1, bases=bases, times=times[~left_out].tolist())
     basis = np.stack([shared.basis(float(t)).double().numpy() for t in times])
-    fitted, trust = basis[~left_out], confidence[~left_out]
-    difference = np.diff(np.eye(bases), axis=0)
-    prior = STEADINESS * difference.T @ difference + RIDGE * np.eye(bases)
-    outer = (fitted[:, :, None] * fitted[:, None, :]).reshape(len(fitted), -1)
-    normal = (trust.T @ outer).reshape(-1, bases, bases) + prior
-    right = np.tensordot(series[~left_out] * trust[..., None], fitted, (0, 0)).transpose(0, 2, 1)
-    weights = np.linalg.solve(normal, right)  # [n, B, 6]
+    weights = fit_series(series[~left_out], confidence[~left_out], basis[~left_out])
     missed = series[left_out] - np.einsum("kb,nbc->knc", basis[left_out], weights)
     weight = confidence[left_out]
     return float((missed**2 * weight[..., None]).sum() / max(3 * weight.sum(), 1e-9))

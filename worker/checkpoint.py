@@ -18,6 +18,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,7 @@ class Scene:
         """Bytes of the model's tensors in memory."""
         return sum(each.numel() * each.element_size() for each in self.tensors().values())
 
-    @property
+    @cached_property  # it takes a copy of the file to know
     def file_bytes(self) -> int:
         """Bytes of scene.safetensors."""
         return len(save(dict(self.stored or self.tensors())))

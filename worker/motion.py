@@ -168,23 +168,30 @@ def fit_tracks(
     shared, member = np.unique(rows * width + columns, return_inverse=True)
     row = np.minimum(shared // width // tracks.step_px, tracks.confidence.shape[1] - 1)
     column = np.minimum(shared % width // tracks.step_px, tracks.confidence.shape[2] - 1)
-    bases = basis.shape[1]
-    difference = np.diff(np.eye(bases), axis=0)
-    prior = STEADINESS * difference.T @ difference + RIDGE * np.eye(bases)
-    outer = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    weights = np.zeros((len(shared), bases, 6), np.float32)
+    weights = np.zeros((len(shared), basis.shape[1], 6), np.float32)
     support = np.zeros(len(shared), np.float32)
 
     def fit(first: int) -> None:
         some = slice(first, first + POINTS_AT_ONCE)
         confidence = tracks.confidence[:, row[some], column[some]]  # [K, points]
         changes = [values[:, row[some], column[some]] for values in (tracks.displacement_mm, tracks.colour)]
-        trusted = np.concatenate(changes, axis=-1) * confidence[..., None]
-        normal = (confidence.T @ outer).reshape(-1, bases, bases) + prior
-        right = (basis.T @ trusted.reshape(len(basis), -1)).reshape(bases, -1, 6).transpose(1, 0, 2)
-        weights[some] = np.linalg.solve(normal, right)
+        weights[some] = fit_series(np.concatenate(changes, axis=-1), confidence, basis)
         support[some] = confidence.mean(0)
 
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(fit, range(0, len(shared), POINTS_AT_ONCE)))
     return weights[member], support[member]
+
+
+def fit_series(
+    series: NDArray[np.floating], confidence: NDArray[np.floating], basis: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The least squares of fit_tracks: series [K, N, C], confidence [K, N], basis [K, B] -> weights [N, B, C]."""
+    bases, (_, points, channels) = basis.shape[1], series.shape
+    difference = np.diff(np.eye(bases), axis=0)
+    prior = STEADINESS * difference.T @ difference + RIDGE * np.eye(bases)
+    outer = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
+    normal = (confidence.T @ outer).reshape(points, bases, bases) + prior
+    trusted = (series * confidence[..., None]).reshape(len(basis), -1)
+    right = (basis.T @ trusted).reshape(bases, points, channels).transpose(1, 0, 2)
+    return np.asarray(np.linalg.solve(normal, right), np.float64)

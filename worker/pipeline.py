@@ -37,7 +37,8 @@ from worker.presets import Preset, preset_named
 from worker.quality import Training, View, build_report, measure, sample_frames
 from worker.rangecoder import compile_coder
 from worker.raster.cpu import compile_kernels
-from worker.shrink import Shrunk, model_of, shrink
+from worker.render import model_of
+from worker.shrink import Shrunk, shrink
 from worker.start import bases_of, fusion_for, settled, start_model
 from worker.stereo import estimate_depth
 from worker.targets import TrainingFrames, solid_depth_mm, units_per_mm

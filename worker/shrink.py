@@ -19,7 +19,7 @@ from worker.compact import STATE, prepare, round_to
 from worker.deformation import SharedBasis
 from worker.gaussians import SH_C0
 from worker.metrics import psnr_tissue
-from worker.raster.cpu.model import FusedModel
+from worker.render import model_of
 from worker.targets import TrainingFrames
 from worker.visibility import spread
 
@@ -114,11 +114,6 @@ def _mean_db(scene: Scene, clip: DepthClip, frames: TrainingFrames, judged: Sequ
         image = model.render(frames.cameras[index], float(frames.t[index]))
         scores.append(psnr_tissue(image[:3].transpose(1, 2, 0), clip.rgb[index], clip.tissue[index]))
     return float(np.nanmean(scores))
-
-
-def model_of(scene: Scene) -> FusedModel:
-    """The scene to render, at its clip's size; not for training."""
-    return FusedModel(scene.gaussians, scene.deformation, scene.intrinsics.width, scene.intrinsics.height)
 
 
 def _effect(scene: Scene, clip: DepthClip, frames: TrainingFrames, step: float) -> NDArray[np.float64]:

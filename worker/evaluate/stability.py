@@ -124,6 +124,7 @@ class Atlas:
     grid: Grid
     rows: list[Row] = field(default_factory=list)
     _clean: dict[int, CleanClip] = field(default_factory=dict)
+    _commit: str = field(default_factory=commit)  # of the code as it was loaded; the tree may go on while this runs
 
     def __post_init__(self) -> None:
         self.rows = read_rows(self.folder / STABILITY)
@@ -143,6 +144,7 @@ class Atlas:
             self._clean.clear()  # one at a time: cells come seed by seed
             self._clean[cell.seed] = clean_clip(self.grid.settings(cell.seed))
         row = measured(cell, self._clean[cell.seed], self.grid, hooks)
+        row |= {"machine": machine(), "commit": self._commit}
         key = cell.clean.key(self.grid)
         clean = next((each for each in self.rows if tuple(each[name] for name in KEY) == key), None)
         row |= verdict(row, row if cell == cell.clean else clean)
@@ -153,10 +155,9 @@ class Atlas:
 
 
 def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: Hooks) -> Row:
-    """The row of a cell, without its verdict; a failure's row says why in `error`."""
+    """The row of a cell, without its verdict and origin; a failure's row says why in `error`."""
     condition = CONDITIONS.get(cell.condition)
     row = dict(zip(KEY, cell.key(grid), strict=True)) | {name: "" for name in FIELDS if name not in KEY}
-    row |= {"machine": machine(), "commit": commit()}
     row["level"] = "" if condition is None else f"{condition.level(cell.severity):g}"
     start = time.perf_counter()
     try:
