@@ -42,8 +42,8 @@ _ABLATION = """
 
 `python benchmarks/bm_ablation.py --iterations 300 --csv docs/results/ablation.csv` ([ablation.csv](ablation.csv)):
 held-out psnr_tissue in dB after the same number of iterations, one part changed at a time. The synthetic clips are
-320x256, where the finest grid has 20 k points, so the last two rows equal the first there. More points gain where
-the picture is larger, and cost time and bytes in proportion.
+320x256, where the finest grid has 20 k points, so rows that name fewer points than `fast` equal its own there. More
+points gain where the picture is larger, and cost time and bytes in proportion.
 """
 _RASTER = """
 ## Splatting on the CPU
