@@ -14,7 +14,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TypeVar
 
-import numba
 import numpy as np
 import torch
 
@@ -46,6 +45,9 @@ from worker.train import Run, Stopwatch, iterations_within, load_run, save_run, 
 from worker.visibility import drop_strays, seen_share
 
 _Result = TypeVar("_Result")
+Seconds = dict[str, float]  # by stage; each stage that is timed adds its own
+VERSIONED = ("intrasplat", "torch", "numba")
+"""What decides a scene's numbers; the report names their versions."""
 
 
 @dataclass(frozen=True)
@@ -92,42 +94,25 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
     check_options(request)
     check_device(request.device)
     out_dir.mkdir(parents=True, exist_ok=True)
-    seconds: dict[str, float] = {}
+    seconds: Seconds = {}
 
     clip = depth_clip_of(request, hooks, seconds)
     split = split_frames(clip, request.holdout)
-    seconds["compile_s"] = compile_kernels(lambda share: report_stage(hooks, "compile", share))
-    seconds["compile_s"] += compile_coder()
+    seconds["compile_s"] = compile_kernels(lambda share: report_stage(hooks, "compile", share)) + compile_coder()
     clock = Stopwatch()
     run, scale = prepare(clip, split, preset, request, clock, hooks, seconds)
     resumed_s = resume(out_dir, run)
     clock = Stopwatch(resumed_s) if resumed_s is not None else clock
-    started_s = clock.elapsed_s
-    view_of = view_function(run, scale)
     try:
-        train(
-            run,
-            clock,
-            evaluate=lambda: held_out_psnr(clip, split, view_of, hooks),
-            hooks=hooks,
-            copy_scene=lambda: snapshot_of(run, clip, split, scale, request.seed),
-        )
-        seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
-        hooks.on_progress(Progress("finish", 0.0, run.iteration, run.iterations))
-        scene = timed(seconds, "finish_s", lambda: scene_of(run, clip, split, scale, request.seed))
-        shrunk = timed(seconds, "shrink_s", lambda: shrink(scene, clip, run.frames))
-        scene = shrunk.scene if shrunk else scene
-        stored_view_of = view_function(run, scale, model_of(scene)) if shrunk else view_of
-        scored = reporting(run, stored_view_of, split, hooks)
-        report = report_of(run, clip, split, scene, request, seconds, scored, accepted_at_s, shrunk)
+        optimise(run, clip, split, clock, hooks, seconds)
+        scene, shrunk = finish(run, clip, split, hooks, seconds)
+        view_of = reporting(run, view_function(run, scale, model_of(scene) if shrunk else None), split, hooks)
+        report = report_of(run, clip, split, scene, shrunk, request, seconds, view_of, accepted_at_s)
     except Cancelled:
         save_run(out_dir, run, seconds.get("t_train_s", clock.elapsed_s))
         raise
     hooks.on_progress(Progress("score", 1.0, run.iteration, run.iterations, report.psnr_tissue_db))
-    (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
-    write_curve(out_dir / CURVE, run)
-    save_scene(out_dir, scene, beside=(REPORT, CURVE))
-    (out_dir / RESUME_FILE).unlink(missing_ok=True)
+    publish(out_dir, scene, report, run)
     return report
 
 
@@ -152,7 +137,7 @@ def check_device(device: str) -> None:
         raise UnavailableError(problem, "Use --device auto or --device cpu.")
 
 
-def timed(seconds: dict[str, float], name: str, work: Callable[[], _Result]) -> _Result:
+def timed(seconds: Seconds, name: str, work: Callable[[], _Result]) -> _Result:
     """work(), its duration stored under name."""
     start = time.perf_counter()
     result = work()
@@ -171,7 +156,7 @@ def report_stage(hooks: Hooks, stage: str, share: float) -> None:
         raise Cancelled(f"Stopped during stage {stage!r}.")
 
 
-def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: dict[str, float]) -> DepthClip:
+def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: Seconds) -> DepthClip:
     """Decode, and for stereo input rectify and match: the left frames with depth."""
     if isinstance(request.clip, DepthClip):
         return request.clip
@@ -208,7 +193,7 @@ def prepare(
     request: ReconstructionRequest,
     clock: Stopwatch,
     hooks: Hooks | None = None,
-    seconds: dict[str, float] | None = None,
+    seconds: Seconds | None = None,
 ) -> tuple[Run, float]:
     """Fuse points, start the model, and settle how many iterations are made; seconds by stage go into `seconds`."""
     hooks, seconds = hooks or Hooks(), {} if seconds is None else seconds
@@ -253,6 +238,28 @@ def resume(out_dir: Path, run: Run) -> float | None:
     except (ValueError, KeyError, SceneError) as error:
         problem = f"{out_dir / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
         raise InputError("--out", problem, "Give the options it was started with, or name a new folder.") from error
+
+
+def optimise(run: Run, clip: DepthClip, split: FrameSplit, clock: Stopwatch, hooks: Hooks, seconds: Seconds) -> None:
+    """Train run to its last iteration, scoring held-out frames and showing snapshots on the way."""
+    started_s, scale = clock.elapsed_s, run.frames.scale
+    view_of = view_function(run, scale)
+    train(
+        run,
+        clock,
+        evaluate=lambda: held_out_psnr(clip, split, view_of, hooks),
+        hooks=hooks,
+        copy_scene=lambda: snapshot_of(run, clip, split, scale, run.seed),
+    )
+    seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
+
+
+def finish(run: Run, clip: DepthClip, split: FrameSplit, hooks: Hooks, seconds: Seconds) -> tuple[Scene, Shrunk | None]:
+    """What is kept of a trained run, in whole numbers where that loses next to nothing, and what it did lose."""
+    hooks.on_progress(Progress("finish", 0.0, run.iteration, run.iterations))
+    scene = timed(seconds, "finish_s", lambda: scene_of(run, clip, split, run.frames.scale, run.seed))
+    shrunk = timed(seconds, "shrink_s", lambda: shrink(scene, clip, run.frames))
+    return (shrunk.scene if shrunk else scene), shrunk
 
 
 def view_function(run: Run, scale: float, model: Model | None = None) -> Callable[[int], View]:
@@ -325,11 +332,11 @@ def report_of(
     clip: DepthClip,
     split: FrameSplit,
     scene: Scene,
+    shrunk: Shrunk | None,
     request: ReconstructionRequest,
-    seconds: dict[str, float],
+    seconds: Seconds,
     view_of: Callable[[int], View],
     accepted_at_s: float,
-    shrunk: Shrunk | None = None,
 ) -> Report:
     """Score the held-out frames beside the copy baselines and say what to distrust.
 
@@ -341,9 +348,20 @@ def report_of(
     trained = measure(clip, sample_frames(split.train), view_of)
     baselines = copy_baselines(clip, split.train, split.held_out)
     seconds |= {"score_s": time.perf_counter() - start, "t_post_s": time.time() - accepted_at_s}
-    training = Training(
+    training = training_of(run, scene, shrunk, request, seconds)
+    report = build_report(clip, split, held_out, trained, baselines, training)
+    if report.psnr_tissue_db is not None and run.curve:
+        run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=report.psnr_tissue_db)
+    return report
+
+
+def training_of(
+    run: Run, scene: Scene, shrunk: Shrunk | None, request: ReconstructionRequest, seconds: Seconds
+) -> Training:
+    """What the report repeats of the run: what it was made of, what it chose, how long it took."""
+    return Training(
         preset=run.preset.name,
-        seed=request.seed,
+        seed=run.seed,
         device="cpu",
         iterations=run.iteration,
         gaussians=len(scene.gaussians),
@@ -354,17 +372,8 @@ def report_of(
         assumptions=(*run.chosen, *(shrunk.words if shrunk else ())),
         measurements=shrunk.measurements if shrunk else {},
         warnings=training_warnings(run, request),
-        versions={
-            "intrasplat": version("intrasplat"),
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "numba": numba.__version__,
-        },
+        versions={"python": platform.python_version(), **{name: version(name) for name in VERSIONED}},
     )
-    report = build_report(clip, split, held_out, trained, baselines, training)
-    if report.psnr_tissue_db is not None and run.curve:
-        run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=report.psnr_tissue_db)
-    return report
 
 
 def training_warnings(run: Run, request: ReconstructionRequest) -> tuple[str, ...]:
@@ -372,6 +381,14 @@ def training_warnings(run: Run, request: ReconstructionRequest) -> tuple[str, ..
     if request.iterations is None and run.preset.iterations is None and run.iterations == len(run.frames.indices):
         return ("The time given allowed less than one step a training frame; one a frame was made all the same.",)
     return ()
+
+
+def publish(out_dir: Path, scene: Scene, report: Report, run: Run) -> None:
+    """Write the report, the curve and the scene; what was kept of a stopped run is not needed any more."""
+    (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
+    write_curve(out_dir / CURVE, run)
+    save_scene(out_dir, scene, beside=(REPORT, CURVE))
+    (out_dir / RESUME_FILE).unlink(missing_ok=True)
 
 
 def write_curve(path: Path, run: Run) -> None:
