@@ -22,6 +22,8 @@ PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do \
 CLIPS ?= d4d_endonerf phantom:still phantom:breathing phantom:pull phantom:cut
 GRID_CLIPS ?= phantom:still:640x512 phantom:breathing:640x512 phantom:pull:640x512 phantom:cut:640x512
 EVALUATE := $(BIN)/intrasplat evaluate
+# the folder of the recordings: d4d_endonerf/ and so on
+evaluate capacity: export INTRASPLAT_DATA ?= ../shared/data
 
 .PHONY: help setup demo test check bench evaluate capacity chaos sbom clean
 

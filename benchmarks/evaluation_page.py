@@ -62,9 +62,9 @@ beside it; encoding and sending come on top. `hexplane` is slow for the reason g
 _INTRODUCTION = """
 ## Speed against accuracy
 
-`make evaluate` ([runs.csv](runs.csv), a row a run with its command; [curves.csv](curves.csv);
-[summary.csv](summary.csv), medians over seeds). `intrasplat evaluate --redraw --out docs/results` draws all charts anew
-from the rows; PNG and SVG lie beside this page. {count}
+`make evaluate` ([runs.csv](runs.csv), a row a run with its command, which looks for `d4d_endonerf` in the folder
+`INTRASPLAT_DATA` names; [curves.csv](curves.csv); [summary.csv](summary.csv), medians over seeds). `intrasplat evaluate
+--redraw --out docs/results` draws all charts anew from the rows; PNG and SVG lie beside this page. {count}
 """
 _TRUTH = """
 ### What copying cannot do

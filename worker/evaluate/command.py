@@ -28,7 +28,10 @@ SUMMARY = "summary.csv"
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the options of `evaluate`; run_cli reads them."""
     parser.add_argument(
-        "clips", nargs="*", metavar="CLIP", help="a path, phantom:MOTION[:WxH][:FRAMESframes][:seedN], or d4d_endonerf"
+        "clips",
+        nargs="*",
+        metavar="CLIP",
+        help="a path, phantom:MOTION[:WxH][:FRAMESframes][:seedN], or d4d_endonerf or d4d_stereo of INTRASPLAT_DATA",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="rows, summary and charts; goes on there"

@@ -2,7 +2,7 @@
 
 PATH                                        anything `reconstruct` reads
 phantom:MOTION[:WxH][:FRAMESframes][:seedN] synthetic tissue with true depth, 320x256, 64 frames, seed 0
-d4d_endonerf, d4d_stereo                    the recordings found under INTRASPLAT_DATA; rows name them d4d-a
+d4d_endonerf, d4d_stereo                    the recordings in the folder INTRASPLAT_DATA names; rows call them d4d-a
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def source_of(argument: str, options: Mapping[str, Any] | None = None) -> Source
     """The source that an argument names; options (calibration, masks, layout, ...) are for paths.
 
     Raises:
-        InputError: there is no such motion or file.
+        InputError: there is no such motion or file, or a recording is asked for and INTRASPLAT_DATA is not set.
     """
     if argument.startswith("phantom:"):
         settings = _phantom_settings(argument)
@@ -69,11 +69,6 @@ def source_of(argument: str, options: Mapping[str, Any] | None = None) -> Source
         remedy = f"Give a path, phantom:MOTION ({', '.join(MOTIONS)}), or one of {', '.join(RECORDINGS)}."
         raise InputError("CLIP", f"there is no {argument!r}.", remedy)
     return Source(Path(argument).stem, argument, None, {"clip": Path(argument), **(options or {})})
-
-
-def data_folder() -> Path:
-    """Where recordings are looked for."""
-    return Path(os.environ.get(DATA_VARIABLE, "../shared/data"))
 
 
 def open_source(source: Source, holdout: str, hooks: Hooks) -> OpenClip:
@@ -92,10 +87,13 @@ def open_source(source: Source, holdout: str, hooks: Hooks) -> OpenClip:
 
 def _recording(argument: str) -> Source:
     name, file, beside = RECORDINGS[argument]
-    path = data_folder() / file
+    folder, remedy = os.environ.get(DATA_VARIABLE), f"Set {DATA_VARIABLE} to the folder that holds it, or leave it out."
+    if not folder:
+        problem = f"{argument} is looked for where {DATA_VARIABLE} says, and that is not set."
+        raise InputError("CLIP", problem, remedy)
+    path = Path(folder) / file
     if not path.exists():
-        problem = f"{argument} is not under {data_folder()}."
-        raise InputError("CLIP", problem, f"Set {DATA_VARIABLE} to the folder that holds it, or leave it out.")
+        raise InputError("CLIP", f"{argument} is not under {folder}.", remedy)
     return Source(name, argument, None, {"clip": path, **{key: path.parent / each for key, each in beside.items()}})
 
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from contract.errors import Cancelled
+from contract.errors import Cancelled, InputError
 from contract.exits import ExitCode
 from worker.__main__ import main
 from worker.evaluate.cells import Cell, plan
 from worker.evaluate.command import SUMMARY, measure_all
 from worker.evaluate.measure import Bench, Values, command_of
 from worker.evaluate.rows import CURVES, KEY, RUN_FIELDS, RUNS, Results, read_rows
-from worker.evaluate.sources import source_of
+from worker.evaluate.sources import DATA_VARIABLE, source_of
 from worker.hooks import Hooks
 
 CLIP = "phantom:pull:96x80:12frames"
@@ -57,6 +57,17 @@ def test_the_command_of_a_file_has_what_it_was_read_with(tmp_path: Path) -> None
     (cell,) = plan([source.name], ["fast"], ["every8"], [3], budgets_s=[6])
     asked = f"evaluate '{clip}' --layout sbs --mask-polarity auto --series fast --holdout every8 --seeds 3 --budget-s 6"
     assert command_of(cell, source) == f"intrasplat {asked} --out DIR"
+
+
+def test_a_recording_is_looked_for_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(DATA_VARIABLE, raising=False)
+    with pytest.raises(InputError, match=f"{DATA_VARIABLE} says, and that is not set"):
+        source_of("d4d_endonerf")
+    monkeypatch.setenv(DATA_VARIABLE, str(tmp_path))
+    with pytest.raises(InputError, match=f"d4d_endonerf is not under {tmp_path}"):
+        source_of("d4d_endonerf")
+    (tmp_path / "d4d_endonerf").mkdir()
+    assert source_of("d4d_endonerf").options == {"clip": tmp_path / "d4d_endonerf"}
 
 
 def test_a_curve_ends_where_its_run_does(measured: Path) -> None:
