@@ -17,7 +17,7 @@ from contract.progress_bar import ProgressBar
 from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
 from worker.evaluate.measure import Bench
-from worker.evaluate.rows import Results, write_rows
+from worker.evaluate.rows import Results, adding_alone, write_rows
 from worker.evaluate.sources import source_of
 from worker.evaluate.summary import SUMMARY_FIELDS, Sooner, capacities, groups_of, orderings, sooner
 from worker.hooks import Hooks, Progress
@@ -63,25 +63,31 @@ def run_cli(options: argparse.Namespace) -> int:
     """Measures what is asked for and has no row; returns the exit code.
 
     Raises:
-        InputError: a clip, a series or an option is not known.
+        InputError: a clip, a series or an option is not known, or another process adds rows to the folder.
         Cancelled: a signal came; what was measured until then is kept.
     """
     out: Path = options.out
     if options.redraw == bool(options.clips):
         remedy = "Name one or more clips, or say --redraw alone."
         raise InputError("CLIP", "either clips are measured or rows redrawn.", remedy)
-    results = Results(out)
-    if options.again:
-        results.forget_failed()
     if options.clips:
         bench, cells = _asked(options)
-        waiting = [cell for cell in cells if not results.has(cell.key)]
-        print(f"{len(cells)} cells, {len(cells) - len(waiting)} of them have their rows already")
-        measure_all(bench, waiting, results)
+        with adding_alone(out):
+            measure_missing(bench, cells, Results(out), again=options.again)
+    results = Results(out)
     if not results.runs:
         raise InputError("--out", f"{out} holds no rows.", "Name clips to measure.")
     conclude(results, out)
     return ExitCode.OK
+
+
+def measure_missing(bench: Bench, cells: Sequence[Cell], results: Results, *, again: bool = False) -> None:
+    """Measure the cells that have no row, or whose row says that they failed if `again`. Raises Cancelled."""
+    if again:
+        results.forget_failed()
+    waiting = [cell for cell in cells if not results.has(cell.key)]
+    print(f"{len(cells)} cells, {len(cells) - len(waiting)} of them have their rows already")
+    measure_all(bench, waiting, results)
 
 
 def measure_all(bench: Bench, cells: Sequence[Cell], results: Results) -> None:

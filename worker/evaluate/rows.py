@@ -1,5 +1,7 @@
 """runs.csv and curves.csv: a row a run, kept as soon as the run has ended, and which commit and machine it is of.
 
+Who adds rows to a folder writes its files whole, so one process at a time may: adding_alone().
+
 A run is found by KEY. Both files are written whole and renamed, the curve before the run, so that after any
 interruption a run either has its row and its curve or is measured again.
 """
@@ -11,12 +13,17 @@ import os
 import platform
 import subprocess
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+
+from contract.errors import InputError
+from contract.locks import FolderLock
 
 Row = dict[str, str]
 
 RUNS, CURVES = "runs.csv", "curves.csv"
+LOCK = ".lock"
 KEY = ("clip", "holdout", "series", "seed", "limit")
 SCORES = ("psnr_tissue_db", "psnr_paper_db", "ssim", "depth_agreement_mm", "coverage", "train_psnr_tissue_db")
 COPIES = ("copy_blend_db", "copy_flow_db")
@@ -64,6 +71,24 @@ class Results:
         self._folder.mkdir(parents=True, exist_ok=True)
         write_rows(self._folder / CURVES, CURVE_FIELDS, self.curves)
         write_rows(self._folder / RUNS, RUN_FIELDS, self.runs)
+
+
+@contextmanager
+def adding_alone(folder: Path) -> Iterator[None]:
+    """The folder, made if need be, is this process's to add rows to; the lock goes when the process does.
+
+    Raises:
+        InputError: another process adds rows to it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FolderLock(folder / LOCK)
+    if not lock.take():
+        problem = f"another process is adding rows to {folder}, and would overwrite those of this one."
+        raise InputError("--out", problem, "Wait until it has ended, or name another folder.")
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def read_rows(path: Path) -> list[Row]:

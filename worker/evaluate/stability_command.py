@@ -15,8 +15,8 @@ from contract.processes import heeding_signals
 from contract.progress_bar import ProgressBar
 from worker.evaluate.atlas import count_outcomes, draw_map, places_of, series_in, told_table
 from worker.evaluate.conditions import CONDITIONS, SEVERITIES
-from worker.evaluate.rows import Row
-from worker.evaluate.stability import Atlas, Grid, StabilityCell, plan
+from worker.evaluate.rows import Row, adding_alone, read_rows
+from worker.evaluate.stability import STABILITY, Atlas, Grid, StabilityCell, plan
 from worker.hooks import Hooks
 
 DEFAULT_SERIES = ("fast", "paper", "pfs", "hexplane", "without_mapf")
@@ -52,19 +52,23 @@ def run_cli(options: argparse.Namespace) -> int:
     """Measures what is asked for and has no row; returns the exit code.
 
     Raises:
-        InputError: a condition or series is not known, or there is nothing to draw.
+        InputError: a condition or series is not known, another process adds rows to the folder, or there is nothing
+            to draw.
         Cancelled: a signal came; what was measured until then is kept.
     """
-    width, height = options.size
-    atlas = Atlas(options.out, Grid(width, height, options.frames, options.iterations))
+    out: Path = options.out
     if not options.redraw:
+        width, height = options.size
         cells = plan(options.conditions, options.severities, options.series, range(options.seeds))
-        waiting = atlas.missing(cells)
-        print(f"{len(cells)} cells, {len(cells) - len(waiting)} of them have their rows already")
-        measure_all(atlas, waiting)
-    if not atlas.rows:
-        raise InputError("--out", f"{options.out} holds no rows.", "Leave --redraw out.")
-    draw_all(atlas.rows, options.out)
+        with adding_alone(out):
+            atlas = Atlas(out, Grid(width, height, options.frames, options.iterations))
+            waiting = atlas.missing(cells)
+            print(f"{len(cells)} cells, {len(cells) - len(waiting)} of them have their rows already")
+            measure_all(atlas, waiting)
+    rows = read_rows(out / STABILITY)
+    if not rows:
+        raise InputError("--out", f"{out} holds no rows.", "Leave --redraw out.")
+    draw_all(rows, out)
     return ExitCode.OK
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +16,7 @@ from worker.__main__ import main
 from worker.evaluate.cells import Cell, plan
 from worker.evaluate.command import SUMMARY, measure_all
 from worker.evaluate.measure import Bench, Values, command_of
-from worker.evaluate.rows import CURVES, KEY, RUN_FIELDS, RUNS, Results, read_rows
+from worker.evaluate.rows import CURVES, KEY, LOCK, RUN_FIELDS, RUNS, Results, adding_alone, read_rows
 from worker.evaluate.sources import DATA_VARIABLE, source_of
 from worker.hooks import Hooks
 
@@ -108,6 +110,38 @@ def test_what_failed_is_measured_again_only_if_asked_to(tmp_path: Path) -> None:
     assert [row["error"] for row in read_rows(tmp_path / RUNS)] == ["RuntimeError: the disk was full"]
     assert evaluate(tmp_path, "--series", "fast", "--again") == ExitCode.OK
     assert [row["error"] for row in read_rows(tmp_path / RUNS)] == [""]
+
+
+@pytest.mark.parametrize(
+    "command", [["evaluate", CLIP, "--iterations", "1"], ["stability", "--conditions", "smoke", "--iterations", "1"]]
+)
+def test_a_second_process_that_would_add_rows_to_a_folder_is_refused(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with adding_alone(tmp_path):
+        assert main([*command, "--out", str(tmp_path)]) == ExitCode.BAD_INPUT
+    assert "another process is adding rows" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == [LOCK]
+
+
+def test_rows_are_drawn_while_others_are_added(measured: Path) -> None:
+    with adding_alone(measured):
+        assert main(["evaluate", "--redraw", "--out", str(measured)]) == ExitCode.OK
+
+
+def test_a_process_that_was_killed_leaves_the_folder_to_the_next(tmp_path: Path) -> None:
+    program = (
+        "import sys, time; from pathlib import Path; from worker.evaluate.rows import adding_alone\n"
+        "with adding_alone(Path(sys.argv[1])): print(flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with pytest.raises(InputError, match="another process"), adding_alone(tmp_path):
+            pass
+        other.kill()
+    with adding_alone(tmp_path):
+        pass
 
 
 class InterruptedAfterOne(Bench):
