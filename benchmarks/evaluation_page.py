@@ -64,7 +64,8 @@ _INTRODUCTION = """
 
 `make evaluate` ([runs.csv](runs.csv), a row a run with its command, which looks for `d4d_endonerf` in the folder
 `INTRASPLAT_DATA` names; [curves.csv](curves.csv); [summary.csv](summary.csv), medians over seeds). `intrasplat evaluate
---redraw --out docs/results` draws all charts anew from the rows; PNG and SVG lie beside this page. {count}
+--redraw --out docs/results` draws all charts anew from the rows; PNG and SVG lie beside this page. In rows of
+commit `f46701b` `t_post_s` has the scoring of the curve in it, which a user's run has not. {count}
 """
 _TRUTH = """
 ### What copying cannot do

@@ -36,7 +36,8 @@ SPEED = ("t_train_s", "t_post_s", "seconds", "step_ms", "render_ms", "render_fps
 ORIGIN = ("machine", "commit", "command", "error")
 RUN_FIELDS = (*KEY, *SCORES, *COPIES, *TRUTH, *SIZE, *SPEED, *ORIGIN)
 """Empty means not measured. docs/conventions.md defines SCORES and the clocks, truth.py TRUTH, measure.py the rest:
-SIZE in _size and _stored_loss_db, step_ms and render_ms in _speed; seconds is JSON, load_1min before the run.
+SIZE in _size and _stored_loss_db, step_ms and render_ms in _speed; t_post_s and seconds, which is JSON, are what the
+user of `reconstruct` sees (seconds_of); load_1min is before the run.
 """
 CURVE_FIELDS = (*KEY, "t_train_s", "iteration", "psnr_tissue_db", "ssim", "depth_agreement_mm")
 

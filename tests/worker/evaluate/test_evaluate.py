@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from contract.exits import ExitCode
 from worker.__main__ import main
 from worker.evaluate.cells import Cell, plan
 from worker.evaluate.command import SUMMARY, measure_all
-from worker.evaluate.measure import Bench, Values, command_of
+from worker.evaluate.measure import Bench, Values, command_of, seconds_of
 from worker.evaluate.rows import CURVES, KEY, LOCK, RUN_FIELDS, RUNS, Results, adding_alone, read_rows
 from worker.evaluate.sources import DATA_VARIABLE, source_of
 from worker.hooks import Hooks
@@ -47,6 +48,11 @@ def test_a_run_becomes_a_row_with_every_figure(measured: Path) -> None:
     assert empty == {"error"}
     assert abs(float(fast["stored_loss_db"])) < 0.3
     assert float(fast["psnr_tissue_db"]) > 15
+    seconds = json.loads(fast["seconds"])
+    assert [float(fast[name]) for name in ("t_train_s", "t_post_s")] == pytest.approx(
+        [seconds["t_train_s"], seconds["t_post_s"]], abs=1e-3
+    )
+    assert 0 < seconds["t_train_s"] <= seconds["t_post_s"]
     assert 0 <= float(fast["motion_error_mm"]) < 20
     again = f"intrasplat evaluate {CLIP} --series fast --holdout every8 --seeds 0 --iterations 12 --out DIR"
     assert fast["command"] == again
@@ -59,6 +65,11 @@ def test_the_command_of_a_file_has_what_it_was_read_with(tmp_path: Path) -> None
     (cell,) = plan([source.name], ["fast"], ["every8"], [3], budgets_s=[6])
     asked = f"evaluate '{clip}' --layout sbs --mask-polarity auto --series fast --holdout every8 --seeds 3 --budget-s 6"
     assert command_of(cell, source) == f"intrasplat {asked} --out DIR"
+
+
+def test_the_seconds_of_a_row_are_those_of_a_run_that_nobody_evaluates() -> None:
+    run, opening = {"t_train_s": 15.0, "score_s": 1.0, "t_post_s": 22.0}, {"decode_s": 2.0}
+    assert seconds_of(run, opening, judging_s=3.0) == {**run, **opening, "t_post_s": 19.0}
 
 
 def test_a_recording_is_looked_for_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
