@@ -240,7 +240,7 @@ def _size(group: Group) -> list[str]:
     return [
         *(_number(group.median(name), 0) for name in ("gaussians", "bases", "floats_a_gaussian")),
         _number(group.median("scene_bytes") / 1e6, 2),
-        _number(group.median("stored_loss_db"), 3),
+        _number(group.median("stored_loss_held_out_db"), 3),
         *(_number(group.median(name), 1) for name in ("t_train_s", "step_ms")),
         _number(group.median("render_fps"), 0),
         str(len(group.rows)),

@@ -103,7 +103,10 @@ class Bench:
             scene_bytes = sum(path.stat().st_size for path in kept)
         seconds = seconds_of(report.seconds, opened.seconds, on_the_way.took_s)
         values = _reported(report, seconds) | _size(scene) | _speed(scene, report)
-        values |= {"scene_bytes": scene_bytes, "stored_loss_db": _stored_loss_db(report, on_the_way.last_db)}
+        values |= {
+            "scene_bytes": scene_bytes,
+            "stored_loss_held_out_db": _stored_loss_held_out_db(report, on_the_way.last_db),
+        }
         if curve:  # else there was no tissue to score
             curve = [point | scores for point, scores in zip(curve, on_the_way.scores(), strict=True)]
             # its end is scored on all held-out frames of the model as it is kept
@@ -216,7 +219,7 @@ def _speed(scene: Scene, report: Report) -> Values:
     return {"step_ms": step_ms, "render_ms": median_ms, "render_fps": 1000 / median_ms}
 
 
-def _stored_loss_db(report: Report, trained_db: Mapping[int, float]) -> float | None:
+def _stored_loss_held_out_db(report: Report, trained_db: Mapping[int, float]) -> float | None:
     """What held-out frames of the stored scene score below those of the model as training left it, on the frames that
     were scored then: the price of rounding, and of strays taken out. The report's own scores are of the stored scene.
     """

@@ -31,13 +31,12 @@ TRUTH = (
     "psnr_view10_db", "psnr_view15_db", "psnr_baked10_db", "psnr_baked15_db", "bound10_db", "bound15_db",
     "psnr_hidden_db", "depth_error_mm", "motion_error_mm", "moving_error_mm", "moving_mm",
 )  # fmt: skip
-SIZE = ("iterations", "gaussians", "bases", "floats_a_gaussian", "scene_bytes", "stored_loss_db")
+SIZE = ("iterations", "gaussians", "bases", "floats_a_gaussian", "scene_bytes", "stored_loss_held_out_db")
 SPEED = ("t_train_s", "t_post_s", "seconds", "step_ms", "render_ms", "render_fps", "width", "height", "load_1min")
 ORIGIN = ("machine", "commit", "command", "error")
 RUN_FIELDS = (*KEY, *SCORES, *COPIES, *TRUTH, *SIZE, *SPEED, *ORIGIN)
 """Empty means not measured. docs/conventions.md defines SCORES and the clocks, truth.py TRUTH, measure.py the rest:
-SIZE in _size and _stored_loss_db, step_ms and render_ms in _speed; t_post_s and seconds, which is JSON, are what the
-user of `reconstruct` sees (seconds_of); load_1min is before the run.
+SIZE in _size and _stored_loss_held_out_db, SPEED in seconds_of and _speed. seconds is JSON, load_1min before the run.
 """
 CURVE_FIELDS = (*KEY, "t_train_s", "iteration", "psnr_tissue_db", "ssim", "depth_agreement_mm")
 

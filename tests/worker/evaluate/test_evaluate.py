@@ -46,7 +46,7 @@ def test_a_run_becomes_a_row_with_every_figure(measured: Path) -> None:
     )
     empty = {name for name in RUN_FIELDS if not fast[name]}
     assert empty == {"error"}
-    assert abs(float(fast["stored_loss_db"])) < 0.3
+    assert abs(float(fast["stored_loss_held_out_db"])) < 0.3
     assert float(fast["psnr_tissue_db"]) > 15
     seconds = json.loads(fast["seconds"])
     assert [float(fast[name]) for name in ("t_train_s", "t_post_s")] == pytest.approx(
