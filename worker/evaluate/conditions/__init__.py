@@ -58,7 +58,9 @@ class Condition:
     def apply(self, clean: CleanClip, severity: int, seed: int) -> Given:
         """The clip of a severity, as level() has them; the same arguments give the same clip.
 
-        What is drawn at random does not depend on the severity, so that a higher one is the same mishap, but worse.
+        The generator is seeded by the condition's name and the seed, not by the severity: where the level is a size, a
+        share or a strength, a higher one is the same mishap, but worse. Where it is a number of things (highlights),
+        those of a lower one start at the same places, but go other ways, because the generator takes turns among them.
         """
         random = np.random.default_rng([seed, zlib.crc32(self.name.encode())])
         return self.spoil(clean, self.level(severity), random)
