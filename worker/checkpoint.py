@@ -93,10 +93,16 @@ class Scene:
         """Bytes of the model's tensors in memory."""
         return sum(each.numel() * each.element_size() for each in self.tensors().values())
 
-    @cached_property  # it takes a copy of the file to know
+    @cached_property  # its length is asked for before it is written
+    def file_content(self) -> bytes:
+        """scene.safetensors, of the tensors as they are when it is first asked for."""
+        content: bytes = save(dict(self.stored or self.tensors()))
+        return content
+
+    @property
     def file_bytes(self) -> int:
         """Bytes of scene.safetensors."""
-        return len(save(dict(self.stored or self.tensors())))
+        return len(self.file_content)
 
 
 def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> None:
@@ -112,8 +118,7 @@ def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> 
     _check_counts(scene)
     tensors = dict(scene.stored or scene.tensors())
     directory.mkdir(parents=True, exist_ok=True)
-    data = save(tensors)
-    files = {SCENE_FILE: data} | {name: (directory / _plain(name)).read_bytes() for name in beside}
+    files = {SCENE_FILE: scene.file_content} | {name: (directory / _plain(name)).read_bytes() for name in beside}
     manifest = {
         "format": FORMAT,
         "version": FORMAT_VERSION,
@@ -135,7 +140,7 @@ def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> 
         },
     }
     text = json.dumps(manifest, indent=1, allow_nan=False)
-    _write(directory / SCENE_FILE, data)
+    _write(directory / SCENE_FILE, scene.file_content)
     _write(directory / MANIFEST_FILE, text.encode())
 
 
