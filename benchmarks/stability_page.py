@@ -27,6 +27,26 @@ method, so counts compare within a row.
 _MAP = """
 ![Decibels lost of each condition at five severities, marked where the user was told and where not](stability-fast.png)
 """
+_WHY_SILENT = {
+    ("wrong_baseline",): """
+**Why a wrong baseline is silent.** Depth is focal length times baseline over disparity: a wrong baseline scales every
+distance, and the tissue's motion with it, and changes no pixel of either eye. The rows of the eyes match as well, the
+scene renders as well, so no check of one stereo pair's pictures can find it; only a length known beforehand could,
+such as an instrument's width, and none is asked for. Every report on stereo names the baseline it took among its
+assumptions, right or wrong alike, so that does not count as told here: compare it with your endoscope's.
+""",
+    ("fast_pull", "cutting"): """
+**Why fast pulls and cuts are silent.** Much of what they lose lies behind the instrument, which moves as the tissue
+does and hides a few hundredths of the judged picture while the tissue there goes on unseen; a calm clip's instrument
+rests, and what it hides throughout is not judged. No score of training or of held-out frames looks there: none has a
+picture of it. What the frames do show loses 1 to 4 dB beside the calm clip and stays near what a clip that breathes
+comes to, and the speed of visible tissue is no sign either: good clips, the real one among them, move as fast
+([decision 016](../decisions/016-stability.md) has the numbers). A warning wherever an instrument hides tissue that
+moves would stand in every report. It is told by the pixel instead: in a render, `confidence` falls where tissue was
+hidden for part of the clip. What is shown behind an instrument is a guess.
+""",
+}
+"""By the conditions, why nothing is said; shown where one of them is silent."""
 
 
 def stability_sections(results: Path) -> list[str]:
@@ -34,12 +54,15 @@ def stability_sections(results: Path) -> list[str]:
     rows = read_rows(results / STABILITY)
     if not rows:
         return []
-    lines = []
+    lines, silent = [], set()
     for series in series_in(rows):
-        counted = count_outcomes(places_of(rows, series))
+        places = places_of(rows, series)
+        counted = count_outcomes(places)
+        silent |= {condition for (condition, _), place in places.items() if place.outcome == "silent"}
         measured = f"{sum(counted.values())} of {len(CONDITIONS) * len(SEVERITIES)}"
         counts = " | ".join(str(counted.get(outcome, 0)) for outcome in WORST_FIRST)
         name = f"{map_name(series)}.png"
         shown = f"[{name}]({name})" if (results / name).exists() else ""
         lines.append(f"| {series} | {measured} | {counts} | {shown} |\n")
-    return [_INTRODUCTION, *lines, *([_MAP] if (results / "stability-fast.png").exists() else [])]
+    drawn = [_MAP] if (results / "stability-fast.png").exists() else []
+    return [_INTRODUCTION, *lines, *drawn, *(why for names, why in _WHY_SILENT.items() if silent & {*names})]

@@ -198,5 +198,13 @@ def test_the_page_of_results_counts_how_the_places_ended(tmp_path: Path) -> None
     page = "".join(stability_sections(tmp_path))
     assert "| fast | 6 of 145 | 1 | 1 | 1 | 1 | 1 | 1 | 0 |  |" in page
     assert "stability-fast.png" not in page
+    assert "Why a wrong baseline is silent" not in page
+
+
+def test_the_page_says_why_a_place_is_silent(tmp_path: Path) -> None:
+    write_rows(tmp_path / STABILITY, FIELDS, [placed("wrong_baseline", 4, "silent", "0.03")])
+    page = "".join(stability_sections(tmp_path))
+    assert "Why a wrong baseline is silent" in page
+    assert "Why fast pulls" not in page
     draw_map(places_of(ROWS, "fast"), "fast", tmp_path)
     assert "[stability-fast.png](stability-fast.png)" in "".join(stability_sections(tmp_path))
