@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from numba.core.errors import TypingError
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,7 +22,7 @@ from worker.gaussians import Gaussians
 from worker.loss import LossSettings, training_loss
 from worker.optimize import StepRates
 from worker.raster import Camera
-from worker.raster.cpu import Rasterizer, Target, camera_vector, padded, update
+from worker.raster.cpu import Rasterizer, Target, camera_vector, padded
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion, motion_of
 
@@ -385,10 +384,3 @@ def test_gaussians_taken_afresh_start_with_no_moments() -> None:
     assert model.arrays()["moments.canonical"][..., 0].any()
     assert model.count == 3
     assert len(model.export()[0]) == 3
-
-
-def test_a_strided_array_is_no_vector_memory() -> None:
-    strided = np.zeros((16, 2), np.float32)[:, 0]
-    dense = np.zeros(16, np.float32)
-    with pytest.raises(TypingError, match="C-contiguous"):
-        update.adam(0, 1, strided, dense, dense, dense, *[np.float32(1)] * 4)

@@ -9,7 +9,8 @@ time), opacity_logit [N], colour [3, N]. A splat is a Gaussian on the image, SPL
     9     camera z
     10    2**(2 k_yy): by this factor the ratio of alpha from row to row changes from row to row
     11    a value of the caller's that is blended as colour is, at first 0
-Arithmetic is float64 on LANES Gaussians at once, storage float32; exponentials have float32's precision.
+Arithmetic is float64 on LANES Gaussians at once, storage float32; exponentials have float32's precision and end at
+LARGEST_EXP, so no log-scale or logit, however far out, leaves the numbers.
 """
 
 from __future__ import annotations
@@ -42,6 +43,10 @@ SPLAT = 12
 LOG2E = 1.4426950408889634
 _LN2 = 0.6931471805599453
 _LARGEST = 1e300
+_MOST_POWER = 20.0
+LARGEST_EXP = 2.0**_MOST_POWER
+"""The most that e^x gives. A Gaussian that wide, 17,000 times the median depth, covers any image evenly, and its extent
+still fits into float32; an opacity of one in as many is never drawn."""
 
 
 @njit(cache=True, nogil=True)
@@ -85,7 +90,9 @@ def _rows_of(state, first, i):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _exp(x):  # type: ignore[no-untyped-def]
-    return widen(exp2(narrow(x * LOG2E)))
+    """e^x, at most LARGEST_EXP; NaN of NaN."""
+    power, most = x * LOG2E, widen(splat(np.float32(_MOST_POWER)))
+    return widen(exp2(narrow(where_less(most, power, most, power))))
 
 
 @njit(cache=True, nogil=True)
@@ -149,6 +156,49 @@ def _held(ratio, low, high):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _unless_culled(extent2, z, det, centre, reach, width, height):  # type: ignore[no-untyped-def]
+    """extent2; -1 where there is no ellipse, or no pixel centre of the image within its reach."""
+    zero = widen(splat(np.float32(0.0)))
+    culled = zero - 1.0
+    visible = where_less(zero, det, extent2, culled)
+    visible = where_less(det, zero + _LARGEST, visible, culled)
+    visible = where_less(zero + NEAR, z, visible, culled)
+    visible = where_less(centre[0] + reach[0], zero + 0.5, culled, visible)
+    visible = where_less(zero + (width - 0.5), centre[0] - reach[0], culled, visible)
+    visible = where_less(centre[1] + reach[1], zero + 0.5, culled, visible)
+    return where_less(zero + (height - 0.5), centre[1] - reach[1], culled, visible)
+
+
+@njit(cache=True, nogil=True)
+def _store_splats(splats, at, centre, covariance, inverse_det, log2_opacity, z):  # type: ignore[no-untyped-def]
+    """All of LANES splats but their colour, from splats[at]."""
+    cxx, cxy, cyy = covariance
+    k_yy = -0.5 * LOG2E * cxx * inverse_det
+    store_strided(splats, at, SPLAT, narrow(centre[0]))
+    store_strided(splats, at + 1, SPLAT, narrow(centre[1]))
+    store_strided(splats, at + 2, SPLAT, narrow(-0.5 * LOG2E * cyy * inverse_det))
+    store_strided(splats, at + 3, SPLAT, narrow(LOG2E * cxy * inverse_det))
+    store_strided(splats, at + 4, SPLAT, narrow(k_yy))
+    store_strided(splats, at + 5, SPLAT, narrow(log2_opacity))
+    store_strided(splats, at + 9, SPLAT, narrow(z))
+    store_strided(splats, at + 10, SPLAT, exp2(narrow(2.0 * k_yy)))
+    store_strided(splats, at + 11, SPLAT, splat(np.float32(0.0)))
+
+
+@njit(cache=True, nogil=True)
+def _store_extents(extent, at, covariance, det, extent2, reach):  # type: ignore[no-untyped-def]
+    """What bins.EXTENT lists; the conic's a, b, c are cyy, -cxy, cxx over det, and ac - b^2 is 1 / det."""
+    cxx, cxy, cyy = covariance
+    inverse_cxx = 1.0 / cxx
+    store_strided(extent, at, EXTENT, narrow(reach[0]))
+    store_strided(extent, at + 1, EXTENT, narrow(cxy / cyy * reach[1]))
+    store_strided(extent, at + 2, EXTENT, narrow(cxy * inverse_cxx))
+    store_strided(extent, at + 3, EXTENT, narrow(extent2 * det * inverse_cxx))
+    store_strided(extent, at + 4, EXTENT, narrow(det * inverse_cxx * inverse_cxx))
+    store_strided(extent, at + 5, EXTENT, narrow(reach[1]))
+
+
+@njit(cache=True, nogil=True)
 def project(  # type: ignore[no-untyped-def]
     thread, threads, camera, state, opacity_logit, colour, splats, radius2, extent
 ):
@@ -178,43 +228,15 @@ def project(  # type: ignore[no-untyped-def]
         k0 = _each(_through(_sum(j0, w[0], zero - j0 * u, w[2]), r), scale)
         k1 = _each(_through(_sum(j1, w[1], zero - j1 * v, w[2]), r), scale)
         cxx, cxy, cyy = _dot(k0, k0) + EPS2D, _dot(k0, k1), _dot(k1, k1) + EPS2D
-        det = cxx * cyy - cxy * cxy
-        inverse_det = 1.0 / det
         log2_opacity = zero - log2(1.0 + _exp(zero - widen(load(opacity_logit, i))))
         extent2 = 2.0 * _LN2 * (log2_opacity - np.log2(MIN_ALPHA))
-        mx, my = j0 * x + cx, j1 * y + cy
-        reach_x, reach_y = sqrt(extent2 * cxx), sqrt(extent2 * cyy)
-
-        visible = where_less(zero, det, extent2, zero - 1.0)
-        visible = where_less(det, zero + _LARGEST, visible, zero - 1.0)
-        visible = where_less(zero + NEAR, z, visible, zero - 1.0)
-        visible = where_less(mx + reach_x, zero + 0.5, zero - 1.0, visible)
-        visible = where_less(zero + (width - 0.5), mx - reach_x, zero - 1.0, visible)
-        visible = where_less(my + reach_y, zero + 0.5, zero - 1.0, visible)
-        visible = where_less(zero + (height - 0.5), my - reach_y, zero - 1.0, visible)
-        store(radius2, i, narrow(visible))
-
-        k_yy = -0.5 * LOG2E * cxx * inverse_det
-        at = i * SPLAT
-        store_strided(splats, at, SPLAT, narrow(mx))
-        store_strided(splats, at + 1, SPLAT, narrow(my))
-        store_strided(splats, at + 2, SPLAT, narrow(-0.5 * LOG2E * cyy * inverse_det))
-        store_strided(splats, at + 3, SPLAT, narrow(LOG2E * cxy * inverse_det))
-        store_strided(splats, at + 4, SPLAT, narrow(k_yy))
-        store_strided(splats, at + 5, SPLAT, narrow(log2_opacity))
+        det = cxx * cyy - cxy * cxy
+        centre, reach = (j0 * x + cx, j1 * y + cy), (sqrt(extent2 * cxx), sqrt(extent2 * cyy))
+        store(radius2, i, narrow(_unless_culled(extent2, z, det, centre, reach, width, height)))
+        _store_splats(splats, i * SPLAT, centre, (cxx, cxy, cyy), 1.0 / det, log2_opacity, z)
         for channel in range(3):
-            store_strided(splats, at + 6 + channel, SPLAT, load(colour[channel], i))
-        store_strided(splats, at + 9, SPLAT, narrow(z))
-        store_strided(splats, at + 10, SPLAT, exp2(narrow(2.0 * k_yy)))
-        store_strided(splats, at + 11, SPLAT, splat(np.float32(0.0)))
-        # The conic's a, b, c are cyy, -cxy, cxx over det, and ac - b^2 is 1 / det.
-        at, inverse_cxx = i * EXTENT, 1.0 / cxx
-        store_strided(extent, at, EXTENT, narrow(reach_x))
-        store_strided(extent, at + 1, EXTENT, narrow(cxy / cyy * reach_y))
-        store_strided(extent, at + 2, EXTENT, narrow(cxy * inverse_cxx))
-        store_strided(extent, at + 3, EXTENT, narrow(extent2 * det * inverse_cxx))
-        store_strided(extent, at + 4, EXTENT, narrow(det * inverse_cxx * inverse_cxx))
-        store_strided(extent, at + 5, EXTENT, narrow(reach_y))
+            store_strided(splats, i * SPLAT + 6 + channel, SPLAT, load(colour[channel], i))
+        _store_extents(extent, i * EXTENT, (cxx, cxy, cyy), det, extent2, reach)
 
 
 @njit(cache=True, nogil=True)
@@ -283,7 +305,8 @@ def project_backward(  # type: ignore[no-untyped-def]
         q, n = _quaternion(state, i)
         r = _rotation(q)
         s0, s1, s2 = _rows_of(state, 7, i)
-        variance = (_exp(2.0 * s0), _exp(2.0 * s1), _exp(2.0 * s2))
+        scale = (_exp(s0), _exp(s1), _exp(s2))
+        variance = _each(scale, scale)
         ratio_x, ratio_y = x * inverse_z, y * inverse_z
         u, v = _held(ratio_x, low_u, high_u), _held(ratio_y, low_v, high_v)
         j0, j1 = fx * inverse_z, fy * inverse_z
