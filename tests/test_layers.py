@@ -25,6 +25,7 @@ MAY_IMPORT = {
 STAGES = (
     "hooks",
     "opencv",
+    "cache",
     "clip",
     "calibration",
     "decode",

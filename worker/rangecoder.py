@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from worker.raster.cpu.cache import use_kernel_cache
+from worker.cache import use_kernel_cache
 
 Table = NDArray[np.int32]
 
@@ -27,7 +27,7 @@ PARTS = 4
 """A table is coded as so many tables, of neighbouring rows each, that share nothing and so may be read at once."""
 LARGEST = 2**30 - 1
 """Magnitudes have at most 30 digits."""
-BUCKETS = 12
+BUCKETS = 10
 """Sets of probabilities a row, by activity."""
 MODELS = 33 + 31 + 2 * 31
 """Of a set: digits told so far, the second digit by their number, the third by their number and the second."""
@@ -36,10 +36,14 @@ ONE = 1 << 16
 """Probabilities of a 0 are shares of this, each the mean of a quick and a slow estimate."""
 QUICK, SLOW = 4, 7
 DEAREST_BITS = 10
-"""What a bit costs at most: estimates stop at 15 and 127 of ONE, and log2(ONE / 71) is 9.9."""
+"""What a bit with a model costs at most: `it >> k` is 0 below 2**k, so estimates stay 15 and 127 away from 0 and ONE,
+their mean 71, and log2(ONE / 71) is 9.85; cutting a range of at least 2**24 in whole numbers adds less than 0.01."""
 AVERAGE = 64
 """Activity of a number as large as its row's average."""
 MOST_ACTIVE = 6 * AVERAGE
+THRESHOLDS = np.array([14, 21, 31, 46, 69, 103, 154, 231, 346])
+"""Activities at which the next bucket begins: each half as much again, rounded down."""
+_BUCKET_OF = np.searchsorted(THRESHOLDS, np.arange(MOST_ACTIVE + 1), side="right")
 _TOP = np.uint64(1 << 24)
 _FULL = np.uint64(0xFFFFFFFF)
 _BYTE = np.uint64(8)
@@ -56,7 +60,9 @@ def encode(table: Table) -> list[bytes]:
     largest = max(abs(int(table.min())), abs(int(table.max()))) if table.size else 0
     if largest > LARGEST:
         raise ValueError(f"numbers up to {largest} cannot be coded")
-    most_bits = DEAREST_BITS * (largest.bit_length() + 1) + largest.bit_length()
+    digits = largest.bit_length()
+    # of a number: with models so many ones and a 0, and two digits; plain its sign and what digits are left
+    most_bits = DEAREST_BITS * (digits + 3) + digits
 
     def coded(part: Table) -> bytes:
         out = np.zeros(64 + part.size * most_bits // 8, np.uint8)  # pages that stay untouched take no memory
@@ -98,33 +104,32 @@ def _encode(table, out):  # type: ignore[no-untyped-def]
     """Code a table into out; returns the bytes written."""
     count, rows = table.shape
     models, average, nearby = _start(rows)
-    # Low; the range; the byte held back, as a carry may come; that and the 255s behind it, counted; bytes written.
-    # Plain numbers that are handed around: an array of them would be slower.
-    state = np.uint64(0), _FULL, np.uint64(0), 1, 0
+    # Low; the range; bytes written, the first of them 0. Handed around as plain numbers: an array would be slower.
+    state = np.uint64(0), _FULL, 1
     for n in range(count):
         here = AVERAGE
         for k in range(rows):
             number = table[n, k]
             magnitude = abs(number)
-            set_ = models[k, _bucket((3 * here + nearby[k]) >> 2)]
+            first = _set(k, here, nearby)
             digits = 0
             while magnitude >> digits:
-                state = _tell(state, out, set_[digits], 1)
+                state = _tell(state, out, models, first + digits, 1)
                 digits += 1
-            state = _tell(state, out, set_[digits], 0)
+            state = _tell(state, out, models, first + digits, 0)
             if digits:
                 state = _tell_plain(state, out, number < 0)
             for digit in range(digits - 2, -1, -1):
                 bit = (magnitude >> digit) & 1
                 model = _digit_model(digits, digit, magnitude)
                 if model:
-                    state = _tell(state, out, set_[model], bit)
+                    state = _tell(state, out, models, first + model, bit)
                 else:
                     state = _tell_plain(state, out, bit)
             here = _follow(magnitude, here, average, nearby, k)
-    for _ in range(5):
-        state = _shift(state, out)
-    return state[4]
+    for _ in range(4):
+        state = _give(state, out)
+    return state[2]
 
 
 @njit(cache=True, nogil=True)
@@ -138,10 +143,10 @@ def _decode(code, table):  # type: ignore[no-untyped-def]
     for n in range(count):
         here = AVERAGE
         for k in range(rows):
-            set_ = models[k, _bucket((3 * here + nearby[k]) >> 2)]
+            first = _set(k, here, nearby)
             digits = 0
             while digits < 31:
-                state, bit = _ask(state, code, set_[digits])
+                state, bit = _ask(state, code, models, first + digits)
                 if not bit:
                     break
                 digits += 1
@@ -154,7 +159,7 @@ def _decode(code, table):  # type: ignore[no-untyped-def]
             for digit in range(digits - 2, -1, -1):
                 model = _digit_model(digits, digit, magnitude << (digit + 1))
                 if model:
-                    state, bit = _ask(state, code, set_[model])
+                    state, bit = _ask(state, code, models, first + model)
                 else:
                     state, bit = _ask_plain(state, code)
                 magnitude = 2 * magnitude + bit
@@ -165,19 +170,15 @@ def _decode(code, table):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _start(rows):  # type: ignore[no-untyped-def]
-    """Probabilities [rows, BUCKETS, MODELS, 2], each row's average magnitude (of 256) and activity so far."""
-    models = np.full((rows, BUCKETS, MODELS, 2), ONE // 2, np.int32)
+    """Probabilities [rows * BUCKETS * MODELS, 2], each row's average magnitude (of 256) and activity so far."""
+    models = np.full((rows * BUCKETS * MODELS, 2), ONE // 2, np.uint16)  # they never reach ONE
     return models, np.full(rows, 256, np.int64), np.full(rows, AVERAGE, np.int64)
 
 
 @njit(cache=True, nogil=True)
-def _bucket(activity):  # type: ignore[no-untyped-def]
-    """0 below 14, then one more at 21, 31, 46, ...: each threshold half as much again."""
-    bucket, threshold = 0, 14
-    while bucket < BUCKETS - 1 and activity >= threshold:
-        bucket += 1
-        threshold += threshold >> 1
-    return bucket
+def _set(k, here, nearby):  # type: ignore[no-untyped-def]
+    """Where the models of this row and activity begin."""
+    return (k * BUCKETS + _BUCKET_OF[(3 * here + nearby[k]) >> 2]) * MODELS
 
 
 @njit(cache=True, nogil=True)
@@ -194,31 +195,33 @@ def _digit_model(digits, digit, magnitude):  # type: ignore[no-untyped-def]
 def _follow(magnitude, here, average, nearby, k):  # type: ignore[no-untyped-def]
     """After a number: its row's average and activity; returns the Gaussian's activity."""
     average[k] += ((magnitude << 8) - average[k]) >> 7
-    activity = min((magnitude << 14) // (average[k] + AVERAGE), MOST_ACTIVE)
+    activity = 0
+    if magnitude:  # most are 0, and nothing here is slower than to divide
+        activity = min((magnitude << 14) // (average[k] + AVERAGE), MOST_ACTIVE)
     nearby[k] += (activity - nearby[k]) >> 3
     return here + ((activity - here) >> 3)
 
 
 @njit(cache=True, nogil=True)
-def _adapt(model, bit):  # type: ignore[no-untyped-def]
+def _adapt(models, at, bit):  # type: ignore[no-untyped-def]
+    quick, slow = np.int64(models[at, 0]), np.int64(models[at, 1])
     if bit:
-        model[0] -= model[0] >> QUICK
-        model[1] -= model[1] >> SLOW
+        quick, slow = quick - (quick >> QUICK), slow - (slow >> SLOW)
     else:
-        model[0] += (ONE - model[0]) >> QUICK
-        model[1] += (ONE - model[1]) >> SLOW
+        quick, slow = quick + ((ONE - quick) >> QUICK), slow + ((ONE - slow) >> SLOW)
+    models[at, 0], models[at, 1] = quick, slow
 
 
 @njit(cache=True, nogil=True)
-def _bound(width, model):  # type: ignore[no-untyped-def]
+def _bound(width, models, at):  # type: ignore[no-untyped-def]
     """Where a range is cut: a 0 takes what is below."""
-    return (width >> np.uint64(16)) * np.uint64((model[0] + model[1]) >> 1)
+    return (width >> np.uint64(16)) * np.uint64((np.int64(models[at, 0]) + np.int64(models[at, 1])) >> 1)
 
 
 @njit(cache=True, nogil=True)
-def _tell(state, out, model, bit):  # type: ignore[no-untyped-def]
-    state = _cut(state, out, _bound(state[1], model), bit)
-    _adapt(model, bit)
+def _tell(state, out, models, at, bit):  # type: ignore[no-untyped-def]
+    state = _cut(state, out, _bound(state[1], models, at), bit)
+    _adapt(models, at, bit)
     return state
 
 
@@ -229,36 +232,42 @@ def _tell_plain(state, out, bit):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _cut(state, out, bound, bit):  # type: ignore[no-untyped-def]
-    low, width, held, pending, place = state
+    low, width, place = state
     if bit:
         low += bound
         width -= bound
+        if low > _FULL:
+            _carry(out, place)
+            low &= _FULL
     else:
         width = bound
     while width < _TOP:
-        low, width, held, pending, place = _shift((low, width << _BYTE, held, pending, place), out)
-    return low, width, held, pending, place
+        low, width, place = _give((low, width << _BYTE, place), out)
+    return low, width, place
 
 
 @njit(cache=True, nogil=True)
-def _shift(state, out):  # type: ignore[no-untyped-def]
-    """Move low's top byte out, once it is known whether a carry comes; until then 255s are only counted."""
-    low, width, held, pending, place = state
-    if low < np.uint64(0xFF000000) or low > _FULL:
-        carry = low >> np.uint64(32)
-        while pending:
-            out[place] = np.uint8((held + carry) & np.uint64(255))
-            place += 1
-            pending -= 1
-            held = np.uint64(255)
-        held = (low >> np.uint64(24)) & np.uint64(255)
-    return (low & np.uint64(0x00FFFFFF)) << _BYTE, width, held, pending + 1, place
+def _carry(out, place):  # type: ignore[no-untyped-def]
+    """Add 1 to the number written so far; its first byte is 0 and takes what no other can."""
+    place -= 1
+    while out[place] == 255:
+        out[place] = 0
+        place -= 1
+    out[place] += 1
 
 
 @njit(cache=True, nogil=True)
-def _ask(state, code, model):  # type: ignore[no-untyped-def]
-    state, bit = _which(state, code, _bound(state[1], model))
-    _adapt(model, bit)
+def _give(state, out):  # type: ignore[no-untyped-def]
+    """Move low's top byte out."""
+    low, width, place = state
+    out[place] = np.uint8(low >> np.uint64(24))
+    return (low << _BYTE) & _FULL, width, place + 1
+
+
+@njit(cache=True, nogil=True)
+def _ask(state, code, models, at):  # type: ignore[no-untyped-def]
+    state, bit = _which(state, code, _bound(state[1], models, at))
+    _adapt(models, at, bit)
     return state, bit
 
 

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from worker.rangecoder import LARGEST, PARTS, decode, encode
+from tests.conftest import REPOSITORY
+from worker.rangecoder import DEAREST_BITS, LARGEST, ONE, PARTS, _adapt, _bound, decode, encode
+
+GOLDEN_TABLE = [[0, 3, -1, 700, 0], [1, 2, 0, -650, 0], [0, -4, 0, 723, 0], [-1, 5, 0, 0, 1], [0, 3, 0, -9, 0]]
+GOLDEN_CODES = ("00666dc79cf1a99a00", "009fff8000", "00ffc5ad66a162abb6f63b3c1a00", "00137444e2")
 
 
 def table_of(count: int, rows: int, spread: float, seed: int = 0) -> NDArray[np.int32]:
@@ -72,3 +81,49 @@ def test_noise_never_reads_beyond_its_end() -> None:
             decode(noise, 400, 12)
     with pytest.raises(ValueError, match="does not end"):
         decode([b"\xff" * 400] * PARTS, 400, 12)
+
+
+def test_files_of_today_are_read_tomorrow() -> None:
+    """Another constant of the coder would make other bytes, and every stored scene unreadable."""
+    table = np.array(GOLDEN_TABLE, np.int32)
+    assert tuple(code.hex() for code in encode(table)) == GOLDEN_CODES
+    np.testing.assert_array_equal(decode([bytes.fromhex(code) for code in GOLDEN_CODES], *table.shape), table)
+
+
+@pytest.mark.parametrize("bit", [0, 1])
+@pytest.mark.parametrize("width", [1 << 24, (1 << 24) + 65535, (1 << 32) - 1])
+def test_no_bit_ever_costs_more_than_the_dearest(bit: int, width: int) -> None:
+    models = np.full((1, 2), ONE // 2, np.uint16)
+    for _ in range(3000):
+        _adapt(models, 0, 1 - bit)
+    below = int(_bound(np.uint64(width), models, 0))
+    left = width - below if bit else below
+    assert np.log2(width / left) < DEAREST_BITS
+
+
+def test_numbers_that_are_never_as_expected_find_room() -> None:
+    """Long rests teach that there are only zeros; then each number comes at its dearest."""
+    table = np.zeros((3000, 4), np.int32)
+    table[2999] = [LARGEST, -LARGEST, 5, 2]
+    np.testing.assert_array_equal(decode(encode(table), *table.shape), table)
+    lone = np.full((1, 400), LARGEST, np.int32)
+    np.testing.assert_array_equal(decode(encode(lone), *lone.shape), lone)
+
+
+def test_a_carry_runs_through_bytes_that_are_full() -> None:
+    tables = [np.random.default_rng(seed).integers(-3, 4, (2000, 8), np.int32) for seed in range(8)]
+    for table in tables:
+        np.testing.assert_array_equal(decode(encode(table), *table.shape), table)
+
+
+def test_the_coder_needs_no_rasteriser_and_complains_once_where_nothing_can_be_kept(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    program = "import sys, worker.rangecoder; from worker.cache import use_kernel_cache as use; use(); "
+    program += "print('worker.raster' in sys.modules)"
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=REPOSITORY, env={**os.environ, "INTRASPLAT_CACHE": str(tmp_path / "file")},
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert result.stdout.split() == ["False"]
+    assert result.stderr.count("compiled kernels cannot be kept") == 1

@@ -2,7 +2,8 @@
 
 Numba keys a kernel's cache by its own source file and does not see a change in a module it was compiled from (a
 constant, an inlined helper, the vector type), so a stale kernel could run with a new layout of its arrays. All kernels
-therefore live in a folder named after a hash of every source file of this package: any change starts afresh.
+therefore live in a folder named after a hash of the rasteriser's source files, the only ones that build on each other:
+any change there starts afresh.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 import shutil
 import tempfile
 import warnings
+from functools import cache
 from pathlib import Path
 
 import numba
@@ -26,15 +28,16 @@ def kernel_cache_directory() -> Path:
     """
     digest = hashlib.sha256(numba.__version__.encode())
     folder = Path(__file__).parent
-    for source in [*sorted(folder.glob("*.py")), folder.parent / "__init__.py"]:
+    for source in [folder / "cache.py", folder / "raster" / "__init__.py", *sorted(folder.glob("raster/cpu/*.py"))]:
         digest.update(source.read_bytes())
     chosen = os.environ.get("INTRASPLAT_CACHE")
     base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "intrasplat"
     return base / "kernels" / digest.hexdigest()[:16]
 
 
+@cache
 def use_kernel_cache() -> None:
-    """Point Numba at that folder; must run before the first kernel is declared.
+    """Point Numba at that folder, once a process; must run before the first kernel is declared.
 
     Where nothing can be written there, a temporary folder takes its place until the process ends, with a warning.
     """
