@@ -44,7 +44,7 @@ from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion
 from worker.raster.cpu.project import LOG2E
 from worker.raster.cpu.simd import fma, lane_sum, load, splat
-from worker.raster.cpu.threads import THREADS, run
+from worker.raster.cpu.threads import run, thread_count
 from worker.raster.cpu.vectors import LANES
 
 WIDTH, HEIGHT, GRID_STEP_PX = 640, 512, 2.86
@@ -77,11 +77,11 @@ def main() -> None:
     parser.add_argument("--cpu-time", action="store_true", help="time on the processor, not on the clock: one thread")
     arguments = parser.parse_args()
     if arguments.cpu_time:
-        if THREADS != 1:
-            parser.error(f"--cpu-time is that of one thread; there are {THREADS}: set INTRASPLAT_THREADS=1")
+        if thread_count() != 1:
+            parser.error(f"--cpu-time is that of one thread; there are {thread_count()}: set INTRASPLAT_THREADS=1")
         time.perf_counter = time.thread_time
     load_1min = os.getloadavg()[0]
-    machine = {"cpu": _cpu_model(), "threads": THREADS, "commit": commit(), "load_1min": round(load_1min, 2)}
+    machine = {"cpu": _cpu_model(), "threads": thread_count(), "commit": commit(), "load_1min": round(load_1min, 2)}
     print(", ".join(f"{name} {value}" for name, value in machine.items()))
     print(f"kernels compiled or loaded in {compile_kernels():.1f} s")
     peaks = _peak_rows()
@@ -295,13 +295,13 @@ def _read(thread, threads, values, out):  # type: ignore[no-untyped-def]
 
 def _peak_rows() -> list[Row]:
     """Multiply-adds and bytes a second of one thread and of all, printed."""
-    out = np.zeros(THREADS, np.float32)
+    out = np.zeros(thread_count(), np.float32)
     values = np.ones(1 << 26, np.float32)  # 256 MiB: far beyond the caches
     rounds = 2_000_000
     rows = []
     for label, threads, call in (
         ("one thread", 1, lambda kernel, *given: kernel(0, 1, *given)),
-        (f"{THREADS} threads", THREADS, run),
+        (f"{thread_count()} threads", thread_count(), run),
     ):
         times = [_fastest(call, _multiply_add, rounds, out), _fastest(call, _read, values, out)]
         fma_per_s, bytes_per_s = threads * rounds * 10 * LANES / times[0], values.nbytes / times[1]

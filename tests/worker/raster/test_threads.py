@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from contract.errors import InputError
 from tests.worker.raster.test_cpu import NORMALISED, RATES, moving_gaussians, random_frame
 from worker.raster.cpu import camera_vector
 from worker.raster.cpu.model import FusedModel
-from worker.raster.cpu.threads import THREADS, run
+from worker.raster.cpu.threads import THREADS_VARIABLE, run, thread_count
 
 PATIENCE_S = 120.0
 """Longer than any of this takes on a busy machine: only a deadlock lasts so long."""
@@ -80,10 +81,10 @@ def test_training_and_rendering_at_once_give_what_each_gives_alone() -> None:
 
 
 def test_more_callers_than_threads_all_come_to_an_end() -> None:
-    counts = np.zeros((16, THREADS), np.int64)
+    counts = np.zeros((16, thread_count()), np.int64)
 
     def kernel(thread: int, threads: int, row: NDArray[np.int64]) -> None:
-        assert threads == THREADS
+        assert threads == thread_count()
         time.sleep(1e-4)
         row[thread] += 1
 
@@ -98,9 +99,27 @@ def test_more_callers_than_threads_all_come_to_an_end() -> None:
     assert bool((counts == 50).all())
 
 
-@pytest.mark.parametrize("failing", [0, THREADS - 1])
+@pytest.mark.parametrize("given", ["-1", "0", "two", "1.5", " "])
+def test_a_number_of_threads_that_is_none_is_refused_with_its_name_and_remedy(
+    given: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(THREADS_VARIABLE, given)
+    with pytest.raises(InputError, match=f"INTRASPLAT_THREADS: {given!r} is no .* above 0, or leave it unset"):
+        thread_count.__wrapped__()  # past the cache: this process has chosen already
+
+
+def test_threads_are_as_many_as_the_variable_says_or_this_process_has_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(THREADS_VARIABLE, "3")
+    assert thread_count.__wrapped__() == 3
+    monkeypatch.setenv(THREADS_VARIABLE, "")
+    cores = thread_count.__wrapped__()
+    monkeypatch.delenv(THREADS_VARIABLE)
+    assert thread_count.__wrapped__() == cores >= 1
+
+
+@pytest.mark.parametrize("failing", [0, thread_count() - 1])
 def test_an_error_in_one_share_is_raised_when_all_shares_are_done(failing: int) -> None:
-    done = np.zeros(THREADS, np.int64)
+    done = np.zeros(thread_count(), np.int64)
 
     def kernel(thread: int, threads: int) -> None:
         if thread == failing:
@@ -110,7 +129,7 @@ def test_an_error_in_one_share_is_raised_when_all_shares_are_done(failing: int) 
 
     with pytest.raises(ZeroDivisionError, match=f"share {failing}"):
         run(kernel)
-    assert done.sum() == THREADS - 1
+    assert done.sum() == thread_count() - 1
     run(lambda thread, threads: None)  # and the pool works on
 
 
@@ -119,7 +138,7 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
     run(lambda thread, threads: None)  # the parent's pool is there before the fork
     child = os.fork()
     if child == 0:
-        done = np.zeros(THREADS, np.int64)
+        done = np.zeros(thread_count(), np.int64)
         run(lambda thread, threads: done.__setitem__(thread, 1))
         os._exit(0 if done.all() else 1)
     deadline = time.monotonic() + PATIENCE_S

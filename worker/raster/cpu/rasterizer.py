@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from worker.raster import Camera
 from worker.raster.cpu import bins, project
 from worker.raster.cpu.blend import COTANGENT, LOSS, PLANE, PLANES, RECORD, RENDER, STATISTICS, blend
-from worker.raster.cpu.threads import THREADS, run
+from worker.raster.cpu.threads import run, thread_count
 from worker.raster.cpu.vectors import LANES
 
 Floats = NDArray[np.float32]
@@ -58,24 +58,24 @@ class Gradients:
     opacity_logit: Floats  # [N]
     colour: Floats  # [3, N]
     mean2d_norm: Floats  # [N], in normalised device coordinates
-    pose: NDArray[np.float64]  # [THREADS, 12], to be summed
+    pose: NDArray[np.float64]  # [threads, 12], to be summed
 
 
 class Rasterizer:
     """Buffers for one image size; they grow with the scene and are reused from step to step. Not thread-safe."""
 
     def __init__(self, width: int, height: int) -> None:
-        self.width, self.height = width, height
+        self.width, self.height, self.threads = width, height, thread_count()
         self.tiles_x, tiles_y = -(-width // LANES), -(-height // bins.TILE_ROWS)
         self.tiles = self.tiles_x * tiles_y
         self.stride = self.tiles_x * LANES
         self.image = np.zeros(6 * height * self.stride, np.float32)
         self.statistics = np.zeros((self.tiles, STATISTICS), np.float32)
-        self._planes = _aligned(THREADS, PLANES * PLANE)
-        self._trail, self._records = _aligned(THREADS, 0), _aligned(THREADS, 0)
-        self._spans = np.zeros((THREADS, 0, 3), np.int32)
+        self._planes = _aligned(self.threads, PLANES * PLANE)
+        self._trail, self._records = _aligned(self.threads, 0), _aligned(self.threads, 0)
+        self._spans = np.zeros((self.threads, 0, 3), np.int32)
         self._tile_start = np.zeros(self.tiles + 1, np.int64)
-        self._region_end = np.zeros((THREADS, 2), np.int64)
+        self._region_end = np.zeros((self.threads, 2), np.int64)
         self._next_block = np.zeros(1, np.int64)
         self._no_target = Target(np.zeros(1, np.uint8), np.zeros(1, np.uint8), np.zeros(1, np.float32))
         self._allocate_gaussians(0)
@@ -97,13 +97,13 @@ class Rasterizer:
             np.zeros(count, np.float32),
             np.zeros((3, count), np.float32),
             np.zeros(count, np.float32),
-            np.zeros((THREADS, 12)),
+            np.zeros((self.threads, 12)),
         )
 
     def _allocate_slots(self, slots: int, homes: int) -> None:
         """Room for so many a thread."""
-        self._slot_info, self._entries = np.zeros((2, THREADS * slots), np.uint32)
-        self._sums = np.zeros(THREADS * homes * bins.GRADIENT, np.float32)
+        self._slot_info, self._entries = np.zeros((2, self.threads * slots), np.uint32)
+        self._sums = np.zeros(self.threads * homes * bins.GRADIENT, np.float32)
 
     def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
         """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N]."""
@@ -139,11 +139,11 @@ class Rasterizer:
 
     def _regions(self) -> NDArray[np.int64]:
         """Slots and homes that a thread has room for."""
-        return np.array([len(self._slot_info), len(self._sums) // bins.GRADIENT]) // THREADS
+        return np.array([len(self._slot_info), len(self._sums) // bins.GRADIENT]) // self.threads
 
     def _needed(self) -> NDArray[np.int64]:
         """Slots and homes of the thread that has most."""
-        return np.asarray((self._region_end - self._regions() * np.arange(THREADS)[:, None]).max(0))
+        return np.asarray((self._region_end - self._regions() * np.arange(self.threads)[:, None]).max(0))
 
     def sort(self) -> None:
         """Last third: the slots of every tile, nearest first."""
@@ -159,9 +159,9 @@ class Rasterizer:
         most = int(np.diff(self._tile_start).max()) * bins.TILE_ROWS
         if self._spans.shape[1] < most:
             most = most * 5 // 4
-            self._spans = np.zeros((THREADS, most, 3), np.int32)
-            self._records = _aligned(THREADS, most * RECORD)
-            self._trail = _aligned(THREADS, most * 2 * LANES)
+            self._spans = np.zeros((self.threads, most, 3), np.int32)
+            self._records = _aligned(self.threads, most * RECORD)
+            self._trail = _aligned(self.threads, most * 2 * LANES)
 
     def _empty_homes(self) -> None:
         """Zeros in what the gradients are added to."""

@@ -14,26 +14,43 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 
+from contract.errors import InputError
+
+THREADS_VARIABLE = "INTRASPLAT_THREADS"
+
 
 def _available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-THREADS = int(os.environ.get("INTRASPLAT_THREADS", 0)) or _available_cores()
-"""Threads a kernel is split over: the cores this process may use, or INTRASPLAT_THREADS."""
+@cache
+def thread_count() -> int:
+    """Threads a kernel is split over, for the whole life of this process: INTRASPLAT_THREADS, or the cores it may use.
+
+    Raises:
+        InputError: INTRASPLAT_THREADS is set to anything but a whole number above 0.
+    """
+    given = os.environ.get(THREADS_VARIABLE)
+    if not given:
+        return _available_cores()
+    if not given.isdecimal() or int(given) == 0:
+        remedy = "Set it to a whole number above 0, or leave it unset to use every core."
+        raise InputError(THREADS_VARIABLE, f"{given!r} is no number of threads.", remedy)
+    return int(given)
 
 
 @cache
 def _pool(process_id: int) -> ThreadPoolExecutor:
     del process_id  # a forked process inherits the pool's object but none of its threads: it needs one of its own
-    return ThreadPoolExecutor(max_workers=max(1, THREADS - 1), thread_name_prefix="raster")
+    return ThreadPoolExecutor(max_workers=max(1, thread_count() - 1), thread_name_prefix="raster")
 
 
 def run(kernel: Callable[..., object], *args: object) -> None:
-    """Call kernel(thread, THREADS, *args) once a thread and wait for all; an error in any is raised here."""
-    others = [_pool(os.getpid()).submit(kernel, thread, THREADS, *args) for thread in range(1, THREADS)]
+    """Call kernel(thread, threads, *args) once a thread and wait for all; an error in any is raised here."""
+    threads = thread_count()
+    others = [_pool(os.getpid()).submit(kernel, thread, threads, *args) for thread in range(1, threads)]
     try:
-        kernel(0, THREADS, *args)
+        kernel(0, threads, *args)
     finally:
         wait(others)  # they write into the caller's arrays
     for other in others:
