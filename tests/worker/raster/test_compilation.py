@@ -61,7 +61,6 @@ def test_without_a_folder_to_keep_them_in_kernels_are_compiled_into_a_temporary_
 
 WHERE = """
 import numba, numpy
-from worker.raster.cpu.harmonics import C0
 from worker.raster.cpu import bins, Rasterizer
 print(numba.config.CACHE_DIR, Rasterizer(8, 8).statistics.sum())
 none, scratch = numpy.zeros((0, 12), numpy.float32), (numpy.zeros(0, numpy.int32), numpy.zeros(0, numpy.uint32))

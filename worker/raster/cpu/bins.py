@@ -68,6 +68,16 @@ def _rows(extent, g, x, y, column, bounds):  # type: ignore[no-untyped-def]
     store(bounds, LANES, floor(bottom + splat(y + _HALF + ROUNDING)))
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _number_homes(homes, g, home, first, last, highest, lowest):  # type: ignore[no-untyped-def]
+    """Homes of splat g for tiles in columns first to last and bands highest to lowest, from this one on; the next."""
+    first_block, last_block = first // BLOCK_TILES, last // BLOCK_TILES
+    step = last_block - first_block + 1
+    homes[g, 1] = step * (lowest - highest + 1)
+    homes[g, 2], homes[g, 3] = home - step * highest - first_block, step
+    return home + homes[g, 1]
+
+
 @njit(cache=True, nogil=True)
 def fill_slots(  # type: ignore[no-untyped-def]
     thread, threads, splats, radius2, extent, height, tiles_x, home_capacity,
@@ -75,8 +85,7 @@ def fill_slots(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Write the slots of the thread's share of splats into its region, an equal share of slot_info; number its homes.
 
-    home_capacity: homes of all threads. region_end [threads, 2]: where slots and homes end, or would: beyond the region
-    nothing is written, and the caller makes room.
+    home_capacity: of all threads. region_end [threads, 2]: where both end; past the region's end they are only counted.
     """
     region = slot_info.shape[0] // threads
     slot, full = thread * region, (thread + 1) * region
@@ -108,11 +117,7 @@ def fill_slots(  # type: ignore[no-untyped-def]
                 slot += 1
         slot_count[g] = slot - slot_start[g]
         if slot_count[g] > 0:
-            first_block, last_block = first // BLOCK_TILES, last // BLOCK_TILES
-            step = last_block - first_block + 1
-            homes[g, 1] = step * (lowest - highest + 1)
-            homes[g, 2], homes[g, 3] = home - step * highest - first_block, step
-            home += homes[g, 1]
+            home = _number_homes(homes, g, home, first, last, highest, lowest)
     region_end[thread, 0], region_end[thread, 1] = slot, home
 
 

@@ -75,9 +75,7 @@ def blend(  # type: ignore[no-untyped-def]
 
     next_block int64 [1]: 0 at the start. records, spans, trail, planes [threads, ...]: scratch (see above).
     sums [homes * GRADIENT] (bins.py): added to in modes LOSS and COTANGENT. statistics [tiles, STATISTICS]: LOSS.
-    target [3, H, stride] uint8, weight [H, stride] uint8 (255 = tissue), inverse_depth [H, stride] float32 (0 = none):
-    LOSS, flattened, stride = tiles_x * LANES. loss_settings float32 [5]: colour weight a channel, depth weight,
-    1 / width of the quadratic zone of the colour and of the depth loss, 1 for normalised depth else 0.
+    target, weight, inverse_depth, loss_settings: LOSS, see _loss; stride = tiles_x * LANES.
     image [6, H, stride] flattened: R G B Z A and the blended value, written in RENDER; the first five are read as
     cotangents in COTANGENT.
     """
@@ -203,7 +201,10 @@ def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[
 
 @njit(cache=True, nogil=True)
 def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-untyped-def]
-    """Gradients of the first count records, back to front; planes hold B - g_A, then g_R g_G g_B g_Z."""
+    """Gradients of the first count records, back to front; planes hold B - g_A, then g_R g_G g_B g_Z.
+
+    One long function, because ten running sums go from row to row and record to record and have to stay in registers.
+    """
     zero, cap = splat(_ZERO), splat(_CAP)
     lanes = iota()
     v_red, v_green, v_blue, v_depth = zero, zero, zero, zero
@@ -281,12 +282,40 @@ def _clip_unit(x):  # type: ignore[no-untyped-def]
     return where_less(one, x, one, x)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _depth_loss(planes, p, tissue, wanted, normalised, sharpness, depth_weight):  # type: ignore[no-untyped-def]
+    """The depth's share of _loss at the LANES pixels from p: its L1, and its gradient into the planes Z and T."""
+    zero, one = splat(_ZERO), splat(_ONE)
+    coverage = one - load(planes, p)
+    # Where nothing was blended there is no depth to correct; 1e-2 keeps the divisions finite.
+    solid = where_less(splat(np.float32(1e-2)), coverage, one, zero)
+    usable = where_less(zero, wanted, tissue * solid, zero)
+    divisor = where_less(zero, usable, load(planes, p + 4 * PLANE), one)
+    inverse = one / divisor
+    if normalised:
+        inverse = inverse * coverage
+    error = inverse - wanted
+    slope = _clip_unit(error * sharpness) * usable * depth_weight
+    # d(1/D)/dZ with D = Z (paper) or Z / A; d(1/D)/dA = 1 / Z in the second case.
+    store(planes, p + 4 * PLANE, (zero - slope) * inverse / divisor)
+    if normalised:
+        store(planes, p, zero - slope / divisor)
+    else:
+        store(planes, p, zero)
+    return usable * where_less(error, zero, zero - error, error)
+
+
 @njit(cache=True, nogil=True)
 def _loss(  # type: ignore[no-untyped-def]
     planes, statistics, target, weight, inverse_depth, loss_settings, origin, stride, size, rows
 ):
-    """Loss of the tile into statistics, its gradient into the planes (worker/loss.py has the same in plain torch)."""
-    zero, one = splat(_ZERO), splat(_ONE)
+    """Loss of the tile into statistics, its gradient into the planes (worker/loss.py has the same in plain torch).
+
+    target [3, H, stride] uint8, weight [H, stride] uint8 (255 = tissue), inverse_depth [H, stride] float32 (0 = none),
+    flattened. loss_settings float32 [5]: colour weight a channel, depth weight, 1 / width of the quadratic zone of the
+    colour and of the depth loss, 1 for normalised depth else 0.
+    """
+    zero = splat(_ZERO)
     per_byte = splat(np.float32(1.0 / 255.0))
     colour_weight, depth_weight = splat(loss_settings[0]), splat(loss_settings[1])
     colour_sharpness, depth_sharpness = splat(loss_settings[2]), splat(loss_settings[3])
@@ -302,24 +331,7 @@ def _loss(  # type: ignore[no-untyped-def]
             store(planes, p + (k + 1) * PLANE, _clip_unit(error * colour_sharpness) * tissue * colour_weight)
         transmittance = load(planes, p)
         holes = fma(tissue, transmittance, holes)
-        coverage = one - transmittance
         wanted = load(inverse_depth, q)
-        summed = load(planes, p + 4 * PLANE)
-        # Where nothing was blended there is no depth to correct; 1e-2 keeps the divisions finite.
-        solid = where_less(splat(np.float32(1e-2)), coverage, one, zero)
-        usable = where_less(zero, wanted, tissue * solid, zero)
-        divisor = where_less(zero, usable, summed, one)
-        inverse = one / divisor
-        if normalised:
-            inverse = inverse * coverage
-        error = inverse - wanted
-        depth_l1 = fma(usable, where_less(error, zero, zero - error, error), depth_l1)
-        slope = _clip_unit(error * depth_sharpness) * usable * depth_weight
-        # d(1/D)/dZ with D = Z (paper) or Z / A; d(1/D)/dA = 1 / Z in the second case.
-        store(planes, p + 4 * PLANE, (zero - slope) * inverse / divisor)
-        if normalised:
-            store(planes, p, zero - slope / divisor)
-        else:
-            store(planes, p, zero)
+        depth_l1 = depth_l1 + _depth_loss(planes, p, tissue, wanted, normalised, depth_sharpness, depth_weight)
     statistics[0], statistics[1] = lane_sum(l1), lane_sum(depth_l1)
     statistics[2], statistics[3] = lane_sum(squared), lane_sum(holes)

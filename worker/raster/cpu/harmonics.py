@@ -11,8 +11,9 @@ import math
 import numpy as np
 from numba import njit
 
-C0 = 0.28209479177387814
-C1 = 0.4886025119029199
+from worker.gaussians import SH_C0  # a kernel keeps its value: no other will ever be right
+
+_C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
 _C3 = (
     -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
@@ -23,11 +24,11 @@ _C3 = (
 @njit(cache=True, nogil=True)
 def _terms(degree, x, y, z, value, slope):  # type: ignore[no-untyped-def]
     """Real harmonics at the unit direction (x, y, z) into value [K]; as polynomials, their slopes into [K, 3]."""
-    value[0] = C0
+    value[0] = SH_C0
     slope[:, :] = 0.0
     if degree >= 1:
-        value[1], value[2], value[3] = -C1 * y, C1 * z, -C1 * x
-        slope[1, 1], slope[2, 2], slope[3, 0] = -C1, C1, -C1
+        value[1], value[2], value[3] = -_C1 * y, _C1 * z, -_C1 * x
+        slope[1, 1], slope[2, 2], slope[3, 0] = -_C1, _C1, -_C1
     if degree >= 2:
         a, b, c, d, e = _C2
         value[4], value[5], value[6] = a * x * y, b * y * z, c * (2 * z * z - x * x - y * y)
@@ -67,7 +68,7 @@ def colour_from_sh(thread, threads, degree, centre, state, rest, colour):  # typ
         n = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
         _terms(degree, x * n, y * n, z * n, value, slope)
         for channel in range(3):
-            total = 0.5 + C0 * state[10 + channel, g]
+            total = 0.5 + SH_C0 * state[10 + channel, g]
             for k in range(1, terms):
                 total += rest[k - 1, channel, g] * value[k]
             colour[channel, g] = max(total, 0.0)
@@ -89,7 +90,7 @@ def colour_from_sh_backward(  # type: ignore[no-untyped-def]
         v_direction[:] = 0.0
         for channel in range(3):
             gradient = v_colour[channel, g] if colour[channel, g] > 0.0 else np.float32(0.0)
-            v_state[10 + channel, g] = gradient * C0
+            v_state[10 + channel, g] = gradient * SH_C0
             for k in range(1, terms):
                 v_rest[k - 1, channel, g] = gradient * value[k]
                 for axis in range(3):

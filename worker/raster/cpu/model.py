@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from worker.deformation import Deformation
-from worker.gaussians import Gaussians
+from worker.gaussians import SH_C0, Gaussians
 from worker.optimize import StepRates, adam_step
 from worker.raster.cpu import harmonics, update
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
@@ -21,7 +21,6 @@ from worker.raster.cpu.threads import run
 
 PAD_LOGIT = -30.0
 """Opacity logit of the columns that only fill the last vector: never drawn."""
-C0 = harmonics.C0
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class FusedModel:
         """The Gaussians at time t on this camera's image."""
         self.motion.deform(self.canonical, t, self.state)
         if sh_degree == 0:
-            np.multiply(self.state[10:13], np.float32(C0), out=self.colour)
+            np.multiply(self.state[10:13], np.float32(SH_C0), out=self.colour)
             self.colour += np.float32(0.5)
             np.maximum(self.colour, 0, out=self.colour)
         else:
@@ -117,7 +116,7 @@ class FusedModel:
         self.project(camera, t, sh_degree)
         gradients = self.rasterizer.loss_backward(target, loss_settings)
         if sh_degree == 0:
-            np.multiply(gradients.colour, np.float32(C0), out=gradients.state[10:13])
+            np.multiply(gradients.colour, np.float32(SH_C0), out=gradients.state[10:13])
             gradients.state[10:13] *= self.colour > 0
         else:
             run(
