@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from worker.clip import DepthClip
 from worker.deformation import SharedBasis
-from worker.motion import Tracks, fit_series
+from worker.motion import Tracks, cell_means, fit_series
 
 Reals = NDArray[np.float64]
 
@@ -146,16 +146,16 @@ def _series(tracks: Tracks, clip: DepthClip, reference: int) -> tuple[Reals, Rea
         ],
         axis=1,
     )  # [n, 2, 3]
-    grey_per_mm = _slopes(clip.rgb[reference], (width, height), step).reshape(-1, 3, 2)[some] @ px_per_mm
+    grey_per_mm = _slopes(clip.rgb[reference], step).reshape(-1, 3, 2)[some] @ px_per_mm
     displacement_mm = tracks.displacement_mm.reshape(frames, -1, 3)[:, some]
     shifted = np.einsum("ncd,knd->knc", grey_per_mm, displacement_mm)
     colour = 255 * tracks.colour.reshape(frames, -1, 3)[:, some]
     return np.concatenate([shifted, colour], axis=2), confidence
 
 
-def _slopes(rgb: NDArray[np.uint8], size: tuple[int, int], step: int) -> Reals:
-    """[h, w, 3, 2] grey levels a clip pixel to the right and down, on the tracks' grid of (w, h) cells."""
-    small = cv2.resize(rgb[: size[1] * step, : size[0] * step], size, interpolation=cv2.INTER_AREA).astype(np.float32)
+def _slopes(rgb: NDArray[np.uint8], step: int) -> Reals:
+    """[h, w, 3, 2] grey levels a clip pixel to the right and down, on the tracks' grid of h w cells."""
+    small = cell_means(rgb, step).astype(np.float32)
     slopes = [cv2.Scharr(small, cv2.CV_32F, int(axis == 0), int(axis == 1)) / (32 * step) for axis in range(2)]
     return np.stack(slopes, axis=-1).astype(np.float64)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Lock
 from typing import Any
 
 import cv2
@@ -61,8 +62,8 @@ class Tracks:
 def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None) -> Tracks:
     """Follow the first training frame's tissue through the others.
 
-    on_progress is called with the share of frames done, now and then, from threads of this function's own; what it
-    raises ends the work and is raised here.
+    on_progress is called with the share of frames done, which grows, from threads of this function's own, one at a
+    time; what it raises ends the work and is raised here.
     """
     step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // LEAST_SIDE_PX))
     grid = _Grid(clip, step)
@@ -70,22 +71,34 @@ def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], 
     displacement, colour = np.zeros((2, len(train), *reference.grey.shape, 3), np.float32)
     confidence = np.zeros((len(train), *reference.grey.shape), np.float32)
     confidence[0] = reference.trust
+    followed, counting = 0, Lock()
 
     def follow(places: Sequence[int]) -> None:
+        nonlocal followed
         flow_solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         forward: Floats | None = None
-        for done, place in enumerate(places):  # in order of time: the last flow starts the next
+        for place in places:  # in order of time: the last flow starts the next
             target = _Coarse(clip, train[place], grid)
             forward = flow_solver.calc(reference.grey, target.grey, None if forward is None else forward.copy())
             backward = flow_solver.calc(target.grey, reference.grey, -forward)
             displacement[place], colour[place], confidence[place] = _lift(reference, target, forward, backward)
-            on_progress((done + 1) / len(places))
+            with counting:
+                followed += 1
+                on_progress(followed / (len(train) - 1))
 
     # Two halves on any machine: which flow starts which must not depend on the number of cores.
     middle = (len(train) + 1) // 2
     with one_opencv_thread(), ThreadPoolExecutor(2) as pool:
         list(pool.map(follow, (range(1, middle), range(middle, len(train)))))
     return Tracks(displacement, colour, confidence, step)
+
+
+def cell_means(image: NDArray[Any], step: int) -> NDArray[Any]:
+    """[h, w, ...] means of the cells of step by step pixels, from the upper left; pixels beyond the last are left out,
+    so that cell (i, j) is of the pixels from (step i, step j) whatever the image's size."""
+    h, w = image.shape[0] // step, image.shape[1] // step
+    means: NDArray[Any] = cv2.resize(image[: h * step, : w * step], (w, h), interpolation=cv2.INTER_AREA)
+    return means
 
 
 class _Grid:
@@ -109,9 +122,8 @@ class _Coarse:
     """A frame on the coarse grid: colour, grey, camera points (world, mm), and how far to trust depth and mask."""
 
     def __init__(self, clip: DepthClip, index: int, grid: _Grid) -> None:
-        grey = cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY)
-        self.grey = cv2.resize(grey, grid.size, interpolation=cv2.INTER_AREA)
-        self.rgb = cv2.resize(clip.rgb[index], grid.size, interpolation=cv2.INTER_AREA) / np.float32(255)
+        self.grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), grid.step)
+        self.rgb = np.asarray(cell_means(clip.rgb[index], grid.step) / np.float32(255), np.float32)
         depth_mm = grid.sample(clip.depth_mm[index])
         usable = grid.sample(clip.tissue[index]) & (depth_mm > 0)
         pose = clip.world_from_camera[index].astype(np.float32)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tests.helpers import assert_close
 from worker.clip import DepthClip
 from worker.deformation import SharedBasis
-from worker.motion import Tracks, fit_tracks, track
+from worker.motion import Tracks, cell_means, fit_tracks, track
 from worker.phantom import Motion, PhantomSettings, Trajectories, make_phantom
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 24
@@ -122,6 +122,36 @@ def test_a_large_clip_is_followed_on_a_coarser_grid(width: int, step: int) -> No
     assert weights.shape == (width * height, 2, 6)
     assert support[0] == pytest.approx(tracks.confidence[:, 0, 0].mean())
     assert support[-1] == pytest.approx(tracks.confidence[:, -1, -1].mean())
+
+
+@pytest.mark.parametrize(("size", "step"), [((641, 130), 3), ((854, 481), 3), ((1919, 1079), 6), ((97, 80), 1)])
+def test_a_cells_mean_is_that_of_its_own_pixels_at_every_size(size: tuple[int, int], step: int) -> None:
+    rows, columns = np.mgrid[0 : size[1], 0 : size[0]].astype(np.float32)
+    shape = (size[1] // step, size[0] // step)
+    for ramp, axis in ((rows, 0), (columns, 1)):
+        expected = np.indices(shape)[axis] * step + (step - 1) / 2
+        assert_close(cell_means(ramp, step), expected)
+
+
+def test_colour_and_depth_are_of_the_same_pixels_at_the_far_edge() -> None:
+    clip = make_phantom(PhantomSettings(width=641, height=161, frames=2, motion="still", noise=False)).depth_clip()
+    lit = np.zeros(clip.tissue.shape[1:], np.bool_)
+    lit[99:129, 600:630] = True  # whole cells: there alone is depth, and there alone the light changes
+    clip.rgb[0], clip.rgb[1] = 100, np.where(lit[..., None], 120, 100)
+    clip.depth_mm[:, ~lit] = 0
+    clip.tissue[:] = True
+    tracks = track(clip, [0, 1])
+    trusted = tracks.confidence[1] > TRUSTED
+    assert tracks.step_px == 3
+    assert trusted.sum() == 100
+    assert (255 * tracks.colour[1][trusted]).min() > 19
+
+
+def test_progress_grows_to_one_with_the_last_frame() -> None:
+    clip, _ = phantom("still")
+    shares: list[float] = []
+    track(clip, TRAIN, shares.append)
+    assert shares == pytest.approx([done / (len(TRAIN) - 1) for done in range(1, len(TRAIN))])
 
 
 def test_light_that_fades_is_told_from_motion() -> None:
