@@ -38,7 +38,7 @@ from worker.rangecoder import compile_coder
 from worker.raster.cpu import compile_kernels
 from worker.render import model_of
 from worker.shrink import Shrunk, shrink
-from worker.start import bases_of, fusion_for, settled, start_model
+from worker.start import fusion_for, settled, start_model
 from worker.stereo import estimate_depth
 from worker.targets import TrainingFrames, solid_depth_mm, units_per_mm
 from worker.train import Run, Stopwatch, iterations_within, load_run, save_run, train
@@ -365,7 +365,7 @@ def training_of(
         device="cpu",
         iterations=run.iteration,
         gaussians=len(scene.gaussians),
-        bases=bases_of(scene.deformation),
+        bases=scene.deformation.bases,
         scene_bytes=scene.file_bytes,
         units_per_mm=scene.units_per_mm,
         seconds=seconds,

@@ -136,9 +136,3 @@ def _reference_pixels(cloud: PointCloud, clip: DepthClip, reference: int) -> NDA
     row = np.clip(np.floor(k.fy * y / z + k.cy), 0, k.height - 1)
     pixels: NDArray[np.intp] = (row * k.width + column).astype(np.intp)
     return pixels
-
-
-def bases_of(model_deformation: object) -> int:
-    """B of a deformation's channels; 0 where there is no such number."""
-    weight = getattr(model_deformation, "weight", None)
-    return 0 if weight is None else int(weight.shape[-1])

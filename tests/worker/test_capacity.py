@@ -15,7 +15,7 @@ from worker.clip import DepthClip, split_frames
 from worker.motion import Tracks, track
 from worker.phantom import Motion
 from worker.presets import PRESETS
-from worker.start import MIN_STRIDE, bases_of, fusion_for, settled
+from worker.start import MIN_STRIDE, fusion_for, settled
 
 FAST = PRESETS["fast"]
 FRAMES = 40
@@ -131,6 +131,6 @@ def test_a_fixed_number_is_kept_to(bases: int) -> None:
 def test_the_report_is_told_what_was_chosen() -> None:
     clip = phantom_clip()
     run = prepared_on(clip, split_frames(clip))
-    bases = bases_of(run.model.export()[1])
+    bases = run.model.export()[1].bases
     assert any(each.startswith(f"Motion has {bases} bases: ") for each in run.chosen)
     assert prepared_on(clip, split_frames(clip)).chosen == run.chosen

@@ -16,7 +16,7 @@ from worker.fusion import PointCloud, fuse
 from worker.model import Model
 from worker.motion import track
 from worker.presets import PRESETS, Preset
-from worker.start import MIN_STRIDE, bases_of, fusion_for, settled, start_model
+from worker.start import MIN_STRIDE, fusion_for, settled, start_model
 from worker.targets import units_per_mm
 
 TIMES = (0.0, 0.31, 11 / 12)
@@ -87,9 +87,9 @@ def test_with_tracks_each_gaussian_passes_through_its_point_at_the_time_it_was_s
 def test_a_short_clip_has_no_more_bases_than_frames(frames: int) -> None:
     model, _, _ = started(phantom_clip(frames=frames), PRESETS["fast"])
     _, deformation = model.export()
-    assert 1 <= bases_of(deformation) <= frames
+    assert 1 <= deformation.bases <= frames
 
 
 def test_a_deformation_without_bases_has_zero() -> None:
-    assert bases_of(started(phantom_clip(), PRESETS["paper"])[0].export()[1]) == PRESETS["paper"].bases
-    assert bases_of(started(phantom_clip(), PRESETS["hexplane"])[0].export()[1]) == 0
+    assert started(phantom_clip(), PRESETS["paper"])[0].export()[1].bases == PRESETS["paper"].bases
+    assert started(phantom_clip(), PRESETS["hexplane"])[0].export()[1].bases == 0

@@ -25,12 +25,16 @@ class Deformation(Protocol):
 
     Attributes:
         kind: its name in a checkpoint (deformation.restore).
+        bases: B, of every channel; 0 where there is no such number.
         floats_per_gaussian: trained numbers each Gaussian adds.
         shared_floats: numbers, trained or fixed, that all Gaussians share.
     """
 
     @property
     def kind(self) -> str: ...
+
+    @property
+    def bases(self) -> int: ...
 
     @property
     def floats_per_gaussian(self) -> int: ...

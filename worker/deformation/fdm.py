@@ -67,8 +67,12 @@ class FlexibleDeformation:
         return f"fdm-{self.form}"
 
     @property
+    def bases(self) -> int:
+        return int(self.weight.shape[2])
+
+    @property
     def floats_per_gaussian(self) -> int:
-        return 3 * CHANNELS * int(self.weight.shape[2])
+        return 3 * CHANNELS * self.bases
 
     @property
     def shared_floats(self) -> int:

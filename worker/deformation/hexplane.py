@@ -84,6 +84,10 @@ class HexPlane:
         return "hexplane"
 
     @property
+    def bases(self) -> int:
+        return 0
+
+    @property
     def floats_per_gaussian(self) -> int:
         return 0
 

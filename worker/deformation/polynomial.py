@@ -44,8 +44,12 @@ class PolynomialFourier:
         return "pfs"
 
     @property
+    def bases(self) -> int:
+        return int(self.weight.shape[2])
+
+    @property
     def floats_per_gaussian(self) -> int:
-        return CHANNELS * int(self.weight.shape[2])
+        return CHANNELS * self.bases
 
     @property
     def shared_floats(self) -> int:
@@ -53,9 +57,8 @@ class PolynomialFourier:
 
     def basis(self, t: float) -> Tensor:
         """Value of every function at t: [B] in [-1, 1]."""
-        weights = int(self.weight.shape[2])
-        harmonics = (weights - 1) // 3
-        powers = weights - 2 * harmonics
+        harmonics = (self.bases - 1) // 3
+        powers = self.bases - 2 * harmonics
         chebyshev = [1.0, 2 * t - 1]
         while len(chebyshev) <= powers:
             chebyshev.append(2 * (2 * t - 1) * chebyshev[-1] - chebyshev[-2])

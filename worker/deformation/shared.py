@@ -83,12 +83,16 @@ class SharedBasis:
         return "shared"
 
     @property
+    def bases(self) -> int:
+        return int(self.weight.shape[2])
+
+    @property
     def floats_per_gaussian(self) -> int:
-        return int(self.weight.shape[1] * self.weight.shape[2])
+        return int(self.weight.shape[1]) * self.bases
 
     @property
     def shared_floats(self) -> int:
-        return 2 * int(self.centre.shape[0])
+        return 2 * self.bases
 
     def basis(self, t: float) -> Tensor:
         """phi at t: [B] in [0, 1], summing to 1."""
