@@ -42,6 +42,7 @@ STAGES = (
     "metrics",
     "baselines",
     "densify",
+    "differences",
     "rangecoder",
     "compact",
     "checkpoint",

@@ -18,9 +18,9 @@ Steps 2 to 4 are what the decoder undoes; docs/scene-file.md describes the file 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,13 +29,13 @@ from torch import Tensor
 
 from worker.deformation import CHANNELS, SharedBasis
 from worker.deformation.shared import CHANNELS_WITH_COLOUR
+from worker.differences import FINEST, LARGEST_STORED, add_differences, take_differences, told_order
 from worker.gaussians import Gaussians
 from worker.rangecoder import PARTS, decode, encode
 
 Reals = NDArray[np.float64]
 Whole = NDArray[np.int64]
-Level = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
-"""Of the Gaussians left at a level: those that stay, those between them, and the ones that stay right of these."""
+Floats = NDArray[np.float32]
 
 STATE = 14
 """Numbers of a Gaussian at rest: mean 0:3, quaternion 3:7, log-scale 7:10, colour 10:13, opacity logit."""
@@ -44,18 +44,21 @@ GROUP_OF = np.array([0] * 3 + [1] * 7 + [2] * 4)
 """Which power belongs to each number of the state: of place, shape or colour."""
 PLAIN = 3
 """Group of the last columns, the powers and seen, whose steps are 1."""
-COARSEST, FINEST = -3, 4
-"""Powers of two by which a Gaussian's precision may differ from the mean: what the trained frames hardly show may be
-seen from elsewhere, so it keeps an eighth."""
+COARSEST = -3
+"""Least power of two, FINEST being the largest, by which a Gaussian's precision may differ from the mean: what the
+trained frames hardly show may be seen from elsewhere, so it keeps an eighth."""
+COARSEST_ROTATION = 2.0**COARSEST / 2
+"""Largest step of a quaternion at power 0. One of length 1 has a number of at least 1/2: at the coarsest power that is
+one step, and so none is rounded to nothing, which would be no rotation at all."""
 LEAST_EFFECT = 1e-3
 """A channel that the frames do not show at all is stored as if they showed it so much. Rotations have 0.02, places
 0.3."""
 SEEN_LEVELS = 63
 RIDGE = 0.01
 """Of the bases' mean strength, added to each: motion that no trained time shows keeps a tenth of the precision."""
-LARGEST_STORED = 2**28
-MOST_NUMBERS = 2**28
-"""Numbers a file may unpack to, 1 GiB of them: far beyond any scene, within any machine."""
+MOST_NUMBERS = 2**27
+"""Numbers a scene may have, four times those of 80 thousand Gaussians and 33 bases. Unpacking takes up to 14 bytes
+a number (where there is one basis; 9 where there are many), so no file, however small, takes more than 2 GiB."""
 CURVE_BITS = 16
 _OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 """Orthonormal: brightness, red - blue, magenta - green."""
@@ -66,7 +69,7 @@ class Prepared:
     """A scene in its new coordinates and order, to be rounded at any step.
 
     state    [N, STATE]  means over the trained times
-    motion   [N, C, R]   coefficients of the patterns, float32
+    motion   [C, N, R]   coefficients of the patterns, float32
     pattern  [C, R, B]   weights of each pattern
     power    [N, 3]      of two: precision of place, shape and colour
     effect   [STATE]     root mean squared change of the picture by errors of 2**-power in all Gaussians
@@ -101,50 +104,62 @@ class Compact:
 
     def model(self) -> tuple[Gaussians, SharedBasis, Tensor]:
         """Gaussians, motion and seen [N], as floats."""
-        count = len(self.table)
-        channels, patterns, bases = self.pattern.shape
-        values, power, seen = np.split(self.table, [-4, -1], axis=1)
-        scale = np.exp2(-power[:, GROUP_OF].astype(np.float32))  # exact
-        state = values[:, :STATE] * scale * self.step
-        weight = np.empty((count, channels, bases), np.float32)
-        for channel in range(channels):
-            first = STATE + channel * patterns
-            weight[:, channel] = (values[:, first : first + patterns] * scale[:, channel, None]) @ self.pattern[channel]
-        mixing = _OPPONENT.astype(np.float32)
-        state[:, COLOUR] = state[:, COLOUR] @ mixing
+        weight = torch.from_numpy(self._motion(self.pattern))
+        share = torch.from_numpy(self.table[:, -1].astype(np.float32) / np.float32(SEEN_LEVELS))
+        return _gaussians_of(self._state()), SharedBasis(weight, self.centre, self.width), share
+
+    def at(self, times: Sequence[float]) -> Iterator[Gaussians]:
+        """The Gaussians at each of some model times: what model()'s deformation gives, without its weights."""
+        bases = SharedBasis(torch.zeros(0, CHANNELS, len(self.centre)), self.centre, self.width)
+        values = np.stack([bases.basis(t).numpy() for t in times], 1)  # [B, times]
+        state, motion = self._state(), self._motion(self.pattern @ values)
+        for place in range(len(times)):
+            moved = state.copy()
+            moved[:, : motion.shape[1]] += motion[:, :, place]
+            yield _gaussians_of(moved)
+
+    def _scale(self, group: int) -> Floats:
+        """[N] of the powers of a group."""
+        return np.exp2(-self.table[:, -4 + group].astype(np.float32))  # exact
+
+    def _state(self) -> Floats:
+        """[N, STATE], colour as red, green and blue."""
+        scales = [self._scale(group) for group in range(PLAIN)]
+        state = np.empty((len(self.table), STATE), np.float32)
+        for column, group in enumerate(GROUP_OF):
+            state[:, column] = self.table[:, column] * (scales[group] * self.step[column])
+        state[:, COLOUR] = state[:, COLOUR] @ _OPPONENT.astype(np.float32)
+        return state
+
+    def _motion(self, pattern: Floats) -> Floats:
+        """[N, C, X] the motion's numbers times patterns [C, R, X], colour as red, green and blue."""
+        channels, patterns, columns = pattern.shape
+        motion = np.empty((len(self.table), channels, columns), np.float32)
+
+        def numbers(first: int, last: int) -> Floats:
+            block = self.table[:, STATE + first * patterns : STATE + last * patterns].astype(np.float32)
+            block *= self._scale(GROUP_OF[first])[:, None]
+            return block
+
+        for channel in range(CHANNELS):
+            motion[:, channel] = numbers(channel, channel + 1) @ pattern[channel]
         if channels == CHANNELS_WITH_COLOUR:
-            weight[:, COLOUR] = mixing.T @ weight[:, COLOUR]
-        held = torch.from_numpy(np.ascontiguousarray(state, np.float32))
-        gaussians = Gaussians(
-            mean=held[:, PLACE].contiguous(),
-            quaternion=held[:, 3:7].contiguous(),
-            log_scale=held[:, 7:10].contiguous(),
-            opacity_logit=held[:, OPACITY].contiguous(),
-            sh=held[:, None, COLOUR].contiguous(),
-        )
-        share = torch.from_numpy(seen[:, 0].astype(np.float32) / np.float32(SEEN_LEVELS))
-        return gaussians, SharedBasis(torch.from_numpy(weight), self.centre, self.width), share
+            mixed = np.einsum("or,opx->oprx", _OPPONENT.astype(np.float32), pattern[COLOUR])
+            colour = numbers(CHANNELS, channels) @ mixed.reshape(3 * patterns, 3 * columns)
+            motion[:, COLOUR] = colour.reshape(-1, 3, columns)
+        return motion
 
     def tensors(self) -> dict[str, Tensor]:
-        """What is stored: the table, differenced where that helps, level by level, and coded; the rest as it is."""
-        table, levels = self.table.astype(np.int64), _levels(len(self.table))
-        stored, shared = self.table[_coarse_first(levels)], np.zeros(table.shape[1], np.uint8)
-        for columns, power in _groups(table, self.pattern.shape):
-            part = table[:, columns]
-            differences = part.copy()
-            for even, odd, right in levels:
-                differences[odd] -= _between(part, power, even, odd, right)
-            helped = np.abs(differences).sum(0) < np.abs(part).sum(0)
-            shared[columns] = helped
-            stored[:, columns[helped]] = differences[:, helped][_coarse_first(levels)]
+        """What is stored: the table, differenced where that helps, and coded; the rest as it is."""
+        stored, shared = take_differences(self.table, _powers(self.table), _group(self.pattern.shape))
         codes = [torch.from_numpy(np.frombuffer(code, np.uint8).copy()) for code in encode(stored)]
         return {
-            "count": torch.tensor([len(table)]),
+            "count": torch.tensor([len(self.table)]),
             "step": torch.from_numpy(self.step),
             "pattern": torch.from_numpy(self.pattern),
             "centre": self.centre,
             "width": self.width,
-            "shared": torch.from_numpy(shared),
+            "shared": torch.from_numpy(shared.astype(np.uint8)),
             **{f"code.{part}": code for part, code in enumerate(codes)},
         }
 
@@ -169,7 +184,7 @@ def prepare(
     state[:, :channels] += mean
     weight -= mean[:, :, None]  # the bases sum to 1
     length = np.linalg.norm(state[:, 3:7], axis=1)
-    length[length == 0] = 1
+    state[length == 0, 3], length[length == 0] = 1, 1
     state[:, 3:7] /= length[:, None]
     weight[:, 3:7] /= length[:, None, None].astype(np.float32)
     effect[3:7] *= length**2
@@ -193,22 +208,27 @@ def round_to(prepared: Prepared, step: float) -> Compact:
         step: change of the picture, 1 from black to white, by one step of a mean Gaussian's number in all Gaussians.
 
     Raises:
-        ValueError: numbers would need more digits than the coder takes.
+        ValueError: numbers would need more digits than are stored, or there are more than MOST_NUMBERS.
     """
-    channels = prepared.pattern.shape[0]
+    channels, count, patterns = prepared.motion.shape
+    columns = STATE + channels * patterns + 4
+    _check_size(count, columns)
     steps = step / prepared.effect
+    steps[3:7] = np.minimum(steps[3:7], COARSEST_ROTATION)
+    table: NDArray[np.int32] = np.empty((count, columns), np.int32)
+
+    def put(first: int, numbers: NDArray[np.floating]) -> None:
+        largest = max(-float(numbers.min(initial=0)), float(numbers.max(initial=0)))
+        if not largest <= LARGEST_STORED:
+            raise ValueError(f"a step of {step:g} makes numbers as large as {largest:g}")
+        table[:, first : first + numbers.shape[1]] = np.rint(numbers, out=numbers)
+
     units = np.exp2(prepared.power)[:, GROUP_OF] / steps  # [N, STATE]
-    motion = prepared.motion * units[:, :channels, None].astype(np.float32)
-    parts: list[NDArray[Any]] = [
-        prepared.state * units,
-        motion.reshape(len(units), -1),
-        prepared.power,
-        prepared.seen[:, None] * SEEN_LEVELS,
-    ]
-    largest = max(float(np.abs(part).max(initial=0)) for part in parts)
-    if not largest <= LARGEST_STORED:
-        raise ValueError(f"a step of {step:g} makes numbers as large as {largest:g}")
-    table: NDArray[np.int32] = np.concatenate([np.rint(part).astype(np.int32) for part in parts], axis=1)
+    put(0, prepared.state * units)
+    for channel, motion in enumerate(prepared.motion):
+        put(STATE + channel * patterns, motion * units[:, channel, None].astype(np.float32))
+    table[:, -4:-1] = prepared.power
+    put(columns - 1, prepared.seen[:, None] * SEEN_LEVELS)
     pattern = np.ascontiguousarray(prepared.pattern * steps[:channels, None, None], np.float32)
     basis = prepared.basis
     return Compact(table, steps.astype(np.float32), pattern, basis.centre, basis.width)
@@ -239,14 +259,21 @@ def read(tensors: Mapping[str, Tensor]) -> Compact:
     if patterns != bases - 1 or channels not in (CHANNELS, CHANNELS_WITH_COLOUR):
         raise ValueError(f"{patterns} patterns in {channels} channels do not fit {bases} bases")
     rows = int(count[0])
-    if rows < 1 or rows * max(columns, channels * bases) > MOST_NUMBERS:
-        raise ValueError(f"{rows} Gaussians of {columns} numbers are not to be unpacked; at most {MOST_NUMBERS} are")
-    table = np.empty((rows, columns), np.int64)
-    table[_coarse_first(_levels(rows))] = decode(codes, rows, columns)
+    _check_size(rows, columns)
+    table: NDArray[np.int32] = np.empty((rows, columns), np.int32)
+    table[told_order(rows)] = decode(codes, rows, columns)
     _undo_differences(table, shared.numpy().astype(bool), pattern.shape)
-    if np.abs(table).max() > LARGEST_STORED:
-        raise ValueError(f"a number exceeds {LARGEST_STORED}")
-    return Compact(table.astype(np.int32), step.numpy(), pattern.numpy(), centre, width)
+    _check_numbers(table, step.numpy())
+    return Compact(table, step.numpy(), pattern.numpy(), centre, width)
+
+
+def compile_coder() -> float:
+    """Compile what packs and unpacks for this processor, or load it from the cache; returns seconds."""
+    start = time.perf_counter()
+    table = np.ones((2, STATE + 4), np.int32)
+    still = np.zeros((CHANNELS, 0, 1), np.float32)
+    read(Compact(table, np.ones(STATE, np.float32), still, torch.zeros(1), torch.ones(1)).tensors())
+    return time.perf_counter() - start
 
 
 def _checked(tensors: Mapping[str, Tensor], name: str, kind: torch.dtype, dimensions: int) -> Tensor:
@@ -255,56 +282,55 @@ def _checked(tensors: Mapping[str, Tensor], name: str, kind: torch.dtype, dimens
     return tensors[name]
 
 
-def _undo_differences(table: Whole, shared: NDArray[np.bool_], shape: Sequence[int]) -> None:
-    """Differences to numbers, in place, coarse levels first."""
-    levels = _levels(len(table))
-    for columns, power in _groups(table, shape):
-        columns = columns[shared[columns]]
-        part = table[:, columns]
-        for even, odd, right in reversed(levels):
-            part[odd] += _between(part, power, even, odd, right)
-        table[:, columns] = part
+def _check_size(rows: int, columns: int) -> None:
+    if rows < 1 or rows * columns > MOST_NUMBERS:
+        raise ValueError(f"{rows} Gaussians of {columns} numbers are not kept so; at most {MOST_NUMBERS} numbers are")
 
 
-def _groups(table: Whole, shape: Sequence[int]) -> Iterator[tuple[NDArray[np.intp], Whole]]:
-    """Columns that share a power, and that power [N]; the powers' own columns come first, their power is 0.
+def _check_numbers(table: NDArray[np.int32], step: Floats) -> None:
+    if table.max() > LARGEST_STORED or table.min() < -LARGEST_STORED:
+        raise ValueError(f"a number exceeds {LARGEST_STORED}")
+    if not (step > 0).all() or not table[:, 3:7].any(axis=1).all():
+        raise ValueError("a step or a quaternion is 0")
+
+
+def _undo_differences(table: NDArray[np.int32], shared: NDArray[np.bool_], shape: Sequence[int]) -> None:
+    """Differences to numbers, in place; the powers first, as the others hang on them.
 
     Raises:
-        ValueError: a power or a share lies outside its range, once they are there.
+        ValueError: a number, a power or a share lies outside its range.
     """
-    channels, patterns, _ = shape
-    group = np.concatenate([GROUP_OF, np.repeat(GROUP_OF[:channels], patterns), np.full(4, PLAIN)])
-    yield np.flatnonzero(group == PLAIN), np.zeros(len(table), np.int64)
+    group = _group(shape)
+    add_differences(table, np.zeros((len(table), PLAIN + 1), np.int64), group, shared & (group == PLAIN))
     power, seen = table[:, -4:-1], table[:, -1]
     if power.min() < COARSEST or power.max() > FINEST or seen.min() < 0 or seen.max() > SEEN_LEVELS:
         raise ValueError("a power or a share lies outside its range")
-    for which in range(PLAIN):
-        yield np.flatnonzero(group == which), power[:, which].copy()
+    add_differences(table, _powers(table), group, shared & (group != PLAIN))
 
 
-def _between(
-    part: Whole, power: Whole, even: NDArray[np.intp], odd: NDArray[np.intp], right: NDArray[np.intp]
-) -> Whole:
-    """The rounded mean of the two beside each odd Gaussian, in its own step."""
-    shift = (FINEST + 1 - power[odd])[:, None]
-    left, far = (part[side] << (FINEST - power[side])[:, None] for side in (even[: len(odd)], right))
-    mean: Whole = (left + far + (1 << (shift - 1))) >> shift
-    return mean
+def _group(shape: Sequence[int]) -> Whole:
+    """[K] which power belongs to each column of the table; shape [C, R, B]."""
+    channels, patterns, _ = shape
+    return np.concatenate([GROUP_OF, np.repeat(GROUP_OF[:channels], patterns), np.full(4, PLAIN)])
 
 
-def _levels(count: int) -> list[Level]:
-    """Fine to coarse: every second Gaussian of those left lies between two others (the last one perhaps beside one)."""
-    levels, left = [], np.arange(count)
-    while len(left) > 1:
-        even, odd = left[::2], left[1::2]
-        levels.append((even, odd, np.append(even[1:], even[-1])[: len(odd)]))
-        left = even
-    return levels
+def _powers(table: NDArray[np.int32]) -> Whole:
+    """[N, 4] of place, shape and colour, and 0 for the plain columns."""
+    powers = table[:, -4:].astype(np.int64)
+    powers[:, PLAIN] = 0
+    return powers
 
 
-def _coarse_first(levels: Sequence[Level]) -> NDArray[np.intp]:
-    """Gaussians in the order they are told: the one that is left, then level by level those between."""
-    return np.concatenate([np.zeros(1, np.intp), *(odd for _, odd, _ in reversed(levels))])
+def _gaussians_of(state: Floats) -> Gaussians:
+    """Gaussians of their numbers at rest [N, STATE]."""
+    held = torch.from_numpy(state)
+    return Gaussians(
+        mean=held[:, PLACE].contiguous(),
+        quaternion=held[:, 3:7].contiguous(),
+        log_scale=held[:, 7:10].contiguous(),
+        opacity_logit=held[:, OPACITY].contiguous(),
+        sh=held[:, None, COLOUR].contiguous(),
+    )
 
 
 def _state_of(gaussians: Gaussians) -> Reals:
@@ -329,7 +355,7 @@ def _power(effect: Reals) -> Whole:
 
 
 def _patterns(weight: NDArray[np.float32], values: Reals, scale: Reals) -> tuple[NDArray[np.float32], Reals]:
-    """Coefficients [N, C, R] and patterns [C, R, B] of weights [N, C, B] whose mean over the times is 0.
+    """Coefficients [C, N, R] and patterns [C, R, B] of weights [N, C, B] whose mean over the times is 0.
 
     values [T, B] of the bases at the trained times; scale [N, C or more], precision of each Gaussian's channel.
     """
@@ -337,14 +363,14 @@ def _patterns(weight: NDArray[np.float32], values: Reals, scale: Reals) -> tuple
     strength = values.T @ values / len(values)
     strength += RIDGE * np.trace(strength) / bases * np.eye(bases)
     root = np.linalg.cholesky(strength)  # errors of equal size after it weigh the same over the trained times
-    coefficients = np.empty((*weight.shape[:2], bases - 1), np.float32)
+    coefficients = np.empty((weight.shape[1], len(weight), bases - 1), np.float32)
     patterns = np.empty((weight.shape[1], bases - 1, bases))
     for channel in range(weight.shape[1]):
         seen = weight[:, channel] @ root.astype(np.float32)
         scaled = seen * scale[:, channel, None].astype(np.float32)
         _, components = np.linalg.eigh((scaled.T @ scaled).astype(np.float64))
         kept = components[:, :0:-1]  # the weakest is nothing: the mean over time has been taken out
-        coefficients[:, channel] = seen @ kept.astype(np.float32)
+        coefficients[channel] = seen @ kept.astype(np.float32)
         patterns[channel] = np.linalg.solve(root.T, kept).T
     return coefficients, patterns
 

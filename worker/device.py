@@ -19,6 +19,7 @@ from contract.settings import Settings
 from contract.store import Store, open_store
 from worker.channel import Channel, Orders, Task
 from worker.checkpoint import RESUME_FILE
+from worker.compact import compile_coder
 from worker.faults import describe
 from worker.hooks import Hooks, Progress
 from worker.orders import (
@@ -33,7 +34,6 @@ from worker.orders import (
 )
 from worker.pace import Pace
 from worker.pipeline import ReconstructionRequest, check_device, reconstruct
-from worker.rangecoder import compile_coder
 from worker.raster.cpu import compile_kernels
 from worker.serve import RequestServer
 from worker.snapshot import Snapshots

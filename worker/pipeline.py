@@ -25,6 +25,7 @@ from worker.baselines import copy_baselines
 from worker.calibration import rectify
 from worker.checkpoint import RESUME_FILE, Scene, save_scene
 from worker.clip import ClipLimits, DepthClip, FrameSplit, held_out_frames, split_frames
+from worker.compact import compile_coder
 from worker.decode import decode_clip
 from worker.densify import Densifier
 from worker.fusion import fuse
@@ -34,7 +35,6 @@ from worker.model import Model
 from worker.motion import track
 from worker.presets import Preset, preset_named
 from worker.quality import Training, View, build_report, measure, sample_frames
-from worker.rangecoder import compile_coder
 from worker.raster.cpu import compile_kernels
 from worker.render import model_of
 from worker.shrink import Shrunk, shrink

@@ -12,7 +12,6 @@ whoever writes another reader.
 
 from __future__ import annotations
 
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -90,13 +89,6 @@ def decode(codes: list[bytes], count: int, rows: int) -> Table:
             if size != len(code):
                 raise ValueError(f"a code of {len(code)} bytes does not end where its numbers do")
     return table
-
-
-def compile_coder() -> float:
-    """Compile the coder for this processor, or load it from the cache; returns seconds."""
-    start = time.perf_counter()
-    decode(encode(np.zeros((1, PARTS), np.int32)), 1, PARTS)
-    return time.perf_counter() - start
 
 
 @njit(cache=True, nogil=True)
