@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -45,6 +46,8 @@ RESUME_VERSION = 1
 SCENE_FILE = "scene.safetensors"
 MANIFEST_FILE = "manifest.json"
 RESUME_FILE = RESUME
+MISFITS = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""What reading raises where a manifest's entry or a tensor is not of the shape or type that it should be."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +91,10 @@ class Scene:
         named["seen"] = self.seen
         return {name: each.detach().cpu().contiguous() for name, each in named.items()}
 
+    def file_tensors(self) -> dict[str, Tensor]:
+        """Every tensor of scene.safetensors by its name."""
+        return self.tensors() if self.stored is None else dict(self.stored)
+
     @property
     def byte_count(self) -> int:
         """Bytes of the model's tensors in memory."""
@@ -96,7 +103,7 @@ class Scene:
     @cached_property  # its length is asked for before it is written
     def file_content(self) -> bytes:
         """scene.safetensors, of the tensors as they are when it is first asked for."""
-        content: bytes = save(dict(self.stored or self.tensors()))
+        content: bytes = save(self.file_tensors())
         return content
 
     @property
@@ -112,11 +119,13 @@ def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> 
         beside: names of files already in the directory (report.json, curve.csv) whose hashes the manifest shall hold.
 
     Raises:
-        SceneError: a tensor is not finite, or the tensors do not belong together; nothing is written.
+        SceneError: a number is not finite or out of its range, or the tensors do not belong together; nothing is
+            written.
     """
     _check_finite(scene.tensors())
     _check_counts(scene)
-    tensors = dict(scene.stored or scene.tensors())
+    _check_values(scene)
+    tensors = scene.file_tensors()
     directory.mkdir(parents=True, exist_ok=True)
     files = {SCENE_FILE: scene.file_content} | {name: (directory / _plain(name)).read_bytes() for name in beside}
     manifest = {
@@ -148,7 +157,7 @@ def load_scene(directory: Path) -> Scene:
     """The scene of a directory, on the CPU, every file checked against its hash.
 
     Raises:
-        SceneError: missing, damaged, of another version, or with tensors of another shape, type or not finite.
+        SceneError: missing, damaged, of another version, or with tensors or numbers of another shape, type or range.
     """
     manifest = _read_manifest(directory / MANIFEST_FILE)
     try:
@@ -156,10 +165,11 @@ def load_scene(directory: Path) -> Scene:
         tensors = _parse(data[SCENE_FILE], directory / SCENE_FILE)
         _check_declared(tensors, manifest["tensors"])
         scene = _scene_of(manifest, tensors)
-        _check_finite(scene.tensors())
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except MISFITS as error:
         raise SceneError(f"The scene in {directory} does not fit its manifest: {error!r}.") from error
+    _check_finite(scene.tensors())
     _check_counts(scene)
+    _check_values(scene)
     return scene
 
 
@@ -199,8 +209,8 @@ def _scene_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> Scene:
     gaussians, deformation, seen = _model_of(manifest, tensors)
     poses = np.array(manifest["world_from_camera"], dtype=np.float64)
     times_s = np.array(manifest["frame_times_s"], dtype=np.float64)
-    if poses.shape != (len(times_s), 4, 4) or not np.isfinite(poses).all():
-        raise ValueError(f"world_from_camera has shape {poses.shape} for {len(times_s)} frames")
+    if times_s.ndim != 1 or poses.shape != (len(times_s), 4, 4):
+        raise ValueError(f"world_from_camera has shape {poses.shape} for frame_times_s of {times_s.shape}")
     return Scene(
         gaussians=gaussians,
         deformation=deformation,
@@ -230,36 +240,57 @@ def _model_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> tuple[Gau
     def under(prefix: str) -> dict[str, Tensor]:
         return {name.removeprefix(prefix): each for name, each in tensors.items() if name.startswith(prefix)}
 
+    deformation: Deformation
     if _coding(manifest) == EXACT:
         deformation = restore(manifest["deformation"], under("deformation."))
-        return Gaussians(**under("gaussians.")), deformation, tensors["seen"]
-    _check_finite(tensors)
-    gaussians, shared, seen = read(tensors).model()
-    if shared.kind != manifest["deformation"] or len(gaussians) != manifest["gaussians"]:
-        raise ValueError(f"{len(gaussians)} Gaussians of kind {shared.kind} are not those the manifest speaks of")
-    return gaussians, shared, seen
+        gaussians, seen = Gaussians(**under("gaussians.")), tensors["seen"]
+    else:
+        _check_finite(tensors)
+        gaussians, deformation, seen = read(tensors).model()
+    if deformation.kind != manifest["deformation"] or len(gaussians) != manifest["gaussians"]:
+        raise ValueError(f"{len(gaussians)} Gaussians of kind {deformation.kind} are not those the manifest speaks of")
+    return gaussians, deformation, seen
 
 
 def _check_counts(scene: Scene) -> None:
     """N is the same everywhere, and the deformation is one of these Gaussians."""
-    count = len(scene.gaussians)
+    mean, harmonics = scene.gaussians.mean, scene.gaussians.sh
+    count = mean.shape[0] if mean.ndim else 0
+    degree = scene.gaussians.sh_degree if harmonics.ndim == 3 else 0
     shapes = {
         "quaternion": ((count, 4), scene.gaussians.quaternion),
-        "mean": ((count, 3), scene.gaussians.mean),
+        "mean": ((count, 3), mean),
         "log_scale": ((count, 3), scene.gaussians.log_scale),
         "opacity_logit": ((count,), scene.gaussians.opacity_logit),
         "seen": ((count,), scene.seen),
-        "sh": ((count, (scene.gaussians.sh_degree + 1) ** 2, 3), scene.gaussians.sh),
+        "sh": ((count, (degree + 1) ** 2, 3), harmonics),
     }
     for name, (expected, tensor) in shapes.items():
         if tuple(tensor.shape) != expected or tensor.dtype != torch.float32:
             found = f"{_dtype(tensor)} {list(tensor.shape)}"
             raise SceneError(f"The scene's {name} is {found}, {count} Gaussians need float32 {list(expected)}.")
-    weight = scene.deformation.parameters().get("weight")
-    if weight is not None and weight.shape[0] != count:
-        raise SceneError(f"The scene's deformation moves {weight.shape[0]} Gaussians, there are {count}.")
-    if not scene.units_per_mm > 0:
-        raise SceneError(f"The scene's units_per_mm is {scene.units_per_mm}, it must be above 0.")
+    moving = scene.deformation.parameters() | scene.deformation.constants()
+    for name, tensor in moving.items():
+        if tensor.dtype != torch.float32:
+            raise SceneError(f"The scene's deformation has a {name} of {_dtype(tensor)}, it must be float32.")
+    if "weight" in moving and moving["weight"].shape[0] != count:
+        raise SceneError(f"The scene's deformation moves {moving['weight'].shape[0]} Gaussians, there are {count}.")
+
+
+def _check_values(scene: Scene) -> None:
+    """What is no tensor is finite, and what has a range stays in it."""
+    if not 0 < scene.units_per_mm < math.inf:
+        raise SceneError(f"The scene's units_per_mm is {scene.units_per_mm}, it must be above 0 and finite.")
+    for name, numbers in (("world_from_camera", scene.world_from_camera), ("frame_times_s", scene.frame_times_s)):
+        if not np.isfinite(numbers).all():
+            raise SceneError(f"The scene's {name} holds numbers that are NaN or infinite.")
+    shown = [math.isfinite(t) and 0 <= round(t * scene.frame_count) < scene.frame_count for t in scene.trained_t]
+    if not shown or not all(shown):
+        raise SceneError(f"The scene's trained_t are not times of its {scene.frame_count} frames.")
+    if not bool(((scene.seen >= 0) & (scene.seen <= 1)).all()):
+        raise SceneError(
+            f"The scene's seen lies in {float(scene.seen.min()):g} to {float(scene.seen.max()):g}, not in 0 to 1."
+        )
 
 
 def _check_declared(tensors: dict[str, Tensor], declared: dict[str, Any]) -> None:
@@ -279,7 +310,7 @@ def _check_finite(tensors: dict[str, Tensor]) -> None:
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(_read(path))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SceneError(f"{path} is damaged: {error}.") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise SceneError(f"{path} is not the manifest of a scene.")

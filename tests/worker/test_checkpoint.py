@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load, save
 
 from contract.errors import SceneError
 from tests.worker.scenes import KINDS, random_scene
@@ -117,6 +119,18 @@ def test_a_missing_file_is_named(tmp_path: Path, missing: str) -> None:
         ({"tensors": {}}, "gaussians.mean"),
         ({"intrinsics": {"width": -1}}, "does not fit its manifest"),
         ({"units_per_mm": 0.0}, "units_per_mm"),
+        ({"units_per_mm": math.inf}, "units_per_mm is inf"),
+        ({"units_per_mm": 10**400}, "does not fit its manifest"),
+        ({"frame_times_s": [math.nan] * 6}, "frame_times_s holds numbers that are NaN"),
+        ({"frame_times_s": [[0.0]] * 6}, "frame_times_s"),
+        ({"world_from_camera": [[[math.inf] * 4] * 4] * 6}, "world_from_camera holds numbers"),
+        ({"world_from_camera": [], "frame_times_s": []}, "world_from_camera"),
+        ({"trained_t": [0.0, math.nan]}, "trained_t"),
+        ({"trained_t": [1.0]}, "trained_t are not times of its 6 frames"),
+        ({"trained_t": []}, "trained_t"),
+        ({"gaussians": 12}, "11 Gaussians of kind shared are not those"),
+        ({"seed": math.inf}, "does not fit its manifest"),
+        ({"files": {"\0": {}}}, "does not fit its manifest"),
         ({"frame_times_s": [0.0]}, "world_from_camera"),
         ({"files": {"../scene.safetensors": {}}}, "not the name of a file"),
         ({"files": {}}, "does not fit its manifest"),
@@ -131,10 +145,56 @@ def test_a_manifest_that_lies_is_refused(tmp_path: Path, change: dict[str, objec
         load_scene(tmp_path)
 
 
-def test_a_manifest_that_is_no_json_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", ["{", "[" * 100_000], ids=["cut", "deep"])
+def test_a_manifest_that_is_no_json_is_refused(tmp_path: Path, text: str) -> None:
     save_scene(tmp_path, random_scene())
-    (tmp_path / MANIFEST_FILE).write_text("{")
+    (tmp_path / MANIFEST_FILE).write_text(text)
     with pytest.raises(SceneError, match="damaged"):
+        load_scene(tmp_path)
+
+
+def forge(directory: Path, name: str, tensor: torch.Tensor) -> None:
+    """Another tensor in the scene of a folder, with a manifest that lists it."""
+    content = save(load((directory / SCENE_FILE).read_bytes()) | {name: tensor})
+    manifest = json.loads((directory / MANIFEST_FILE).read_text())
+    dtype = str(tensor.dtype).removeprefix("torch.")
+    manifest["tensors"][name] = {"shape": list(tensor.shape), "dtype": dtype}
+    manifest["files"][SCENE_FILE] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    (directory / SCENE_FILE).write_bytes(content)
+    (directory / MANIFEST_FILE).write_text(json.dumps(manifest))
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor", "message"),
+    [
+        ("gaussians.sh", torch.zeros(11), "sh is float32"),
+        ("gaussians.sh", torch.tensor(1.0), "sh is float32"),
+        ("gaussians.mean", torch.tensor(1.0), "does not fit its manifest|mean is float32"),
+        ("gaussians.mean", torch.zeros(11, 3, dtype=torch.int32), "mean is int32"),
+        ("gaussians.log_scale", torch.full((11, 3), torch.inf), "log_scale holds 33"),
+        ("gaussians.opacity_logit", torch.full((11,), torch.nan), "opacity_logit holds 11"),
+        ("gaussians.more", torch.zeros(11), "does not fit its manifest"),
+        ("deformation.weight", torch.zeros(11, 10, 5, dtype=torch.int64), "weight of int64"),
+        ("deformation.weight", torch.zeros(11, 10, 5, dtype=torch.float64), "weight of float64"),
+        ("deformation.weight", torch.tensor(0.0), "does not fit its manifest"),
+        ("deformation.centre", torch.tensor(0.0), "does not fit its manifest"),
+        ("seen", torch.full((11,), 1.5), "seen lies in 1.5 to 1.5"),
+        ("seen", torch.full((11,), -0.1), "seen lies in"),
+        ("seen", torch.tensor(1.0), "seen is float32"),
+    ],
+)  # fmt: skip
+def test_tensors_that_a_manifest_vouches_for_are_looked_at_all_the_same(
+    tmp_path: Path, name: str, tensor: torch.Tensor, message: str
+) -> None:
+    save_scene(tmp_path, random_scene())
+    forge(tmp_path, name, tensor)
+    with pytest.raises(SceneError, match=message):
+        load_scene(tmp_path)
+
+
+def test_no_stored_tensors_are_not_taken_for_exact_ones(tmp_path: Path) -> None:
+    save_scene(tmp_path, dataclasses.replace(random_scene(), stored={}))
+    with pytest.raises(SceneError, match="is missing"):
         load_scene(tmp_path)
 
 
