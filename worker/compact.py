@@ -1,6 +1,6 @@
 """A scene's numbers as few bytes: each as coarse as the picture allows, then packed by the range coder.
 
-Symbols: N Gaussians, C channels (10, or 13 with colour), B bases, R = B - 1 patterns of motion a channel, K rows.
+Symbols: N Gaussians, C channels (10, or 13 with colour), B bases, R = B - 1 patterns of motion a channel, K columns.
 
 What is lost is decided by `effect`: the mean squared change of the picture that a change of 1 in a number makes.
 
@@ -10,8 +10,9 @@ What is lost is decided by `effect`: the mean squared change of the picture that
    trained times see them. Errors of equal size in any coefficient then weigh the same in time.
 3. Every number is divided by its step and rounded. A step is a channel's own, so that all channels' errors weigh the
    same in the picture, times a power of two a Gaussian, for its place, its shape and its colour.
-4. Gaussians are put in order along a curve through the picture; of a row that neighbours share, every second number is
-   replaced by its difference from the mean of the two beside it, then every second of those left, and so on.
+4. Gaussians are put in order along a curve through the view from the world's origin; where neighbours are alike,
+   every second number is replaced by its difference from the mean of the two beside it, then every second of those
+   left, and so on.
 
 Steps 2 to 4 are what the decoder undoes; docs/scene-file.md describes the file for other readers.
 """
@@ -58,7 +59,7 @@ RIDGE = 0.01
 """Of the bases' mean strength, added to each: motion that no trained time shows keeps a tenth of the precision."""
 MOST_NUMBERS = 2**27
 """Numbers a scene may have, four times those of 80 thousand Gaussians and 33 bases. Unpacking takes up to 14 bytes
-a number (where there is one basis; 9 where there are many), so no file, however small, takes more than 2 GiB."""
+a number (where there is one basis; 10 where there are many), so no file, however small, takes more than 2 GiB."""
 CURVE_BITS = 16
 _OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 """Orthonormal: brightness, red - blue, magenta - green."""
@@ -376,7 +377,8 @@ def _patterns(weight: NDArray[np.float32], values: Reals, scale: Reals) -> tuple
 
 
 def _along_curve(mean: Reals) -> Whole:
-    """[N] places along a Hilbert curve through the picture of the first frame's camera; mean [N, 3] in units."""
+    """[N] places along a Hilbert curve through the view from the world's origin, by convention the first frame's;
+    mean [N, 3] in units."""
     direction = mean[:, :2] / np.maximum(mean[:, 2:], 1.0)
     direction -= direction.min(0)
     size = 1 << CURVE_BITS

@@ -16,12 +16,14 @@ from torch import Tensor
 
 from contract.errors import SceneError
 from tests.worker.phantoms import phantom_clip, prepared, trained
+from tests.worker.plain_reader import read_plainly
 from tests.worker.scenes import random_scene
 from worker import compact
 from worker.checkpoint import MANIFEST_FILE, SCENE_FILE, Scene, load_scene, save_scene
 from worker.compact import STATE, Compact, prepare, read, round_to
 from worker.deformation import SharedBasis
 from worker.differences import LARGEST_STORED
+from worker.gaussians import Gaussians
 from worker.pipeline import scene_of
 from worker.shrink import TOLERANCE_DB, shrink
 
@@ -65,6 +67,12 @@ def colourful(count: int) -> Scene:
     still = shared(scene)
     weight = 0.1 * torch.randn(count, 13, 5, generator=torch.Generator().manual_seed(1))
     return dataclasses.replace(scene, deformation=SharedBasis(weight, still.centre, still.width))
+
+
+def at_rest(gaussians: Gaussians) -> list[Tensor]:
+    """The numbers of a Gaussian at rest, in the file's order."""
+    one = gaussians
+    return [one.mean, one.quaternion, one.log_scale, one.sh[:, 0], one.opacity_logit[:, None]]
 
 
 def told_apart(scene: Scene) -> Scene:
@@ -142,6 +150,25 @@ def test_a_scene_comes_back_from_its_folder_as_it_was_scored(tmp_path: Path) -> 
     assert json.loads((tmp_path / MANIFEST_FILE).read_text())["coding"] == "compact"
     save_scene(tmp_path / "again", back)
     assert (tmp_path / "again" / SCENE_FILE).read_bytes() == (tmp_path / SCENE_FILE).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "scene", [told_apart(random_scene(count=90)), colourful(200)], ids=["ten channels", "thirteen"]
+)
+def test_a_reader_written_from_the_page_alone_reads_the_same(tmp_path: Path, scene: Scene) -> None:
+    effect = effect_of(len(scene.gaussians)) * np.geomspace(0.01, 100, len(scene.gaussians))
+    small = rounded(scene, 1e-2, effect)
+    gaussians, deformation, seen = small.model()
+    stored = small.tensors()
+    assert 0 < stored["shared"].sum() < len(stored["shared"])
+    save_scene(
+        tmp_path, dataclasses.replace(scene, gaussians=gaussians, deformation=deformation, seen=seen, stored=stored)
+    )
+    plain = read_plainly(tmp_path)
+    state = torch.cat([each.flatten(1) for each in at_rest(gaussians)], 1)
+    torch.testing.assert_close(torch.tensor(plain.state), state, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(torch.tensor(plain.weight), deformation.weight, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(torch.tensor(plain.seen), seen)
 
 
 def test_the_same_scene_gives_the_same_bytes() -> None:
