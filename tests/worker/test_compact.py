@@ -20,12 +20,17 @@ from tests.worker.plain_reader import read_plainly
 from tests.worker.scenes import random_scene
 from worker import compact
 from worker.checkpoint import MANIFEST_FILE, SCENE_FILE, Scene, load_scene, save_scene
+from worker.clip import DepthClip
 from worker.compact import STATE, Compact, prepare, read, round_to
 from worker.deformation import SharedBasis
 from worker.differences import LARGEST_STORED
 from worker.gaussians import Gaussians
+from worker.metrics import psnr_tissue
 from worker.pipeline import scene_of
-from worker.shrink import TOLERANCE_DB, shrink
+from worker.render import model_of
+from worker.shrink import JUDGED_FRAMES, TOLERANCE_DB, shrink
+from worker.targets import TrainingFrames
+from worker.visibility import spread
 
 TIMES = tuple(np.arange(6) / 6)
 
@@ -336,10 +341,21 @@ def test_shrinking_keeps_its_tolerance_and_says_what_it_took() -> None:
     assert small.loss_db <= 0.1 < tiny.loss_db <= 0.5
     assert tiny.scene.file_bytes < small.scene.file_bytes < 0.25 * scene.byte_count
     assert f"{small.scene.file_bytes / 1e6:.2f} MB" in small.words[0]
+    judged = spread(run.frames.indices, JUDGED_FRAMES)
+    assert small.frames == len(judged)
+    exact, kept = (mean_db(each, clip, run.frames, judged) for each in (scene, small.scene))
+    assert small.loss_db == pytest.approx(exact - kept, abs=1e-3)
     again = shrink(scene, clip, run.frames, 0.1)
     assert again is not None
     assert again.step == small.step
     assert save(dict(again.scene.stored or {})) == save(dict(small.scene.stored or {}))
+
+
+def mean_db(scene: Scene, clip: DepthClip, frames: TrainingFrames, judged: list[int]) -> float:
+    model = model_of(scene)
+    images = [model.render(frames.cameras[i], float(frames.t[i]))[:3].transpose(1, 2, 0).copy() for i in judged]
+    scores = [psnr_tissue(image, clip.rgb[i], clip.tissue[i]) for i, image in zip(judged, images, strict=True)]
+    return float(np.mean(scores))
 
 
 def test_frames_without_tissue_are_not_judged_and_where_there_is_none_floats_are_kept() -> None:
