@@ -185,7 +185,7 @@ def prepare(
     state[:, :channels] += mean
     weight -= mean[:, :, None]  # the bases sum to 1
     length = np.linalg.norm(state[:, 3:7], axis=1)
-    state[length == 0, 3], length[length == 0] = 1, 1
+    state[length == 0, 3], length[length == 0] = 1, 1  # zeros are no rotation, and are not to be divided by
     state[:, 3:7] /= length[:, None]
     weight[:, 3:7] /= length[:, None, None].astype(np.float32)
     effect[3:7] *= length**2
