@@ -15,10 +15,10 @@ JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
 """Job ids are made by the service, never by a caller, so they are safe as file names and key parts."""
 
 PresetName = Literal[
-    "instant", "fast", "quality", "paper", "paper-released", "paper-wide", "pfs", "hexplane", "without_mapf"
+    "instant", "fast", "quality", "small", "paper", "paper-released", "paper-wide", "pfs", "hexplane", "without_mapf"
 ]
-"""instant, fast and quality are ours; paper is the published method as published; the others are compared with it
-(worker/presets.py)."""
+"""instant, fast, quality and small are ours; paper is the published method as published; the others are compared with
+it (worker/presets.py)."""
 
 Layout = Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]
 """How a clip's eyes, depths and masks are laid out (docs/conventions.md); auto looks for itself."""

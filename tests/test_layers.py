@@ -52,6 +52,8 @@ STAGES = (
     "start",
     "targets",
     "visibility",
+    "schedule",
+    "average",
     "train",
     "render",
     "shrink",

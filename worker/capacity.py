@@ -26,6 +26,10 @@ BASES = (3, 5, 9, 13, 17, 25, 33)
 """Numbers of bases to choose from."""
 FRAMES_A_BASIS = 3
 """Training frames a basis stands for where nothing could be followed."""
+FOLLOWED = 0.5
+"""Share of the error with the fewest bases that has to go with more, or these errors tell nothing of a motion."""
+MORE_FRAMES_THAN = 2
+"""Training frames for each basis are more than this: with fewer they gain what held-out frames lose."""
 WORTH_DB = 0.25
 """More bases have to lower the expected error of the picture by more than this."""
 COARSEST = 4
@@ -56,8 +60,8 @@ class Choice:
 # bases --------------------------------------------------------------------------------------------------------------
 
 
-def errors_by_bases(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> dict[int, float]:
-    """What each number of bases would leave in frames it was not fitted to: B -> error, squared grey levels.
+def errors_by_bases(tracks: Tracks, clip: DepthClip, train: Sequence[int], most: int | None = None) -> dict[int, float]:
+    """What each number of bases up to most would leave in frames it was not fitted to: B -> error, squared grey levels.
 
     Every fourth training frame is left out, the tracks of the others are fitted by three quarters of B bases, and the
     fit is compared with the tracks in those left out: displacement, as the grey levels by which it changes the picture
@@ -72,20 +76,25 @@ def errors_by_bases(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> di
     left_out[FIRST_LEFT_OUT::LEAVE_OUT_EVERY] = True
     times = np.array([float(clip.t[index]) for index in train])
     share = 1 - left_out.mean()
+    most_bases = min(most or BASES[-1], max(BASES[0], (len(train) - 1) // MORE_FRAMES_THAN))
     return {
         bases: _left_out_error(series, confidence, times, left_out, max(2, round(share * bases)))
         for bases in BASES
-        if bases <= len(train)
+        if bases <= most_bases
     }
 
 
-def choose_bases(errors: dict[int, float], floor: float, frames: int) -> Choice:
+def choose_bases(errors: dict[int, float], floor: float, frames: int, most: int | None = None) -> Choice:
     """The fewest bases whose expected error, on top of the floor that the Gaussians leave, is within WORTH_DB of the
-    least; errors as from errors_by_bases, frames the number of training frames."""
+    least; errors as from errors_by_bases, frames the number of training frames. Without errors one for every
+    FRAMES_A_BASIS frames, at most `most`."""
     if not errors:
-        bases = min(frames, max(BASES[0], min(BASES[-1], -(-frames // FRAMES_A_BASIS))))
-        reason = f"one for about {FRAMES_A_BASIS} training frames, for too little could be followed to tell"
+        bases = min(frames, max(BASES[0], min(most or BASES[-1], -(-frames // FRAMES_A_BASIS))))
+        reason = f"one for {frames / bases:.2g} training frames, for too little could be followed to tell more"
         return Choice(bases, reason)
+    if min(errors.values()) > max(floor, FOLLOWED * errors[min(errors)]):
+        reason = f"the most that {frames} training frames bear, for the motion is too fast to be followed by fewer"
+        return Choice(max(errors), reason)
     allowed = (min(errors.values()) + floor) * 10 ** (WORTH_DB / 10)
     bases = min(each for each, error in errors.items() if error + floor <= allowed)
     best = min(errors, key=lambda each: errors[each])

@@ -86,6 +86,10 @@ class Model(Protocol):
         """Keep these Gaussians, in this order (repeats are copies); Adam's moments start at 0 where fresh."""
         ...
 
+    def parameters(self) -> dict[str, np.ndarray]:
+        """What is trained, by name; views of the live arrays. May be written."""
+        ...
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything a resumed run needs, by name; views of the live arrays."""
         ...

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import math
@@ -37,11 +36,12 @@ from worker.presets import Preset, preset_named
 from worker.quality import Training, View, build_report, measure, sample_frames
 from worker.raster.cpu import compile_kernels
 from worker.render import model_of
+from worker.schedule import Schedule, left_out
 from worker.shrink import Shrunk, shrink
 from worker.start import fusion_for, settled, start_model
 from worker.stereo import estimate_depth
 from worker.targets import TrainingFrames, solid_depth_mm, units_per_mm
-from worker.train import Run, Stopwatch, iterations_within, load_run, save_run, train
+from worker.train import Run, Stopwatch, iterations_within, load_run, save_run, train, write_curve
 from worker.visibility import drop_strays, seen_share
 
 _Result = TypeVar("_Result")
@@ -216,12 +216,15 @@ def prepare(
     fixed = request.iterations or (None if request.budget_s else preset.iterations)
     budget_s = request.budget_s or preset.budget_s
     asked = f"{fixed} iterations" if fixed else f"{budget_s} s"
-    run = Run(model, frames, preset, fixed or 1, request.seed, asked, densifier=densifier, chosen=chosen)
+    any_length = 1000  # calibration needs a place in the schedule, not its end
+    schedule = Schedule(fixed or any_length, preset.cycles)
+    run = Run(model, frames, preset, schedule, request.seed, asked, densifier=densifier, chosen=chosen)
     if fixed is None:
         assert budget_s is not None
-        run.iterations = 1000  # any length: calibration needs a place in the schedule, not its end
         report_stage(hooks, "calibrate", 0.0)
-        run.iterations = iterations_within(run, budget_s, clock.elapsed_s)
+        planned = iterations_within(run, budget_s, clock.elapsed_s)
+        worth_db = preset.worth_db if left_out(frames.indices) else None
+        run.schedule = Schedule(planned, preset.cycles, worth_db)
     return run, scale
 
 
@@ -369,7 +372,7 @@ def training_of(
         scene_bytes=scene.file_bytes,
         units_per_mm=scene.units_per_mm,
         seconds=seconds,
-        assumptions=(*run.chosen, *(shrunk.words if shrunk else ())),
+        assumptions=(*run.chosen, *run.schedule.words, *(shrunk.words if shrunk else ())),
         measurements=shrunk.measurements if shrunk else {},
         warnings=training_warnings(run, request),
         versions={"python": platform.python_version(), **{name: version(name) for name in VERSIONED}},
@@ -389,11 +392,3 @@ def publish(out_dir: Path, scene: Scene, report: Report, run: Run) -> None:
     write_curve(out_dir / CURVE, run)
     save_scene(out_dir, scene, beside=(REPORT, CURVE))
     (out_dir / RESUME_FILE).unlink(missing_ok=True)
-
-
-def write_curve(path: Path, run: Run) -> None:
-    """curve.csv: t_train_s, iteration, psnr_tissue_db of the held-out frames."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["t_train_s", "iteration", "psnr_tissue_db"])
-        writer.writerows([f"{p.t_train_s:.3f}", p.iteration, f"{p.psnr_tissue_db:.4f}"] for p in run.curve)

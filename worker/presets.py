@@ -1,4 +1,5 @@
-"""What distinguishes the ways of training: `instant`, `fast`, `quality`, ours; `paper` and its variants; the rivals.
+"""What distinguishes the ways of training: `instant`, `fast`, `quality`, `small`, ours; `paper` and its variants; the
+rivals.
 
 A preset is data only; train.py reads it. Rates are in optimiser units (median depth 60).
 """
@@ -26,11 +27,14 @@ class Preset:
                      apart as the scene's detail allows
     deformation      "shared", "fdm", "fdm-quartic", "pfs", "hexplane"
     bases            B of the deformation; None: as many as the scene's motion needs ("shared" alone)
+    most_bases       of those the scene may choose; None: as many as there are to choose from
     tracks           whether optical-flow tracks start the motion ("shared" only)
     start_width      sigma at the start, model time; None where the deformation places its own
     opacity, spread  of a Gaussian at the start; spread is its standard deviation over the distance to its neighbours
     sh_degree        of the colour; from 1 on, a degree is added every sh_every iterations
     order            "epochs": every training frame once, shuffled, again and again; "random": one drawn each iteration
+    cycles           whether rates rise again when the steps have doubled (worker/schedule.py); else they fall once
+    worth_db         a run with budget_s ends where a doubling of its steps is worth less; None: never before its time
     iterations       of a run without budget_s and iterations; None: budget_s
     budget_s         seconds of training of a run without either
     """
@@ -40,6 +44,7 @@ class Preset:
     points_per_image: int | None
     deformation: Literal["shared", "fdm", "fdm-quartic", "pfs", "hexplane"]
     bases: int | None
+    most_bases: int | None
     tracks: bool
     start_width: float | None
     opacity: float
@@ -47,6 +52,8 @@ class Preset:
     sh_degree: int
     sh_every: int
     order: Literal["epochs", "random"]
+    cycles: bool
+    worth_db: float | None
     rates: Rates
     loss: LossSettings
     densify: DensifySettings | None
@@ -54,7 +61,7 @@ class Preset:
     budget_s: float | None
 
 
-FEW_POINTS, MANY_POINTS = 40_000, 80_000
+FEWEST_POINTS, FEW_POINTS, MANY_POINTS = 20_000, 40_000, 80_000
 PAYS_FROM_S = 9.0
 """From this budget on, twice the points are worth the time they take (docs/decisions/015)."""
 
@@ -80,6 +87,7 @@ _PAPER = Preset(
     points_per_image=None,
     deformation="fdm",
     bases=17,
+    most_bases=None,
     tracks=False,
     start_width=0.01,
     opacity=0.1,
@@ -87,6 +95,8 @@ _PAPER = Preset(
     sh_degree=3,
     sh_every=500,
     order="random",
+    cycles=False,
+    worth_db=None,
     rates=_PAPER_RATES,
     loss=LossSettings(normalised_depth=False),
     densify=DensifySettings(),
@@ -112,12 +122,16 @@ _FAST_RATES = Rates(
     beta2=0.95,
 )
 
+# A quarter of the Gaussians, half the bases and no change of size: what loses least for each byte (docs/decisions/017)
+_SMALL_RATES = replace(_FAST_RATES, motion_log_scale=Rate(0.0))
+
 _FAST = Preset(
     name="fast",
     fusion=FusionSettings(mode="fill"),
     points_per_image=MANY_POINTS,
     deformation="shared",
     bases=None,
+    most_bases=None,
     tracks=True,
     start_width=None,
     opacity=0.9,
@@ -125,6 +139,8 @@ _FAST = Preset(
     sh_degree=0,
     sh_every=0,
     order="epochs",
+    cycles=True,
+    worth_db=0.25,
     rates=_FAST_RATES,
     loss=LossSettings(colour_zone=0.1),
     densify=None,
@@ -138,7 +154,8 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
         for preset in (
             replace(_FAST, name="instant", points_per_image=FEW_POINTS, budget_s=6.0),
             _FAST,
-            replace(_FAST, name="quality", budget_s=240.0),
+            replace(_FAST, name="quality", worth_db=0.05, budget_s=240.0),
+            replace(_FAST, name="small", points_per_image=FEWEST_POINTS, most_bases=17, rates=_SMALL_RATES),
             _PAPER,
             replace(_PAPER, name="paper-released", deformation="fdm-quartic"),
             replace(_PAPER, name="paper-wide", start_width=0.6 / 16),
@@ -148,12 +165,13 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
         )
     }
 )
-"""Every preset by its name. `instant` and `quality` are `fast` for less and for more time; `paper-wide` starts FDM's
+"""Every preset by its name. `instant` and `quality` are `fast` for less and for more time, `small` is `fast` for little
+room; `paper-wide` starts FDM's
 bases as wide as 0.6 of their spacing."""
 
 
 def preset_named(name: str, budget_s: float | None = None) -> Preset:
-    """The preset of this name; one of ours with as many points as pay within budget_s, if that is given.
+    """The preset of this name; of ours but `small` with as many points as pay within budget_s, if that is given.
 
     Raises:
         InputError: there is none.
@@ -161,6 +179,6 @@ def preset_named(name: str, budget_s: float | None = None) -> Preset:
     if name not in PRESETS:
         raise InputError("options.preset", f"there is no preset {name!r}.", f"Use one of: {', '.join(PRESETS)}.")
     preset = PRESETS[name]
-    if budget_s is None or preset.points_per_image is None:
+    if budget_s is None or preset.points_per_image not in (FEW_POINTS, MANY_POINTS):
         return preset
     return replace(preset, points_per_image=FEW_POINTS if budget_s < PAYS_FROM_S else MANY_POINTS)

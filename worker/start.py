@@ -46,7 +46,7 @@ def settled(
     """The preset with what it leaves to the scene settled (docs/decisions/014), and why, in words for the report."""
     words = []
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
-    errors = errors_by_bases(tracks, clip, train) if tracks is not None and left_open else {}
+    errors = errors_by_bases(tracks, clip, train, preset.most_bases) if tracks is not None and left_open else {}
     fusion = fusion_for(preset, clip.intrinsics)
     if fusion.mode == "fill" and preset.points_per_image is not None:
         words.append(f"Gaussians start {fusion.stride} pixels apart: nearest to {preset.points_per_image} an image.")
@@ -57,7 +57,8 @@ def settled(
         preset = dataclasses.replace(preset, fusion=fusion)
         words.append(f"Gaussians start {choice.count} pixels apart: {choice.reason}.")
     if preset.bases is None:
-        choice = choose_bases(errors, floor_error(clip, train[0], fusion.stride), len(train))
+        floor = floor_error(clip, train[0], fusion.stride)
+        choice = choose_bases(errors, floor, len(train), preset.most_bases)
         preset = dataclasses.replace(preset, bases=choice.count)
         words.append(f"Motion has {choice.count} bases: {choice.reason}.")
     return preset, tuple(words)

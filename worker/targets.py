@@ -61,7 +61,7 @@ class TrainingFrames:
         self.scale = scale
         self._row = {index: row for row, index in enumerate(self.indices)}
         height, width = clip.rgb.shape[1:3]
-        stride = padded(width)
+        self._width, stride = width, padded(width)
         count = len(self.indices)
         self._rgb = np.zeros((count, 3, height, stride), np.uint8)
         self._weight = np.zeros((count, height, stride), np.uint8)
@@ -84,6 +84,11 @@ class TrainingFrames:
         """What frame `index` is compared with; views."""
         row = self._row[index]
         return Target(self._rgb[row].ravel(), self._weight[row].ravel(), self._inverse_depth[row].ravel())
+
+    def picture(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """The frame itself: rgb [H, W, 3] and tissue [H, W]."""
+        row, width = self._row[index], self._width
+        return self._rgb[row, :, :, :width].transpose(1, 2, 0), self._weight[row, :, :width] > 0
 
     def loss_settings(self, index: int, loss: LossSettings) -> NDArray[np.float32]:
         """The weights the blend applies a pixel (blend.py): each loss is a mean over its valid pixels."""

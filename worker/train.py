@@ -1,28 +1,32 @@
 """The one training loop. Everything it is given is built before; everything it decides is in Run.
 
-Symbols: p = iteration / iterations, the progress of the schedule. Nothing in a schedule reads the clock, so the same
-seed and iterations give the same bits, and a resumed run gives those of an uninterrupted one.
+Nothing in a schedule reads the clock, so the same seed and iterations give the same bits, and a resumed run gives those
+of an uninterrupted one.
 """
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from contract.errors import Cancelled, TrainingDiverged
+from worker.average import RunningMean
 from worker.checkpoint import Scene, load_resume, save_resume
 from worker.densify import Densifier
 from worker.hooks import Hooks, Progress
+from worker.metrics import psnr_tissue
 from worker.model import Model
 from worker.optimize import rates_at
 from worker.presets import Preset
+from worker.schedule import Schedule, left_out
 from worker.targets import TrainingFrames
 
 CURVE_SECONDS = (1, 2, 5, 10, 20, 40, 60, 90, 120, 180, 300, 600)
@@ -69,8 +73,9 @@ class Run:
     model        Gaussians, deformation, Adam's moments
     frames       targets and cameras
     preset       rates, loss, order, densification
-    iterations   of the whole schedule; iteration: those done
+    schedule     how many iterations, and how rates fall in them; iteration: those done
     asked        the length that was asked for, in words; a stored run goes on only with its own
+    average      of the models that end a cycle
     densifier    its statistics; None where the preset has no densification
     chosen       what was left to the scene, how it was settled and why, in words
     """
@@ -78,18 +83,26 @@ class Run:
     model: Model
     frames: TrainingFrames
     preset: Preset
-    iterations: int
+    schedule: Schedule
     seed: int
     asked: str = ""
     iteration: int = 0
+    average: RunningMean = field(default_factory=RunningMean)
     densifier: Densifier | None = None
     chosen: tuple[str, ...] = ()
     curve: list[CurvePoint] = field(default_factory=list)
+
+    @property
+    def iterations(self) -> int:
+        """Of the whole run, as far as is known."""
+        return self.schedule.iterations
 
 
 def frame_at(run: Run, iteration: int) -> int:
     """The training frame of an iteration (from 1): a function of seed and iteration alone, so a run can resume."""
     indices = run.frames.indices
+    if run.schedule.leaves_out(iteration):
+        indices = [index for index in indices if index not in left_out(indices)]
     if run.preset.order == "random":
         return indices[int(np.random.default_rng([run.seed, iteration]).integers(len(indices)))]
     epoch, place = divmod(iteration - 1, len(indices))
@@ -105,7 +118,7 @@ def step(run: Run, iteration: int) -> float:
         float(run.frames.t[index]),
         run.frames.target(index),
         run.frames.loss_settings(index, preset.loss),
-        rates_at(preset.rates, iteration / run.iterations),
+        rates_at(preset.rates, run.schedule.progress(iteration)),
         iteration,
         sh_degree,
     )
@@ -169,8 +182,16 @@ def train(
             if iteration < run.iterations:  # what is split then would get no step any more
                 run.densifier.apply(run.model, iteration, np.random.default_rng([run.seed, iteration, 1]))
 
+        # the end of a cycle
+        if run.schedule.averages(iteration):
+            run.average.add(run.model.parameters())
+        if run.average.count and iteration in run.schedule.ends:
+            run.average.put(run.model.parameters())
+        if run.schedule.judges(iteration):
+            run.schedule = run.schedule.with_score(_left_out_psnr(run))
+
         # the curve
-        if marks and clock.elapsed_s >= marks[0] and iteration < run.iterations:
+        if iteration < run.iterations and (iteration in run.schedule.ends or (marks and clock.elapsed_s >= marks[0])):
             marks = [mark for mark in marks if mark > clock.elapsed_s]
             scored = _score(run, clock, evaluate)
 
@@ -184,6 +205,15 @@ def train(
     _check_finite(run)
     if not run.curve or run.curve[-1].iteration < run.iteration:  # else it was stopped after its last score
         _score(run, clock, evaluate)
+
+
+def _left_out_psnr(run: Run) -> float:
+    """Mean psnr_tissue of the training frames left out so far, dB."""
+    scores = []
+    for index in left_out(run.frames.indices):
+        image = run.model.render(run.frames.cameras[index], float(run.frames.t[index]))
+        scores.append(psnr_tissue(image[:3].transpose(1, 2, 0), *run.frames.picture(index)))
+    return float(np.nanmean(scores))
 
 
 def _check_finite(run: Run) -> None:
@@ -203,14 +233,15 @@ def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], float]) -> float |
 
 
 def save_run(directory: Path, run: Run, t_train_s: float) -> None:
-    """Write what load_run needs to go on: parameters, moments, densification statistics, curve."""
-    arrays = {**run.model.arrays(), **(run.densifier.arrays() if run.densifier else {})}
+    """Write what load_run needs to go on: parameters, moments, averages, densification statistics, curve."""
+    arrays = {**run.model.arrays(), **run.average.arrays(), **(run.densifier.arrays() if run.densifier else {})}
     tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}
     state = {
         "identity": _identity(run),
         "iteration": run.iteration,
-        "iterations": run.iterations,
+        "schedule": asdict(run.schedule),
         "count": run.model.count,
+        "averaged": run.average.count,
         "t_train_s": t_train_s,
         "curve": [[point.t_train_s, point.iteration, point.psnr_tissue_db] for point in run.curve],
     }
@@ -245,8 +276,19 @@ def load_run(directory: Path, run: Run) -> float:
         columns = np.zeros(state["count"], np.int64)
         run.model.take(columns, np.ones(len(columns), np.bool_))
     run.model.load_arrays(arrays)
+    run.average.load_arrays(arrays, state["averaged"])
     if run.densifier is not None:
         run.densifier.load_arrays(arrays)
-    run.iteration, run.iterations = state["iteration"], state["iterations"]
+    stored_schedule = state["schedule"]
+    run.iteration = state["iteration"]
+    run.schedule = Schedule(**{**stored_schedule, "scores": tuple(stored_schedule["scores"])})
     run.curve = [CurvePoint(*row) for row in state["curve"]]
     return float(state["t_train_s"])
+
+
+def write_curve(path: Path, run: Run) -> None:
+    """curve.csv: t_train_s, iteration, psnr_tissue_db of the held-out frames."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t_train_s", "iteration", "psnr_tissue_db"])
+        writer.writerows([f"{p.t_train_s:.3f}", p.iteration, f"{p.psnr_tissue_db:.4f}"] for p in run.curve)

@@ -99,10 +99,13 @@ class AutogradMotion:
             taken[:, torch.from_numpy(fresh)] = 0.0
             self._moments[name] = taken
 
+    def parameters(self) -> dict[str, np.ndarray]:
+        """What is trained, by name; views."""
+        return {f"motion.{name}": each.detach().numpy() for name, each in self._parameters.items()}
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Parameters and moments by name; views."""
-        parameters = {f"motion.{name}": each.detach().numpy() for name, each in self._parameters.items()}
-        return parameters | {f"motion.moments.{name}": each.numpy() for name, each in self._moments.items()}
+        return self.parameters() | {f"motion.moments.{name}": each.numpy() for name, each in self._moments.items()}
 
     def export(self, count: int) -> Deformation:
         """The first count Gaussians' deformation as torch tensors (copies)."""

@@ -82,6 +82,21 @@ def test_the_less_the_gaussians_can_show_the_fewer_bases_are_worth_it() -> None:
     assert counts[-1] == 3
 
 
+def test_motion_too_fast_for_any_number_gets_the_most() -> None:
+    errors = {3: 670.0, 5: 665.0, 9: 790.0, 17: 860.0}
+    assert choose_bases(errors, 5.0, 40).count == 17
+    assert choose_bases(errors, 1000.0, 40).count == 3  # it does not show beside what the Gaussians leave
+
+
+@pytest.mark.parametrize("frames", [10, 21, 40])
+def test_there_are_more_than_two_training_frames_for_each_basis(frames: int) -> None:
+    clip = phantom_clip("pull", frames=frames)
+    train = list(range(frames))
+    tried = errors_by_bases(track(clip, train), clip, train)
+    assert frames / max(tried) > 2
+    assert max(errors_by_bases(track(clip, train), clip, train, most=5)) <= 5
+
+
 def test_gaussians_farther_apart_leave_more_of_the_picture() -> None:
     clip, train, _ = followed("still")
     left = [floor_error(clip, train[0], stride) for stride in (1, 2, 3, 4, 6)]

@@ -245,14 +245,13 @@ def test_odd_sizes_are_no_trouble(name: str, tmp_path: Path) -> None:
 
 def test_a_moving_camera_is_read_from_its_poses(tmp_path: Path) -> None:
     clip = endonerf(tmp_path / "clip", 10, moving_camera=True)
-    opengl = run(clip, tmp_path / "opengl", iterations=60)
-    scene = load_scene(tmp_path / "opengl")
     truth = make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=10, period_frames=12, moving_camera=True))
-    np.testing.assert_allclose(scene.world_from_camera[7], truth.world_from_camera(7), atol=1e-6)
-    llff = run(clip, tmp_path / "llff", iterations=60, pose_convention="llff")
-    assert opengl.psnr_tissue_db is not None
-    assert llff.psnr_tissue_db is not None
-    assert opengl.psnr_tissue_db > llff.psnr_tissue_db  # the wrong axes put the frames where they were not
+    placed = {}
+    for convention in ("opengl", "llff"):
+        run(clip, tmp_path / convention, iterations=10, pose_convention=convention)
+        placed[convention] = load_scene(tmp_path / convention).world_from_camera[7]
+    np.testing.assert_allclose(placed["opengl"], truth.world_from_camera(7), atol=1e-6)
+    assert np.abs(placed["llff"] - truth.world_from_camera(7)).max() > 0.1  # the wrong axes put it elsewhere
 
 
 def test_tissue_whose_depth_is_never_known_is_covered_all_the_same() -> None:

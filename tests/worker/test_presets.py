@@ -50,7 +50,7 @@ def test_a_rival_differs_from_the_paper_in_what_it_is_named_for_alone(name: str,
 def test_ours_differ_in_time_and_in_how_many_gaussians_it_pays_for() -> None:
     instant, fast, quality = (PRESETS[name] for name in ("instant", "fast", "quality"))
     for other in (instant, quality):
-        assert differing(other, fast) <= {"points_per_image", "budget_s"}
+        assert differing(other, fast) <= {"points_per_image", "budget_s", "worth_db"}
     budgets = [preset.budget_s or 0.0 for preset in (instant, fast, quality)]
     assert budgets == sorted(set(budgets))
 
@@ -58,6 +58,7 @@ def test_ours_differ_in_time_and_in_how_many_gaussians_it_pays_for() -> None:
 def test_little_time_is_not_spent_on_many_gaussians() -> None:
     assert differing(preset_named("fast", budget_s=6.0), PRESETS["instant"]) == {"budget_s"}
     assert preset_named("instant", budget_s=60.0).points_per_image == PRESETS["fast"].points_per_image
+    assert preset_named("small", budget_s=60.0) == PRESETS["small"]
     assert preset_named("paper", budget_s=6.0) == PRESETS["paper"]
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from contract.errors import InputError
 from worker.presets import PRESETS, Preset, preset_named
 
-OURS = tuple(name for name in ("instant", "fast", "quality") if name in PRESETS)
+OURS = tuple(name for name in ("instant", "fast", "quality", "small") if name in PRESETS)
 RIVALS = ("paper", "paper-released", "without_mapf", "pfs", "hexplane")
 """The published method, as printed and as released, and what it compares itself with."""
 DEFAULT_SERIES = (*OURS, *RIVALS)

@@ -46,6 +46,7 @@ _LOOKS = {
     "instant": Look("#E69F00", "^"),
     "fast": Look("#0072B2", "o"),
     "quality": Look("#009E73", "s"),
+    "small": Look("#882255", "h"),
     "paper": Look("#D55E00", "D"),
     "paper-released": Look("#CC79A7", "v"),
     "without_mapf": Look("#56B4E9", "<"),

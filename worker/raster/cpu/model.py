@@ -155,6 +155,10 @@ class FusedModel:
         self.count = count
         self._allocate()
 
+    def parameters(self) -> dict[str, np.ndarray]:
+        """What is trained, by name; views of the live arrays."""
+        return {**self._parameters(), **self.motion.parameters()}
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything a resumed run needs, by name; views of the live arrays."""
         moments = {f"moments.{name}": values for name, values in self._moments.items()}

@@ -40,6 +40,9 @@ class Motion(Protocol):
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         """Keep these columns, in this order; moments start at 0 where fresh."""
 
+    def parameters(self) -> dict[str, np.ndarray]:
+        """What is trained, by name; views."""
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything that must be stored to resume, by name; views."""
 
@@ -99,9 +102,12 @@ class LinearMotion:
         self.weight = np.ascontiguousarray(self.weight[:, :, columns])
         self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
 
+    def parameters(self) -> dict[str, np.ndarray]:
+        return {"motion.weight": self.weight}
+
     def arrays(self) -> dict[str, np.ndarray]:
-        names = ("weight", "first", "second", "steps")
-        return {f"motion.{name}": getattr(self, name) for name in names}
+        names = ("first", "second", "steps")
+        return self.parameters() | {f"motion.{name}": getattr(self, name) for name in names}
 
     def export(self, count: int) -> LinearDeformation:
         weight = torch.from_numpy(np.ascontiguousarray(self.weight[:, :, :count].transpose(2, 1, 0)))
@@ -136,8 +142,11 @@ class FdmMotion:
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[..., columns]))
         self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
 
+    def parameters(self) -> dict[str, np.ndarray]:
+        return {f"motion.{name}": getattr(self, name) for name in ("weight", "centre", "width")}
+
     def arrays(self) -> dict[str, np.ndarray]:
-        return {f"motion.{name}": getattr(self, name) for name in ("weight", "centre", "width", "first", "second")}
+        return self.parameters() | {"motion.first": self.first, "motion.second": self.second}
 
     def export(self, count: int) -> FlexibleDeformation:
         weight, centre, width = (

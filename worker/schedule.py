@@ -1,0 +1,113 @@
+"""When rates fall, when they rise again, and when a run has gone on for long enough.
+
+A run is a row of cycles, each as long as all before it together (after Loshchilov and Hutter 2017). Rates fall within a
+cycle, and its last steps are averaged (Polyak and Juditsky 1992), so the model at its end is a finished one. What the
+last doubling of the steps was worth can be told then, on a few training frames that are left out until it is decided.
+The clock has no say, so the same seed and iterations do the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+SHORTEST_CYCLE = 250
+"""Iterations."""
+RESTART = 0.6
+"""How far rates have fallen already where every cycle but the first begins."""
+AVERAGED_SHARE, AVERAGED = 1 / 8, 6
+"""The last share of a cycle from which models are averaged, and how many of them."""
+CLOSING_SHARE = 0.25
+"""Iterations after a stop, in which the frames left out are learnt too, over those before it."""
+LEAVE_OUT_EVERY = 14
+FEWEST_FRAMES = 28
+"""Of fewer training frames none is left out, and a run takes the time it is given."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The cycles of a run; iterations count from 1.
+
+    planned   iterations if nothing stops the run
+    cycles    whether it has more than one cycle
+    worth_db  a doubling of the steps that brings the frames left out less than this is the last; None: none is left out
+    scores    psnr_tissue of the frames left out, dB, at the ends of the cycles so far
+    """
+
+    planned: int
+    cycles: bool = False
+    worth_db: float | None = None
+    scores: tuple[float, ...] = ()
+
+    @property
+    def _planned_ends(self) -> tuple[int, ...]:
+        ends = [self.planned]
+        while self.cycles and ends[0] // 2 >= SHORTEST_CYCLE:
+            ends.insert(0, ends[0] // 2)
+        return tuple(ends)
+
+    @property
+    def stopped_at(self) -> int | None:
+        """The end of the cycle that was worth too little; None as long as there is none."""
+        if self.worth_db is None or len(self.scores) < 2 or self.scores[-1] - self.scores[-2] >= self.worth_db:
+            return None
+        return self._planned_ends[len(self.scores) - 1]
+
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """The last iteration of every cycle, ascending."""
+        stopped_at = self.stopped_at
+        if stopped_at is None:
+            return self._planned_ends
+        closed_at = min(self.planned, round(stopped_at * (1 + CLOSING_SHARE)))
+        return (*self._planned_ends[: len(self.scores)], closed_at)
+
+    @property
+    def iterations(self) -> int:
+        """Of the whole run, as far as is known."""
+        return self.ends[-1]
+
+    def cycle(self, iteration: int) -> tuple[int, int]:
+        """The iterations after which its cycle begins and ends."""
+        end = next(end for end in self.ends if iteration <= end)
+        return max((each for each in self.ends if each < end), default=0), end
+
+    def progress(self, iteration: int) -> float:
+        """How far rates have fallen, in (0, 1]: 1 at the end of every cycle."""
+        begun, end = self.cycle(iteration)
+        fallen = RESTART if begun else 0.0
+        return fallen + (1 - fallen) * (iteration - begun) / (end - begun)
+
+    def averages(self, iteration: int) -> bool:
+        """Whether the model after an iteration is one of those whose mean ends the cycle."""
+        begun, end = self.cycle(iteration)
+        apart = max(1, int((end - begun) * AVERAGED_SHARE / AVERAGED))
+        return self.cycles and (end - iteration) % apart == 0 and (end - iteration) // apart < AVERAGED
+
+    def leaves_out(self, iteration: int) -> bool:
+        """Whether frames are left out at an iteration: a decision that needs them is still to come."""
+        return self.worth_db is not None and iteration <= max(self.ends[:-1], default=0)
+
+    def judges(self, iteration: int) -> bool:
+        """Whether the frames left out are scored after an iteration, which with_score then takes."""
+        return self.leaves_out(iteration) and iteration == self._planned_ends[len(self.scores)]
+
+    def with_score(self, psnr_db: float) -> Schedule:
+        """The schedule after a cycle's end at which the frames left out scored so much."""
+        return replace(self, scores=(*self.scores, psnr_db))
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What was decided, for the report."""
+        if self.stopped_at is None:
+            return ()
+        return (
+            f"Training ended after {self.iterations} of {self.planned} iterations that the time allowed: doubling the "
+            f"first {self.stopped_at // 2} was worth {self.scores[-1] - self.scores[-2]:.2f} dB on training frames "
+            "left out until then.",
+        )
+
+
+def left_out(frames: Sequence[int]) -> tuple[int, ...]:
+    """Of the training frames those that judge a run: every LEAVE_OUT_EVERY-th, never the first or the last."""
+    return tuple(frames[LEAVE_OUT_EVERY // 2 :: LEAVE_OUT_EVERY]) if len(frames) >= FEWEST_FRAMES else ()
