@@ -49,9 +49,10 @@ class Schedule:
     @property
     def stopped_at(self) -> int | None:
         """The end of the cycle that was worth too little; None as long as there is none."""
-        if self.worth_db is None or len(self.scores) < 2 or self.scores[-1] - self.scores[-2] >= self.worth_db:
+        if self.worth_db is None or len(self.scores) < 2:
             return None
-        return self._planned_ends[len(self.scores) - 1]
+        too_little = self.scores[-1] - self.scores[-2] < self.worth_db  # never of scores that are no numbers
+        return self._planned_ends[len(self.scores) - 1] if too_little else None
 
     @property
     def ends(self) -> tuple[int, ...]:
@@ -86,7 +87,8 @@ class Schedule:
 
     def leaves_out(self, iteration: int) -> bool:
         """Whether frames are left out at an iteration: a decision that needs them is still to come."""
-        return self.worth_db is not None and iteration <= max(self.ends[:-1], default=0)
+        decides = self.worth_db is not None and len(self._planned_ends) > 2  # two scores, and a cycle to be spared
+        return decides and iteration <= self.ends[-2]
 
     def judges(self, iteration: int) -> bool:
         """Whether the frames left out are scored after an iteration, which with_score then takes."""
@@ -110,4 +112,4 @@ class Schedule:
 
 def left_out(frames: Sequence[int]) -> tuple[int, ...]:
     """Of the training frames those that judge a run: every LEAVE_OUT_EVERY-th, never the first or the last."""
-    return tuple(frames[LEAVE_OUT_EVERY // 2 :: LEAVE_OUT_EVERY]) if len(frames) >= FEWEST_FRAMES else ()
+    return tuple(frames[LEAVE_OUT_EVERY // 2 : -1 : LEAVE_OUT_EVERY]) if len(frames) >= FEWEST_FRAMES else ()

@@ -102,7 +102,8 @@ def frame_at(run: Run, iteration: int) -> int:
     """The training frame of an iteration (from 1): a function of seed and iteration alone, so a run can resume."""
     indices = run.frames.indices
     if run.schedule.leaves_out(iteration):
-        indices = [index for index in indices if index not in left_out(indices)]
+        judging = left_out(indices)
+        indices = [index for index in indices if index not in judging]
     if run.preset.order == "random":
         return indices[int(np.random.default_rng([run.seed, iteration]).integers(len(indices)))]
     epoch, place = divmod(iteration - 1, len(indices))
@@ -213,7 +214,8 @@ def _left_out_psnr(run: Run) -> float:
     for index in left_out(run.frames.indices):
         image = run.model.render(run.frames.cameras[index], float(run.frames.t[index]))
         scores.append(psnr_tissue(image[:3].transpose(1, 2, 0), *run.frames.picture(index)))
-    return float(np.nanmean(scores))
+    known = [score for score in scores if not math.isnan(score)]  # a frame without tissue has none
+    return float(np.mean(known)) if known else math.nan
 
 
 def _check_finite(run: Run) -> None:

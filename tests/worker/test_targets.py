@@ -67,6 +67,21 @@ def test_a_target_holds_the_frames_colour_tissue_and_inverse_depth(clip: DepthCl
         assert not inverse[:, WIDTH:].any()
 
 
+def test_a_picture_is_the_frame_without_padding(clip: DepthClip) -> None:
+    frames = TrainingFrames(clip, TRAIN, 1.7)
+    for index in TRAIN:
+        rgb, tissue = frames.picture(index)
+        assert rgb.dtype == np.uint8
+        assert tissue.dtype == np.bool_
+        np.testing.assert_array_equal(rgb, clip.rgb[index])
+        np.testing.assert_array_equal(tissue, clip.tissue[index])
+
+
+def test_there_is_no_picture_of_a_held_out_frame(clip: DepthClip) -> None:
+    with pytest.raises(KeyError):
+        TrainingFrames(clip, TRAIN, 1.7).picture(1)
+
+
 def test_each_loss_is_a_mean_over_its_own_pixels(clip: DepthClip) -> None:
     frames = TrainingFrames(clip, TRAIN, 1.0)
     loss = LossSettings(colour_weight=2.0, depth_weight=0.5, colour_zone=0.02)
