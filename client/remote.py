@@ -78,7 +78,9 @@ def _add_submit(commands: Commands) -> None:
         "--holdout", metavar="every8|blocks8|none|LIST", help="frames kept from training, to measure on"
     )
     parser.add_argument(
-        "--preset", choices=get_args(PresetName), help="ours: instant, fast (default), quality; paper: as published"
+        "--preset",
+        choices=get_args(PresetName),
+        help="ours: instant, fast (default), quality, small; paper: as published",
     )
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-s", type=positive, metavar="S", help="seconds of training")

@@ -103,7 +103,7 @@ def _add_reconstruct(commands: Commands) -> None:
         "--preset",
         choices=get_args(PresetName),
         default="fast",
-        help="ours: instant, fast (default), quality; paper: as published",
+        help="ours: instant, fast (default), quality, small; paper: as published",
     )
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-s", type=positive, metavar="S", help="seconds of training (default: the preset's)")

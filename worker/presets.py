@@ -1,5 +1,4 @@
-"""What distinguishes the ways of training: `instant`, `fast`, `quality`, `small`, ours; `paper` and its variants; the
-rivals.
+"""What distinguishes the ways of training: ours, `instant`, `fast`, `quality`, `small`; `paper`, its variants, rivals.
 
 A preset is data only; train.py reads it. Rates are in optimiser units (median depth 60).
 """
@@ -166,8 +165,7 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
     }
 )
 """Every preset by its name. `instant` and `quality` are `fast` for less and for more time, `small` is `fast` for little
-room; `paper-wide` starts FDM's
-bases as wide as 0.6 of their spacing."""
+room; `paper-wide` starts FDM's bases as wide as 0.6 of their spacing."""
 
 
 def preset_named(name: str, budget_s: float | None = None) -> Preset:
