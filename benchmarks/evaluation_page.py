@@ -29,9 +29,10 @@ _CHARTS = {
 
 Each line is one run, the strong one the seed that ends in the middle; the clock counts what
 [conventions](../conventions.md) call `t_train_s`, so neither compilation nor the scoring of held-out frames nor, after
-the last step, storing (`finish_s` and `shrink_s` of the column `seconds`). A curve ends with the score of the stored
-scene. Dashed is what copying the neighbouring frames scores: where a curve stays below, a copy is the better picture
-from the endoscope's own pose, and has no other pose, no depth and nothing behind the instrument.
+the last step, storing (`finish_s` and `shrink_s` of the column `seconds`). Rates fall and rise in cycles, and so do the
+curves of ours; each ends with the score of the stored scene. Dashed is what copying the neighbouring frames scores:
+where a curve stays below, a copy is the better picture from the endoscope's own pose, and has no other pose, no depth
+and nothing behind the instrument.
 
 ![Held-out SSIM against seconds of training](curves-ssim.png)
 
