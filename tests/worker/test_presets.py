@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 
 from contract.errors import InputError
+from worker.optimize import Rate
 from worker.presets import PRESETS, Preset, preset_named
 
 VARIANTS = {
@@ -53,6 +54,21 @@ def test_ours_differ_in_time_and_in_how_many_gaussians_it_pays_for() -> None:
         assert differing(other, fast) <= {"points_per_image", "budget_s", "worth_db"}
     budgets = [preset.budget_s or 0.0 for preset in (instant, fast, quality)]
     assert budgets == sorted(set(budgets))
+
+
+def test_small_is_fast_with_less_to_store() -> None:
+    small, fast = PRESETS["small"], PRESETS["fast"]
+    assert differing(small, fast) == {"points_per_image", "most_bases", "rates"}
+    assert (small.points_per_image or 0) < (PRESETS["instant"].points_per_image or 0)
+    still = dataclasses.replace(fast.rates, motion_log_scale=Rate(0.0))
+    assert small.rates == still
+
+
+def test_cycles_are_ours_alone() -> None:
+    """An average of models needs a fixed number of Gaussians, which densification changes."""
+    assert {name for name, preset in PRESETS.items() if preset.cycles} == {"instant", "fast", "quality", "small"}
+    assert all(preset.densify is None for preset in PRESETS.values() if preset.cycles)
+    assert all(preset.cycles for preset in PRESETS.values() if preset.worth_db is not None)
 
 
 def test_little_time_is_not_spent_on_many_gaussians() -> None:
