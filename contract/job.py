@@ -81,7 +81,9 @@ class JobOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     preset: PresetName = "fast"
-    budget_s: float | None = Field(default=None, gt=0, le=7200, description="seconds of training; not with iterations")
+    budget_s: float | None = Field(
+        default=None, gt=0, le=7200, description="seconds of training at most; not with iterations"
+    )
     iterations: int | None = Field(default=None, ge=1, le=1_000_000, description="fixed schedule; not with budget_s")
     mask_polarity: MaskPolarity = "auto"
     layout: Layout = "auto"

@@ -106,7 +106,9 @@ def _add_reconstruct(commands: Commands) -> None:
         help="ours: instant, fast (default), quality, small; paper: as published",
     )
     limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--budget-s", type=positive, metavar="S", help="seconds of training (default: the preset's)")
+    limit.add_argument(
+        "--budget-s", type=positive, metavar="S", help="seconds of training at most (default: the preset's)"
+    )
     limit.add_argument("--iterations", type=int, metavar="N", help="steps of training; the same N gives the same bits")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")

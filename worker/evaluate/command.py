@@ -45,7 +45,9 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--holdout", nargs="+", default=list(DEFAULT_HOLDOUTS), help="(default: %(default)s)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N", help="(default: 0)")
     limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--budget-s", nargs="+", type=positive, default=[], metavar="S", help="seconds of training")
+    limit.add_argument(
+        "--budget-s", nargs="+", type=positive, default=[], metavar="S", help="seconds of training at most"
+    )
     limit.add_argument("--iterations", nargs="+", type=count, default=[], metavar="N", help="instead of the preset's")
     parser.add_argument(
         "--grid", action="store_true", help="of each series, the grid of fixed capacities beside its own choice"
