@@ -154,7 +154,9 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
             replace(_FAST, name="instant", points_per_image=FEW_POINTS, budget_s=6.0),
             _FAST,
             replace(_FAST, name="quality", worth_db=0.05, budget_s=240.0),
-            replace(_FAST, name="small", points_per_image=FEWEST_POINTS, most_bases=17, rates=_SMALL_RATES),
+            replace(
+                _FAST, name="small", points_per_image=FEWEST_POINTS, most_bases=17, rates=_SMALL_RATES, budget_s=30.0
+            ),
             _PAPER,
             replace(_PAPER, name="paper-released", deformation="fdm-quartic"),
             replace(_PAPER, name="paper-wide", start_width=0.6 / 16),

@@ -131,16 +131,21 @@ def step(run: Run, iteration: int) -> float:
 
 
 def iterations_within(run: Run, budget_s: float, elapsed_s: float) -> int:
-    """How many iterations fit into what is left of budget_s, by timing a few steps and taking them back."""
-    stored = {name: values.copy() for name, values in run.model.arrays().items()}
-    untimed, timed = CALIBRATION_STEPS
+    """How many iterations fit into what is left of budget_s, by timing a few first steps and taking them back."""
     start = time.perf_counter()
-    run.model.load_arrays(stored)  # touches the moments' memory once: the first touch of a page costs as much as a step
-    ends = [start]
+    stored = {name: values.copy() for name, values in run.model.parameters().items()}
+
+    def start_again() -> None:
+        for name, values in run.model.arrays().items():
+            values[...] = stored.get(name, 0)  # moments and their counts are 0 before the first step
+
+    untimed, timed = CALIBRATION_STEPS
+    start_again()  # touches the moments' memory once: the first touch of a page costs as much as a step
+    ends = [time.perf_counter()]
     for iteration in range(1, untimed + timed + 1):
         step(run, iteration)
         ends.append(time.perf_counter())
-    run.model.load_arrays(stored)
+    start_again()
     step_s = float(np.median(np.diff(ends)[untimed:])) * LATER_STEPS
     left_s = budget_s - elapsed_s - (time.perf_counter() - start)
     return max(len(run.frames.indices), int(left_s / step_s))
