@@ -1,4 +1,4 @@
-"""How large a model the scene needs: how many bases its motion, and where Gaussians stand closer than elsewhere.
+"""How large a model the scene needs: how many bases its motion has, and how far apart its Gaussians start.
 
 Both are decided before training, from training frames alone, by the squared error of the picture each is expected to
 leave, in squared grey levels (of 255) a channel of a tissue pixel.
@@ -9,7 +9,7 @@ Symbols: K training frames, n sampled cells of the tracks' grid, B bases, N poin
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -27,9 +27,9 @@ BASES = (3, 5, 9, 13, 17, 25, 33)
 FRAMES_A_BASIS = 3
 """Training frames a basis stands for where nothing could be followed."""
 FOLLOWED = 0.5
-"""Share of the error with the fewest bases that has to go with more, or these errors tell nothing of a motion."""
+"""Share of the fewest bases' error in motion that has to go with more bases, or no number follows it."""
 MORE_FRAMES_THAN = 2
-"""Training frames for each basis are more than this: with fewer they gain what held-out frames lose."""
+"""Each basis has more training frames than this: where it has fewer, they gain what held-out frames lose."""
 WORTH_DB = 0.25
 """More bases have to lower the expected error of the picture by more than this."""
 COARSEST = 4
@@ -41,10 +41,11 @@ TRAINED_SHARE = 0.1
 they place and shape themselves. Measured on a still clip at 2 to 4 pixels, where 0.04 to 0.14 were left."""
 CELLS = 1000
 """Tracks on which bases are tried."""
-FEWEST_CELLS = 30
-FEWEST_FRAMES = 8
+FEWEST_CELLS_TO_TRY = 30
+FEWEST_FRAMES_TO_TRY = 8
 """Below either, leaving frames out says nothing."""
-LEAVE_OUT_EVERY, FIRST_LEFT_OUT = 4, 2
+TRIED_ON_EVERY, FIRST_TRIED_ON = 4, 2
+"""Bases are tried on every fourth training frame, from the third on, and fitted to the others."""
 TRUSTED = 0.3
 """Mean confidence a track needs to be tried on."""
 
@@ -57,50 +58,80 @@ class Choice:
     reason: str
 
 
+@dataclass(frozen=True)
+class Missed:
+    """What a number of bases would leave in frames it was not fitted to, squared grey levels: of motion, by which the
+    picture changes where the track starts, and of light, the change of colour along the track."""
+
+    motion: float
+    light: float
+
+    @property
+    def total(self) -> float:
+        return self.motion + self.light
+
+
 # bases --------------------------------------------------------------------------------------------------------------
 
 
-def errors_by_bases(tracks: Tracks, clip: DepthClip, train: Sequence[int], most: int | None = None) -> dict[int, float]:
-    """What each number of bases up to most would leave in frames it was not fitted to: B -> error, squared grey levels.
+def errors_by_bases(
+    tracks: Tracks, clip: DepthClip, train: Sequence[int], most: int | None = None
+) -> dict[int, Missed]:
+    """What each number of bases that the training frames bear, up to most, would leave in frames it was not fitted to.
 
     Every fourth training frame is left out, the tracks of the others are fitted by three quarters of B bases, and the
-    fit is compared with the tracks in those left out: displacement, as the grey levels by which it changes the picture
-    where the track starts, and colour. Empty where too little could be followed.
+    fit is compared with the tracks in those left out. Frames bear as many bases as leave each more than
+    MORE_FRAMES_THAN of them. Empty where too little could be followed.
     """
-    if len(train) < FEWEST_FRAMES:
+    if len(train) < FEWEST_FRAMES_TO_TRY:
         return {}
     series, confidence = _series(tracks, clip, train[0])
-    if series.shape[1] < FEWEST_CELLS:
+    if series.shape[1] < FEWEST_CELLS_TO_TRY:
         return {}
     left_out = np.zeros(len(train), np.bool_)
-    left_out[FIRST_LEFT_OUT::LEAVE_OUT_EVERY] = True
+    left_out[FIRST_TRIED_ON::TRIED_ON_EVERY] = True
     times = np.array([float(clip.t[index]) for index in train])
     share = 1 - left_out.mean()
-    most_bases = min(most or BASES[-1], max(BASES[0], (len(train) - 1) // MORE_FRAMES_THAN))
+    cap = _cap(len(train), most).count
     return {
-        bases: _left_out_error(series, confidence, times, left_out, max(2, round(share * bases)))
-        for bases in BASES
-        if bases <= most_bases
+        bases: _missed(series, confidence, times, left_out, max(2, round(share * bases)))
+        for bases in [each for each in BASES if each <= cap] or [cap]
     }
 
 
-def choose_bases(errors: dict[int, float], floor: float, frames: int, most: int | None = None) -> Choice:
+def choose_bases(errors: Mapping[int, Missed], floor: float, frames: int, most: int | None = None) -> Choice:
     """The fewest bases whose expected error, on top of the floor that the Gaussians leave, is within WORTH_DB of the
-    least; errors as from errors_by_bases, frames the number of training frames. Without errors one for every
-    FRAMES_A_BASIS frames, at most `most`."""
+    least; errors as from errors_by_bases, frames the number of training frames.
+
+    The most, where several numbers were tried and none follows the motion: even the best leaves more of it than the
+    Gaussians do, and more than FOLLOWED of what the fewest bases leave. Light that nothing follows, such as a lamp
+    that flickers, asks for no more bases. Without errors one for every FRAMES_A_BASIS frames, at most `most`.
+    """
     if not errors:
-        bases = min(frames, max(BASES[0], min(most or BASES[-1], -(-frames // FRAMES_A_BASIS))))
+        bases = min(frames, most or BASES[-1], max(BASES[0], -(-frames // FRAMES_A_BASIS)))
         reason = f"one for {frames / bases:.2g} training frames, for too little could be followed to tell more"
         return Choice(bases, reason)
-    if min(errors.values()) > max(floor, FOLLOWED * errors[min(errors)]):
-        reason = f"the most that {frames} training frames bear, for the motion is too fast to be followed by fewer"
-        return Choice(max(errors), reason)
-    allowed = (min(errors.values()) + floor) * 10 ** (WORTH_DB / 10)
-    bases = min(each for each, error in errors.items() if error + floor <= allowed)
-    best = min(errors, key=lambda each: errors[each])
-    told = sorted({min(errors), bases, best})
-    left = ", ".join(f"{each} leave {math.sqrt(errors[each] + floor):.1f}" for each in told)
+    fewest, cap = min(errors), _cap(frames, most)
+    if len(errors) == 1:
+        return Choice(fewest, cap.reason)
+    if min(each.motion for each in errors.values()) > max(floor, FOLLOWED * errors[fewest].motion):
+        return Choice(max(errors), f"{cap.reason}, for none that was tried follows the motion in frames left out")
+    total = {bases: each.total for bases, each in errors.items()}
+    best = min(total, key=lambda each: total[each])
+    allowed = (total[best] + floor) * 10 ** (WORTH_DB / 10)
+    bases = min(each for each, error in total.items() if error + floor <= allowed)
+    left = ", ".join(f"{each} leave {math.sqrt(total[each] + floor):.1f}" for each in sorted({fewest, bases, best}))
     return Choice(bases, f"the fewest within {WORTH_DB} dB of the best; in frames left out {left} of 255 grey levels")
+
+
+def _cap(frames: int, most: int | None) -> Choice:
+    """The most bases that may be tried, and what says so."""
+    limits = [
+        Choice(BASES[-1], "the most there are to choose from"),
+        Choice(most or BASES[-1], "the most that the preset allows"),
+        Choice((frames - 1) // MORE_FRAMES_THAN, f"the most that {frames} training frames bear"),
+    ]
+    return min(limits, key=lambda each: each.count)
 
 
 def choose_stride(clip: DepthClip, index: int, finest: int, least_error: float) -> Choice:
@@ -169,11 +200,12 @@ def _slopes(rgb: NDArray[np.uint8], step: int) -> Reals:
     return np.stack(slopes, axis=-1).astype(np.float64)
 
 
-def _left_out_error(series: Reals, confidence: Reals, times: Reals, left_out: NDArray[np.bool_], bases: int) -> float:
+def _missed(series: Reals, confidence: Reals, times: Reals, left_out: NDArray[np.bool_], bases: int) -> Missed:
     """Mean squared error a channel in the frames left out, of the series fitted to the others as motion.py fits."""
     shared = SharedBasis.initial(1, bases=bases, times=times[~left_out].tolist())
     basis = np.stack([shared.basis(float(t)).double().numpy() for t in times])
     weights = fit_series(series[~left_out], confidence[~left_out], basis[~left_out])
     missed = series[left_out] - np.einsum("kb,nbc->knc", basis[left_out], weights)
     weight = confidence[left_out]
-    return float((missed**2 * weight[..., None]).sum() / max(3 * weight.sum(), 1e-9))
+    squares = (missed**2 * weight[..., None]).sum((0, 1)) / max(3 * weight.sum(), 1e-9)
+    return Missed(motion=float(squares[:3].sum()), light=float(squares[3:].sum()))

@@ -1,4 +1,4 @@
-"""The model before its first step: points become Gaussians, motion starts at rest."""
+"""The model before its first step: points become Gaussians; motion starts as the tracks have it, or at rest."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def settled(
         words.append(f"Gaussians start {fusion.stride} pixels apart: nearest to {preset.points_per_image} an image.")
     elif fusion.mode == "fill":
         finest = _stride_for(MOST_POINTS, clip.intrinsics)
-        choice = choose_stride(clip, train[0], finest, min(errors.values(), default=0.0))
+        choice = choose_stride(clip, train[0], finest, min((each.total for each in errors.values()), default=0.0))
         fusion = dataclasses.replace(fusion, stride=choice.count)
         preset = dataclasses.replace(preset, fusion=fusion)
         words.append(f"Gaussians start {choice.count} pixels apart: {choice.reason}.")

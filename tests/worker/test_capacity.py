@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from tests.worker.phantoms import phantom_clip, prepared_on
-from worker.capacity import BASES, COARSEST, FEWEST_FRAMES, WORTH_DB, choose_bases, errors_by_bases, floor_error
+from worker.capacity import (
+    BASES,
+    COARSEST,
+    FEWEST_FRAMES_TO_TRY,
+    WORTH_DB,
+    Missed,
+    choose_bases,
+    errors_by_bases,
+    floor_error,
+)
 from worker.clip import DepthClip, split_frames
 from worker.motion import Tracks, track
 from worker.phantom import Motion
@@ -33,6 +42,11 @@ def bases_for(motion: Motion) -> int:
     bases = settled(FAST, tracks, clip, train)[0].bases
     assert bases is not None
     return bases
+
+
+def motion_left(errors: dict[int, float]) -> dict[int, Missed]:
+    """The same errors, all of motion."""
+    return {bases: Missed(motion=error, light=0.0) for bases, error in errors.items()}
 
 
 def faster(clip: DepthClip, every: int) -> DepthClip:
@@ -71,21 +85,59 @@ def test_held_out_frames_are_never_read() -> None:
 
 def test_the_choice_is_the_fewest_within_the_tolerance_of_the_best() -> None:
     errors = {3: 100.0, 5: 30.0, 9: 20.4, 17: 20.0, 33: 21.0}
-    assert choose_bases(errors, 0.0, 60).count == 9
-    assert choose_bases({**errors, 9: 20.0 * 10 ** (WORTH_DB / 10) + 0.1}, 0.0, 60).count == 17
+    assert choose_bases(motion_left(errors), 0.0, 60).count == 9
+    errors[9] = 20.0 * 10 ** (WORTH_DB / 10) + 0.1
+    assert choose_bases(motion_left(errors), 0.0, 60).count == 17
 
 
 def test_the_less_the_gaussians_can_show_the_fewer_bases_are_worth_it() -> None:
     errors = {3: 100.0, 5: 30.0, 9: 20.4, 17: 20.0, 33: 21.0}
-    counts = [choose_bases(errors, floor, 60).count for floor in (0.0, 100.0, 300.0, 3000.0)]
+    counts = [choose_bases(motion_left(errors), floor, 60).count for floor in (0.0, 100.0, 300.0, 3000.0)]
     assert counts == sorted(counts, reverse=True)
     assert counts[-1] == 3
 
 
 def test_motion_too_fast_for_any_number_gets_the_most() -> None:
-    errors = {3: 670.0, 5: 665.0, 9: 790.0, 17: 860.0}
-    assert choose_bases(errors, 5.0, 40).count == 17
+    errors = motion_left({3: 670.0, 5: 665.0, 9: 790.0, 17: 860.0})
+    choice = choose_bases(errors, 5.0, 40)
+    assert choice.count == 17
+    assert "none that was tried follows the motion" in choice.reason
     assert choose_bases(errors, 1000.0, 40).count == 3  # it does not show beside what the Gaussians leave
+
+
+def test_light_that_no_number_follows_gets_no_more_bases() -> None:
+    clip, train, _ = followed("still")
+    brightness = 1 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (FRAMES, 1, 1, 1))
+    flickering = dataclasses.replace(clip, rgb=np.clip(clip.rgb * brightness, 0, 255).astype(np.uint8))
+    errors = errors_by_bases(track(flickering, train), flickering, train)
+    floor = floor_error(flickering, train[0], MIN_STRIDE)
+    assert min(each.light for each in errors.values()) > max(floor, errors[BASES[0]].light / 2)
+    choice = choose_bases(errors, floor, len(train))
+    assert choice.count == BASES[0]
+    assert "follows the motion" not in choice.reason
+
+
+def test_where_one_number_alone_could_be_tried_nothing_is_said_of_the_motion() -> None:
+    choice = choose_bases(motion_left({3: 1000.0}), 1.0, 10)
+    assert choice.count == 3
+    assert choice.reason == "the most that 10 training frames bear"
+
+
+@pytest.mark.parametrize(
+    ("frames", "most", "tried", "cap"),
+    [
+        (40, None, 17, "the most that 40 training frames bear"),
+        (40, 17, 17, "the most that the preset allows"),
+        (40, 25, 17, "the most that 40 training frames bear"),
+        (200, 17, 17, "the most that the preset allows"),
+        (200, None, 33, "the most there are to choose from"),
+    ],
+)
+def test_the_most_is_called_by_what_limits_it(frames: int, most: int | None, tried: int, cap: str) -> None:
+    errors = motion_left({bases: 1000.0 for bases in BASES if bases <= tried})
+    choice = choose_bases(errors, 1.0, frames, most)
+    assert choice.count == tried
+    assert choice.reason.startswith(cap + ",")
 
 
 @pytest.mark.parametrize("frames", [10, 21, 40])
@@ -94,7 +146,6 @@ def test_there_are_more_than_two_training_frames_for_each_basis(frames: int) -> 
     train = list(range(frames))
     tried = errors_by_bases(track(clip, train), clip, train)
     assert frames / max(tried) > 2
-    assert max(errors_by_bases(track(clip, train), clip, train, most=5)) <= 5
 
 
 def test_gaussians_farther_apart_leave_more_of_the_picture() -> None:
@@ -121,7 +172,7 @@ def test_a_fixed_number_of_points_is_kept_to(points: int) -> None:
     assert fusion_for(fixed, clip.intrinsics).stride == max(MIN_STRIDE, round(math.sqrt(96 * 80 / points)))
 
 
-@pytest.mark.parametrize("frames", [1, 2, FEWEST_FRAMES - 1])
+@pytest.mark.parametrize("frames", [1, 2, FEWEST_FRAMES_TO_TRY - 1])
 def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: int) -> None:
     clip = phantom_clip(frames=frames)
     train = list(range(frames))
@@ -134,6 +185,22 @@ def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: 
 @pytest.mark.parametrize(("frames", "bases"), [(1, 1), (2, 2), (12, 4), (1000, 33)])
 def test_where_nothing_could_be_followed_bases_come_by_the_frames_up_to_the_most(frames: int, bases: int) -> None:
     assert choose_bases({}, 10.0, frames).count == bases
+
+
+@pytest.mark.parametrize("most", [2, 5, 12, 1000])
+def test_a_preset_may_allow_fewer_bases_than_the_scene_would_get(most: int) -> None:
+    clip, train, tracks = followed("breathing")
+    limited, words = settled(dataclasses.replace(FAST, most_bases=most), tracks, clip, train)
+    assert limited.bases is not None
+    assert limited.bases <= most
+    assert limited.bases == bases_for("breathing") or most < bases_for("breathing")
+    assert words[-1].startswith(f"Motion has {limited.bases} bases: ")
+    assert max(errors_by_bases(tracks, clip, train, most)) <= most
+
+
+@pytest.mark.parametrize("most", [1, 2, 17])
+def test_where_nothing_could_be_followed_a_preset_gets_no_more_bases_than_it_allows(most: int) -> None:
+    assert choose_bases({}, 10.0, 1000, most).count == most
 
 
 @pytest.mark.parametrize("bases", [3, 9, 33])
