@@ -43,7 +43,7 @@ def _stride_for(points: int, intrinsics: Intrinsics) -> int:
 def settled(
     preset: Preset, tracks: Tracks | None, clip: DepthClip, train: Sequence[int]
 ) -> tuple[Preset, tuple[str, ...]]:
-    """The preset with what it leaves to the scene settled (docs/decisions/014, 018), and why, in words for the report."""
+    """The preset with what it leaves to the scene settled (decisions 014, 018), and why, in words for the report."""
     words = []
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
     errors = errors_by_bases(tracks, clip, train, preset.most_bases) if tracks is not None and left_open else {}
