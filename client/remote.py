@@ -83,7 +83,7 @@ def _add_submit(commands: Commands) -> None:
         help="ours: instant, fast (default), quality, small; paper: as published",
     )
     limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--budget-s", type=positive, metavar="S", help="seconds of training at most")
+    limit.add_argument("--budget-s", type=positive, metavar="S", help="about how many seconds to train, often less")
     limit.add_argument("--iterations", type=int, metavar="N", help="steps of training")
     parser.add_argument("--seed", type=int, metavar="N", help="of the random numbers (default: 0)")
     parser.add_argument("--priority", choices=get_args(Priority), help="high: before, and in place of, standard jobs")

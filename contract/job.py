@@ -82,7 +82,7 @@ class JobOptions(BaseModel):
 
     preset: PresetName = "fast"
     budget_s: float | None = Field(
-        default=None, gt=0, le=7200, description="seconds of training at most; not with iterations"
+        default=None, gt=0, le=7200, description="about how many seconds to train, often less; not with iterations"
     )
     iterations: int | None = Field(default=None, ge=1, le=1_000_000, description="fixed schedule; not with budget_s")
     mask_polarity: MaskPolarity = "auto"

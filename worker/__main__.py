@@ -107,7 +107,10 @@ def _add_reconstruct(commands: Commands) -> None:
     )
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument(
-        "--budget-s", type=positive, metavar="S", help="seconds of training at most (default: the preset's)"
+        "--budget-s",
+        type=positive,
+        metavar="S",
+        help="about how many seconds to train, often less (default: the preset's)",
     )
     limit.add_argument("--iterations", type=int, metavar="N", help="steps of training; the same N gives the same bits")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")

@@ -46,7 +46,12 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N", help="(default: 0)")
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument(
-        "--budget-s", nargs="+", type=positive, default=[], metavar="S", help="seconds of training at most"
+        "--budget-s",
+        nargs="+",
+        type=positive,
+        default=[],
+        metavar="S",
+        help="about how many seconds to train, often less",
     )
     limit.add_argument("--iterations", nargs="+", type=count, default=[], metavar="N", help="instead of the preset's")
     parser.add_argument(
