@@ -1,7 +1,8 @@
 """How near a render is to the recorded frame (docs/conventions.md, "Scores").
 
 Symbols: H W pixels. Colours are RGB: float in [0, 1], or uint8; tissue [H, W] bool, True = tissue.
-Each function judges one frame, except depth_agreement_mm; what has no pixel to be judged on is NaN.
+Each function judges one frame, except depth_agreement_mm; what has no pixel to be judged on is NaN, and so is the
+score of a picture that is no number where it is judged.
 """
 
 from __future__ import annotations
@@ -74,10 +75,10 @@ def ssim_map(first: NDArray[np.floating], second: NDArray[np.floating]) -> NDArr
 def depth_errors_mm(
     rendered_mm: NDArray[np.floating], stereo_mm: NDArray[np.floating], tissue: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """|rendered - stereo| in mm at the tissue pixels where both depths are valid (above 0), [M]."""
+    """|rendered - stereo| in mm at the tissue pixels where both depths are valid (above 0), [M]; of NaN it is NaN."""
     if not rendered_mm.shape == stereo_mm.shape == tissue.shape:
         raise ValueError(f"shapes differ: {rendered_mm.shape}, {stereo_mm.shape}, tissue {tissue.shape}")
-    both = tissue & (rendered_mm > 0) & (stereo_mm > 0)
+    both = tissue & ~(rendered_mm <= 0) & ~(stereo_mm <= 0)
     return np.abs(rendered_mm[both] - stereo_mm[both]).astype(np.float32)
 
 
@@ -88,7 +89,7 @@ def depth_agreement_mm(errors_mm: list[NDArray[np.float32]]) -> float:
 
 
 def coverage(alpha: NDArray[np.floating], tissue: NDArray[np.bool_]) -> float:
-    """Share of tissue pixels with a sum of blending weights of at least 0.5."""
+    """Share of tissue pixels with a sum of blending weights of at least 0.5, which NaN is not."""
     if alpha.shape != tissue.shape:
         raise ValueError(f"shapes differ: {alpha.shape}, tissue {tissue.shape}")
     return float((alpha[tissue] >= COVERED_ALPHA).mean()) if tissue.any() else math.nan
@@ -105,6 +106,8 @@ def _decibel(difference: NDArray[np.floating]) -> float:
     if not difference.size:
         return math.nan
     squared = float(np.mean(np.square(difference, dtype=np.float64)))
+    if math.isnan(squared):
+        return math.nan
     return min(BEST_PSNR_DB, -10 * math.log10(squared)) if squared > 0 else BEST_PSNR_DB
 
 

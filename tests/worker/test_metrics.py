@@ -95,6 +95,23 @@ def test_nothing_to_judge_is_not_a_score(score: object) -> None:
         score(rendered[:-1], truth, tissue)  # type: ignore[operator]
 
 
+@pytest.mark.parametrize("score", [psnr_tissue, psnr_paper, ssim], ids=lambda each: each.__name__)
+def test_a_picture_that_is_no_number_has_no_score(score: object) -> None:
+    rendered, truth, tissue = pictures()
+    rendered[~tissue] = math.nan
+    assert not math.isnan(score(rendered, truth, tissue))  # type: ignore[operator]
+    rendered[30, 30, 1] = math.nan
+    assert math.isnan(score(rendered, truth, tissue))  # type: ignore[operator]
+
+
+def test_depth_that_is_no_number_does_not_agree() -> None:
+    tissue = np.ones((1, 3), dtype=np.bool_)
+    errors = depth_errors_mm(np.array([[51.0, math.nan, 0.0]], np.float32), np.full((1, 3), 50, np.float32), tissue)
+    assert errors.tolist() == pytest.approx([1.0, math.nan], nan_ok=True)
+    assert math.isnan(depth_agreement_mm([errors]))
+    assert coverage(np.array([[0.9, math.nan, 0.9]]), tissue) == pytest.approx(2 / 3)
+
+
 def test_depth_agreement_is_the_median_over_all_frames_where_both_are_valid() -> None:
     tissue = np.ones((1, 4), dtype=np.bool_)
     tissue[0, 3] = False
