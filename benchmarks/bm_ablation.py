@@ -52,7 +52,7 @@ CHANGES: dict[str, Preset] = {
     ),
     "Adam's moments as published": _rates(beta1=_PAPER.rates.beta1, beta2=_PAPER.rates.beta2),
     "plain L1 of colour": dataclasses.replace(_FAST, loss=dataclasses.replace(_FAST.loss, colour_zone=0.0)),
-    "rates fall once, nothing averaged": dataclasses.replace(_FAST, cycles=False),
+    "rates fall once, nothing averaged": dataclasses.replace(_FAST, cycles=False, worth_db=None),
     "opacity 0.8, spread 0.6": dataclasses.replace(_FAST, opacity=0.8, spread=0.6),
     "9 bases": dataclasses.replace(_FAST, bases=9),
     "20 k points": dataclasses.replace(_FAST, points_per_image=20_000),

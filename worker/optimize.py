@@ -1,6 +1,7 @@
 """Adam's rates and their schedules. The arithmetic itself is fused into the backends' steps.
 
-Rates are stated in optimiser units (median depth 60) and a whole run: progress p = iteration / iterations in [0, 1).
+Rates are stated in optimiser units (median depth 60). Progress in (0, 1] is how far they have fallen: 1 at the end of
+every cycle of the schedule (worker/schedule.py), and of a run without cycles.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Rate:
-    """A learning rate that falls log-linearly from start to end over the run; constant where end is None."""
+    """A learning rate that falls log-linearly from start to end as progress goes to 1; constant where end is None."""
 
     start: float
     end: float | None = None
@@ -77,7 +78,7 @@ class AdamStep:
 
 
 def rates_at(rates: Rates, progress: float) -> StepRates:
-    """Every group's rate at progress in [0, 1]."""
+    """Every group's rate at progress in (0, 1]."""
     found = {name: getattr(rates, name) for name in StepRates.__dataclass_fields__}
     return StepRates(**{name: each.at(progress) if isinstance(each, Rate) else each for name, each in found.items()})
 

@@ -24,6 +24,7 @@ class Preset:
     fusion           which points become Gaussians
     points_per_image "fill" fusion takes the grid stride that comes nearest to this many points a frame; None: as far
                      apart as the scene's detail allows
+    points_by_budget whether a run with budget_s takes as many points as pay within it instead
     deformation      "shared", "fdm", "fdm-quartic", "pfs", "hexplane"
     bases            B of the deformation; None: as many as the scene's motion needs ("shared" alone)
     most_bases       of those the scene may choose; None: as many as there are to choose from
@@ -32,15 +33,20 @@ class Preset:
     opacity, spread  of a Gaussian at the start; spread is its standard deviation over the distance to its neighbours
     sh_degree        of the colour; from 1 on, a degree is added every sh_every iterations
     order            "epochs": every training frame once, shuffled, again and again; "random": one drawn each iteration
-    cycles           whether rates rise again when the steps have doubled (worker/schedule.py); else they fall once
+    cycles           whether rates rise again when the steps have doubled, if there are enough for two cycles, and the
+                     last models of each are averaged (worker/schedule.py); else rates fall once and nothing is averaged
     worth_db         a run with budget_s ends where a doubling of its steps is worth less; None: never before its time
     iterations       of a run without budget_s and iterations; None: budget_s
     budget_s         seconds of training of a run without either
+
+    Raises:
+        ValueError: cycles with densification, or worth_db without cycles.
     """
 
     name: str
     fusion: FusionSettings
     points_per_image: int | None
+    points_by_budget: bool
     deformation: Literal["shared", "fdm", "fdm-quartic", "pfs", "hexplane"]
     bases: int | None
     most_bases: int | None
@@ -58,6 +64,12 @@ class Preset:
     densify: DensifySettings | None
     iterations: int | None
     budget_s: float | None
+
+    def __post_init__(self) -> None:
+        if self.cycles and self.densify is not None:
+            raise ValueError("cycles end in an average of models, which are not of one size with densification")
+        if self.worth_db is not None and not self.cycles:
+            raise ValueError("worth_db compares the ends of cycles, so it needs cycles")
 
 
 FEWEST_POINTS, FEW_POINTS, MANY_POINTS = 20_000, 40_000, 80_000
@@ -84,6 +96,7 @@ _PAPER = Preset(
     name="paper",
     fusion=FusionSettings(mode="paper"),
     points_per_image=None,
+    points_by_budget=False,
     deformation="fdm",
     bases=17,
     most_bases=None,
@@ -128,6 +141,7 @@ _FAST = Preset(
     name="fast",
     fusion=FusionSettings(mode="fill"),
     points_per_image=MANY_POINTS,
+    points_by_budget=True,
     deformation="shared",
     bases=None,
     most_bases=None,
@@ -155,7 +169,13 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
             _FAST,
             replace(_FAST, name="quality", worth_db=0.05, budget_s=240.0),
             replace(
-                _FAST, name="small", points_per_image=FEWEST_POINTS, most_bases=17, rates=_SMALL_RATES, budget_s=30.0
+                _FAST,
+                name="small",
+                points_per_image=FEWEST_POINTS,
+                points_by_budget=False,
+                most_bases=17,
+                rates=_SMALL_RATES,
+                budget_s=30.0,
             ),
             _PAPER,
             replace(_PAPER, name="paper-released", deformation="fdm-quartic"),
@@ -171,7 +191,7 @@ room; `paper-wide` starts FDM's bases as wide as 0.6 of their spacing."""
 
 
 def preset_named(name: str, budget_s: float | None = None) -> Preset:
-    """The preset of this name; of ours but `small` with as many points as pay within budget_s, if that is given.
+    """The preset of this name; with points_by_budget, as many points as pay within budget_s if that is given.
 
     Raises:
         InputError: there is none.
@@ -179,6 +199,6 @@ def preset_named(name: str, budget_s: float | None = None) -> Preset:
     if name not in PRESETS:
         raise InputError("options.preset", f"there is no preset {name!r}.", f"Use one of: {', '.join(PRESETS)}.")
     preset = PRESETS[name]
-    if budget_s is None or preset.points_per_image not in (FEW_POINTS, MANY_POINTS):
+    if budget_s is None or not preset.points_by_budget:
         return preset
     return replace(preset, points_per_image=FEW_POINTS if budget_s < PAYS_FROM_S else MANY_POINTS)

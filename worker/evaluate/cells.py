@@ -87,6 +87,7 @@ def preset_of(series: str) -> Preset:
     """
     name, _, changes = series.partition(":")
     preset = preset_named(name)
+    values: dict[str, Any] = {}
     for change in filter(None, changes.split(",")):
         field, _, text = change.partition("=")
         plain = _plain_fields()
@@ -96,9 +97,12 @@ def preset_of(series: str) -> Preset:
         if field == "points_per_image" and preset.fusion.mode != "fill":
             problem = f"{name!r} does not choose how many points an image gives, so {change!r} would change nothing."
             raise InputError("--series", problem, "Leave it out.")
-        values: dict[str, Any] = {field: _value(series, field, text, getattr(preset, field))}
-        preset = dataclasses.replace(preset, **values)
-    return preset
+        values[field] = _value(series, field, text, getattr(preset, field))
+    try:
+        return dataclasses.replace(preset, **values) if values else preset
+    except ValueError as error:
+        problem = f"{series!r} cannot be trained: {error}."
+        raise InputError("--series", problem, "Change what it needs too, or leave the change out.") from None
 
 
 def base_of(series: str) -> str:
@@ -113,8 +117,9 @@ def capacity_grid(preset: str) -> list[str]:
 
 
 def _plain_fields() -> list[str]:
-    """The fields of a preset that are numbers, words or switches in every preset, but for its name."""
-    names = [each.name for each in dataclasses.fields(Preset) if each.name != "name"]
+    """The fields of a preset that are numbers, words or switches in every preset, but for those that a name stands for:
+    the name itself, and whether a budget chooses the points, which nothing does of a changed preset."""
+    names = [each.name for each in dataclasses.fields(Preset) if each.name not in ("name", "points_by_budget")]
     return [name for name in names if not any(dataclasses.is_dataclass(getattr(x, name)) for x in PRESETS.values())]
 
 

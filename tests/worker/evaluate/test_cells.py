@@ -13,6 +13,7 @@ def test_a_series_is_a_preset_with_its_changes_made() -> None:
     changed = preset_of("fast:tracks=false,spread=0.5,start_width=none,bases=9,order=random,budget_s=9")
     assert (changed.tracks, changed.spread, changed.start_width) == (False, 0.5, None)
     assert (changed.bases, changed.order, changed.budget_s) == (9, "random", 9.0)
+    assert not preset_of("fast:cycles=false,worth_db=none").cycles
     assert preset_of("fast:start_width=0.1").start_width == 0.1
     assert preset_of("paper") is PRESETS["paper"]
     assert base_of("fast:tracks=false") == "fast"
@@ -23,11 +24,19 @@ def test_a_series_is_a_preset_with_its_changes_made() -> None:
     [
         "slow", "fast:speed=3", "fast:rates=1", "fast:densify=1", "fast:name=best", "fast:tracks=maybe",
         "fast:bases=few", "fast:bases", "fast:spread=none", "fast:order=sorted", "paper:points_per_image=9000",
+        "fast:points_by_budget=false",
     ],
 )  # fmt: skip
 def test_what_no_preset_has_is_refused_with_its_name(series: str) -> None:
     with pytest.raises(InputError, match=series.split(":")[-1].split("=")[0]):
         preset_of(series)
+
+
+@pytest.mark.parametrize("series", ["paper:cycles=true", "paper:worth_db=0.1", "fast:cycles=false"])
+def test_changes_that_do_not_go_together_are_refused(series: str) -> None:
+    with pytest.raises(InputError, match=series) as refused:
+        preset_of(series)
+    assert refused.value.field == "--series"
 
 
 def test_a_preset_trains_as_long_as_it_says_unless_told_otherwise() -> None:
