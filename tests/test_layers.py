@@ -55,6 +55,7 @@ STAGES = (
     "schedule",
     "average",
     "train",
+    "resume",
     "render",
     "shrink",
     "encode",

@@ -23,7 +23,7 @@ class RunningMean:
         if self.count == 1:
             self._total = {name: values.copy() for name, values in parameters.items()}
             return
-        for name, values in parameters.items():
+        for name, values in parameters.items():  # torch adds on every core, numpy on one; the sums are the same
             torch.from_numpy(self._total[name]).add_(torch.from_numpy(values))
 
     def put(self, parameters: Mapping[str, np.ndarray]) -> None:

@@ -42,7 +42,8 @@ FORMAT_VERSION = 2
 """Raised when an older reader would misread what is written. Version 1 knew exact tensors only and is still read."""
 READ_VERSIONS = (1, FORMAT_VERSION)
 EXACT, COMPACT = "exact", "compact"
-RESUME_VERSION = 1
+RESUME_VERSION = 2
+"""Raised whenever what a stopped run leaves changes; nothing reads older states."""
 SCENE_FILE = "scene.safetensors"
 MANIFEST_FILE = "manifest.json"
 RESUME_FILE = RESUME
@@ -198,7 +199,10 @@ def load_resume(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors = _parse(data, path)
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__", {})
     if header.get("version") != str(RESUME_VERSION):
-        raise SceneError(f"{path} is of version {header.get('version')}, this program reads {RESUME_VERSION}.")
+        found = header.get("version")
+        raise SceneError(
+            f"{path} was written by another version ({found}; this program goes on from {RESUME_VERSION})."
+        )
     if header.get("sha256") != _digest(tensors, header.get("state", "")):
         raise SceneError(f"{path} is damaged: its contents do not match their hash.")
     state: dict[str, Any] = json.loads(header["state"])

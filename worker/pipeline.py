@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from contract.errors import Cancelled, InputError, SceneError, UnavailableError
+from contract.errors import Cancelled, InputError, UnavailableError
 from contract.job import Layout, MaskPolarity, PoseConvention
 from contract.report import Report
 from contract.store import CURVE, REPORT
@@ -36,12 +36,13 @@ from worker.presets import Preset, preset_named
 from worker.quality import Training, View, build_report, measure, sample_frames
 from worker.raster.cpu import compile_kernels
 from worker.render import model_of
+from worker.resume import resume, save_run
 from worker.schedule import Schedule, left_out
 from worker.shrink import Shrunk, shrink
 from worker.start import fusion_for, settled, start_model
 from worker.stereo import estimate_depth
 from worker.targets import TrainingFrames, solid_depth_mm, units_per_mm
-from worker.train import Run, Stopwatch, iterations_within, load_run, save_run, train, write_curve
+from worker.train import Run, Stopwatch, iterations_within, train, write_curve
 from worker.visibility import drop_strays, seen_share
 
 _Result = TypeVar("_Result")
@@ -213,34 +214,30 @@ def prepare(
     )
     frames = timed(seconds, "targets_s", lambda: TrainingFrames(clip, split.train, scale))
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
-    fixed = request.iterations or (None if request.budget_s else preset.iterations)
-    budget_s = request.budget_s or preset.budget_s
-    asked = f"{fixed} iterations" if fixed else f"{budget_s} s"
-    any_length = 1000  # calibration needs a place in the schedule, not its end
-    schedule = Schedule(fixed or any_length, preset.cycles)
+    schedule, asked = schedule_of(model, frames, preset, request, clock, hooks)
     run = Run(model, frames, preset, schedule, request.seed, asked, densifier=densifier, chosen=chosen)
-    if fixed is None:
-        assert budget_s is not None
-        report_stage(hooks, "calibrate", 0.0)
-        planned = iterations_within(run, budget_s, clock.elapsed_s)
-        worth_db = preset.worth_db if left_out(frames.indices) else None
-        run.schedule = Schedule(planned, preset.cycles, worth_db)
     return run, scale
 
 
-def resume(out_dir: Path, run: Run) -> float | None:
-    """Go on with the run stored in out_dir, if there is one; its t_train_s.
+def fixed_iterations(request: ReconstructionRequest, preset: Preset) -> int | None:
+    """The iterations that were asked for, or else are the preset's own; None where seconds say how long a run is."""
+    return request.iterations or (None if request.budget_s else preset.iterations)
 
-    Raises:
-        InputError: it was started with another preset, seed, length or clip, or cannot be read.
-    """
-    if not (out_dir / RESUME_FILE).exists():
-        return None
-    try:
-        return load_run(out_dir, run)
-    except (ValueError, KeyError, SceneError) as error:
-        problem = f"{out_dir / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
-        raise InputError("--out", problem, "Give the options it was started with, or name a new folder.") from error
+
+def schedule_of(
+    model: Model, frames: TrainingFrames, preset: Preset, request: ReconstructionRequest, clock: Stopwatch, hooks: Hooks
+) -> tuple[Schedule, str]:
+    """How many iterations are made and how rates fall in them; and, in words, the length that was asked for."""
+    count = len(frames.indices)
+    fixed = fixed_iterations(request, preset)
+    if fixed is not None:
+        return Schedule(fixed, preset.cycles, frames=count), f"{fixed} iterations"
+    budget_s = request.budget_s or preset.budget_s
+    assert budget_s is not None
+    report_stage(hooks, "calibrate", 0.0)
+    planned = iterations_within(model, frames, preset, request.seed, budget_s, clock.elapsed_s)
+    worth_db = preset.worth_db if left_out(frames.indices) else None
+    return Schedule(planned, preset.cycles, worth_db, count), f"{budget_s} s"
 
 
 def optimise(run: Run, clip: DepthClip, split: FrameSplit, clock: Stopwatch, hooks: Hooks, seconds: Seconds) -> None:
@@ -300,9 +297,9 @@ def held_out_psnr(
         view = view_of(index)
         if hooks is not None:
             hooks.on_held_out(index, view)
-        scores.append(psnr_tissue(view.rgb, clip.rgb[index], clip.tissue[index]))
-    known = [score for score in scores if not math.isnan(score)]  # a frame without tissue has no score
-    return float(np.mean(known)) if known else math.nan
+        if clip.tissue[index].any():  # else it has no score
+            scores.append(psnr_tissue(view.rgb, clip.rgb[index], clip.tissue[index]))
+    return float(np.mean(scores)) if scores else math.nan
 
 
 def scene_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: int) -> Scene:
@@ -326,7 +323,11 @@ def snapshot_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed
         trained_t=tuple(float(clip.t[i]) for i in split.train),
         seen=torch.zeros(len(gaussians)),
         seed=seed,
-        settings={"made_iterations": run.iteration, "preset": json.loads(json.dumps(asdict(run.preset), default=str))},
+        settings={
+            "made_iterations": run.iteration,
+            "schedule": run.schedule.settings,
+            "preset": json.loads(json.dumps(asdict(run.preset), default=str)),
+        },
     )
 
 
@@ -381,7 +382,8 @@ def training_of(
 
 def training_warnings(run: Run, request: ReconstructionRequest) -> tuple[str, ...]:
     """What the run itself has to say."""
-    if request.iterations is None and run.preset.iterations is None and run.iterations == len(run.frames.indices):
+    timed = fixed_iterations(request, run.preset) is None
+    if timed and run.schedule.planned == len(run.frames.indices):
         return ("The time given allowed less than one step a training frame; one a frame was made all the same.",)
     return ()
 

@@ -8,19 +8,22 @@ The clock has no say, so the same seed and iterations do the same.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
-SHORTEST_CYCLE = 250
-"""Iterations."""
+SHORTEST_CYCLE, SHORTEST_CYCLE_EPOCHS = 250, 3
+"""Iterations, and steps a training frame: a cycle has as many as both ask for."""
 RESTART = 0.6
 """How far rates have fallen already where every cycle but the first begins."""
 AVERAGED_SHARE, AVERAGED = 1 / 8, 6
 """The last share of a cycle from which models are averaged, and how many of them."""
-CLOSING_SHARE = 0.25
-"""Iterations after a stop, in which the frames left out are learnt too, over those before it."""
-LEAVE_OUT_EVERY = 14
-FEWEST_FRAMES = 28
+CLOSING_SHARE, CLOSING_EPOCHS = 0.25, 2
+"""Iterations after a stop, in which the frames left out are learnt too, over those before it; and the fewest a training
+frame: wherever in an epoch they begin, a whole one follows."""
+JUDGE_EVERY = 14
+FEWEST_FRAMES_TO_JUDGE = 28
 """Of fewer training frames none is left out, and a run takes the time it is given."""
 
 
@@ -29,20 +32,24 @@ class Schedule:
     """The cycles of a run; iterations count from 1.
 
     planned   iterations if nothing stops the run
-    cycles    whether it has more than one cycle
-    worth_db  a doubling of the steps that brings the frames left out less than this is the last; None: none is left out
+    cycles    whether there are several, if planned is long enough for two, and averages end them
+    worth_db  a doubling of the steps that brings the frames left out less than this is the last; None: no frame is left
+              out, and nothing stops the run
+    frames    training frames, those left out among them; a long clip needs long cycles
     scores    psnr_tissue of the frames left out, dB, at the ends of the cycles so far
     """
 
     planned: int
     cycles: bool = False
     worth_db: float | None = None
+    frames: int = 1
     scores: tuple[float, ...] = ()
 
     @property
     def _planned_ends(self) -> tuple[int, ...]:
         ends = [self.planned]
-        while self.cycles and ends[0] // 2 >= SHORTEST_CYCLE:
+        shortest = max(SHORTEST_CYCLE, SHORTEST_CYCLE_EPOCHS * self.frames)
+        while self.cycles and ends[0] // 2 >= shortest:
             ends.insert(0, ends[0] // 2)
         return tuple(ends)
 
@@ -60,8 +67,8 @@ class Schedule:
         stopped_at = self.stopped_at
         if stopped_at is None:
             return self._planned_ends
-        closed_at = min(self.planned, round(stopped_at * (1 + CLOSING_SHARE)))
-        return (*self._planned_ends[: len(self.scores)], closed_at)
+        closed_at = max(round(stopped_at * (1 + CLOSING_SHARE)), stopped_at + CLOSING_EPOCHS * self.frames)
+        return (*self._planned_ends[: len(self.scores)], min(self.planned, closed_at))
 
     @property
     def iterations(self) -> int:
@@ -99,6 +106,17 @@ class Schedule:
         return replace(self, scores=(*self.scores, psnr_db))
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """Its fields as JSON holds them; a score that is no number is null."""
+        return asdict(self) | {"scores": [None if math.isnan(score) else score for score in self.scores]}
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> Schedule:
+        """The schedule with these settings. With all scores of a run it is that run's: the same steps, none judged."""
+        scores = tuple(math.nan if score is None else float(score) for score in settings["scores"])
+        return cls(**{**settings, "scores": scores})
+
+    @property
     def words(self) -> tuple[str, ...]:
         """What was decided, for the report."""
         if self.stopped_at is None:
@@ -111,5 +129,5 @@ class Schedule:
 
 
 def left_out(frames: Sequence[int]) -> tuple[int, ...]:
-    """Of the training frames those that judge a run: every LEAVE_OUT_EVERY-th, never the first or the last."""
-    return tuple(frames[LEAVE_OUT_EVERY // 2 : -1 : LEAVE_OUT_EVERY]) if len(frames) >= FEWEST_FRAMES else ()
+    """Of the training frames those that judge a run: every JUDGE_EVERY-th, never the first or the last."""
+    return tuple(frames[JUDGE_EVERY // 2 : -1 : JUDGE_EVERY]) if len(frames) >= FEWEST_FRAMES_TO_JUDGE else ()

@@ -111,7 +111,3 @@ class TrainingFrames:
         for values in (self._rgb, self._weight, self._inverse_depth, cameras):
             found.update(np.ascontiguousarray(values).data)
         return found.hexdigest()
-
-    def tissue_channels(self, index: int) -> int:
-        """Tissue pixels times colour channels: what a squared error is divided by."""
-        return 3 * int(self._pixels[self._row[index], 0])

@@ -7,19 +7,17 @@ of an uninterrupted one.
 from __future__ import annotations
 
 import csv
-import hashlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from contract.errors import Cancelled, TrainingDiverged
 from worker.average import RunningMean
-from worker.checkpoint import Scene, load_resume, save_resume
+from worker.checkpoint import Scene
 from worker.densify import Densifier
 from worker.hooks import Hooks, Progress
 from worker.metrics import psnr_tissue
@@ -74,10 +72,12 @@ class Run:
     frames       targets and cameras
     preset       rates, loss, order, densification
     schedule     how many iterations, and how rates fall in them; iteration: those done
+    seed         of everything random; with the iteration it draws what that iteration needs
     asked        the length that was asked for, in words; a stored run goes on only with its own
     average      of the models that end a cycle
     densifier    its statistics; None where the preset has no densification
     chosen       what was left to the scene, how it was settled and why, in words
+    curve        scores of held-out frames so far
     """
 
     model: Model
@@ -99,7 +99,7 @@ class Run:
 
 
 def frame_at(run: Run, iteration: int) -> int:
-    """The training frame of an iteration (from 1): a function of seed and iteration alone, so a run can resume."""
+    """The training frame of an iteration (from 1): a function of seed, schedule and iteration, so a run can resume."""
     indices = run.frames.indices
     if run.schedule.leaves_out(iteration):
         judging = left_out(indices)
@@ -110,8 +110,12 @@ def frame_at(run: Run, iteration: int) -> int:
     return indices[int(np.random.default_rng([run.seed, epoch]).permutation(len(indices))[place])]
 
 
-def step(run: Run, iteration: int) -> float:
-    """One iteration; returns its psnr_tissue before the update, in dB."""
+def step(run: Run, iteration: int) -> None:
+    """One iteration of the model.
+
+    Raises:
+        TrainingDiverged: the loss is not finite, or no Gaussian is in view.
+    """
     preset, index = run.preset, frame_at(run, iteration)
     sh_degree = min(preset.sh_degree, iteration // preset.sh_every) if preset.sh_degree else 0
     sums = run.model.step(
@@ -127,28 +131,33 @@ def step(run: Run, iteration: int) -> float:
         raise TrainingDiverged(f"The loss is no longer a number at iteration {iteration} (frame {index}).")
     if not run.model.visible.any():
         raise TrainingDiverged(f"No Gaussian is left in view at iteration {iteration} (frame {index}).")
-    return -10 * math.log10(max(sums.squared_error / max(run.frames.tissue_channels(index), 1), 1e-10))
 
 
-def iterations_within(run: Run, budget_s: float, elapsed_s: float) -> int:
-    """How many iterations fit into what is left of budget_s, by timing a few first steps and taking them back."""
+def iterations_within(
+    model: Model, frames: TrainingFrames, preset: Preset, seed: int, budget_s: float, elapsed_s: float
+) -> int:
+    """How many iterations of a new model fit into what is left of budget_s, by timing a few and taking them back.
+
+    One a training frame are made even if fewer fit.
+    """
     start = time.perf_counter()
-    stored = {name: values.copy() for name, values in run.model.parameters().items()}
+    stored = {name: values.copy() for name, values in model.parameters().items()}
 
     def start_again() -> None:
-        for name, values in run.model.arrays().items():
+        for name, values in model.arrays().items():
             values[...] = stored.get(name, 0)  # moments and their counts are 0 before the first step
 
     untimed, timed = CALIBRATION_STEPS
+    trial = Run(model, frames, preset, Schedule(untimed + timed), seed)
     start_again()  # touches the moments' memory once: the first touch of a page costs as much as a step
     ends = [time.perf_counter()]
     for iteration in range(1, untimed + timed + 1):
-        step(run, iteration)
+        step(trial, iteration)
         ends.append(time.perf_counter())
     start_again()
     step_s = float(np.median(np.diff(ends)[untimed:])) * LATER_STEPS
     left_s = budget_s - elapsed_s - (time.perf_counter() - start)
-    return max(len(run.frames.indices), int(left_s / step_s))
+    return max(len(frames.indices), int(left_s / step_s))
 
 
 def train(
@@ -178,32 +187,11 @@ def train(
             raise Cancelled(f"Stopped after iteration {run.iteration} of {run.iterations}.")
         if copy_scene is not None and hooks.wants_snapshot():
             hooks.on_snapshot(copy_scene(), run.iteration)
-
-        # the step
-        iteration = run.iteration + 1
-        step(run, iteration)
-        run.iteration = iteration
-        if run.densifier is not None:
-            run.densifier.observe(run.model)
-            if iteration < run.iterations:  # what is split then would get no step any more
-                run.densifier.apply(run.model, iteration, np.random.default_rng([run.seed, iteration, 1]))
-
-        # the end of a cycle
-        if run.schedule.averages(iteration):
-            run.average.add(run.model.parameters())
-        if run.average.count and iteration in run.schedule.ends:
-            run.average.put(run.model.parameters())
-        if run.schedule.judges(iteration):
-            run.schedule = run.schedule.with_score(_left_out_psnr(run))
-
-        # the curve
+        iteration = _advance(run)
         if iteration < run.iterations and (iteration in run.schedule.ends or (marks and clock.elapsed_s >= marks[0])):
             marks = [mark for mark in marks if mark > clock.elapsed_s]
             scored = _score(run, clock, evaluate)
-
-        # the report
-        now = clock.elapsed_s
-        if now - reported >= REPORT_EVERY_S:
+        if (now := clock.elapsed_s) - reported >= REPORT_EVERY_S:
             reported = now
             left_s = (now - began) / (iteration - begun_at) * (run.iterations - iteration)
             share = iteration / run.iterations
@@ -213,14 +201,38 @@ def train(
         _score(run, clock, evaluate)
 
 
+def _advance(run: Run) -> int:
+    """The next iteration and what follows it, densification or the end of a cycle; returns its number."""
+    iteration = run.iteration + 1
+    step(run, iteration)
+    run.iteration = iteration
+    if run.densifier is not None:
+        run.densifier.observe(run.model)
+        if iteration < run.iterations:  # what is split then would get no step any more
+            run.densifier.apply(run.model, iteration, np.random.default_rng([run.seed, iteration, 1]))
+    _end_cycle(run, iteration)
+    return iteration
+
+
+def _end_cycle(run: Run, iteration: int) -> None:
+    """Average the last models of a cycle; their mean ends it, and is judged while that can still decide anything."""
+    if run.schedule.averages(iteration):
+        run.average.add(run.model.parameters())
+    if run.average.count and iteration in run.schedule.ends:
+        run.average.put(run.model.parameters())
+    if run.schedule.judges(iteration):
+        run.schedule = run.schedule.with_score(_left_out_psnr(run))
+
+
 def _left_out_psnr(run: Run) -> float:
-    """Mean psnr_tissue of the training frames left out so far, dB."""
+    """Mean psnr_tissue of the training frames left out so far that show tissue, dB; NaN if none does."""
     scores = []
     for index in left_out(run.frames.indices):
-        image = run.model.render(run.frames.cameras[index], float(run.frames.t[index]))
-        scores.append(psnr_tissue(image[:3].transpose(1, 2, 0), *run.frames.picture(index)))
-    known = [score for score in scores if not math.isnan(score)]  # a frame without tissue has none
-    return float(np.mean(known)) if known else math.nan
+        rgb, tissue = run.frames.picture(index)
+        if tissue.any():
+            image = run.model.render(run.frames.cameras[index], float(run.frames.t[index]))
+            scores.append(psnr_tissue(image[:3].transpose(1, 2, 0), rgb, tissue))
+    return float(np.mean(scores)) if scores else math.nan
 
 
 def _check_finite(run: Run) -> None:
@@ -237,60 +249,6 @@ def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], float]) -> float |
         return None
     run.curve.append(CurvePoint(t_train_s, run.iteration, psnr))
     return psnr
-
-
-def save_run(directory: Path, run: Run, t_train_s: float) -> None:
-    """Write what load_run needs to go on: parameters, moments, averages, densification statistics, curve."""
-    arrays = {**run.model.arrays(), **run.average.arrays(), **(run.densifier.arrays() if run.densifier else {})}
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}
-    state = {
-        "identity": _identity(run),
-        "iteration": run.iteration,
-        "schedule": asdict(run.schedule),
-        "count": run.model.count,
-        "averaged": run.average.count,
-        "t_train_s": t_train_s,
-        "curve": [[point.t_train_s, point.iteration, point.psnr_tissue_db] for point in run.curve],
-    }
-    save_resume(directory, tensors, state)
-
-
-def _identity(run: Run) -> dict[str, str]:
-    """By the words for it, what a stored run must share with the one that goes on from it."""
-    return {
-        "preset": run.preset.name,
-        "settings of the preset": hashlib.sha256(repr(run.preset).encode()).hexdigest(),
-        "seed": str(run.seed),
-        "length": run.asked,
-        "clip, or other frames of it": run.frames.digest(),
-    }
-
-
-def load_run(directory: Path, run: Run) -> float:
-    """Put a freshly built run where a stored one was; returns its t_train_s.
-
-    Raises:
-        SceneError: nothing usable is stored there.
-        ValueError: it was started with another preset, seed, length or clip.
-    """
-    tensors, state = load_resume(directory)
-    stored = state.get("identity", {})
-    differing = [f"another {name}" for name, own in _identity(run).items() if stored.get(name) != own]
-    if differing:
-        raise ValueError(f"the stored run was started with {', '.join(differing)}")
-    arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
-    if state["count"] != run.model.count:  # densified since the start
-        columns = np.zeros(state["count"], np.int64)
-        run.model.take(columns, np.ones(len(columns), np.bool_))
-    run.model.load_arrays(arrays)
-    run.average.load_arrays(arrays, state["averaged"])
-    if run.densifier is not None:
-        run.densifier.load_arrays(arrays)
-    stored_schedule = state["schedule"]
-    run.iteration = state["iteration"]
-    run.schedule = Schedule(**{**stored_schedule, "scores": tuple(stored_schedule["scores"])})
-    run.curve = [CurvePoint(*row) for row in state["curve"]]
-    return float(state["t_train_s"])
 
 
 def write_curve(path: Path, run: Run) -> None:

@@ -19,6 +19,7 @@ from tests.worker.scenes import KINDS, random_scene
 from worker.checkpoint import (
     MANIFEST_FILE,
     RESUME_FILE,
+    RESUME_VERSION,
     SCENE_FILE,
     load_resume,
     load_scene,
@@ -238,6 +239,14 @@ def test_a_training_state_comes_back_with_every_type(tmp_path: Path) -> None:
     for name, tensor in tensors.items():
         assert loaded[name].dtype == tensor.dtype
         assert torch.equal(loaded[name], tensor)
+
+
+def test_a_training_state_of_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as earlier:
+        earlier.setattr("worker.checkpoint.RESUME_VERSION", RESUME_VERSION - 1)
+        save_resume(tmp_path, {"moment": torch.ones(4)}, {"iteration": 12})
+    with pytest.raises(SceneError, match=rf"another version \({RESUME_VERSION - 1}; .* {RESUME_VERSION}\)"):
+        load_resume(tmp_path)
 
 
 def test_a_damaged_training_state_is_refused(tmp_path: Path) -> None:

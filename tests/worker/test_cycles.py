@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,12 @@ from worker.clip import DepthClip, FrameSplit, split_frames
 from worker.hooks import Hooks
 from worker.metrics import psnr_tissue
 from worker.model import Model
-from worker.pipeline import ReconstructionRequest, prepare
+from worker.pipeline import ReconstructionRequest, prepare, snapshot_of
 from worker.presets import PRESETS
+from worker.resume import load_run, save_run
 from worker.schedule import AVERAGED, Schedule, left_out
 from worker.targets import TrainingFrames
-from worker.train import Run, Stopwatch, frame_at, load_run, save_run, train
+from worker.train import Run, Stopwatch, frame_at, train
 
 SHORTEST, PLANNED = 24, 192
 """Cycles that end at 24, 48, 96 and 192."""
@@ -99,15 +101,24 @@ def test_a_score_is_how_near_the_finished_model_is_to_the_frames_left_out(clip: 
     assert list(run.schedule.scores) == pytest.approx([float(np.mean(scores))])
 
 
-def test_frames_left_out_are_not_shown_before_the_decision_and_are_after_it(clip: DepthClip, split: FrameSplit) -> None:
-    run, judges = judged(clip, split), set(left_out(split.train))
-    before = {frame_at(run, iteration) for iteration in range(1, STOPPED_AT + 1)}
-    assert before == set(split.train) - judges
-    run.schedule = run.schedule.with_score(30.0).with_score(30.0)
-    assert {frame_at(run, iteration) for iteration in range(1, STOPPED_AT + 1)} == before
-    epoch = len(split.train)
-    closing = {frame_at(run, iteration) for iteration in range(STOPPED_AT + 1, STOPPED_AT + 2 * epoch)}
-    assert closing == set(split.train)
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("count", [28, 47, 63, 64, 83, 84, 131, 200])
+def test_frames_left_out_are_not_shown_before_the_decision_and_are_after_it(
+    clip: DepthClip, split: FrameSplit, count: int, seed: int
+) -> None:
+    """Of clips of any length: which frame an iteration shows depends on how many there are alone."""
+    run = judged(clip, split)
+    run.seed, run.frames.indices = seed, list(range(count))
+    planned = Schedule(24 * count + seed, cycles=True, worth_db=NEVER_ENOUGH_DB, frames=count)
+    run.schedule = planned.with_score(30.0).with_score(30.0)
+    stopped_at, judges = run.schedule.stopped_at, set(left_out(range(count)))
+    assert stopped_at is not None
+    before = [frame_at(run, iteration) for iteration in range(1, stopped_at + 1)]
+    assert set(before) == set(range(count)) - judges
+    closing = {frame_at(run, iteration) for iteration in range(stopped_at + 1, run.iterations + 1)}
+    assert closing == set(range(count))
+    run.schedule = planned
+    assert before == [frame_at(run, iteration) for iteration in range(1, stopped_at + 1)]
 
 
 def test_what_frames_left_out_show_trains_nothing_until_the_decision(
@@ -176,13 +187,27 @@ def test_a_cycle_ends_with_the_mean_of_its_last_models(clip: DepthClip, split: F
     run, models = judged(clip, split, None), []
     for iteration in range(SHORTEST - AVERAGED + 1, SHORTEST):
         models.append(copied(until(iteration, run).model))
-    alone = prepared_on(clip, split, dataclasses.replace(PRESETS["fast"], cycles=False), iterations=SHORTEST)
+    alone = prepared_on(
+        clip, split, dataclasses.replace(PRESETS["fast"], cycles=False, worth_db=None), iterations=SHORTEST
+    )
     models.append(copied(trained(alone).model))  # the same steps, and nothing averaged
     averaged = until(SHORTEST, run).model.parameters()
     for name, values in averaged.items():
         expected = np.mean([model[name] for model in models], axis=0, dtype=np.float64)
         np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-5, err_msg=name)
     assert not np.array_equal(averaged["motion.weight"], models[-1]["motion.weight"])
+
+
+@pytest.mark.parametrize("worth_db", [NEVER_ENOUGH_DB, ALWAYS_ENOUGH_DB])
+def test_the_schedule_that_a_scene_names_makes_the_same_steps_again(
+    clip: DepthClip, split: FrameSplit, worth_db: float
+) -> None:
+    run = trained(judged(clip, split, worth_db))
+    settings = json.dumps(snapshot_of(run, clip, split, run.frames.scale, run.seed).settings, allow_nan=False)
+    again = prepared_on(clip, split, "fast", iterations=1)
+    again.schedule = Schedule.of(json.loads(settings)["schedule"])
+    assert bits(trained(again), clip, split) == bits(run, clip, split)
+    assert again.iteration == run.iteration
 
 
 def prepared_for(clip: DepthClip, split: FrameSplit, **length: float) -> Run:

@@ -159,6 +159,17 @@ def test_a_stopped_run_with_a_budget_keeps_its_schedule(clip: Path, tmp_path: Pa
     assert run(clip, tmp_path, iterations=None, budget_s=0.5).iterations == planned
 
 
+@pytest.mark.parametrize("name", ["fast", "paper"])
+def test_a_budget_too_short_for_its_frames_is_told(name: str, clip: Path, tmp_path: Path) -> None:
+    def told(**length: Any) -> bool:
+        report = run(clip, tmp_path / str(length), preset=name, **length)
+        return any("less than one step a training frame" in warning for warning in report.warnings)
+
+    assert told(iterations=None, budget_s=1e-6)
+    assert not told(iterations=FRAMES - 2)
+    assert not told(iterations=3)
+
+
 @pytest.mark.parametrize(
     "change", [{"preset": "paper"}, {"seed": 1}, {"iterations": ITERATIONS + 1}, {"holdout": "2"}, {"clip": "another"}]
 )

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 
 import pytest
 
 from worker.schedule import (
     AVERAGED,
+    CLOSING_EPOCHS,
     CLOSING_SHARE,
-    FEWEST_FRAMES,
-    LEAVE_OUT_EVERY,
+    FEWEST_FRAMES_TO_JUDGE,
+    JUDGE_EVERY,
     RESTART,
     SHORTEST_CYCLE,
+    SHORTEST_CYCLE_EPOCHS,
     Schedule,
     left_out,
 )
@@ -174,6 +177,31 @@ def test_the_shortest_run_that_can_stop_spares_its_last_cycle() -> None:
     assert scored_to_the_end(planned, [30.0, 30.0]).iterations == round(501 * 1.25)
 
 
+@pytest.mark.parametrize("frames", [28, 63, 83, 84, 200, 1000])
+@pytest.mark.parametrize("planned", [1003, 1733, 4003, 30_000])
+def test_no_run_stops_before_it_has_seen_its_frames_or_closes_without_those_left_out(planned: int, frames: int) -> None:
+    schedule = Schedule(planned, True, WORTH_DB, frames)
+    assert schedule.ends[0] >= min(planned, SHORTEST_CYCLE_EPOCHS * frames)
+    for count in range(2, len(schedule.ends)):
+        stopped = after(schedule, *[30.0] * count)
+        assert stopped.stopped_at is not None
+        assert stopped.stopped_at >= 2 * SHORTEST_CYCLE_EPOCHS * frames
+        assert planned >= stopped.iterations >= stopped.stopped_at + CLOSING_EPOCHS * frames
+
+
+@pytest.mark.parametrize("planned", LENGTHS)
+def test_a_clip_that_250_steps_show_three_times_needs_no_longer_cycles(planned: int) -> None:
+    assert Schedule(planned, True, WORTH_DB, frames=83).ends == Schedule(planned, True, WORTH_DB).ends
+
+
+@pytest.mark.parametrize("scores", [(), (30.0, 31.5), (30.0, 30.1), (30.0, math.nan)])
+def test_a_schedule_is_told_again_by_its_settings(scores: tuple[float, ...]) -> None:
+    schedule = after(Schedule(4003, True, WORTH_DB, 83), *scores)
+    again = Schedule.of(json.loads(json.dumps(schedule.settings, allow_nan=False)))
+    assert again.settings == schedule.settings
+    assert (again.ends, again.stopped_at) == (schedule.ends, schedule.stopped_at)
+
+
 def test_scores_that_are_no_numbers_stop_nothing() -> None:
     planned = Schedule(DECIDING, True, WORTH_DB)
     for scores in ((math.nan, math.nan), (30.0, math.nan), (math.nan, 30.0)):
@@ -189,15 +217,15 @@ def test_a_stop_is_told_in_words() -> None:
     assert after(Schedule(4000, True), 30.0, 30.0).words == ()
 
 
-@pytest.mark.parametrize("count", range(FEWEST_FRAMES, FEWEST_FRAMES + 2 * LEAVE_OUT_EVERY))
+@pytest.mark.parametrize("count", range(FEWEST_FRAMES_TO_JUDGE, FEWEST_FRAMES_TO_JUDGE + 2 * JUDGE_EVERY))
 def test_frames_left_out_lie_between_others(count: int) -> None:
     frames = [3 * place + 5 for place in range(count)]
     found = left_out(frames)
     assert len(found) >= 2
     assert set(found) < set(frames[1:-1])
-    assert all(later - one == 3 * LEAVE_OUT_EVERY for one, later in itertools.pairwise(found))
+    assert all(later - one == 3 * JUDGE_EVERY for one, later in itertools.pairwise(found))
 
 
 def test_of_few_frames_none_is_left_out() -> None:
-    assert left_out(range(FEWEST_FRAMES - 1)) == ()
+    assert left_out(range(FEWEST_FRAMES_TO_JUDGE - 1)) == ()
     assert left_out([]) == ()

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ from worker.hooks import Hooks, Progress
 from worker.metrics import psnr_tissue
 from worker.optimize import Rate
 from worker.presets import PRESETS, Preset
-from worker.train import CurvePoint, Run, Stopwatch, frame_at, iterations_within, load_run, save_run, train
+from worker.resume import load_run, save_run
+from worker.train import CALIBRATION_STEPS, LATER_STEPS, CurvePoint, Run, Stopwatch, frame_at, iterations_within, train
 
 SOON = DensifySettings(from_iteration=6, every=6, gradient_threshold=1e-5)
 """Splits early enough to happen in these short runs; so does splitting_soon add harmonics."""
@@ -116,12 +118,34 @@ def test_random_order_draws_training_frames_alone() -> None:
     assert drawn == [frame_at(run, iteration) for iteration in range(1, 400)]
 
 
+def fitting(run: Run, budget_s: float, elapsed_s: float = 0.0) -> int:
+    return iterations_within(run.model, run.frames, run.preset, run.seed, budget_s, elapsed_s)
+
+
+def test_a_budget_allows_what_is_left_of_it_over_the_median_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, split = prepared(phantom_clip(), "fast")
+    untimed, timed = CALIBRATION_STEPS
+    storing_s, step_s, later_s = 0.5, 0.02, 0.25
+    steps_s = [0.9] * untimed + [step_s] * (timed - 2) + [step_s / 2, 3.0]
+    durations_s = [storing_s, *steps_s, later_s]
+    times_s = [sum(durations_s[:place]) for place in range(len(durations_s) + 1)]
+
+    def fitting_by_this_clock(budget_s: float) -> int:
+        clock = iter(times_s)
+        monkeypatch.setattr("worker.train.time", SimpleNamespace(perf_counter=lambda: next(clock)))
+        return fitting(run, budget_s, elapsed_s=1.0)
+
+    for budget_s in (10.0, 30.0, 61.0):
+        assert fitting_by_this_clock(budget_s) == int((budget_s - 1.0 - times_s[-1]) / (LATER_STEPS * step_s))
+    assert fitting_by_this_clock(1.0) == len(split.train)
+
+
 def test_calibration_leaves_the_model_as_it_was() -> None:
     for name in ("fast", "paper", "hexplane"):
         run, split = prepared(phantom_clip(), name)
         before = {key: values.copy() for key, values in run.model.arrays().items()}
         for budget_s in (1e-9, 0.5):
-            assert iterations_within(run, budget_s, elapsed_s=0.1) >= len(split.train)
+            assert fitting(run, budget_s, elapsed_s=0.1) >= len(split.train)
         after = run.model.arrays()
         assert before.keys() == after.keys()
         for key, values in before.items():
@@ -133,7 +157,7 @@ def test_calibration_does_not_change_what_training_makes() -> None:
     clip = phantom_clip()
     for name in ("fast", "hexplane"):
         run, split = prepared(clip, name, iterations=ITERATIONS)
-        iterations_within(run, 1.0, 0.0)
+        fitting(run, 1.0)
         assert bits(trained(run), clip, split) == run_bits(clip, PRESETS[name])
 
 
