@@ -67,7 +67,7 @@ bench: setup ## every benchmarks/bm_*.py, one after the other
 evaluate: setup ## every preset on every clip, and the charts; hours, and it goes on where it was (CLIPS="phantom:pull ...")
 	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out docs/results
 	@$(EVALUATE) $(CLIPS) --series fast --budget-s 15 --seeds 0 1 2 --out docs/results
-	@$(EVALUATE) d4d_stereo --series instant fast --holdout every8 --out docs/results
+	@$(if $(filter d4d_%,$(CLIPS)),$(EVALUATE) d4d_stereo --series instant fast --holdout every8 --out docs/results)
 	@$(EVALUATE) $(CLIPS) --series rivals --out docs/results
 	@$(BIN)/python benchmarks/write_results.py
 

@@ -18,7 +18,6 @@ from worker.clip import DepthClip
 from worker.compact import STATE, Compact, prepare, round_to
 from worker.deformation import SharedBasis
 from worker.gaussians import SH_C0
-from worker.metrics import psnr_tissue
 from worker.raster.cpu.model import FusedModel
 from worker.render import model_of
 from worker.targets import TrainingFrames
@@ -82,7 +81,7 @@ def shrink(scene: Scene, clip: DepthClip, frames: TrainingFrames, tolerance_db: 
     if not isinstance(scene.deformation, SharedBasis) or scene.gaussians.sh_degree > 0 or not with_tissue:
         return None
     model, judged = model_of(scene), spread(with_tissue, JUDGED_FRAMES)
-    exact_db = _mean_db((model.render(frames.cameras[i], float(frames.t[i])) for i in judged), clip, judged)
+    exact_db = _mean_db((model.render(frames.cameras[i], float(frames.t[i])) for i in judged), frames, judged)
     if not math.isfinite(exact_db):
         return None
     effect = _effect(model, clip, frames, with_tissue, len(scene.deformation.centre))
@@ -92,7 +91,7 @@ def shrink(scene: Scene, clip: DepthClip, frames: TrainingFrames, tolerance_db: 
     for _ in range(TRIALS):
         try:
             compact = round_to(prepared, step)
-            loss_db = exact_db - _mean_db(_renders(compact, scene, frames, judged), clip, judged)
+            loss_db = exact_db - _mean_db(_renders(compact, scene, frames, judged), frames, judged)
         except ValueError:  # finer than whole numbers of this size can be
             loss_db = math.inf
         if not loss_db <= tolerance_db:
@@ -119,12 +118,8 @@ def _noise(loss_db: float) -> float:
     return float(10 ** (loss_db / 10) - 1)
 
 
-def _mean_db(images: Iterable[NDArray[np.float32]], clip: DepthClip, judged: Sequence[int]) -> float:
-    scores = [
-        psnr_tissue(image[:3].transpose(1, 2, 0), clip.rgb[index], clip.tissue[index])
-        for index, image in zip(judged, images, strict=True)
-    ]
-    return float(np.mean(scores))
+def _mean_db(images: Iterable[NDArray[np.float32]], frames: TrainingFrames, judged: Sequence[int]) -> float:
+    return float(np.mean([frames.psnr_tissue_db(i, image) for i, image in zip(judged, images, strict=True)]))
 
 
 def _renders(

@@ -15,7 +15,7 @@ from contract.camera import Intrinsics
 from contract.errors import InputError
 from worker.clip import DepthClip
 from worker.loss import LossSettings
-from worker.metrics import COVERED_ALPHA
+from worker.metrics import COVERED_ALPHA, psnr_tissue
 from worker.raster import Camera
 from worker.raster.cpu import Target, camera_vector, padded
 
@@ -89,6 +89,10 @@ class TrainingFrames:
         """The frame itself: rgb [H, W, 3] and tissue [H, W]."""
         row, width = self._row[index], self._width
         return self._rgb[row, :, :, :width].transpose(1, 2, 0), self._weight[row, :, :width] > 0
+
+    def psnr_tissue_db(self, index: int, image: NDArray[np.float32]) -> float:
+        """Of a model's render [5, H, W] beside frame `index`; NaN without tissue."""
+        return psnr_tissue(image[:3].transpose(1, 2, 0), *self.picture(index))
 
     def loss_settings(self, index: int, loss: LossSettings) -> NDArray[np.float32]:
         """The weights the blend applies a pixel (blend.py): each loss is a mean over its valid pixels."""

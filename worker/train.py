@@ -20,7 +20,6 @@ from worker.average import RunningMean
 from worker.checkpoint import Scene
 from worker.densify import Densifier
 from worker.hooks import Hooks, Progress
-from worker.metrics import psnr_tissue
 from worker.model import Model
 from worker.optimize import rates_at
 from worker.presets import Preset
@@ -226,12 +225,12 @@ def _end_cycle(run: Run, iteration: int) -> None:
 
 def _left_out_psnr(run: Run) -> float:
     """Mean psnr_tissue of the training frames left out so far that show tissue, dB; NaN if none does."""
-    scores = []
-    for index in left_out(run.frames.indices):
-        rgb, tissue = run.frames.picture(index)
-        if tissue.any():
-            image = run.model.render(run.frames.cameras[index], float(run.frames.t[index]))
-            scores.append(psnr_tissue(image[:3].transpose(1, 2, 0), rgb, tissue))
+    frames = run.frames
+    scores = [
+        frames.psnr_tissue_db(index, run.model.render(frames.cameras[index], float(frames.t[index])))
+        for index in left_out(frames.indices)
+        if frames.picture(index)[1].any()
+    ]
     return float(np.mean(scores)) if scores else math.nan
 
 
