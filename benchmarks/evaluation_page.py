@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from statistics import median
+from statistics import median, mode
 
 from worker.evaluate.cells import DEFAULT_SERIES, GRID_BASES, GRID_POINTS, OURS, base_of
 from worker.evaluate.charts import clip_alone
@@ -136,8 +136,10 @@ def write_readme(readme: Path, folder: Path) -> None:
     picture = f"![Seconds of training against held-out decibels, for every preset]({place})"
     clip = clip_alone(groups_of(results.runs))
     caption = (
-        f"*Held-out frames of `{clip}`, medians of all seeds; a disc's area is the scene's size on disk; "
-        "dashed is copying the neighbouring frames; hollow is published, on other hardware and data.*"
+        f"*Held-out frames of `{clip}`, medians of the seeds that were run; a disc's area is the scene's size on "
+        "disk, the line joins what nothing is both sooner and better than; dashed and dotted is copying the "
+        "neighbouring frames; hollow is published, on other hardware and data. `psnr_tissue` and the splits every8 and "
+        "blocks8 are defined in [docs/conventions.md](docs/conventions.md).*"
     )
     page = f"[All charts and figures]({folder.relative_to(readme.parent)}/index.md)"
     before, rest = text.split(MARKS[0])
@@ -158,6 +160,9 @@ def _claim(found: Sequence[Sooner]) -> str:
             seconds = _span(each.times_in_seconds or math.nan for each in reached)
             iterations = _span(each.times_in_iterations or math.nan for each in reached)
             said += f": {seconds} times sooner in seconds, {iterations} times in iterations"
+            usual = mode(each.our_limit for each in reached)
+            others = [f"`{each.clip}` when given {each.our_limit}" for each in reached if each.our_limit != usual]
+            said += f" ({', '.join(others)} instead of {usual})" if others else ""
         sentences.append(f"{said}.")
     return " ".join(sentences)
 
@@ -174,9 +179,10 @@ def _headline(found: Sequence[Sooner]) -> str:
     if not rows:
         return ""
     method = (
-        "Medians over seeds, on the same machine and kernels; between two samples of a curve the moment is "
-        "interpolated, the logarithm of time being linear in dB. Samples are scored on at most sixteen of the held-out "
-        "frames, ends on all."
+        "Medians over the seeds that were run, often one of the rivals, on one kind of machine and this program's "
+        "kernels, at the commits named below the last table of this part; between two samples of a curve the moment is "
+        "interpolated, the logarithm of time being linear in dB, and a curve that is there at its first sample counts "
+        "from that one: it was sooner. Samples are scored on at most sixteen of the held-out frames, ends on all."
     )
     return f"\n### How much sooner\n\n{_claim(found)} {method}\n{table(header, rows)}"
 

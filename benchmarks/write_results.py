@@ -26,8 +26,8 @@ _INTRODUCTION = """# Results
 Every figure here was printed by a command in this repository and stands in the CSV file named beside it; this page is
 written by `python benchmarks/write_results.py`. `d4d-a` is a real da Vinci recording (96 frames, 640x512, camera at
 rest), `surgt_raw` another of 10 raw frames, neither part of the project; the rest is synthetic. `psnr_tissue` is the
-honest score, `psnr_paper` what papers print ([conventions](../conventions.md)). The machines are shared and noisy: each
-run has its load.
+honest score, `psnr_paper` what papers print ([conventions](../conventions.md)). The machines are shared and noisy: rows
+of runs have their load. A section holds for the commits it names; later ones may train or splat differently.
 """
 _TRAIN = """
 ## Whole reconstructions
@@ -35,7 +35,8 @@ _TRAIN = """
 `python benchmarks/bm_train.py --csv docs/results/train.csv` ([train.csv](train.csv)). Copying is the better of blending
 the neighbouring frames and warping them half-way by optical flow, with the masks respected: a picture without a model.
 With a camera at rest and frames held out one by one (`every8`) copying is hard to beat; it cannot show another pose,
-depth, or what the instrument hides. {passing}
+depth, or what the instrument hides. These rows are of an older `fast`, with half the points and without cycles
+([decision 017](../decisions/017-cycles-averages-and-an-end.md)); the first part of this page has today's. {passing}
 """
 _ABLATION = """
 ## What each part of fast is worth
@@ -43,7 +44,8 @@ _ABLATION = """
 `python benchmarks/bm_ablation.py --iterations 300 --csv docs/results/ablation.csv` ([ablation.csv](ablation.csv)):
 held-out psnr_tissue in dB after the same number of iterations, one part changed at a time. The synthetic clips are
 320x256, where the finest grid has 20 k points, so rows that name fewer points than `fast` equal its own there. More
-points gain where the picture is larger, and cost time and bytes in proportion.
+points gain where the picture is larger, and cost time and bytes in proportion. Measured before
+[decisions 017 and 018](../decisions/README.md): without averages, and with more bases on the synthetic clips.
 """
 _RASTER = """
 ## Splatting on the CPU
