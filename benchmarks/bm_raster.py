@@ -37,15 +37,17 @@ from numpy.typing import NDArray
 from worker.checkpoint import load_scene
 from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
 from worker.gaussians import Gaussians
+from worker.loss import LossSettings
 from worker.optimize import StepRates
 from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera
-from worker.raster.cpu import Rasterizer, Target, camera_vector, compile_kernels
+from worker.raster.cpu import Rasterizer, compile_kernels
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion
 from worker.raster.cpu.project import LOG2E
 from worker.raster.cpu.simd import fma, lane_sum, load, splat
 from worker.raster.cpu.threads import run, thread_count
 from worker.raster.cpu.vectors import LANES
+from worker.raster.step import Target, TrainingFrame, camera_vector
 
 WIDTH, HEIGHT, GRID_STEP_PX = 640, 512, 2.86
 SPREAD, OPACITY, DEPTH = 0.6, 0.88, 60.0
@@ -164,12 +166,11 @@ def measure(
 ) -> list[Row]:
     """Median ms of a render and of a step, printed with their parts, as rows."""
     model = FusedModel(gaussians, deformation, camera.width, camera.height)
-    view, target = camera_vector(camera), _target(model.rasterizer)
-    pixels = camera.width * camera.height
-    settings = np.array([1 / (3 * pixels), 1 / pixels, 1e30, 1e30, 1.0], np.float32)
+    view, pixels = camera_vector(camera), camera.width * camera.height
+    frame = TrainingFrame(view, TIME, _target(model.rasterizer), pixels, pixels)
     works: dict[str, Callable[[], object]] = {
         "render": lambda: model.render(view, TIME),
-        "step": lambda: model.step(view, TIME, target, settings, RATES, 1, model.sh_degree),
+        "step": lambda: model.step(frame, LossSettings(), RATES, 1, model.sh_degree),
     }
     blended = blended_per_pixel(model, view)
     rows = []

@@ -4,39 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
 import torch
+from torch import Tensor
 
 PREFIX = "average."
 
 
 class RunningMean:
-    """Sums of a model's parameters; arrays by the names that the model gives them."""
+    """Sums of a model's parameters, by the names and on the device of the model's own."""
 
     def __init__(self) -> None:
         self.count = 0
-        self._total: dict[str, np.ndarray] = {}
+        self._total: dict[str, Tensor] = {}
 
-    def add(self, parameters: Mapping[str, np.ndarray]) -> None:
+    def add(self, parameters: Mapping[str, Tensor]) -> None:
         """One more of what is averaged."""
         self.count += 1
         if self.count == 1:
-            self._total = {name: values.copy() for name, values in parameters.items()}
+            self._total = {name: values.clone() for name, values in parameters.items()}
             return
-        for name, values in parameters.items():  # torch adds on every core, numpy on one; the sums are the same
-            torch.from_numpy(self._total[name]).add_(torch.from_numpy(values))
-
-    def put(self, parameters: Mapping[str, np.ndarray]) -> None:
-        """Write the mean into these arrays and begin anew."""
         for name, values in parameters.items():
-            np.divide(self._total[name], np.float32(self.count), out=values)
+            self._total[name] = self._total[name].to(values.device).add_(values)  # stored ones come from the host
+
+    def put(self, parameters: Mapping[str, Tensor]) -> None:
+        """Write the mean into these tensors and begin anew."""
+        for name, values in parameters.items():
+            torch.div(self._total[name].to(values.device), self.count, out=values)
         self.count, self._total = 0, {}
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, Tensor]:
         """What a resumed run needs beside the count."""
         return {PREFIX + name: values for name, values in self._total.items()}
 
-    def load_arrays(self, arrays: Mapping[str, np.ndarray], count: int) -> None:
+    def load_arrays(self, arrays: Mapping[str, Tensor], count: int) -> None:
         """Put back what arrays() gave, out of more."""
         self.count = count
-        self._total = {name.removeprefix(PREFIX): a.copy() for name, a in arrays.items() if name.startswith(PREFIX)}
+        self._total = {name.removeprefix(PREFIX): a.clone() for name, a in arrays.items() if name.startswith(PREFIX)}

@@ -14,8 +14,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from contract.errors import TrainingDiverged
 from worker.deformation import LOG_SCALE, MEAN, QUATERNION
@@ -73,20 +75,20 @@ class DensifyResult:
 
 
 class Densifier:
-    """Gathers every Gaussian's gradients and edits the model when the time has come."""
+    """Gathers every Gaussian's gradients on the model's device, and edits the model when the time has come."""
 
     def __init__(self, settings: DensifySettings, count: int) -> None:
         self.settings = settings
         self._forget(count)
 
     def _forget(self, count: int) -> None:
-        self._gradient_sum = np.zeros(count, np.float64)
-        self._steps_seen = np.zeros(count, np.int64)
+        self._gradient_sum = torch.zeros(count, dtype=torch.float64)
+        self._steps_seen = torch.zeros(count, dtype=torch.int64)
 
     @property
     def mean_gradient(self) -> NDArray[np.float64]:
         """[N] mean of g_k over the steps that saw each Gaussian since the last densification; 0 for those unseen."""
-        return self._gradient_sum / np.maximum(self._steps_seen, 1)
+        return (self._gradient_sum / self._steps_seen.clamp(min=1)).cpu().numpy()
 
     def observe(self, model: Model) -> None:
         """Add the model's last step to the statistics.
@@ -96,8 +98,13 @@ class Densifier:
         """
         if model.count != len(self._steps_seen):
             raise ValueError(f"statistics are of {len(self._steps_seen)} Gaussians, the model has {model.count}")
-        self._gradient_sum += np.where(model.visible, model.gradient_norm, 0.0)
-        self._steps_seen += model.visible
+        visible = model.visible
+        # New and stored statistics lie on the host.
+        self._gradient_sum, self._steps_seen = (
+            each.to(visible.device) for each in (self._gradient_sum, self._steps_seen)
+        )
+        self._gradient_sum += torch.where(visible, model.gradient_norm, 0.0)
+        self._steps_seen += visible
 
     def apply(self, model: Model, iteration: int, random: np.random.Generator) -> DensifyResult | None:
         """Split and prune if that is due after this iteration, else None. The statistics start anew.
@@ -113,7 +120,7 @@ class Densifier:
             raise TrainingDiverged(
                 f"The gradients of {broken} Gaussians are no longer numbers at iteration {iteration}."
             )
-        pruned = model.opacity_logit[: model.count] < _logit(self.settings.min_opacity)
+        pruned = model.parameters()["opacity_logit"].cpu().numpy() < _logit(self.settings.min_opacity)
         if pruned.all():
             raise TrainingDiverged(f"All {model.count} Gaussians have become transparent by iteration {iteration}.")
         asked = np.flatnonzero((gradient > self.settings.gradient_threshold) & ~pruned)
@@ -126,11 +133,11 @@ class Densifier:
         """How many of count Gaussians may be split."""
         return max(0, self.settings.max_count - count) // (self.settings.split_into - 1)
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, Tensor]:
         """The statistics, by name; views."""
         return {"densify.gradient_sum": self._gradient_sum, "densify.steps_seen": self._steps_seen}
 
-    def load_arrays(self, stored: dict[str, np.ndarray]) -> None:
+    def load_arrays(self, stored: dict[str, Tensor]) -> None:
         """Put back what arrays() gave; the number of Gaussians becomes that of then.
 
         Raises:
@@ -138,9 +145,10 @@ class Densifier:
         """
         gradient_sum, steps_seen = stored["densify.gradient_sum"], stored["densify.steps_seen"]
         if gradient_sum.ndim != 1 or gradient_sum.shape != steps_seen.shape:
-            raise ValueError(f"densify.* have shapes {gradient_sum.shape} and {steps_seen.shape}, not the same [N]")
-        self._gradient_sum = np.array(gradient_sum, np.float64)
-        self._steps_seen = np.array(steps_seen, np.int64)
+            shapes = tuple(gradient_sum.shape), tuple(steps_seen.shape)
+            raise ValueError(f"densify.* have shapes {shapes[0]} and {shapes[1]}, not the same [N]")
+        self._gradient_sum = gradient_sum.to(torch.float64, copy=True)
+        self._steps_seen = steps_seen.to(torch.int64, copy=True)
 
 
 def _logit(opacity: float) -> float:
@@ -166,10 +174,12 @@ def _replace(
     columns = np.concatenate([survivors, np.tile(split, children)])
     model.take(columns, np.arange(len(columns)) >= len(survivors))
 
-    born = slice(len(survivors), model.count)
-    mean, quaternion, log_scale = (model.canonical[rows, born] for rows in (MEAN, QUATERNION, LOG_SCALE))
-    if mean.shape[1] == 0:
+    if len(split) == 0:
         return
+    born = model.parameters()["canonical"][:, len(survivors) :]
+    state = np.array(born.cpu())
+    mean, quaternion, log_scale = (state[rows] for rows in (MEAN, QUATERNION, LOG_SCALE))
     along_axes = random.standard_normal(mean.T.shape) * np.exp(log_scale.T)
     mean += Rotation.from_quat(quaternion.T[:, [1, 2, 3, 0]]).apply(along_axes).T.astype(np.float32)
     log_scale -= np.float32(math.log(SPLIT_SHRINK * children))
+    born.copy_(torch.from_numpy(state))

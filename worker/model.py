@@ -1,7 +1,12 @@
 """What training needs of a model, whatever computes its steps: Gaussians, their deformation and Adam's moments.
 
-Symbols: N Gaussians; arrays in rows of N or more: columns from N on only fill the last vector. H W pixels.
-Implementations: worker/raster/cpu/model.py, and worker/unfused.py for deformations without kernels of their own.
+Symbols: N Gaussians; H W pixels, as many as the camera says.
+Implementations: worker/raster/cpu/model.py, worker/raster/cuda/model.py, and worker/unfused.py for deformations without
+kernels of their own. worker/backend.py makes the one for a device.
+
+A device may lag behind: step() returns before its step is made. Every other method waits for the steps before it, so
+none ever sees a model between two steps. What has to be known of steps that nobody waited for, whether their loss is a
+number and any Gaussian in view, comes with the next answer.
 """
 
 from __future__ import annotations
@@ -10,18 +15,22 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from worker.deformation import Deformation
 from worker.gaussians import Gaussians
+from worker.loss import LossSettings
 from worker.optimize import StepRates
-from worker.raster.cpu import Target
-from worker.raster.cpu.model import StepSums
+from worker.raster.step import StepSums, TrainingFrame
 
 Floats = NDArray[np.float32]
 
 
 class Model(Protocol):
-    """A scene that can be trained a frame at a time, rendered, and edited between two steps."""
+    """A scene that can be trained a frame at a time, rendered, and edited between two steps.
+
+    Tensors lie on the model's device; NumPy arrays on the host.
+    """
 
     @property
     def count(self) -> int:
@@ -29,23 +38,35 @@ class Model(Protocol):
         ...
 
     @property
-    def canonical(self) -> Floats:
-        """[13, >= N]: mean 0:3, quaternion 3:7, log-scale 7:10, constant harmonic 10:13. May be written."""
+    def answers_every(self) -> int:
+        """Steps from one answer to the next; 1 where every step is waited for."""
+        ...
+
+    def step(
+        self, frame: TrainingFrame, loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
+    ) -> StepSums | None:
+        """One iteration (counted from 1) on one frame.
+
+        Args:
+            sh_degree: the harmonics in use at this iteration.
+
+        Returns:
+            What the steps since the last answer add up to; None where the device has not been asked.
+        """
+        ...
+
+    def wait(self) -> StepSums | None:
+        """Return when every step is made: their sums, or None if there was none since the last answer."""
         ...
 
     @property
-    def opacity_logit(self) -> Floats:
-        """[>= N]. May be written."""
+    def gradient_norm(self) -> Tensor:
+        """[N] float32 |dL/dmean2d| of the last step in NDC (the image is 2 wide and 2 high); a view."""
         ...
 
     @property
-    def gradient_norm(self) -> Floats:
-        """[N] |dL/dmean2d| of the last step in NDC (the image is 2 wide and 2 high); a view."""
-        ...
-
-    @property
-    def visible(self) -> NDArray[np.bool_]:
-        """[N] whether the last frame could see each Gaussian: in front of the camera, in the image, not too faint."""
+    def visible(self) -> Tensor:
+        """[N] bool, whether the last frame could see each: in front of the camera, in the image, not too faint."""
         ...
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
@@ -59,45 +80,38 @@ class Model(Protocol):
         """Further values [N], blended as colour was in the last render: [H, W]; a view."""
         ...
 
-    def deformed_mean(self, t: float) -> Floats:
-        """Centres at time t, [3, N] in units, as a copy."""
+    def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
+        """Gradient of sum(cotangents * render(camera, t)), cotangents [5, H, W], to the Gaussians as they are at t.
+
+        [14, N]: mean 0:3, quaternion 3:7, log-scale 7:10, constant harmonic 10:13 (as if no colour were held above 0),
+        opacity logit 13. Other harmonics are left out.
+        """
         ...
 
-    def step(
-        self,
-        camera: NDArray[np.float64],
-        t: float,
-        target: Target,
-        loss_settings: Floats,
-        rates: StepRates,
-        iteration: int,
-        sh_degree: int = 0,
-    ) -> StepSums:
-        """One iteration (counted from 1) on one frame.
-
-        Args:
-            camera: camera_vector of the frame; target: the frame, padded.
-            loss_settings: [5] as the blend reads them (worker/raster/cpu/blend.py).
-            sh_degree: the harmonics in use at this iteration.
-        """
+    def deformed_mean(self, t: float) -> Floats:
+        """Centres at time t, [3, N] in units, as a copy."""
         ...
 
     def take(self, columns: NDArray[np.int64], fresh: NDArray[np.bool_]) -> None:
         """Keep these Gaussians, in this order (repeats are copies); Adam's moments start at 0 where fresh."""
         ...
 
-    def parameters(self) -> dict[str, np.ndarray]:
-        """What is trained, by name; views of the live arrays. May be written."""
+    def parameters(self) -> dict[str, Tensor]:
+        """What is trained, by name; views of the live tensors, on every device of one shape. May be written.
+
+        Among them: canonical [13, N] (mean 0:3, quaternion 3:7, log-scale 7:10, constant harmonic 10:13) and
+        opacity_logit [N].
+        """
         ...
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Everything a resumed run needs, by name; views of the live arrays."""
+    def arrays(self) -> dict[str, Tensor]:
+        """Everything a resumed run needs, by name; likewise."""
         ...
 
-    def load_arrays(self, stored: dict[str, np.ndarray]) -> None:
-        """Put back what arrays() gave, into a model of the same size; ValueError if the sizes differ."""
+    def load_arrays(self, stored: dict[str, Tensor]) -> None:
+        """Put back what arrays() gave, on any device, into a model of the same size; ValueError if the sizes differ."""
         ...
 
     def export(self) -> tuple[Gaussians, Deformation]:
-        """The Gaussians and their deformation as torch tensors (copies)."""
+        """The Gaussians and their deformation as tensors on the host (copies)."""
         ...

@@ -6,7 +6,6 @@ N Gaussians, H W pixels. Scenes keep their kernels' buffers between frames, so t
 from __future__ import annotations
 
 import weakref
-from collections import OrderedDict
 from dataclasses import dataclass
 from threading import Lock
 
@@ -18,8 +17,8 @@ from contract.camera import Intrinsics
 from worker.checkpoint import Scene
 from worker.deformation import HexPlane
 from worker.metrics import COVERED_ALPHA
-from worker.raster.cpu import Rasterizer, camera_vector
 from worker.raster.cpu.model import FusedModel
+from worker.raster.step import camera_vector
 from worker.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
 from worker.unfused import UnfusedModel
 
@@ -30,7 +29,6 @@ FAR_POSE = 0.35
 LOW_CONFIDENCE, MANY = 0.3, 0.1
 """A frame warns when this share of its pixels lies below this confidence."""
 HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
-SIZES_KEPT = 3
 ROUNDING = 1e-6
 """Model time by which t may exceed the last frame's without a warning: i / T need not survive a decimal fraction."""
 
@@ -65,17 +63,7 @@ class SceneRenderer:
         self._scene = weakref.ref(scene)
         self._model = model_of(scene)
         self._is_vouched = bool(scene.seen.any())
-        self._rasterizers: OrderedDict[tuple[int, int], Rasterizer] = OrderedDict()
         self._lock = Lock()
-
-    def _rasterizer(self, width: int, height: int) -> Rasterizer:
-        """The buffers of an image size; the few sizes used last are kept."""
-        if (width, height) not in self._rasterizers:
-            self._rasterizers[width, height] = Rasterizer(width, height)
-        self._rasterizers.move_to_end((width, height))
-        while len(self._rasterizers) > SIZES_KEPT:
-            self._rasterizers.popitem(last=False)
-        return self._rasterizers[width, height]
 
     def layers(
         self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
@@ -85,7 +73,6 @@ class SceneRenderer:
         assert scene is not None
         camera = camera_vector(camera_in_units(intrinsics, world_from_camera, scene.units_per_mm))
         with self._lock:
-            self._model.rasterizer = self._rasterizer(intrinsics.width, intrinsics.height)
             # Of a snapshot nothing is known yet: nothing is blended, and 0 is shown.
             image = self._model.render(camera, t, scene.seen.numpy() if self._is_vouched else None).copy()
         seen = image[5] if self._is_vouched else np.zeros_like(image[0])

@@ -1,4 +1,7 @@
-"""What a stopped run leaves in its folder, and how it goes on from there to the bits of an unstopped one."""
+"""What a stopped run leaves in its folder, and how it goes on from there to the bits of an unstopped one.
+
+What is stored names no device: a run may go on on another one, but then to bits of its own.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,6 @@ from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from contract.errors import InputError, SceneError
 from worker.checkpoint import RESUME_FILE, load_resume, save_resume
@@ -33,7 +35,7 @@ def resume(out_dir: Path, run: Run) -> float | None:
 def save_run(directory: Path, run: Run, t_train_s: float) -> None:
     """Write what load_run needs to go on: parameters, moments, averages, densification statistics, curve."""
     arrays = {**run.model.arrays(), **run.average.arrays(), **(run.densifier.arrays() if run.densifier else {})}
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}
+    tensors = {name: values.cpu().contiguous() for name, values in arrays.items()}
     state = {
         "identity": _identity(run),
         "iteration": run.iteration,
@@ -58,14 +60,13 @@ def load_run(directory: Path, run: Run) -> float:
     differing = [f"another {name}" for name, own in _identity(run).items() if stored.get(name) != own]
     if differing:
         raise ValueError(f"the stored run was started with {', '.join(differing)}")
-    arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
     if state["count"] != run.model.count:  # densified since the start
         columns = np.zeros(state["count"], np.int64)
         run.model.take(columns, np.ones(len(columns), np.bool_))
-    run.model.load_arrays(arrays)
-    run.average.load_arrays(arrays, state["averaged"])
+    run.model.load_arrays(tensors)
+    run.average.load_arrays(tensors, state["averaged"])
     if run.densifier is not None:
-        run.densifier.load_arrays(arrays)
+        run.densifier.load_arrays(tensors)
     run.iteration = state["iteration"]
     run.schedule = Schedule.of(state["schedule"])
     run.curve = [CurvePoint(*row) for row in state["curve"]]

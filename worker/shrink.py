@@ -11,14 +11,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from worker.checkpoint import Scene
 from worker.clip import DepthClip
 from worker.compact import STATE, Compact, prepare, round_to
 from worker.deformation import SharedBasis
-from worker.gaussians import SH_C0
-from worker.raster.cpu.model import FusedModel
+from worker.model import Model
 from worker.render import model_of
 from worker.targets import TrainingFrames
 from worker.visibility import spread
@@ -133,7 +133,7 @@ def _renders(
 
 
 def _effect(
-    model: FusedModel, clip: DepthClip, frames: TrainingFrames, indices: Sequence[int], bases: int
+    model: Model, clip: DepthClip, frames: TrainingFrames, indices: Sequence[int], bases: int
 ) -> NDArray[np.float64]:
     """[STATE, N]: an error e in a number adds effect * e**2 / N to the mean squared error of the tissue's pixels.
 
@@ -149,32 +149,25 @@ def _effect(
         tissue = clip.tissue[index]
         signs = np.zeros((5, *tissue.shape), np.float32)
         signs[:3] = random.choice(np.array([-1, 1], np.float32), (3, *tissue.shape)) * tissue
-        model.project(frames.cameras[index], float(frames.t[index]), 0)
-        gradients = model.rasterizer.cotangent_backward(signs)
-        found = np.concatenate(
-            [
-                gradients.state[:10, : model.count],
-                gradients.colour[:, : model.count] * np.float32(SH_C0),
-                gradients.opacity_logit[None, : model.count],
-            ]
-        )
+        found = model.image_gradient(frames.cameras[index], float(frames.t[index]), signs)
         effect += found.astype(np.float64) ** 2 * (model.count / max(3 * int(tissue.sum()), 1) / len(sampled))
     effect[2] = effect[:2].mean(0) * _depth_over_place(model, clip, frames, effect, indices[len(indices) // 2], bases)
     return effect
 
 
 def _depth_over_place(
-    model: FusedModel, clip: DepthClip, frames: TrainingFrames, effect: NDArray[np.float64], index: int, bases: int
+    model: Model, clip: DepthClip, frames: TrainingFrames, effect: NDArray[np.float64], index: int, bases: int
 ) -> float:
     """How much more an error along the first camera's axis changes frame `index` than one across it, squared."""
     across = max(float(effect[:2].mean()), 1e-12)
     size = FIRST_STEP * math.sqrt(bases / (12 * across))  # so many numbers of a channel add their errors at any time
     noise = size * np.random.default_rng(0).standard_normal(model.count).astype(np.float32)
-    exact_depth = model.canonical[2].copy()
+    depth = model.parameters()["canonical"][2]
+    exact_depth = depth.clone()
     camera, t = frames.cameras[index], float(frames.t[index])
     exact = model.render(camera, t)[:3].copy()
-    model.canonical[2, : model.count] += noise
+    depth += torch.from_numpy(noise).to(depth.device)
     error = (model.render(camera, t)[:3] - exact)[:, clip.tissue[index]]
-    model.canonical[2] = exact_depth
+    depth.copy_(exact_depth)
     measured = float(np.mean(error.astype(np.float64) ** 2))
     return max(measured / size**2 / across, 1.0)

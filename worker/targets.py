@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from contract.camera import Intrinsics
 from contract.errors import InputError
 from worker.clip import DepthClip
-from worker.loss import LossSettings
 from worker.metrics import COVERED_ALPHA, psnr_tissue
 from worker.raster import Camera
-from worker.raster.cpu import Target, camera_vector, padded
+from worker.raster.cpu import padded
+from worker.raster.step import Target, TrainingFrame, camera_vector
 
 MEDIAN_DEPTH_UNITS = 60.0
 """The median valid depth of the training frames in optimiser units; Adam's rates are stated in this unit."""
@@ -66,24 +66,25 @@ class TrainingFrames:
         self._rgb = np.zeros((count, 3, height, stride), np.uint8)
         self._weight = np.zeros((count, height, stride), np.uint8)
         self._inverse_depth = np.zeros((count, height, stride), np.float32)
-        self._pixels = np.zeros((count, 2), np.int64)  # of tissue; of tissue with depth
+        self.t = clip.t
+        self.cameras = {
+            index: camera_vector(camera_in_units(clip.intrinsics, clip.world_from_camera[index], scale))
+            for index in range(clip.frame_count)
+        }
+        self._frames: dict[int, TrainingFrame] = {}
         for row, index in enumerate(self.indices):
             tissue, depth_mm = clip.tissue[index], clip.depth_mm[index]
             measured = tissue & (depth_mm > 0)
             self._rgb[row, :, :, :width] = clip.rgb[index].transpose(2, 0, 1)
             self._weight[row, :, :width] = np.where(tissue, np.uint8(255), np.uint8(0))
             np.divide(1 / scale, depth_mm, out=self._inverse_depth[row, :, :width], where=measured)
-            self._pixels[row] = tissue.sum(), measured.sum()
-        self.cameras = {
-            index: camera_vector(camera_in_units(clip.intrinsics, clip.world_from_camera[index], scale))
-            for index in range(clip.frame_count)
-        }
-        self.t = clip.t
+            target = Target(self._rgb[row].ravel(), self._weight[row].ravel(), self._inverse_depth[row].ravel())
+            counts = int(tissue.sum()), int(measured.sum())
+            self._frames[index] = TrainingFrame(self.cameras[index], float(clip.t[index]), target, *counts)
 
-    def target(self, index: int) -> Target:
-        """What frame `index` is compared with; views."""
-        row = self._row[index]
-        return Target(self._rgb[row].ravel(), self._weight[row].ravel(), self._inverse_depth[row].ravel())
+    def frame(self, index: int) -> TrainingFrame:
+        """Frame `index` as a step takes it: views, and the same object every time."""
+        return self._frames[index]
 
     def picture(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """The frame itself: rgb [H, W, 3] and tissue [H, W]."""
@@ -93,20 +94,6 @@ class TrainingFrames:
     def psnr_tissue_db(self, index: int, image: NDArray[np.float32]) -> float:
         """Of a model's render [5, H, W] beside frame `index`; NaN without tissue."""
         return psnr_tissue(image[:3].transpose(1, 2, 0), *self.picture(index))
-
-    def loss_settings(self, index: int, loss: LossSettings) -> NDArray[np.float32]:
-        """The weights the blend applies a pixel (blend.py): each loss is a mean over its valid pixels."""
-        tissue, measured = self._pixels[self._row[index]]
-        return np.array(
-            [
-                loss.colour_weight / (3 * max(tissue, 1)),
-                loss.depth_weight / max(measured, 1),
-                1 / max(loss.colour_zone, 1e-30),
-                1 / max(loss.depth_zone, 1e-30),
-                float(loss.normalised_depth),
-            ],
-            np.float32,
-        )
 
     def digest(self) -> str:
         """SHA-256 over all that training reads of the clip: two runs on the same frames have the same."""

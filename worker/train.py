@@ -1,7 +1,7 @@
 """The one training loop. Everything it is given is built before; everything it decides is in Run.
 
-Nothing in a schedule reads the clock, so the same seed and iterations give the same bits, and a resumed run gives those
-of an uninterrupted one.
+Nothing in a schedule reads the clock, so on one device the same seed and iterations give the same bits, and a resumed
+run gives those of an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from contract.errors import Cancelled, TrainingDiverged
 from worker.average import RunningMean
@@ -23,6 +24,7 @@ from worker.hooks import Hooks, Progress
 from worker.model import Model
 from worker.optimize import rates_at
 from worker.presets import Preset
+from worker.raster.step import StepSums
 from worker.schedule import Schedule, left_out
 from worker.targets import TrainingFrames
 
@@ -30,7 +32,8 @@ CURVE_SECONDS = (1, 2, 5, 10, 20, 40, 60, 90, 120, 180, 300, 600)
 """Training times at which held-out frames are scored; the clock stands still meanwhile."""
 CALIBRATION_STEPS = (3, 12)
 """Untimed and timed steps that tell how many fit into a budget; they are taken back. Their median counts: the first
-steps fill caches, and other processes come and go."""
+steps fill caches, and other processes come and go. Where not every step is waited for, so many times the steps from one
+answer to the next."""
 LATER_STEPS = 1.15
 """Allowance for steps that become slower while Gaussians grow. A judgement: it differs from clip to clip."""
 REPORT_EVERY_S = 0.25
@@ -113,23 +116,23 @@ def step(run: Run, iteration: int) -> None:
     """One iteration of the model.
 
     Raises:
-        TrainingDiverged: the loss is not finite, or no Gaussian is in view.
+        TrainingDiverged: the loss is not finite, or no Gaussian is in view; a model that does not answer at every step
+            tells it some steps later.
     """
-    preset, index = run.preset, frame_at(run, iteration)
+    preset, frame = run.preset, run.frames.frame(frame_at(run, iteration))
     sh_degree = min(preset.sh_degree, iteration // preset.sh_every) if preset.sh_degree else 0
-    sums = run.model.step(
-        run.frames.cameras[index],
-        float(run.frames.t[index]),
-        run.frames.target(index),
-        run.frames.loss_settings(index, preset.loss),
-        rates_at(preset.rates, run.schedule.progress(iteration)),
-        iteration,
-        sh_degree,
-    )
+    rates = rates_at(preset.rates, run.schedule.progress(iteration))
+    _check(run.model.step(frame, preset.loss, rates, iteration, sh_degree), iteration)
+
+
+def _check(sums: StepSums | None, iteration: int) -> None:
+    """Of the steps up to this iteration that sums are of, if the model has answered for any."""
+    if sums is None:
+        return
     if not math.isfinite(sums.colour_l1 + sums.depth_l1):
-        raise TrainingDiverged(f"The loss is no longer a number at iteration {iteration} (frame {index}).")
-    if not run.model.visible.any():
-        raise TrainingDiverged(f"No Gaussian is left in view at iteration {iteration} (frame {index}).")
+        raise TrainingDiverged(f"The loss is no longer a number by iteration {iteration}.")
+    if sums.visible == 0:
+        raise TrainingDiverged(f"No Gaussian is left in view by iteration {iteration}.")
 
 
 def iterations_within(
@@ -140,21 +143,24 @@ def iterations_within(
     One a training frame are made even if fewer fit.
     """
     start = time.perf_counter()
-    stored = {name: values.copy() for name, values in model.parameters().items()}
+    stored = {name: values.clone() for name, values in model.parameters().items()}
 
     def start_again() -> None:
-        for name, values in model.arrays().items():
-            values[...] = stored.get(name, 0)  # moments and their counts are 0 before the first step
+        for name, values in model.arrays().items():  # moments and their counts are 0 before the first step
+            values.copy_(stored[name]) if name in stored else values.zero_()
 
+    at_once = model.answers_every
     untimed, timed = CALIBRATION_STEPS
-    trial = Run(model, frames, preset, Schedule(untimed + timed), seed)
+    trial = Run(model, frames, preset, Schedule((untimed + timed) * at_once), seed)
     start_again()  # touches the moments' memory once: the first touch of a page costs as much as a step
     ends = [time.perf_counter()]
-    for iteration in range(1, untimed + timed + 1):
+    for iteration in range(1, trial.iterations + 1):
         step(trial, iteration)
-        ends.append(time.perf_counter())
+        if iteration % at_once == 0:
+            _check(model.wait(), iteration)
+            ends.append(time.perf_counter())
     start_again()
-    step_s = float(np.median(np.diff(ends)[untimed:])) * LATER_STEPS
+    step_s = float(np.median(np.diff(ends)[untimed:])) / at_once * LATER_STEPS
     left_s = budget_s - elapsed_s - (time.perf_counter() - start)
     return max(len(frames.indices), int(left_s / step_s))
 
@@ -195,6 +201,7 @@ def train(
             left_s = (now - began) / (iteration - begun_at) * (run.iterations - iteration)
             share = iteration / run.iterations
             hooks.on_progress(Progress("train", share, iteration, run.iterations, scored, left_s))
+    _check(run.model.wait(), run.iteration)
     _check_finite(run)
     if not run.curve or run.curve[-1].iteration < run.iteration:  # else it was stopped after its last score
         _score(run, clock, evaluate)
@@ -236,12 +243,13 @@ def _left_out_psnr(run: Run) -> float:
 
 def _check_finite(run: Run) -> None:
     """A Gaussian that is not a number is not drawn either, so the loss alone does not show it."""
-    broken = [name for name, values in run.model.arrays().items() if not np.isfinite(values).all()]
+    broken = [name for name, values in run.model.arrays().items() if not bool(torch.isfinite(values).all())]
     if broken:
         raise TrainingDiverged(f"After {run.iteration} iterations {', '.join(broken)} hold values that are no numbers.")
 
 
 def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], float]) -> float | None:
+    _check(run.model.wait(), run.iteration)  # what is still being trained is no part of scoring
     t_train_s = clock.elapsed_s
     psnr = clock.pause(evaluate)
     if math.isnan(psnr):

@@ -99,13 +99,13 @@ class AutogradMotion:
             taken[:, torch.from_numpy(fresh)] = 0.0
             self._moments[name] = taken
 
-    def parameters(self) -> dict[str, np.ndarray]:
-        """What is trained, by name; views."""
-        return {f"motion.{name}": each.detach().numpy() for name, each in self._parameters.items()}
+    def parameters(self, count: int) -> dict[str, Tensor]:
+        """What is trained, by name; views. The Gaussians that only fill the last vector are among them, if any are."""
+        return {f"motion.{name}": each.detach() for name, each in self._parameters.items()}
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self, count: int) -> dict[str, Tensor]:
         """Parameters and moments by name; views."""
-        return self.parameters() | {f"motion.moments.{name}": each.numpy() for name, each in self._moments.items()}
+        return self.parameters(count) | {f"motion.moments.{name}": each for name, each in self._moments.items()}
 
     def export(self, count: int) -> Deformation:
         """The first count Gaussians' deformation as torch tensors (copies)."""

@@ -18,8 +18,9 @@ from worker.loss import LossSettings
 from worker.model import Model
 from worker.optimize import StepRates
 from worker.raster import Camera
-from worker.raster.cpu import Target, camera_vector, padded
-from worker.raster.cpu.model import FusedModel, StepSums
+from worker.raster.cpu import padded
+from worker.raster.cpu.model import FusedModel
+from worker.raster.step import StepSums, Target, TrainingFrame, camera_vector
 
 WIDTH, HEIGHT = 64, 48
 RATES = StepRates(
@@ -41,7 +42,7 @@ NORMALISED = LossSettings(depth_weight=20.0, colour_zone=0.02, depth_zone=1e-3)
 
 
 @dataclass(frozen=True, eq=False)
-class TrainingFrame:
+class Picture:
     """rgb [H, W, 3] uint8, tissue [H, W] bool, depth [H, W] in units, 0 = invalid; seen at time t."""
 
     t: float
@@ -59,12 +60,10 @@ class TrainingFrame:
             inverse_depth=np.pad(inverse, columns).ravel(),
         )
 
-    def loss_settings(self, loss: LossSettings) -> NDArray[np.float32]:
-        """As the kernels read it: weights a pixel, so that each term is a mean, and sharpness of the zones."""
+    def seen_from(self, camera: NDArray[np.float64]) -> TrainingFrame:
+        """As a step takes it."""
         measured = self.tissue & (self.depth > 0)
-        weights = [loss.colour_weight / (3 * self.tissue.sum()), loss.depth_weight / measured.sum()]
-        sharpness = [1 / max(zone, 1e-30) for zone in (loss.colour_zone, loss.depth_zone)]
-        return np.array([*weights, *sharpness, loss.normalised_depth], np.float32)
+        return TrainingFrame(camera, self.t, self.target(), int(self.tissue.sum()), int(measured.sum()))
 
 
 def endoscope(sideways: float = 0.0) -> Camera:
@@ -88,7 +87,7 @@ def wall(*, stride: int = 3, sh_degree: int = 0, opacity: float = 0.6, seed: int
     return dataclasses.replace(start, quaternion=turned, log_scale=stretched)
 
 
-def training_frames(count: int = 3, *, seed: int = 1) -> list[TrainingFrame]:
+def training_frames(count: int = 3, *, seed: int = 1) -> list[Picture]:
     """Frames of something else than the wall: noise, with holes in tissue and depth."""
     random = np.random.default_rng(seed)
     frames = []
@@ -96,7 +95,7 @@ def training_frames(count: int = 3, *, seed: int = 1) -> list[TrainingFrame]:
         coarse = random.integers(0, 256, (HEIGHT // 4, WIDTH // 4, 3), dtype=np.uint8)
         depth = random.uniform(50, 70, (HEIGHT, WIDTH)) * (random.uniform(size=(HEIGHT, WIDTH)) > 0.2)
         frames.append(
-            TrainingFrame(
+            Picture(
                 t=0.3 + 0.4 * k / count,
                 rgb=coarse.repeat(4, 0).repeat(4, 1),
                 tissue=random.uniform(size=(HEIGHT, WIDTH)) > 0.15,
@@ -106,14 +105,14 @@ def training_frames(count: int = 3, *, seed: int = 1) -> list[TrainingFrame]:
     return frames
 
 
-def frame_of(gaussians: Gaussians, t: float) -> TrainingFrame:
+def frame_of(gaussians: Gaussians, t: float) -> Picture:
     """The frame that shows exactly these Gaussians at time t, with their depth where they are solid."""
     still = SharedBasis.initial(len(gaussians), bases=1)
     red, green, blue, summed, alpha = FusedModel(gaussians, still, WIDTH, HEIGHT).render(camera_vector(endoscope()), t)
     rgb = np.clip(np.stack([red, green, blue], axis=-1) * 255, 0, 255).round().astype(np.uint8)
     solid = alpha > 0.5
     depth = np.where(solid, summed / np.where(solid, alpha, 1), 0).astype(np.float32)
-    return TrainingFrame(t, rgb, np.ones((HEIGHT, WIDTH), bool), depth)
+    return Picture(t, rgb, np.ones((HEIGHT, WIDTH), bool), depth)
 
 
 def moving_hexplane(gaussians: Gaussians) -> HexPlane:
@@ -144,7 +143,7 @@ def moving_fdm(gaussians: Gaussians) -> FlexibleDeformation:
 
 def take_steps(
     model: Model,
-    frames: list[TrainingFrame],
+    frames: list[Picture],
     *,
     loss: LossSettings = PAPER,
     rates: StepRates = RATES,
@@ -154,7 +153,8 @@ def take_steps(
 ) -> list[StepSums]:
     """One step on every frame, iterations counted from first."""
     seen_from = camera_vector(camera or endoscope())
-    return [
-        model.step(seen_from, each.t, each.target(), each.loss_settings(loss), rates, iteration, sh_degree)
+    sums = [
+        model.step(each.seen_from(seen_from), loss, rates, iteration, sh_degree)
         for iteration, each in enumerate(frames, start=first)
     ]
+    return [each for each in sums if each is not None]

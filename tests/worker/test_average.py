@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
+from torch import Tensor
 
 from tests.worker.phantoms import phantom_clip, prepared
 from worker.average import PREFIX, RunningMean
 from worker.presets import PRESETS
 
-Parameters = dict[str, np.ndarray]
+Parameters = dict[str, Tensor]
 
 
 @pytest.fixture
 def models(rng: np.random.Generator) -> list[Parameters]:
     shapes = {"mean": (3, 16), "motion.weight": (10, 4, 16), "opacity": (16,)}
-    return [{name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()} for _ in range(6)]
+    return [
+        {name: torch.from_numpy(rng.normal(size=shape)).float() for name, shape in shapes.items()} for _ in range(6)
+    ]
 
 
 def mean_of(mean: RunningMean, like: Parameters) -> Parameters:
-    found = {name: np.full_like(values, np.nan) for name, values in like.items()}
+    found = {name: torch.full_like(values, torch.nan) for name, values in like.items()}
     mean.put(found)
     return found
 
@@ -30,8 +34,8 @@ def test_what_is_put_is_the_mean_of_what_was_added(models: list[Parameters]) -> 
         mean.add(model)
     assert mean.count == len(models)
     for name, values in mean_of(mean, models[0]).items():
-        expected = np.mean([model[name].astype(np.float64) for model in models], axis=0)
-        assert values.dtype == np.float32
+        expected = np.mean([model[name].double().numpy() for model in models], axis=0)
+        assert values.dtype == torch.float32
         np.testing.assert_allclose(values, expected, atol=1e-6)
 
 
@@ -54,7 +58,7 @@ def test_a_mean_that_was_put_is_over(models: list[Parameters]) -> None:
 
 def test_adding_copies_and_leaves_what_it_is_given(models: list[Parameters]) -> None:
     """A model's arrays are live: training goes on in them."""
-    mean, live = RunningMean(), {name: values.copy() for name, values in models[0].items()}
+    mean, live = RunningMean(), {name: values.clone() for name, values in models[0].items()}
     mean.add(live)
     for name, values in live.items():
         values[...] = models[1][name]
@@ -62,7 +66,7 @@ def test_adding_copies_and_leaves_what_it_is_given(models: list[Parameters]) -> 
     for name, values in live.items():
         np.testing.assert_array_equal(values, models[1][name])
     for name, values in mean_of(mean, live).items():
-        np.testing.assert_array_equal(values, (models[0][name] + models[1][name]) / np.float32(2))
+        np.testing.assert_array_equal(values, (models[0][name] + models[1][name]) / 2)
 
 
 @pytest.mark.parametrize("stopped_after", range(7))
@@ -72,8 +76,8 @@ def test_a_stored_mean_goes_on_to_the_same_bits(models: list[Parameters], stoppe
         straight.add(model)
     for model in models[:stopped_after]:
         before.add(model)
-    stored = {name: values.copy() for name, values in before.arrays().items()}
-    resumed.load_arrays({"mean": np.zeros(3, np.float32), **stored}, before.count)
+    stored = {name: values.clone() for name, values in before.arrays().items()}
+    resumed.load_arrays({"mean": torch.zeros(3), **stored}, before.count)
     for model in models[stopped_after:]:
         resumed.add(model)
     expected = mean_of(straight, models[0])

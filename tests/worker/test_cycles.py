@@ -60,7 +60,7 @@ def until(iteration: int, run: Run) -> Run:
 
 
 def copied(model: Model) -> dict[str, np.ndarray]:
-    return {name: values.copy() for name, values in model.parameters().items()}
+    return {name: values.numpy().copy() for name, values in model.parameters().items()}
 
 
 def poisoned(clip: DepthClip, frames: list[int], rng: np.random.Generator) -> DepthClip:
@@ -191,7 +191,7 @@ def test_a_cycle_ends_with_the_mean_of_its_last_models(clip: DepthClip, split: F
         clip, split, dataclasses.replace(PRESETS["fast"], cycles=False, worth_db=None), iterations=SHORTEST
     )
     models.append(copied(trained(alone).model))  # the same steps, and nothing averaged
-    averaged = until(SHORTEST, run).model.parameters()
+    averaged = copied(until(SHORTEST, run).model)
     for name, values in averaged.items():
         expected = np.mean([model[name] for model in models], axis=0, dtype=np.float64)
         np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-5, err_msg=name)

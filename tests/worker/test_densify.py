@@ -31,8 +31,8 @@ from worker.densify import Densifier, DensifyResult, DensifySettings
 from worker.gaussians import Gaussians
 from worker.loss import LossSettings
 from worker.model import Model
-from worker.raster.cpu import camera_vector
 from worker.raster.cpu.model import FusedModel
+from worker.raster.step import camera_vector
 from worker.unfused import UnfusedModel
 
 NOTHING = DensifySettings(gradient_threshold=1e9)
@@ -60,7 +60,7 @@ def densify(model: Model, densifier: Densifier, *, seed: int = 0) -> DensifyResu
 
 
 def copies(model: Model) -> dict[str, NDArray[np.float32]]:
-    return {name: values.copy() for name, values in model.arrays().items()}
+    return {name: values.numpy().copy() for name, values in model.arrays().items()}
 
 
 def with_opacity(gaussians: Gaussians, rows: list[int], opacity: float) -> Gaussians:
@@ -90,8 +90,8 @@ def test_the_mean_gradient_is_over_the_steps_that_saw_a_gaussian() -> None:
     for iteration, (frame, sideways) in enumerate(zip(training_frames(3), (0.0, 30.0, -45.0), strict=True), start=1):
         take_steps(model, [frame], first=iteration, camera=endoscope(sideways))
         densifier.observe(model)
-        norms.append(model.gradient_norm.astype(np.float64))
-        seen.append(model.visible.copy())
+        norms.append(model.gradient_norm.double().numpy())
+        seen.append(model.visible.numpy())
     sometimes = np.any(seen, 0) & ~np.all(seen, 0)
     assert sometimes.sum() > 50
     for g in range(model.count):
@@ -110,9 +110,9 @@ def test_gradients_are_in_device_coordinates() -> None:
         model = FusedModel(gaussian, still, WIDTH, HEIGHT)
         camera = camera_vector(endoscope())
         camera[2:4] += shift
-        colours = frame.loss_settings(LossSettings(depth_weight=0.0))
-        sums = model.step(camera, frame.t, frame.target(), colours, RATES, 1)
-        return sums.colour_l1 * float(colours[0]), float(model.gradient_norm[0])
+        seen, colours = frame.seen_from(camera), LossSettings(depth_weight=0.0)
+        sums = model.step(seen, colours, RATES, 1)
+        return sums.colour_l1 * float(seen.loss_settings(colours)[0]), float(model.gradient_norm[0])
 
     nudge = 0.1  # pixels
     by_x, by_y = (
@@ -132,7 +132,7 @@ def test_every_split_gaussian_becomes_two_smaller_ones_that_share_the_rest() -> 
     assert model.count == result.count
     parents = np.concatenate([kept, split, split])
     born = slice(len(kept), model.count)
-    after = model.arrays()
+    after = copies(model)
     for name in ("opacity_logit", "sh_rest", "motion.weight"):
         assert bool((after[name][..., : model.count] == before[name][..., parents]).all()), name
     rest = np.r_[3:7, 10:13]
@@ -189,7 +189,7 @@ def test_transparent_gaussians_are_dropped_and_the_others_keep_their_numbers() -
     kept = np.setdiff1d(np.arange(model.count), rows)
     result = densify(model, densifier)
     assert result == DensifyResult(split=0, pruned=4, withheld=0, count=len(kept))
-    for name, values in model.arrays().items():
+    for name, values in copies(model).items():
         if name != "motion.steps":
             assert bool((values[..., : model.count] == before[name][..., kept]).all()), name
 
@@ -210,7 +210,7 @@ def test_moments_of_survivors_stay_and_those_of_children_start_at_zero() -> None
     densify(model, densifier)
     moments = ("moments.canonical", "moments.opacity_logit", "motion.first", "motion.second")
     for name in moments:
-        values = model.arrays()[name]
+        values = copies(model)[name]
         assert bool((values[..., : len(survivors)] == before[name][..., survivors]).all()), name
         assert not values[..., len(survivors) :].any(), name
         assert before[name].any(), name
@@ -244,7 +244,8 @@ def test_statistics_start_anew_afterwards() -> None:
     assert not densifier.mean_gradient.any()
     take_steps(model, training_frames(1), first=601)
     densifier.observe(model)
-    assert bool((densifier.mean_gradient == np.where(model.visible, model.gradient_norm, 0)).all())
+    expected = torch.where(model.visible, model.gradient_norm, 0).numpy()
+    assert bool((densifier.mean_gradient == expected).all())
 
 
 def test_a_model_whose_motion_has_no_kernels_is_densified_likewise() -> None:
@@ -298,12 +299,11 @@ def test_a_run_resumed_after_densification_takes_the_same_steps(tmp_path: Path) 
     whole = fused(wall())
     statistics = Densifier(settings, whole.count)
     go_on(whole, statistics, 1, 3)
-    stored = {**whole.arrays(), **statistics.arrays()}
-    save_resume(tmp_path, {name: torch.from_numpy(values) for name, values in stored.items()}, {"count": whole.count})
+    stored = {name: values.contiguous() for name, values in (whole.arrays() | statistics.arrays()).items()}
+    save_resume(tmp_path, stored, {"count": whole.count})
     go_on(whole, statistics, 4, 6)
 
-    tensors, state = load_resume(tmp_path)
-    arrays = {name: each.numpy() for name, each in tensors.items()}
+    arrays, state = load_resume(tmp_path)
     resumed = fused(wall())
     assert state["count"] > resumed.count
     resumed_statistics = Densifier(settings, resumed.count)
@@ -326,7 +326,7 @@ def test_losing_every_gaussian_is_an_error_that_says_so() -> None:
 def test_gradients_that_are_not_numbers_are_an_error() -> None:
     model, densifier = trained(wall(), NOTHING)
     stored = densifier.arrays()
-    stored["densify.gradient_sum"][:2] = np.nan
+    stored["densify.gradient_sum"][:2] = math.nan
     densifier.load_arrays(stored)
     with pytest.raises(TrainingDiverged, match="2 Gaussians"):
         densify(model, densifier)
@@ -337,7 +337,9 @@ def test_statistics_of_another_model_are_refused() -> None:
     with pytest.raises(ValueError, match="statistics are of 3"):
         Densifier(NOTHING, 3).observe(model)
     with pytest.raises(ValueError, match="same"):
-        Densifier(NOTHING, 3).load_arrays({"densify.gradient_sum": np.zeros(3), "densify.steps_seen": np.zeros(4)})
+        Densifier(NOTHING, 3).load_arrays(
+            {"densify.gradient_sum": torch.zeros(3), "densify.steps_seen": torch.zeros(4)}
+        )
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,8 @@ from tests.helpers import assert_close
 from tests.worker.clips import HEIGHT, WIDTH, plane_clip
 from worker.clip import DepthClip
 from worker.loss import LossSettings
-from worker.raster.cpu import camera_vector, padded
+from worker.raster.cpu import padded
+from worker.raster.step import camera_vector
 from worker.targets import MEDIAN_DEPTH_UNITS, TrainingFrames, camera_in_units, units_per_mm
 
 TRAIN = [0, 2, 3]
@@ -55,7 +56,7 @@ def test_a_target_holds_the_frames_colour_tissue_and_inverse_depth(clip: DepthCl
     frames = TrainingFrames(clip, TRAIN, scale)
     stride = padded(WIDTH)
     for index in TRAIN:
-        target = frames.target(index)
+        target = frames.frame(index).target
         rgb = target.rgb.reshape(3, HEIGHT, stride)
         weight, inverse = (each.reshape(HEIGHT, stride) for each in (target.weight, target.inverse_depth))
         np.testing.assert_array_equal(rgb[:, :, :WIDTH], clip.rgb[index].transpose(2, 0, 1))
@@ -89,7 +90,7 @@ def test_each_loss_is_a_mean_over_its_own_pixels(clip: DepthClip) -> None:
         tissue = int(clip.tissue[index].sum())
         measured = int((clip.tissue[index] & (clip.depth_mm[index] > 0)).sum())
         assert measured < tissue
-        colour, depth, colour_slope, _, normalised = frames.loss_settings(index, loss)
+        colour, depth, colour_slope, _, normalised = frames.frame(index).loss_settings(loss)
         assert colour * 3 * tissue == pytest.approx(2.0)
         assert depth * measured == pytest.approx(0.5)
         assert colour_slope == pytest.approx(1 / 0.02)
@@ -100,7 +101,7 @@ def test_a_frame_without_tissue_divides_by_nothing(clip: DepthClip) -> None:
     tissue = clip.tissue.copy()
     tissue[2] = False
     frames = TrainingFrames(dataclasses.replace(clip, tissue=tissue), TRAIN, 1.0)
-    assert np.isfinite(frames.loss_settings(2, LossSettings())).all()
+    assert np.isfinite(frames.frame(2).loss_settings(LossSettings())).all()
 
 
 def test_a_point_in_mm_and_in_units_lands_on_the_same_pixel() -> None:

@@ -143,7 +143,7 @@ def test_a_budget_allows_what_is_left_of_it_over_the_median_step(monkeypatch: py
 def test_calibration_leaves_the_model_as_it_was() -> None:
     for name in ("fast", "paper", "hexplane"):
         run, split = prepared(phantom_clip(), name)
-        before = {key: values.copy() for key, values in run.model.arrays().items()}
+        before = {key: values.clone() for key, values in run.model.arrays().items()}
         for budget_s in (1e-9, 0.5):
             assert fitting(run, budget_s, elapsed_s=0.1) >= len(split.train)
         after = run.model.arrays()

@@ -31,8 +31,8 @@ from worker.deformation import Deformation, HexPlane
 from worker.gaussians import Gaussians
 from worker.loss import LossSettings, training_loss
 from worker.raster import reference
-from worker.raster.cpu import camera_vector
 from worker.raster.cpu.model import FusedModel
+from worker.raster.step import camera_vector
 from worker.unfused import UnfusedModel
 
 LOSSES = pytest.mark.parametrize("loss", [PAPER, NORMALISED], ids=["paper", "normalised"])
@@ -140,12 +140,12 @@ def test_taking_rows_keeps_their_motion_and_moments(moving: Callable[[Gaussians]
     take_steps(model, training_frames(2))
     columns = np.array([7, 3, 3, 11, 200])
     fresh = np.array([False, False, True, False, False])
-    before = {name: each.copy() for name, each in model.arrays().items()}
+    before = {name: each.numpy().copy() for name, each in model.arrays().items()}
     mean = model.deformed_mean(0.4)
     model.take(columns, fresh)
     assert model.count == 5
     assert_close(model.deformed_mean(0.4), mean[:, columns])
-    after = model.arrays()
+    after = {name: each.numpy() for name, each in model.arrays().items()}
     kept = before["moments.canonical"][:, :, columns] * ~fresh
     assert bool((after["moments.canonical"][:, :, :5] == kept).all())
     for name in (each for each in after if each.startswith("motion.moments.")):
@@ -161,12 +161,12 @@ def test_a_resumed_model_takes_the_steps_of_an_uninterrupted_one(tmp_path: Path)
     frames = training_frames(4)
     whole = UnfusedModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT)
     take_steps(whole, frames[:2])
-    save_resume(tmp_path, {name: torch.from_numpy(each) for name, each in whole.arrays().items()}, {})
+    save_resume(tmp_path, {name: each.contiguous() for name, each in whole.arrays().items()}, {})
     take_steps(whole, frames[2:], first=3)
 
     tensors, _ = load_resume(tmp_path)
     resumed = UnfusedModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT)
-    resumed.load_arrays({name: each.numpy() for name, each in tensors.items()})
+    resumed.load_arrays(tensors)
     take_steps(resumed, frames[2:], first=3)
     for name, each in resumed.arrays().items():
         assert bool((each == whole.arrays()[name]).all()), name

@@ -34,7 +34,7 @@ from worker.metrics import depth_agreement_mm, depth_errors_mm, psnr_tissue, ssi
 from worker.pipeline import ReconstructionRequest, reconstruct
 from worker.presets import PRESETS
 from worker.quality import View
-from worker.raster.cpu import camera_vector
+from worker.raster.step import camera_vector
 from worker.render import model_of
 from worker.targets import camera_in_units
 

@@ -44,7 +44,7 @@ from worker.hooks import Hooks
 from worker.metrics import psnr_tissue
 from worker.phantom import PhantomSettings
 from worker.pipeline import ReconstructionRequest, reconstruct
-from worker.raster.cpu import camera_vector
+from worker.raster.step import camera_vector
 from worker.render import model_of
 from worker.targets import camera_in_units, solid_depth_mm
 

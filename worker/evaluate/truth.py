@@ -37,7 +37,7 @@ from worker.clip import DepthClip
 from worker.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
 from worker.phantom import Phantom
 from worker.quality import View, sample_frames
-from worker.raster.cpu import camera_vector
+from worker.raster.step import camera_vector
 from worker.render import model_of
 from worker.targets import camera_in_units, solid_depth_mm
 

@@ -15,10 +15,12 @@ from numba.core.dispatcher import Dispatcher
 
 from worker.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
 from worker.gaussians import Gaussians
+from worker.loss import LossSettings
 from worker.optimize import StepRates
 from worker.raster import Camera
-from worker.raster.cpu import Target, camera_vector, compile_kernels, rasterize
+from worker.raster.cpu import compile_kernels, rasterize
 from worker.raster.cpu.model import FusedModel
+from worker.raster.step import Target, TrainingFrame, camera_vector
 
 COUNT, WIDTH, HEIGHT = 50, 37, 35
 
@@ -60,9 +62,9 @@ def use_everything(digest: hashlib._Hash) -> None:
         rgb, weight = np.full(3 * pixels, 100, np.uint8), np.full(pixels, 255, np.uint8)
         target = Target(rgb, weight, np.ones(pixels, np.float32))
         for iteration in range(1, 5):
-            settings = np.array([1e-3, 1e-3, 1e30, 1e30, iteration % 2], np.float32)
-            used = min(degree, iteration - 1)
-            model.step(camera, 0.3 * iteration % 1, target, settings, StepRates(*[1e-3] * 11), iteration, used)
+            frame = TrainingFrame(camera, 0.3 * iteration % 1, target, pixels, pixels)
+            loss = LossSettings(normalised_depth=bool(iteration % 2))
+            model.step(frame, loss, StepRates(*[1e-3] * 11), iteration, min(degree, iteration - 1))
             model.take(np.arange(model.count)[::-1].copy(), np.zeros(model.count, np.bool_))
         digest.update(model.render(camera, 0.4).tobytes())
     one = gaussians(0)

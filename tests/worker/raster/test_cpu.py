@@ -22,9 +22,10 @@ from worker.gaussians import Gaussians
 from worker.loss import LossSettings, training_loss
 from worker.optimize import StepRates
 from worker.raster import Camera
-from worker.raster.cpu import Rasterizer, Target, camera_vector, padded
+from worker.raster.cpu import Rasterizer, padded
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion, motion_of
+from worker.raster.step import Target, TrainingFrame, camera_vector
 
 LOSSES = {
     "summed depth": LossSettings(2e3, 4e4, normalised_depth=False, colour_zone=0.05, depth_zone=1e-3),
@@ -84,6 +85,11 @@ class Frame:
             ],
             np.float32,
         )
+
+    def seen_from(self, camera: Camera, t: float, rasterizer: Rasterizer) -> TrainingFrame:
+        """As a step takes it."""
+        counts = int(self.tissue.sum()), int((self.tissue & (self.depth > 0)).sum())
+        return TrainingFrame(camera_vector(camera), t, self.target(rasterizer), *counts)
 
     def loss(self, scene: Scene, settings: LossSettings) -> Tensor:
         """worker.loss on the reference's render."""
@@ -254,8 +260,7 @@ def test_a_fused_step_has_the_gradients_of_the_stages_one_by_one(kind: str, sh_d
     wanted = dict(zip([*leaves, *motion], gradients, strict=True))
 
     model = FusedModel(gaussians, deformation, camera.width, camera.height)
-    target = frame.target(model.rasterizer)
-    model.step(camera_vector(camera), t, target, frame.kernel_settings(NORMALISED), RATES, 1, sh_degree)
+    model.step(frame.seen_from(camera, t, model.rasterizer), NORMALISED, RATES, 1, sh_degree)
     stored = {name: 10 * np.asarray(each) for name, each in model.arrays().items()}
 
     canonical = torch.cat([wanted["mean"], wanted["quaternion"], wanted["log_scale"], wanted["sh"][:, 0]], dim=1)
@@ -357,13 +362,11 @@ def test_beyond_six_widths_the_kernels_of_fdm_give_the_canonical_state() -> None
 def test_a_model_that_took_some_of_its_gaussians_trains_on_as_they_did(kind: str) -> None:
     gaussians, deformation, camera = moving_gaussians(kind, 1)
     frame = random_frame(camera, np.zeros((camera.height, camera.width), bool))
-    settings = frame.kernel_settings(NORMALISED)
     models = [FusedModel(gaussians, deformation, camera.width, camera.height) for _ in range(2)]
     order = np.random.default_rng(3).permutation(90)
     for iteration in (1, 2, 3):
         for model in models:
-            target = frame.target(model.rasterizer)
-            model.step(camera_vector(camera), 0.4, target, settings, RATES, iteration, 1)
+            model.step(frame.seen_from(camera, 0.4, model.rasterizer), NORMALISED, RATES, iteration, 1)
         if iteration == 1:
             models[1].take(order, np.zeros(90, np.bool_))
     kept, permuted = ((exported.tensors(), motion.parameters()) for exported, motion in (m.export() for m in models))
@@ -376,8 +379,7 @@ def test_gaussians_taken_afresh_start_with_no_moments() -> None:
     gaussians, deformation, camera = moving_gaussians("shared with colour", 0)
     frame = random_frame(camera, np.zeros((camera.height, camera.width), bool))
     model = FusedModel(gaussians, deformation, camera.width, camera.height)
-    settings, target = frame.kernel_settings(NORMALISED), frame.target(model.rasterizer)
-    model.step(camera_vector(camera), 0.4, target, settings, RATES, 1)
+    model.step(frame.seen_from(camera, 0.4, model.rasterizer), NORMALISED, RATES, 1)
     model.take(np.array([5, 5, 7]), np.array([False, True, True]))
     moments = [each for name, each in model.arrays().items() if name.startswith("moments.") or name[7:] == "first"]
     assert all(not each[..., 1:].any() for each in moments)

@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from worker.raster import Camera
-from worker.raster.cpu import Rasterizer, camera_vector
+from worker.raster.cpu import Rasterizer
 from worker.raster.cpu.vectors import LANES
+from worker.raster.step import camera_vector
 
 SIZE = 24
 VIEW = camera_vector(Camera(30.0, 30.0, SIZE / 2, SIZE / 2, SIZE, SIZE, np.eye(4)))

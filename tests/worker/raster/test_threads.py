@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from contract.errors import InputError
 from tests.worker.raster.test_cpu import NORMALISED, RATES, moving_gaussians, random_frame
-from worker.raster.cpu import camera_vector
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.threads import THREADS_VARIABLE, run, thread_count
+from worker.raster.step import camera_vector
 
 PATIENCE_S = 120.0
 """Longer than any of this takes on a busy machine: only a deadlock lasts so long."""
@@ -47,9 +47,9 @@ def train(kind: str, steps: int) -> list[NDArray[np.float32]]:
     gaussians, deformation, camera = moving_gaussians(kind, 0)
     frame = random_frame(camera, np.zeros((camera.height, camera.width), bool))
     model = FusedModel(gaussians, deformation, camera.width, camera.height)
-    target, settings = frame.target(model.rasterizer), frame.kernel_settings(NORMALISED)
+    seen = frame.seen_from(camera, 0.4, model.rasterizer)
     for iteration in range(1, steps + 1):
-        model.step(camera_vector(camera), 0.4, target, settings, RATES, iteration)
+        model.step(seen, NORMALISED, RATES, iteration)
     return [np.array(each) for each in model.arrays().values()]
 
 

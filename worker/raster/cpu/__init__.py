@@ -11,6 +11,6 @@ use_kernel_cache()
 # The cache folder must be set before a kernel is declared.
 from worker.raster.cpu.autograd import rasterize  # noqa: E402
 from worker.raster.cpu.compilation import compile_kernels  # noqa: E402
-from worker.raster.cpu.rasterizer import Gradients, Rasterizer, Target, camera_vector, padded  # noqa: E402
+from worker.raster.cpu.rasterizer import Gradients, Rasterizer, padded  # noqa: E402
 
-__all__ = ["Gradients", "Rasterizer", "Target", "camera_vector", "compile_kernels", "padded", "rasterize"]
+__all__ = ["Gradients", "Rasterizer", "compile_kernels", "padded", "rasterize"]

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from worker.raster import Camera, Rendered
-from worker.raster.cpu.rasterizer import Floats, Rasterizer, camera_vector, padded
+from worker.raster.cpu.rasterizer import Floats, Rasterizer, padded
 from worker.raster.reference import check_shapes
+from worker.raster.step import camera_vector
 
 _LARGEST_LOGIT = 30.0
 """Stands for opacities 0 and 1, which have no finite logit; sigmoid(30) differs from 1 by 1e-13."""

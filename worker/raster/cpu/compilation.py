@@ -10,10 +10,12 @@ import torch
 
 from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
 from worker.gaussians import Gaussians
+from worker.loss import LossSettings
 from worker.optimize import StepRates
 from worker.raster import Camera
 from worker.raster.cpu.model import FusedModel
-from worker.raster.cpu.rasterizer import Rasterizer, Target, camera_vector
+from worker.raster.cpu.rasterizer import padded
+from worker.raster.step import Target, TrainingFrame, camera_vector
 
 _COUNT, _WIDTH, _HEIGHT = 8, 16, 16
 _RATES = StepRates(*[1e-3] * 11)
@@ -61,10 +63,8 @@ def _gaussians(sh_degree: int) -> Gaussians:
 
 
 def _step(model: FusedModel, camera: np.ndarray, sh_degree: int) -> None:
-    model.step(camera, 0.5, _target(model.rasterizer), np.ones(5, np.float32), _RATES, 1, sh_degree)
-
-
-def _target(rasterizer: Rasterizer) -> Target:
-    pixels = rasterizer.height * rasterizer.stride
-    weight = np.full(pixels, 255, np.uint8)
-    return Target(np.zeros(3 * pixels, np.uint8), weight, np.full(pixels, 1 / 60, np.float32))
+    pixels = _HEIGHT * padded(_WIDTH)
+    weight, inverse_depth = np.full(pixels, 255, np.uint8), np.full(pixels, 1 / 60, np.float32)
+    target = Target(np.zeros(3 * pixels, np.uint8), weight, inverse_depth)
+    frame = TrainingFrame(camera, 0.5, target, pixels, pixels)
+    model.step(frame, LossSettings(), _RATES, 1, sh_degree)

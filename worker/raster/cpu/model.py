@@ -5,36 +5,34 @@ N Gaussians (padded to whole vectors), rows of N floats; canonical and state [13
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from collections import OrderedDict
+from dataclasses import astuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from worker.deformation import Deformation
 from worker.gaussians import SH_C0, Gaussians
+from worker.loss import LossSettings
 from worker.optimize import StepRates, adam_step
 from worker.raster.cpu import harmonics, update
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
-from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, Target, padded
+from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, padded
 from worker.raster.cpu.threads import run
+from worker.raster.step import StepSums, TrainingFrame
 
 PAD_LOGIT = -30.0
 """Opacity logit of the columns that only fill the last vector: never drawn."""
-
-
-@dataclass(frozen=True)
-class StepSums:
-    """Sums over the tissue pixels of one step, before its update."""
-
-    colour_l1: float
-    depth_l1: float
-    squared_error: float
-    holes: float
+SIZES_KEPT = 3
+"""Image sizes, of those used last, whose buffers are kept."""
 
 
 class FusedModel:
     """Canonical Gaussians, their deformation and Adam's moments, trained a frame at a time on the CPU."""
+
+    answers_every = 1
 
     def __init__(self, gaussians: Gaussians, deformation: Deformation, width: int, height: int):
         self.count = len(gaussians)
@@ -50,7 +48,8 @@ class FusedModel:
         self.sh_rest[:, :, : self.count] = gaussians.sh[:, 1:].permute(1, 2, 0).numpy()
         self.sh_degree = gaussians.sh_degree  # of those stored; a schedule may use fewer
         self.motion = self._motion_of(deformation, columns)
-        self.rasterizer = Rasterizer(width, height)
+        self._rasterizers: OrderedDict[tuple[int, int], Rasterizer] = OrderedDict()
+        self.rasterizer = self._rasterizer(width, height)
         self._moments = {name: np.zeros((2, *a.shape), np.float32) for name, a in self._parameters().items()}
         self._allocate()
 
@@ -66,18 +65,28 @@ class FusedModel:
         self.colour = np.zeros((3, columns), np.float32)
         self._v_rest = np.zeros_like(self.sh_rest)
 
-    @property
-    def gradient_norm(self) -> Floats:
-        """[N] |dL/dmean2d| of the last step in NDC; a view."""
-        return self.rasterizer.gradients.mean2d_norm[: self.count]
+    def _rasterizer(self, width: int, height: int) -> Rasterizer:
+        """The buffers of an image size; the few sizes used last are kept."""
+        if (width, height) not in self._rasterizers:
+            self._rasterizers[width, height] = Rasterizer(width, height)
+        self._rasterizers.move_to_end((width, height))
+        while len(self._rasterizers) > SIZES_KEPT:
+            self._rasterizers.popitem(last=False)
+        return self._rasterizers[width, height]
 
     @property
-    def visible(self) -> NDArray[np.bool_]:
+    def gradient_norm(self) -> Tensor:
+        """[N] |dL/dmean2d| of the last step in NDC; a view."""
+        return torch.from_numpy(self.rasterizer.gradients.mean2d_norm[: self.count])
+
+    @property
+    def visible(self) -> Tensor:
         """[N] whether the last frame could see each Gaussian."""
-        return self.rasterizer.radius2[: self.count] >= 0
+        return torch.from_numpy(self.rasterizer.radius2[: self.count] >= 0)
 
     def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
         """The Gaussians at time t on this camera's image."""
+        self.rasterizer = self._rasterizer(int(camera[4]), int(camera[5]))
         self.motion.deform(self.canonical, t, self.state)
         if sh_degree == 0:
             np.multiply(self.state[10:13], np.float32(SH_C0), out=self.colour)
@@ -97,36 +106,40 @@ class FusedModel:
         blended: Floats = self.rasterizer.render(values)[5]
         return blended
 
+    def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
+        """Gradient of sum(cotangents * render(camera, t)) to the Gaussians as they are at t, [14, N]."""
+        self.project(camera, t, 0)
+        gradients = self.rasterizer.cotangent_backward(cotangents)
+        colour = gradients.colour * np.float32(SH_C0)
+        return np.concatenate([gradients.state[:10], colour, gradients.opacity_logit[None]])[:, : self.count]
+
     def deformed_mean(self, t: float) -> Floats:
         """Centres at time t, [3, N] in units, as a copy."""
         self.motion.deform(self.canonical, t, self.state)
         return self.state[:3, : self.count].copy()
 
     def step(
-        self,
-        camera: NDArray[np.float64],
-        t: float,
-        target: Target,
-        loss_settings: Floats,
-        rates: StepRates,
-        iteration: int,
-        sh_degree: int = 0,
+        self, frame: TrainingFrame, loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
     ) -> StepSums:
         """One iteration (counted from 1) on one frame; sh_degree: the harmonics in use at this iteration."""
-        self.project(camera, t, sh_degree)
-        gradients = self.rasterizer.loss_backward(target, loss_settings)
+        self.project(frame.camera, frame.t, sh_degree)
+        gradients = self.rasterizer.loss_backward(frame.target, frame.loss_settings(loss))
         if sh_degree == 0:
             np.multiply(gradients.colour, np.float32(SH_C0), out=gradients.state[10:13])
             gradients.state[10:13] *= self.colour > 0
         else:
             run(
-                harmonics.colour_from_sh_backward, sh_degree, _centre(camera), self.state, self.sh_rest, self.colour,
-                gradients.colour, self._v_rest, gradients.state,
+                harmonics.colour_from_sh_backward, sh_degree, _centre(frame.camera), self.state, self.sh_rest,
+                self.colour, gradients.colour, self._v_rest, gradients.state,
             )  # fmt: skip
-        self.motion.update(gradients.state, t, rates, iteration)
+        self.motion.update(gradients.state, frame.t, rates, iteration)
         self.update_canonical(gradients, rates, iteration, sh_degree)
         colour_l1, depth_l1, squared_error, holes = self.rasterizer.statistics.sum(0, dtype=np.float64).tolist()
-        return StepSums(colour_l1, depth_l1, squared_error, holes)
+        visible = int(np.count_nonzero(self.rasterizer.radius2[: self.count] >= 0))
+        return StepSums(colour_l1, depth_l1, squared_error, holes, visible)
+
+    def wait(self) -> None:
+        """Every step has been waited for, and answered."""
 
     def update_canonical(self, gradients: Gradients, rates: StepRates, iteration: int, sh_degree: int) -> None:
         """One Adam step of everything but the motion, given dL/dcanonical."""
@@ -155,21 +168,25 @@ class FusedModel:
         self.count = count
         self._allocate()
 
-    def parameters(self) -> dict[str, np.ndarray]:
+    def parameters(self) -> dict[str, Tensor]:
         """What is trained, by name; views of the live arrays."""
-        return {**self._parameters(), **self.motion.parameters()}
+        return {**self._views(self._parameters()), **self.motion.parameters(self.count)}
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, Tensor]:
         """Everything a resumed run needs, by name; views of the live arrays."""
         moments = {f"moments.{name}": values for name, values in self._moments.items()}
-        return {**self._parameters(), **moments, **self.motion.arrays()}
+        return {**self._views(self._parameters() | moments), **self.motion.arrays(self.count)}
 
-    def load_arrays(self, stored: dict[str, np.ndarray]) -> None:
+    def _views(self, padded_arrays: dict[str, Floats]) -> dict[str, Tensor]:
+        return {name: torch.from_numpy(values)[..., : self.count] for name, values in padded_arrays.items()}
+
+    def load_arrays(self, stored: dict[str, Tensor]) -> None:
         """Put back what arrays() gave, into a model of the same size."""
         for name, values in self.arrays().items():
             if stored[name].shape != values.shape:
-                raise ValueError(f"{name} has shape {stored[name].shape}, this model needs {values.shape}")
-            values[...] = stored[name]
+                shapes = tuple(stored[name].shape), tuple(values.shape)
+                raise ValueError(f"{name} has shape {shapes[0]}, this model needs {shapes[1]}")
+            values.copy_(stored[name])
 
     def export(self) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as torch tensors (copies)."""

@@ -6,10 +6,12 @@ N Gaussians (padded), B bases, C channels (10, or 13 where colour moves too), ro
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from worker.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
 from worker.optimize import StepRates, adam_step
@@ -40,11 +42,11 @@ class Motion(Protocol):
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         """Keep these columns, in this order; moments start at 0 where fresh."""
 
-    def parameters(self) -> dict[str, np.ndarray]:
-        """What is trained, by name; views."""
+    def parameters(self, count: int) -> dict[str, Tensor]:
+        """What is trained, of the first count Gaussians, by name; views."""
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Everything that must be stored to resume, by name; views."""
+    def arrays(self, count: int) -> dict[str, Tensor]:
+        """Everything that must be stored to resume, likewise."""
 
     def export(self, count: int) -> Deformation:
         """The first count Gaussians' deformation as torch tensors (copies)."""
@@ -102,12 +104,11 @@ class LinearMotion:
         self.weight = np.ascontiguousarray(self.weight[:, :, columns])
         self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
 
-    def parameters(self) -> dict[str, np.ndarray]:
-        return {"motion.weight": self.weight}
+    def parameters(self, count: int) -> dict[str, Tensor]:
+        return _views(self, ("weight",), count)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        names = ("first", "second", "steps")
-        return self.parameters() | {f"motion.{name}": getattr(self, name) for name in names}
+    def arrays(self, count: int) -> dict[str, Tensor]:
+        return _views(self, ("weight", "first", "second"), count) | {"motion.steps": torch.from_numpy(self.steps)}
 
     def export(self, count: int) -> LinearDeformation:
         weight = torch.from_numpy(np.ascontiguousarray(self.weight[:, :, :count].transpose(2, 1, 0)))
@@ -142,11 +143,11 @@ class FdmMotion:
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[..., columns]))
         self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
 
-    def parameters(self) -> dict[str, np.ndarray]:
-        return {f"motion.{name}": getattr(self, name) for name in ("weight", "centre", "width")}
+    def parameters(self, count: int) -> dict[str, Tensor]:
+        return _views(self, ("weight", "centre", "width"), count)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return self.parameters() | {"motion.first": self.first, "motion.second": self.second}
+    def arrays(self, count: int) -> dict[str, Tensor]:
+        return _views(self, ("weight", "centre", "width", "first", "second"), count)
 
     def export(self, count: int) -> FlexibleDeformation:
         weight, centre, width = (
@@ -154,6 +155,11 @@ class FdmMotion:
             for a in (self.weight, self.centre, self.width)
         )
         return FlexibleDeformation(weight, centre, width, form=self.form)
+
+
+def _views(motion: LinearMotion | FdmMotion, names: Sequence[str], count: int) -> dict[str, Tensor]:
+    """Arrays of a motion by name, the columns that only fill the last vector left out."""
+    return {f"motion.{name}": torch.from_numpy(getattr(motion, name))[..., :count] for name in names}
 
 
 def _columns_last(tensor: torch.Tensor, columns: int, fill: float) -> Floats:

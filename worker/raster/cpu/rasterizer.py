@@ -8,14 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from worker.raster import Camera
 from worker.raster.cpu import bins, project
 from worker.raster.cpu.blend import COTANGENT, LOSS, PLANE, PLANES, RECORD, RENDER, STATISTICS, blend
 from worker.raster.cpu.threads import run, thread_count
 from worker.raster.cpu.vectors import LANES
+from worker.raster.step import Target
 
 Floats = NDArray[np.float32]
 _NO_LOSS = np.zeros(5, np.float32)
@@ -31,23 +30,6 @@ def _aligned(rows: int, columns: int) -> Floats:
 def padded(count: int) -> int:
     """The next multiple of LANES: rows of N are processed LANES at a time."""
     return -(-count // LANES) * LANES
-
-
-def camera_vector(camera: Camera) -> NDArray[np.float64]:
-    """fx, fy, cx, cy, W, H and camera_from_world [3, 4] row-major, as the kernels read a camera."""
-    given = camera.camera_from_world
-    matrix = given.detach().double().numpy() if isinstance(given, torch.Tensor) else given
-    pose = np.asarray(matrix, np.float64)[:3].ravel()
-    return np.concatenate([[camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], pose])
-
-
-@dataclass
-class Target:
-    """What a rendered frame is compared with, padded to whole tiles; one row of TrainingTargets."""
-
-    rgb: NDArray[np.uint8]  # [3 * H * stride]
-    weight: NDArray[np.uint8]  # [H * stride], 255 = tissue
-    inverse_depth: Floats  # [H * stride], 1 / units, 0 = none
 
 
 @dataclass

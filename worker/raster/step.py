@@ -1,0 +1,77 @@
+"""What a training step is given and what it answers, on every device.
+
+Symbols: H W pixels; stride = W rounded up to whole vectors of the CPU's kernels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from worker.loss import LossSettings
+from worker.raster import Camera
+
+
+def camera_vector(camera: Camera) -> NDArray[np.float64]:
+    """fx, fy, cx, cy, W, H and camera_from_world [3, 4] row-major, as the kernels read a camera."""
+    given = camera.camera_from_world
+    matrix = given.detach().double().numpy() if isinstance(given, torch.Tensor) else given
+    pose = np.asarray(matrix, np.float64)[:3].ravel()
+    return np.concatenate([[camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], pose])
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What a rendered frame is compared with, its rows padded to the stride."""
+
+    rgb: NDArray[np.uint8]  # [3 * H * stride]
+    weight: NDArray[np.uint8]  # [H * stride], 255 = tissue
+    inverse_depth: NDArray[np.float32]  # [H * stride], 1 / units, 0 = none
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingFrame:
+    """One frame to train on. It is equal to itself alone, so a device may keep what it copied of it by the object.
+
+    camera           camera_vector, in optimiser units
+    t                model time
+    target           on the host
+    tissue_pixels    how many pixels are tissue
+    measured_pixels  how many of those have a depth
+    """
+
+    camera: NDArray[np.float64]
+    t: float
+    target: Target
+    tissue_pixels: int
+    measured_pixels: int
+
+    def loss_settings(self, loss: LossSettings) -> NDArray[np.float32]:
+        """[5] as the blend applies them a pixel (cpu/blend.py): each loss is a mean over its valid pixels."""
+        return np.array(
+            [
+                loss.colour_weight / (3 * max(self.tissue_pixels, 1)),
+                loss.depth_weight / max(self.measured_pixels, 1),
+                1 / max(loss.colour_zone, 1e-30),
+                1 / max(loss.depth_zone, 1e-30),
+                float(loss.normalised_depth),
+            ],
+            np.float32,
+        )
+
+
+@dataclass(frozen=True)
+class StepSums:
+    """Sums over the tissue pixels, before the update, of the steps since the last answer; one step on the CPU.
+
+    visible  Gaussians in view; of several steps the least
+    """
+
+    colour_l1: float
+    depth_l1: float
+    squared_error: float
+    holes: float
+    visible: int
