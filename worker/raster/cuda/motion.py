@@ -1,0 +1,260 @@
+"""The deformation on the device, linear in bases common to all Gaussians or FDM; Adam's moments beside the weights.
+
+N Gaussians (padded), F frames a step, B bases, C channels (10, or 13 where colour moves too); rows of N floats. What is
+alive, negligible and counted is as in raster/cpu/motion.py.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+import triton
+from torch import Tensor
+
+from worker.deformation import Deformation, FlexibleDeformation
+from worker.optimize import StepRates, adam_step
+from worker.raster.cpu.motion import NEGLIGIBLE, LinearDeformation
+from worker.raster.cuda import motion_kernels as kernels
+from worker.raster.cuda.control import ADAM, Field
+from worker.raster.cuda.update import BLOCK, PROGRAM_ROWS, ROWS
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a step's last kernel changes beside the motion, and the gradients it reads; update.py has the shapes."""
+
+    canonical: Tensor
+    canonical_moments: Tensor
+    opacity_logit: Tensor
+    opacity_moments: Tensor
+    v_state: Tensor
+    v_opacity_logit: Tensor
+    v_colour: Tensor
+    colour: Tensor
+    touched: Tensor
+    statistics: Tensor
+    ok: Tensor
+    report: Tensor
+
+    @property
+    def frames(self) -> int:
+        """F."""
+        return self.v_state.shape[0]
+
+    @property
+    def columns(self) -> int:
+        """N, padded."""
+        return self.canonical.shape[1]
+
+    @property
+    def tiles(self) -> int:
+        """Of all frames."""
+        return self.statistics.numel() // 4
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """In the order in which the kernels take them, without those of the motion, which come after the fourth."""
+        return tuple(getattr(self, field.name) for field in dataclasses.fields(self))
+
+
+class Motion(Protocol):
+    """A deformation the step can evaluate and train; `control` is the block's fields on the device (control.py)."""
+
+    def fields(self, frames: int) -> dict[str, Field]:
+        """What it needs in the control block."""
+
+    def write_times(self, row: Mapping[str, np.ndarray], times: Sequence[float]) -> None:
+        """Fill what deform reads."""
+
+    def write_rates(self, row: Mapping[str, np.ndarray], times: Sequence[float], rates: StepRates, step: int) -> None:
+        """Fill what update reads beside, and count the step; it is counted from 1."""
+
+    def deform(self, canonical: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
+        """state [F, 13, N] = canonical + psi(t) at the times, colour [F, 3, N] without other harmonics."""
+
+    def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
+        """One Adam step of the canonical state, the opacity and the weights that reach the times, and its report."""
+
+    def take(self, columns: Tensor, fresh: Tensor) -> None:
+        """Keep these columns, in this order; moments start at 0 where fresh."""
+
+    def parameters(self, count: int) -> dict[str, Tensor]:
+        """What is trained, of the first count Gaussians, by name; views."""
+
+    def arrays(self, count: int) -> dict[str, Tensor]:
+        """Everything that must be stored to resume, likewise. motion.steps lies on the host."""
+
+    def export(self, count: int) -> Deformation:
+        """The first count Gaussians' deformation as tensors on the CPU (copies)."""
+
+
+def kept_where_old(moments: Tensor, columns: Tensor, fresh: Tensor) -> Tensor:
+    """These columns of Adam's moments, 0 where fresh."""
+    return moments.index_select(-1, columns).masked_fill_(fresh, 0.0)
+
+
+def _grid(rows: int, columns: int, *frames: int) -> tuple[int, ...]:
+    return (triton.cdiv(columns, BLOCK), rows, *frames)
+
+
+class LinearMotion:
+    """Bases of t common to all Gaussians; only the weights of those alive at a step's times are read or written in it.
+
+    Adam's moments of a weight advance only in steps that use it, with its own count of them.
+    """
+
+    def __init__(self, deformation: LinearDeformation, columns: int, device: torch.device) -> None:
+        count, self._channels, self._bases = deformation.weight.shape
+        self._form = dataclasses.replace(deformation, weight=deformation.weight[:0])  # for its bases, not its weights
+        self.weight = torch.zeros(self._bases, self._channels, columns, device=device)
+        self.weight[:, :, :count] = deformation.weight.permute(2, 1, 0).to(device)
+        self.first, self.second = torch.zeros_like(self.weight), torch.zeros_like(self.weight)
+        self.steps = torch.zeros(self._bases, dtype=torch.int64)
+        self._found: dict[float, tuple[np.ndarray, int, int]] = {}
+
+    def _alive(self, t: float) -> tuple[np.ndarray, int, int]:
+        """The bases' values at t, and the first of those in use and the one after the last; 0 outside of them."""
+        if t not in self._found:
+            values = self._form.basis(t).numpy()
+            alive = np.flatnonzero(np.abs(values) >= NEGLIGIBLE)
+            first, last = (int(alive[0]), int(alive[-1]) + 1) if alive.size else (0, 0)
+            values[:first], values[last:] = 0.0, 0.0
+            self._found[t] = values, first, last
+        return self._found[t]
+
+    def fields(self, frames: int) -> dict[str, Field]:
+        bases = self._bases
+        return {
+            "basis": Field((frames, bases)),
+            "span": Field((frames, 2), "int"),
+            "alive": Field((1 + bases,), "int"),
+            "basis_size": Field((bases,)),
+            "basis_floor": Field((bases,)),
+            "channel_rate": Field((ROWS,)),
+        }
+
+    def write_times(self, row: Mapping[str, np.ndarray], times: Sequence[float]) -> None:
+        for frame, t in enumerate(times):
+            row["basis"][frame], *row["span"][frame] = self._alive(t)
+
+    def write_rates(self, row: Mapping[str, np.ndarray], times: Sequence[float], rates: StepRates, step: int) -> None:
+        spans = [range(*self._alive(t)[1:]) for t in times]
+        alive = sorted(set().union(*spans))
+        row["alive"][0], row["alive"][1 : 1 + len(alive)] = len(alive), alive
+        steps = self.steps.numpy()
+        steps[alive] += 1
+        for j in alive:
+            adam = adam_step(1.0, rates, int(steps[j]))
+            row["basis_size"][j], row["basis_floor"][j] = adam.size, adam.floor
+        channel_rate = row["channel_rate"]
+        channel_rate[0:3], channel_rate[3:7] = rates.motion_mean, rates.motion_quaternion
+        channel_rate[7:10], channel_rate[10:13] = rates.motion_log_scale, rates.motion_colour
+
+    def deform(self, canonical: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
+        frames, _, columns = state.shape
+        kernels.deform_linear[_grid(ROWS, columns, frames)](
+            canonical, self.weight, control["basis"], control["span"], state, colour, columns, self._bases,
+            CHANNELS=self._channels, BLOCK=BLOCK,
+        )  # fmt: skip
+
+    def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
+        tensors = trained.tensors()
+        kernels.update_linear[_grid(PROGRAM_ROWS, trained.columns)](
+            *tensors[:4], self.weight, self.first, self.second, *tensors[4:], *(control[name] for name in ADAM),
+            *(control[name] for name in ("basis", "alive", "basis_size", "basis_floor", "channel_rate")),
+            trained.columns, self._bases, trained.tiles, CHANNELS=self._channels, FRAMES=trained.frames, BLOCK=BLOCK,
+        )  # fmt: skip
+
+    def take(self, columns: Tensor, fresh: Tensor) -> None:
+        self.weight = self.weight.index_select(-1, columns)
+        self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
+
+    def parameters(self, count: int) -> dict[str, Tensor]:
+        return _views(self, ("weight",), count)
+
+    def arrays(self, count: int) -> dict[str, Tensor]:
+        return _views(self, ("weight", "first", "second"), count) | {"motion.steps": self.steps}
+
+    def export(self, count: int) -> LinearDeformation:
+        weight = self.weight[:, :, :count].permute(2, 1, 0).contiguous().cpu()
+        return dataclasses.replace(self._form, weight=weight)
+
+
+class FdmMotion:
+    """The paper's FDM: weight, centre and width of every basis learnable a Gaussian and channel; dense Adam."""
+
+    def __init__(self, deformation: FlexibleDeformation, columns: int, device: torch.device) -> None:
+        self._form = deformation.form
+        self.weight, self.centre, self.width = (
+            _columns_last(tensor, columns, fill, device)
+            for tensor, fill in ((deformation.weight, 0.0), (deformation.centre, 0.5), (deformation.width, 1.0))
+        )
+        self.first = torch.zeros(3, *self.weight.shape, device=device)
+        self.second = torch.zeros_like(self.first)
+
+    def fields(self, frames: int) -> dict[str, Field]:
+        return {"time": Field((frames,)), "motion_size": Field((1,))}
+
+    def write_times(self, row: Mapping[str, np.ndarray], times: Sequence[float]) -> None:
+        row["time"][:] = times
+
+    def write_rates(self, row: Mapping[str, np.ndarray], times: Sequence[float], rates: StepRates, step: int) -> None:
+        row["motion_size"][0] = adam_step(rates.motion_mean, rates, step).size
+
+    def deform(self, canonical: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
+        frames, _, columns = state.shape
+        kernels.deform_fdm[_grid(ROWS, columns, frames)](
+            canonical, self.weight, self.centre, self.width, control["time"], state, colour, columns,
+            self.weight.shape[1], QUARTIC=self._form == "quartic", BLOCK=BLOCK,
+        )  # fmt: skip
+
+    def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
+        tensors = trained.tensors()
+        kernels.update_fdm[_grid(PROGRAM_ROWS, trained.columns)](
+            *tensors[:4], self.weight, self.centre, self.width, self.first, self.second, *tensors[4:],
+            *(control[name] for name in ADAM), control["time"], control["motion_size"],
+            trained.columns, self.weight.shape[1], trained.tiles,
+            QUARTIC=self._form == "quartic", FRAMES=trained.frames, BLOCK=BLOCK,
+        )  # fmt: skip
+
+    def take(self, columns: Tensor, fresh: Tensor) -> None:
+        for name in ("weight", "centre", "width"):
+            setattr(self, name, getattr(self, name).index_select(-1, columns))
+        self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
+
+    def parameters(self, count: int) -> dict[str, Tensor]:
+        return _views(self, ("weight", "centre", "width"), count)
+
+    def arrays(self, count: int) -> dict[str, Tensor]:
+        return _views(self, ("weight", "centre", "width", "first", "second"), count)
+
+    def export(self, count: int) -> FlexibleDeformation:
+        weight, centre, width = (
+            each[..., :count].permute(2, 0, 1).contiguous().cpu() for each in (self.weight, self.centre, self.width)
+        )
+        return FlexibleDeformation(weight, centre, width, form=self._form)
+
+
+def _views(motion: LinearMotion | FdmMotion, names: Sequence[str], count: int) -> dict[str, Tensor]:
+    """Tensors of a motion by name, the columns that only fill the rows left out."""
+    return {f"motion.{name}": getattr(motion, name)[..., :count] for name in names}
+
+
+def _columns_last(tensor: Tensor, columns: int, fill: float, device: torch.device) -> Tensor:
+    """[N, 10, B] tensor as [10, B, columns] rows."""
+    rows = torch.full((*tensor.shape[1:], columns), fill, device=device)
+    rows[..., : tensor.shape[0]] = tensor.permute(1, 2, 0).to(device)
+    return rows
+
+
+def motion_of(deformation: Deformation, columns: int, device: torch.device) -> LinearMotion | FdmMotion:
+    """The trainable form of a deformation, padded to columns Gaussians; ValueError if it has none."""
+    if isinstance(deformation, FlexibleDeformation):
+        return FdmMotion(deformation, columns, device)
+    if isinstance(deformation, LinearDeformation):
+        return LinearMotion(deformation, columns, device)
+    raise ValueError(f"deformation {deformation.kind!r} has no kernels of its own: worker/unfused.py trains it")
