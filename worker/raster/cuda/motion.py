@@ -180,7 +180,7 @@ class LinearMotion:
         return _views(self, ("weight", "first", "second"), count) | {"motion.steps": self.steps}
 
     def export(self, count: int) -> LinearDeformation:
-        weight = self.weight[:, :, :count].permute(2, 1, 0).contiguous().cpu()
+        weight = _host_copy(self.weight[:, :, :count].permute(2, 1, 0))
         return dataclasses.replace(self._form, weight=weight)
 
 
@@ -234,7 +234,7 @@ class FdmMotion:
 
     def export(self, count: int) -> FlexibleDeformation:
         weight, centre, width = (
-            each[..., :count].permute(2, 0, 1).contiguous().cpu() for each in (self.weight, self.centre, self.width)
+            _host_copy(each[..., :count].permute(2, 0, 1)) for each in (self.weight, self.centre, self.width)
         )
         return FlexibleDeformation(weight, centre, width, form=self._form)
 
@@ -242,6 +242,10 @@ class FdmMotion:
 def _views(motion: LinearMotion | FdmMotion, names: Sequence[str], count: int) -> dict[str, Tensor]:
     """Tensors of a motion by name, the columns that only fill the rows left out."""
     return {f"motion.{name}": getattr(motion, name)[..., :count] for name in names}
+
+
+def _host_copy(tensor: Tensor) -> Tensor:
+    return tensor.cpu().clone(memory_format=torch.contiguous_format)
 
 
 def _columns_last(tensor: Tensor, columns: int, fill: float, device: torch.device) -> Tensor:

@@ -1,0 +1,281 @@
+"""The blend on the device: compositing, the loss, and the gradients of every splat, a tile a program.
+
+Symbols: K splats of a chunk (axis 0), P pixels of a tile (axis 1); for one pixel and its splats i, nearest first,
+    alpha_i = min(MAX_ALPHA, 2**power2_i), 0 below MIN_ALPHA or once T < MIN_TRANSMITTANCE
+    T_i     = product over j < i of (1 - alpha_j);  w_i = alpha_i T_i
+    odds_i  = alpha_i / (1 - alpha_i), so that w_i = odds_i T_(i+1): an inclusive product is all that is needed
+    s_i     = g_C . c_i + g_Z z_i + g_A, with g the loss gradient at this pixel
+    R_i     = sum over j > i of w_j s_j, what the pixel's gradient holds behind splat i
+    dL/dpower_i = w_i (s_i - R_i / T_(i+1)) = odds_i (T_(i+1) s_i - R_i), 0 where alpha was capped
+R is summed from the back, so it holds no difference of large numbers, and 1 / (1 - alpha) is never more than 100.
+Derivations: docs/rasterizer.md; the loss: worker/loss.py, as in worker/raster/cpu/blend.py.
+
+Layout. Pixels lie along the lanes and all K splats of a pixel in one thread: products and sums over splats need no
+shuffle. A program is one warp, so its barriers cost nothing; what keeps the processor busy is the K P / 32 independent
+numbers a thread works on. Sums over pixels are matrix products on the tensor cores: dL/dpower times the monomials 1 x y
+xx xy yy of the pixel (relative to the tile's middle), and w times g. One operand is split into two parts of 11 bits,
+hence exact to 2^-22; the monomials have few enough bits to be exact, and g is split too, into 8 columns.
+
+Each instance's gradient goes to its own slot (bins.py): SLOT floats, the moments in 0:6 and dL/d(r, g, b, z) in 8:12
+plus 12:16. No atomics, so the same inputs give the same bits.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from worker.raster.cuda.project import RECORD
+from worker.raster.cuda.project_backward import SLOT
+
+CHUNK = 16
+"""Splats a chunk: the least a matrix product takes, and K P / 32 = 32 registers an intermediate."""
+WARPS = 1
+STATISTICS = 4
+"""Sums a tile reports: colour loss, depth loss, squared colour error (of channels), |1 - A| over tissue."""
+RENDER, LOSS, COTANGENT = 0, 1, 2
+"""Modes: images only; images never, gradients of the built-in loss; gradients of given image cotangents."""
+
+_RECORD = tl.constexpr(RECORD)
+_SLOT = tl.constexpr(SLOT)
+_STATISTICS = tl.constexpr(STATISTICS)
+_RENDER, _LOSS = tl.constexpr(RENDER), tl.constexpr(LOSS)
+_MIN_ALPHA, _MAX_ALPHA = tl.constexpr(MIN_ALPHA), tl.constexpr(MAX_ALPHA)
+_STOP = tl.constexpr(MIN_TRANSMITTANCE)
+_UPPER_BITS = tl.constexpr(-(1 << 13))  # the sign, the exponent and 10 bits of a float32: what TF32 keeps
+_PER_BYTE = tl.constexpr(1.0 / 255.0)
+_LEAST_COVER = tl.constexpr(1e-2)
+_NOWHERE = tl.constexpr(-1000.0)  # log2 of an opacity that is never drawn
+
+
+@triton.jit
+def _pair(records, row, part: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Floats 2 part and 2 part + 1 of K records, each [K, 1].
+
+    Two floats are read as one int64, of which every thread wants both halves: half as many loads as floats.
+    """
+    both = tl.load(records + row * (_RECORD // 2) + part)
+    first = both.to(tl.int32).to(tl.float32, bitcast=True)
+    second = (both >> 32).to(tl.int32).to(tl.float32, bitcast=True)
+    return first[:, None], second[:, None]
+
+
+@triton.jit
+def _weights(records, row, there, x, y, before, k):  # type: ignore[no-untyped-def]
+    """2^power2, odds and T after each splat [K, P] of a chunk in front of which T is before [P]; k = 0 ... K - 1."""
+    mean_x, mean_y = _pair(records, row, 0)
+    k_xx, k_xy = _pair(records, row, 1)
+    k_yy, lo = _pair(records, row, 2)
+    lo = tl.where(there[:, None], lo, _NOWHERE)
+    dx, dy = x[None, :] - mean_x, y[None, :] - mean_y
+    power2 = tl.fma(dx, tl.fma(k_xx, dx, k_xy * dy), tl.fma(k_yy * dy, dy, lo))
+    raw = tl.exp2(power2)
+    alpha = tl.where(raw < _MIN_ALPHA, 0.0, tl.minimum(raw, _MAX_ALPHA))
+    root = tl.rsqrt(1.0 - alpha)
+    inverse = root * root
+    after = tl.cumprod((1.0 - alpha) * tl.where(k == 0, before[None, :], 1.0), 0)
+    # Beyond a full pixel T only gets smaller, so the products may go on (worker/raster/reference.py).
+    odds = tl.where(after * inverse < _STOP, 0.0, alpha * inverse)
+    return raw, odds, after
+
+
+@triton.jit
+def _row(values, k, which: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Row which of values [K, P]. Adding -0.0 is no instruction, since a thread's k are known to the compiler."""
+    return tl.sum(tl.where(k == which, values, -0.0), 0)
+
+
+@triton.jit
+def _upper(value):  # type: ignore[no-untyped-def]
+    """value cut to the bits that a TF32 product keeps; what is left has as few."""
+    return (value.to(tl.int32, bitcast=True) & _UPPER_BITS).to(tl.float32, bitcast=True)
+
+
+@triton.jit
+def _sum_split(values, columns):  # type: ignore[no-untyped-def]
+    """values [K, P] times columns [P, 8], whose numbers have at most 11 bits: [K, 8]."""
+    upper = _upper(values)
+    lower = tl.dot(values - upper, columns, input_precision="tf32")
+    return tl.dot(upper, columns, lower, input_precision="tf32")
+
+
+@triton.jit
+def _split_columns(red, green, blue, depth):  # type: ignore[no-untyped-def]
+    """[P, 8]: the upper bits of four numbers a pixel, then what is left of them."""
+    column = tl.arange(0, 8)[None, :]
+    which = column % 4
+    value = tl.where(which < 2, tl.where(which == 0, red[:, None], green[:, None]), blue[:, None])
+    value = tl.where(which == 3, depth[:, None], value)
+    return tl.where(column < 4, _upper(value), value - _upper(value))
+
+
+@triton.jit
+def _clip_unit(value):  # type: ignore[no-untyped-def]
+    """value held within [-1, 1]: the derivative of the L1 loss with a quadratic zone of half-width 1."""
+    return tl.minimum(tl.maximum(value, -1.0), 1.0)
+
+
+@triton.jit
+def _monomials(x, y):  # type: ignore[no-untyped-def]
+    """[P, 8]: 1 x y xx xy yy 0 0 of pixels at x, y [P]."""
+    column = tl.arange(0, 8)[None, :]
+    by_x = tl.where((column == 1) | (column == 4), x[:, None], tl.where(column == 3, (x * x)[:, None], 1.0))
+    by_y = tl.where((column == 2) | (column == 4), y[:, None], tl.where(column == 5, (y * y)[:, None], 1.0))
+    return tl.where(column < 6, by_x * by_y, 0.0)
+
+
+@triton.jit
+def _colour_loss(colour, target, q, inside, tissue, sharpness, weight):  # type: ignore[no-untyped-def]
+    """One channel's L1, squared error and gradient at P pixels."""
+    error = colour - tl.load(target + q, mask=inside, other=0).to(tl.float32) * _PER_BYTE
+    slope = _clip_unit(error * sharpness) * tissue * weight
+    return tl.sum(tl.abs(error) * tissue), tl.sum(error * error * tissue), slope
+
+
+@triton.jit
+def _depth_loss(depth, cover, wanted, tissue, normalised, sharpness, weight):  # type: ignore[no-untyped-def]
+    """L1 of the inverse depth, and its gradients to sum w z and sum w."""
+    # Where nothing was blended there is no depth to correct; _LEAST_COVER keeps the divisions finite.
+    usable = (wanted > 0.0) & (cover > _LEAST_COVER)
+    inverse = 1.0 / tl.where(usable & (tissue > 0.0), depth, 1.0)
+    rendered = tl.where(normalised, cover * inverse, inverse)
+    error = rendered - wanted
+    share = tl.where(usable, tissue, 0.0)
+    slope = _clip_unit(error * sharpness) * share * weight
+    # d(1/D)/dZ with D = Z (paper) or Z / A; d(1/D)/dA = 1 / Z in the second case.
+    return tl.sum(share * tl.abs(error)), -slope * rendered * inverse, tl.where(normalised, slope * inverse, 0.0)
+
+
+@triton.jit
+def blend(  # type: ignore[no-untyped-def]
+    records, owner, slot, tile_start, before, image, slots, statistics,
+    target, weight, inverse_depth, loss_settings, frame,
+    width, height, tiles_x, tiles,
+    MODE: tl.constexpr, VALUES: tl.constexpr, TILE_W: tl.constexpr, TILE_H: tl.constexpr, K: tl.constexpr,
+):  # fmt: skip
+    """Composite one tile of one frame: program = frame * tiles + tile, tiles row by row.
+
+    records [F N, RECORD] (project.py). owner, slot int32 [M]: record and slot of every instance, sorted by tile, nearest
+    first; tile_start int32 [F tiles + 1]. before [M / K + F tiles, P]: scratch for T before each chunk.
+    image [F, 5 or 6, H, W]: R G B Z A and, with VALUES, the blended value: written in RENDER; read as cotangents in
+    COTANGENT. slots [M, SLOT] and, in LOSS, statistics [F tiles, STATISTICS] are written.
+    target [*, 3, H, W] uint8, weight [*, H, W] uint8 (255 = tissue), inverse_depth [*, H, W] (0 = none), of which the
+    tile's frame is frame[f]; loss_settings float32 [F, 5]: colour weight a channel, depth weight, 1 / width of the
+    quadratic zone of the colour and of the depth loss, 1 for normalised depth else 0.
+
+    One long function, because the pixels' sums have to stay in registers from the first chunk to the last.
+    """
+    P: tl.constexpr = TILE_W * TILE_H
+    program = tl.program_id(0)
+    f, tile = program // tiles, program % tiles
+    pixel = tl.arange(0, P)
+    column, line = tile % tiles_x * TILE_W + pixel % TILE_W, tile // tiles_x * TILE_H + pixel // TILE_W
+    inside = (column < width) & (line < height)
+    x, y = column.to(tl.float32) + 0.5, line.to(tl.float32) + 0.5
+    at_pixel, size = line * width + column, width * height
+    first, end = tl.load(tile_start + program), tl.load(tile_start + program + 1)
+    in_chunk = tl.arange(0, K)
+    k = in_chunk[:, None]
+    scratch = before + (first // K + program).to(tl.int64) * P
+
+    transmittance = tl.where(inside, 1.0, 0.0)
+    red = tl.zeros((P,), tl.float32)
+    green, blue, depth, cover, value = red, red, red, red, red
+    i = first
+    while (i < end) & (tl.max(transmittance) >= _STOP):
+        there = i + in_chunk < end
+        row = tl.load(owner + tl.minimum(i + in_chunk, end - 1))
+        _, odds, after = _weights(records, row, there, x, y, transmittance, k)
+        w = odds * after
+        c_red, c_green = _pair(records, row, 3)
+        c_blue, c_depth = _pair(records, row, 4)
+        red += tl.sum(w * c_red, 0)
+        green += tl.sum(w * c_green, 0)
+        blue += tl.sum(w * c_blue, 0)
+        depth += tl.sum(w * c_depth, 0)
+        cover += tl.sum(w, 0)
+        if VALUES:
+            c_value, _ = _pair(records, row, 5)
+            value += tl.sum(w * c_value, 0)
+        if MODE != _RENDER:
+            tl.store(scratch + pixel, transmittance)
+            scratch += P
+        transmittance = _row(after, k, K - 1)
+        i += K
+
+    if MODE == _RENDER:
+        planes: tl.constexpr = 6 if VALUES else 5
+        out = image + (f * planes).to(tl.int64) * size + at_pixel
+        tl.store(out, red, mask=inside)
+        tl.store(out + size, green, mask=inside)
+        tl.store(out + 2 * size, blue, mask=inside)
+        tl.store(out + 3 * size, depth, mask=inside)
+        tl.store(out + 4 * size, cover, mask=inside)
+        if VALUES:
+            tl.store(out + 5 * size, value, mask=inside)
+    else:
+        if MODE == _LOSS:
+            source = tl.load(frame + f).to(tl.int64) * size
+            settings = loss_settings + 5 * f
+            colour_weight, depth_weight = tl.load(settings), tl.load(settings + 1)
+            sharp, depth_sharp = tl.load(settings + 2), tl.load(settings + 3)
+            normalised = tl.load(settings + 4) > 0.0
+            tissue = tl.load(weight + source + at_pixel, mask=inside, other=0).to(tl.float32) * _PER_BYTE
+            channel = target + 3 * source
+            l1_r, sq_r, g_red = _colour_loss(red, channel, at_pixel, inside, tissue, sharp, colour_weight)
+            l1_g, sq_g, g_green = _colour_loss(green, channel + size, at_pixel, inside, tissue, sharp, colour_weight)
+            l1_b, sq_b, g_blue = _colour_loss(blue, channel + 2 * size, at_pixel, inside, tissue, sharp, colour_weight)
+            wanted = tl.load(inverse_depth + source + at_pixel, mask=inside, other=0.0).to(tl.float32)
+            depth_l1, g_depth, g_cover = _depth_loss(
+                depth, cover, wanted, tissue, normalised, depth_sharp, depth_weight
+            )
+            report = statistics + program * _STATISTICS
+            tl.store(report, l1_r + l1_g + l1_b)
+            tl.store(report + 1, depth_l1)
+            tl.store(report + 2, sq_r + sq_g + sq_b)
+            tl.store(report + 3, tl.sum(tissue * (1.0 - cover)))
+        else:
+            given = image + (f * 5).to(tl.int64) * size + at_pixel
+            g_red = tl.load(given, mask=inside, other=0.0)
+            g_green = tl.load(given + size, mask=inside, other=0.0)
+            g_blue = tl.load(given + 2 * size, mask=inside, other=0.0)
+            g_depth = tl.load(given + 3 * size, mask=inside, other=0.0)
+            g_cover = tl.load(given + 4 * size, mask=inside, other=0.0)
+
+        # Relative to the tile's middle the monomials are small, and exact in few bits.
+        monomials = _monomials((pixel % TILE_W).to(tl.float32) - 0.5 * (TILE_W - 1),
+                               (pixel // TILE_W).to(tl.float32) - 0.5 * (TILE_H - 1))  # fmt: skip
+        of_colour = _split_columns(g_red, g_green, g_blue, g_depth)
+        part = tl.arange(0, 8)[None, :]
+        behind = tl.zeros((P,), tl.float32)
+        tl.debug_barrier()  # scratch was perhaps written by another thread of the warp than the one that reads it
+        j = i
+        while j > first:
+            j -= K
+            scratch -= P
+            there = j + in_chunk < end
+            row = tl.load(owner + tl.minimum(j + in_chunk, end - 1))
+            place = tl.load(slot + j + in_chunk, mask=there, other=0)
+            out = slots + place.to(tl.int64)[:, None] * _SLOT + part
+            transmittance = tl.load(scratch + pixel)
+            raw, odds, after = _weights(records, row, there, x, y, transmittance, k)
+            tl.store(out + 8, _sum_split(odds * after, of_colour), mask=there[:, None])
+            c_red, c_green = _pair(records, row, 3)
+            c_blue, c_depth = _pair(records, row, 4)
+            score = tl.fma(g_red[None, :], c_red, g_green[None, :] * c_green)
+            score += tl.fma(g_blue[None, :], c_blue, tl.fma(g_depth[None, :], c_depth, g_cover[None, :]))
+            reach = after * score
+            shown = odds * reach
+            last = shown + tl.where(k == K - 1, behind[None, :], -0.0)
+            summed = tl.flip(tl.cumsum(tl.flip(last, 0), 0), 0)
+            behind = _row(summed, k, 0)
+            v_power = tl.where(raw < _MAX_ALPHA, odds * (reach - (summed - shown)), 0.0)
+            tl.store(out, _sum_split(v_power, monomials), mask=there[:, None])
+        while i < end:  # what lies behind a full tile
+            there = i + in_chunk < end
+            place = tl.load(slot + i + in_chunk, mask=there, other=0)
+            out = slots + place.to(tl.int64)[:, None] * _SLOT + part
+            tl.store(out, tl.zeros((K, 8), tl.float32), mask=there[:, None])
+            tl.store(out + 8, tl.zeros((K, 8), tl.float32), mask=there[:, None])
+            i += K

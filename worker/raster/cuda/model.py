@@ -1,0 +1,389 @@
+"""The training step on the device: deform, project, bin, blend with loss and gradients, Adam; captured in a CUDA graph.
+
+N Gaussians (padded to COLUMNS), rows of N floats; F frames a step; canonical and state [13, N] as in
+raster/cpu/update.py; H W pixels.
+
+step() returns before its step is made. What changes from step to step goes to the device as one row of the control
+block (control.py); everything else lies there already, so a step is a copy of some hundred floats and a replay.
+
+Room. The rasteriser's buffers hold so many instances. A step that needs more changes nothing, nor do those after it;
+every CHECK_EVERY steps, and before anything else is done with the model, the host looks, makes room, and sends the steps
+that were not made again, from the rows that it kept. So a model with little room ends as one with ample room does.
+
+Where the host waits for the device: every CHECK_EVERY-th step; wait, and every method and property but step; a render,
+for its picture; the first use of a frame, for its copy; when buffers grow.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from worker.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation
+from worker.gaussians import SH_C0, Gaussians
+from worker.loss import LossSettings
+from worker.optimize import StepRates
+from worker.raster.cuda import harmonics
+from worker.raster.cuda.captured import Captured
+from worker.raster.cuda.control import Control, Field, adam_fields, write_adam
+from worker.raster.cuda.frames import FrameStore
+from worker.raster.cuda.motion import Motion, Trained, kept_where_old, motion_of
+from worker.raster.cuda.rasterizer import CudaRasterizer, Gradients
+from worker.raster.cuda.update import MADE, ROWS, SEEN, SUMS, padded
+from worker.raster.step import StepSums, TrainingFrame
+
+Floats = NDArray[np.float32]
+PAD_LOGIT = -30.0
+"""Opacity logit of the columns that only fill the rows: never drawn."""
+CHECK_EVERY = 32
+"""Steps from one look at the device to the next. The device idles while the host looks, some 50 us; and a step that
+found no room costs at most so many again."""
+SIZES_KEPT = 3
+"""Image sizes, of those rendered last, whose buffers are kept."""
+
+
+class View:
+    """Frames of one size, `frames` of them at once: the rasteriser's buffers, and the control block that steers them."""
+
+    def __init__(
+        self, width: int, height: int, frames: int, motion: Motion, device: torch.device, *, rows: int = 1
+    ) -> None:
+        self.frames, self._device = frames, device
+        self.rasterizer = CudaRasterizer(width, height, device, frames=frames)
+        cameras = {"camera": Field((frames, 18), "double"), "centre": Field((frames, 3))}
+        training = {"loss": Field((frames, 5)), "frame": Field((frames,), "int")} | adam_fields()
+        self.control = Control(cameras | motion.fields(frames) | training, rows, device)
+        self.fit(0)
+
+    def fit(self, columns: int) -> None:
+        """Buffers for so many Gaussians."""
+        self.state = torch.zeros(self.frames, ROWS, columns, device=self._device)
+        self.colour = torch.zeros(self.frames, 3, columns, device=self._device)
+
+    def write_cameras(self, row: int, cameras: Sequence[NDArray[np.float64]]) -> None:
+        """Fill a row's cameras."""
+        written = self.control.rows[row]
+        for frame, camera in enumerate(cameras):
+            pose = camera[6:].reshape(3, 4)
+            written["camera"][frame], written["centre"][frame] = camera, -pose[:, :3].T @ pose[:, 3]
+
+
+class CudaModel:
+    """Canonical Gaussians, their deformation and Adam's moments, trained on the device. See worker/model.py."""
+
+    answers_every = CHECK_EVERY
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        deformation: Deformation,
+        width: int,
+        height: int,
+        device: str | torch.device = "cuda",
+        frames: int = 1,
+    ) -> None:
+        """frames: how many a step trains on (step_frames); step is for one."""
+        self.count, self.device = len(gaussians), torch.device(device)
+        columns = padded(self.count)
+        canonical = torch.zeros(ROWS, columns)
+        canonical[3] = 1.0
+        canonical[:, : self.count] = torch.cat(
+            [gaussians.mean, gaussians.quaternion, gaussians.log_scale, gaussians.sh[:, 0]], 1
+        ).T
+        opacity_logit = torch.full((columns,), PAD_LOGIT)
+        opacity_logit[: self.count] = gaussians.opacity_logit
+        sh_rest = torch.zeros(gaussians.sh.shape[1] - 1, 3, columns)
+        sh_rest[:, :, : self.count] = gaussians.sh[:, 1:].permute(1, 2, 0)
+        self.sh_degree = gaussians.sh_degree  # of those stored; a schedule may use fewer
+        self._values = {"canonical": canonical, "opacity_logit": opacity_logit, "sh_rest": sh_rest}
+        self._values = {name: each.to(self.device) for name, each in self._values.items()}
+        self._moments = {name: torch.zeros(2, *a.shape, device=self.device) for name, a in self._values.items()}
+        self.motion: Motion = motion_of(deformation, columns, self.device)
+        self._size = width, height
+        self._training = View(width, height, frames, self.motion, self.device, rows=CHECK_EVERY)
+        self._training.fit(columns)
+        self._views: OrderedDict[tuple[int, int, int], View] = OrderedDict()
+        self._store = FrameStore(width, height, self.device)
+        self._launches = Captured(self._launch, self.device)
+        self._report = torch.zeros(SEEN + CHECK_EVERY, dtype=torch.int32, device=self.device)
+        self._sent: list[int] = []  # the harmonics' degree of every step that nobody has waited for
+        self._learnt: StepSums | None = None
+        self._gradients: Gradients | None = None
+        self._shown: View | None = None
+
+    # Steps
+
+    def step(
+        self, frame: TrainingFrame, loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
+    ) -> StepSums | None:
+        """One iteration (counted from 1) on one frame; sh_degree: the harmonics in use at this iteration.
+
+        Returns:
+            What the steps since the last answer add up to, where the host has looked.
+        """
+        return self.step_frames([frame], loss, rates, iteration, sh_degree)
+
+    def step_frames(
+        self,
+        frames: Sequence[TrainingFrame],
+        loss: LossSettings,
+        rates: StepRates,
+        iteration: int,
+        sh_degree: int = 0,
+    ) -> StepSums | None:
+        """One iteration on the sum of the losses of so many frames as the model was made for."""
+        if len(frames) != self._training.frames:
+            raise ValueError(f"a step on {len(frames)} frames, this model was made for {self._training.frames}")
+        if self._store.is_full and not all(self._store.holds(frame) for frame in frames):
+            self._launches.forget()
+        slot = len(self._sent)
+        row, times = self._training.control.rows[slot], [frame.t for frame in frames]
+        self._training.write_cameras(slot, [frame.camera for frame in frames])
+        for k, frame in enumerate(frames):
+            row["loss"][k], row["frame"][k] = frame.loss_settings(loss), self._store.row(frame)
+        write_adam(row, slot, rates, iteration)
+        self.motion.write_times(row, times)
+        self.motion.write_rates(row, times, rates, iteration)
+        self._sent.append(sh_degree)
+        self._send(slot)
+        if len(self._sent) == CHECK_EVERY:
+            self._settle()
+        return self._answer()
+
+    def wait(self) -> StepSums | None:
+        """Return when every step is made: their sums, or None if there was none since the last answer."""
+        self._settle()
+        return self._answer()
+
+    def _send(self, slot: int) -> None:
+        """Have the device make the step of a row."""
+        self._training.control.send(slot)
+        self._launches.run(self._sent[slot])
+
+    def _launch(self, sh_degree: int) -> None:
+        """Everything that a step launches, in order."""
+        view, values, moments = self._training, self._values, self._moments
+        self._project(view, sh_degree)
+        control, rasterizer = view.control.values, view.rasterizer
+        store = self._store
+        gradients = rasterizer.loss_backward(
+            store.rgb, store.weight, store.inverse_depth, control["loss"], control["frame"]
+        )
+        if sh_degree > 0:
+            seen_from, shown = (view.state, values["sh_rest"], control["centre"]), (view.colour, gradients.colour)
+            harmonics.carry_back(*seen_from, *shown, gradients.state, sh_degree)
+            harmonics.update(
+                values["sh_rest"], moments["sh_rest"], view.state, control["centre"], *shown, rasterizer.ok, control,
+                sh_degree,
+            )  # fmt: skip
+        trained = Trained(
+            values["canonical"], moments["canonical"], values["opacity_logit"], moments["opacity_logit"],
+            gradients.state, gradients.opacity_logit, gradients.colour, view.colour,
+            rasterizer.count, rasterizer.statistics, rasterizer.ok, self._report,
+        )  # fmt: skip
+        self.motion.update(trained, control)
+        self._gradients = gradients
+
+    def _project(self, view: View, sh_degree: int) -> None:
+        """The Gaussians, at the times and on the images that the view's control block says."""
+        control = view.control.values
+        self.motion.deform(self._values["canonical"], control, view.state, view.colour)
+        if sh_degree > 0:
+            harmonics.show(view.state, self._values["sh_rest"], control["centre"], view.colour, sh_degree)
+        view.rasterizer.project(control["camera"], view.state, self._values["opacity_logit"], view.colour)
+
+    def _settle(self) -> None:
+        """Wait for the steps sent, and send those again that found no room."""
+        first = 0
+        while first < len(self._sent):
+            grown = self._training.rasterizer.grown()
+            first = self._learn(first)
+            if not grown:
+                break
+            self._launches.forget()
+            for slot in range(first, len(self._sent)):
+                self._send(slot)
+        self._sent.clear()
+
+    def _learn(self, first: int) -> int:
+        """Read the report of the steps made from `first` on; the place of the first that was not made."""
+        report = self._report.to("cpu", copy=True)
+        self._report.zero_()
+        last = first + int(report[MADE])
+        if last == first:
+            return last
+        sums = report[:SUMS].view(torch.float32).tolist()
+        visible = int(report[SEEN + first : SEEN + last].min())
+        if self._learnt is not None:
+            before = dataclasses.astuple(self._learnt)
+            sums, visible = [old + new for old, new in zip(before, sums, strict=False)], min(before[4], visible)
+        self._learnt = StepSums(*sums, visible)
+        return last
+
+    def _answer(self) -> StepSums | None:
+        """What was learnt since the last answer."""
+        learnt, self._learnt = self._learnt, None
+        return learnt
+
+    @property
+    def gradient_norm(self) -> Tensor:
+        """[N] |dL/dmean2d| of the last step in NDC, the largest of its frames."""
+        self._settle()
+        if self._gradients is None:
+            raise ValueError("no step has been made")
+        return self._gradients.mean2d_norm[:, : self.count].amax(0)
+
+    @property
+    def visible(self) -> Tensor:
+        """[N] whether any of the last step's frames could see each Gaussian."""
+        self._settle()
+        return self._training.rasterizer.count[:, : self.count].amax(0) > 0
+
+    # Pictures
+
+    def _view(self, width: int, height: int, frames: int) -> View:
+        """The buffers for so many images of a size; those of the sizes used last are kept."""
+        if (width, height) == self._size and frames == self._training.frames:
+            return self._training
+        size = width, height, frames
+        if size not in self._views:
+            self._views[size] = View(width, height, frames, self.motion, self.device)
+            self._views[size].fit(self._values["canonical"].shape[1])
+        self._views.move_to_end(size)
+        while len(self._views) > SIZES_KEPT:
+            self._views.popitem(last=False)
+        return self._views[size]
+
+    def _steer(self, camera: NDArray[np.float64], times: Sequence[float]) -> View:
+        """Settle, and have a view that sees these times through this camera."""
+        self._settle()
+        view = self._view(int(camera[4]), int(camera[5]), len(times))
+        view.write_cameras(0, [camera] * len(times))
+        self.motion.write_times(view.control.rows[0], times)
+        view.control.send(0)
+        return view
+
+    def _fitted(self, view: View) -> bool:
+        """Wait; whether the last projection had room. If not, there is room now."""
+        grown = view.rasterizer.grown()
+        if grown and view is self._training:
+            self._launches.forget()
+        return not grown
+
+    def render_times(self, camera: NDArray[np.float64], times: Sequence[float], values: Floats | None = None) -> Tensor:
+        """R G B Z A at several times at once, [F, 5, H, W] on the device; a view that the next render overwrites.
+
+        With values [N], a number a Gaussian, they are blended as colour is, and [F, 6, H, W] ends with them.
+        """
+        view = self._shown = self._steer(camera, times)
+        while True:
+            self._project(view, self.sh_degree)
+            image: Tensor = view.rasterizer.render(self._padded(values))
+            if self._fitted(view):
+                return image
+
+    def _padded(self, values: Floats | None) -> Tensor | None:
+        """[N] on the device, with zeros for the columns that only fill the rows."""
+        if values is None:
+            return None
+        filled = torch.zeros(self._values["canonical"].shape[1])
+        filled[: len(values)] = torch.from_numpy(np.asarray(values, np.float32))
+        return filled.to(self.device)
+
+    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
+        """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
+        image: Floats = self.render_times(camera, [t], values)[0].cpu().numpy()
+        return image
+
+    def blend_values(self, values: Floats) -> Floats:
+        """Further values [N], blended as colour was in the last render: [H, W]; a view."""
+        if self._shown is None:
+            raise ValueError("nothing has been rendered")
+        image: Floats = self._shown.rasterizer.render(self._padded(values))[0, 5].cpu().numpy()
+        return image
+
+    def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
+        """Gradient of sum(cotangents * image), cotangents [5, H, W], to the Gaussians as they are at t, [14, N]."""
+        view = self._steer(camera, [t])
+        wanted = torch.from_numpy(np.ascontiguousarray(cotangents, np.float32)).to(self.device)[None]
+        while True:
+            self._project(view, 0)
+            found = view.rasterizer.cotangent_backward(wanted)
+            if self._fitted(view):
+                break
+        rows = torch.cat([found.state[0], found.colour[0] * SH_C0, found.opacity_logit])
+        gradient: Floats = rows[:, : self.count].cpu().numpy()
+        return gradient
+
+    def deformed_mean(self, t: float) -> Floats:
+        """Centres at time t, [3, N] in units, as a copy."""
+        self._settle()
+        view = self._view(*self._size, 1)
+        self.motion.write_times(view.control.rows[0], [t])
+        view.control.send(0)
+        self.motion.deform(self._values["canonical"], view.control.values, view.state, view.colour)
+        mean: Floats = view.state[0, :3, : self.count].cpu().numpy().copy()
+        return mean
+
+    # What is stored
+
+    def take(self, columns: NDArray[np.int64], fresh: NDArray[np.bool_]) -> None:
+        """Keep these Gaussians, in this order (repeats are copies); Adam's moments start at 0 where fresh."""
+        self._settle()
+        count = len(columns)
+        fill = padded(count) - count
+        chosen = torch.from_numpy(np.concatenate([columns, np.zeros(fill, np.int64)])).to(self.device)
+        is_fresh = torch.from_numpy(np.concatenate([fresh, np.ones(fill, np.bool_)])).to(self.device)
+        for name, each in self._values.items():
+            self._values[name] = each.index_select(-1, chosen)
+            self._moments[name] = kept_where_old(self._moments[name], chosen, is_fresh)
+        self.motion.take(chosen, is_fresh)
+        self._values["opacity_logit"][count:] = PAD_LOGIT
+        self.count = count
+        self._launches.forget()
+        self._training.fit(len(chosen))
+        self._views.clear()
+        self._gradients = self._shown = None
+
+    def _of_the_gaussians(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Without the columns that only fill the rows."""
+        return {name: each[..., : self.count] for name, each in tensors.items()}
+
+    def parameters(self) -> dict[str, Tensor]:
+        """What is trained, by name; views of the live tensors."""
+        self._settle()
+        return self._of_the_gaussians(self._values) | self.motion.parameters(self.count)
+
+    def arrays(self) -> dict[str, Tensor]:
+        """Everything a resumed run needs, by name; views of the live tensors, motion.steps on the host."""
+        self._settle()
+        moments = {f"moments.{name}": each for name, each in self._moments.items()}
+        return self._of_the_gaussians(self._values | moments) | self.motion.arrays(self.count)
+
+    def load_arrays(self, stored: dict[str, Tensor]) -> None:
+        """Put back what arrays() gave, on any device, into a model of the same size; ValueError if the sizes differ."""
+        for name, each in self.arrays().items():
+            if stored[name].shape != each.shape:
+                shapes = tuple(stored[name].shape), tuple(each.shape)
+                raise ValueError(f"{name} has shape {shapes[0]}, this model needs {shapes[1]}")
+            each.copy_(stored[name])
+
+    def export(self) -> tuple[Gaussians, Deformation]:
+        """The Gaussians and their deformation as tensors on the host (copies)."""
+        self._settle()
+        canonical, opacity_logit, sh_rest = (each[..., : self.count].cpu() for each in self._values.values())
+        state = canonical.T.clone(memory_format=torch.contiguous_format)
+        gaussians = Gaussians(
+            state[:, MEAN].contiguous(),
+            state[:, QUATERNION].contiguous(),
+            state[:, LOG_SCALE].contiguous(),
+            opacity_logit.clone(),
+            torch.cat([canonical[None, 10:13], sh_rest]).permute(2, 0, 1).contiguous(),
+        )
+        return gaussians, self.motion.export(self.count)
