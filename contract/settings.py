@@ -12,6 +12,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from contract.errors import InputError
 
 GIB = 2**30
+DeviceName = Literal["auto", "cpu", "cuda"]
+"""Where to compute; auto: on an NVIDIA GPU where there is one and what it takes, else on the CPU."""
 ENVIRONMENT_PREFIX = "INTRASPLAT_"
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 """A service at one of these is reached from this machine alone."""
@@ -55,7 +57,7 @@ class Settings(BaseModel):
     port: int = Field(default=8765, ge=1, le=65535)
     dashboard_dir: Path | None = None
     worker_name: str = Field(default="worker-1", pattern=r"^[A-Za-z0-9-]{1,40}$")
-    device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda)$")
+    device: DeviceName = "auto"
     log_format: Literal["text", "json"] = "text"
 
     # what is accepted

@@ -39,6 +39,7 @@ STAGES = (
     "raster",
     "model",
     "unfused",
+    "backend",
     "metrics",
     "baselines",
     "densify",

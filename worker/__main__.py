@@ -28,7 +28,7 @@ from contract.logs import configure
 from contract.processes import told_to_end
 from contract.progress_bar import ProgressBar
 from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
-from contract.settings import Settings
+from contract.settings import DeviceName, Settings
 from contract.store import MANIFEST, REPORT
 
 SUFFIX_FORMATS = {
@@ -113,7 +113,7 @@ def _add_reconstruct(commands: Commands) -> None:
         help="about how many seconds to train, often less (default: the preset's)",
     )
     limit.add_argument("--iterations", type=int, metavar="N", help="steps of training; the same N gives the same bits")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    _add_device(parser, "auto")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
 
 
@@ -141,6 +141,12 @@ def _add_render(commands: Commands) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="PATH", help="a .png, .jpg or .npy file; with --frames a folder"
     )
+    _add_device(parser, "cpu")  # a GPU needs longer to begin than the CPU for a few images
+
+
+def _add_device(parser: argparse.ArgumentParser, default: str) -> None:
+    what = "auto: an NVIDIA GPU where there is one and Triton, else the CPU"
+    parser.add_argument("--device", choices=get_args(DeviceName), default=default, help=f"{what} (default: {default})")
 
 
 def _add_phantom(commands: Commands, wanted: bool) -> None:
@@ -230,11 +236,13 @@ def _print_report(report: dict[str, Any], out: Path) -> None:
 
 def _render(options: argparse.Namespace) -> int:
     from contract.pose import parse_pose
+    from worker.backend import choose_device
     from worker.checkpoint import load_scene
     from worker.encode import encode_layer
     from worker.render import render_frame
     from worker.views import camera_of, pose_of
 
+    device = choose_device(options.device)
     if not (options.scene / MANIFEST).is_file():
         raise InputError("SCENE", f"{options.scene} holds no scene.", "Name a folder that `reconstruct --out` wrote.")
     scene = load_scene(options.scene)
@@ -245,7 +253,7 @@ def _render(options: argparse.Namespace) -> int:
         image_format = SUFFIX_FORMATS.get(path.suffix.lower())
         if image_format is None:
             raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
-        frame = render_frame(scene, t, pose, camera)
+        frame = render_frame(scene, t, pose, camera, device)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(encode_layer(frame, Layer(options.layer), image_format))
         print(path)

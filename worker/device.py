@@ -17,6 +17,7 @@ from contract.job import JobRecord
 from contract.processes import die_with_parent
 from contract.settings import Settings
 from contract.store import Store, open_store
+from worker.backend import CPU, CPU_BY_VARIABLE, choose_device
 from worker.channel import Channel, Orders, Task
 from worker.checkpoint import RESUME_FILE
 from worker.compact import compile_coder
@@ -33,7 +34,7 @@ from worker.orders import (
     job_progress,
 )
 from worker.pace import Pace
-from worker.pipeline import ReconstructionRequest, check_device, reconstruct
+from worker.pipeline import ReconstructionRequest, reconstruct
 from worker.raster.cpu import compile_kernels
 from worker.serve import RequestServer
 from worker.snapshot import Snapshots
@@ -66,15 +67,16 @@ def run_device(settings: Settings) -> None:
 
 
 def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
-    device = training_device(settings.device)
+    device = choose_device(settings.device, cpu_by=CPU_BY_VARIABLE)
     store, snapshots, pace = open_store(settings), Snapshots(), Pace()
     # What is unpacked of clips stays in the data directory, and does not outlive the next start.
     tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
     started_s = time.monotonic()
-    compile_kernels()
+    if device == CPU:  # those of a GPU are compiled for the model of a job, and kept
+        compile_kernels()
     compile_coder()
     logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
-    views = Views(store, snapshots, settings.hot_bytes, pace)
+    views = Views(store, snapshots, settings.hot_bytes, pace, device)
 
     def tell_what_is_held() -> None:
         views.forget_purged()
@@ -84,7 +86,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     with RequestServer(
         endpoint, views.answer, between=tell_what_is_held, rest_s=pace.rest_s, render_secret=settings.render_secret
     ):
-        channel.send(Ready(endpoint=endpoint, device=device))
+        channel.send(Ready(endpoint=endpoint, device=str(device)))
         logger.info("the device process is ready on %s", device)
         shown = ""
         while True:
@@ -94,7 +96,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
             else:
                 shown = task.run.record.job_id
                 with pace.training():
-                    end = work_on(task, device, ClipLimits.of(settings), snapshots, channel)
+                    end = work_on(task, settings.device, ClipLimits.of(settings), snapshots, channel)
                 channel.send(end)
 
 
@@ -172,19 +174,6 @@ def run_or_start_anew(request: ReconstructionRequest, out: Path, hooks: Hooks) -
         logger.warning("the stored state is of no use to this version; training starts anew")
         (out / RESUME_FILE).unlink()
         reconstruct(request, out, hooks)
-
-
-def training_device(device: str) -> str:
-    """The device that jobs are trained on, where INTRASPLAT_DEVICE is `device`.
-
-    Raises:
-        UnavailableError: this version cannot train there.
-    """
-    try:
-        check_device(device)
-    except UnavailableError as error:
-        raise UnavailableError(error.problem, "Set INTRASPLAT_DEVICE to auto or cpu.") from error
-    return "cpu"
 
 
 def _socket_endpoint(store: Store, name: str) -> str:

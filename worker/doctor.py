@@ -116,16 +116,20 @@ def _packages() -> list[Finding]:
 
 def _device(settings: Settings) -> list[Finding]:
     try:
-        torch = importlib.import_module("torch")
-        device = importlib.import_module("worker.device").training_device(settings.device)
+        backend = importlib.import_module("worker.backend")
     except ImportError:
         return []  # said above
+    gpu = backend.find_gpu()
+    try:
+        device = backend.choose_device(settings.device, gpu, cpu_by=backend.CPU_BY_VARIABLE)
     except UnavailableError as error:
         return [Finding("device", error.problem, error.remedy, blocks=True)]
-    build = f"CUDA {torch.version.cuda} build, no GPU seen" if torch.version.cuda else "CPU build of torch"
-    if torch.cuda.is_available():
-        build = f"GPU seen, unused in this version: {torch.cuda.get_device_name(0)}"
-    return [Finding("device", f"{device}, {_cores()} threads ({build})")]
+    if device.kind == "cuda":
+        return [Finding("device", str(device))]
+    found = f"cpu, {_cores()} threads"
+    if settings.device == "auto" and gpu.name is not None:
+        return [Finding("device", f"{found} (the {gpu.name} is not used: {gpu.missing})", gpu.remedy)]
+    return [Finding("device", f"{found} ({gpu.missing or 'the GPU is not asked for'})")]
 
 
 def _video() -> list[Finding]:

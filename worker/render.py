@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from contract.camera import Intrinsics
+from worker.backend import CPU, Device, make_model
 from worker.checkpoint import Scene
-from worker.deformation import HexPlane
 from worker.metrics import COVERED_ALPHA
-from worker.raster.cpu.model import FusedModel
+from worker.model import Model
 from worker.raster.step import camera_vector
 from worker.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
-from worker.unfused import UnfusedModel
 
 POSE_FALL_OFF = 0.25
 """Distance from the nearest trained pose, in median depths, at which confidence has fallen to exp(-1/2): 14 degrees."""
@@ -50,18 +49,18 @@ class Frame:
     warnings: tuple[str, ...]
 
 
-def model_of(scene: Scene) -> FusedModel:
-    """The scene's Gaussians and their motion in the form that the kernels render."""
-    kind = UnfusedModel if isinstance(scene.deformation, HexPlane) else FusedModel
-    return kind(scene.gaussians, scene.deformation, scene.intrinsics.width, scene.intrinsics.height)
+def model_of(scene: Scene, device: Device = CPU) -> Model:
+    """The scene's Gaussians and their motion in the form that the device renders."""
+    size = scene.intrinsics.width, scene.intrinsics.height
+    return make_model(scene.gaussians, scene.deformation, *size, device)
 
 
 class SceneRenderer:
-    """A scene ready to be rendered. Serialises its callers: the kernels share buffers."""
+    """A scene ready to be rendered on a device. Serialises its callers: the kernels share buffers."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, device: Device = CPU) -> None:
         self._scene = weakref.ref(scene)
-        self._model = model_of(scene)
+        self._model = model_of(scene, device)
         self._is_vouched = bool(scene.seen.any())
         self._lock = Lock()
 
@@ -79,16 +78,17 @@ class SceneRenderer:
         return image[:5], seen
 
 
-_renderers: weakref.WeakKeyDictionary[Scene, SceneRenderer] = weakref.WeakKeyDictionary()
+_renderers: weakref.WeakKeyDictionary[Scene, dict[Device, SceneRenderer]] = weakref.WeakKeyDictionary()
 _renderers_lock = Lock()
 
 
-def renderer_of(scene: Scene) -> SceneRenderer:
-    """The scene's renderer, made at its first frame and kept as long as the scene is."""
+def renderer_of(scene: Scene, device: Device = CPU) -> SceneRenderer:
+    """The scene's renderer on a device, made at its first frame there and kept as long as the scene is."""
     with _renderers_lock:
-        if scene not in _renderers:
-            _renderers[scene] = SceneRenderer(scene)
-        return _renderers[scene]
+        made = _renderers.setdefault(scene, {})
+        if device not in made:
+            made[device] = SceneRenderer(scene, device)
+        return made[device]
 
 
 def endoscope_pose(scene: Scene, t: float) -> NDArray[np.float64]:
@@ -110,6 +110,7 @@ def render_frame(
     t: float,
     world_from_camera: NDArray[np.float64] | None = None,
     intrinsics: Intrinsics | None = None,
+    device: Device = CPU,
 ) -> Frame:
     """The scene at model time t (held within the clip) from a pose (mm; None: the endoscope's) through a camera."""
     last = (scene.frame_count - 1) / scene.frame_count
@@ -118,7 +119,7 @@ def render_frame(
     if not 0.0 <= t <= last + ROUNDING:
         warnings.append(f"t = {t:g} lies outside the clip; t = {shown:.4g} is shown.")
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
-    image, seen = renderer_of(scene).layers(shown, pose, intrinsics or scene.intrinsics)
+    image, seen = renderer_of(scene, device).layers(shown, pose, intrinsics or scene.intrinsics)
     alpha = image[4]
     solid = alpha >= COVERED_ALPHA
     depth_mm = solid_depth_mm(image[3], alpha, scene.units_per_mm)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from worker.backend import CPU, Device
 from worker.checkpoint import Scene
 from worker.clip import DepthClip
 from worker.compact import STATE, Compact, prepare, round_to
@@ -72,7 +73,13 @@ class Shrunk:
         return {"stored_step": self.step, "stored_loss_db": self.loss_db}
 
 
-def shrink(scene: Scene, clip: DepthClip, frames: TrainingFrames, tolerance_db: float = TOLERANCE_DB) -> Shrunk | None:
+def shrink(
+    scene: Scene,
+    clip: DepthClip,
+    frames: TrainingFrames,
+    tolerance_db: float = TOLERANCE_DB,
+    device: Device = CPU,
+) -> Shrunk | None:
     """The scene in whole numbers; None for a model that is stored as floats, or where no trial kept the tolerance.
 
     Each trial says which step should just keep the tolerance.
@@ -80,7 +87,7 @@ def shrink(scene: Scene, clip: DepthClip, frames: TrainingFrames, tolerance_db: 
     with_tissue = [index for index in frames.indices if clip.tissue[index].any()]
     if not isinstance(scene.deformation, SharedBasis) or scene.gaussians.sh_degree > 0 or not with_tissue:
         return None
-    model, judged = model_of(scene), spread(with_tissue, JUDGED_FRAMES)
+    model, judged = model_of(scene, device), spread(with_tissue, JUDGED_FRAMES)
     exact_db = _mean_db((model.render(frames.cameras[i], float(frames.t[i])) for i in judged), frames, judged)
     if not math.isfinite(exact_db):
         return None
@@ -91,7 +98,7 @@ def shrink(scene: Scene, clip: DepthClip, frames: TrainingFrames, tolerance_db: 
     for _ in range(TRIALS):
         try:
             compact = round_to(prepared, step)
-            loss_db = exact_db - _mean_db(_renders(compact, scene, frames, judged), frames, judged)
+            loss_db = exact_db - _mean_db(_renders(compact, scene, frames, judged, device), frames, judged)
         except ValueError:  # finer than whole numbers of this size can be
             loss_db = math.inf
         if not loss_db <= tolerance_db:
@@ -123,12 +130,12 @@ def _mean_db(images: Iterable[NDArray[np.float32]], frames: TrainingFrames, judg
 
 
 def _renders(
-    compact: Compact, scene: Scene, frames: TrainingFrames, judged: Sequence[int]
+    compact: Compact, scene: Scene, frames: TrainingFrames, judged: Sequence[int], device: Device
 ) -> Iterator[NDArray[np.float32]]:
     """The judged frames as what is stored shows them. Only the Gaussians at their times are made, not all weights."""
     rest = SharedBasis.initial(len(scene.gaussians), bases=1)
     for index, gaussians in zip(judged, compact.at([float(frames.t[index]) for index in judged]), strict=True):
-        still = model_of(dataclasses.replace(scene, gaussians=gaussians, deformation=rest))
+        still = model_of(dataclasses.replace(scene, gaussians=gaussians, deformation=rest), device)
         yield still.render(frames.cameras[index], 0.0)
 
 

@@ -11,17 +11,16 @@ import torch
 from numpy.typing import NDArray
 
 from contract.camera import Intrinsics
+from worker.backend import CPU, Device, make_model
 from worker.capacity import MOST_POINTS, choose_bases, choose_stride, errors_by_bases, floor_error
 from worker.clip import DepthClip
-from worker.deformation import FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
+from worker.deformation import Deformation, FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
 from worker.deformation.base import CHANNELS, MEAN
 from worker.fusion import FusionSettings, PointCloud
 from worker.gaussians import SH_C0, Gaussians, initial_gaussians
 from worker.model import Model
 from worker.motion import Tracks, fit_tracks
 from worker.presets import Preset
-from worker.raster.cpu.model import FusedModel
-from worker.unfused import UnfusedModel
 
 SHARE_PX = 4
 """Points within such a square start with one motion: tracks are smooth over more, and fewer systems are solved."""
@@ -72,6 +71,7 @@ def start_model(
     preset: Preset,
     scale: float,
     seed: int,
+    device: Device = CPU,
 ) -> Model:
     """Gaussians at the cloud's points (mm, scaled to optimiser units) with the preset's motion: as the tracks have it
     where the motion is "shared" and there are tracks, else at rest. The preset must be settled."""
@@ -82,28 +82,30 @@ def start_model(
         opacity=preset.opacity,
     )
     gaussians = dataclasses.replace(gaussians, log_scale=gaussians.log_scale + math.log(preset.spread))
-    width, height = clip.intrinsics.width, clip.intrinsics.height
+    motion = _at_rest(gaussians, preset, [float(clip.t[i]) for i in train], seed)
+    if tracks is not None and isinstance(motion, SharedBasis):
+        gaussians = _follow_tracks(gaussians, motion, cloud, tracks, clip, train, scale)
+    return make_model(gaussians, motion, clip.intrinsics.width, clip.intrinsics.height, device)
+
+
+def _at_rest(gaussians: Gaussians, preset: Preset, times: Sequence[float], seed: int) -> Deformation:
+    """The preset's motion of these Gaussians before anything is known of it; times are those of the training frames."""
     count = len(gaussians)
     assert preset.bases is not None
     if preset.deformation == "hexplane":
         bounds = torch.stack([gaussians.mean.amin(0), gaussians.mean.amax(0)])
-        return UnfusedModel(gaussians, HexPlane.initial(bounds, seed=seed), width, height)
+        return HexPlane.initial(bounds, seed=seed)
     if preset.deformation == "pfs":
-        return FusedModel(gaussians, PolynomialFourier.initial(count, weights=preset.bases), width, height)
+        return PolynomialFourier.initial(count, weights=preset.bases)
     if preset.deformation == "shared":
-        bases = min(len(train), preset.bases)
-        shared = SharedBasis.initial(count, bases=bases, colour=True, times=[float(clip.t[i]) for i in train])
-        if tracks is not None:
-            gaussians = _follow_tracks(gaussians, shared, cloud, tracks, clip, train, scale)
-        return FusedModel(gaussians, shared, width, height)
+        return SharedBasis.initial(count, bases=min(len(times), preset.bases), colour=True, times=times)
     assert preset.start_width is not None
-    fdm = FlexibleDeformation.initial(
+    return FlexibleDeformation.initial(
         count,
         bases=preset.bases,
         width=preset.start_width,
         form="gaussian" if preset.deformation == "fdm" else "quartic",
     )
-    return FusedModel(gaussians, fdm, width, height)
 
 
 def _follow_tracks(

@@ -9,7 +9,8 @@ from __future__ import annotations
 import csv
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import torch
 
 from contract.errors import Cancelled, TrainingDiverged
 from worker.average import RunningMean
+from worker.backend import CPU, Device
 from worker.checkpoint import Scene
 from worker.densify import Densifier
 from worker.hooks import Hooks, Progress
@@ -78,6 +80,7 @@ class Run:
     asked        the length that was asked for, in words; a stored run goes on only with its own
     average      of the models that end a cycle
     densifier    its statistics; None where the preset has no densification
+    device       where the model lies
     chosen       what was left to the scene, how it was settled and why, in words
     curve        scores of held-out frames so far
     """
@@ -91,6 +94,7 @@ class Run:
     iteration: int = 0
     average: RunningMean = field(default_factory=RunningMean)
     densifier: Densifier | None = None
+    device: Device = CPU
     chosen: tuple[str, ...] = ()
     curve: list[CurvePoint] = field(default_factory=list)
 
@@ -135,6 +139,42 @@ def _check(sums: StepSums | None, iteration: int) -> None:
         raise TrainingDiverged(f"No Gaussian is left in view by iteration {iteration}.")
 
 
+@contextmanager
+def taken_back(model: Model) -> Iterator[None]:
+    """Steps of a model that has made none yet, for what they tell: at the end it is as it was."""
+    stored = {name: values.clone() for name, values in model.parameters().items()}
+
+    def start_again() -> None:
+        for name, values in model.arrays().items():  # moments and their counts are 0 before the first step
+            values.copy_(stored[name]) if name in stored else values.zero_()
+
+    start_again()  # touches the moments' memory once: the first touch of a page costs as much as a step
+    yield
+    start_again()
+
+
+def warm_up(model: Model, frames: TrainingFrames, preset: Preset, on_progress: Callable[[float], None]) -> float:
+    """Make each kind of step and render of a new model once, on a device whose kernels are compiled for the very model;
+    the steps are taken back. Returns seconds; on_progress is told the share done, in (0, 1]."""
+    start = time.perf_counter()
+    frame = frames.frame(frames.indices[0])
+    nothing = np.zeros((5, int(frame.camera[5]), int(frame.camera[4])), np.float32)
+    parts: list[Callable[[], object]] = [
+        lambda degree=degree: model.step(frame, preset.loss, rates_at(preset.rates, 1.0), 1, degree)  # type: ignore[misc]
+        for degree in range(preset.sh_degree + 1)
+    ]
+    parts += [
+        model.wait,
+        lambda: model.render(frame.camera, frame.t, np.zeros(model.count, np.float32)),
+        lambda: model.image_gradient(frame.camera, frame.t, nothing),
+    ]
+    with taken_back(model):
+        for done, part in enumerate(parts, start=1):
+            part()
+            on_progress(done / len(parts))
+    return time.perf_counter() - start
+
+
 def iterations_within(
     model: Model, frames: TrainingFrames, preset: Preset, seed: int, budget_s: float, elapsed_s: float
 ) -> int:
@@ -143,23 +183,16 @@ def iterations_within(
     One a training frame are made even if fewer fit.
     """
     start = time.perf_counter()
-    stored = {name: values.clone() for name, values in model.parameters().items()}
-
-    def start_again() -> None:
-        for name, values in model.arrays().items():  # moments and their counts are 0 before the first step
-            values.copy_(stored[name]) if name in stored else values.zero_()
-
     at_once = model.answers_every
     untimed, timed = CALIBRATION_STEPS
     trial = Run(model, frames, preset, Schedule((untimed + timed) * at_once), seed)
-    start_again()  # touches the moments' memory once: the first touch of a page costs as much as a step
-    ends = [time.perf_counter()]
-    for iteration in range(1, trial.iterations + 1):
-        step(trial, iteration)
-        if iteration % at_once == 0:
-            _check(model.wait(), iteration)
-            ends.append(time.perf_counter())
-    start_again()
+    with taken_back(model):
+        ends = [time.perf_counter()]
+        for iteration in range(1, trial.iterations + 1):
+            step(trial, iteration)
+            if iteration % at_once == 0:
+                _check(model.wait(), iteration)
+                ends.append(time.perf_counter())
     step_s = float(np.median(np.diff(ends)[untimed:])) / at_once * LATER_STEPS
     left_s = budget_s - elapsed_s - (time.perf_counter() - start)
     return max(len(frames.indices), int(left_s / step_s))

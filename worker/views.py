@@ -16,6 +16,7 @@ from contract.pose import MatrixPose, OrbitPose, world_from_camera
 from contract.rendering import MEDIA_TYPES, ExportRequest, IntrinsicsOverride, RenderRequest
 from contract.settings import GIB
 from contract.store import Store
+from worker.backend import CPU, Device
 from worker.checkpoint import Scene, load_scene
 from worker.encode import encode_layer
 from worker.export import export_ply
@@ -45,11 +46,13 @@ class Views:
         snapshots: Snapshots | None = None,
         hot_bytes: int = 2 * GIB,
         pace: Pace | None = None,
+        device: Device = CPU,
     ) -> None:
         self._store = store
         self._snapshots = snapshots or Snapshots()
         self._pace = pace or Pace()
         self._hot_bytes = hot_bytes
+        self._device = device
         self._scenes: OrderedDict[tuple[str, int], Scene] = OrderedDict()
         self.held: tuple[str, ...] = ()
 
@@ -66,12 +69,12 @@ class Views:
                 return _export(self._stored(request.scene_id, request.attempt), request.t)
         if request.attempt is not None:
             with self._pace.rendering():
-                return _render(self._stored(request.scene_id, request.attempt), request)
+                return _render(self._stored(request.scene_id, request.attempt), request, self._device)
         snapshot = self._snapshots.newest(request.scene_id)  # may wait for training, which costs that nothing
         if snapshot is None:
             raise NotYetError(f"Job {request.scene_id} has nothing to show yet.")
         with self._pace.rendering():
-            return _render(snapshot.scene, request, snapshot.iteration)
+            return _render(snapshot.scene, request, self._device, snapshot.iteration)
 
     def forget_purged(self) -> None:
         """Let go of scenes whose folders are gone; to be called now and then."""
@@ -101,10 +104,10 @@ class Views:
         return COPIES * sum(scene.byte_count for scene in self._scenes.values())
 
 
-def _render(scene: Scene, request: RenderRequest, iteration: int | None = None) -> View:
+def _render(scene: Scene, request: RenderRequest, device: Device, iteration: int | None = None) -> View:
     """One view; iteration is that of a snapshot, None of a finished scene."""
     intrinsics = camera_of(scene.intrinsics, request.camera, request.max_pixels)
-    frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics)
+    frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics, device)
     body = encode_layer(frame, request.layer, request.format, request.quality)
     warnings = frame.warnings
     if iteration is not None:

@@ -14,6 +14,7 @@ from contract.exits import ExitCode
 from contract.job import JobProgress, Layout, MaskPolarity, PoseConvention
 from contract.processes import heeding_signals
 from contract.progress_bar import ProgressBar
+from contract.settings import DeviceName
 from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
 from worker.evaluate.measure import Bench
@@ -56,6 +57,12 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     limit.add_argument("--iterations", nargs="+", type=count, default=[], metavar="N", help="instead of the preset's")
     parser.add_argument(
         "--grid", action="store_true", help="of each series, the grid of fixed capacities beside its own choice"
+    )
+    parser.add_argument(
+        "--device",
+        choices=get_args(DeviceName),
+        default="auto",
+        help="rows of another device belong into a folder of their own (default: auto)",
     )
     parser.add_argument("--again", action="store_true", help="measure anew what failed")
     parser.add_argument("--redraw", action="store_true", help="measure nothing; sum up and draw the rows in DIR")
@@ -153,7 +160,7 @@ def _asked(options: argparse.Namespace) -> tuple[Bench, list[Cell]]:
     for twice in {name for name in clips if clips.count(name) > 1}:
         raise InputError("CLIP", f"rows would call two clips {twice!r}.", "Give the files names of their own.")
     cells = plan(clips, series, options.holdout, options.seeds, options.budget_s, options.iterations)
-    return Bench({source.name: source for source in sources}), cells
+    return Bench({source.name: source for source in sources}, options.device), cells
 
 
 def _reporter(bar: ProgressBar, place: int, total: int) -> Callable[[Progress], None]:

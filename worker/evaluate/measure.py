@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 
 from contract.errors import Cancelled
 from contract.report import Report
+from contract.settings import DeviceName
 from contract.store import CURVE, REPORT
+from worker.backend import Device, choose_device
 from worker.checkpoint import Scene, load_scene
 from worker.clip import DepthClip
 from worker.evaluate.cells import Cell, preset_of
@@ -47,9 +49,13 @@ Values = dict[str, object]
 
 @dataclass
 class Bench:
-    """Opens clips and measures cells on them; the clip and truth used last are kept for the next cell."""
+    """Opens clips and measures cells on them; the clip and truth used last are kept for the next cell.
+
+    What is trained on device is judged by renders of the CPU, so that all rows are judged alike.
+    """
 
     sources: Mapping[str, Source]
+    device: DeviceName = "auto"
     _commit: str = field(default_factory=commit)  # of the code as it was loaded; the tree may go on while this runs
     _open: dict[tuple[str, str], OpenClip] = field(default_factory=dict)
     _truth: dict[tuple[str, str], Truth] = field(default_factory=dict)
@@ -64,7 +70,7 @@ class Bench:
         row: Values = {
             **dict(zip(KEY, cell.key, strict=True)),
             "load_1min": os.getloadavg()[0],
-            "command": command_of(cell, source),
+            "command": command_of(cell, source, self.device),
         }
         row |= {"machine": machine(), "commit": self._commit}
         try:
@@ -89,6 +95,7 @@ class Bench:
             preset=cell.series if cell.series in PRESETS else preset_of(cell.series),
             budget_s=cell.budget_s,
             iterations=cell.iterations,
+            device=self.device,
             seed=cell.seed,
             accepted_at_s=time.time() - sum(opened.seconds.values()),
         )
@@ -102,8 +109,9 @@ class Bench:
             kept = [path for path in out.iterdir() if path.name not in (REPORT, CURVE)]
             scene_bytes = sum(path.stat().st_size for path in kept)
         seconds = seconds_of(report.seconds, opened.seconds, on_the_way.took_s)
-        values = _reported(report, seconds) | _size(scene) | _speed(scene, report)
+        values = _reported(report, seconds) | _size(scene) | _speed(scene, report, choose_device(self.device))
         values |= {
+            "machine": machine(report.device),
             "scene_bytes": scene_bytes,
             "stored_loss_held_out_db": _stored_loss_held_out_db(report, on_the_way.last_db),
         }
@@ -160,7 +168,7 @@ class _OnTheWay:
         ]
 
 
-def command_of(cell: Cell, source: Source) -> str:
+def command_of(cell: Cell, source: Source, device: DeviceName = "auto") -> str:
     """The command line that measures this cell, as a shell reads it."""
     limit = {"--iterations": cell.iterations} if cell.iterations else {"--budget-s": f"{cell.budget_s:g}"}
     is_path = source.argument == str(source.options.get("clip"))
@@ -168,13 +176,14 @@ def command_of(cell: Cell, source: Source) -> str:
         f"--{name.replace('_', '-')}": value for name, value in source.options.items() if is_path and name != "clip"
     }
     own = {"--series": cell.series, "--holdout": cell.holdout, "--seeds": cell.seed, **limit, "--out": "DIR"}
+    own |= {} if device == "auto" else {"--device": device}
     options = [str(part) for option in {**given, **own}.items() for part in option]
     return shlex.join(["intrasplat", "evaluate", source.argument, *options])
 
 
-def render_ms(scene: Scene) -> float:
+def render_ms(scene: Scene, device: Device) -> float:
     """Median milliseconds of an image at the clip's size, deformation included, at times spread over the clip."""
-    model = model_of(scene)
+    model = model_of(scene, device)
     camera = camera_vector(camera_in_units(scene.intrinsics, scene.world_from_camera[0], scene.units_per_mm))
     took: list[float] = []
     for t in np.random.default_rng(0).permutation(np.linspace(0, 1, UNTIMED_RENDERS + TIMED_RENDERS, endpoint=False)):
@@ -213,8 +222,8 @@ def _size(scene: Scene) -> Values:
     return {"gaussians": len(scene.gaussians), "floats_a_gaussian": floats / len(scene.gaussians)}
 
 
-def _speed(scene: Scene, report: Report) -> Values:
-    median_ms = render_ms(scene)
+def _speed(scene: Scene, report: Report, device: Device) -> Values:
+    median_ms = render_ms(scene, device)
     step_ms = 1000 * report.seconds["optimise_s"] / report.iterations
     return {"step_ms": step_ms, "render_ms": median_ms, "render_fps": 1000 / median_ms}
 

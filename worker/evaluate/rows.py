@@ -111,14 +111,15 @@ def write_rows(path: Path, fields: Iterable[str], rows: Iterable[Mapping[str, ob
     aside.replace(path)
 
 
-def machine() -> str:
-    """Processor, cores and date: the figures are of this machine on this day."""
+def machine(device: str = "cpu") -> str:
+    """Processor, cores, a device other than them, and date: the figures are of this machine on this day."""
     name = platform.processor() or platform.machine()
     if Path("/proc/cpuinfo").exists():
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         models = [line.split(":", 1)[1].strip() for line in lines if "model name" in line]
         name = models[0] if models else name
-    return f"{name}, {os.cpu_count()} cores, {time.strftime('%Y-%m-%d')}"
+    parts = [name, f"{os.cpu_count()} cores", *([] if device == "cpu" else [device]), time.strftime("%Y-%m-%d")]
+    return ", ".join(parts)
 
 
 def commit() -> str:

@@ -144,7 +144,7 @@ class Atlas:
             self._clean.clear()  # one at a time: cells come seed by seed
             self._clean[cell.seed] = clean_clip(self.grid.settings(cell.seed))
         row = measured(cell, self._clean[cell.seed], self.grid, hooks)
-        row |= {"machine": machine(), "commit": self._commit}
+        row |= {"machine": row["machine"] or machine(), "commit": self._commit}
         key = cell.clean.key(self.grid)
         clean = next((each for each in self.rows if tuple(each[name] for name in KEY) == key), None)
         row |= verdict(row, row if cell == cell.clean else clean)
@@ -241,6 +241,7 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Hooks) 
         "psnr_db": _text(psnr_db),
         "depth_error_mm": _text(depth_error_mm),
         "reported_db": _text(report.psnr_tissue_db),
+        "machine": machine(report.device),
         "warnings": SEPARATOR.join(_one_line(report)),
     }
 

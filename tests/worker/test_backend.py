@@ -1,0 +1,106 @@
+"""Which device is taken, what is said where it cannot be, and that nothing of a GPU is loaded without one."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from contract.errors import InputError, UnavailableError
+from tests.worker.models import HEIGHT, WIDTH, moving_fdm, moving_hexplane, moving_shared, wall
+from worker.backend import CPU, CPU_BY_VARIABLE, Device, Gpu, choose_device, device_for, find_gpu, make_model
+from worker.presets import PRESETS
+from worker.raster.cpu.model import FusedModel
+from worker.unfused import UnfusedModel
+
+H200 = Gpu(build="13.0", name="NVIDIA H200", has_triton=True)
+CPU_BUILD = Gpu(build=None, name=None, has_triton=False)
+NO_GPU = Gpu(build="13.0", name=None, has_triton=True)
+NO_TRITON = Gpu(build="13.0", name="NVIDIA H200", has_triton=False)
+
+
+def test_auto_takes_the_gpu_where_everything_is_there_and_else_the_cpu() -> None:
+    assert choose_device("auto", H200) == Device("cuda", "NVIDIA H200", "cuda")
+    for gpu in (CPU_BUILD, NO_GPU, NO_TRITON):
+        assert choose_device("auto", gpu) == CPU
+
+
+def test_what_is_asked_for_by_name_is_taken() -> None:
+    assert choose_device("cpu", H200) == CPU
+    assert choose_device("cuda", H200).kind == "cuda"
+
+
+@pytest.mark.parametrize(
+    ("gpu", "said", "remedy"),
+    [
+        (CPU_BUILD, "torch is a CPU build and Triton is not installed", "TORCH_INDEX"),
+        (NO_GPU, "torch sees no NVIDIA GPU", "nvidia-smi"),
+        (NO_TRITON, "Triton is not installed", "intrasplat[gpu]"),
+    ],
+)
+def test_a_gpu_that_cannot_be_used_is_refused_with_what_is_missing_and_the_remedy(
+    gpu: Gpu, said: str, remedy: str
+) -> None:
+    with pytest.raises(UnavailableError) as refused:
+        choose_device("cuda", gpu)
+    assert said in refused.value.problem
+    assert remedy in refused.value.remedy
+    assert refused.value.remedy.endswith("--device cpu.")
+    with pytest.raises(UnavailableError, match=CPU_BY_VARIABLE):
+        choose_device("cuda", gpu, cpu_by=CPU_BY_VARIABLE)
+
+
+def test_a_device_that_is_not_known_is_refused() -> None:
+    with pytest.raises(InputError, match="tpu") as refused:
+        choose_device("tpu", H200)
+    assert refused.value.field == "options.device"
+
+
+def test_a_motion_without_kernels_for_a_gpu_trains_on_the_cpu_and_not_on_a_gpu_that_was_asked_for() -> None:
+    motion = PRESETS["hexplane"].deformation
+    assert device_for(motion, "auto", H200) == device_for(motion, "cpu", H200) == CPU
+    with pytest.raises(InputError, match="hexplane") as refused:
+        device_for(motion, "cuda", H200)
+    assert refused.value.field == "options.device"
+    with pytest.raises(UnavailableError):
+        device_for(motion, "cuda", NO_GPU)
+    for preset in PRESETS.values():
+        if preset.deformation != motion:
+            assert device_for(preset.deformation, "auto", H200).kind == "cuda"
+
+
+def test_reports_name_the_gpu() -> None:
+    assert str(CPU) == "cpu"
+    assert str(choose_device("auto", H200)) == "cuda (NVIDIA H200)"
+
+
+def test_the_model_of_a_motion_is_that_of_the_device() -> None:
+    gaussians = wall()
+    for moving in (moving_shared, moving_fdm):
+        assert type(make_model(gaussians, moving(gaussians), WIDTH, HEIGHT)) is FusedModel
+    for device in (CPU, Device("cuda", "NVIDIA H200", "cuda")):
+        assert type(make_model(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT, device)) is UnfusedModel
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_this_machine_without_a_gpu_is_seen_as_one() -> None:
+    gpu = find_gpu()
+    assert gpu.name is None
+    assert gpu.missing
+
+
+def test_without_a_gpu_nothing_of_triton_is_loaded() -> None:
+    program = (
+        "import sys, worker.pipeline, worker.views; from worker.backend import choose_device; choose_device('auto');"
+        "print(*(each for each in sys.modules if each == 'triton' or each.startswith('worker.raster.cuda')))"
+    )
+    environment = {"PATH": "", "CUDA_VISIBLE_DEVICES": "", "HOME": str(Path.home())}
+    folder = Path(__file__).parents[2]
+    command = [sys.executable, "-c", program]
+    result = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=True
+    )
+    assert result.stdout.split() == []

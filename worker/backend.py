@@ -1,0 +1,140 @@
+"""Which device computes, and the model for it: an NVIDIA GPU by Triton's kernels, or the processor by Numba's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Literal, get_args
+
+import torch
+
+from contract.errors import InputError, UnavailableError
+from contract.settings import DeviceName
+from worker.deformation import Deformation, HexPlane
+from worker.gaussians import Gaussians
+from worker.model import Model
+from worker.raster.cpu.model import FusedModel
+from worker.unfused import UnfusedModel
+
+CPU_ALONE = frozenset({"hexplane"})
+"""Kinds of motion without kernels of their own: torch moves the Gaussians, on the processor."""
+
+
+CPU_BY_OPTION, CPU_BY_VARIABLE = "--device cpu", "INTRASPLAT_DEVICE=cpu"
+"""How the CPU is chosen for one reconstruction, and for a worker."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where a model is trained and rendered.
+
+    kind    what the user calls it
+    name    the GPU's own, in reports
+    memory  where its tensors lie, as torch calls it
+    """
+
+    kind: Literal["cpu", "cuda"]
+    name: str = ""
+    memory: str = "cpu"
+
+    def __str__(self) -> str:
+        return f"{self.kind} ({self.name})" if self.name else self.kind
+
+
+CPU = Device("cpu")
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """What training on a GPU takes, as far as it is there.
+
+    build       the CUDA version that torch was built for; None: it is a CPU build
+    name        of the GPU that torch sees; None: it sees none
+    has_triton  whether Triton is installed
+    """
+
+    build: str | None
+    name: str | None
+    has_triton: bool
+
+    @property
+    def missing(self) -> str:
+        """What is not there, in words; empty if nothing is missing."""
+        lacks = []
+        if self.build is None:
+            lacks.append("torch is a CPU build")
+        elif self.name is None:
+            lacks.append("torch sees no NVIDIA GPU")
+        if not self.has_triton:
+            lacks.append("Triton is not installed")
+        return " and ".join(lacks)
+
+    @property
+    def remedy(self) -> str:
+        """What to do about what is missing first; it ends without a full stop."""
+        if self.build is None:
+            return "Install torch's CUDA build (`make setup TORCH_INDEX=https://download.pytorch.org/whl/cu128`)"
+        if self.name is None:
+            return "See whether `nvidia-smi` lists the GPU, and whether its driver is as new as torch's CUDA"
+        return "Install Triton (`pip install 'intrasplat[gpu]'`)"
+
+
+def find_gpu() -> Gpu:
+    """What there is on this machine."""
+    name = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
+    return Gpu(torch.version.cuda, name, has_triton=find_spec("triton") is not None)
+
+
+def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OPTION) -> Device:
+    """The device for auto, cpu or cuda; auto takes the GPU where everything is there that it takes.
+
+    Args:
+        gpu: what there is; None looks.
+        cpu_by: how the caller's user chooses the CPU, for the remedy.
+
+    Raises:
+        InputError: there is no device of that name.
+        UnavailableError: cuda is asked for, and something is missing.
+    """
+    if asked not in get_args(DeviceName):
+        raise InputError("options.device", f"there is no device {asked!r}.", "Use auto, cpu or cuda.")
+    if asked == "cpu":
+        return CPU
+    gpu = gpu or find_gpu()
+    if gpu.name is not None and gpu.has_triton:
+        return Device("cuda", gpu.name, "cuda")
+    if asked == "auto":
+        return CPU
+    problem = f"device 'cuda' was asked for, but {gpu.missing}."
+    raise UnavailableError(problem, f"{gpu.remedy}, or train on the CPU: {cpu_by}.")
+
+
+def device_for(deformation: str, asked: str, gpu: Gpu | None = None) -> Device:
+    """choose_device for training a motion of this kind: auto trains one without kernels for a GPU on the CPU.
+
+    Raises:
+        InputError: cuda is asked for, and the motion trains on the CPU only; or there is no device of that name.
+        UnavailableError: as choose_device.
+    """
+    device = choose_device(asked, gpu)
+    if device.kind == "cpu" or deformation not in CPU_ALONE:
+        return device
+    if asked == "cuda":
+        problem = f"cuda was asked for, but motion {deformation!r} trains on the CPU only."
+        raise InputError("options.device", problem, "Use auto or cpu, or another preset.")
+    return CPU
+
+
+def make_model(gaussians: Gaussians, deformation: Deformation, width: int, height: int, device: Device = CPU) -> Model:
+    """The Gaussians (on the host) and their motion in the form that the device trains and renders.
+
+    A motion without kernels of its own lies on the CPU, whatever the device. Triton is imported for a GPU alone.
+    """
+    if isinstance(deformation, HexPlane):
+        return UnfusedModel(gaussians, deformation, width, height)
+    if device.kind == "cpu":
+        return FusedModel(gaussians, deformation, width, height)
+    from worker.raster.cuda.model import CudaModel
+
+    model: Model = CudaModel(gaussians, deformation, width, height, device.memory)
+    return model
