@@ -27,7 +27,7 @@ EXTENT = 8
 """Floats that tell which tiles a splat touches: its centre, the half-height of the ellipse, the dy at which it reaches
 furthest to the right; the middle of its chord at dy, over dy; and the square of half a chord at dy = 0, and how much
 that loses with dy^2. One spare."""
-FILL_BLOCK = 128
+FILL_BLOCK = 256
 MOST_FRAMES = 16
 """Frames whose depths can be sorted as one: 4 bits of a depth key."""
 DEPTH_BITS = 28
@@ -108,6 +108,10 @@ def fill_slots(  # type: ignore[no-untyped-def]
     if tl.program_id(0) == 0:
         tl.store(needed, tl.maximum(tl.load(needed), tl.minimum(total, 2147483647).to(tl.int32)))
         tl.store(ok, tl.where(total > capacity, 0, tl.load(ok)))
+    if tl.program_id(0) * BLOCK >= total:
+        tl.store(key + slot, tl.full((BLOCK,), no_tile, key.dtype.element_ty), mask=slot < capacity)
+        tl.store(owner + slot, tl.zeros((BLOCK,), tl.int32), mask=slot < capacity)
+        return
     used = (slot < capacity) & (slot < total)
 
     rank = tl.zeros_like(slot)  # how many splats end at or before the slot
@@ -138,9 +142,6 @@ def fill_slots(  # type: ignore[no-untyped-def]
         ahead -= wide
         row += 1
         looking = tl.where((tile < 0) & (row <= last), looking, 0)
-    frame = splat // gaussians
-    found = used & (tile >= 0)
-    kept = slot < capacity
-    number = tl.where(found, frame * (tiles_x * rows) + tile, no_tile)
-    tl.store(key + slot, number.to(key.dtype.element_ty), mask=kept)
-    tl.store(owner + slot, splat, mask=kept)
+    number = tl.where(tile >= 0, splat // gaussians * (tiles_x * rows) + tile, no_tile)
+    tl.store(key + slot, number.to(key.dtype.element_ty), mask=slot < capacity)
+    tl.store(owner + slot, splat, mask=slot < capacity)

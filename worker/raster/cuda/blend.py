@@ -87,6 +87,20 @@ def _row(values, k, which: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
+def _upside_down(values, K: tl.constexpr, P: tl.constexpr):  # type: ignore[no-untyped-def]
+    """values [K, P] with the last row first: a name for other registers, no instruction.
+
+    Rows are exchanged by halves, quarters and so on, each as (a + b) - a = b in integers, where that is exact and the
+    compiler sees through it. (A scan with reverse=True would send every number through the warp five times over.)
+    """
+    bits = values.to(tl.int32, bitcast=True)
+    for i in tl.static_range(K.bit_length() - 1):
+        bits = tl.reshape(bits, (2**i, 2, K // 2 ** (i + 1), P))
+        bits = tl.sum(bits, 1, keep_dims=True) - bits
+    return tl.reshape(bits, (K, P)).to(tl.float32, bitcast=True)
+
+
+@triton.jit
 def _upper(value):  # type: ignore[no-untyped-def]
     """value cut to the bits that a TF32 product keeps; what is left has as few."""
     return (value.to(tl.int32, bitcast=True) & _UPPER_BITS).to(tl.float32, bitcast=True)
@@ -268,7 +282,7 @@ def blend(  # type: ignore[no-untyped-def]
             reach = after * score
             shown = odds * reach
             last = shown + tl.where(k == K - 1, behind[None, :], -0.0)
-            summed = tl.flip(tl.cumsum(tl.flip(last, 0), 0), 0)
+            summed = _upside_down(tl.cumsum(_upside_down(last, K, P), 0), K, P)
             behind = _row(summed, k, 0)
             v_power = tl.where(raw < _MAX_ALPHA, odds * (reach - (summed - shown)), 0.0)
             tl.store(out, _sum_split(v_power, monomials), mask=there[:, None])

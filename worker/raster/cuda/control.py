@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from worker.optimize import StepRates, adam_step
-from worker.raster.cuda.update import ROWS
+from worker.raster.cuda.update import VALUES
 
 ALIGNMENT = 16
 """Bytes: a field begins at a multiple of so many, as kernels are compiled for."""
@@ -70,7 +70,7 @@ def adam_fields() -> dict[str, Field]:
     rows and the opacity, and of the other harmonics; the floor they share; the decays of the moments."""
     return {
         "slot": Field((1,), "int"),
-        "size": Field((ROWS + 1,)),
+        "size": Field((VALUES,)),
         "rest_size": Field((1,)),
         "floor": Field((1,)),
         "betas": Field((2,)),

@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from worker.raster.cuda.update import COLOUR_ROW, CONSTANT_HARMONIC, GRADIENT_ROWS, ROW_COUNT, adam
+from worker.raster.cuda.update import COLOUR_ROW, CONSTANT_HARMONIC, STATE_ROWS, adam
 
 BLOCK = 128
 """Gaussians a program, one a thread: a direction and its slopes stay in registers."""
@@ -88,7 +88,7 @@ def _term(K: tl.constexpr, x, y, z):  # type: ignore[no-untyped-def]
 @triton.jit
 def _direction(state, centre, frame, at, inside, columns):  # type: ignore[no-untyped-def]
     """Unit vector from the frame's camera to the means, and one over the distance."""
-    mean, eye = state + frame * ROW_COUNT * columns + at, centre + 3 * frame
+    mean, eye = state + frame * STATE_ROWS * columns + at, centre + 3 * frame
     x = tl.load(mean, mask=inside, other=1.0) - tl.load(eye)
     y = tl.load(mean + columns, mask=inside, other=1.0) - tl.load(eye + 1)
     z = tl.load(mean + 2 * columns, mask=inside, other=1.0) - tl.load(eye + 2)
@@ -106,14 +106,14 @@ def _colour_gradient(v_colour, colour, frame, channel, at, inside, columns):  # 
 
 @triton.jit
 def colour_from_sh(  # type: ignore[no-untyped-def]
-    state, rest, centre, colour, columns, TERMS: tl.constexpr, BLOCK: tl.constexpr
+    rest, state, centre, colour, columns, TERMS: tl.constexpr, BLOCK: tl.constexpr
 ):
     """colour = max(0, 0.5 + sum_k c_k Y_k(direction from the camera to the mean)), k < TERMS. Grid (blocks, F)."""
     frame = tl.program_id(1)
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = at < columns
     x, y, z, _ = _direction(state, centre, frame, at, inside, columns)
-    constant = state + (frame * ROW_COUNT + COLOUR_ROW) * columns + at
+    constant = state + (frame * STATE_ROWS + COLOUR_ROW) * columns + at
     red = 0.5 + CONSTANT_HARMONIC * tl.load(constant, mask=inside, other=0.0)
     green = 0.5 + CONSTANT_HARMONIC * tl.load(constant + columns, mask=inside, other=0.0)
     blue = 0.5 + CONSTANT_HARMONIC * tl.load(constant + 2 * columns, mask=inside, other=0.0)
@@ -131,7 +131,7 @@ def colour_from_sh(  # type: ignore[no-untyped-def]
 
 @triton.jit
 def colour_from_sh_backward(  # type: ignore[no-untyped-def]
-    state, rest, centre, colour, v_colour, v_state, columns, TERMS: tl.constexpr, BLOCK: tl.constexpr
+    rest, state, centre, colour, v_colour, v_state, columns, TERMS: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Add the directions' share to rows 0:3 of v_state [F, 10, columns]; update.py finds the constant harmonic's in
     v_colour. Grid (blocks, F)."""
@@ -153,7 +153,7 @@ def colour_from_sh_backward(  # type: ignore[no-untyped-def]
         v_y += share * by_y
         v_z += share * by_z
     along = v_x * x + v_y * y + v_z * z
-    out = v_state + frame * GRADIENT_ROWS * columns + at
+    out = v_state + frame * COLOUR_ROW * columns + at
     tl.store(out, tl.load(out, mask=inside, other=0.0) + nearness * (v_x - along * x), mask=inside)
     out += columns
     tl.store(out, tl.load(out, mask=inside, other=0.0) + nearness * (v_y - along * y), mask=inside)
@@ -193,19 +193,19 @@ def _grid(columns: int, *frames: int) -> tuple[int, ...]:
     return (triton.cdiv(columns, BLOCK), *frames)
 
 
-def show(state: Tensor, rest: Tensor, centre: Tensor, colour: Tensor, degree: int) -> None:
+def show(rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, degree: int) -> None:
     """Write the colour seen from the cameras, by the harmonics up to a degree of at least 1."""
     frames, _, columns = state.shape
-    colour_from_sh[_grid(columns, frames)](state, rest, centre, colour, columns, TERMS=(degree + 1) ** 2, BLOCK=BLOCK)
+    colour_from_sh[_grid(columns, frames)](rest, state, centre, colour, columns, TERMS=(degree + 1) ** 2, BLOCK=BLOCK)
 
 
 def carry_back(
-    state: Tensor, rest: Tensor, centre: Tensor, colour: Tensor, v_colour: Tensor, v_state: Tensor, degree: int
+    rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, v_colour: Tensor, v_state: Tensor, degree: int
 ) -> None:
     """Add to rows 0:3 of v_state [F, 10, columns] what dL/dcolour [F, 3, columns] says through the directions."""
     frames, _, columns = state.shape
     colour_from_sh_backward[_grid(columns, frames)](
-        state, rest, centre, colour, v_colour, v_state, columns, TERMS=(degree + 1) ** 2, BLOCK=BLOCK
+        rest, state, centre, colour, v_colour, v_state, columns, TERMS=(degree + 1) ** 2, BLOCK=BLOCK
     )
 
 

@@ -1,7 +1,6 @@
 """The training step on the device: deform, project, bin, blend with loss and gradients, Adam; captured in a CUDA graph.
 
-N Gaussians (padded to COLUMNS), rows of N floats; F frames a step; canonical and state [13, N] as in
-raster/cpu/update.py; H W pixels.
+N Gaussians (padded to COLUMNS), rows of N floats; F frames a step; values [14, N] as in update.py; H W pixels.
 
 step() returns before its step is made. What changes from step to step goes to the device as one row of the control
 block (control.py); everything else lies there already, so a step is a copy of some hundred floats and a replay.
@@ -35,7 +34,7 @@ from worker.raster.cuda.control import Control, Field, adam_fields, write_adam
 from worker.raster.cuda.frames import FrameStore
 from worker.raster.cuda.motion import Motion, Trained, kept_where_old, motion_of
 from worker.raster.cuda.rasterizer import CudaRasterizer, Gradients
-from worker.raster.cuda.update import MADE, ROWS, SEEN, SUMS, padded
+from worker.raster.cuda.update import MADE, ROWS, SEEN, SUMS, VALUES, padded
 from worker.raster.step import StepSums, TrainingFrame
 
 Floats = NDArray[np.float32]
@@ -91,19 +90,17 @@ class CudaModel:
         """frames: how many a step trains on (step_frames); step is for one."""
         self.count, self.device = len(gaussians), torch.device(device)
         columns = padded(self.count)
-        canonical = torch.zeros(ROWS, columns)
-        canonical[3] = 1.0
-        canonical[:, : self.count] = torch.cat(
-            [gaussians.mean, gaussians.quaternion, gaussians.log_scale, gaussians.sh[:, 0]], 1
-        ).T
-        opacity_logit = torch.full((columns,), PAD_LOGIT)
-        opacity_logit[: self.count] = gaussians.opacity_logit
+        values = torch.zeros(VALUES, columns)
+        values[3], values[13] = 1.0, PAD_LOGIT
+        parts = [gaussians.mean, gaussians.quaternion, gaussians.log_scale, gaussians.sh[:, 0]]
+        values[:, : self.count] = torch.cat([*parts, gaussians.opacity_logit[:, None]], 1).T
         sh_rest = torch.zeros(gaussians.sh.shape[1] - 1, 3, columns)
         sh_rest[:, :, : self.count] = gaussians.sh[:, 1:].permute(1, 2, 0)
         self.sh_degree = gaussians.sh_degree  # of those stored; a schedule may use fewer
-        self._values = {"canonical": canonical, "opacity_logit": opacity_logit, "sh_rest": sh_rest}
-        self._values = {name: each.to(self.device) for name, each in self._values.items()}
-        self._moments = {name: torch.zeros(2, *a.shape, device=self.device) for name, a in self._values.items()}
+        self._values, self._sh_rest = values.to(self.device), sh_rest.to(self.device)
+        self._moments, self._rest_moments = (
+            torch.zeros(2, *each.shape, device=self.device) for each in (self._values, self._sh_rest)
+        )
         self.motion: Motion = motion_of(deformation, columns, self.device)
         self._size = width, height
         self._training = View(width, height, frames, self.motion, self.device, rows=CHECK_EVERY)
@@ -168,7 +165,7 @@ class CudaModel:
 
     def _launch(self, sh_degree: int) -> None:
         """Everything that a step launches, in order."""
-        view, values, moments = self._training, self._values, self._moments
+        view = self._training
         self._project(view, sh_degree)
         control, rasterizer = view.control.values, view.rasterizer
         store = self._store
@@ -176,15 +173,13 @@ class CudaModel:
             store.rgb, store.weight, store.inverse_depth, control["loss"], control["frame"]
         )
         if sh_degree > 0:
-            seen_from, shown = (view.state, values["sh_rest"], control["centre"]), (view.colour, gradients.colour)
-            harmonics.carry_back(*seen_from, *shown, gradients.state, sh_degree)
+            seen, shown = (view.state, control["centre"], view.colour), (gradients.colour, gradients.state)
+            harmonics.carry_back(self._sh_rest, *seen, *shown, sh_degree)
             harmonics.update(
-                values["sh_rest"], moments["sh_rest"], view.state, control["centre"], *shown, rasterizer.ok, control,
-                sh_degree,
-            )  # fmt: skip
+                self._sh_rest, self._rest_moments, *seen, gradients.colour, rasterizer.ok, control, sh_degree
+            )
         trained = Trained(
-            values["canonical"], moments["canonical"], values["opacity_logit"], moments["opacity_logit"],
-            gradients.state, gradients.opacity_logit, gradients.colour, view.colour,
+            self._values, self._moments, gradients.state, gradients.opacity_logit, gradients.colour, view.colour,
             rasterizer.count, rasterizer.statistics, rasterizer.ok, self._report,
         )  # fmt: skip
         self.motion.update(trained, control)
@@ -193,10 +188,10 @@ class CudaModel:
     def _project(self, view: View, sh_degree: int) -> None:
         """The Gaussians, at the times and on the images that the view's control block says."""
         control = view.control.values
-        self.motion.deform(self._values["canonical"], control, view.state, view.colour)
+        self.motion.deform(self._values, control, view.state, view.colour)
         if sh_degree > 0:
-            harmonics.show(view.state, self._values["sh_rest"], control["centre"], view.colour, sh_degree)
-        view.rasterizer.project(control["camera"], view.state, self._values["opacity_logit"], view.colour)
+            harmonics.show(self._sh_rest, view.state, control["centre"], view.colour, sh_degree)
+        view.rasterizer.project(control["camera"], view.state, self._values[ROWS], view.colour)
 
     def _settle(self) -> None:
         """Wait for the steps sent, and send those again that found no room."""
@@ -254,7 +249,7 @@ class CudaModel:
         size = width, height, frames
         if size not in self._views:
             self._views[size] = View(width, height, frames, self.motion, self.device)
-            self._views[size].fit(self._values["canonical"].shape[1])
+            self._views[size].fit(self._values.shape[1])
         self._views.move_to_end(size)
         while len(self._views) > SIZES_KEPT:
             self._views.popitem(last=False)
@@ -292,7 +287,7 @@ class CudaModel:
         """[N] on the device, with zeros for the columns that only fill the rows."""
         if values is None:
             return None
-        filled = torch.zeros(self._values["canonical"].shape[1])
+        filled = torch.zeros(self._values.shape[1])
         filled[: len(values)] = torch.from_numpy(np.asarray(values, np.float32))
         return filled.to(self.device)
 
@@ -327,7 +322,7 @@ class CudaModel:
         view = self._view(*self._size, 1)
         self.motion.write_times(view.control.rows[0], [t])
         view.control.send(0)
-        self.motion.deform(self._values["canonical"], view.control.values, view.state, view.colour)
+        self.motion.deform(self._values, view.control.values, view.state, view.colour)
         mean: Floats = view.state[0, :3, : self.count].cpu().numpy().copy()
         return mean
 
@@ -340,31 +335,33 @@ class CudaModel:
         fill = padded(count) - count
         chosen = torch.from_numpy(np.concatenate([columns, np.zeros(fill, np.int64)])).to(self.device)
         is_fresh = torch.from_numpy(np.concatenate([fresh, np.ones(fill, np.bool_)])).to(self.device)
-        for name, each in self._values.items():
-            self._values[name] = each.index_select(-1, chosen)
-            self._moments[name] = kept_where_old(self._moments[name], chosen, is_fresh)
+        self._values, self._sh_rest = (each.index_select(-1, chosen) for each in (self._values, self._sh_rest))
+        self._moments, self._rest_moments = (
+            kept_where_old(each, chosen, is_fresh) for each in (self._moments, self._rest_moments)
+        )
         self.motion.take(chosen, is_fresh)
-        self._values["opacity_logit"][count:] = PAD_LOGIT
+        self._values[ROWS, count:] = PAD_LOGIT
         self.count = count
         self._launches.forget()
         self._training.fit(len(chosen))
         self._views.clear()
         self._gradients = self._shown = None
 
-    def _of_the_gaussians(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Without the columns that only fill the rows."""
-        return {name: each[..., : self.count] for name, each in tensors.items()}
-
     def parameters(self) -> dict[str, Tensor]:
         """What is trained, by name; views of the live tensors."""
         self._settle()
-        return self._of_the_gaussians(self._values) | self.motion.parameters(self.count)
+        return self._own(self._values, self._sh_rest) | self.motion.parameters(self.count)
+
+    def _own(self, values: Tensor, sh_rest: Tensor, prefix: str = "") -> dict[str, Tensor]:
+        """By their names, without the columns that only fill the rows; [..., VALUES, N] and [..., K - 1, 3, N]."""
+        named = {"canonical": values[..., :ROWS, :], "opacity_logit": values[..., ROWS, :], "sh_rest": sh_rest}
+        return {prefix + name: each[..., : self.count] for name, each in named.items()}
 
     def arrays(self) -> dict[str, Tensor]:
         """Everything a resumed run needs, by name; views of the live tensors, motion.steps on the host."""
         self._settle()
-        moments = {f"moments.{name}": each for name, each in self._moments.items()}
-        return self._of_the_gaussians(self._values | moments) | self.motion.arrays(self.count)
+        moments = self._own(self._moments, self._rest_moments, "moments.")
+        return self._own(self._values, self._sh_rest) | moments | self.motion.arrays(self.count)
 
     def load_arrays(self, stored: dict[str, Tensor]) -> None:
         """Put back what arrays() gave, on any device, into a model of the same size; ValueError if the sizes differ."""
@@ -377,13 +374,10 @@ class CudaModel:
     def export(self) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as tensors on the host (copies)."""
         self._settle()
-        canonical, opacity_logit, sh_rest = (each[..., : self.count].cpu() for each in self._values.values())
-        state = canonical.T.clone(memory_format=torch.contiguous_format)
+        values, sh_rest = (each[..., : self.count].cpu() for each in (self._values, self._sh_rest))
         gaussians = Gaussians(
-            state[:, MEAN].contiguous(),
-            state[:, QUATERNION].contiguous(),
-            state[:, LOG_SCALE].contiguous(),
-            opacity_logit.clone(),
-            torch.cat([canonical[None, 10:13], sh_rest]).permute(2, 0, 1).contiguous(),
+            *(values[rows].T.clone(memory_format=torch.contiguous_format) for rows in (MEAN, QUATERNION, LOG_SCALE)),
+            values[ROWS].clone(),
+            torch.cat([values[None, 10:ROWS], sh_rest]).permute(2, 0, 1).contiguous(),
         )
         return gaussians, self.motion.export(self.count)

@@ -21,17 +21,15 @@ from worker.optimize import StepRates, adam_step
 from worker.raster.cpu.motion import NEGLIGIBLE, LinearDeformation
 from worker.raster.cuda import motion_kernels as kernels
 from worker.raster.cuda.control import ADAM, Field
-from worker.raster.cuda.update import BLOCK, PROGRAM_ROWS, ROWS
+from worker.raster.cuda.update import BLOCK, ROWS
 
 
 @dataclass(frozen=True)
 class Trained:
     """What a step's last kernel changes beside the motion, and the gradients it reads; update.py has the shapes."""
 
-    canonical: Tensor
-    canonical_moments: Tensor
-    opacity_logit: Tensor
-    opacity_moments: Tensor
+    values: Tensor
+    moments: Tensor
     v_state: Tensor
     v_opacity_logit: Tensor
     v_colour: Tensor
@@ -49,7 +47,7 @@ class Trained:
     @property
     def columns(self) -> int:
         """N, padded."""
-        return self.canonical.shape[1]
+        return self.values.shape[1]
 
     @property
     def tiles(self) -> int:
@@ -57,7 +55,7 @@ class Trained:
         return self.statistics.numel() // 4
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """In the order in which the kernels take them, without those of the motion, which come after the fourth."""
+        """In the order in which the kernels take them, without those of the motion, which come after the second."""
         return tuple(getattr(self, field.name) for field in dataclasses.fields(self))
 
 
@@ -73,11 +71,11 @@ class Motion(Protocol):
     def write_rates(self, row: Mapping[str, np.ndarray], times: Sequence[float], rates: StepRates, step: int) -> None:
         """Fill what update reads beside, and count the step; it is counted from 1."""
 
-    def deform(self, canonical: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
-        """state [F, 13, N] = canonical + psi(t) at the times, colour [F, 3, N] without other harmonics."""
+    def deform(self, values: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
+        """state [F, 13, N] = values [14, N] + psi(t) at the times, colour [F, 3, N] without other harmonics."""
 
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
-        """One Adam step of the canonical state, the opacity and the weights that reach the times, and its report."""
+        """One Adam step of the values and of the weights that reach the times, and its report."""
 
     def take(self, columns: Tensor, fresh: Tensor) -> None:
         """Keep these columns, in this order; moments start at 0 where fresh."""
@@ -97,8 +95,8 @@ def kept_where_old(moments: Tensor, columns: Tensor, fresh: Tensor) -> Tensor:
     return moments.index_select(-1, columns).masked_fill_(fresh, 0.0)
 
 
-def _grid(rows: int, columns: int, *frames: int) -> tuple[int, ...]:
-    return (triton.cdiv(columns, BLOCK), rows, *frames)
+def _grid(columns: int, *frames: int) -> tuple[int, ...]:
+    return (triton.cdiv(columns, BLOCK), *frames)
 
 
 class LinearMotion:
@@ -154,17 +152,17 @@ class LinearMotion:
         channel_rate[0:3], channel_rate[3:7] = rates.motion_mean, rates.motion_quaternion
         channel_rate[7:10], channel_rate[10:13] = rates.motion_log_scale, rates.motion_colour
 
-    def deform(self, canonical: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
+    def deform(self, values: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
         frames, _, columns = state.shape
-        kernels.deform_linear[_grid(ROWS, columns, frames)](
-            canonical, self.weight, control["basis"], control["span"], state, colour, columns, self._bases,
+        kernels.deform_linear[_grid(columns, frames)](
+            values, self.weight, control["basis"], control["span"], state, colour, columns, self._bases,
             CHANNELS=self._channels, BLOCK=BLOCK,
         )  # fmt: skip
 
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
         tensors = trained.tensors()
-        kernels.update_linear[_grid(PROGRAM_ROWS, trained.columns)](
-            *tensors[:4], self.weight, self.first, self.second, *tensors[4:], *(control[name] for name in ADAM),
+        kernels.update_linear[_grid(trained.columns)](
+            *tensors[:2], self.weight, self.first, self.second, *tensors[2:], *(control[name] for name in ADAM),
             *(control[name] for name in ("basis", "alive", "basis_size", "basis_floor", "channel_rate")),
             trained.columns, self._bases, trained.tiles, CHANNELS=self._channels, FRAMES=trained.frames, BLOCK=BLOCK,
         )  # fmt: skip
@@ -205,17 +203,17 @@ class FdmMotion:
     def write_rates(self, row: Mapping[str, np.ndarray], times: Sequence[float], rates: StepRates, step: int) -> None:
         row["motion_size"][0] = adam_step(rates.motion_mean, rates, step).size
 
-    def deform(self, canonical: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
+    def deform(self, values: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
         frames, _, columns = state.shape
-        kernels.deform_fdm[_grid(ROWS, columns, frames)](
-            canonical, self.weight, self.centre, self.width, control["time"], state, colour, columns,
+        kernels.deform_fdm[_grid(columns, frames)](
+            values, self.weight, self.centre, self.width, control["time"], state, colour, columns,
             self.weight.shape[1], QUARTIC=self._form == "quartic", BLOCK=BLOCK,
         )  # fmt: skip
 
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
         tensors = trained.tensors()
-        kernels.update_fdm[_grid(PROGRAM_ROWS, trained.columns)](
-            *tensors[:4], self.weight, self.centre, self.width, self.first, self.second, *tensors[4:],
+        kernels.update_fdm[_grid(trained.columns)](
+            *tensors[:2], self.weight, self.centre, self.width, self.first, self.second, *tensors[2:],
             *(control[name] for name in ADAM), control["time"], control["motion_size"],
             trained.columns, self.weight.shape[1], trained.tiles,
             QUARTIC=self._form == "quartic", FRAMES=trained.frames, BLOCK=BLOCK,

@@ -1,9 +1,8 @@
 """How Gaussians move on the device: deformation to the frames' times, and Adam on everything but the other harmonics.
 
 N Gaussians in rows of `columns` floats, F frames a step, B bases, C channels (10, or 13 where colour moves too); state
-[F, 13, columns] and the rest as in update.py. One program a row of the state and BLOCK Gaussians. The equations are
-those of raster/cpu/update.py. Loops whose length is known on the device alone are while loops: Triton's interpreter has
-no other way to run them beside a recent NumPy.
+[F, 13, columns], the rest and a program's share as in update.py. The equations are those of raster/cpu/update.py. Loops
+whose length the device alone knows are while loops: beside a recent NumPy Triton's interpreter runs no others.
 """
 
 from __future__ import annotations
@@ -14,10 +13,12 @@ import triton.language as tl
 from worker.raster.cuda.update import (
     COLOUR_ROW,
     CONSTANT_HARMONIC,
-    ROW_COUNT,
+    STATE_ROWS,
+    TILE_ROWS,
     adam,
-    row_gradient,
-    update_row,
+    gradient_of_values,
+    report_step,
+    update_values,
 )
 
 MIN_WIDTH = tl.constexpr(1e-3)
@@ -29,69 +30,71 @@ FDM_CHANNELS = tl.constexpr(10)
 
 
 @triton.jit
-def _store_row(state, colour, frame, row, at, inside, total, columns):  # type: ignore[no-untyped-def]
-    """A row of the state, and the colour it shows where no other harmonic is in use."""
-    tl.store(state + (frame * ROW_COUNT + row) * columns + at, total, mask=inside)
-    if row >= COLOUR_ROW:
-        shown = tl.maximum(total * CONSTANT_HARMONIC + 0.5, 0.0)
-        tl.store(colour + (frame * 3 + row - COLOUR_ROW) * columns + at, shown, mask=inside)
+def _place(columns, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """A program's rows [TILE_ROWS, 1] and Gaussians [1, BLOCK], and which of those there are."""
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[None, :]
+    return tl.arange(0, TILE_ROWS)[:, None], at, at < columns
+
+
+@triton.jit
+def _store_state(state, colour, frame, row, at, inside, moved, columns):  # type: ignore[no-untyped-def]
+    """The state, and the colour that it shows where no other harmonic is in use."""
+    tl.store(state + (frame * STATE_ROWS + row) * columns + at, moved, mask=inside & (row < STATE_ROWS))
+    shown = tl.maximum(moved * CONSTANT_HARMONIC + 0.5, 0.0)
+    is_colour = inside & (row >= COLOUR_ROW) & (row < STATE_ROWS)
+    tl.store(colour + (frame * 3 + row - COLOUR_ROW) * columns + at, shown, mask=is_colour)
 
 
 @triton.jit
 def deform_linear(  # type: ignore[no-untyped-def]
-    canonical, weight, basis, span, state, colour, columns, bases, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
+    values, weight, basis, span, state, colour, columns, bases, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """state = canonical + sum over j in span of basis_j weight_j, and its colour. Grid (blocks, 13, F).
+    """state = canonical + sum over j in span of basis_j weight_j, and its colour. Grid (blocks, F).
 
     weight [B, C, columns], basis [F, B], span int32 [F, 2]: the first of the bases in use and the one after the last.
     """
-    row, frame = tl.program_id(1), tl.program_id(2)
-    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    inside = at < columns
-    total = tl.load(canonical + row * columns + at, mask=inside, other=0.0)
-    if row < CHANNELS:
-        j, last = tl.load(span + 2 * frame), tl.load(span + 2 * frame + 1)
-        while j < last:
-            moved = tl.load(weight + (j * CHANNELS + row) * columns + at, mask=inside, other=0.0)
-            total += tl.load(basis + frame * bases + j) * moved
-            j += 1
-    _store_row(state, colour, frame, row, at, inside, total, columns)
+    frame = tl.program_id(1)
+    row, at, inside = _place(columns, BLOCK)
+    moved = tl.load(values + row * columns + at, mask=inside & (row < STATE_ROWS), other=0.0)
+    j, last = tl.load(span + 2 * frame), tl.load(span + 2 * frame + 1)
+    while j < last:
+        weights = tl.load(weight + (j * CHANNELS + row) * columns + at, mask=inside & (row < CHANNELS), other=0.0)
+        moved += tl.load(basis + frame * bases + j) * weights
+        j += 1
+    _store_state(state, colour, frame, row, at, inside, moved, columns)
 
 
 @triton.jit
 def update_linear(  # type: ignore[no-untyped-def]
-    canonical, canonical_moments, opacity, opacity_moments, weight, first, second,
-    v_state, v_opacity, v_colour, colour, touched, statistics, ok, report, slot, size, floor, betas,
-    basis, alive, basis_size, basis_floor, channel_rate, columns, bases, tiles,
+    values, moments, weight, first, second, v_state, v_opacity, v_colour, colour, touched, statistics, ok, report,
+    slot, size, floor, betas, basis, alive, basis_size, basis_floor, channel_rate, columns, bases, tiles,
     CHANNELS: tl.constexpr, FRAMES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adam on the canonical state, the opacity, and the weights of the bases in use; the report. Grid (blocks, 15).
+    """Adam on the values and on the weights of the bases in use; the report. Grid (blocks,).
 
     weight and its moments [B, C, columns]; basis [F, B], 0 where a frame does not use it; alive int32 [1 + B]: how many
     bases are in use, and which. Their step's size is basis_size [B] times channel_rate [13], its floor basis_floor [B].
     """
-    row = tl.program_id(1)
-    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    inside = at < columns
+    row, at, inside = _place(columns, BLOCK)
     if tl.load(ok) != 0:
-        update_row(
-            canonical, canonical_moments, opacity, opacity_moments, v_state, v_opacity, v_colour, colour,
-            touched, statistics, report, slot, size, floor, betas, row, at, inside, columns, tiles, FRAMES,
+        report_step(touched, statistics, report, slot, at, inside, columns, tiles, FRAMES)
+        total = update_values(
+            values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, inside, columns, FRAMES
         )  # fmt: skip
-        if row < CHANNELS:
-            rate = tl.load(channel_rate + row)
-            if rate != 0.0:
-                left = tl.load(alive)
-                while left > 0:
-                    j = tl.load(alive + left)
-                    gradient = tl.zeros(at.shape, tl.float32)
-                    for frame in tl.static_range(FRAMES):
-                        share = row_gradient(v_state, v_colour, colour, frame, row, at, inside, columns)
-                        gradient += tl.load(basis + frame * bases + j) * share
-                    place = (j * CHANNELS + row) * columns + at
-                    step, low = tl.load(basis_size + j) * rate, tl.load(basis_floor + j)
-                    adam(weight, first, second, place, inside, gradient, step, low, betas)
-                    left -= 1
+        rate = tl.load(channel_rate + row, mask=row < CHANNELS, other=0.0)
+        used, left = inside & (rate != 0.0), tl.load(alive)
+        while left > 0:
+            j = tl.load(alive + left)
+            if FRAMES == 1:
+                gradient = tl.load(basis + j) * total
+            else:
+                gradient = tl.zeros_like(total)
+                for frame in tl.static_range(FRAMES):
+                    share = gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, inside, columns)
+                    gradient += tl.load(basis + frame * bases + j) * share
+            step, low = tl.load(basis_size + j) * rate, tl.load(basis_floor + j)
+            adam(weight, first, second, (j * CHANNELS + row) * columns + at, used, gradient, step, low, betas)
+            left -= 1
 
 
 @triton.jit
@@ -120,67 +123,65 @@ def fdm_basis(t, centre, width, QUARTIC: tl.constexpr):  # type: ignore[no-untyp
 
 @triton.jit
 def deform_fdm(  # type: ignore[no-untyped-def]
-    canonical, weight, centre, width, time, state, colour, columns, bases, QUARTIC: tl.constexpr, BLOCK: tl.constexpr
+    values, weight, centre, width, time, state, colour, columns, bases, QUARTIC: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """state = canonical + FDM at the frames' times, and its colour. Grid (blocks, 13, F).
+    """state = canonical + FDM at the frames' times, and its colour. Grid (blocks, F).
 
     weight, centre, width [10, B, columns] (Deform3DGS, equations 3 and 4); time [F].
     """
-    row, frame = tl.program_id(1), tl.program_id(2)
-    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    inside = at < columns
-    total = tl.load(canonical + row * columns + at, mask=inside, other=0.0)
-    if row < FDM_CHANNELS:
-        t, left = tl.load(time + frame), bases
-        while left > 0:
-            left -= 1
-            place = (row * bases + left) * columns + at
-            centres = tl.load(centre + place, mask=inside, other=0.0)
-            widths = tl.load(width + place, mask=inside, other=1.0)
-            value, _, _ = fdm_basis(t, centres, widths, QUARTIC)
-            total += tl.load(weight + place, mask=inside, other=0.0) * value
-    _store_row(state, colour, frame, row, at, inside, total, columns)
+    frame = tl.program_id(1)
+    row, at, inside = _place(columns, BLOCK)
+    moved = tl.load(values + row * columns + at, mask=inside & (row < STATE_ROWS), other=0.0)
+    used, t, left = inside & (row < FDM_CHANNELS), tl.load(time + frame), bases
+    while left > 0:
+        left -= 1
+        place = (row * bases + left) * columns + at
+        centres = tl.load(centre + place, mask=used, other=0.0)
+        widths = tl.load(width + place, mask=used, other=1.0)
+        value, _, _ = fdm_basis(t, centres, widths, QUARTIC)
+        moved += tl.load(weight + place, mask=used, other=0.0) * value
+    _store_state(state, colour, frame, row, at, inside, moved, columns)
 
 
 @triton.jit
 def update_fdm(  # type: ignore[no-untyped-def]
-    canonical, canonical_moments, opacity, opacity_moments, weight, centre, width, first, second,
-    v_state, v_opacity, v_colour, colour, touched, statistics, ok, report, slot, size, floor, betas,
-    time, motion_size, columns, bases, tiles,
+    values, moments, weight, centre, width, first, second, v_state, v_opacity, v_colour, colour, touched, statistics,
+    ok, report, slot, size, floor, betas, time, motion_size, columns, bases, tiles,
     QUARTIC: tl.constexpr, FRAMES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adam on the canonical state, the opacity, and weight, centre and width of every basis; the report.
-    Grid (blocks, 15).
+    """Adam on the values and on weight, centre and width of every basis; the report. Grid (blocks,).
 
-    Moments of the motion [3, 10, B, columns], motion_size [1]: the size of its step.
+    Moments of the motion [3, 10, B, columns]; motion_size [1]: the size of its step.
     """
-    row = tl.program_id(1)
-    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    inside = at < columns
+    row, at, inside = _place(columns, BLOCK)
     if tl.load(ok) != 0:
-        update_row(
-            canonical, canonical_moments, opacity, opacity_moments, v_state, v_opacity, v_colour, colour,
-            touched, statistics, report, slot, size, floor, betas, row, at, inside, columns, tiles, FRAMES,
+        report_step(touched, statistics, report, slot, at, inside, columns, tiles, FRAMES)
+        total = update_values(
+            values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, inside, columns, FRAMES
         )  # fmt: skip
-        if row < FDM_CHANNELS:
-            step, low, group = tl.load(motion_size), tl.load(floor), FDM_CHANNELS * bases * columns
-            left = bases
-            while left > 0:
-                left -= 1
-                place = (row * bases + left) * columns + at
-                centres = tl.load(centre + place, mask=inside, other=0.0)
-                widths = tl.load(width + place, mask=inside, other=1.0)
-                weights = tl.load(weight + place, mask=inside, other=0.0)
-                to_weight = tl.zeros(at.shape, tl.float32)
-                to_centre = tl.zeros(at.shape, tl.float32)
-                to_width = tl.zeros(at.shape, tl.float32)
-                for frame in tl.static_range(FRAMES):
-                    share = row_gradient(v_state, v_colour, colour, frame, row, at, inside, columns)
-                    value, by_centre, by_width = fdm_basis(tl.load(time + frame), centres, widths, QUARTIC)
-                    share = share * value
-                    to_weight += share
-                    to_centre += share * weights * by_centre
-                    to_width += share * weights * by_width
-                adam(weight, first, second, place, inside, to_weight, step, low, betas)
-                adam(centre, first + group, second + group, place, inside, to_centre, step, low, betas)
-                adam(width, first + 2 * group, second + 2 * group, place, inside, to_width, step, low, betas)
+        step, low, group = tl.load(motion_size), tl.load(floor), FDM_CHANNELS * bases * columns
+        used, left = inside & (row < FDM_CHANNELS), bases
+        if step == 0.0:
+            left *= 0
+        while left > 0:
+            left -= 1
+            place = (row * bases + left) * columns + at
+            centres = tl.load(centre + place, mask=used, other=0.0)
+            widths = tl.load(width + place, mask=used, other=1.0)
+            weights = tl.load(weight + place, mask=used, other=0.0)
+            value, by_centre, by_width = fdm_basis(tl.load(time), centres, widths, QUARTIC)
+            if FRAMES == 1:
+                share = total * value
+            else:
+                share = value * gradient_of_values(v_state, v_opacity, v_colour, colour, 0, row, at, inside, columns)
+            to_weight, to_centre, to_width = share, share * weights * by_centre, share * weights * by_width
+            for frame in tl.static_range(1, FRAMES):
+                value, by_centre, by_width = fdm_basis(tl.load(time + frame), centres, widths, QUARTIC)
+                share = gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, inside, columns)
+                share = share * value
+                to_weight += share
+                to_centre += share * weights * by_centre
+                to_width += share * weights * by_width
+            adam(weight, first, second, place, used, to_weight, step, low, betas)
+            adam(centre, first + group, second + group, place, used, to_centre, step, low, betas)
+            adam(width, first + 2 * group, second + 2 * group, place, used, to_width, step, low, betas)

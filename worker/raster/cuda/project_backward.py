@@ -25,8 +25,8 @@ from worker.raster.cuda.project import (
 SLOT = 16
 """Floats of an instance's gradient: the moments 1, x, y, xx, xy, yy of dL/dpower about the tile's middle in 0:6, and
 dL/d(r, g, b, z) as 8:12 plus 12:16."""
-SPLATS_BLOCK, LANES = 4, 32
-"""sum_slots: splats a program, each a warp wide."""
+SPLATS_BLOCK, LANES = 16, 32
+"""sum_slots: splats a program, and slots of each that are added at once."""
 BACKWARD_BLOCK = 128
 POSE = 12
 
