@@ -25,7 +25,7 @@ from worker.raster.cpu.motion import motion_of as cpu_motion_of
 from worker.raster.cuda import harmonics
 from worker.raster.cuda.control import Control, adam_fields, write_adam
 from worker.raster.cuda.motion import LinearMotion, Motion, Trained, motion_of
-from worker.raster.cuda.update import MADE, ROWS, SEEN, SUMS, padded
+from worker.raster.cuda.update import MADE, ROWS, SEEN, SUMS, VALUES, padded
 
 COUNT = 90
 TIMES = (0.4, 0.55)
@@ -48,7 +48,7 @@ class Bench:
     def deform(self) -> None:
         self.motion.write_times(self.control.rows[0], self.times)
         self.control.send(0)
-        self.motion.deform(self.trained.canonical, self.control.values, self.state, self.trained.colour)
+        self.motion.deform(self.trained.values, self.control.values, self.state, self.trained.colour)
 
     def update(self, rates: StepRates, iteration: int) -> None:
         """Adam with the gradients that lie in `trained`."""
@@ -70,16 +70,14 @@ def bench(kind: str, device: str, times: tuple[float, ...] = TIMES) -> Bench:
     gaussians, deformation, _ = moving_gaussians(kind, 0)
     columns, frames = padded(COUNT), len(times)
     motion = motion_of(deformation, columns, torch.device(device))
-    canonical = torch.zeros(ROWS, columns, device=device)
-    canonical[:, :COUNT] = canonical_rows(gaussians).to(device)
-    opacity = torch.zeros(columns, device=device)
-    opacity[:COUNT] = gaussians.opacity_logit.to(device)
+    values = torch.zeros(VALUES, columns, device=device)
+    values[:, :COUNT] = torch.cat([canonical_rows(gaussians), gaussians.opacity_logit[None]]).to(device)
 
     def poisoned(*shape: int) -> Tensor:
         return torch.full(shape, float("nan"), device=device)
 
     trained = Trained(
-        canonical, torch.zeros(2, *canonical.shape, device=device), opacity, torch.zeros(2, columns, device=device),
+        values, torch.zeros(2, *values.shape, device=device),
         poisoned(frames, 10, columns), poisoned(frames, columns), poisoned(frames, 3, columns),
         poisoned(frames, 3, columns), torch.zeros(frames, columns, dtype=torch.int32, device=device),
         torch.rand(frames, 300, 4, generator=torch.Generator().manual_seed(1)).to(device),
@@ -121,7 +119,7 @@ def test_the_state_at_several_times_is_that_of_the_deformation(kind: str, device
 def test_one_frame_moves_and_trains_as_on_the_cpu(kind: str, device: str) -> None:
     made, random = bench(kind, device, (0.4,)), np.random.default_rng(5)
     cpu = cpu_motion_of(made.deformation, padded(COUNT))
-    canonical = made.trained.canonical.cpu().numpy().copy()
+    canonical = made.trained.values[:ROWS].cpu().numpy().copy()
     for iteration, t in enumerate((0.4, 0.52, 0.31), start=1):
         made.times = (t,)
         made.deform()
@@ -134,7 +132,7 @@ def test_one_frame_moves_and_trains_as_on_the_cpu(kind: str, device: str) -> Non
         no_canonical = dataclasses.replace(SAME_RATE, mean=0, quaternion=0, log_scale=0, opacity=0, colour=0)
         made.update(no_canonical, iteration)
         cpu.update(v_state, t, SAME_RATE, iteration)
-    assert bool((made.trained.canonical.cpu() == torch.from_numpy(canonical)).all())
+    assert bool((made.trained.values[:ROWS].cpu() == torch.from_numpy(canonical)).all())
     stored = made.motion.arrays(COUNT)
     for name, wanted in cpu.arrays(COUNT).items():
         assert_close(stored[name], wanted, relative=1e-6, absolute=1e-9, name=name)
@@ -167,8 +165,8 @@ def test_several_frames_take_the_step_of_torchs_adam_on_their_sum(kind: str, dev
         optimiser.step()
         made.update(SAME_RATE, iteration)
     wanted = canonical_rows(Gaussians(**gaussians)).detach()
-    assert_close(made.trained.canonical[:, :COUNT], wanted, relative=1e-5, name="canonical")
-    assert_close(made.trained.opacity_logit[:COUNT], gaussians["opacity_logit"].detach(), relative=1e-5)
+    assert_close(made.trained.values[:ROWS, :COUNT], wanted, relative=1e-5, name="canonical")
+    assert_close(made.trained.values[ROWS, :COUNT], gaussians["opacity_logit"].detach(), relative=1e-5)
     for name, each in made.motion.export(COUNT).parameters().items():
         assert_close(each, leaves[name].detach(), relative=1e-5, name=name)
 
@@ -194,7 +192,7 @@ def test_a_rate_of_nothing_and_a_step_that_must_not_be_made_change_no_bit(kind: 
     made.draw_gradients(np.random.default_rng(7))
 
     def everything() -> list[Tensor]:
-        own = made.trained.tensors()[:4]
+        own = made.trained.tensors()[:2]
         return [each.clone() for each in (*own, made.trained.report, *made.motion.arrays(COUNT).values())]
 
     before = everything()
@@ -210,11 +208,10 @@ def test_a_rate_of_nothing_and_a_step_that_must_not_be_made_change_no_bit(kind: 
         motion_colour=0.0,
     )  # fmt: skip
     made.update(only_means, 1)
-    changed = (made.trained.canonical_moments[0] != 0).any(1)
-    assert changed.tolist() == [True] * 3 + [False] * 10
-    assert not made.trained.opacity_moments.any()
+    changed = (made.trained.moments[0] != 0).any(1)
+    assert changed.tolist() == [True] * 3 + [False] * 11
     if kind == "shared with colour":
-        assert (made.motion.arrays(COUNT)["motion.first"] != 0).any(2).any(0).tolist() == changed.tolist()
+        assert (made.motion.arrays(COUNT)["motion.first"] != 0).any(2).any(0).tolist() == changed[:ROWS].tolist()
 
 
 def test_beyond_six_widths_fdm_gives_the_canonical_state(device: str) -> None:
@@ -223,7 +220,7 @@ def test_beyond_six_widths_fdm_gives_the_canonical_state(device: str) -> None:
     fdm = dataclasses.replace(fdm, weight=torch.ones_like(fdm.weight))
     made.motion, made.times = motion_of(fdm, padded(COUNT), torch.device(device)), (0.25, 0.75)  # 25 widths away
     made.deform()
-    assert bool((made.state == made.trained.canonical).all())
+    assert bool((made.state == made.trained.values[:ROWS]).all())
 
 
 def sh_scene(degree: int) -> tuple[Gaussians, Tensor]:
@@ -244,7 +241,7 @@ def test_harmonics_and_their_step_are_those_of_torch(degree: int, device: str) -
     rest[:, :, :COUNT] = gaussians.sh[:, 1:].permute(1, 2, 0)
     state, rest, centre = state.to(device), rest.to(device), centre.to(device)
     colour = torch.full((2, 3, columns), float("nan"), device=device)
-    harmonics.show(state, rest, centre, colour, degree)
+    harmonics.show(rest, state, centre, colour, degree)
 
     sh, mean = gaussians.sh.double().requires_grad_(), gaussians.mean.double().requires_grad_()
     moved = dataclasses.replace(exact(gaussians), sh=sh, mean=mean)
@@ -261,7 +258,7 @@ def test_harmonics_and_their_step_are_those_of_torch(degree: int, device: str) -
     write_adam(control.rows[0], 0, RATES, 1)
     control.send(0)
     moments, ok = torch.zeros(2, *rest.shape, device=device), torch.ones(1, dtype=torch.int32, device=device)
-    harmonics.carry_back(state, rest, centre, colour, v_colour, v_state, degree)
+    harmonics.carry_back(rest, state, centre, colour, v_colour, v_state, degree)
     harmonics.update(rest, moments, state, centre, colour, v_colour, ok, control.values, degree)
 
     (wanted * cotangent.double()).sum().backward()  # type: ignore[no-untyped-call]

@@ -11,7 +11,7 @@ from torch import Tensor
 from worker.raster.step import TrainingFrame
 
 FIRST_ROOM = 32
-"""Frames there is room for from the first on; when it is used up it doubles, and whoever holds addresses begins anew."""
+"""Frames there is room for from the first on; when it is used up it doubles: all that holds addresses begins anew."""
 
 
 class FrameStore:

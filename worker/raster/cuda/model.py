@@ -6,8 +6,8 @@ step() returns before its step is made. What changes from step to step goes to t
 block (control.py); everything else lies there already, so a step is a copy of some hundred floats and a replay.
 
 Room. The rasteriser's buffers hold so many instances. A step that needs more changes nothing, nor do those after it;
-every CHECK_EVERY steps, and before anything else is done with the model, the host looks, makes room, and sends the steps
-that were not made again, from the rows that it kept. So a model with little room ends as one with ample room does.
+every CHECK_EVERY steps, and before anything else is done with the model, the host looks, makes room, and sends again
+the steps that were not made, from the rows that it kept. So a model with little room ends as one with ample room does.
 
 Where the host waits for the device: every CHECK_EVERY-th step; wait, and every method and property but step; a render,
 for its picture; the first use of a frame, for its copy; when buffers grow.
@@ -15,7 +15,6 @@ for its picture; the first use of a frame, for its copy; when buffers grow.
 
 from __future__ import annotations
 
-import dataclasses
 from collections import OrderedDict
 from collections.abc import Sequence
 
@@ -48,7 +47,7 @@ SIZES_KEPT = 3
 
 
 class View:
-    """Frames of one size, `frames` of them at once: the rasteriser's buffers, and the control block that steers them."""
+    """So many frames of one size at once: the rasteriser's buffers, and the control block that steers them."""
 
     def __init__(
         self, width: int, height: int, frames: int, motion: Motion, device: torch.device, *, rows: int = 1
@@ -213,12 +212,16 @@ class CudaModel:
         last = first + int(report[MADE])
         if last == first:
             return last
-        sums = report[:SUMS].view(torch.float32).tolist()
+        colour_l1, depth_l1, squared_error, holes = report[:SUMS].view(torch.float32).tolist()
         visible = int(report[SEEN + first : SEEN + last].min())
-        if self._learnt is not None:
-            before = dataclasses.astuple(self._learnt)
-            sums, visible = [old + new for old, new in zip(before, sums, strict=False)], min(before[4], visible)
-        self._learnt = StepSums(*sums, visible)
+        before = self._learnt or StepSums(0.0, 0.0, 0.0, 0.0, visible)
+        self._learnt = StepSums(
+            before.colour_l1 + colour_l1,
+            before.depth_l1 + depth_l1,
+            before.squared_error + squared_error,
+            before.holes + holes,
+            min(before.visible, visible),
+        )
         return last
 
     def _answer(self) -> StepSums | None:
@@ -375,9 +378,9 @@ class CudaModel:
         """The Gaussians and their deformation as tensors on the host (copies)."""
         self._settle()
         values, sh_rest = (each[..., : self.count].cpu() for each in (self._values, self._sh_rest))
-        gaussians = Gaussians(
-            *(values[rows].T.clone(memory_format=torch.contiguous_format) for rows in (MEAN, QUATERNION, LOG_SCALE)),
-            values[ROWS].clone(),
-            torch.cat([values[None, 10:ROWS], sh_rest]).permute(2, 0, 1).contiguous(),
+        mean, quaternion, log_scale = (
+            values[rows].T.clone(memory_format=torch.contiguous_format) for rows in (MEAN, QUATERNION, LOG_SCALE)
         )
+        sh = torch.cat([values[None, 10:ROWS], sh_rest]).permute(2, 0, 1).contiguous()
+        gaussians = Gaussians(mean, quaternion, log_scale, values[ROWS].clone(), sh)
         return gaussians, self.motion.export(self.count)

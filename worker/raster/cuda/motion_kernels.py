@@ -45,7 +45,7 @@ def _store_state(state, colour, frame, row, at, inside, moved, columns):  # type
     tl.store(colour + (frame * 3 + row - COLOUR_ROW) * columns + at, shown, mask=is_colour)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["bases"])
 def deform_linear(  # type: ignore[no-untyped-def]
     values, weight, basis, span, state, colour, columns, bases, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
 ):
@@ -64,7 +64,7 @@ def deform_linear(  # type: ignore[no-untyped-def]
     _store_state(state, colour, frame, row, at, inside, moved, columns)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["bases", "tiles"])
 def update_linear(  # type: ignore[no-untyped-def]
     values, moments, weight, first, second, v_state, v_opacity, v_colour, colour, touched, statistics, ok, report,
     slot, size, floor, betas, basis, alive, basis_size, basis_floor, channel_rate, columns, bases, tiles,
@@ -121,7 +121,7 @@ def fdm_basis(t, centre, width, QUARTIC: tl.constexpr):  # type: ignore[no-untyp
     return value, by_centre, by_width
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["bases"])
 def deform_fdm(  # type: ignore[no-untyped-def]
     values, weight, centre, width, time, state, colour, columns, bases, QUARTIC: tl.constexpr, BLOCK: tl.constexpr
 ):
@@ -143,7 +143,7 @@ def deform_fdm(  # type: ignore[no-untyped-def]
     _store_state(state, colour, frame, row, at, inside, moved, columns)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["bases", "tiles"])
 def update_fdm(  # type: ignore[no-untyped-def]
     values, moments, weight, centre, width, first, second, v_state, v_opacity, v_colour, colour, touched, statistics,
     ok, report, slot, size, floor, betas, time, motion_size, columns, bases, tiles,

@@ -1,13 +1,13 @@
 """Adam on the device: what all parameters share; the canonical state and the opacity; and what a step reports.
 
-N Gaussians in rows of `columns` floats, a multiple of COLUMNS; F frames a step. values [VALUES, columns] are the rows of
-the canonical state, as in raster/cpu/update.py, and the opacity's logit. A program has BLOCK Gaussians and all of their
-rows, so tensors in it are [TILE_ROWS, BLOCK]. A gradient is a sum over the frames.
+N Gaussians in rows of `columns` floats, a multiple of COLUMNS; F frames a step. values [VALUES, columns] are the rows
+of the canonical state, as in raster/cpu/update.py, and the opacity's logit. A program has BLOCK Gaussians and all of
+their rows, so tensors in it are [TILE_ROWS, BLOCK]. A gradient is a sum over the frames.
 
-Whatever changes from step to step is read from tensors on the device (control.py), so that a launch never changes. Rates
-come as sizes and floors that have Adam's bias corrections folded in (worker/optimize.py); a size of 0 leaves a parameter
-and its moments untouched. Every kernel that changes the model reads `ok` first and does nothing where it is 0: the step
-had no room (rasterizer.py, model.py).
+Whatever changes from step to step is read from tensors on the device (control.py), so that a launch never changes.
+Rates come as sizes and floors that have Adam's bias corrections folded in (worker/optimize.py); a size of 0 leaves a
+parameter and its moments untouched. Every kernel that changes the model reads `ok` first and does nothing where it is
+0: the step had no room (rasterizer.py, model.py).
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ SUMS, MADE, SEEN = 4, 4, 5
 """The report: floats before SUMS, the sums that rasterizer.statistics lists; then, as int32, how many steps were made,
 and from SEEN on how many Gaussians each of them had in view."""
 _MADE, _SEEN = tl.constexpr(MADE), tl.constexpr(SEEN)
-_CHUNK = tl.constexpr(256)
+_CHUNK = tl.constexpr(512)
+"""Tiles whose sums are added at once."""
 
 
 def padded(count: int) -> int:
@@ -57,8 +58,8 @@ def adam(value, first, second, at, mask, gradient, size, floor, betas):  # type:
 def gradient_of_values(  # type: ignore[no-untyped-def]
     v_state, v_opacity, v_colour, colour, frame, row, at, inside, columns
 ):
-    """dL/dvalues of a frame: v_state [F, 10, columns]; what v_colour [F, 3, columns] says of the constant harmonic where
-    the colour was not held at 0; v_opacity [F, columns]. row [TILE_ROWS, 1], at and inside [1, BLOCK]."""
+    """dL/dvalues of a frame: v_state [F, 10, columns]; what v_colour [F, 3, columns] says of the constant harmonic
+    where the colour was not held at 0; v_opacity [F, columns]. row [TILE_ROWS, 1], at and inside [1, BLOCK]."""
     of_state = inside & (row < COLOUR_ROW)
     of_colour = inside & (row >= COLOUR_ROW) & (row < OPACITY_ROW)
     of_opacity = inside & (row == OPACITY_ROW)
@@ -91,8 +92,8 @@ def update_values(  # type: ignore[no-untyped-def]
 def report_step(  # type: ignore[no-untyped-def]
     touched, statistics, report, slot, at, inside, columns, tiles, FRAMES: tl.constexpr
 ):
-    """Count the program's Gaussians in view, at the step's place slot [1]; the first program adds the step to those made,
-    and its sums to the report. touched int32 [F, columns]: tiles a Gaussian touches; statistics [tiles, 4]."""
+    """Count the program's Gaussians in view, at the step's place slot [1]; the first program adds the step to those
+    made, and its sums to the report. touched int32 [F, columns]: tiles a Gaussian touches; statistics [tiles, 4]."""
     most = tl.load(touched + at, mask=inside, other=0)
     for frame in tl.static_range(1, FRAMES):
         most = tl.maximum(most, tl.load(touched + frame * columns + at, mask=inside, other=0))

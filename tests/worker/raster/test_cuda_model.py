@@ -1,0 +1,282 @@
+"""The training step of the CUDA backend: it trains as the CPU's does, whatever room it has, and what it trains is kept.
+
+N Gaussians, H W pixels. Scenes are tiny: without a GPU every kernel runs in Triton's interpreter.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
+
+from tests.helpers import assert_close
+from tests.worker.raster.scenes import random_scene
+from worker.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.gaussians import Gaussians
+from worker.loss import LossSettings
+from worker.optimize import StepRates
+from worker.raster.cpu import padded
+from worker.raster.cpu.model import FusedModel
+from worker.raster.cuda.model import CHECK_EVERY, CudaModel
+from worker.raster.step import Target, TrainingFrame, camera_vector
+
+WIDTH, HEIGHT, COUNT = 32, 24, 60
+Fused = SharedBasis | PolynomialFourier | FlexibleDeformation
+LOSS = LossSettings(depth_weight=20.0, colour_zone=0.05, depth_zone=1e-3)
+RATES = StepRates(
+    mean=2e-3,
+    quaternion=3e-3,
+    log_scale=4e-3,
+    opacity=5e-3,
+    colour=6e-3,
+    sh_rest=1e-3,
+    motion_mean=7e-3,
+    motion_quaternion=7e-3,
+    motion_log_scale=7e-3,
+    motion_colour=7e-3,
+    eps=1e-8,
+)
+"""eps is far above rounding, so that gradients that are nothing but rounding do not become whole steps."""
+SCENE = random_scene(COUNT, width=WIDTH, height=HEIGHT, seed=50, pixels=2.5)
+CAMERA = camera_vector(SCENE.camera)
+
+
+def gaussians(sh_degree: int = 0) -> Gaussians:
+    random = torch.Generator().manual_seed(5)
+    sh = 0.1 * torch.randn(COUNT, (sh_degree + 1) ** 2, 3, generator=random)
+    sh[:, 0] += 0.8
+    return Gaussians(
+        mean=SCENE.mean.float(),
+        quaternion=SCENE.quaternion.float(),
+        log_scale=SCENE.scale.log().float(),
+        opacity_logit=torch.logit(SCENE.opacity).float(),
+        sh=sh,
+    )
+
+
+def deformation(kind: str) -> Fused:
+    random = torch.Generator().manual_seed(6)
+
+    def stirred(tensor: Tensor) -> Tensor:
+        return tensor + 0.05 * torch.randn(tensor.shape, generator=random)
+
+    if kind.startswith("fdm"):
+        fdm = FlexibleDeformation.initial(COUNT, bases=2, width=0.3)
+        weight, centre, width = (stirred(each) for each in fdm.parameters().values())
+        return FlexibleDeformation(weight, centre, width, form="quartic" if kind == "fdm-quartic" else "gaussian")
+    linear: Fused = SharedBasis.initial(COUNT, bases=4, colour=kind == "shared with colour")
+    linear = PolynomialFourier.initial(COUNT, weights=4) if kind == "pfs" else linear
+    return dataclasses.replace(linear, weight=stirred(linear.weight))
+
+
+def frames(count: int, width: int = WIDTH) -> list[TrainingFrame]:
+    """Noise in coarse squares, with holes in tissue and depth."""
+    random = np.random.default_rng(51)
+    made = []
+    for k in range(count):
+        shape, stride = (HEIGHT, width), padded(width)
+        rgb = np.full((3, HEIGHT, stride), 255, np.uint8)
+        weight, inverse = np.zeros((HEIGHT, stride), np.uint8), np.full((HEIGHT, stride), 0.5, np.float32)
+        rgb[:, :, :width] = (
+            random.integers(0, 256, (3, HEIGHT // 4, width // 4 + 1)).repeat(4, 1).repeat(4, 2)[..., :width]
+        )
+        tissue = random.uniform(size=shape) > 0.15
+        measured = tissue & (random.uniform(size=shape) > 0.2)
+        weight[:, :width] = tissue * 255
+        inverse[:, :width] = np.where(measured, 1 / random.uniform(50, 70, shape), 0)
+        camera = CAMERA.copy()
+        camera[4], camera[9] = width, camera[9] + 0.1 * k
+        target = Target(rgb.ravel(), weight.ravel(), inverse.ravel())
+        made.append(TrainingFrame(camera, 0.3 + 0.4 * k / count, target, int(tissue.sum()), int(measured.sum())))
+    return made
+
+
+AnyModel = CudaModel | FusedModel
+
+
+def model(device: str, kind: str = "shared with colour", sh_degree: int = 0, frames_a_step: int = 1) -> CudaModel:
+    return CudaModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT, device, frames_a_step)
+
+
+def train(trained: AnyModel, seen: Sequence[TrainingFrame], sh_degree: int = 0, first: int = 1) -> None:
+    for iteration, frame in enumerate(seen, start=first):
+        trained.step(frame, LOSS, RATES, iteration, min(sh_degree, iteration // 2))
+
+
+def stored(trained: AnyModel) -> dict[str, Tensor]:
+    return {name: each.cpu().clone() for name, each in trained.arrays().items()}
+
+
+def assert_same_bits(got: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
+    assert got.keys() == wanted.keys()
+    for name, each in wanted.items():
+        assert bool((got[name] == each).all()), name
+
+
+@pytest.mark.parametrize(
+    ("kind", "sh_degree"),
+    [("shared", 1), ("shared with colour", 0), ("pfs", 0), ("fdm-gaussian", 0), ("fdm-quartic", 0)],
+)
+def test_steps_change_a_model_as_they_do_on_the_cpu(kind: str, sh_degree: int, device: str) -> None:
+    cpu = FusedModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT)
+    cuda = model(device, kind, sh_degree)
+    for trained in (cpu, cuda):
+        train(trained, frames(3), sh_degree)
+    before = FusedModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT).parameters()
+    wanted = cpu.arrays()
+    got = stored(cuda)
+    assert got.keys() == wanted.keys()
+    for name, each in wanted.items():
+        if name in before and each.numel():
+            moved = each - before[name]
+            assert bool(moved.any()), name
+            assert_close(got[name] - before[name].numpy(), moved, relative=1e-3, name=f"step of {name}")
+        assert_close(got[name], each, relative=1e-4, absolute=1e-9, name=name)
+
+
+def test_what_was_trained_on_the_device_renders_on_the_cpu_within_an_8_bit_step(device: str) -> None:
+    cuda = model(device)
+    train(cuda, frames(3))
+    cpu = FusedModel(*cuda.export(), WIDTH, HEIGHT)
+    values = np.linspace(0, 1, COUNT, dtype=np.float32)
+    image = cuda.render(CAMERA, 0.6, values)
+    wanted = cpu.render(CAMERA, 0.6, values)
+    assert_close(image, wanted, relative=0.0, absolute=1 / 255, name="image")
+    assert np.abs(image[[0, 1, 2, 4]] - wanted[[0, 1, 2, 4]]).mean() < 1e-5
+    assert_close(cuda.blend_values(values[::-1].copy()), cpu.blend_values(values[::-1].copy()), absolute=1e-3)
+    assert_close(cuda.deformed_mean(0.6), cpu.deformed_mean(0.6), relative=1e-6)
+
+
+def test_several_times_are_rendered_at_once_and_other_sizes_too(device: str) -> None:
+    cuda = model(device, sh_degree=1)
+    images = cuda.render_times(CAMERA, [0.2, 0.7]).cpu().numpy().copy()
+    for image, t in zip(images, (0.2, 0.7), strict=True):
+        assert_close(image, cuda.render(CAMERA, t), relative=1e-6, name=f"at {t}")
+    other = CAMERA.copy()
+    other[:6] *= 0.5
+    wanted = FusedModel(gaussians(1), deformation("shared with colour"), 16, 12).render(other, 0.2)
+    assert_close(cuda.render(other, 0.2), wanted, relative=1e-3, name="half the size")
+
+
+def test_the_gradient_of_an_image_is_the_cpus(device: str) -> None:
+    cotangents = np.random.default_rng(3).normal(size=(5, HEIGHT, WIDTH)).astype(np.float32)
+    cpu = FusedModel(gaussians(1), deformation("shared"), WIDTH, HEIGHT)
+    wanted = cpu.image_gradient(CAMERA, 0.4, cotangents)
+    got = model(device, "shared", 1).image_gradient(CAMERA, 0.4, cotangents)
+    for row in range(14):
+        assert_close(got[row], wanted[row], relative=1e-3, name=f"row {row}")
+
+
+def test_the_same_steps_give_the_same_bits_also_after_a_resumption(device: str) -> None:
+    whole, again, resumed = model(device), model(device), model(device)
+    train(whole, frames(4))
+    train(again, frames(4)[:2])
+    kept = stored(again)
+    train(again, frames(4)[2:], first=3)
+    assert_same_bits(stored(again), stored(whole))
+    resumed.load_arrays(kept)
+    train(resumed, frames(4)[2:], first=3)
+    assert_same_bits(stored(resumed), stored(whole))
+
+
+def test_arrays_of_another_size_are_refused_by_name(device: str) -> None:
+    arrays = stored(model(device))
+    arrays["opacity_logit"] = arrays["opacity_logit"][:-1]
+    with pytest.raises(ValueError, match=r"opacity_logit has shape \(59,\), this model needs \(60,\)"):
+        model(device).load_arrays(arrays)
+
+
+def test_a_model_with_too_little_room_ends_as_one_with_ample_room(device: str) -> None:
+    ample, tight = model(device), model(device)
+    train(ample, frames(4))
+    train(tight, frames(4)[:1])
+    tight.wait()
+    tight._training.rasterizer._allocate_slots(8)
+    train(tight, frames(4)[1:], first=2)
+    answer = tight.wait()
+    assert answer is not None
+    assert tight._training.rasterizer.capacity > 8
+    assert_same_bits(stored(tight), stored(ample))
+
+
+def test_steps_are_answered_for_once_and_together(device: str) -> None:
+    cpu = FusedModel(gaussians(), deformation("shared"), WIDTH, HEIGHT)
+    answers = [cpu.step(frame, LOSS, RATES, k + 1) for k, frame in enumerate(frames(3))]
+    cuda = model(device, "shared")
+    assert cuda.answers_every == CHECK_EVERY
+    assert [cuda.step(frame, LOSS, RATES, k + 1) for k, frame in enumerate(frames(3))] == [None] * 3
+    answer = cuda.wait()
+    assert answer is not None
+    for name in ("colour_l1", "depth_l1", "squared_error", "holes"):
+        assert getattr(answer, name) == pytest.approx(sum(getattr(each, name) for each in answers), rel=1e-4)
+    assert answer.visible == min(each.visible for each in answers)
+    assert cuda.wait() is None
+
+
+def test_what_was_learnt_while_waiting_for_something_else_comes_with_the_next_step(device: str) -> None:
+    cuda, seen = model(device, "shared"), frames(2)
+    assert cuda.step(seen[0], LOSS, RATES, 1) is None
+    assert cuda.visible.shape == (COUNT,)
+    answer = cuda.step(seen[1], LOSS, RATES, 2)
+    assert answer is not None
+    assert answer.visible == int(cuda.visible.sum())
+
+
+def test_a_step_on_several_frames_is_a_step_on_the_sum_of_their_losses(device: str) -> None:
+    frame = frames(1)[0]
+    halved = dataclasses.replace(LOSS, colour_weight=LOSS.colour_weight / 2, depth_weight=LOSS.depth_weight / 2)
+    one, two = model(device, sh_degree=1), model(device, sh_degree=1, frames_a_step=2)
+    one.step(frame, LOSS, RATES, 1, 1)
+    two.step_frames([frame, frame], halved, RATES, 1, 1)
+    wanted = stored(one)
+    for name, each in stored(two).items():
+        assert_close(each, wanted[name], relative=1e-4, absolute=1e-9, name=name)
+    with pytest.raises(ValueError, match="a step on 1 frames, this model was made for 2"):
+        two.step(frame, LOSS, RATES, 2)
+
+
+@pytest.mark.parametrize("kind", ["shared with colour", "fdm-gaussian"])
+def test_gaussians_taken_train_on_as_on_the_cpu(kind: str, device: str) -> None:
+    models = (FusedModel(gaussians(), deformation(kind), WIDTH, HEIGHT), model(device, kind))
+    columns = np.r_[np.arange(COUNT)[::-1], 5, 7, 7]
+    for trained in models:
+        train(trained, frames(3)[:1])
+        trained.take(columns, np.arange(len(columns)) >= COUNT)
+        train(trained, frames(3)[1:], first=2)
+        assert trained.count == COUNT + 3
+        assert len(trained.export()[0]) == COUNT + 3
+    wanted = models[0].arrays()
+    for name, each in stored(models[1]).items():
+        assert_close(each, wanted[name], relative=1e-4, absolute=1e-9, name=name)
+    assert_close(models[1].gradient_norm, models[0].gradient_norm, relative=1e-3)
+    assert bool((models[1].visible.cpu() == models[0].visible).all())
+
+
+def test_parameters_may_be_written_between_two_steps(device: str) -> None:
+    written, frame = model(device), frames(1)[0]
+    start = stored(written)
+    written.step(frame, LOSS, RATES, 1)
+    after = stored(written)
+    for name, values in written.arrays().items():  # as a trial run is taken back
+        values.copy_(start[name])
+    written.step(frame, LOSS, RATES, 1)
+    assert_same_bits(stored(written), after)
+
+
+def test_more_frames_than_there_was_room_for_and_frames_of_another_size(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("worker.raster.cuda.frames.FIRST_ROOM", 1)
+    crowded, ample = model(device), model(device)
+    train(crowded, frames(3))
+    monkeypatch.undo()
+    train(ample, frames(3))
+    assert_same_bits(stored(crowded), stored(ample))
+    with pytest.raises(ValueError, match="a frame of 40 x 24 pixels, the others have 32 x 24"):
+        ample.step(frames(1, width=40)[0], LOSS, RATES, 4)
