@@ -15,7 +15,8 @@ from client.connection import DEFAULT_URL
 from contract.arguments import Commands, add_command, finite, positive
 from contract.errors import InputError
 from contract.exits import ExitCode
-from contract.job import JobProgress, JobState, JobView, Layout, MaskPolarity, PoseConvention, PresetName, Priority
+from contract.job import JobProgress, JobState, JobView, Priority
+from contract.names import Layout, MaskPolarity, PoseConvention, PresetName
 from contract.progress_bar import ProgressBar
 
 URL_VARIABLE = "INTRASPLAT_URL"

@@ -27,18 +27,8 @@ from pydantic import ValidationError
 
 from contract.errors import SceneError, UnavailableError
 from contract.job import JobRecord
-from contract.store import (
-    ABANDONED_AFTER_S,
-    MANIFEST,
-    NO_ROOM,
-    SUBMISSION,
-    Removed,
-    Store,
-    disk_errors,
-    is_job_id,
-    new_job_id,
-    remove_tree,
-)
+from contract.names import MANIFEST, SUBMISSION
+from contract.store import ABANDONED_AFTER_S, NO_ROOM, Removed, Store, disk_errors, is_job_id, new_job_id, remove_tree
 
 LOOKED_FOR_S = 2.0
 """What was there is taken to be there for so long: a purge on another machine takes effect as late."""

@@ -2,20 +2,55 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+import math
+from dataclasses import asdict, dataclass, fields
 
 
-class Intrinsics(BaseModel):
-    """Pinhole intrinsics in pixels; pixel (i, j) has its centre at (j + 0.5, i + 0.5) (docs/conventions.md)."""
+@dataclass(frozen=True, kw_only=True)
+class Intrinsics:
+    """Pinhole intrinsics in pixels; pixel (i, j) has its centre at (j + 0.5, i + 0.5) (docs/conventions.md).
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    A plain dataclass, so that whoever trains on a machine without pydantic has a camera, too.
 
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
+    Raises:
+        ValueError: a size or focal length is not above 0, a size is no whole number, or something is not finite.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
     cx: float
     cy: float
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if isinstance(value, bool | str) or not math.isfinite(value):
+                raise ValueError(f"{name} of a camera is {value!r}, which is no finite number")
+            if name in ("width", "height") and value != int(value):
+                raise ValueError(f"{name} of a camera is {value!r} pixels, which is no whole number")
+            if name not in ("cx", "cy") and value <= 0:
+                raise ValueError(f"{name} of a camera is {value!r}, not above 0")
+            kind = int if name in ("width", "height") else float  # NumPy's numbers are not written as JSON
+            object.__setattr__(self, name, kind(value))
+
+    @classmethod
+    def parsed(cls, value: object) -> Intrinsics:
+        """The camera that numbers() gave, read from JSON.
+
+        Raises:
+            ValueError: it is none.
+        """
+        names = {each.name for each in fields(cls)}
+        if not isinstance(value, dict) or value.keys() != names:
+            raise ValueError(f"a camera has {', '.join(sorted(names))}, and nothing else")
+        if not all(isinstance(each, int | float) for each in value.values()):
+            raise ValueError("a camera consists of numbers")
+        return cls(**value)
+
+    def numbers(self) -> dict[str, float]:
+        """The numbers by their names, for JSON."""
+        return asdict(self)
 
     def resized(self, width: int, height: int) -> Intrinsics:
         """The same camera with another pixel grid over the same field of view."""

@@ -8,9 +8,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from contract.errors import LimitError
-from contract.settings import Settings
+
+if TYPE_CHECKING:
+    from contract.settings import Settings
 
 SMALLEST_SIDE_PX = 16  # below this neither stereo matching nor a tile of the rasteriser has anything to work on
 

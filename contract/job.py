@@ -10,25 +10,10 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from contract.errors import InputError
+from contract.names import Layout, MaskPolarity, PoseConvention, PresetName
 
 JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
 """Job ids are made by the service, never by a caller, so they are safe as file names and key parts."""
-
-PresetName = Literal[
-    "instant", "fast", "quality", "small", "paper", "paper-released", "paper-wide", "pfs", "hexplane", "without_mapf"
-]
-"""instant, fast, quality and small are ours; paper is the published method as published; the others are compared with
-it (worker/presets.py)."""
-
-Layout = Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]
-"""How a clip's eyes, depths and masks are laid out (docs/conventions.md); auto looks for itself."""
-
-MaskPolarity = Literal["auto", "tool", "tissue"]
-"""What is bright in the masks."""
-
-PoseConvention = Literal["opengl", "llff"]
-"""Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
-
 
 Priority = Literal["standard", "high"]
 """high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""

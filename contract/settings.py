@@ -10,10 +10,9 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from contract.errors import InputError
+from contract.names import DeviceName
 
 GIB = 2**30
-DeviceName = Literal["auto", "cpu", "cuda"]
-"""Where to compute; auto: on an NVIDIA GPU where there is one and what it takes, else on the CPU."""
 ENVIRONMENT_PREFIX = "INTRASPLAT_"
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 """A service at one of these is reached from this machine alone."""

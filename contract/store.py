@@ -34,15 +34,10 @@ from pydantic import ValidationError
 from contract.durable import flush
 from contract.errors import SceneError, UnavailableError
 from contract.job import JOB_ID_PATTERN, JobRecord
+from contract.names import MANIFEST, SUBMISSION
 from contract.settings import Settings
 
 AREAS = ("incoming", "spool", "work", "scenes", "run")
-
-SUBMISSION = "submission.json"
-MANIFEST = "manifest.json"
-REPORT = "report.json"
-CURVE = "curve.csv"
-RESUME = "resume.safetensors"
 
 ABANDONED_AFTER_S = 24 * 3600.0
 """What has not changed for this long was given up, or cut off by the end of its process."""

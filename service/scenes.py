@@ -14,9 +14,10 @@ from contract.audit import AuditAction
 from contract.errors import SceneError
 from contract.job import JobRecord, JobState
 from contract.keys import KeyScope
+from contract.names import CURVE, REPORT
 from contract.queue import LISTING_LIMIT
 from contract.rendering import ExportRequest
-from contract.store import CURVE, REPORT, is_job_id
+from contract.store import is_job_id
 from service.access import Caller
 from service.deps import AnyCaller, Deps, ListingLimit, Services, no_such_scene, owned_scene
 from service.problems import Problem

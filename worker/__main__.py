@@ -23,13 +23,12 @@ from pydantic import ValidationError
 from contract.arguments import Commands, add_command, finite, positive
 from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableError
 from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.job import Layout, MaskPolarity, PoseConvention, PresetName
 from contract.logs import configure
+from contract.names import MANIFEST, REPORT, DeviceName, Layout, MaskPolarity, PoseConvention, PresetName
 from contract.processes import told_to_end
 from contract.progress_bar import ProgressBar
 from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
-from contract.settings import DeviceName, Settings
-from contract.store import MANIFEST, REPORT
+from contract.settings import Settings
 
 SUFFIX_FORMATS = {
     ".png": ImageFormat.PNG,

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import torch
 
 from contract.errors import InputError, UnavailableError
-from contract.settings import DeviceName
+from contract.names import DeviceName
 from worker.deformation import Deformation, HexPlane
 from worker.gaussians import Gaussians
 from worker.model import Model

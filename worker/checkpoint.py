@@ -32,7 +32,7 @@ from torch import Tensor
 
 from contract.camera import Intrinsics
 from contract.errors import SceneError
-from contract.store import RESUME
+from contract.names import RESUME
 from worker.compact import read
 from worker.deformation import Deformation, restore
 from worker.gaussians import Gaussians
@@ -135,7 +135,7 @@ def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> 
         "coding": EXACT if scene.stored is None else COMPACT,
         "deformation": scene.deformation.kind,
         "gaussians": len(scene.gaussians),
-        "intrinsics": scene.intrinsics.model_dump(),
+        "intrinsics": scene.intrinsics.numbers(),
         "world_from_camera": scene.world_from_camera.tolist(),
         "frame_times_s": scene.frame_times_s.tolist(),
         "units_per_mm": scene.units_per_mm,
@@ -218,7 +218,7 @@ def _scene_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> Scene:
     return Scene(
         gaussians=gaussians,
         deformation=deformation,
-        intrinsics=Intrinsics.model_validate(manifest["intrinsics"]),
+        intrinsics=Intrinsics.parsed(manifest["intrinsics"]),
         world_from_camera=poses,
         frame_times_s=times_s,
         units_per_mm=float(manifest["units_per_mm"]),

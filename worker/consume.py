@@ -16,8 +16,9 @@ from typing import TypeVar
 
 from contract.errors import IntrasplatError, UnavailableError
 from contract.job import JobProgress, JobRecord, JobState
+from contract.names import RESUME
 from contract.queue import Claim, Order, Queue
-from contract.store import RESUME, Store
+from contract.store import Store
 from worker.child import DeviceChild, Ended, Keeper
 from worker.faults import describe
 from worker.heartbeat import Heartbeat

@@ -18,9 +18,8 @@ import numpy as np
 import torch
 
 from contract.errors import Cancelled, InputError
-from contract.job import Layout, MaskPolarity, PoseConvention
+from contract.names import CURVE, REPORT, Layout, MaskPolarity, PoseConvention
 from contract.report import Report
-from contract.store import CURVE, REPORT
 from worker.backend import CPU, Device, choose_device, device_for
 from worker.baselines import copy_baselines
 from worker.calibration import rectify

@@ -5,6 +5,7 @@ A scene whose folder is gone is forgotten at once: a deleted patient's tissue is
 
 from __future__ import annotations
 
+import dataclasses
 from collections import OrderedDict
 
 import numpy as np
@@ -155,4 +156,4 @@ def camera_of(clip: Intrinsics, wanted: IntrinsicsOverride, max_pixels: int) -> 
         problem = f"{width} x {height} is more than {max_pixels} pixels."
         raise LimitError("width", problem, "Ask for a smaller image.")
     changes = {name: value for name in ("fx", "fy", "cx", "cy") if (value := getattr(wanted, name)) is not None}
-    return clip.resized(width, height).model_copy(update=changes)
+    return dataclasses.replace(clip.resized(width, height), **changes)

@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 
 from contract.job import JobProgress
+from contract.names import MANIFEST, REPORT
 from contract.processes import die_with_parent
 from contract.settings import Settings
-from contract.store import MANIFEST, REPORT
 from tests.chaos.points import Point, reach
 from worker.channel import Channel, Orders, Task
 from worker.orders import Advanced, Finished, Ready, Stopped

@@ -25,12 +25,13 @@ from selenium.webdriver.support.ui import WebDriverWait
 from client.up import DASHBOARD
 from contract.embedded import short_socket_path
 from contract.job import JobFiles, JobProgress, JobRecord
+from contract.names import CURVE, MANIFEST, REPORT
 from contract.pose import OrbitPose
 from contract.queue import Claim
 from contract.queue_memory import MemoryQueue
 from contract.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
 from contract.settings import Settings
-from contract.store import CURVE, MANIFEST, REPORT, Store, new_job_id
+from contract.store import Store, new_job_id
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server

@@ -17,11 +17,12 @@ import numpy as np
 
 from contract.embedded import short_socket_path
 from contract.job import JobError
+from contract.names import CURVE, MANIFEST, REPORT
 from contract.queue import Claim
 from contract.queue_memory import MemoryQueue
 from contract.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
 from contract.settings import Settings
-from contract.store import CURVE, MANIFEST, REPORT, Store
+from contract.store import Store
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server

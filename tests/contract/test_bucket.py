@@ -15,8 +15,9 @@ import pytest
 
 from contract.bucket import BucketStore
 from contract.errors import SceneError, UnavailableError
+from contract.names import MANIFEST, SUBMISSION
 from contract.settings import Settings
-from contract.store import ABANDONED_AFTER_S, MANIFEST, SUBMISSION, Store, new_job_id, open_store
+from contract.store import ABANDONED_AFTER_S, Store, new_job_id, open_store
 from tests.contract.stores import accepted, received
 
 pytest.importorskip("s3fs")

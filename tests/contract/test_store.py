@@ -11,7 +11,8 @@ import pytest
 
 from contract.errors import SceneError, UnavailableError
 from contract.job import JobRecord
-from contract.store import ABANDONED_AFTER_S, MANIFEST, SUBMISSION, Store, is_job_id, new_job_id
+from contract.names import MANIFEST, SUBMISSION
+from contract.store import ABANDONED_AFTER_S, Store, is_job_id, new_job_id
 from tests.contract.stores import accepted
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from contract.errors import UnavailableError
-from contract.store import MANIFEST, SUBMISSION, Store, StoreFullError, disk_errors, new_job_id
+from contract.names import MANIFEST, SUBMISSION
+from contract.store import Store, StoreFullError, disk_errors, new_job_id
 from tests.contract.stores import files_no_larger_than, received
 
 NOBODY = 65534

@@ -12,11 +12,12 @@ import httpx
 from contract.embedded import short_socket_path
 from contract.errors import InputError, SceneError
 from contract.job import JobRecord
+from contract.names import CURVE, MANIFEST, REPORT
 from contract.queue import Claim
 from contract.queue_memory import MemoryQueue
 from contract.rendering import ExportRequest, RenderRequest, WorkerAddress
 from contract.settings import Settings
-from contract.store import CURVE, MANIFEST, REPORT, Store
+from contract.store import Store
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from tests.service.asgi import AsgiClient, serving

@@ -15,11 +15,12 @@ from typing import Any
 from contract.embedded import short_socket_path
 from contract.errors import SceneError
 from contract.job import JobFiles, JobRecord
+from contract.names import MANIFEST
 from contract.queue import Claim
 from contract.queue_memory import MemoryQueue
 from contract.rendering import ExportRequest, RenderRequest, WorkerAddress
 from contract.settings import Settings
-from contract.store import MANIFEST, Store, new_job_id
+from contract.store import Store, new_job_id
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server

@@ -18,10 +18,11 @@ from contract.audit import AUDIT_FILE, RESERVE_FILE, AuditAction, AuditLog
 from contract.embedded import EmbeddedServer
 from contract.errors import InputError, UnavailableError
 from contract.job import JobError, JobFiles, JobOptions, JobRecord
+from contract.names import CURVE, MANIFEST, REPORT
 from contract.queue import Claim
 from contract.queue_redis import RedisQueue
 from contract.settings import Settings
-from contract.store import CURVE, MANIFEST, REPORT, Store, new_job_id
+from contract.store import Store, new_job_id
 from service.audit import Audit
 from service.done import DoneJobs
 from service.purge import LOG_CLEARED_AFTER_S, NOTES, Purger

@@ -14,10 +14,10 @@ from contract.embedded import short_socket_path
 from contract.errors import UnavailableError
 from contract.job import JobRecord
 from contract.keys import DEFAULT_SCOPES, KeyFile, KeyScope
+from contract.names import MANIFEST, REPORT
 from contract.queue import Claim
 from contract.queue_memory import MemoryQueue
 from contract.rendering import RenderRequest, WorkerAddress, WorkerReply
-from contract.store import MANIFEST, REPORT
 from tests.service.house import IDENTITY, House, assert_problem, make_house
 
 

@@ -9,9 +9,10 @@ import pytest
 
 from contract.errors import UnavailableError
 from contract.job import JobRecord, JobState
+from contract.names import MANIFEST, SUBMISSION
 from contract.queue import Admission
 from contract.queue_memory import MemoryQueue
-from contract.store import MANIFEST, SUBMISSION, Store
+from contract.store import Store
 from service.sweep import Sweep
 from tests.service.house import House, assert_problem, make_house
 

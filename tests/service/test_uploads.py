@@ -13,7 +13,8 @@ import pytest
 from fastapi import FastAPI
 
 from contract.job import JobRecord
-from contract.store import ABANDONED_AFTER_S, SUBMISSION, Store, new_job_id
+from contract.names import SUBMISSION
+from contract.store import ABANDONED_AFTER_S, Store, new_job_id
 from service.problems import Problem, install_handlers
 from service.upload import UploadLimits, receive_upload
 from tests.service.asgi import serving

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from contract.exits import ExitCode
-from contract.job import PresetName
+from contract.names import PresetName
 from worker.__main__ import main
 from worker.checkpoint import RESUME_FILE, load_resume
 from worker.presets import PRESETS

@@ -14,10 +14,11 @@ import pytest
 
 from contract.errors import UnavailableError
 from contract.job import JobError, JobProgress, JobRecord, JobState
+from contract.names import MANIFEST, RESUME
 from contract.queue import MAX_ATTEMPTS, Claim, Order
 from contract.queue_memory import MemoryQueue
 from contract.rendering import WorkerAddress
-from contract.store import MANIFEST, RESUME, Store
+from contract.store import Store
 from tests.worker.jobs import STANDIN, Jobs, eventually
 from worker import child, consume, liveness
 from worker.child import Keeper

@@ -16,8 +16,9 @@ import torch
 from contract.errors import InputError, TrainingDiverged, UnavailableError
 from contract.exits import ExitCode
 from contract.job import JobFiles, JobOptions, JobRecord
+from contract.names import REPORT
 from contract.settings import Settings
-from contract.store import REPORT, new_job_id
+from contract.store import new_job_id
 from worker.__main__ import main
 from worker.checkpoint import RESUME_FILE, load_resume, load_scene
 from worker.child import DeviceChild

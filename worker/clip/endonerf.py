@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from contract.camera import Intrinsics
 from contract.clip_limits import MOST_POSES_BYTES
 from contract.errors import InputError
-from contract.job import MaskPolarity, PoseConvention
+from contract.names import MaskPolarity, PoseConvention
 from worker.clip.files import FileTree
 from worker.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
 from worker.clip.masks import NO_MASKS, MaskFrames, TissueMasks, tissue_from_masks

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from contract.clip_limits import ClipLimits
 from contract.errors import InputError
-from contract.job import MaskPolarity
+from contract.names import MaskPolarity
 from worker.clip.files import FileTree, check_exists, open_tree
 from worker.clip.images import MASK_THRESHOLD, ImageSequence, as_mask, open_images
 from worker.clip.naming import left_eye_only

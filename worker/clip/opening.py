@@ -10,7 +10,7 @@ from typing import get_args
 
 from contract.clip_limits import MOST_CALIBRATION_BYTES, ClipLimits
 from contract.errors import InputError
-from contract.job import Layout, MaskPolarity, PoseConvention
+from contract.names import Layout, MaskPolarity, PoseConvention
 from worker.clip.endonerf import is_endonerf, read_endonerf
 from worker.clip.files import FileTree, check_exists, open_tree, scratch_folder
 from worker.clip.masks import NO_MASKS, BrightClass, MaskFrames, open_masks

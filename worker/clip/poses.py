@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.errors import InputError
-from contract.job import PoseConvention
+from contract.names import PoseConvention
 
 POSE_CONVENTIONS: tuple[str, ...] = get_args(PoseConvention)
 

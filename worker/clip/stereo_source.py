@@ -13,7 +13,7 @@ import numpy as np
 
 from contract.clip_limits import SMALLEST_SIDE_PX, ClipLimits
 from contract.errors import InputError
-from contract.job import MaskPolarity
+from contract.names import MaskPolarity
 from worker.clip.files import FileTree, open_tree
 from worker.clip.images import ImageSequence, open_images
 from worker.clip.masks import BrightClass, MaskFrames, mask_names, tissue_from_masks

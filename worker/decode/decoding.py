@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from contract.calibration import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
 from contract.camera import Intrinsics
 from contract.errors import InputError
-from contract.job import Layout, MaskPolarity, PoseConvention
+from contract.names import Layout, MaskPolarity, PoseConvention
 from worker.calibration import check_calibration
 from worker.clip import ClipLimits, DepthClip, StereoClip
 from worker.clip.files import DEEPEST_FOLDER
@@ -129,7 +129,7 @@ def _received(told: dict[str, Any], folder: Path, allowance: Allowance) -> Stere
             tissue=map_array(folder, "tissue", size) != 0,
             depth_mm=_checked_depth(map_array(folder, "depth_mm", size)),
             depth_confidence=map_array(folder, "depth_confidence", size),
-            intrinsics=Intrinsics.model_validate(told["intrinsics"]),
+            intrinsics=Intrinsics.parsed(told["intrinsics"]),
             world_from_camera=_finite(map_array(folder, "world_from_camera", size).copy()),
             frame_times_s=frame_times_s,
             assumptions=assumptions,

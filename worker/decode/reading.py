@@ -41,7 +41,7 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
     }
     if isinstance(clip, DepthClip):
         write_arrays(folder, _depth_arrays(clip, reports))
-        return told | {"kind": DEPTH, "intrinsics": clip.intrinsics.model_dump()}
+        return told | {"kind": DEPTH, "intrinsics": clip.intrinsics.numbers()}
     reports.reading("calibration")
     calibration = _calibration(request, clip, folder, limits)
     reports.reading("clip")

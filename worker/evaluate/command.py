@@ -11,10 +11,10 @@ from typing import Any, get_args
 from contract.arguments import count, positive
 from contract.errors import InputError
 from contract.exits import ExitCode
-from contract.job import JobProgress, Layout, MaskPolarity, PoseConvention
+from contract.job import JobProgress
+from contract.names import DeviceName, Layout, MaskPolarity, PoseConvention
 from contract.processes import heeding_signals
 from contract.progress_bar import ProgressBar
-from contract.settings import DeviceName
 from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
 from worker.evaluate.measure import Bench

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.errors import Cancelled
+from contract.names import CURVE, REPORT, DeviceName
 from contract.report import Report
-from contract.settings import DeviceName
-from contract.store import CURVE, REPORT
 from worker.backend import Device, choose_device
 from worker.checkpoint import Scene, load_scene
 from worker.clip import DepthClip

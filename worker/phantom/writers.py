@@ -99,7 +99,7 @@ def write_endonerf(phantom: Phantom, path: Path, tick: Tick = _ignore) -> None:
     )
     _write_novel_views(phantom, path / "truth" / "novel_views.npz")
     camera = {
-        "intrinsics": phantom.settings.intrinsics.model_dump(),
+        "intrinsics": phantom.settings.intrinsics.numbers(),
         "world_from_camera": _poses(phantom).tolist(),
     }
     (path / "truth" / "camera.json").write_text(json.dumps(camera, indent=1))
