@@ -5,7 +5,7 @@ Symbols: H W pixels of one eye; d disparity, x_left - x_right in px; dy = y_righ
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,7 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.errors import InputError
-from worker.stereo.matching import DISPARITY_STEPS, Grey, padded, semi_global_matcher, shift_rows
+from worker.stereo.matching import DISPARITY_STEPS, Grey, Image, padded, semi_global_matcher, shift_rows
+
+Agreed = Callable[[NDArray[np.uint8], NDArray[np.uint8], int, int], tuple[Image, NDArray[np.bool_]]]
+"""agreed_disparities, or what does the same on another device."""
 
 FEATURE_WIDTH = (
     400  # features are found on images at most this wide: the median over pairs is as good, in a third of the time
@@ -29,6 +32,7 @@ SWAPPED_SHARE = 0.8
 COARSE_WIDTH = 176  # px; wide enough for tissue, and a search of every disparity costs milliseconds
 NEAREST_MM = 12.0  # an endoscope that close sees nothing sharp
 WIDEST_DISPARITY = 0.6  # of the width: less overlap than that gives no depth worth having
+TEXTURED = 8.0  # mean |gradient| in grey levels from which a match is more than chance
 RANGE_PERCENTILES = (0.5, 99.5)
 RANGE_MARGIN_PX, RANGE_MARGIN = 3.0, 0.1  # the sampled frames do not show every disparity of the clip
 
@@ -109,9 +113,15 @@ def measure_row_shift(matches: NDArray[np.float64], infinity_px: float, equal_ro
 
 
 def choose_range(
-    pairs: Sequence[tuple[Grey, Grey]], row_shift_px: float, infinity_px: float, focal_baseline_px_mm: float
+    pairs: Sequence[tuple[Grey, Grey]],
+    row_shift_px: float,
+    infinity_px: float,
+    focal_baseline_px_mm: float,
+    agreed: Agreed,
 ) -> tuple[float, float]:
     """The disparities (low, high) in px that the clip needs, from a coarse search of all of them on a few pairs.
+
+    They are those of textured, lit pixels on which both matching directions agree.
 
     Raises:
         InputError: no pair has matching points.
@@ -122,13 +132,11 @@ def choose_range(
     widest = min(focal_baseline_px_mm / NEAREST_MM, WIDEST_DISPARITY * width)
     low = int(np.floor(infinity_px * scale))
     count = 16 * max(1, int(np.ceil(widest * scale / 16)))
-    found = []
-    for left, right in pairs:
-        small = [
-            cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, shift_rows(right, row_shift_px))
-        ]
-        found.append(_consistent_disparities(small[0], small[1], low, count) / scale)
-    disparities = np.concatenate(found)
+    lefts = np.stack([_resized(left, size) for left, _ in pairs])
+    rights = np.stack([_resized(shift_rows(right, row_shift_px), size) for _, right in pairs])
+    found, both_agree = agreed(lefts, rights, low, count)
+    textured = np.stack([cv2.boxFilter(np.abs(cv2.Sobel(left, cv2.CV_32F, 1, 0)), -1, (5, 5)) for left in lefts])
+    disparities = found[both_agree & (textured > TEXTURED)].astype(np.float64) / scale
     if disparities.size < 0.02 * size[0] * size[1] * len(pairs):
         raise InputError(
             "clip",
@@ -172,17 +180,24 @@ def _check_eyes(beyond_infinity_px: NDArray[np.float64]) -> None:
     )
 
 
-def _consistent_disparities(left: Grey, right: Grey, low: int, count: int) -> NDArray[np.float64]:
-    """Disparities (px of these images) on which both matching directions agree, at textured, lit pixels."""
-    wide_left, wide_right, pad = padded(left, right, low, count)
+def agreed_disparities(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, count: int
+) -> tuple[Image, NDArray[np.bool_]]:
+    """Disparities of pairs [F, h, w], searched in low <= d < low + count, and where both matching directions agree."""
+    one, other = (np.empty(left.shape, np.float32) for _ in range(2))
     matcher = semi_global_matcher(low, count)
-    columns = slice(pad, pad + left.shape[1])
-    one = matcher.compute(wide_left, wide_right)[:, columns] / DISPARITY_STEPS
-    other = cv2.ximgproc.createRightMatcher(matcher).compute(wide_right, wide_left)[:, columns]
-    other = -other / DISPARITY_STEPS
-    x_right = np.rint(np.arange(left.shape[1]) - one).astype(np.int64)
-    seen = (x_right >= 0) & (x_right < left.shape[1])
-    back = np.take_along_axis(other, np.clip(x_right, 0, left.shape[1] - 1), axis=1)
-    textured = cv2.boxFilter(np.abs(cv2.Sobel(left, cv2.CV_32F, 1, 0)), -1, (5, 5)) > 8.0
-    agreed: NDArray[np.float64] = one[seen & textured & (np.abs(one - back) <= 1.0)]
-    return agreed
+    right_matcher = cv2.ximgproc.createRightMatcher(matcher)
+    for i, pair in enumerate(zip(left, right, strict=True)):
+        wide_left, wide_right, pad = padded(*pair, low, count)
+        columns = slice(pad, pad + left.shape[2])
+        one[i] = matcher.compute(wide_left, wide_right)[:, columns] / DISPARITY_STEPS
+        other[i] = -right_matcher.compute(wide_right, wide_left)[:, columns] / DISPARITY_STEPS
+    x_right = np.rint(np.arange(left.shape[2]) - one).astype(np.int64)
+    seen = (x_right >= 0) & (x_right < left.shape[2])
+    back = np.take_along_axis(other, np.clip(x_right, 0, left.shape[2] - 1), axis=2)
+    return one, seen & (np.abs(one - back) <= 1.0)
+
+
+def _resized(image: Grey, size: tuple[int, int]) -> Grey:
+    smaller: Grey = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return smaller

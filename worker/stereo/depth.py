@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -18,8 +19,8 @@ from worker.calibration import RectifiedClip
 from worker.clip.types import DepthClip
 from worker.hooks import Hooks, Progress
 from worker.opencv import one_opencv_thread
-from worker.stereo.alignment import RowShift, choose_range, feature_matches, measure_row_shift
-from worker.stereo.matching import Grey, MatchPlan, match
+from worker.stereo.alignment import RowShift, agreed_disparities, choose_range, feature_matches, measure_row_shift
+from worker.stereo.matching import MAX_DEPTH_MM, MIN_CONFIDENCE, Grey, MatchPlan, match
 
 STAGE = "stereo"
 DECODING_SHARE, MEASURING_SHARE = 0.15, 0.05  # of the stage's progress
@@ -27,20 +28,23 @@ RANGE_PAIRS, ALIGNMENT_PAIRS = (
     7,
     3,
 )  # spread over the measured frames; a pair costs 10 ms for the range, 100 for the alignment
-MIN_CONFIDENCE = 16  # of 255: below it a depth is a guess
-MAX_DEPTH_MM = 400.0  # beyond it an endoscope's disparity is a fraction of a pixel
 WARN_SHIFT_PX = 0.5
 WARN_VALID_SHARE = 0.5
 MIN_VALID_SHARE = 0.02  # unrelated images match by chance at 0.2 to 0.4 % of their pixels
 
 
 def estimate_depth(
-    clip: RectifiedClip, hooks: Hooks | None = None, *, measured_frames: Sequence[int] | None = None
+    clip: RectifiedClip,
+    hooks: Hooks | None = None,
+    *,
+    measured_frames: Sequence[int] | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
 ) -> DepthClip:
     """Depth and confidence of every frame; the eyes' row shift is measured, corrected up to 8 px, and reported.
 
     What all frames share, row shift and disparity range, is measured on measured_frames alone (None: on all); beyond
     that a frame's depth depends on its own pair only. So frames left out of measured_frames change no other's depth.
+    On "cuda" pairs are matched by many at once by a matcher of its own (worker/stereo/cuda), which needs triton.
 
     `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| left after the correction),
     min_disparity_px and max_disparity_px (the range searched) and depth_valid_share (of tissue pixels).
@@ -57,8 +61,11 @@ def estimate_depth(
         raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
     rgb, right = _decode(clip, hooks)
     with one_opencv_thread(), _pool() as pool:
-        shift, plan = _plan(clip, rgb, right, measured, pool)
-        depth_mm, confidence = _match_all(clip, rgb, right, plan, pool, hooks)
+        shift, plan = _plan(clip, rgb, right, measured, pool, device)
+        if device == "cuda":
+            depth_mm, confidence = _match_on_device(clip, rgb, right, plan, hooks)
+        else:
+            depth_mm, confidence = _match_all(clip, rgb, right, plan, pool, hooks)
     valid_share = _valid_share(depth_mm, clip.tissue)
     return DepthClip(
         rgb=rgb,
@@ -105,6 +112,7 @@ def _plan(
     right: NDArray[np.uint8],
     measured: Sequence[int],
     pool: ThreadPoolExecutor,
+    device: str,
 ) -> tuple[RowShift, MatchPlan]:
     """Row shift and disparity range, from a few pairs spread over the measured frames."""
 
@@ -114,9 +122,12 @@ def _plan(
 
     matches = np.concatenate(list(pool.map(lambda pair: feature_matches(*pair), spread(ALIGNMENT_PAIRS))))
     shift = measure_row_shift(matches, clip.disparity_offset_px, clip.equal_rows_px)
-    low, high = choose_range(
-        spread(RANGE_PAIRS), shift.correction_px, clip.disparity_offset_px, clip.intrinsics.fx * clip.baseline_mm
-    )
+    agreed = agreed_disparities
+    if device == "cuda":
+        from worker.stereo.cuda import agreed_disparities as agreed
+    focal_baseline = clip.intrinsics.fx * clip.baseline_mm
+    pairs = spread(RANGE_PAIRS)
+    low, high = choose_range(pairs, shift.correction_px, clip.disparity_offset_px, focal_baseline, agreed)
     return shift, MatchPlan(low, high, shift.correction_px)
 
 
@@ -146,6 +157,26 @@ def _match_all(
             hooks.on_progress(Progress(STAGE, 1 - share * left_over / len(jobs)))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+    return depth_mm, confidence
+
+
+def _match_on_device(
+    clip: RectifiedClip, rgb: NDArray[np.uint8], right: NDArray[np.uint8], plan: MatchPlan, hooks: Hooks
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """As _match_all, by as many pairs at once as their volumes leave room for."""
+    from worker.stereo.cuda import depth_of, frames_at_once
+
+    depth_mm = np.empty(right.shape, np.float32)
+    confidence = np.empty(right.shape, np.uint8)
+    at_once = frames_at_once(clip.intrinsics.height, clip.intrinsics.width, plan)
+    focal_baseline = clip.intrinsics.fx * clip.baseline_mm
+    for first in range(0, len(right), at_once):
+        _check_stop(hooks)
+        some = slice(first, first + at_once)
+        left = np.stack([_grey(frame) for frame in rgb[some]])
+        depth_mm[some], confidence[some] = depth_of(left, right[some], plan, focal_baseline, clip.disparity_offset_px)
+        left_over = max(len(right) - first - at_once, 0) / len(right)
+        hooks.on_progress(Progress(STAGE, 1 - (1 - DECODING_SHARE - MEASURING_SHARE) * left_over))
     return depth_mm, confidence
 
 

@@ -34,6 +34,8 @@ TEXTURE_FOR_TRUST = 8.0  # mean squared gradient (grey levels squared) below whi
 RESIDUAL_FOR_TRUST = 8.0  # mean |left - warped right| (grey levels) above which errors grow, measured
 BLACK_LEVEL, SATURATED_LEVEL = 10, 250
 SATURATED_TRUST = 0.25  # highlights move with the eye, so what matches there need not be the surface
+MIN_CONFIDENCE = 16  # of 255: below it a depth is a guess
+MAX_DEPTH_MM = 400.0  # beyond it an endoscope's disparity is a fraction of a pixel
 
 
 @dataclass(frozen=True)

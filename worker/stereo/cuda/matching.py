@@ -1,0 +1,271 @@
+"""Dense disparity of many rectified pairs on the device, with a confidence: the steps of worker/stereo/matching.py.
+
+Symbols: F frames, H W pixels of one eye; h w pixels the matcher works on, D disparities; d disparity in px.
+
+Reduced images are matched by census costs along four directions (kernels.py). The right eye's disparities are read
+from the same sums; where both agree, an edge-aware least-squares filter (Min et al. 2014) starts, fills the rest, and
+one Lucas-Kanade step along the row at full resolution restores the sub-pixel part (docs/decisions/021).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import triton
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from worker.stereo.cuda import kernels
+from worker.stereo.matching import (
+    BLACK_LEVEL,
+    COLOUR_SIGMA,
+    HIGH_PASS_PX,
+    MATCHING_WIDTH,
+    MAX_DEPTH_MM,
+    MAX_REFINEMENT_PX,
+    MIN_CONFIDENCE,
+    REFERENCE_WIDTH,
+    REFINE_DAMPING,
+    REFINE_WINDOW_PX,
+    RESIDUAL_FOR_TRUST,
+    SATURATED_LEVEL,
+    SATURATED_TRUST,
+    SMOOTHNESS,
+    TEXTURE_FOR_TRUST,
+    MatchPlan,
+)
+
+Greys = NDArray[np.uint8]  # [F, H, W]
+
+SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 12, 100
+"""P1 and P2 against costs of up to 24 bits a pixel of the block: a half and four bits a pixel."""
+FILTER_PASSES, FILTER_EASING = 3, 0.25
+"""The filter alternates rows and columns so often, each time with this share of the strength before."""
+AGREEMENT_PX = 1.5
+"""Of the reduced image: by more the disparities of both eyes contradict each other."""
+ROUGHNESS_PX, ROUGHNESS_PER_PX2 = 5, 0.256
+"""Side of the window, and how much trust a variance of the disparity of 1 px^2 within it costs: jumps are not sharp."""
+LEAST_WEIGHT = 1e-8
+"""Where the filter finds no start far around."""
+LEAST_LANES = 32
+VOLUME_BYTES = 1 << 30
+"""Of the cost volumes at a time: some seventy frames, whose lines are enough for a large GPU."""
+BYTES_A_COST = 5
+"""int16 for the cost and the sum, and the uint8 of the sums over columns."""
+
+
+@dataclass(frozen=True)
+class _Share:
+    """What one program of a kernel takes: pixels, pixels with their lanes, lines with their lanes, bare lines."""
+
+    pixels: int
+    costs: int
+    paths: int
+    lines: int
+
+
+ON_GPU = _Share(pixels=256, costs=16, paths=1, lines=32)
+INTERPRETED = _Share(pixels=4096, costs=4096, paths=512, lines=512)  # it takes time by program, hardly by number
+
+
+def frames_at_once(height: int, width: int, plan: MatchPlan) -> int:
+    """How many pairs of H x W pixels go through match_frames together."""
+    (h, w), _, count = _reduced(height, width, plan)
+    return max(1, VOLUME_BYTES // (BYTES_A_COST * h * w * count))
+
+
+def depth_of(
+    left: Greys, right: Greys, plan: MatchPlan, focal_baseline: float, offset_px: float
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Depth in mm, 0 where it is invalid, and its confidence, 0 at the same pixels, of pairs [F, H, W] on the host."""
+    device = _device()
+    disparity, confidence = match_frames(torch.from_numpy(left).to(device), torch.from_numpy(right).to(device), plan)
+    beyond_infinity_px = disparity - offset_px
+    valid = (confidence >= MIN_CONFIDENCE) & (beyond_infinity_px > focal_baseline / MAX_DEPTH_MM)
+    depth_mm = torch.where(valid, focal_baseline / beyond_infinity_px, 0.0)
+    return depth_mm.cpu().numpy(), torch.where(valid, confidence, 0).cpu().numpy()
+
+
+def match_frames(left: Tensor, right: Tensor, plan: MatchPlan) -> tuple[Tensor, Tensor]:
+    """Disparity float32 in px and confidence uint8 of pairs uint8 [F, H, W], on their device; see matching.match."""
+    right = shift_rows(right, plan.row_shift_px)
+    height, width = left.shape[1:]
+    size, low, count = _reduced(height, width, plan)
+    small_left, small_right = _resized(left, size), _resized(right, size)
+    disparity, opposite = _semi_global(small_left, small_right, low, count)
+    consistency = _consistency(disparity, opposite)
+    disparity = filled(disparity, consistency, small_left)
+    disparity = _enlarged(disparity, (height, width)) * (width / size[1])
+    disparity, texture, residual = refine(disparity, left, right)
+    trust = _enlarged(255 * consistency, (height, width))
+    trust *= (texture / TEXTURE_FOR_TRUST).clamp_max(1)
+    trust *= (RESIDUAL_FOR_TRUST / residual.clamp_min(1e-3)).clamp_max(1)
+    trust = torch.where(left >= SATURATED_LEVEL, SATURATED_TRUST * trust, trust)
+    x_right = torch.arange(width, device=left.device) - disparity
+    unseen = (left <= BLACK_LEVEL) | (x_right < 0) | (x_right > width - 1)
+    return disparity, trust.masked_fill(unseen, 0).round().to(torch.uint8)
+
+
+def agreed_disparities(
+    left: Greys, right: Greys, low: int, count: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """As alignment.agreed_disparities."""
+    device = _device()
+    disparity, opposite = _semi_global(
+        torch.from_numpy(left).to(device), torch.from_numpy(right).to(device), low, count
+    )
+    seen = torch.arange(left.shape[2], device=device) - disparity >= 0
+    agreed = seen & (_disagreement(disparity, opposite)[0] <= 1)
+    return disparity.cpu().numpy(), agreed.cpu().numpy()
+
+
+def _device() -> str:
+    return "cpu" if triton.knobs.runtime.interpret else "cuda"
+
+
+def _reduced(height: int, width: int, plan: MatchPlan) -> tuple[tuple[int, int], int, int]:
+    """Size (h, w) of the reduced images, and their least disparity and number of disparities."""
+    factor = -(-width // MATCHING_WIDTH)
+    size = (round(height / factor), round(width / factor))
+    scale = size[1] / width
+    low = math.floor(plan.min_disparity_px * scale)
+    return size, low, math.ceil(plan.max_disparity_px * scale) - low + 1
+
+
+def shift_rows(image: Tensor, shift_px: float) -> Tensor:
+    """As matching.shift_rows, of [F, H, W]."""
+    if shift_px == 0:
+        return image
+    row = (torch.arange(image.shape[1], device=image.device) + shift_px).clamp(0, image.shape[1] - 1)
+    above = row.long().clamp_max(image.shape[1] - 2)
+    share = (row - above)[:, None]
+    return (image[:, above] * (1 - share) + image[:, above + 1] * share).round().to(torch.uint8)
+
+
+def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
+    if image.shape[1:] == size:
+        return image
+    return functional.interpolate(image[None].float(), size, mode="area")[0].round().to(torch.uint8)
+
+
+def _enlarged(image: Tensor, size: tuple[int, int]) -> Tensor:
+    return functional.interpolate(image[None], size, mode="bilinear")[0]
+
+
+def _semi_global(left: Tensor, right: Tensor, low: int, count: int) -> tuple[Tensor, Tensor]:
+    """Disparity float32 [F, h, w] of the left eyes' pixels and, in whole numbers, of the right eyes'."""
+    return winners(path_sums(left, right, low, count), low)
+
+
+def path_sums(left: Tensor, right: Tensor, low: int, count: int) -> Tensor:
+    """S int16 [F, h, w, D] of pairs uint8 [F, h, w] (kernels.py)."""
+    share = _share(left)
+    frames, h, w = left.shape
+    pixels, lanes = left.numel(), _lanes(count)
+    words = torch.empty((2, *left.shape), dtype=torch.int32, device=left.device)
+    for image, word in zip((left.contiguous(), right.contiguous()), words, strict=True):
+        kernels.census[(triton.cdiv(pixels, share.pixels),)](image, word, pixels, h, w, share.pixels)
+    columns = torch.empty((frames, h, w, count), dtype=torch.uint8, device=left.device)
+    costs, sums = (torch.empty(columns.shape, dtype=torch.int16, device=left.device) for _ in range(2))
+    grid = (triton.cdiv(pixels, share.costs),)
+    kernels.column_costs[grid](words[0], words[1], columns, low, pixels, h, w, count, share.costs, lanes)
+    kernels.block_costs[grid](columns, costs, pixels, h, w, count, share.costs, lanes)
+    for add, (lines, length, line_stride, step_stride) in enumerate(((h, w, w, 1), (w, h, 1, w))):
+        kernels.add_paths[(triton.cdiv(lines, share.paths), frames)](
+            costs, sums, lines, length, line_stride, step_stride, h * w, count,
+            SMALL_STEP_PENALTY, LARGE_STEP_PENALTY, bool(add), share.paths, lanes, num_warps=1,
+        )  # fmt: skip
+    return sums
+
+
+def winners(sums: Tensor, low: int) -> tuple[Tensor, Tensor]:
+    """Disparity float32 [F, h, w] of the left eyes' pixels and, in whole numbers, of the right eyes'."""
+    share, (w, count) = _share(sums), sums.shape[2:]
+    disparity, opposite = (torch.empty(sums.shape[:3], dtype=torch.float32, device=sums.device) for _ in range(2))
+    pixels = disparity.numel()
+    grid = (triton.cdiv(pixels, share.costs),)
+    kernels.winners[grid](sums, disparity, opposite, low, pixels, w, count, share.costs, _lanes(count))
+    return disparity, opposite
+
+
+def _share(tensor: Tensor) -> _Share:
+    return ON_GPU if tensor.is_cuda else INTERPRETED
+
+
+def _lanes(count: int) -> int:
+    return max(LEAST_LANES, 1 << (count - 1).bit_length())
+
+
+def _disagreement(disparity: Tensor, opposite: Tensor) -> tuple[Tensor, Tensor]:
+    """|d - the right eye's d at the match| in px, and the column of that match [F, h, w] int64."""
+    width = disparity.shape[2]
+    match = (torch.arange(width, device=disparity.device) - disparity).round().long().clamp(0, width - 1)
+    return (disparity - opposite.gather(2, match)).abs(), match
+
+
+def _consistency(disparity: Tensor, opposite: Tensor) -> Tensor:
+    """[F, h, w] in [0, 1]: 0 where the eyes contradict each other, low where the disparity is rough in either."""
+    difference, match = _disagreement(disparity, opposite)
+    smooth, opposite_smooth = _smoothness(disparity), _smoothness(opposite)
+    return torch.where(difference < AGREEMENT_PX, torch.minimum(smooth, opposite_smooth.gather(2, match)), 0.0)
+
+
+def _smoothness(disparity: Tensor) -> Tensor:
+    mean = _box(disparity, ROUGHNESS_PX)
+    variance = _box(disparity.square(), ROUGHNESS_PX) - mean.square()
+    return (1 - ROUGHNESS_PER_PX2 * variance).clamp(0, 1)
+
+
+def filled(disparity: Tensor, trust: Tensor, guide: Tensor) -> Tensor:
+    """The trusted disparities' mean along paths without edges of guide uint8 [F, h, w]; it reaches every pixel."""
+    share = _share(disparity)
+    frames, h, w = disparity.shape
+    weighted, weight, kept = disparity * trust, trust.clone(), torch.empty_like(trust)
+    strength = SMOOTHNESS
+    for _ in range(FILTER_PASSES):
+        for lines, length, line_stride, step_stride in ((h, w, w, 1), (w, h, 1, w)):
+            kernels.smooth_lines[(triton.cdiv(lines, share.lines), frames)](
+                guide, weighted, weight, kept, lines, length, line_stride, step_stride, h * w,
+                strength, 1 / (COLOUR_SIGMA * math.log(2)), share.lines, num_warps=1,
+            )  # fmt: skip
+        strength *= FILTER_EASING
+    return torch.where(weight > LEAST_WEIGHT, weighted / weight.clamp_min(LEAST_WEIGHT), disparity)
+
+
+def refine(disparity: Tensor, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """As matching._refine: disparity after one Lucas-Kanade step, texture and residual, all [F, H, W]."""
+    width = left.shape[2]
+    fineness = max(1.0, width / REFERENCE_WIDTH)
+    reference, searched = _high_pass(left, fineness), _high_pass(right, fineness)
+    x = (torch.arange(width, device=left.device) - disparity).clamp(0, width - 1)
+    before = x.long().clamp_max(width - 2)
+    at = searched.gather(2, before)
+    warped = at + (x - before) * (searched.gather(2, before + 1) - at)
+    difference = warped - reference
+    mean = functional.pad(0.5 * (warped + reference), (1, 1), mode="reflect")
+    gradient = 0.5 * (mean[:, :, 2:] - mean[:, :, :-2])
+    window = _window(REFINE_WINDOW_PX, fineness)
+    texture = _box(gradient.square(), window) * fineness**2
+    step = _box(gradient * difference, window) * fineness**2 / (texture + REFINE_DAMPING)
+    residual = _box(difference.abs(), window)
+    return disparity + step.clamp(-MAX_REFINEMENT_PX, MAX_REFINEMENT_PX), texture, residual
+
+
+def _high_pass(image: Tensor, fineness: float) -> Tensor:
+    values = image.float()
+    return values - _box(values, _window(HIGH_PASS_PX, fineness))
+
+
+def _window(size_px: int, fineness: float) -> int:
+    return 2 * round(size_px * fineness / 2 - 0.5) + 1
+
+
+def _box(image: Tensor, size: int) -> Tensor:
+    """Means over squares of an odd number of pixels [F, H, W]; beyond the margin the image is mirrored."""
+    radius = size // 2
+    wide = functional.pad(image, (radius, radius, radius, radius), mode="reflect")
+    return functional.avg_pool2d(functional.avg_pool2d(wide, (1, size), 1), (size, 1), 1)
