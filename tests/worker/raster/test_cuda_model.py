@@ -26,7 +26,7 @@ from worker.raster.cpu.model import FusedModel
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
 from worker.raster.step import Target, TrainingFrame, camera_vector
 
-WIDTH, HEIGHT, COUNT = 32, 24, 60
+WIDTH, HEIGHT, COUNT = 20, 16, 45
 Fused = SharedBasis | PolynomialFourier | FlexibleDeformation
 LOSS = LossSettings(depth_weight=20.0, colour_zone=0.05, depth_zone=1e-3)
 RATES = StepRates(
@@ -75,7 +75,7 @@ def deformation(kind: str) -> Fused:
     return dataclasses.replace(linear, weight=stirred(linear.weight))
 
 
-def frames(count: int, width: int = WIDTH) -> list[TrainingFrame]:
+def frames(count: int = 3, width: int = WIDTH) -> list[TrainingFrame]:
     """Noise in coarse squares, with holes in tissue and depth."""
     random = np.random.default_rng(51)
     made = []
@@ -106,7 +106,7 @@ def model(device: str, kind: str = "shared with colour", sh_degree: int = 0, fra
 
 def train(trained: AnyModel, seen: Sequence[TrainingFrame], sh_degree: int = 0, first: int = 1) -> None:
     for iteration, frame in enumerate(seen, start=first):
-        trained.step(frame, LOSS, RATES, iteration, min(sh_degree, iteration // 2))
+        trained.step(frame, LOSS, RATES, iteration, min(sh_degree, iteration - 1))
 
 
 def stored(trained: AnyModel) -> dict[str, Tensor]:
@@ -127,7 +127,7 @@ def test_steps_change_a_model_as_they_do_on_the_cpu(kind: str, sh_degree: int, d
     cpu = FusedModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT)
     cuda = model(device, kind, sh_degree)
     for trained in (cpu, cuda):
-        train(trained, frames(3), sh_degree)
+        train(trained, frames(2), sh_degree)
     before = FusedModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT).parameters()
     wanted = cpu.arrays()
     got = stored(cuda)
@@ -142,7 +142,7 @@ def test_steps_change_a_model_as_they_do_on_the_cpu(kind: str, sh_degree: int, d
 
 def test_what_was_trained_on_the_device_renders_on_the_cpu_within_an_8_bit_step(device: str) -> None:
     cuda = model(device)
-    train(cuda, frames(3))
+    train(cuda, frames(1))
     cpu = FusedModel(*cuda.export(), WIDTH, HEIGHT)
     values = np.linspace(0, 1, COUNT, dtype=np.float32)
     image = cuda.render(CAMERA, 0.6, values)
@@ -160,7 +160,7 @@ def test_several_times_are_rendered_at_once_and_other_sizes_too(device: str) -> 
         assert_close(image, cuda.render(CAMERA, t), relative=1e-6, name=f"at {t}")
     other = CAMERA.copy()
     other[:6] *= 0.5
-    wanted = FusedModel(gaussians(1), deformation("shared with colour"), 16, 12).render(other, 0.2)
+    wanted = FusedModel(gaussians(1), deformation("shared with colour"), 10, 8).render(other, 0.2)
     assert_close(cuda.render(other, 0.2), wanted, relative=1e-3, name="half the size")
 
 
@@ -173,49 +173,55 @@ def test_the_gradient_of_an_image_is_the_cpus(device: str) -> None:
         assert_close(got[row], wanted[row], relative=1e-3, name=f"row {row}")
 
 
-def test_the_same_steps_give_the_same_bits_also_after_a_resumption(device: str) -> None:
-    whole, again, resumed = model(device), model(device), model(device)
-    train(whole, frames(4))
-    train(again, frames(4)[:2])
+@pytest.fixture(scope="module")
+def three_steps(device: str) -> dict[str, Tensor]:
+    """What a model is after a step on each of three frames that nothing came between."""
+    trained = model(device)
+    train(trained, frames())
+    return stored(trained)
+
+
+def test_the_same_steps_give_the_same_bits_also_after_a_resumption(three_steps: dict[str, Tensor], device: str) -> None:
+    again, resumed, seen = model(device), model(device), frames()
+    train(again, seen[:1])
     kept = stored(again)
-    train(again, frames(4)[2:], first=3)
-    assert_same_bits(stored(again), stored(whole))
+    train(again, seen[1:], first=2)
+    assert_same_bits(stored(again), three_steps)
     resumed.load_arrays(kept)
-    train(resumed, frames(4)[2:], first=3)
-    assert_same_bits(stored(resumed), stored(whole))
+    train(resumed, seen[1:], first=2)
+    assert_same_bits(stored(resumed), three_steps)
 
 
 def test_arrays_of_another_size_are_refused_by_name(device: str) -> None:
     arrays = stored(model(device))
     arrays["opacity_logit"] = arrays["opacity_logit"][:-1]
-    with pytest.raises(ValueError, match=r"opacity_logit has shape \(59,\), this model needs \(60,\)"):
+    with pytest.raises(ValueError, match=r"opacity_logit has shape \(44,\), this model needs \(45,\)"):
         model(device).load_arrays(arrays)
 
 
-def test_a_model_with_too_little_room_ends_as_one_with_ample_room(device: str) -> None:
-    ample, tight = model(device), model(device)
-    train(ample, frames(4))
-    train(tight, frames(4)[:1])
+def test_a_model_with_too_little_room_ends_as_one_with_ample_room(three_steps: dict[str, Tensor], device: str) -> None:
+    tight, seen = model(device), frames()
+    train(tight, seen[:1])
     tight.wait()
     tight._training.rasterizer._allocate_slots(8)
-    train(tight, frames(4)[1:], first=2)
-    answer = tight.wait()
-    assert answer is not None
+    train(tight, seen[1:], first=2)
+    assert tight.wait() is not None
     assert tight._training.rasterizer.capacity > 8
-    assert_same_bits(stored(tight), stored(ample))
+    assert_same_bits(stored(tight), three_steps)
 
 
 def test_steps_are_answered_for_once_and_together(device: str) -> None:
     cpu = FusedModel(gaussians(), deformation("shared"), WIDTH, HEIGHT)
-    answers = [cpu.step(frame, LOSS, RATES, k + 1) for k, frame in enumerate(frames(3))]
+    seen = frames(2)
+    answers = [cpu.step(frame, LOSS, RATES, k + 1) for k, frame in enumerate(seen)]
     cuda = model(device, "shared")
     assert cuda.answers_every == CHECK_EVERY
-    assert [cuda.step(frame, LOSS, RATES, k + 1) for k, frame in enumerate(frames(3))] == [None] * 3
+    assert [cuda.step(frame, LOSS, RATES, k + 1) for k, frame in enumerate(seen)] == [None] * 2
     answer = cuda.wait()
     assert answer is not None
     for name in ("colour_l1", "depth_l1", "squared_error", "holes"):
         assert getattr(answer, name) == pytest.approx(sum(getattr(each, name) for each in answers), rel=1e-4)
-    assert answer.visible == min(each.visible for each in answers)
+    assert 0 < answer.visible <= min(each.visible for each in answers)
     assert cuda.wait() is None
 
 
@@ -246,16 +252,18 @@ def test_gaussians_taken_train_on_as_on_the_cpu(kind: str, device: str) -> None:
     models = (FusedModel(gaussians(), deformation(kind), WIDTH, HEIGHT), model(device, kind))
     columns = np.r_[np.arange(COUNT)[::-1], 5, 7, 7]
     for trained in models:
-        train(trained, frames(3)[:1])
+        train(trained, frames(2)[:1])
         trained.take(columns, np.arange(len(columns)) >= COUNT)
-        train(trained, frames(3)[1:], first=2)
+        train(trained, frames(2)[1:], first=2)
         assert trained.count == COUNT + 3
         assert len(trained.export()[0]) == COUNT + 3
     wanted = models[0].arrays()
     for name, each in stored(models[1]).items():
         assert_close(each, wanted[name], relative=1e-4, absolute=1e-9, name=name)
     assert_close(models[1].gradient_norm, models[0].gradient_norm, relative=1e-3)
-    assert bool((models[1].visible.cpu() == models[0].visible).all())
+    seen = models[1].visible.cpu()
+    assert bool(seen[models[0].gradient_norm > 0].all())
+    assert not bool((seen & ~models[0].visible).any())  # the CPU culls by a bound, here by the very tiles
 
 
 def test_parameters_may_be_written_between_two_steps(device: str) -> None:
@@ -270,13 +278,11 @@ def test_parameters_may_be_written_between_two_steps(device: str) -> None:
 
 
 def test_more_frames_than_there_was_room_for_and_frames_of_another_size(
-    device: str, monkeypatch: pytest.MonkeyPatch
+    three_steps: dict[str, Tensor], device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("worker.raster.cuda.frames.FIRST_ROOM", 1)
-    crowded, ample = model(device), model(device)
-    train(crowded, frames(3))
-    monkeypatch.undo()
-    train(ample, frames(3))
-    assert_same_bits(stored(crowded), stored(ample))
-    with pytest.raises(ValueError, match="a frame of 40 x 24 pixels, the others have 32 x 24"):
-        ample.step(frames(1, width=40)[0], LOSS, RATES, 4)
+    crowded = model(device)
+    train(crowded, frames())
+    assert_same_bits(stored(crowded), three_steps)
+    with pytest.raises(ValueError, match="a frame of 40 x 16 pixels, the others have 20 x 16"):
+        crowded.step(frames(1, width=40)[0], LOSS, RATES, 4)
