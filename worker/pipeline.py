@@ -98,7 +98,7 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
     out_dir.mkdir(parents=True, exist_ok=True)
     seconds: Seconds = {}
 
-    clip = depth_clip_of(request, hooks, seconds)
+    clip = depth_clip_of(request, hooks, seconds, device)
     split = split_frames(clip, request.holdout)
     seconds["compile_s"] = compile_coder()
     if device == CPU:
@@ -153,7 +153,7 @@ def report_stage(hooks: Hooks, stage: str, share: float) -> None:
         raise Cancelled(f"Stopped during stage {stage!r}.")
 
 
-def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: Seconds) -> DepthClip:
+def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: Seconds, device: Device = CPU) -> DepthClip:
     """Decode, and for stereo input rectify and match: the left frames with depth."""
     if isinstance(request.clip, DepthClip):
         return request.clip
@@ -180,7 +180,8 @@ def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: Seconds
     frame_count = decoded.clip.frame_count
     held_out = set(held_out_frames(frame_count, request.holdout))
     measured = [i for i in range(frame_count) if i not in held_out]
-    return timed(seconds, "stereo_s", lambda: estimate_depth(rectified, hooks, measured_frames=measured))
+    matched = partial(estimate_depth, rectified, hooks, measured_frames=measured, device=device.kind)
+    return timed(seconds, "stereo_s", matched)
 
 
 def prepare(

@@ -86,7 +86,7 @@ class Bench:
         if place not in self._open:
             self._open.clear()
             self._truth.clear()
-            self._open[place] = open_source(source, cell.holdout, hooks)
+            self._open[place] = open_source(source, cell.holdout, hooks, choose_device(self.device))
         opened = self._open[place]
         request = ReconstructionRequest(
             clip=opened.clip,

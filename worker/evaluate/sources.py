@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from contract.errors import InputError
+from worker.backend import CPU, Device
 from worker.clip import DepthClip
 from worker.hooks import Hooks
 from worker.phantom import MOTIONS, Phantom, PhantomSettings, make_phantom
@@ -71,7 +72,7 @@ def source_of(argument: str, options: Mapping[str, Any] | None = None) -> Source
     return Source(Path(argument).stem, argument, None, {"clip": Path(argument), **(options or {})})
 
 
-def open_source(source: Source, holdout: str, hooks: Hooks) -> OpenClip:
+def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU) -> OpenClip:
     """Draw or decode the clip. Stereo measures the frames that are not held out, so a clip belongs to its holdout.
 
     Raises:
@@ -81,7 +82,7 @@ def open_source(source: Source, holdout: str, hooks: Hooks) -> OpenClip:
         phantom = make_phantom(source.phantom)
         return OpenClip(phantom.depth_clip(), phantom, {})
     seconds: dict[str, float] = {}
-    clip = depth_clip_of(ReconstructionRequest(holdout=holdout, **source.options), hooks, seconds)
+    clip = depth_clip_of(ReconstructionRequest(holdout=holdout, **source.options), hooks, seconds, device)
     return OpenClip(clip, None, seconds)
 
 
