@@ -13,7 +13,20 @@ SEED = 20240527
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--device", choices=("cpu", "cuda"), default="cpu", help="where tests that need a device run")
+    parser.addoption(
+        "--device",
+        choices=("cpu", "cuda"),
+        default="cpu",
+        help="where tests that need a device run: the CUDA backend's kernels in Triton's interpreter, or on the GPU",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Triton decides when it is imported whether its kernels are interpreted, so that is said before any test is."""
+    if config.getoption("--device") == "cpu":
+        os.environ["TRITON_INTERPRET"] = "1"
+    else:
+        os.environ.pop("TRITON_INTERPRET", None)
 
 
 @pytest.fixture(scope="session")

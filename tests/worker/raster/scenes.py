@@ -6,8 +6,10 @@ Symbols: N Gaussians, H W pixels.
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -19,8 +21,27 @@ from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera, Rende
 
 Rasterize = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Camera], Rendered]
 
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+"""Whether the CUDA backend's kernels run in Triton's interpreter (tests/conftest.py): right, and a million times slower
+than on a GPU, so that it gets small scenes."""
+
+
+def cuda_rasterize(
+    mean: Tensor, quaternion: Tensor, scale: Tensor, opacity: Tensor, colour: Tensor, camera: Camera
+) -> Rendered:
+    """The CUDA backend for tensors of the host: there and back, gradients too."""
+    from worker.raster.cuda import rasterize  # needs Triton
+
+    device = "cpu" if INTERPRETED else "cuda"
+    moved = [each.to(device) for each in (mean, quaternion, scale, opacity, colour)]
+    rendered = rasterize(*moved, camera)
+    return Rendered(rendered.rgb.cpu(), rendered.depth.cpu(), rendered.alpha.cpu())
+
+
 BACKENDS: dict[str, Rasterize] = {"reference": reference.rasterize, "cpu": cpu.rasterize}
 """Every backend by name, all tested in float32 (the reference too: it shows what float32 alone costs)."""
+if find_spec("triton") is not None:
+    BACKENDS["cuda"] = cuda_rasterize
 
 NAMES = ("mean", "quaternion", "scale", "opacity", "colour")
 
@@ -61,6 +82,13 @@ class Scene:
         pose = self.camera.camera_from_world
         assert isinstance(pose, Tensor)
         return {**{name: getattr(self, name) for name in NAMES}, "camera_from_world": pose}
+
+
+def affordable(rasterize: Rasterize, count: int, *, width: int, height: int) -> dict[str, int]:
+    """A scene's count, width and height; a small one's where kernels are interpreted: 2 x 2 tiles, three cut."""
+    if INTERPRETED and rasterize is BACKENDS.get("cuda"):
+        count, width, height = min(count, 40), min(width, 13), min(height, 11)
+    return {"count": count, "width": width, "height": height}
 
 
 def tilted_pose() -> NDArray[np.float64]:
@@ -120,9 +148,9 @@ def opaque_wall() -> Scene:
     return random_scene(400, width=37, height=35, seed=40, pixels=9.0, opacities=(0.9,))
 
 
-def opacities_at_both_ends() -> Scene:
+def opacities_at_both_ends(count: int = 150, *, width: int = 41, height: int = 34) -> Scene:
     """A third of the Gaussians at opacity 1, a third at 0: neither has a finite logit."""
-    scene = random_scene(150, width=41, height=34, seed=41)
+    scene = random_scene(count, width=width, height=height, seed=41)
     opacity = scene.opacity.clone()
     opacity[0::3], opacity[1::3] = 1.0, 0.0
     return dataclasses.replace(scene, opacity=opacity)

@@ -18,8 +18,10 @@ from torch import Tensor
 from tests.helpers import assert_close
 from tests.worker.raster.scenes import (
     BACKENDS,
+    INTERPRETED,
     Rasterize,
     Scene,
+    affordable,
     opacities_at_both_ends,
     opaque_wall,
     pixels_near_a_cut,
@@ -43,6 +45,22 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "thinner than a pixel": lambda: random_scene(600, width=56, height=40, seed=8, pixels=0.15),
     "a small frame": lambda: random_scene(1500, width=96, height=80, seed=9),
 }
+SMALL_SCENES: dict[str, Callable[[], Scene]] = {
+    "one Gaussian": SCENES["one Gaussian"],
+    "one pixel": SCENES["one pixel"],
+    "one column": lambda: random_scene(40, width=1, height=21, seed=42),
+    "one row": lambda: random_scene(40, width=19, height=1, seed=5),
+    "past a tile": lambda: random_scene(60, width=17, height=9, seed=6),
+    "wide": lambda: random_scene(40, width=10, height=12, seed=7, pixels=7.0),
+    "opaque": lambda: random_scene(120, width=9, height=8, seed=40, pixels=9.0, opacities=(0.9,)),
+    "thinner than a pixel": lambda: random_scene(120, width=14, height=10, seed=8, pixels=0.15),
+}
+"""The same, as small as an interpreted kernel needs them."""
+COMPARISONS = [
+    (backend, name)
+    for backend in sorted(BACKENDS)
+    for name in (SMALL_SCENES if backend == "cuda" and INTERPRETED else SCENES)
+]
 
 
 def test_the_opaque_scene_hides_most_of_its_gaussians() -> None:
@@ -58,11 +76,12 @@ def rasterize(request: pytest.FixtureRequest) -> Rasterize:
     return BACKENDS[request.param]
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(("backend", "name"), COMPARISONS)
 def test_values_and_gradients_are_the_references(
-    name: str, rasterize: Rasterize, record_property: Callable[[str, object], None]
+    backend: str, name: str, record_property: Callable[[str, object], None]
 ) -> None:
-    exact = SCENES[name]()
+    rasterize = BACKENDS[backend]
+    exact = (SMALL_SCENES if backend == "cuda" and INTERPRETED else SCENES)[name]()
     single = exact.to(torch.float32)
     exact = single.to(torch.float64)  # the same numbers, so that only the arithmetic differs
     left_out = pixels_near_a_cut(exact)
@@ -80,7 +99,8 @@ def test_values_and_gradients_are_the_references(
 
 
 def test_an_opacity_of_one_gets_its_gradient(rasterize: Rasterize) -> None:
-    scene = opacities_at_both_ends().to(torch.float32).differentiable()
+    size = affordable(rasterize, 150, width=41, height=34)
+    scene = opacities_at_both_ends(**size).to(torch.float32).differentiable()
     (gradient,) = torch.autograd.grad(scene.render(rasterize).alpha.sum(), [scene.opacity])
     assert float((gradient[0::3] != 0).double().mean()) > 0.3
     assert not gradient[1::3].any()
@@ -94,7 +114,7 @@ def test_shapes_that_do_not_belong_together_are_refused(rasterize: Rasterize) ->
 
 def test_no_gaussians_are_black_with_gradients_of_their_shape(rasterize: Rasterize) -> None:
     scene = random_scene(5, width=19, height=11).to(torch.float32).rows(torch.zeros(0, dtype=torch.long))
-    cotangent = random_cotangent(scene, np.zeros((11, 19), bool))
+    cotangent = random_cotangent(scene, no_pixel(scene))
     rendered, gradients = values_and_gradients(scene, rasterize, cotangent)
     assert rendered.rgb.shape == (11, 19, 3)
     assert not rendered.rgb.any()
@@ -112,8 +132,8 @@ def test_no_gaussians_are_black_with_gradients_of_their_shape(rasterize: Rasteri
 
 
 def test_gaussians_that_are_culled_get_zero_gradient(rasterize: Rasterize) -> None:
-    scene = random_scene(200, width=31, height=27, seed=13).to(torch.float32)
-    cotangent = random_cotangent(scene, np.zeros((27, 31), bool))
+    scene = random_scene(**affordable(rasterize, 200, width=31, height=27), seed=13, pixels=0.4).to(torch.float32)
+    cotangent = random_cotangent(scene, no_pixel(scene))
     _, gradients = values_and_gradients(scene, rasterize, cotangent)
     projected = reference.project(*scene.to(torch.float64).tensors()[:4], scene.camera)
     hidden = ~projected.visible
@@ -123,9 +143,9 @@ def test_gaussians_that_are_culled_get_zero_gradient(rasterize: Rasterize) -> No
 
 
 def test_permuting_the_gaussians_permutes_their_gradients(rasterize: Rasterize) -> None:
-    scene = random_scene(150, width=31, height=27, seed=14).to(torch.float32)
-    order = torch.randperm(150, generator=torch.Generator().manual_seed(0))
-    cotangent = random_cotangent(scene, np.zeros((27, 31), bool))
+    scene = random_scene(**affordable(rasterize, 150, width=31, height=27), seed=14).to(torch.float32)
+    order = torch.randperm(len(scene.mean), generator=torch.Generator().manual_seed(0))
+    cotangent = random_cotangent(scene, no_pixel(scene))
     _, gradients = values_and_gradients(scene, rasterize, cotangent)
     _, permuted = values_and_gradients(scene.rows(order), rasterize, cotangent)
     for name in ("mean", "quaternion", "scale", "opacity", "colour"):
@@ -134,7 +154,7 @@ def test_permuting_the_gaussians_permutes_their_gradients(rasterize: Rasterize) 
 
 
 def test_gradients_of_one_layer_alone_are_right(rasterize: Rasterize) -> None:
-    scene = random_scene(80, width=30, height=22, seed=15).to(torch.float32)
+    scene = random_scene(**affordable(rasterize, 80, width=30, height=22), seed=15).to(torch.float32)
     left_out = pixels_near_a_cut(scene)
     full = random_cotangent(scene, left_out)
     for layer, channels in {"rgb": slice(0, 3), "depth": slice(3, 4), "alpha": slice(4, 5)}.items():
@@ -147,13 +167,17 @@ def test_gradients_of_one_layer_alone_are_right(rasterize: Rasterize) -> None:
 
 
 def test_the_same_scene_gives_the_same_bits(rasterize: Rasterize) -> None:
-    scene = random_scene(300, width=45, height=41, seed=16).to(torch.float32)
-    cotangent = random_cotangent(scene, np.zeros((41, 45), bool))
+    scene = random_scene(**affordable(rasterize, 300, width=45, height=41), seed=16).to(torch.float32)
+    cotangent = random_cotangent(scene, no_pixel(scene))
     first, first_gradients = values_and_gradients(scene, rasterize, cotangent)
     again, again_gradients = values_and_gradients(scene, rasterize, cotangent)
     assert bool((again.rgb == first.rgb).all())
     assert bool((again.depth == first.depth).all())
     assert all(bool((again_gradients[name] == each).all()) for name, each in first_gradients.items())
+
+
+def no_pixel(scene: Scene) -> NDArray[np.bool_]:
+    return np.zeros((scene.camera.height, scene.camera.width), bool)
 
 
 def random_cotangent(scene: Scene, left_out: NDArray[np.bool_]) -> Tensor:

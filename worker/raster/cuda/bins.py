@@ -2,9 +2,9 @@
 
 Symbols: N Gaussians, F frames, M slots (the capacity). A slot is one (splat, tile) pair, an instance.
 
-A splat's slots are consecutive, splats nearest first; sorting the slots by tile, stably, gives every tile its instances,
-nearest first. So two sorts do (torch.sort): the F N depths as one 32-bit key each, and the M tiles, whose keys are
-16 bits wide wherever that many tiles fit: half the passes of 32.
+A splat's slots are consecutive, splats nearest first; sorting the slots by tile, stably, gives every tile its
+instances, nearest first. So two sorts do (torch.sort): the F N depths as one 32-bit key each, and the M tiles, whose
+keys are 16 bits wide wherever that many tiles fit: half the passes of 32.
 
     count [F N]   how many tiles the splat touches (written by project.py)
     ends [F N]    running sum of count in depth order: the slots of rank r are ends[r] - count ... ends[r] - 1
@@ -27,6 +27,9 @@ EXTENT = 8
 """Floats that tell which tiles a splat touches: its centre, the half-height of the ellipse, the dy at which it reaches
 furthest to the right; the middle of its chord at dy, over dy; and the square of half a chord at dy = 0, and how much
 that loses with dy^2. One spare."""
+SLOT = 16
+"""Floats of an instance's gradient: the moments 1, x, y, xx, xy, yy of dL/dpower about the tile's middle in 0:6, and
+dL/d(r, g, b, z) as 8:12 plus 12:16 (blend.py)."""
 FILL_BLOCK = 256
 MOST_FRAMES = 16
 """Frames whose depths can be sorted as one: 4 bits of a depth key."""
@@ -92,16 +95,16 @@ def count_tiles(  # type: ignore[no-untyped-def]
     return total
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["capacity", "splats", "gaussians", "stride"])
 def fill_slots(  # type: ignore[no-untyped-def]
     ends, order, count, extent, key, owner, slot_start, needed, ok,
-    capacity, splats, gaussians, width, height, tiles_x, rows, no_tile,
-    STEPS: tl.constexpr, TILE_W: tl.constexpr, TILE_H: tl.constexpr, BLOCK: tl.constexpr,
+    capacity, splats, gaussians, width, height, tiles_x, rows, no_tile, stride,
+    TILE_W: tl.constexpr, TILE_H: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """key and owner of every slot, slot_start [F N] of every splat that has one; needed and ok (rasterizer.py).
 
     ends int64 [F N], order int64 [F N]: the splats, nearest first, frame after frame. splats = F N, gaussians = N;
-    2^STEPS > splats.
+    stride: the largest power of two up to F N.
     """
     slot = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     total = tl.load(ends + splats - 1)
@@ -115,12 +118,11 @@ def fill_slots(  # type: ignore[no-untyped-def]
     used = (slot < capacity) & (slot < total)
 
     rank = tl.zeros_like(slot)  # how many splats end at or before the slot
-    step = 1 << (STEPS - 1)
-    for _ in range(STEPS):
-        probe = rank + step
+    while stride > 0:
+        probe = rank + stride
         inside = used & (probe <= splats)
         rank = tl.where(inside & (tl.load(ends + probe - 1, mask=inside, other=0) <= slot), probe, rank)
-        step = step // 2
+        stride = stride // 2
     splat = tl.load(order + rank, mask=used, other=0).to(tl.int32)
     own = tl.load(count + splat, mask=used, other=0)
     ahead = (slot - (tl.load(ends + rank, mask=used, other=0) - own)).to(tl.int32)

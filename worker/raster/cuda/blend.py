@@ -16,8 +16,7 @@ numbers a thread works on. Sums over pixels are matrix products on the tensor co
 xx xy yy of the pixel (relative to the tile's middle), and w times g. One operand is split into two parts of 11 bits,
 hence exact to 2^-22; the monomials have few enough bits to be exact, and g is split too, into 8 columns.
 
-Each instance's gradient goes to its own slot (bins.py): SLOT floats, the moments in 0:6 and dL/d(r, g, b, z) in 8:12
-plus 12:16. No atomics, so the same inputs give the same bits.
+Each instance's gradient goes to its own slot (bins.py). No atomics, so the same inputs give the same bits.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ import triton
 import triton.language as tl
 
 from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from worker.raster.cuda.bins import SLOT
 from worker.raster.cuda.project import RECORD
-from worker.raster.cuda.project_backward import SLOT
 
 CHUNK = 16
 """Splats a chunk: the least a matrix product takes, and K P / 32 = 32 registers an intermediate."""
@@ -170,8 +169,9 @@ def blend(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Composite one tile of one frame: program = frame * tiles + tile, tiles row by row.
 
-    records [F N, RECORD] (project.py). owner, slot int32 [M]: record and slot of every instance, sorted by tile, nearest
-    first; tile_start int32 [F tiles + 1]. before [M / K + F tiles, P]: scratch for T before each chunk.
+    records [F N, RECORD] (project.py), as int64. owner int32, slot int64 [M]: record and slot of every instance,
+    sorted by tile, nearest first; tile_start int32 [F tiles + 1]. before [M / K + F tiles, P]: scratch for T before
+    each chunk.
     image [F, 5 or 6, H, W]: R G B Z A and, with VALUES, the blended value: written in RENDER; read as cotangents in
     COTANGENT. slots [M, SLOT] and, in LOSS, statistics [F tiles, STATISTICS] are written.
     target [*, 3, H, W] uint8, weight [*, H, W] uint8 (255 = tissue), inverse_depth [*, H, W] (0 = none), of which the

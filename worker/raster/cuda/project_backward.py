@@ -10,21 +10,11 @@ import triton
 import triton.language as tl
 
 from worker.raster import EPS2D
-from worker.raster.cuda.project import (
-    SUMS,
-    _dot,
-    _exp,
-    _image_row,
-    _limits,
-    _mean,
-    _rotation,
-    _seen,
-    _variances,
-)
+from worker.raster.cuda.bins import SLOT
+from worker.raster.cuda.geometry import dot, exp, image_row, limits, mean_of, rotation_of, seen, variances_of
 
-SLOT = 16
-"""Floats of an instance's gradient: the moments 1, x, y, xx, xy, yy of dL/dpower about the tile's middle in 0:6, and
-dL/d(r, g, b, z) as 8:12 plus 12:16."""
+SUMS = 10
+"""What a splat's slots add up to: the moments 1, x, y, xx, xy, yy of dL/dpower about mean2d, dL/d(r, g, b, z)."""
 SPLATS_BLOCK, LANES = 16, 32
 """sum_slots: splats a program, and slots of each that are added at once."""
 BACKWARD_BLOCK = 128
@@ -40,7 +30,7 @@ def _two(slots, slot, part: tl.constexpr, there):  # type: ignore[no-untyped-def
     return both.to(tl.int32).to(tl.float32, bitcast=True), (both >> 32).to(tl.int32).to(tl.float32, bitcast=True)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["capacity", "splats"])
 def sum_slots(  # type: ignore[no-untyped-def]
     slots, key, slot_start, count, records, sums,
     capacity, splats, tiles, tiles_x, no_tile,
@@ -126,7 +116,7 @@ def _store(out, value, drawn, there):  # type: ignore[no-untyped-def]
 @triton.jit
 def _ratio_gradient(camera, first: tl.constexpr, v, ratio, inverse_z):  # type: ignore[no-untyped-def]
     """dL/d(x / z) through J, 0 where J holds it, over z."""
-    low, high = _limits(camera, first)
+    low, high = limits(camera, first)
     return tl.where((ratio > low) & (ratio < high), v, 0.0) * inverse_z
 
 
@@ -135,16 +125,16 @@ def _sum_of(values, drawn):  # type: ignore[no-untyped-def]
     return tl.sum(tl.where(drawn, values, 0.0))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N", "splats"])
 def project_backward(  # type: ignore[no-untyped-def]
     camera, state, opacity_logit, count, sums, v_state, v_opacity_logit, v_colour, v_mean2d_norm, v_pose,
     N, state_rows, splats,
     WITH_POSE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of frame program_id(1): v_state [F, 10, N], v_opacity_logit [F, N], v_colour [F, 3, N], zeros for culled
-    Gaussians; v_mean2d_norm [F, N]: |dL/dmean2d| in normalised device coordinates (x times W / 2, y times H / 2), the
-    unit in which densification thresholds are published. v_pose float64 [programs, F, POSE]: each program's share of
-    dL/d camera_from_world.
+    """Gradients of frame program_id(1): v_state [F, 10, N], v_opacity_logit [F, N], v_colour [F, 3, N], zeros for
+    culled Gaussians; v_mean2d_norm [F, N]: |dL/dmean2d| in normalised device coordinates (x times W / 2, y times
+    H / 2), the unit in which densification thresholds are published. v_pose float64 [programs, F, POSE]: each
+    program's share of dL/d camera_from_world.
 
     With G = dL/dconic: dL/dcov2d = -conic G conic; dL/dSigma = A^T dL/dcov2d A.
     One long function, because each step of this chain needs most of what the steps before it computed.
@@ -161,28 +151,28 @@ def project_backward(  # type: ignore[no-untyped-def]
     _store(colour, tl.load(sums + 6 * splats, mask=drawn, other=0.0), drawn, there)
     _store(colour + N, tl.load(sums + 7 * splats, mask=drawn, other=0.0), drawn, there)
     _store(colour + 2 * N, tl.load(sums + 8 * splats, mask=drawn, other=0.0), drawn, there)
-    odds = _exp(-tl.load(opacity_logit + n, mask=there, other=0.0))
+    odds = exp(-tl.load(opacity_logit + n, mask=there, other=0.0))
     # times 1 - opacity, exact also where opacity rounds to 1
     v_logit = tl.load(sums, mask=drawn, other=0.0) * odds / (1.0 + odds)
     _store(v_opacity_logit + splat, v_logit, drawn, there)
 
     # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + EPS2D I.
-    a, b, c = _mean(state, n, there, N)
-    x, y, z = _seen(camera, a, b, c)
+    a, b, c = mean_of(state, n, there, N)
+    x, y, z = seen(camera, a, b, c)
     inverse_z = 1.0 / tl.where(drawn, z, 1.0)
     ratio_x, ratio_y = x * inverse_z, y * inverse_z
-    qw, qx, qy, qz, length, r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(state, n, there, N)
-    v0, v1, v2 = _variances(state, n, there, N)
-    j0, u, a00, a01, a02 = _image_row(camera, 0, ratio_x, inverse_z)
-    j1, v, a10, a11, a12 = _image_row(camera, 1, ratio_y, inverse_z)
-    b00, b01 = _dot(a00, a01, a02, r00, r10, r20), _dot(a00, a01, a02, r01, r11, r21)
-    b02, b10 = _dot(a00, a01, a02, r02, r12, r22), _dot(a10, a11, a12, r00, r10, r20)
-    b11, b12 = _dot(a10, a11, a12, r01, r11, r21), _dot(a10, a11, a12, r02, r12, r22)
+    qw, qx, qy, qz, length, r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_of(state, n, there, N)
+    v0, v1, v2 = variances_of(state, n, there, N)
+    j0, u, a00, a01, a02 = image_row(camera, 0, ratio_x, inverse_z)
+    j1, v, a10, a11, a12 = image_row(camera, 1, ratio_y, inverse_z)
+    b00, b01 = dot(a00, a01, a02, r00, r10, r20), dot(a00, a01, a02, r01, r11, r21)
+    b02, b10 = dot(a00, a01, a02, r02, r12, r22), dot(a10, a11, a12, r00, r10, r20)
+    b11, b12 = dot(a10, a11, a12, r01, r11, r21), dot(a10, a11, a12, r02, r12, r22)
     t00, t01, t02 = b00 * v0, b01 * v1, b02 * v2
     t10, t11, t12 = b10 * v0, b11 * v1, b12 * v2
-    cxx = _dot(t00, t01, t02, b00, b01, b02) + _EPS2D
-    cxy = _dot(t00, t01, t02, b10, b11, b12)
-    cyy = _dot(t10, t11, t12, b10, b11, b12) + _EPS2D
+    cxx = dot(t00, t01, t02, b00, b01, b02) + _EPS2D
+    cxy = dot(t00, t01, t02, b10, b11, b12)
+    cyy = dot(t10, t11, t12, b10, b11, b12) + _EPS2D
     inverse_det = 1.0 / (cxx * cyy - cxy * cxy)
     ka, kb, kc = cyy * inverse_det, -cxy * inverse_det, cxx * inverse_det
 
@@ -219,15 +209,15 @@ def project_backward(  # type: ignore[no-untyped-def]
     _store(out + 6 * N, d3 * length, drawn, there)
 
     # dL/dA = E R^T =: F, then to the camera point through A = diag(j) (W_xy - (u, v) W_z).
-    f00, f01 = _dot(e00, e01, e02, r00, r01, r02), _dot(e00, e01, e02, r10, r11, r12)
-    f02, f10 = _dot(e00, e01, e02, r20, r21, r22), _dot(e10, e11, e12, r00, r01, r02)
-    f11, f12 = _dot(e10, e11, e12, r10, r11, r12), _dot(e10, e11, e12, r20, r21, r22)
+    f00, f01 = dot(e00, e01, e02, r00, r01, r02), dot(e00, e01, e02, r10, r11, r12)
+    f02, f10 = dot(e00, e01, e02, r20, r21, r22), dot(e10, e11, e12, r00, r01, r02)
+    f11, f12 = dot(e10, e11, e12, r10, r11, r12), dot(e10, e11, e12, r20, r21, r22)
     w0, w1, w2 = tl.load(camera + 14), tl.load(camera + 15), tl.load(camera + 16)
     v_x, v_y = j0 * v_mx, j1 * v_my
     v_z = tl.load(sums + 9 * splats, mask=drawn, other=0.0).to(tl.float64)
-    v_z -= (x * v_x + y * v_y + _dot(f00, f01, f02, a00, a01, a02) + _dot(f10, f11, f12, a10, a11, a12)) * inverse_z
-    v_u = _ratio_gradient(camera, 0, -j0 * _dot(f00, f01, f02, w0, w1, w2), ratio_x, inverse_z)
-    v_v = _ratio_gradient(camera, 1, -j1 * _dot(f10, f11, f12, w0, w1, w2), ratio_y, inverse_z)
+    v_z -= (x * v_x + y * v_y + dot(f00, f01, f02, a00, a01, a02) + dot(f10, f11, f12, a10, a11, a12)) * inverse_z
+    v_u = _ratio_gradient(camera, 0, -j0 * dot(f00, f01, f02, w0, w1, w2), ratio_x, inverse_z)
+    v_v = _ratio_gradient(camera, 1, -j1 * dot(f10, f11, f12, w0, w1, w2), ratio_y, inverse_z)
     v_x += v_u
     v_y += v_v
     v_z -= v_u * ratio_x + v_v * ratio_y

@@ -22,15 +22,15 @@ import torch
 import triton
 from torch import Tensor
 
-from worker.raster.cuda.bins import EXTENT, FILL_BLOCK, MOST_FRAMES, TILE_HEIGHT, TILE_WIDTH, fill_slots
+from worker.raster.cuda.bins import EXTENT, FILL_BLOCK, MOST_FRAMES, SLOT, TILE_HEIGHT, TILE_WIDTH, fill_slots
 from worker.raster.cuda.blend import CHUNK, COTANGENT, LOSS, RENDER, STATISTICS, WARPS, blend
-from worker.raster.cuda.project import PROJECT_BLOCK, RECORD, SUMS, project
+from worker.raster.cuda.project import PROJECT_BLOCK, RECORD, project
 from worker.raster.cuda.project_backward import (
     BACKWARD_BLOCK,
     LANES,
     POSE,
-    SLOT,
     SPLATS_BLOCK,
+    SUMS,
     project_backward,
     sum_slots,
 )
@@ -41,6 +41,19 @@ _SPARE = 1.25
 """Room beyond what was needed, so that a scene that grows slowly seldom needs more."""
 _MOST_NUMBERS = 2**31 - 1
 """Kernels number the floats of records and slots with 32 bits."""
+
+
+Numbers = torch.dtype | tuple[torch.dtype, ...]
+
+
+def _check(tensor: Tensor, name: str, shape: tuple[int | None, ...], dtype: Numbers = torch.float32) -> None:
+    """Raises ValueError unless the kernels, which are given an address alone, read what is meant; None: any size."""
+    fits = len(tensor.shape) == len(shape) and all(b in (None, a) for a, b in zip(tensor.shape, shape, strict=True))
+    types = dtype if isinstance(dtype, tuple) else (dtype,)
+    if not fits or tensor.dtype not in types or not tensor.is_contiguous():
+        kind = "contiguous" if tensor.is_contiguous() else "strided"
+        wanted = " or ".join(map(str, types))
+        raise ValueError(f"{name} is {kind} {tensor.dtype} {list(tensor.shape)}, not contiguous {wanted} {list(shape)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +96,7 @@ class CudaRasterizer:
         self._image = self._floats(frames, 6, height, width)
         self._nothing = self._floats(1)
         self.reset()
+        self.reserve(0)
 
     def _floats(self, *shape: int) -> Tensor:
         return torch.zeros(shape, dtype=torch.float32, device=self.device)
@@ -111,8 +125,8 @@ class CudaRasterizer:
         self._records = self._floats(splats, RECORD)
         self._extent = self._floats(splats, EXTENT)
         self._depth_key, self._sorted_depth = self._integers(splats), self._integers(splats)
-        self._order, self._ends = self._integers(2, splats, dtype=torch.int64)
-        self._ordered_count, self._slot_start = self._integers(2, splats)
+        self._order, self._ends = (self._integers(splats, dtype=torch.int64) for _ in range(2))
+        self._ordered_count, self._slot_start = self._integers(splats), self._integers(splats)
         self._sums = self._floats(SUMS, splats)
         self._programs = -(-gaussians // BACKWARD_BLOCK)
         self.gradients = Gradients(
@@ -127,8 +141,8 @@ class CudaRasterizer:
         if capacity * SLOT > _MOST_NUMBERS:
             raise ValueError(f"{capacity} tiles touched at once; these kernels number {_MOST_NUMBERS} floats")
         self.capacity = capacity
-        self._key, self._sorted_key = self._integers(2, capacity, dtype=self._key_type)
-        self._owner, self._sorted_owner = self._integers(2, capacity)
+        self._key, self._sorted_key = (self._integers(capacity, dtype=self._key_type) for _ in range(2))
+        self._owner, self._sorted_owner = self._integers(capacity), self._integers(capacity)
         self._sorted_slot = self._integers(capacity, dtype=torch.int64)
         self._slots = self._floats(capacity, SLOT)
         chunks = capacity // CHUNK + self.frames * self.tiles
@@ -152,8 +166,15 @@ class CudaRasterizer:
 
         camera: float64 [F, 18], rows as camera_vector gives; state [F, 10 or more, N]; opacity_logit [N];
         colour [F, 3, N].
+
+        Raises:
+            ValueError: anything else, or more than 32 bits can number.
         """
-        gaussians = state.shape[2]
+        gaussians = state.shape[-1]
+        _check(camera, "camera", (self.frames, 18), torch.float64)
+        _check(state, "state", (self.frames, None, gaussians))
+        _check(opacity_logit, "opacity_logit", (gaussians,))
+        _check(colour, "colour", (self.frames, 3, gaussians))
         self.reserve(gaussians, 0 if gaussians == self.gaussians else None)
         self._camera, self._state, self._opacity_logit = camera, state, opacity_logit
         if gaussians == 0:
@@ -176,7 +197,7 @@ class CudaRasterizer:
             self._ends, self._order, self.count, self._extent, self._key, self._owner, self._slot_start,
             self.needed, self.ok,
             self.capacity, splats, self.gaussians, self.width, self.height, self.tiles_x, self.tiles_y, no_tile,
-            STEPS=splats.bit_length(), TILE_W=TILE_WIDTH, TILE_H=TILE_HEIGHT, BLOCK=FILL_BLOCK,
+            1 << (splats.bit_length() - 1), TILE_W=TILE_WIDTH, TILE_H=TILE_HEIGHT, BLOCK=FILL_BLOCK,
         )  # fmt: skip
         torch.sort(self._key, stable=True, out=(self._sorted_key, self._sorted_slot))
         torch.index_select(self._owner, 0, self._sorted_slot, out=self._sorted_owner)
@@ -220,12 +241,26 @@ class CudaRasterizer:
 
         rgb uint8 [T, 3, H, W], weight uint8 [T, H, W] (255 = tissue), inverse_depth float16 or float32 [T, H, W]
         (1 / units, 0 = none), loss_settings [F, 5], frame int32 [F]: which of the T each frame is.
+
+        Raises:
+            ValueError: anything else.
         """
+        size = (self.height, self.width)
+        _check(rgb, "rgb", (None, 3, *size), torch.uint8)
+        _check(weight, "weight", (len(rgb), *size), torch.uint8)
+        _check(inverse_depth, "inverse_depth", (len(rgb), *size), (torch.float32, torch.float16))
+        _check(loss_settings, "loss_settings", (self.frames, 5))
+        _check(frame, "frame", (self.frames,), torch.int32)
         self._blend(LOSS, self._nothing, False, (rgb, weight, inverse_depth, loss_settings, frame))
         return self._carry_back(pose)
 
     def cotangent_backward(self, cotangents: Tensor, *, pose: bool = False) -> Gradients:
-        """Gradients of sum(cotangents * image), cotangents [F, 5, H, W]."""
+        """Gradients of sum(cotangents * image), cotangents [F, 5, H, W].
+
+        Raises:
+            ValueError: anything else.
+        """
+        _check(cotangents, "cotangents", (self.frames, 5, self.height, self.width))
         self._blend(COTANGENT, cotangents, False)
         return self._carry_back(pose)
 
