@@ -12,11 +12,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from contract.embedded import find_server
 from contract.errors import IntrasplatError, UnavailableError
+from contract.names import DeviceName
 from contract.queue_redis import RedisQueue
 from contract.settings import GIB, Settings
+
+if TYPE_CHECKING:
+    from worker.backend import Gpu
 
 PACKAGES = (
     "torch",
@@ -119,17 +124,22 @@ def _device(settings: Settings) -> list[Finding]:
         backend = importlib.import_module("worker.backend")
     except ImportError:
         return []  # said above
-    gpu = backend.find_gpu()
+    return [device_finding(settings.device, backend.find_gpu())]
+
+
+def device_finding(asked: DeviceName, gpu: Gpu) -> Finding:
+    """What would be trained on, where this is the setting and that is there."""
+    backend = importlib.import_module("worker.backend")
     try:
-        device = backend.choose_device(settings.device, gpu, cpu_by=backend.CPU_BY_VARIABLE)
+        device = backend.choose_device(asked, gpu, cpu_by=backend.CPU_BY_VARIABLE)
     except UnavailableError as error:
-        return [Finding("device", error.problem, error.remedy, blocks=True)]
+        return Finding("device", error.problem, error.remedy, blocks=True)
     if device.kind == "cuda":
-        return [Finding("device", str(device))]
+        return Finding("device", str(device))
     found = f"cpu, {_cores()} threads"
-    if settings.device == "auto" and gpu.name is not None:
-        return [Finding("device", f"{found} (the {gpu.name} is not used: {gpu.missing})", gpu.remedy)]
-    return [Finding("device", f"{found} ({gpu.missing or 'the GPU is not asked for'})")]
+    if asked == "auto" and gpu.name is not None:
+        return Finding("device", f"{found} (the {gpu.name} is not used: {gpu.missing})", f"{gpu.remedy}.")
+    return Finding("device", f"{found} ({gpu.missing or 'the GPU is not asked for'})")
 
 
 def _video() -> list[Finding]:

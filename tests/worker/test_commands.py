@@ -13,6 +13,7 @@ from typing import get_args
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from contract.exits import ExitCode
 from contract.names import PresetName
@@ -43,6 +44,17 @@ def scene(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_reconstruct_writes_a_scene_with_its_report_and_curve(scene: Path) -> None:
     assert {"manifest.json", "scene.safetensors", "report.json", "curve.csv"} <= {path.name for path in scene.iterdir()}
     assert json.loads((scene / "report.json").read_text())["iterations"] == 10
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_an_error_with_a_remedy_and_leaves_nothing(
+    clip: Path, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    for command in (["reconstruct", str(clip)], ["render", str(scene), "--t", "0"]):
+        assert main([*command, "--device", "cuda", "--out", str(out)]) == ExitCode.UNAVAILABLE
+        assert "--device cpu" in capsys.readouterr().err
+        assert not out.exists()
 
 
 def test_render_writes_one_picture_a_frame(scene: Path, tmp_path: Path) -> None:

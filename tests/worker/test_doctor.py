@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import tomllib
 from pathlib import Path
@@ -10,7 +11,19 @@ import pytest
 import torch
 
 from contract.settings import Settings
-from worker.doctor import FIXED_FFMPEG, OPTIONAL_PACKAGES, PACKAGES, Finding, bundled_ffmpeg, examine, format_findings
+from worker.backend import Gpu
+from worker.doctor import (
+    FIXED_FFMPEG,
+    OPTIONAL_PACKAGES,
+    PACKAGES,
+    Finding,
+    bundled_ffmpeg,
+    device_finding,
+    examine,
+    format_findings,
+)
+
+H200 = Gpu(build="13.0", name="NVIDIA H200", has_triton=True)
 
 
 def found(settings: Settings) -> dict[str, Finding]:
@@ -43,6 +56,19 @@ def test_a_device_that_cannot_be_trained_on_blocks_and_has_a_remedy(tmp_path: Pa
     assert finding.blocks
     assert finding.remedy is not None
     assert finding.remedy.endswith("INTRASPLAT_DEVICE=cpu.")
+
+
+def test_the_gpu_that_would_be_trained_on_is_named() -> None:
+    assert device_finding("auto", H200) == Finding("device", "cuda (NVIDIA H200)")
+    assert device_finding("cpu", H200).found.endswith("(the GPU is not asked for)")
+
+
+def test_a_gpu_that_lies_idle_for_want_of_something_has_a_remedy() -> None:
+    finding = device_finding("auto", dataclasses.replace(H200, has_triton=False))
+    assert "NVIDIA H200 is not used: Triton is not installed" in finding.found
+    assert finding.remedy is not None
+    assert "intrasplat[gpu]" in finding.remedy
+    assert not finding.blocks
 
 
 def test_a_queue_that_does_not_answer_has_a_remedy(tmp_path: Path) -> None:
