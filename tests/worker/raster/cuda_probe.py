@@ -1,8 +1,9 @@
-"""Run as a program: compile every kernel the CUDA rasteriser launches for a GPU that need not be there.
+"""Run as a program: compile every kernel the CUDA backend launches for a GPU that need not be there.
 
-The rasteriser runs on the host's tensors with each launch replaced by a compilation for sm_90 (Triton brings its own
-assembler), so what is compiled is what would be launched. Prints a JSON list of {kernel, constants, registers, stack,
-local, shared}; stack and local are the bytes a thread keeps in memory because its registers did not suffice.
+The rasteriser and the model run on the host's tensors with each launch replaced by a compilation for sm_90 (Triton
+brings its own assembler), so what is compiled is what would be launched. Prints a JSON list of {kernel, constants,
+registers, stack, local, shared}; stack and local are the bytes a thread keeps in memory because its registers did not
+suffice.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from triton.runtime.jit import JITFunction
 
+from tests.worker.raster.test_cuda_model import LOSS, RATES, frames, model
 from worker.raster.cuda.rasterizer import CudaRasterizer
 
 TARGET = GPUTarget("cuda", 90, 32)
@@ -57,6 +59,8 @@ def compile_launch(kernel: JITFunction, *args: Any, grid: Any, warmup: bool, **n
             signature[each.name], aligned[(i,)] = f"*{TYPES[value.dtype]}", [["tt.divisibility", 16]]
         else:
             signature[each.name] = "i32"
+            if value % 16 == 0 and not each.do_not_specialize:
+                aligned[(i,)] = [["tt.divisibility", 16]]
     source = ASTSource(kernel, signature=signature, constexprs=constants, attrs=aligned)
     binary = triton.compile(source, target=TARGET, options=options)
     usage = resources(binary.asm["cubin"])
@@ -88,9 +92,19 @@ def launch_everything() -> None:
     rasterizer.cotangent_backward(torch.zeros(FRAMES, 5, HEIGHT, WIDTH), pose=True)
 
 
+def train_everything() -> None:
+    """Steps of every form of motion; of one with a harmonic more and of one on several frames. No kernel runs."""
+    seen = frames(2)
+    for kind in ("shared with colour", "fdm-gaussian", "fdm-quartic"):
+        model("cpu", kind).step(seen[0], LOSS, RATES, 1)
+    for kind in ("shared with colour", "fdm-gaussian"):
+        model("cpu", kind, sh_degree=1, frames_a_step=2).step_frames(seen, LOSS, RATES, 1, sh_degree=1)
+
+
 def main() -> None:
     JITFunction.run = compile_launch
     launch_everything()
+    train_everything()
     print(json.dumps(list(compiled.values())))
 
 

@@ -28,12 +28,12 @@ from worker.gaussians import SH_C0, Gaussians
 from worker.loss import LossSettings
 from worker.optimize import StepRates
 from worker.raster.cuda import harmonics
-from worker.raster.cuda.captured import Captured
-from worker.raster.cuda.control import Control, Field, adam_fields, write_adam
+from worker.raster.cuda.control import write_adam
 from worker.raster.cuda.frames import FrameStore
 from worker.raster.cuda.motion import Motion, Trained, kept_where_old, motion_of
-from worker.raster.cuda.rasterizer import CudaRasterizer, Gradients
+from worker.raster.cuda.rasterizer import Gradients
 from worker.raster.cuda.update import MADE, ROWS, SEEN, SUMS, VALUES, padded
+from worker.raster.cuda.view import View
 from worker.raster.step import StepSums, TrainingFrame
 
 Floats = NDArray[np.float32]
@@ -44,32 +44,6 @@ CHECK_EVERY = 32
 found no room costs at most so many again."""
 SIZES_KEPT = 3
 """Image sizes, of those rendered last, whose buffers are kept."""
-
-
-class View:
-    """So many frames of one size at once: the rasteriser's buffers, and the control block that steers them."""
-
-    def __init__(
-        self, width: int, height: int, frames: int, motion: Motion, device: torch.device, *, rows: int = 1
-    ) -> None:
-        self.frames, self._device = frames, device
-        self.rasterizer = CudaRasterizer(width, height, device, frames=frames)
-        cameras = {"camera": Field((frames, 18), "double"), "centre": Field((frames, 3))}
-        training = {"loss": Field((frames, 5)), "frame": Field((frames,), "int")} | adam_fields()
-        self.control = Control(cameras | motion.fields(frames) | training, rows, device)
-        self.fit(0)
-
-    def fit(self, columns: int) -> None:
-        """Buffers for so many Gaussians."""
-        self.state = torch.zeros(self.frames, ROWS, columns, device=self._device)
-        self.colour = torch.zeros(self.frames, 3, columns, device=self._device)
-
-    def write_cameras(self, row: int, cameras: Sequence[NDArray[np.float64]]) -> None:
-        """Fill a row's cameras."""
-        written = self.control.rows[row]
-        for frame, camera in enumerate(cameras):
-            pose = camera[6:].reshape(3, 4)
-            written["camera"][frame], written["centre"][frame] = camera, -pose[:, :3].T @ pose[:, 3]
 
 
 class CudaModel:
@@ -106,7 +80,6 @@ class CudaModel:
         self._training.fit(columns)
         self._views: OrderedDict[tuple[int, int, int], View] = OrderedDict()
         self._store = FrameStore(width, height, self.device)
-        self._launches = Captured(self._launch, self.device)
         self._report = torch.zeros(SEEN + CHECK_EVERY, dtype=torch.int32, device=self.device)
         self._sent: list[int] = []  # the harmonics' degree of every step that nobody has waited for
         self._learnt: StepSums | None = None
@@ -137,7 +110,7 @@ class CudaModel:
         if len(frames) != self._training.frames:
             raise ValueError(f"a step on {len(frames)} frames, this model was made for {self._training.frames}")
         if self._store.is_full and not all(self._store.holds(frame) for frame in frames):
-            self._launches.forget()
+            self._training.launches.forget()
         slot = len(self._sent)
         row, times = self._training.control.rows[slot], [frame.t for frame in frames]
         self._training.write_cameras(slot, [frame.camera for frame in frames])
@@ -159,8 +132,9 @@ class CudaModel:
 
     def _send(self, slot: int) -> None:
         """Have the device make the step of a row."""
+        sh_degree = self._sent[slot]
         self._training.control.send(slot)
-        self._launches.run(self._sent[slot])
+        self._training.launches.run(("step", sh_degree), lambda: self._launch(sh_degree))
 
     def _launch(self, sh_degree: int) -> None:
         """Everything that a step launches, in order."""
@@ -200,7 +174,7 @@ class CudaModel:
             first = self._learn(first)
             if not grown:
                 break
-            self._launches.forget()
+            self._training.launches.forget()
             for slot in range(first, len(self._sent)):
                 self._send(slot)
         self._sent.clear()
@@ -255,7 +229,7 @@ class CudaModel:
             self._views[size].fit(self._values.shape[1])
         self._views.move_to_end(size)
         while len(self._views) > SIZES_KEPT:
-            self._views.popitem(last=False)
+            self._views.popitem(last=False)[1].launches.forget()
         return self._views[size]
 
     def _steer(self, camera: NDArray[np.float64], times: Sequence[float]) -> View:
@@ -270,8 +244,8 @@ class CudaModel:
     def _fitted(self, view: View) -> bool:
         """Wait; whether the last projection had room. If not, there is room now."""
         grown = view.rasterizer.grown()
-        if grown and view is self._training:
-            self._launches.forget()
+        if grown:
+            view.launches.forget()
         return not grown
 
     def render_times(self, camera: NDArray[np.float64], times: Sequence[float], values: Floats | None = None) -> Tensor:
@@ -280,19 +254,18 @@ class CudaModel:
         With values [N], a number a Gaussian, they are blended as colour is, and [F, 6, H, W] ends with them.
         """
         view = self._shown = self._steer(camera, times)
+        with_values = values is not None
+        if values is not None:
+            view.values[: self.count] = torch.from_numpy(np.asarray(values, np.float32))
         while True:
-            self._project(view, self.sh_degree)
-            image: Tensor = view.rasterizer.render(self._padded(values))
+            view.launches.run(("picture", self.sh_degree, with_values), lambda: self._draw(view, with_values))
             if self._fitted(view):
-                return image
+                return view.images[with_values]
 
-    def _padded(self, values: Floats | None) -> Tensor | None:
-        """[N] on the device, with zeros for the columns that only fill the rows."""
-        if values is None:
-            return None
-        filled = torch.zeros(self._values.shape[1])
-        filled[: len(values)] = torch.from_numpy(np.asarray(values, np.float32))
-        return filled.to(self.device)
+    def _draw(self, view: View, with_values: bool) -> None:
+        """Everything that a picture launches."""
+        self._project(view, self.sh_degree)
+        view.images[with_values] = view.rasterizer.render(view.values if with_values else None)
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
         """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
@@ -301,9 +274,11 @@ class CudaModel:
 
     def blend_values(self, values: Floats) -> Floats:
         """Further values [N], blended as colour was in the last render: [H, W]; a view."""
-        if self._shown is None:
+        view = self._shown
+        if view is None:
             raise ValueError("nothing has been rendered")
-        image: Floats = self._shown.rasterizer.render(self._padded(values))[0, 5].cpu().numpy()
+        view.values[: self.count] = torch.from_numpy(np.asarray(values, np.float32))
+        image: Floats = view.rasterizer.render(view.values)[0, 5].cpu().numpy()
         return image
 
     def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
@@ -345,9 +320,9 @@ class CudaModel:
         self.motion.take(chosen, is_fresh)
         self._values[ROWS, count:] = PAD_LOGIT
         self.count = count
-        self._launches.forget()
         self._training.fit(len(chosen))
-        self._views.clear()
+        for view in self._views.values():
+            view.fit(len(chosen))
         self._gradients = self._shown = None
 
     def parameters(self) -> dict[str, Tensor]:

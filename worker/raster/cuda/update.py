@@ -19,8 +19,8 @@ from worker.gaussians import SH_C0
 
 COLUMNS = 32
 """Rows are padded to a multiple of so many floats, 128 bytes: they begin where lines of memory begin."""
-BLOCK = 64
-"""Gaussians a program. 40,000 make 625 programs, five for each multiprocessor of a large GPU."""
+BLOCK = 32
+"""Gaussians a program, a line of memory of every row. With twice as many, steps on several frames spill registers."""
 ROWS, VALUES = 13, 14
 """Of the state; and with the opacity."""
 TILE_ROWS = tl.constexpr(16)
@@ -33,7 +33,7 @@ SUMS, MADE, SEEN = 4, 4, 5
 """The report: floats before SUMS, the sums that rasterizer.statistics lists; then, as int32, how many steps were made,
 and from SEEN on how many Gaussians each of them had in view."""
 _MADE, _SEEN = tl.constexpr(MADE), tl.constexpr(SEEN)
-_CHUNK = tl.constexpr(512)
+_CHUNK = tl.constexpr(256)
 """Tiles whose sums are added at once."""
 
 
@@ -100,12 +100,11 @@ def report_step(  # type: ignore[no-untyped-def]
     tl.atomic_add(report + _SEEN + tl.load(slot), tl.sum(tl.sum((most > 0).to(tl.int32), 1), 0))
     if tl.program_id(0) == 0:
         kind, tile = tl.arange(0, 4)[None, :], tl.arange(0, _CHUNK)[:, None]
-        total = tl.zeros((4,), tl.float32)
-        first = 0
+        total = tl.load(statistics + tile * 4 + kind, mask=tile < tiles, other=0.0)
+        first = _CHUNK
         while first < tiles:
-            place = (first + tile) * 4 + kind
-            total += tl.sum(tl.load(statistics + place, mask=first + tile < tiles, other=0.0), 0)
+            total += tl.load(statistics + (first + tile) * 4 + kind, mask=first + tile < tiles, other=0.0)
             first += _CHUNK
         sums = report.to(tl.pointer_type(tl.float32)) + tl.arange(0, 4)
-        tl.store(sums, tl.load(sums) + total)
+        tl.store(sums, tl.load(sums) + tl.sum(total, 0))
         tl.store(report + _MADE, tl.load(report + _MADE) + 1)

@@ -1,0 +1,54 @@
+"""What the model keeps for an image size: the rasteriser's buffers, the Gaussians at the frames' times, the steering.
+
+N Gaussians (padded), F frames at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from worker.raster.cuda.captured import Captured
+from worker.raster.cuda.control import Control, Field, adam_fields
+from worker.raster.cuda.motion import Motion
+from worker.raster.cuda.rasterizer import CudaRasterizer
+from worker.raster.cuda.update import ROWS
+
+
+class View:
+    """So many frames of one size at once: the rasteriser's buffers, and the control block that steers them.
+
+    launches  those of steps and pictures; to be forgotten when a buffer moves
+    values    [N], the caller's, to be blended as colour is
+    images    the last picture, by whether values were blended in it
+    """
+
+    def __init__(
+        self, width: int, height: int, frames: int, motion: Motion, device: torch.device, *, rows: int = 1
+    ) -> None:
+        self.frames, self._device = frames, device
+        self.rasterizer = CudaRasterizer(width, height, device, frames=frames)
+        cameras = {"camera": Field((frames, 18), "double"), "centre": Field((frames, 3))}
+        training = {"loss": Field((frames, 5)), "frame": Field((frames,), "int")} | adam_fields()
+        self.control = Control(cameras | motion.fields(frames) | training, rows, device)
+        self.launches = Captured(device)
+        self.images: dict[bool, Tensor] = {}
+        self.fit(0)
+
+    def fit(self, columns: int) -> None:
+        """Buffers for so many Gaussians."""
+        self.launches.forget()
+        self.state = torch.zeros(self.frames, ROWS, columns, device=self._device)
+        self.colour = torch.zeros(self.frames, 3, columns, device=self._device)
+        self.values = torch.zeros(columns, device=self._device)
+
+    def write_cameras(self, row: int, cameras: Sequence[NDArray[np.float64]]) -> None:
+        """Fill a row's cameras."""
+        written = self.control.rows[row]
+        for frame, camera in enumerate(cameras):
+            pose = camera[6:].reshape(3, 4)
+            written["camera"][frame], written["centre"][frame] = camera, -pose[:, :3].T @ pose[:, 3]
