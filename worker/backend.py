@@ -109,6 +109,17 @@ def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OP
     raise UnavailableError(problem, f"{gpu.remedy}, or train on the CPU: {cpu_by}.")
 
 
+def gpu_is_lost() -> bool:
+    """Whether an error has ended what this process may do with its GPU: from then on every use of it fails."""
+    if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
+        return False
+    try:
+        torch.cuda.synchronize()
+    except RuntimeError:
+        return True
+    return False
+
+
 def device_for(deformation: str, asked: str, gpu: Gpu | None = None) -> Device:
     """choose_device for training a motion of this kind: auto trains one without kernels for a GPU on the CPU.
 

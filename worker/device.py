@@ -17,7 +17,7 @@ from contract.job import JobRecord
 from contract.processes import die_with_parent
 from contract.settings import Settings
 from contract.store import Store, open_store
-from worker.backend import CPU, CPU_BY_VARIABLE, choose_device
+from worker.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lost
 from worker.channel import Channel, Orders, Task
 from worker.checkpoint import RESUME_FILE
 from worker.compact import compile_coder
@@ -103,7 +103,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
 def work_on(
     task: Task, device: str, limits: ClipLimits, snapshots: Snapshots, channel: Channel
 ) -> Finished | Stopped | Failed:
-    """Run one job; every error is its end and not this process's."""
+    """Run one job; every error is its end and not this process's, unless it takes the GPU along."""
     run = task.run
     reporter = _Reporter(channel)
     hooks = Hooks(
@@ -120,6 +120,9 @@ def work_on(
         return Stopped(checkpointed=(run.out / RESUME_FILE).exists())
     except Exception as error:
         snapshots.drop(run.record.job_id)
+        if gpu_is_lost():
+            logger.error("the GPU answers this process no more (%s); another takes its place", type(error).__name__)
+            raise SystemExit(1) from error
         return Failed(error=describe(error), fault=type(error).__name__)
     return Finished()
 

@@ -11,7 +11,17 @@ import torch
 
 from contract.errors import InputError, UnavailableError
 from tests.worker.models import HEIGHT, WIDTH, moving_fdm, moving_hexplane, moving_shared, wall
-from worker.backend import CPU, CPU_BY_VARIABLE, Device, Gpu, choose_device, device_for, find_gpu, make_model
+from worker.backend import (
+    CPU,
+    CPU_BY_VARIABLE,
+    Device,
+    Gpu,
+    choose_device,
+    device_for,
+    find_gpu,
+    gpu_is_lost,
+    make_model,
+)
 from worker.presets import PRESETS
 from worker.raster.cpu.model import FusedModel
 from worker.unfused import UnfusedModel
@@ -83,6 +93,10 @@ def test_the_model_of_a_motion_is_that_of_the_device() -> None:
         assert type(make_model(gaussians, moving(gaussians), WIDTH, HEIGHT)) is FusedModel
     for device in (CPU, Device("cuda", "NVIDIA H200", "cuda")):
         assert type(make_model(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT, device)) is UnfusedModel
+
+
+def test_a_process_that_has_used_no_gpu_has_lost_none() -> None:
+    assert not gpu_is_lost()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

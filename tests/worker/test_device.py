@@ -176,6 +176,7 @@ def test_a_state_of_another_version_is_left_behind_and_training_starts_anew(tmp_
         (TrainingDiverged("NaN after 12 iterations."), "NaN after 12"),
         (UnavailableError("No CUDA device.", "Use --device cpu."), "No CUDA device"),
         (MemoryError("smith.mp4"), "out of memory"),
+        (torch.OutOfMemoryError("smith.mp4"), "out of memory"),
         (ValueError("smith.mp4"), "A fault in the worker (ValueError)"),
     ],
 )
