@@ -28,8 +28,8 @@ EXTENT = 8
 furthest to the right; the middle of its chord at dy, over dy; and the square of half a chord at dy = 0, and how much
 that loses with dy^2. One spare."""
 SLOT = 16
-"""Floats of an instance's gradient: the moments 1, x, y, xx, xy, yy of dL/dpower about the tile's middle in 0:6, and
-dL/d(r, g, b, z) as 8:12 plus 12:16 (blend.py)."""
+"""Floats of an instance's gradient (blend.py): the moments 1, x, y, xx, xy, yy of dL/dpower about the tile's middle, x
+and y of that middle, and dL/d(r, g, b, z) as 8:12 plus 12:16."""
 FILL_BLOCK = 256
 MOST_FRAMES = 16
 """Frames whose depths can be sorted as one: 4 bits of a depth key."""

@@ -262,6 +262,8 @@ def blend(  # type: ignore[no-untyped-def]
                                (pixel // TILE_W).to(tl.float32) - 0.5 * (TILE_H - 1))  # fmt: skip
         of_colour = _split_columns(g_red, g_green, g_blue, g_depth)
         part = tl.arange(0, 8)[None, :]
+        middle = tl.where(part == 6, (tile % tiles_x * TILE_W + 0.5 * TILE_W), 0.0)
+        middle = tl.where(part == 7, (tile // tiles_x * TILE_H + 0.5 * TILE_H), middle)
         behind = tl.zeros((P,), tl.float32)
         tl.debug_barrier()  # scratch was perhaps written by another thread of the warp than the one that reads it
         j = i
@@ -285,7 +287,7 @@ def blend(  # type: ignore[no-untyped-def]
             summed = _upside_down(tl.cumsum(_upside_down(last, K, P), 0), K, P)
             behind = _row(summed, k, 0)
             v_power = tl.where(raw < _MAX_ALPHA, odds * (reach - (summed - shown)), 0.0)
-            tl.store(out, _sum_split(v_power, monomials), mask=there[:, None])
+            tl.store(out, _sum_split(v_power, monomials) + middle, mask=there[:, None])
         while i < end:  # what lies behind a full tile
             there = i + in_chunk < end
             place = tl.load(slot + i + in_chunk, mask=there, other=0)

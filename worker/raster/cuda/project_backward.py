@@ -33,12 +33,12 @@ def _two(slots, slot, part: tl.constexpr, there):  # type: ignore[no-untyped-def
 @triton.jit(do_not_specialize=["capacity", "splats"])
 def sum_slots(  # type: ignore[no-untyped-def]
     slots, key, slot_start, count, records, sums,
-    capacity, splats, tiles, tiles_x, no_tile,
-    RECORD: tl.constexpr, TILE_W: tl.constexpr, TILE_H: tl.constexpr, BLOCK: tl.constexpr, LANES: tl.constexpr,
+    capacity, splats, no_tile,
+    RECORD: tl.constexpr, BLOCK: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """sums [SUMS, F N] of every splat's slots; the moments about its mean2d. Zeros for a splat without slots.
 
-    slots: the float32 [M, SLOT] of blend.py, as int64 [M, SLOT / 2]. key [M] (bins.py) tells a slot's tile.
+    slots: float32 [M, SLOT] as int64 [M, SLOT / 2]. key [M] (bins.py): NO_TILE for a slot that no tile has.
     """
     splat = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None]
     lane = tl.arange(0, LANES)[None, :]
@@ -56,15 +56,13 @@ def sum_slots(  # type: ignore[no-untyped-def]
         slot = start + done + lane
         # An overflow leaves counts and starts that lie outside; the step is void then, but stays in its memory.
         valid = (done + lane < own) & (slot >= 0) & (slot < capacity)
-        number = tl.load(key + slot, mask=valid, other=0).to(tl.int32)
-        valid = valid & (number != no_tile)
-        tile = number % tiles
+        valid = valid & (tl.load(key + slot, mask=valid, other=0).to(tl.int32) != no_tile)
         p0, p_x = _two(slots, slot, 0, valid)
         p_y, p_xx = _two(slots, slot, 1, valid)
         p_xy, p_yy = _two(slots, slot, 2, valid)
         # d = (pixel - the tile's middle) + (that middle - mean2d)
-        dx = (tile % tiles_x * TILE_W).to(tl.float32) + 0.5 * TILE_W - mean_x
-        dy = (tile // tiles_x * TILE_H).to(tl.float32) + 0.5 * TILE_H - mean_y
+        dx, dy = _two(slots, slot, 3, valid)
+        dx, dy = dx - mean_x, dy - mean_y
         along_x, along_y = p_x + dx * p0, p_y + dy * p0
         m += p0
         m_x += along_x

@@ -181,7 +181,8 @@ class CudaRasterizer:
             self._tile_start.zero_()
             return
         project[(triton.cdiv(gaussians, PROJECT_BLOCK), self.frames)](
-            camera, state, opacity_logit, colour, self._records, self._extent, self.count, self._depth_key,
+            camera, state, opacity_logit, colour, self._records.view(torch.int64), self._extent.view(torch.int64),
+            self.count, self._depth_key,
             gaussians, state.shape[1], self.width, self.height, self.tiles_x, self.tiles_y,
             TILE_W=TILE_WIDTH, TILE_H=TILE_HEIGHT, BLOCK=PROJECT_BLOCK,
         )  # fmt: skip
@@ -271,8 +272,7 @@ class CudaRasterizer:
             return out
         sum_slots[(triton.cdiv(splats, SPLATS_BLOCK),)](
             self._slots.view(torch.int64), self._key, self._slot_start, self.count, self._records, self._sums,
-            self.capacity, splats, self.tiles, self.tiles_x, self.frames * self.tiles,
-            RECORD=RECORD, TILE_W=TILE_WIDTH, TILE_H=TILE_HEIGHT, BLOCK=SPLATS_BLOCK, LANES=LANES,
+            self.capacity, splats, self.frames * self.tiles, RECORD=RECORD, BLOCK=SPLATS_BLOCK, LANES=LANES,
         )  # fmt: skip
         project_backward[(self._programs, self.frames)](
             self._camera, self._state, self._opacity_logit, self.count, self._sums,
