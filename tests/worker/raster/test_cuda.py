@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import itertools
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ from tests.worker.raster.scenes import INTERPRETED, Scene, pixels_near_a_cut, ra
 from tests.worker.raster.test_backends import random_cotangent, values_and_gradients
 from tests.worker.raster.test_cpu import LOSSES, NORMALISED, Frame, random_frame
 from worker.loss import LossSettings
-from worker.raster import Camera, reference
+from worker.raster import Camera, cpu, reference
+from worker.raster.cpu import padded
 from worker.raster.cuda import rasterize
 from worker.raster.cuda.bins import MOST_FRAMES
 from worker.raster.cuda.rasterizer import CudaRasterizer, Gradients
@@ -281,6 +283,35 @@ def test_every_tile_with_a_pixel_of_a_splat_has_it_and_few_others(
     assert int(touched.sum()) <= chosen <= int(touched.sum()) + 1
     starts = rasterizer._tile_start.cpu().diff().reshape(touched.shape) > 0
     assert bool((starts | ~touched).all())
+
+
+def test_parameters_beyond_all_training_give_what_they_give_on_the_cpu(memory: str) -> None:
+    size = 10
+    view = camera_vector(Camera(30.0, 30.0, 5.0, 5.0, size, size, np.eye(4)))
+    far = [-np.inf, -3e38, -150.0, -104.0, -88.0, -20.0, -1.0, 2.0, 20.0, 88.0, 150.0, 3e38, np.inf]
+    needles = list(itertools.product((-3e38, -20.0, 0.0, 9.0, 16.0, 90.0, 1e4), (0.0, 16.0)))
+    count = padded(len(far) + len(needles))
+    state = np.zeros((10, count), np.float32)
+    state[0], state[2] = np.linspace(-8, 8, count), np.linspace(50, 70, count)
+    state[3:7] = np.array([[0.7], [0.2], [-0.4], [0.1]])
+    state[7:9, len(far) : len(far) + len(needles)] = np.array(needles).T
+    logit = np.full(count, -30.0, np.float32)
+    logit[: len(far)], logit[len(far) : len(far) + len(needles)] = far, 2.0
+    random = np.random.default_rng(0)
+    colour = random.uniform(size=(3, count)).astype(np.float32)
+    cotangents = random.normal(size=(5, size, size)).astype(np.float32)
+    there = cpu.Rasterizer(size, size)
+    there.project(view, state, logit, colour)
+    here = CudaRasterizer(size, size, memory)
+    given = [torch.from_numpy(each).to(memory) for each in (view[None], state[None], logit, colour[None])]
+    here.project(*given)
+    assert not here.grown()
+    assert_close(here.render()[0], there.render(), name="image")
+    got = here.cotangent_backward(torch.from_numpy(cotangents)[None].to(memory))
+    wanted = there.cotangent_backward(cotangents)
+    assert_close(got.state[0], wanted.state[:10], name="state")
+    for name in ("opacity_logit", "colour", "mean2d_norm"):
+        assert_close(getattr(got, name)[0], getattr(wanted, name), name=name)
 
 
 def test_more_frames_than_can_be_sorted_are_refused(memory: str) -> None:

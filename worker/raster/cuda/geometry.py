@@ -12,13 +12,14 @@ import triton.language as tl
 
 from worker.raster import LIMIT
 
-_LIMIT, _LOG2E, _MOST_POWER = tl.constexpr(LIMIT), tl.constexpr(1.4426950408889634), tl.constexpr(20.0)
+_LIMIT, _LOG2E = tl.constexpr(LIMIT), tl.constexpr(1.4426950408889634)
+_LEAST, _MOST = tl.constexpr(-200.0), tl.constexpr(13.862943611198906)  # 0 as a float32, and 20 ln 2
 
 
 @triton.jit
 def exp(x):  # type: ignore[no-untyped-def]
-    """e^x of a float32, at most 2**_MOST_POWER."""
-    return tl.exp2(tl.minimum(x * _LOG2E, _MOST_POWER))
+    """e^x of a float32, at most 2**20."""
+    return tl.exp2(tl.minimum(tl.maximum(x, _LEAST), _MOST) * _LOG2E)
 
 
 @triton.jit

@@ -52,7 +52,8 @@ def project(  # type: ignore[no-untyped-def]
     TILE_W: tl.constexpr, TILE_H: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Splats of frame program_id(1): records [F N, RECORD] and extent [F N, EXTENT] (bins.py), both float32 as int64,
-    half as many; count [F N] of tiles, 0 for a culled one; depth_key [F N], which sorts by frame, then depth, culled ones last.
+    half as many; count [F N] of tiles, 0 for a culled one; depth_key [F N], which sorts by frame, then depth, culled
+    ones last.
 
     camera: float64 [F, 18] = fx, fy, cx, cy, W, H, camera_from_world row-major [3, 4].
     """
