@@ -286,3 +286,17 @@ def test_more_frames_than_there_was_room_for_and_frames_of_another_size(
     assert_same_bits(stored(crowded), three_steps)
     with pytest.raises(ValueError, match="a frame of 40 x 16 pixels, the others have 20 x 16"):
         crowded.step(frames(1, width=40)[0], LOSS, RATES, 4)
+
+
+def test_steps_between_two_looks_make_the_host_wait_for_nothing(device: str) -> None:
+    if device == "cpu":
+        pytest.skip("without a GPU there is nothing to wait for; run with --device cuda")
+    trained, seen = model(device), frames()
+    train(trained, seen)  # compiles, copies the frames, captures
+    trained.wait()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        train(trained, seen, first=4)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert trained.wait() is not None

@@ -32,6 +32,8 @@ TIMES = (0.4, 0.55)
 SAME_RATE = dataclasses.replace(RATES, motion_quaternion=7e-3, motion_log_scale=7e-3, motion_colour=7e-3)
 """One rate for all motion, as FDM needs."""
 
+RATED = [field.name for field in dataclasses.fields(RATES) if field.name not in ("eps", "beta1", "beta2")]
+
 
 @dataclass
 class Bench:
@@ -45,13 +47,20 @@ class Bench:
     state: Tensor
     times: tuple[float, ...]
 
+    def wait(self) -> None:
+        """The row must not be written before it was sent."""
+        if self.state.is_cuda:
+            torch.cuda.synchronize()
+
     def deform(self) -> None:
+        self.wait()
         self.motion.write_times(self.control.rows[0], self.times)
         self.control.send(0)
         self.motion.deform(self.trained.values, self.control.values, self.state, self.trained.colour)
 
     def update(self, rates: StepRates, iteration: int) -> None:
         """Adam with the gradients that lie in `trained`."""
+        self.wait()
         self.motion.write_times(self.control.rows[0], self.times)
         self.motion.write_rates(self.control.rows[0], self.times, rates, iteration)
         write_adam(self.control.rows[0], 0, rates, iteration)
@@ -192,26 +201,30 @@ def test_a_rate_of_nothing_and_a_step_that_must_not_be_made_change_no_bit(kind: 
     made.draw_gradients(np.random.default_rng(7))
 
     def everything() -> list[Tensor]:
-        own = made.trained.tensors()[:2]
-        return [each.clone() for each in (*own, made.trained.report, *made.motion.arrays(COUNT).values())]
+        motion = {name: each for name, each in made.motion.arrays(COUNT).items() if name != "motion.steps"}
+        return [each.clone() for each in (*made.trained.tensors()[:2], *motion.values())]
 
     before = everything()
     made.trained.ok.fill_(0)
     made.update(RATES, 1)
-    motion_steps = made.motion.arrays(COUNT).get("motion.steps")
-    if motion_steps is not None:
-        motion_steps.zero_()  # the host counts what it sends
-    assert all(bool((now == then).all()) for now, then in zip(everything(), before, strict=True))
+    assert not made.trained.report.any()
     made.trained.ok.fill_(1)
-    only_means = dataclasses.replace(
-        RATES, quaternion=0.0, log_scale=0.0, opacity=0.0, colour=0.0, motion_quaternion=0.0, motion_log_scale=0.0,
-        motion_colour=0.0,
-    )  # fmt: skip
-    made.update(only_means, 1)
-    changed = (made.trained.moments[0] != 0).any(1)
-    assert changed.tolist() == [True] * 3 + [False] * 11
+    made.update(dataclasses.replace(RATES, **dict.fromkeys(RATED, 0.0)), 1)
+    assert made.trained.report[MADE] == 1
+    assert all(bool((now == then).all()) for now, then in zip(everything(), before, strict=True))
+
+
+@pytest.mark.parametrize("kind", ["shared with colour", "fdm-gaussian"])
+def test_every_row_has_its_own_rate(kind: str, device: str) -> None:
+    made = bench(kind, device)
+    made.deform()
+    made.draw_gradients(np.random.default_rng(7))
+    still = [name for name in RATED if name not in ("mean", "motion_mean")]
+    made.update(dataclasses.replace(RATES, **dict.fromkeys(still, 0.0)), 1)
+    changed = (made.trained.moments[0] != 0).any(1).tolist()
+    assert changed == [True] * 3 + [False] * 11
     if kind == "shared with colour":
-        assert (made.motion.arrays(COUNT)["motion.first"] != 0).any(2).any(0).tolist() == changed[:ROWS].tolist()
+        assert (made.motion.arrays(COUNT)["motion.first"] != 0).any(2).any(0).tolist() == changed[:ROWS]
 
 
 def test_beyond_six_widths_fdm_gives_the_canonical_state(device: str) -> None:

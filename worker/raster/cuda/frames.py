@@ -29,14 +29,10 @@ class FrameStore:
         self.weight = torch.zeros(0, height, width, dtype=torch.uint8, device=device)
         self.inverse_depth = torch.zeros(0, height, width, device=device)
 
-    def holds(self, frame: TrainingFrame) -> bool:
-        """Whether a frame is here already."""
-        return frame in self._rows
-
     @property
-    def is_full(self) -> bool:
-        """Whether the next new frame moves all to other addresses."""
-        return len(self._rows) == len(self.rgb)
+    def room(self) -> int:
+        """Frames there is room for. When it changes, all are at other addresses."""
+        return len(self.rgb)
 
     def row(self, frame: TrainingFrame) -> int:
         """Where a frame lies along T.
@@ -49,8 +45,8 @@ class FrameStore:
         width, height = int(frame.camera[4]), int(frame.camera[5])
         if (width, height) != (self._width, self._height):
             raise ValueError(f"a frame of {width} x {height} pixels, the others have {self._width} x {self._height}")
-        if self.is_full:
-            more = max(FIRST_ROOM, len(self.rgb))
+        if len(self._rows) == self.room:
+            more = max(FIRST_ROOM, self.room)
             self.rgb, self.weight, self.inverse_depth = (
                 torch.cat([each, each.new_zeros(more, *each.shape[1:])])
                 for each in (self.rgb, self.weight, self.inverse_depth)

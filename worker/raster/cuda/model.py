@@ -109,13 +109,13 @@ class CudaModel:
         """One iteration on the sum of the losses of so many frames as the model was made for."""
         if len(frames) != self._training.frames:
             raise ValueError(f"a step on {len(frames)} frames, this model was made for {self._training.frames}")
-        if self._store.is_full and not all(self._store.holds(frame) for frame in frames):
-            self._training.launches.forget()
-        slot = len(self._sent)
+        room, slot = self._store.room, len(self._sent)
         row, times = self._training.control.rows[slot], [frame.t for frame in frames]
         self._training.write_cameras(slot, [frame.camera for frame in frames])
         for k, frame in enumerate(frames):
             row["loss"][k], row["frame"][k] = frame.loss_settings(loss), self._store.row(frame)
+        if self._store.room != room:
+            self._training.launches.forget()
         write_adam(row, slot, rates, iteration)
         self.motion.write_times(row, times)
         self.motion.write_rates(row, times, rates, iteration)
