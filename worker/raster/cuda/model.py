@@ -40,8 +40,8 @@ Floats = NDArray[np.float32]
 PAD_LOGIT = -30.0
 """Opacity logit of the columns that only fill the rows: never drawn."""
 CHECK_EVERY = 32
-"""Steps from one look at the device to the next. The device idles while the host looks, some 50 us; and a step that
-found no room costs at most so many again."""
+"""Steps from one look at the device to the next. The device idles while the host looks, and a step that found no room
+costs at most so many again."""
 SIZES_KEPT = 3
 """Image sizes, of those rendered last, whose buffers are kept."""
 
