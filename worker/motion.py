@@ -9,10 +9,11 @@ Symbols: K training frames, h w pixels of the coarse grid on which flow is compu
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from threading import Lock
+from threading import Lock, Semaphore
 from typing import Any
 
 import cv2
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from worker.clip import DepthClip
 from worker.fusion import unproject
-from worker.opencv import one_opencv_thread
+from worker.opencv import cores, one_opencv_thread
 
 Floats = NDArray[np.float32]
 
@@ -39,6 +40,9 @@ STEADINESS = 0.02
 """Weight of a difference between neighbouring bases against one fully trusted frame; it carries motion across gaps."""
 RIDGE = 1e-3
 """Weight of the basis weights themselves, only to keep the system solvable."""
+CHAINS = 2
+"""Parts of the clip that are followed side by side, on any machine: which flow starts which must not depend on the
+number of cores."""
 POINTS_AT_ONCE = 4096
 """Points fitted together: bounds the memory of their normal equations."""
 
@@ -59,8 +63,14 @@ class Tracks:
     step_px: int
 
 
-def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None) -> Tracks:
-    """Follow the first training frame's tissue through the others.
+def track(
+    clip: DepthClip,
+    train: Sequence[int],
+    on_progress: Callable[[float], None] = lambda share: None,
+    *,
+    threads: int | None = None,
+) -> Tracks:
+    """Follow the first training frame's tissue through the others; the tracks do not depend on `threads` (None: cores).
 
     on_progress is called with the share of frames done, which grows, from threads of this function's own, one at a
     time; what it raises ends the work and is raised here.
@@ -73,24 +83,56 @@ def track(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], 
     confidence[0] = reference.trust
     followed, counting = 0, Lock()
 
-    def follow(places: Sequence[int]) -> None:
+    def lift(place: int, target: _Coarse, forward: Floats, backward: Floats) -> None:
         nonlocal followed
+        displacement[place], colour[place], confidence[place] = _lift(reference, target, forward, backward)
+        with counting:
+            followed += 1
+            on_progress(followed / (len(train) - 1))
+
+    def follow(places: Sequence[int]) -> None:
         flow_solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         forward: Floats | None = None
         for place in places:  # in order of time: the last flow starts the next
             target = _Coarse(clip, train[place], grid)
             forward = flow_solver.calc(reference.grey, target.grey, None if forward is None else forward.copy())
             backward = flow_solver.calc(target.grey, reference.grey, -forward)
-            displacement[place], colour[place], confidence[place] = _lift(reference, target, forward, backward)
-            with counting:
-                followed += 1
-                on_progress(followed / (len(train) - 1))
+            helped.run(lift, place, target, forward, backward)
 
-    # Two halves on any machine: which flow starts which must not depend on the number of cores.
-    middle = (len(train) + 1) // 2
-    with one_opencv_thread(), ThreadPoolExecutor(2) as pool:
-        list(pool.map(follow, (range(1, middle), range(middle, len(train)))))
+    threads = cores() if threads is None else threads
+    length = -(-len(train) // CHAINS)
+    chains = [range(max(first, 1), min(first + length, len(train))) for first in range(0, len(train), length)]
+    with one_opencv_thread(), ThreadPoolExecutor(CHAINS) as pool, _Helpers(threads - CHAINS) as helped:
+        list(pool.map(follow, chains))
     return Tracks(displacement, colour, confidence, step)
+
+
+class _Helpers:
+    """Threads that take work off others' hands while they are free: lifting a flow takes longer than finding it."""
+
+    def __init__(self, count: int) -> None:
+        self._free = Semaphore(max(count, 0))
+        self._pool = ThreadPoolExecutor(max(count, 1))
+        self._jobs: deque[Future[None]] = deque()
+
+    def run(self, work: Callable[..., None], *arguments: Any) -> None:
+        """Have work(*arguments) done, by the caller where all helpers are busy; raises what earlier work raised."""
+        if not self._free.acquire(blocking=False):
+            work(*arguments)
+            return
+        job = self._pool.submit(work, *arguments)
+        job.add_done_callback(lambda _: self._free.release())
+        self._jobs.append(job)
+        if self._jobs[0].done():
+            self._jobs.popleft().result()
+
+    def __enter__(self) -> _Helpers:
+        return self
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        self._pool.shutdown()
+        for job in self._jobs if error is None else ():
+            job.result()
 
 
 def cell_means(image: NDArray[Any], step: int) -> NDArray[Any]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from contract.errors import Cancelled
 from tests.helpers import assert_close
 from worker.clip import DepthClip
 from worker.deformation import SharedBasis
@@ -152,6 +153,26 @@ def test_progress_grows_to_one_with_the_last_frame() -> None:
     shares: list[float] = []
     track(clip, TRAIN, shares.append)
     assert shares == pytest.approx([done / (len(TRAIN) - 1) for done in range(1, len(TRAIN))])
+
+
+@pytest.mark.parametrize("threads", [1, 7])
+def test_tracks_are_the_same_bits_on_any_number_of_cores(threads: int) -> None:
+    clip, _ = phantom("pull")
+    expected, found = track(clip, TRAIN, threads=2), track(clip, TRAIN, threads=threads)
+    for field in dataclasses.fields(expected):
+        np.testing.assert_array_equal(getattr(found, field.name), getattr(expected, field.name))
+
+
+@pytest.mark.parametrize("threads", [1, 7])
+def test_what_progress_raises_ends_the_work(threads: int) -> None:
+    clip, _ = phantom("still")
+
+    def stop(share: float) -> None:
+        if share > 0.2:
+            raise Cancelled("enough")
+
+    with pytest.raises(Cancelled, match="enough"):
+        track(clip, TRAIN, stop, threads=threads)
 
 
 def test_light_that_fades_is_told_from_motion() -> None:

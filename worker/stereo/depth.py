@@ -5,7 +5,6 @@ Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. d
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Literal
@@ -18,7 +17,7 @@ from contract.errors import Cancelled, InputError
 from worker.calibration import RectifiedClip
 from worker.clip.types import DepthClip
 from worker.hooks import Hooks, Progress
-from worker.opencv import one_opencv_thread
+from worker.opencv import cores, one_opencv_thread
 from worker.stereo.alignment import RowShift, agreed_disparities, choose_range, feature_matches, measure_row_shift
 from worker.stereo.matching import MAX_DEPTH_MM, MIN_CONFIDENCE, Grey, MatchPlan, match
 
@@ -238,5 +237,4 @@ def _grey(rgb: NDArray[np.uint8]) -> Grey:
 
 def _pool() -> ThreadPoolExecutor:
     """One pair a thread and core: OpenCV lets go of the interpreter, and one pair in two threads measured slower."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    return ThreadPoolExecutor(cores, thread_name_prefix=STAGE)
+    return ThreadPoolExecutor(cores(), thread_name_prefix=STAGE)
