@@ -27,7 +27,7 @@ from worker.raster.cuda.control import Control, adam_fields, write_adam
 from worker.raster.cuda.motion import LinearMotion, Motion, Trained, motion_of
 from worker.raster.cuda.update import MADE, ROWS, SEEN, SUMS, VALUES, padded
 
-COUNT = 90
+COUNT = 30
 TIMES = (0.4, 0.55)
 SAME_RATE = dataclasses.replace(RATES, motion_quaternion=7e-3, motion_log_scale=7e-3, motion_colour=7e-3)
 """One rate for all motion, as FDM needs."""
@@ -76,7 +76,7 @@ class Bench:
 
 
 def bench(kind: str, device: str, times: tuple[float, ...] = TIMES) -> Bench:
-    gaussians, deformation, _ = moving_gaussians(kind, 0)
+    gaussians, deformation = some_gaussians(kind, 0)
     columns, frames = padded(COUNT), len(times)
     motion = motion_of(deformation, columns, torch.device(device))
     values = torch.zeros(VALUES, columns, device=device)
@@ -94,6 +94,13 @@ def bench(kind: str, device: str, times: tuple[float, ...] = TIMES) -> Bench:
     )  # fmt: skip
     control = Control(adam_fields() | motion.fields(frames), 1, torch.device(device))
     return Bench(gaussians, deformation, motion, control, trained, poisoned(frames, ROWS, columns), times)
+
+
+def some_gaussians(kind: str, degree: int) -> tuple[Gaussians, Fused]:
+    """The first COUNT of more."""
+    gaussians, deformation, _ = moving_gaussians(kind, degree)
+    fewer = Gaussians(**{name: each[:COUNT] for name, each in gaussians.tensors().items()})
+    return fewer, deformation.select(torch.arange(COUNT))
 
 
 def canonical_rows(gaussians: Gaussians) -> Tensor:
@@ -239,7 +246,7 @@ def test_beyond_six_widths_fdm_gives_the_canonical_state(device: str) -> None:
 def sh_scene(degree: int) -> tuple[Gaussians, Tensor]:
     """Gaussians around the cameras' centres [F, 3]."""
     random = torch.Generator().manual_seed(9)
-    gaussians, _, _ = moving_gaussians("shared", degree)
+    gaussians, _ = some_gaussians("shared", degree)
     sh = 0.4 * torch.randn(gaussians.sh.shape, generator=random)
     return dataclasses.replace(gaussians, sh=sh), 20.0 * torch.randn(2, 3, generator=random)
 

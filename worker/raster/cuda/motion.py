@@ -13,7 +13,6 @@ from typing import Protocol
 
 import numpy as np
 import torch
-import triton
 from torch import Tensor
 
 from worker.deformation import Deformation, FlexibleDeformation
@@ -21,7 +20,7 @@ from worker.optimize import StepRates, adam_step
 from worker.raster.cpu.motion import NEGLIGIBLE, LinearDeformation
 from worker.raster.cuda import motion_kernels as kernels
 from worker.raster.cuda.control import ADAM, Field
-from worker.raster.cuda.update import BLOCK, ROWS
+from worker.raster.cuda.update import COLUMNS, ROWS
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ def kept_where_old(moments: Tensor, columns: Tensor, fresh: Tensor) -> Tensor:
 
 
 def _grid(columns: int, *frames: int) -> tuple[int, ...]:
-    return (triton.cdiv(columns, BLOCK), *frames)
+    return (columns // COLUMNS, *frames)
 
 
 class LinearMotion:
@@ -156,7 +155,7 @@ class LinearMotion:
         frames, _, columns = state.shape
         kernels.deform_linear[_grid(columns, frames)](
             values, self.weight, control["basis"], control["span"], state, colour, columns, self._bases,
-            CHANNELS=self._channels, BLOCK=BLOCK,
+            CHANNELS=self._channels,
         )  # fmt: skip
 
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
@@ -164,7 +163,7 @@ class LinearMotion:
         kernels.update_linear[_grid(trained.columns)](
             *tensors[:2], self.weight, self.first, self.second, *tensors[2:], *(control[name] for name in ADAM),
             *(control[name] for name in ("basis", "alive", "basis_size", "basis_floor", "channel_rate")),
-            trained.columns, self._bases, trained.tiles, CHANNELS=self._channels, FRAMES=trained.frames, BLOCK=BLOCK,
+            trained.columns, self._bases, trained.tiles, CHANNELS=self._channels, FRAMES=trained.frames,
         )  # fmt: skip
 
     def take(self, columns: Tensor, fresh: Tensor) -> None:
@@ -207,7 +206,7 @@ class FdmMotion:
         frames, _, columns = state.shape
         kernels.deform_fdm[_grid(columns, frames)](
             values, self.weight, self.centre, self.width, control["time"], state, colour, columns,
-            self.weight.shape[1], QUARTIC=self._form == "quartic", BLOCK=BLOCK,
+            self.weight.shape[1], QUARTIC=self._form == "quartic",
         )  # fmt: skip
 
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
@@ -216,7 +215,7 @@ class FdmMotion:
             *tensors[:2], self.weight, self.centre, self.width, self.first, self.second, *tensors[2:],
             *(control[name] for name in ADAM), control["time"], control["motion_size"],
             trained.columns, self.weight.shape[1], trained.tiles,
-            QUARTIC=self._form == "quartic", FRAMES=trained.frames, BLOCK=BLOCK,
+            QUARTIC=self._form == "quartic", FRAMES=trained.frames,
         )  # fmt: skip
 
     def take(self, columns: Tensor, fresh: Tensor) -> None:

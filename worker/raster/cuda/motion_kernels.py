@@ -12,6 +12,7 @@ import triton.language as tl
 
 from worker.raster.cuda.update import (
     COLOUR_ROW,
+    COLUMNS,
     CONSTANT_HARMONIC,
     STATE_ROWS,
     TILE_ROWS,
@@ -27,62 +28,62 @@ QUARTIC_FLOOR = tl.constexpr(1e-4)
 """Added to sigma^2 in the released form of the basis."""
 LOG2E = tl.constexpr(1.4426950408889634)
 FDM_CHANNELS = tl.constexpr(10)
+LINE = tl.constexpr(COLUMNS)
 
 
 @triton.jit
-def _place(columns, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
-    """A program's rows [TILE_ROWS, 1] and Gaussians [1, BLOCK], and which of those there are."""
-    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[None, :]
-    return tl.arange(0, TILE_ROWS)[:, None], at, at < columns
+def _place():  # type: ignore[no-untyped-def]
+    """A program's rows [TILE_ROWS, 1] and Gaussians [1, COLUMNS]."""
+    return tl.arange(0, TILE_ROWS)[:, None], tl.program_id(0) * LINE + tl.arange(0, LINE)[None, :]
 
 
 @triton.jit
-def _store_state(state, colour, frame, row, at, inside, moved, columns):  # type: ignore[no-untyped-def]
+def _store_state(state, colour, frame, row, at, moved, columns):  # type: ignore[no-untyped-def]
     """The state, and the colour that it shows where no other harmonic is in use."""
-    tl.store(state + (frame * STATE_ROWS + row) * columns + at, moved, mask=inside & (row < STATE_ROWS))
+    tl.store(state + (frame * STATE_ROWS + row) * columns + at, moved, mask=row < STATE_ROWS)
     shown = tl.maximum(moved * CONSTANT_HARMONIC + 0.5, 0.0)
-    is_colour = inside & (row >= COLOUR_ROW) & (row < STATE_ROWS)
+    is_colour = (row >= COLOUR_ROW) & (row < STATE_ROWS)
     tl.store(colour + (frame * 3 + row - COLOUR_ROW) * columns + at, shown, mask=is_colour)
 
 
 @triton.jit(do_not_specialize=["bases"])
 def deform_linear(  # type: ignore[no-untyped-def]
-    values, weight, basis, span, state, colour, columns, bases, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
+    values, weight, basis, span, state, colour, columns, bases, CHANNELS: tl.constexpr
 ):
-    """state = canonical + sum over j in span of basis_j weight_j, and its colour. Grid (blocks, F).
+    """state = canonical + sum over j in span of basis_j weight_j, and its colour. Grid (lines, F).
 
     weight [B, C, columns], basis [F, B], span int32 [F, 2]: the first of the bases in use and the one after the last.
     """
     frame = tl.program_id(1)
-    row, at, inside = _place(columns, BLOCK)
-    moved = tl.load(values + row * columns + at, mask=inside & (row < STATE_ROWS), other=0.0)
+    row, at = _place()
+    moved = tl.load(values + row * columns + at, mask=row < STATE_ROWS, other=0.0)
     j, last = tl.load(span + 2 * frame), tl.load(span + 2 * frame + 1)
     while j < last:
-        weights = tl.load(weight + (j * CHANNELS + row) * columns + at, mask=inside & (row < CHANNELS), other=0.0)
+        weights = tl.load(weight + (j * CHANNELS + row) * columns + at, mask=row < CHANNELS, other=0.0)
         moved += tl.load(basis + frame * bases + j) * weights
         j += 1
-    _store_state(state, colour, frame, row, at, inside, moved, columns)
+    _store_state(state, colour, frame, row, at, moved, columns)
 
 
 @triton.jit(do_not_specialize=["bases", "tiles"])
 def update_linear(  # type: ignore[no-untyped-def]
     values, moments, weight, first, second, v_state, v_opacity, v_colour, colour, touched, statistics, ok, report,
     slot, size, floor, betas, basis, alive, basis_size, basis_floor, channel_rate, columns, bases, tiles,
-    CHANNELS: tl.constexpr, FRAMES: tl.constexpr, BLOCK: tl.constexpr,
+    CHANNELS: tl.constexpr, FRAMES: tl.constexpr,
 ):  # fmt: skip
-    """Adam on the values and on the weights of the bases in use; the report. Grid (blocks,).
+    """Adam on the values and on the weights of the bases in use; the report. Grid (lines,).
 
     weight and its moments [B, C, columns]; basis [F, B], 0 where a frame does not use it; alive int32 [1 + B]: how many
     bases are in use, and which. Their step's size is basis_size [B] times channel_rate [13], its floor basis_floor [B].
     """
-    row, at, inside = _place(columns, BLOCK)
+    row, at = _place()
     if tl.load(ok) != 0:
-        report_step(touched, statistics, report, slot, at, inside, columns, tiles, FRAMES)
+        report_step(touched, statistics, report, slot, at, columns, tiles, FRAMES)
         total = update_values(
-            values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, inside, columns, FRAMES
+            values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, columns, FRAMES
         )  # fmt: skip
         rate = tl.load(channel_rate + row, mask=row < CHANNELS, other=0.0)
-        used, left = inside & (rate != 0.0), tl.load(alive)
+        used, left = rate != 0.0, tl.load(alive)
         while left > 0:
             j = tl.load(alive + left)
             if FRAMES == 1:
@@ -90,7 +91,7 @@ def update_linear(  # type: ignore[no-untyped-def]
             else:
                 gradient = tl.zeros_like(total)
                 for frame in tl.static_range(FRAMES):
-                    share = gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, inside, columns)
+                    share = gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, columns)
                     gradient += tl.load(basis + frame * bases + j) * share
             step, low = tl.load(basis_size + j) * rate, tl.load(basis_floor + j)
             adam(weight, first, second, (j * CHANNELS + row) * columns + at, used, gradient, step, low, betas)
@@ -123,16 +124,16 @@ def fdm_basis(t, centre, width, QUARTIC: tl.constexpr):  # type: ignore[no-untyp
 
 @triton.jit(do_not_specialize=["bases"])
 def deform_fdm(  # type: ignore[no-untyped-def]
-    values, weight, centre, width, time, state, colour, columns, bases, QUARTIC: tl.constexpr, BLOCK: tl.constexpr
+    values, weight, centre, width, time, state, colour, columns, bases, QUARTIC: tl.constexpr
 ):
-    """state = canonical + FDM at the frames' times, and its colour. Grid (blocks, F).
+    """state = canonical + FDM at the frames' times, and its colour. Grid (lines, F).
 
     weight, centre, width [10, B, columns] (Deform3DGS, equations 3 and 4); time [F].
     """
     frame = tl.program_id(1)
-    row, at, inside = _place(columns, BLOCK)
-    moved = tl.load(values + row * columns + at, mask=inside & (row < STATE_ROWS), other=0.0)
-    used, t, left = inside & (row < FDM_CHANNELS), tl.load(time + frame), bases
+    row, at = _place()
+    moved = tl.load(values + row * columns + at, mask=row < STATE_ROWS, other=0.0)
+    used, t, left = row < FDM_CHANNELS, tl.load(time + frame), bases
     while left > 0:
         left -= 1
         place = (row * bases + left) * columns + at
@@ -140,27 +141,27 @@ def deform_fdm(  # type: ignore[no-untyped-def]
         widths = tl.load(width + place, mask=used, other=1.0)
         value, _, _ = fdm_basis(t, centres, widths, QUARTIC)
         moved += tl.load(weight + place, mask=used, other=0.0) * value
-    _store_state(state, colour, frame, row, at, inside, moved, columns)
+    _store_state(state, colour, frame, row, at, moved, columns)
 
 
 @triton.jit(do_not_specialize=["bases", "tiles"])
 def update_fdm(  # type: ignore[no-untyped-def]
     values, moments, weight, centre, width, first, second, v_state, v_opacity, v_colour, colour, touched, statistics,
     ok, report, slot, size, floor, betas, time, motion_size, columns, bases, tiles,
-    QUARTIC: tl.constexpr, FRAMES: tl.constexpr, BLOCK: tl.constexpr,
+    QUARTIC: tl.constexpr, FRAMES: tl.constexpr,
 ):  # fmt: skip
-    """Adam on the values and on weight, centre and width of every basis; the report. Grid (blocks,).
+    """Adam on the values and on weight, centre and width of every basis; the report. Grid (lines,).
 
     Moments of the motion [3, 10, B, columns]; motion_size [1]: the size of its step.
     """
-    row, at, inside = _place(columns, BLOCK)
+    row, at = _place()
     if tl.load(ok) != 0:
-        report_step(touched, statistics, report, slot, at, inside, columns, tiles, FRAMES)
+        report_step(touched, statistics, report, slot, at, columns, tiles, FRAMES)
         total = update_values(
-            values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, inside, columns, FRAMES
+            values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, columns, FRAMES
         )  # fmt: skip
         step, low, group = tl.load(motion_size), tl.load(floor), FDM_CHANNELS * bases * columns
-        used, left = inside & (row < FDM_CHANNELS), bases
+        used, left = row < FDM_CHANNELS, bases
         if step == 0.0:
             left *= 0
         while left > 0:
@@ -173,11 +174,11 @@ def update_fdm(  # type: ignore[no-untyped-def]
             if FRAMES == 1:
                 share = total * value
             else:
-                share = value * gradient_of_values(v_state, v_opacity, v_colour, colour, 0, row, at, inside, columns)
+                share = value * gradient_of_values(v_state, v_opacity, v_colour, colour, 0, row, at, columns)
             to_weight, to_centre, to_width = share, share * weights * by_centre, share * weights * by_width
             for frame in tl.static_range(1, FRAMES):
                 value, by_centre, by_width = fdm_basis(tl.load(time + frame), centres, widths, QUARTIC)
-                share = gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, inside, columns)
+                share = gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, columns)
                 share = share * value
                 to_weight += share
                 to_centre += share * weights * by_centre

@@ -1,8 +1,8 @@
 """Adam on the device: what all parameters share; the canonical state and the opacity; and what a step reports.
 
 N Gaussians in rows of `columns` floats, a multiple of COLUMNS; F frames a step. values [VALUES, columns] are the rows
-of the canonical state, as in raster/cpu/update.py, and the opacity's logit. A program has BLOCK Gaussians and all of
-their rows, so tensors in it are [TILE_ROWS, BLOCK]. A gradient is a sum over the frames.
+of the canonical state, as in raster/cpu/update.py, and the opacity's logit. A program has COLUMNS Gaussians and all
+of their rows, so tensors in it are [TILE_ROWS, COLUMNS]. A gradient is a sum over the frames.
 
 Whatever changes from step to step is read from tensors on the device (control.py), so that a launch never changes.
 Rates come as sizes and floors that have Adam's bias corrections folded in (worker/optimize.py); a size of 0 leaves a
@@ -18,9 +18,8 @@ import triton.language as tl
 from worker.gaussians import SH_C0
 
 COLUMNS = 32
-"""Rows are padded to a multiple of so many floats, 128 bytes: they begin where lines of memory begin."""
-BLOCK = 32
-"""Gaussians a program, a line of memory of every row. With twice as many, steps on several frames spill registers."""
+"""Rows are padded to a multiple of so many floats, 128 bytes: they begin where lines of memory begin. A program has one
+such line of every row; with two of them, steps on several frames spill registers."""
 ROWS, VALUES = 13, 14
 """Of the state; and with the opacity."""
 TILE_ROWS = tl.constexpr(16)
@@ -56,47 +55,42 @@ def adam(value, first, second, at, mask, gradient, size, floor, betas):  # type:
 
 @triton.jit
 def gradient_of_values(  # type: ignore[no-untyped-def]
-    v_state, v_opacity, v_colour, colour, frame, row, at, inside, columns
+    v_state, v_opacity, v_colour, colour, frame, row, at, columns
 ):
     """dL/dvalues of a frame: v_state [F, 10, columns]; what v_colour [F, 3, columns] says of the constant harmonic
-    where the colour was not held at 0; v_opacity [F, columns]. row [TILE_ROWS, 1], at and inside [1, BLOCK]."""
-    of_state = inside & (row < COLOUR_ROW)
-    of_colour = inside & (row >= COLOUR_ROW) & (row < OPACITY_ROW)
-    of_opacity = inside & (row == OPACITY_ROW)
-    gradient = tl.load(v_state + (frame * COLOUR_ROW + row) * columns + at, mask=of_state, other=0.0)
+    where the colour was not held at 0; v_opacity [F, columns]. row [TILE_ROWS, 1], at [1, COLUMNS]."""
+    of_colour = (row >= COLOUR_ROW) & (row < OPACITY_ROW)
+    gradient = tl.load(v_state + (frame * COLOUR_ROW + row) * columns + at, mask=row < COLOUR_ROW, other=0.0)
     hue = (frame * 3 + row - COLOUR_ROW) * columns + at
     shown = tl.load(colour + hue, mask=of_colour, other=0.0) > 0.0
     gradient += CONSTANT_HARMONIC * tl.load(v_colour + hue, mask=of_colour & shown, other=0.0)
-    gradient += tl.load(v_opacity + frame * columns + at + 0 * row, mask=of_opacity, other=0.0)
+    gradient += tl.load(v_opacity + frame * columns + at + 0 * row, mask=row == OPACITY_ROW, other=0.0)
     return gradient
 
 
 @triton.jit
 def update_values(  # type: ignore[no-untyped-def]
-    values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, inside, columns,
-    FRAMES: tl.constexpr,
-):  # fmt: skip
+    values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, columns, FRAMES: tl.constexpr
+):
     """Adam on a program's values; returns their gradient. moments [2, VALUES, columns], size [VALUES], floor [1]."""
-    gradient = gradient_of_values(v_state, v_opacity, v_colour, colour, 0, row, at, inside, columns)
+    gradient = gradient_of_values(v_state, v_opacity, v_colour, colour, 0, row, at, columns)
     for frame in tl.static_range(1, FRAMES):
-        gradient += gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, inside, columns)
+        gradient += gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, columns)
     rate = tl.load(size + row, mask=row < VALUE_ROWS, other=0.0)
     second = moments + VALUE_ROWS * columns
-    adam(
-        values, moments, second, row * columns + at, inside & (rate != 0.0), gradient, rate, tl.load(floor), betas
-    )  # fmt: skip
+    adam(values, moments, second, row * columns + at, rate != 0.0, gradient, rate, tl.load(floor), betas)
     return gradient
 
 
 @triton.jit
 def report_step(  # type: ignore[no-untyped-def]
-    touched, statistics, report, slot, at, inside, columns, tiles, FRAMES: tl.constexpr
+    touched, statistics, report, slot, at, columns, tiles, FRAMES: tl.constexpr
 ):
     """Count the program's Gaussians in view, at the step's place slot [1]; the first program adds the step to those
     made, and its sums to the report. touched int32 [F, columns]: tiles a Gaussian touches; statistics [tiles, 4]."""
-    most = tl.load(touched + at, mask=inside, other=0)
+    most = tl.load(touched + at)
     for frame in tl.static_range(1, FRAMES):
-        most = tl.maximum(most, tl.load(touched + frame * columns + at, mask=inside, other=0))
+        most = tl.maximum(most, tl.load(touched + frame * columns + at))
     tl.atomic_add(report + _SEEN + tl.load(slot), tl.sum(tl.sum((most > 0).to(tl.int32), 1), 0))
     if tl.program_id(0) == 0:
         kind, tile = tl.arange(0, 4)[None, :], tl.arange(0, _CHUNK)[:, None]
