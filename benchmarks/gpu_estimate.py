@@ -2,13 +2,13 @@
 
     python benchmarks/gpu_estimate.py [--scene FOLDER] [--csv docs/results/gpu-estimate.csv] [--quick]
 
-The frame's work is counted on the CPU (gpu_counts.py): the standard grid of bm_raster.py, 640x512 with 40,096 Gaussians,
-and with --scene a trained scene. The kernels of the step are compiled for sm_90 and their machine code is read
-(gpu_compile.py). Both together give bytes, instructions and launches of every kernel, and the least time that the
-card's data sheet allows them (gpu_work.py). Tiles of other shapes are compiled and counted, too: --quick leaves them out.
+The frame's work is counted on the CPU (gpu_counts.py): of the standard grid of bm_raster.py, 640x512 with 40,096
+Gaussians, and with --scene of a trained scene. The kernels of the step are compiled for sm_90 and their machine code is
+read (gpu_compile.py). Both together give bytes, instructions and launches of every kernel, and the least time that the
+card's data sheet allows them (gpu_work.py). Tiles of other shapes are compiled and counted too; --quick omits them.
 
-A floor is not a forecast: kernels wait for memory, and the last programs of each run alone. As a forecast the sum of the
-floors is given twice over, with 2.5 us for each launch; nearest to the floor would be once, with 1.5 us.
+A floor is not a forecast: kernels wait for memory, and the last programs of each run alone. As a forecast the sum of
+the floors is given twice over, with 2.5 us for each launch; nearest to the floor would be once, with 1.5 us.
 """
 
 from __future__ import annotations
@@ -170,8 +170,9 @@ def _whole(name: str, counts: Counts, sizes: Sizes, floors: list[Floor], blend: 
     """The step's row, with what distinguishes shapes of tiles beside it."""
     launches, floor_us = sum(each.launches for each in floors), sum(each.us for each in floors)
     soonest, latest = H200.launch_us
+    moved = sum(each.bytes for each in floors)
     return _common(name, counts, sizes) | {
-        "part": "step", "kernel": "all", "launches": launches, "megabytes": round(sum(e.bytes for e in floors) / 1e6, 1),
+        "part": "step", "kernel": "all", "launches": launches, "megabytes": round(moved / 1e6, 1),
         "floor_us": round(floor_us, 1), "least_us": round(floor_us + soonest * launches, 1),
         "forecast_us": round(FORECAST * floor_us + latest * launches, 1), "warps": blend.warps,
         "registers": blend.registers, "spilled_bytes": blend.spilled_bytes, "evidence": "estimate",

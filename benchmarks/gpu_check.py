@@ -1,0 +1,169 @@
+"""Everything that only a GPU can show, in one command that ends within eight minutes and needs no network.
+
+    make gpu-check [PYTHON=python3] [ARGS="--clip FOLDER --out docs/results"]
+    python benchmarks/gpu_check.py --interpret --out FOLDER     the same on tiny sizes, in Triton's interpreter
+
+In this order: whether the kernels are right (gpu_correct.py), what a step and a picture take and where the card's own
+peaks are (gpu_speed.py), how soon training is how good (gpu_train.py), tiles of other shapes (gpu_variants.py), and
+gsplat beside it where it is installed (gpu_rival.py). Each part is a process with a time to end at, and writes
+OUT/gpu-*.csv row by row. If a kernel is wrong, the rest is measured all the same, says so in every row, and the exit
+code is 1. Without a GPU there is nothing to check: exit code 5.
+
+--clip names a recording in the EndoNeRF layout (its depth is in it); without it, synthetic tissue is made on the spot.
+This file needs the standard library alone, so that it can say what is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+UNAVAILABLE = 5
+"""As contract/exits.py has it."""
+GRACE_S = 5.0
+"""After its deadline a part may write what it holds; then it is killed."""
+LOOK = (
+    "import importlib.util, json, torch; "
+    "seen = torch.cuda.is_available(); "
+    "print(json.dumps({'build': torch.version.cuda, 'gpu': torch.cuda.get_device_name(0) if seen else None, "
+    "'triton': importlib.util.find_spec('triton') is not None}))"
+)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part: its module, and the seconds that it adds to what the parts before it left over."""
+
+    name: str
+    seconds: float
+
+    @property
+    def program(self) -> Path:
+        return HERE / f"gpu_{self.name}.py"
+
+
+PARTS = (Part("correct", 120), Part("speed", 120), Part("train", 130), Part("variants", 70), Part("rival", 25))
+"""465 s in all, of the 480 there are."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clip", type=Path, help="folder of a recording in the EndoNeRF layout")
+    parser.add_argument("--out", type=Path, help="folder of the CSV files (default: docs/results)")
+    parser.add_argument("--only", nargs="*", choices=[part.name for part in PARTS], help="these parts alone")
+    parser.add_argument("--seed", type=int, help="of all that is random (default: another every time; it is printed)")
+    parser.add_argument("--interpret", action="store_true", help="tiny sizes in Triton's interpreter; needs --out")
+    arguments = parser.parse_args()
+    if arguments.interpret and arguments.out is None:
+        parser.error("--interpret measures nothing: name a folder for its files with --out, other than docs/results")
+    if not arguments.interpret and (missing := what_is_missing()):
+        print(f"gpu-check: {missing}; nothing was checked and nothing was written.", file=sys.stderr)
+        return UNAVAILABLE
+    seed = int(time.time()) if arguments.seed is None else arguments.seed
+    out = (arguments.out or HERE.parent / "docs" / "results").resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    chosen = [part for part in PARTS if arguments.only is None or part.name in arguments.only]
+    print(f"gpu-check: seed {seed}, rows in {out}", flush=True)
+    with tempfile.TemporaryDirectory(prefix="gpu-check-") as work:
+        options = ["--out", str(out), "--work", work, "--seed", str(seed)]
+        options += ["--clip", str(arguments.clip.resolve())] if arguments.clip else []
+        options += ["--interpret"] if arguments.interpret else []
+        for part in chosen:
+            (out / f"gpu-{part.name}.csv").unlink(
+                missing_ok=True
+            )  # what an earlier run left must not pass for this one's
+        failures = run_parts(chosen, options, environment(Path(work), arguments.interpret))
+    print_table(out, [part.name for part in chosen])
+    for failure in failures:
+        print(f"gpu-check: {failure}", file=sys.stderr)
+    return 1 if failures else 0
+
+
+def what_is_missing() -> str:
+    """Why nothing can be checked here; empty if everything is there."""
+    look = subprocess.run([sys.executable, "-c", LOOK], capture_output=True, text=True, check=False)
+    if look.returncode != 0:
+        last = look.stderr.strip().splitlines()[-1:] or ["it ended without a word"]
+        return f"{sys.executable} cannot import torch ({last[0]})"
+    found = json.loads(look.stdout)
+    if found["build"] is None:
+        return f"torch of {sys.executable} is a CPU build"
+    if found["gpu"] is None:
+        return f"torch of {sys.executable} sees no NVIDIA GPU"
+    return "" if found["triton"] else f"{sys.executable} has no Triton"
+
+
+def environment(work: Path, interpret: bool) -> dict[str, str]:
+    """Of the parts: this checkout's modules, and caches that begin empty and end with the check."""
+    own = {
+        "PYTHONPATH": os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
+        "PYTHONUNBUFFERED": "1",
+        "TRITON_CACHE_DIR": str(work / "triton"),
+    }
+    if interpret:
+        own["TRITON_INTERPRET"] = "1"  # and the CPU's kernels stay where they are kept: tests need not compile them
+    else:
+        own["INTRASPLAT_CACHE"] = str(work / "kernels")
+    return {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"} | own
+
+
+def run_parts(parts: list[Part], options: list[str], variables: dict[str, str]) -> list[str]:
+    """Run the parts one after the other beside gpu_prepare.py; what failed, in words."""
+    failures, doubt, deadline = [], "", time.time()
+    prepare = [sys.executable, str(HERE / "gpu_prepare.py"), *options, "--deadline", str(deadline + 460)]
+    with subprocess.Popen(prepare, env=variables, stdout=subprocess.DEVNULL) as prepared:
+        try:
+            for part in parts:
+                deadline += part.seconds
+                print(f"== {part.name}: until {time.strftime('%H:%M:%S', time.localtime(deadline))}", flush=True)
+                command = [sys.executable, str(part.program), *options, "--deadline", str(deadline), "--doubt", doubt]
+                # what is compiled for the tests must not make the time of compilation look short
+                own = variables | {"TRITON_CACHE_DIR": f"{variables['TRITON_CACHE_DIR']}-{part.name == 'correct'}"}
+                if problem := _failure(command, own, deadline):
+                    failures.append(f"{part.name} {problem}")
+                    doubt = doubt or ("a kernel is wrong" if part.name == "correct" else "")
+        finally:
+            prepared.kill()
+    return failures
+
+
+def _failure(command: list[str], variables: dict[str, str], deadline: float) -> str:
+    """Run a part to its end or its deadline; in words how it failed, empty if it did not."""
+    try:
+        limit_s = max(deadline - time.time(), 0) + GRACE_S
+        status = subprocess.run(command, env=variables, timeout=limit_s, check=False).returncode
+    except subprocess.TimeoutExpired:
+        return "did not end in time and was killed"
+    if status == 1:
+        return "found something wrong; see above"
+    return "" if status == 0 else f"ended with status {status}"
+
+
+def print_table(out: Path, names: list[str]) -> None:
+    """What the parts wrote, for people."""
+    for name in names:
+        path = out / f"gpu-{name}.csv"
+        if not path.exists():
+            print(f"{name}: no rows")
+            continue
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        origin = ("believed", "machine", "gpu", "driver", "torch", "triton", "commit")
+        print(f"\n{name}: " + ", ".join(f"{key} {rows[0][key]}" for key in origin if rows[0][key]))
+        columns = [key for key in rows[0] if key not in origin and any(row[key] for row in rows)]
+        widths = {key: max(len(key), *(len(row[key]) for row in rows)) for key in columns}
+        for row in [dict(zip(columns, columns, strict=True)), *rows]:
+            print("  " + "  ".join(f"{row[key]:<{widths[key]}}" for key in columns).rstrip())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,75 @@
+"""What the parts of gpu_check.py need of the processor, made beside them: the CPU's kernels compiled, and the clip.
+
+Both take tens of seconds and none of the GPU. The clip is a recording in the EndoNeRF layout, or synthetic tissue.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from gpu_rows import CLIP, CLIP_READY, KERNELS_READY, Part
+
+from contract.camera import Intrinsics
+from worker.clip import DepthClip, open_clip
+from worker.phantom import PhantomSettings, make_phantom
+from worker.raster.cpu import compile_kernels
+
+ARRAYS = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera", "frame_times_s")
+PHANTOM = PhantomSettings(width=640, height=512, frames=56, motion="breathing", seed=3)
+SMALL_PHANTOM = PhantomSettings(width=64, height=48, frames=9, motion="breathing", seed=3)
+
+
+def main() -> None:
+    part = Part.begin("prepare", ())
+    failed = [_said(part.work / KERNELS_READY, lambda: {"seconds": compile_kernels()})]
+    failed.append(_said(part.work / CLIP_READY, lambda: _clip(part)))
+    sys.exit(1 if any(failed) else 0)
+
+
+def _said(path: Path, work: Callable[[], dict[str, object]]) -> bool:
+    """Write what work says, or what it failed with; whether it did."""
+    told: dict[str, object]
+    try:
+        told = work()
+    except Exception as error:
+        traceback.print_exc()
+        told = {"error": f"{type(error).__name__}: {error}"}
+    aside = path.with_suffix(".part")
+    aside.write_text(json.dumps(told))
+    aside.replace(path)
+    return "error" in told
+
+
+def _clip(part: Part) -> dict[str, object]:
+    start = time.perf_counter()
+    if part.clip:
+        clip = open_clip(Path(part.clip))
+        if not isinstance(clip, DepthClip):
+            raise ValueError(f"{part.clip} has no depth: a folder in the EndoNeRF layout is needed")
+        name = Path(part.clip).name
+    else:
+        settings = SMALL_PHANTOM if part.interpret else PHANTOM
+        clip, name = make_phantom(settings).depth_clip(), f"phantom-{settings.motion}"
+    save_clip(part.work / CLIP, clip)
+    return {"name": name, "seconds": time.perf_counter() - start, "camera": clip.intrinsics.numbers()}
+
+
+def save_clip(path: Path, clip: DepthClip) -> None:
+    """The clip's arrays; its camera goes with what is said of it."""
+    np.savez(path, **{name: np.asarray(getattr(clip, name)) for name in ARRAYS})
+
+
+def load_clip(path: Path, camera: dict[str, float]) -> DepthClip:
+    """What save_clip wrote."""
+    with np.load(path) as stored:
+        return DepthClip(**{name: stored[name] for name in ARRAYS}, intrinsics=Intrinsics.parsed(camera))
+
+
+if __name__ == "__main__":
+    main()
