@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from threading import Lock
 
 import torch
+
+_one_capture = Lock()
+"""Torch captures on one stream for the whole process, and scenes are rendered while another is trained."""
 
 
 class Captured:
@@ -34,7 +38,7 @@ class Captured:
     def forget(self) -> None:
         """Addresses or sizes have changed. Waits: a graph must not be destroyed while it runs."""
         if self._graphs:
-            torch.cuda.synchronize(self._device)
+            torch.cuda.current_stream(self._device).synchronize()
         self._graphs.clear()
         self._was_run.clear()
 
@@ -42,6 +46,6 @@ class Captured:
 def _capture(routine: Callable[[], None]) -> torch.cuda.CUDAGraph:
     """The launches, recorded and not made. Other threads may use the device meanwhile."""
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+    with _one_capture, torch.cuda.graph(graph, capture_error_mode="thread_local"):
         routine()
     return graph

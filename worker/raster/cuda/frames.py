@@ -32,7 +32,7 @@ class FrameStore:
     @property
     def room(self) -> int:
         """Frames there is room for. When it changes, all are at other addresses."""
-        return len(self.rgb)
+        return int(self.rgb.shape[0])
 
     def row(self, frame: TrainingFrame) -> int:
         """Where a frame lies along T.

@@ -111,6 +111,7 @@ class LinearMotion:
         self.weight[:, :, :count] = deformation.weight.permute(2, 1, 0).to(device)
         self.first, self.second = torch.zeros_like(self.weight), torch.zeros_like(self.weight)
         self.steps = torch.zeros(self._bases, dtype=torch.int64)
+        self._counts = self.steps.numpy()  # the same memory
         self._found: dict[float, tuple[np.ndarray, int, int]] = {}
 
     def _alive(self, t: float) -> tuple[np.ndarray, int, int]:
@@ -142,10 +143,9 @@ class LinearMotion:
         spans = [range(*self._alive(t)[1:]) for t in times]
         alive = sorted(set().union(*spans))
         row["alive"][0], row["alive"][1 : 1 + len(alive)] = len(alive), alive
-        steps = self.steps.numpy()
-        steps[alive] += 1
+        self._counts[alive] += 1
         for j in alive:
-            adam = adam_step(1.0, rates, int(steps[j]))
+            adam = adam_step(1.0, rates, int(self._counts[j]))
             row["basis_size"][j], row["basis_floor"][j] = adam.size, adam.floor
         channel_rate = row["channel_rate"]
         channel_rate[0:3], channel_rate[3:7] = rates.motion_mean, rates.motion_quaternion
