@@ -1,7 +1,8 @@
 """Depth from stereo on real clips: agreement with a reference, rows after rectification, and seconds a frame.
 
-    python benchmarks/bm_stereo.py [--data FOLDER] [--repeats 3]
+    python benchmarks/bm_stereo.py [--data FOLDER] [--repeats 3] [--device cuda] [--every 8]
 
+With TRITON_INTERPRET=1 in the environment "cuda" needs no GPU and takes half a minute a pair: accuracy, not speed.
 FOLDER (INTRASPLAT_DATA, else ../shared/data) holds `d4d_stereo` and `d4d_endonerf` (one recording, as stereo video and
 as frames with another group's stereo depth, 1 mm steps) and `surgt_raw` (unrectified, with an OpenCV YAML).
 """
@@ -12,6 +13,10 @@ import argparse
 import os
 import platform
 import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -32,6 +37,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("INTRASPLAT_DATA", "../shared/data")))
     parser.add_argument("--repeats", type=int, default=3, help="timed runs a clip; the fastest is printed")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where pairs are matched")
+    parser.add_argument("--every", type=int, default=1, help="only each so manieth pair is matched")
     arguments = parser.parse_args()
     print(f"machine {platform.processor() or platform.machine()}, {os.cpu_count()} cores; commit {commit()}")
     missing = [name for name in ("d4d_stereo", "d4d_endonerf", "surgt_raw") if not (arguments.data / name).exists()]
@@ -39,14 +46,15 @@ def main() -> None:
         print(f"nothing measured: {arguments.data} lacks {', '.join(missing)}")
         return
     d4d = arguments.data / "d4d_stereo"
-    clip = _rectified(d4d / "stereo_sbs.mp4", d4d / "calibration.json", d4d / "tool_masks.zip")
-    depth = _timed("d4d_stereo", clip, arguments.repeats)
+    every, matched = arguments.every, partial(estimate_depth, device=arguments.device)
+    clip = thinned(_rectified(d4d / "stereo_sbs.mp4", d4d / "calibration.json", d4d / "tool_masks.zip"), every)
+    depth = _timed("d4d_stereo", clip, matched, arguments.repeats)
     reference = open_clip(arguments.data / "d4d_endonerf")
     assert isinstance(reference, DepthClip)
-    _print_agreement(depth, reference)
+    _print_agreement(depth, reference, every)
     surgt = arguments.data / "surgt_raw"
-    clip = _rectified(surgt / "video.mp4", surgt / "calibration.yaml", None)
-    depth = _timed("surgt_raw", clip, arguments.repeats)
+    clip = thinned(_rectified(surgt / "video.mp4", surgt / "calibration.yaml", None), every)
+    depth = _timed("surgt_raw", clip, matched, arguments.repeats)
     _print_rows(clip, depth.measurements["vertical_misalignment_px"])
 
 
@@ -56,12 +64,24 @@ def _rectified(video: Path, calibration: Path, masks: Path | None) -> RectifiedC
     return rectify(clip, load_calibration(calibration, eye_width=clip.width, eye_height=clip.height))
 
 
-def _timed(name: str, clip: RectifiedClip, repeats: int) -> DepthClip:
+def thinned(clip: RectifiedClip, every: int) -> RectifiedClip:
+    """Each so manieth frame of a clip."""
+    kept = range(0, clip.frame_count, every)
+    return replace(
+        clip,
+        frame_count=len(kept),
+        pairs=lambda: islice(clip.pairs(), None, None, every),
+        tissue=clip.tissue[::every],
+        frame_times_s=clip.frame_times_s[::every],
+    )
+
+
+def _timed(name: str, clip: RectifiedClip, matched: Callable[[RectifiedClip], DepthClip], repeats: int) -> DepthClip:
     """Estimate depth and print the fastest run's seconds a frame, decoding and rectification included."""
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter(), time.process_time()
-        depth = estimate_depth(clip)
+        depth = matched(clip)
         seconds.append((time.perf_counter() - start[0], time.process_time() - start[1]))
     size = f"{clip.intrinsics.width}x{clip.intrinsics.height}"
     wall_s, cpu_s = min(seconds)
@@ -73,11 +93,12 @@ def _timed(name: str, clip: RectifiedClip, repeats: int) -> DepthClip:
     return depth
 
 
-def _print_agreement(depth: DepthClip, reference: DepthClip) -> None:
+def _print_agreement(depth: DepthClip, reference: DepthClip, every: int) -> None:
     """|difference| to the reference in mm over tissue where both are valid, at the reference's size."""
     height, width = reference.depth_mm.shape[1:]
     differences, valid = [], []
-    for ours, theirs, tissue in zip(depth.depth_mm, reference.depth_mm, reference.tissue, strict=True):
+    others = zip(reference.depth_mm[::every], reference.tissue[::every], strict=True)
+    for ours, (theirs, tissue) in zip(depth.depth_mm, others, strict=True):
         resized = cv2.resize(ours, (width, height), interpolation=cv2.INTER_NEAREST)
         differences.append(np.abs(resized - theirs)[(resized > 0) & (theirs > 0) & tissue])
         valid.append((resized > 0)[tissue].mean())

@@ -5,6 +5,12 @@ F frames of h w pixels, D disparities.
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +19,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
+from tests.conftest import REPOSITORY
 from tests.helpers import assert_close
 from tests.worker.test_stereo import clip_of, draw_pair, errors_px, slanted
 from worker.hooks import Hooks, Progress
@@ -184,3 +191,18 @@ def test_depth_is_as_true_as_on_the_cpu() -> None:
         assert (confidence[np.arange(WIDTH) - truth < -1] == 0).mean() > 0.98  # what the right eye does not see
     assert not ours.depth_confidence[0, 42:].any()
     assert ours.measurements["min_disparity_px"] < 7 < 13 < ours.measurements["max_disparity_px"] < 26
+
+
+def test_every_kernel_compiles_for_sm_90_and_keeps_its_numbers_in_registers(tmp_path: Path) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    environment |= {"PYTHONPATH": str(REPOSITORY), "TRITON_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "tests.worker.stereo_probe"]
+    answer = subprocess.run(
+        command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert answer.returncode == 0, answer.stderr
+    found = json.loads(answer.stdout)
+    names = {"census", "column_costs", "block_costs", "add_paths", "winners", "smooth_lines"}
+    assert {each["kernel"] for each in found} == names
+    for each in found:
+        assert each["stack"] == each["local"] == 0, f"spills: {each}"

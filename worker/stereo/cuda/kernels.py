@@ -2,6 +2,7 @@
 
 Symbols: F frames of h w pixels; D disparities, low <= d < low + D, of which index i is low + i; a point at x in the
 left eye is at x - d in the right one. Volumes are [F, h, w, D], D fastest. LANES is the power of two from D up.
+All volumes together have fewer than 2^31 entries (matching.VOLUME_BYTES), so places in them are int32.
 
     C(p, i)   cost: bits in which the census words of p and its match differ, over a block (Zabih and Woodfill 1994)
     L_r(p, i) = C(p, i) + min(L_r(p - r, i), L_r(p - r, i +- 1) + P1, min L_r(p - r) + P2) - min L_r(p - r)
@@ -77,7 +78,7 @@ def column_costs(  # type: ignore[no-untyped-def]
         word = tl.load(left + at, mask=pixel < pixels, other=0) ^ tl.load(right + at + to_match, mask=there, other=0)
         by_byte += _bits_by_byte(word)
     total = (by_byte & 255) + ((by_byte >> 8) & 255) + (by_byte >> 16)
-    tl.store(costs + pixel.to(tl.int64) * count + lane, total.to(tl.uint8), mask=there)
+    tl.store(costs + pixel * count + lane, total.to(tl.uint8), mask=there)
 
 
 @triton.jit
@@ -90,9 +91,9 @@ def block_costs(  # type: ignore[no-untyped-def]
     there = (pixel < pixels) & (lane < count)
     total = tl.zeros((PIXELS, LANES), tl.int32)
     for k in tl.static_range(2 * _RADIUS + 1):
-        at = _shifted(pixel, 0, k - _RADIUS, height, width).to(tl.int64) * count + lane
+        at = _shifted(pixel, 0, k - _RADIUS, height, width) * count + lane
         total += tl.load(columns + at, mask=there, other=0).to(tl.int32)
-    tl.store(costs + pixel.to(tl.int64) * count + lane, total.to(tl.int16), mask=there)
+    tl.store(costs + pixel * count + lane, total.to(tl.int16), mask=there)
 
 
 @triton.jit
@@ -140,7 +141,7 @@ def add_paths(  # type: ignore[no-untyped-def]
     line = (tl.program_id(0) * LINES + tl.arange(0, LINES))[:, None]
     lane = tl.arange(0, LANES)[None, :]
     there = (line < lines) & (lane < count)
-    first = (tl.program_id(1).to(tl.int64) * frame_size + line * line_stride) * count + lane
+    first = (tl.program_id(1) * frame_size + line * line_stride) * count + lane
     stride = step_stride * count
     cost_at, sum_at = _follow(costs + first, sums + first, stride, length, there, lane, small, large, ADD, LANES)
     tl.debug_barrier()  # what was stored is read again, perhaps by another thread
@@ -168,7 +169,7 @@ def winners(  # type: ignore[no-untyped-def]
     lane = tl.arange(0, LANES)[None, :]
     inside = pixel < pixels
     there = inside[:, None] & (lane < count)
-    start = pixel.to(tl.int64) * count
+    start = pixel * count
     best, least = _winner(sums, start[:, None] + lane, there, lane)
     between = inside & (best > 0) & (best < count - 1)
     below = tl.load(sums + start + best - 1, mask=between, other=0).to(tl.int32) - least
@@ -178,7 +179,7 @@ def winners(  # type: ignore[no-untyped-def]
     tl.store(left + pixel, (low + best).to(tl.float32) + fraction, mask=inside)
     x = (pixel % width)[:, None]
     to_match = tl.minimum(tl.maximum(x + low + lane, 0), width - 1) - x
-    best, _ = _winner(sums, (pixel[:, None] + to_match).to(tl.int64) * count + lane, there, lane)
+    best, _ = _winner(sums, (pixel[:, None] + to_match) * count + lane, there, lane)
     tl.store(right + pixel, (low + best).to(tl.float32), mask=inside)
 
 
@@ -196,7 +197,7 @@ def smooth_lines(  # type: ignore[no-untyped-def]
     """
     line = tl.program_id(0) * LINES + tl.arange(0, LINES)
     there = line < lines
-    start = tl.program_id(1).to(tl.int64) * frame_size + line * line_stride
+    start = tl.program_id(1) * frame_size + line * line_stride
     guide_at, first_at, second_at, kept_at = guide + start, first + start, second + start, kept + start
     here = tl.load(guide_at, mask=there, other=0).to(tl.float32)
     before = tl.zeros((LINES,), tl.float32)

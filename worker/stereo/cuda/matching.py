@@ -18,6 +18,7 @@ import triton
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
+from triton import knobs
 
 from worker.stereo.cuda import kernels
 from worker.stereo.matching import (
@@ -68,7 +69,7 @@ class _Share:
     lines: int
 
 
-ON_GPU = _Share(pixels=256, costs=16, paths=1, lines=32)
+ON_GPU = _Share(pixels=256, costs=16, paths=2, lines=32)
 INTERPRETED = _Share(pixels=4096, costs=4096, paths=512, lines=512)  # it takes time by program, hardly by number
 
 
@@ -124,7 +125,7 @@ def agreed_disparities(
 
 
 def _device() -> str:
-    return "cpu" if triton.knobs.runtime.interpret else "cuda"
+    return "cpu" if knobs.runtime.interpret else "cuda"
 
 
 def _reduced(height: int, width: int, plan: MatchPlan) -> tuple[tuple[int, int], int, int]:
@@ -163,7 +164,7 @@ def _semi_global(left: Tensor, right: Tensor, low: int, count: int) -> tuple[Ten
 
 def path_sums(left: Tensor, right: Tensor, low: int, count: int) -> Tensor:
     """S int16 [F, h, w, D] of pairs uint8 [F, h, w] (kernels.py)."""
-    share = _share(left)
+    share = _share()
     frames, h, w = left.shape
     pixels, lanes = left.numel(), _lanes(count)
     words = torch.empty((2, *left.shape), dtype=torch.int32, device=left.device)
@@ -184,7 +185,7 @@ def path_sums(left: Tensor, right: Tensor, low: int, count: int) -> Tensor:
 
 def winners(sums: Tensor, low: int) -> tuple[Tensor, Tensor]:
     """Disparity float32 [F, h, w] of the left eyes' pixels and, in whole numbers, of the right eyes'."""
-    share, (w, count) = _share(sums), sums.shape[2:]
+    share, (w, count) = _share(), sums.shape[2:]
     disparity, opposite = (torch.empty(sums.shape[:3], dtype=torch.float32, device=sums.device) for _ in range(2))
     pixels = disparity.numel()
     grid = (triton.cdiv(pixels, share.costs),)
@@ -192,8 +193,8 @@ def winners(sums: Tensor, low: int) -> tuple[Tensor, Tensor]:
     return disparity, opposite
 
 
-def _share(tensor: Tensor) -> _Share:
-    return ON_GPU if tensor.is_cuda else INTERPRETED
+def _share() -> _Share:
+    return INTERPRETED if knobs.runtime.interpret else ON_GPU
 
 
 def _lanes(count: int) -> int:
@@ -222,7 +223,7 @@ def _smoothness(disparity: Tensor) -> Tensor:
 
 def filled(disparity: Tensor, trust: Tensor, guide: Tensor) -> Tensor:
     """The trusted disparities' mean along paths without edges of guide uint8 [F, h, w]; it reaches every pixel."""
-    share = _share(disparity)
+    share = _share()
     frames, h, w = disparity.shape
     weighted, weight, kept = disparity * trust, trust.clone(), torch.empty_like(trust)
     strength = SMOOTHNESS
