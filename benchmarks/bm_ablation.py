@@ -20,12 +20,13 @@ from bm_train import append, commit, machine
 
 from worker.clip import DepthClip, open_clip, split_frames
 from worker.hooks import Hooks
+from worker.looking import held_out_psnr, sample_frames, view_function
 from worker.metrics import psnr_tissue
 from worker.optimize import Rate
 from worker.phantom import PhantomSettings, make_phantom
-from worker.pipeline import ReconstructionRequest, held_out_psnr, prepare, view_function
+from worker.prepare import prepare
 from worker.presets import PRESETS, Preset
-from worker.quality import sample_frames
+from worker.request import ReconstructionRequest
 from worker.train import Stopwatch, train
 
 FIELDS = (

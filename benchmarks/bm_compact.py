@@ -20,8 +20,11 @@ from worker.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
 from worker.clip import DepthClip, open_clip, split_frames
 from worker.evaluate.rows import commit, machine
 from worker.hooks import Hooks
-from worker.pipeline import ReconstructionRequest, held_out_psnr, prepare, scene_of, view_function
+from worker.looking import held_out_psnr, view_function
+from worker.pipeline import scene_of
+from worker.prepare import prepare
 from worker.presets import PRESETS
+from worker.request import ReconstructionRequest
 from worker.shrink import model_of, shrink
 from worker.train import Stopwatch, train
 

@@ -28,9 +28,11 @@ from worker.clip import DepthClip, split_frames
 from worker.hooks import Hooks
 from worker.pace import Pace
 from worker.phantom import PhantomSettings, make_phantom
-from worker.pipeline import ReconstructionRequest, prepare, snapshot_of
+from worker.pipeline import snapshot_of
+from worker.prepare import prepare
 from worker.presets import PRESETS
 from worker.raster.cpu import compile_kernels
+from worker.request import ReconstructionRequest
 from worker.serve import NotYetError
 from worker.snapshot import Snapshots
 from worker.train import Stopwatch, train

@@ -187,7 +187,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
     from worker.checkpoint import RESUME_FILE
     from worker.hooks import Hooks
     from worker.orders import job_progress
-    from worker.pipeline import ReconstructionRequest, reconstruct
+    from worker.pipeline import reconstruct
+    from worker.request import ReconstructionRequest
 
     out: Path = options.out
     if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= {RESUME_FILE}):

@@ -34,8 +34,9 @@ from worker.orders import (
     job_progress,
 )
 from worker.pace import Pace
-from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.pipeline import reconstruct
 from worker.raster.cpu import compile_kernels
+from worker.request import ReconstructionRequest
 from worker.serve import RequestServer
 from worker.snapshot import Snapshots
 from worker.views import Views

@@ -4,79 +4,42 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TypeVar
 
-import numpy as np
 import torch
 
-from contract.errors import Cancelled, InputError
-from contract.names import CURVE, REPORT, Layout, MaskPolarity, PoseConvention
+from contract.errors import Cancelled
+from contract.names import CURVE, REPORT
 from contract.report import Report
 from worker.backend import CPU, Device, choose_device, device_for
 from worker.baselines import copy_baselines
 from worker.calibration import rectify
 from worker.checkpoint import RESUME_FILE, Scene, save_scene
-from worker.clip import ClipLimits, DepthClip, FrameSplit, held_out_frames, split_frames
+from worker.clip import DepthClip, FrameSplit, held_out_frames, split_frames
 from worker.compact import compile_coder
 from worker.decode import decode_clip
-from worker.densify import Densifier
-from worker.fusion import fuse
 from worker.hooks import Hooks, Progress
-from worker.metrics import psnr_tissue
-from worker.model import Model
-from worker.motion import track
+from worker.looking import View, held_out_psnr, sample_frames, view_function
+from worker.prepare import Seconds, fixed_iterations, prepare, report_stage, timed
 from worker.presets import Preset, preset_named
-from worker.quality import Training, View, build_report, measure, sample_frames
+from worker.quality import Training, build_report, measure
 from worker.raster.cpu import compile_kernels
 from worker.render import model_of
+from worker.request import ReconstructionRequest, check_options
 from worker.resume import resume, save_run
-from worker.schedule import Schedule, left_out
 from worker.shrink import Shrunk, shrink
-from worker.start import fusion_for, settled, start_model
 from worker.stereo import estimate_depth
-from worker.targets import TrainingFrames, solid_depth_mm, units_per_mm
-from worker.train import Run, Stopwatch, iterations_within, train, warm_up, write_curve
+from worker.train import Run, Stopwatch, train, write_curve
 from worker.visibility import drop_strays, seen_share
 
-_Result = TypeVar("_Result")
-Seconds = dict[str, float]  # by stage; each stage that is timed adds its own
 VERSIONED = ("intrasplat", "torch", "numba")
 """What decides a scene's numbers; the report names their versions."""
-
-
-@dataclass(frozen=True)
-class ReconstructionRequest:
-    """What to reconstruct and how; the fields are those of `intrasplat reconstruct --help`.
-
-    preset is a name, or a preset of the caller's own. budget_s and iterations exclude each other; without either the
-    preset decides. accepted_at_s is the Unix time at which the clip was accepted, for t_post_s; None means now.
-    limits are what this machine accepts; None means what its memory allows. clip is a path, or a clip with depth that
-    is in memory already and is neither decoded nor matched.
-    """
-
-    clip: Path | DepthClip
-    right: Path | None = None
-    layout: Layout = "auto"
-    calibration: Path | None = None
-    masks: Path | None = None
-    mask_polarity: MaskPolarity = "auto"
-    pose_convention: PoseConvention = "opengl"
-    holdout: str = "every8"
-    preset: str | Preset = "fast"
-    budget_s: float | None = None
-    iterations: int | None = None
-    device: str = "auto"
-    seed: int = 0
-    accepted_at_s: float | None = None
-    limits: ClipLimits | None = None
 
 
 def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> Report:
@@ -120,39 +83,6 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
     return report
 
 
-def check_options(request: ReconstructionRequest) -> None:
-    """Refuse a length or seed that cannot be meant; InputError names it."""
-    budget_s, iterations = request.budget_s, request.iterations
-    if budget_s is not None and iterations is not None:
-        problem = f"{budget_s:g} s came together with {iterations} iterations."
-        raise InputError("options.budget_s", problem, "Give one of them.")
-    if budget_s is not None and not (math.isfinite(budget_s) and budget_s > 0):
-        raise InputError("options.budget_s", f"{budget_s:g} s is no time to train in.", "Give seconds above 0.")
-    if iterations is not None and iterations < 1:
-        raise InputError("options.iterations", f"{iterations} is less than one step.", "Give 1 or more.")
-    if request.seed < 0:
-        raise InputError("options.seed", f"{request.seed} is negative.", "Give 0 or more.")
-
-
-def timed(seconds: Seconds, name: str, work: Callable[[], _Result]) -> _Result:
-    """work(), its duration stored under name."""
-    start = time.perf_counter()
-    result = work()
-    seconds[name] = time.perf_counter() - start
-    return result
-
-
-def report_stage(hooks: Hooks, stage: str, share: float) -> None:
-    """Say how far a stage has come.
-
-    Raises:
-        Cancelled: the caller wants to stop.
-    """
-    hooks.on_progress(Progress(stage, share))
-    if hooks.should_stop():
-        raise Cancelled(f"Stopped during stage {stage!r}.")
-
-
 def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: Seconds, device: Device = CPU) -> DepthClip:
     """Decode, and for stereo input rectify and match: the left frames with depth."""
     if isinstance(request.clip, DepthClip):
@@ -184,63 +114,6 @@ def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: Seconds
     return timed(seconds, "stereo_s", matched)
 
 
-def prepare(
-    clip: DepthClip,
-    split: FrameSplit,
-    preset: Preset,
-    request: ReconstructionRequest,
-    clock: Stopwatch,
-    hooks: Hooks | None = None,
-    seconds: Seconds | None = None,
-    device: Device = CPU,
-) -> tuple[Run, float]:
-    """Fuse points, start the model, and settle how many iterations are made; seconds by stage go into `seconds`."""
-    hooks, seconds = hooks or Hooks(), {} if seconds is None else seconds
-    scale = units_per_mm(clip, split.train)
-    tracks = None
-    if preset.tracks and len(split.train) > 1:
-        tracks = timed(
-            seconds, "motion_s", lambda: track(clip, split.train, lambda share: report_stage(hooks, "motion", share))
-        )
-    report_stage(hooks, "fusion", 0.0)
-    preset, chosen = timed(seconds, "capacity_s", lambda: settled(preset, tracks, clip, split.train))
-    fusion = fusion_for(preset, clip.intrinsics)
-    cloud = timed(seconds, "fusion_s", lambda: fuse(clip, split.train, fusion, seed=request.seed))
-    report_stage(hooks, "start", 0.0)
-    model = timed(
-        seconds, "start_s", lambda: start_model(cloud, tracks, clip, split.train, preset, scale, request.seed, device)
-    )
-    frames = timed(seconds, "targets_s", lambda: TrainingFrames(clip, split.train, scale))
-    densifier = Densifier(preset.densify, model.count) if preset.densify else None
-    if device != CPU:  # kernels of a GPU are compiled for the model; what that takes is no part of training
-        compiled_s = clock.pause(lambda: warm_up(model, frames, preset, partial(report_stage, hooks, "compile")))
-        seconds["compile_s"] = seconds.get("compile_s", 0.0) + compiled_s
-    schedule, asked = schedule_of(model, frames, preset, request, clock, hooks)
-    run = Run(model, frames, preset, schedule, request.seed, asked, densifier=densifier, device=device, chosen=chosen)
-    return run, scale
-
-
-def fixed_iterations(request: ReconstructionRequest, preset: Preset) -> int | None:
-    """The iterations that were asked for, or else are the preset's own; None where seconds say how long a run is."""
-    return request.iterations or (None if request.budget_s else preset.iterations)
-
-
-def schedule_of(
-    model: Model, frames: TrainingFrames, preset: Preset, request: ReconstructionRequest, clock: Stopwatch, hooks: Hooks
-) -> tuple[Schedule, str]:
-    """How many iterations are made and how rates fall in them; and, in words, the length that was asked for."""
-    count = len(frames.indices)
-    fixed = fixed_iterations(request, preset)
-    if fixed is not None:
-        return Schedule(fixed, preset.cycles, frames=count), f"{fixed} iterations"
-    budget_s = request.budget_s or preset.budget_s
-    assert budget_s is not None
-    report_stage(hooks, "calibrate", 0.0)
-    planned = iterations_within(model, frames, preset, request.seed, budget_s, clock.elapsed_s)
-    worth_db = preset.worth_db if left_out(frames.indices) else None
-    return Schedule(planned, preset.cycles, worth_db, count), f"{budget_s} s"
-
-
 def optimise(run: Run, clip: DepthClip, split: FrameSplit, clock: Stopwatch, hooks: Hooks, seconds: Seconds) -> None:
     """Train run to its last iteration, scoring held-out frames and showing snapshots on the way."""
     started_s, scale = clock.elapsed_s, run.frames.scale
@@ -263,16 +136,6 @@ def finish(run: Run, clip: DepthClip, split: FrameSplit, hooks: Hooks, seconds: 
     return (shrunk.scene if shrunk else scene), shrunk
 
 
-def view_function(run: Run, scale: float, model: Model | None = None) -> Callable[[int], View]:
-    """Renders frame i from the endoscope's pose, in mm, of this model instead of the run's own if there is one."""
-
-    def view_of(index: int) -> View:
-        image = (model or run.model).render(run.frames.cameras[index], float(run.frames.t[index])).copy()
-        return View(image[:3].transpose(1, 2, 0), solid_depth_mm(image[3], image[4], scale), image[4])
-
-    return view_of
-
-
 def reporting(run: Run, view_of: Callable[[int], View], split: FrameSplit, hooks: Hooks) -> Callable[[int], View]:
     """view_of that reports the scoring of frames as it goes."""
     total, done = len(split.held_out) + len(sample_frames(split.train)), 0
@@ -287,20 +150,6 @@ def reporting(run: Run, view_of: Callable[[int], View], split: FrameSplit, hooks
         return view_of(index)
 
     return reported
-
-
-def held_out_psnr(
-    clip: DepthClip, split: FrameSplit, view_of: Callable[[int], View], hooks: Hooks | None = None
-) -> float:
-    """Mean psnr_tissue over at most sixteen held-out frames, evenly spread; NaN without any."""
-    scores = []
-    for index in sample_frames(split.held_out, 16):
-        view = view_of(index)
-        if hooks is not None:
-            hooks.on_held_out(index, view)
-        if clip.tissue[index].any():  # else it has no score
-            scores.append(psnr_tissue(view.rgb, clip.rgb[index], clip.tissue[index]))
-    return float(np.mean(scores)) if scores else math.nan
 
 
 def scene_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: int) -> Scene:

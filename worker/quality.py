@@ -21,10 +21,9 @@ from worker.clip import FrameSplit
 from worker.clip.types import DepthClip
 from worker.doubts import course_doubts, picture_doubts
 from worker.fusion import CLEAR_CONFIDENCE
+from worker.looking import View, sample_frames
 from worker.metrics import coverage, depth_agreement_mm, depth_errors_mm, psnr_paper, psnr_tissue, ssim
 
-SAMPLED_FRAMES = 8
-"""Training frames that are looked at, spread over the clip: enough to compare, cheap to render."""
 LEAST_COVERAGE = 0.98
 LEAST_TRAIN_DB = 25.0
 """A model that does not even reproduce its own frames this well has not learnt them; good ones reach 30 to 38."""
@@ -44,18 +43,6 @@ LARGEST_SMOOTH_SHARE = 0.4
 LEAST_TISSUE_SHARE = 0.3
 LARGEST_BRIGHTNESS_DRIFT = 0.25
 """Range of the median brightness over its mean; beyond it, changing light and moving tissue are hard to tell apart."""
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A frame as the model renders it from the endoscope's own pose.
-
-    rgb [H, W, 3] float32, unclamped; depth_mm [H, W] float32, 0 where alpha < 0.5; alpha [H, W] float32
-    """
-
-    rgb: NDArray[np.float32]
-    depth_mm: NDArray[np.float32]
-    alpha: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -94,13 +81,6 @@ class Training:
 
 
 _MERGED_FIELDS = ("assumptions", "warnings", "measurements")  # the clip has them, too; the report holds both
-
-
-def sample_frames(frames: Sequence[int], count: int = SAMPLED_FRAMES) -> list[int]:
-    """At most `count` of the frames, evenly spread, first and last among them."""
-    if len(frames) <= count:
-        return list(frames)
-    return [frames[index] for index in np.linspace(0, len(frames) - 1, count).round().astype(int)]
 
 
 def measure(clip: DepthClip, frames: Sequence[int], view_of: Callable[[int], View]) -> Scores:

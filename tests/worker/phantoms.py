@@ -9,10 +9,12 @@ import numpy as np
 
 from worker.clip import DepthClip, FrameSplit, split_frames
 from worker.hooks import Hooks
+from worker.looking import View, view_function
 from worker.phantom import Motion, PhantomSettings, make_phantom
-from worker.pipeline import ReconstructionRequest, prepare, scene_of, view_function
+from worker.pipeline import scene_of
+from worker.prepare import prepare
 from worker.presets import PRESETS, Preset
-from worker.quality import View
+from worker.request import ReconstructionRequest
 from worker.train import Run, Stopwatch, train
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 12

@@ -17,10 +17,12 @@ from tests.helpers import assert_close
 from tests.worker.clips import plane_clip
 from worker.backend import CPU, Device
 from worker.clip import DepthClip, FrameSplit, split_frames
-from worker.pipeline import ReconstructionRequest, prepare, scene_of
+from worker.pipeline import scene_of
+from worker.prepare import prepare
 from worker.presets import PRESETS
 from worker.raster.cuda.model import CudaModel
 from worker.render import render_frame
+from worker.request import ReconstructionRequest
 from worker.resume import load_run, save_run
 from worker.train import Run, Stopwatch, step
 

@@ -15,8 +15,10 @@ from worker.clip import DepthClip, FrameSplit, split_frames
 from worker.hooks import Hooks
 from worker.metrics import psnr_tissue
 from worker.model import Model
-from worker.pipeline import ReconstructionRequest, prepare, snapshot_of
+from worker.pipeline import snapshot_of
+from worker.prepare import prepare
 from worker.presets import PRESETS
+from worker.request import ReconstructionRequest
 from worker.resume import load_run, save_run
 from worker.schedule import AVERAGED, Schedule, left_out
 from worker.targets import TrainingFrames

@@ -26,7 +26,7 @@ from worker.device import request_of, run_or_start_anew
 from worker.faults import describe
 from worker.hooks import Hooks
 from worker.orders import Advanced, Failed, Finished, Run, Stop, Stopped
-from worker.pipeline import ReconstructionRequest
+from worker.request import ReconstructionRequest
 
 SPOOL = Path("spool")
 CHOSEN = {

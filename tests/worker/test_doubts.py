@@ -13,8 +13,8 @@ from tests.worker.phantoms import phantom_clip
 from worker.clip import DepthClip, open_clip, split_frames
 from worker.doubts import course_doubts, picture_doubts
 from worker.evaluate.conditions import CONDITIONS, CleanClip, clean_clip
+from worker.looking import sample_frames
 from worker.phantom import MOTIONS, Motion, PhantomSettings
-from worker.quality import sample_frames
 
 DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 

@@ -11,7 +11,8 @@ import pytest
 from worker.clip import DepthClip, held_out_frames
 from worker.hooks import Hooks
 from worker.phantom import PhantomSettings, make_phantom, write_stereomis
-from worker.pipeline import ReconstructionRequest, depth_clip_of
+from worker.pipeline import depth_clip_of
+from worker.request import ReconstructionRequest
 
 FRAMES = 12
 

@@ -11,7 +11,8 @@ from worker.hooks import Hooks, Progress
 from worker.liveness import LONGEST_LOOK_S, OTHER_LIMIT_S, STAGE_LIMITS_S, Watch
 from worker.orders import job_progress
 from worker.phantom import PhantomSettings, make_phantom, write_stereo_video
-from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.pipeline import reconstruct
+from worker.request import ReconstructionRequest
 
 
 class Clock:

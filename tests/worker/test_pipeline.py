@@ -22,10 +22,11 @@ from worker.hooks import Hooks, Progress
 from worker.metrics import coverage, psnr_tissue
 from worker.optimize import Rate
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
-from worker.pipeline import ReconstructionRequest, reconstruct, scene_of
+from worker.pipeline import reconstruct, scene_of
 from worker.presets import PRESETS
 from worker.raster.step import camera_vector
 from worker.render import render_frame
+from worker.request import ReconstructionRequest
 from worker.shrink import TOLERANCE_DB, model_of, shrink
 from worker.targets import camera_in_units
 

@@ -16,17 +16,9 @@ from tests.worker.clips import plane_clip
 from worker.baselines import CopyBaselines, copy_baselines
 from worker.clip import FrameSplit, split_frames
 from worker.clip.types import DepthClip
+from worker.looking import View, sample_frames
 from worker.metrics import psnr_tissue
-from worker.quality import (
-    Scores,
-    Training,
-    View,
-    build_report,
-    clip_warnings,
-    measure,
-    sample_frames,
-    score_warnings,
-)
+from worker.quality import Scores, Training, build_report, clip_warnings, measure, score_warnings
 
 TRAINING = Training(
     preset="fast",

@@ -17,8 +17,9 @@ from tests.worker.scenes import random_scene
 from worker.checkpoint import SCENE_FILE, Scene
 from worker.hooks import Hooks, Progress
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf
-from worker.pipeline import ReconstructionRequest, reconstruct, snapshot_of
+from worker.pipeline import reconstruct, snapshot_of
 from worker.render import render_frame
+from worker.request import ReconstructionRequest
 from worker.serve import NotYetError
 from worker.snapshot import Snapshots
 from worker.train import Run, Stopwatch, train

@@ -26,7 +26,8 @@ from tests.worker.jobs import STANDIN, WAIT_S, Jobs, eventually
 from worker.checkpoint import load_resume, load_scene
 from worker.hooks import Hooks
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf
-from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.pipeline import reconstruct
+from worker.request import ReconstructionRequest
 from worker.supervisor import run_supervisor
 
 LEASE_S = 6.0

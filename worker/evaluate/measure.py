@@ -31,12 +31,13 @@ from worker.evaluate.rows import KEY, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
 from worker.evaluate.truth import ShownScene, Truth
 from worker.hooks import Hooks
+from worker.looking import View
 from worker.metrics import depth_agreement_mm, depth_errors_mm, psnr_tissue, ssim
-from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.pipeline import reconstruct
 from worker.presets import PRESETS
-from worker.quality import View
 from worker.raster.step import camera_vector
 from worker.render import model_of
+from worker.request import ReconstructionRequest
 from worker.targets import camera_in_units
 
 UNTIMED_RENDERS, TIMED_RENDERS = 5, 40

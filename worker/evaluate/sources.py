@@ -19,7 +19,8 @@ from worker.backend import CPU, Device
 from worker.clip import DepthClip
 from worker.hooks import Hooks
 from worker.phantom import MOTIONS, Phantom, PhantomSettings, make_phantom
-from worker.pipeline import ReconstructionRequest, depth_clip_of
+from worker.pipeline import depth_clip_of
+from worker.request import ReconstructionRequest
 
 DATA_VARIABLE = "INTRASPLAT_DATA"
 PHANTOM_WIDTH, PHANTOM_HEIGHT = 320, 256

@@ -43,9 +43,10 @@ from worker.evaluate.rows import Row, commit, machine, read_rows, write_rows
 from worker.hooks import Hooks
 from worker.metrics import psnr_tissue
 from worker.phantom import PhantomSettings
-from worker.pipeline import ReconstructionRequest, reconstruct
+from worker.pipeline import reconstruct
 from worker.raster.step import camera_vector
 from worker.render import model_of
+from worker.request import ReconstructionRequest
 from worker.targets import camera_in_units, solid_depth_mm
 
 STABILITY = "stability.csv"

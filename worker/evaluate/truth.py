@@ -34,9 +34,9 @@ from numpy.typing import NDArray
 from contract.pose import OrbitPose, world_from_camera
 from worker.checkpoint import Scene
 from worker.clip import DepthClip
+from worker.looking import View, sample_frames
 from worker.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
 from worker.phantom import Phantom
-from worker.quality import View, sample_frames
 from worker.raster.step import camera_vector
 from worker.render import model_of
 from worker.targets import camera_in_units, solid_depth_mm

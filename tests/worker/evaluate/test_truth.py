@@ -15,9 +15,9 @@ from worker.clip import DepthClip
 from worker.deformation import SharedBasis
 from worker.evaluate.truth import MOVING_MM, ShownScene, Truth
 from worker.gaussians import initial_gaussians
+from worker.looking import View
 from worker.metrics import BEST_PSNR_DB
 from worker.phantom import Phantom, PhantomSettings, make_phantom
-from worker.quality import View
 from worker.targets import MEDIAN_DEPTH_UNITS
 
 FRAMES = 12

@@ -1,0 +1,66 @@
+"""How a run's frames look from the endoscope's own pose, and how held-out ones score on the way.
+
+Symbols: H W pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.clip import DepthClip, FrameSplit
+from worker.hooks import Hooks
+from worker.metrics import psnr_tissue
+from worker.model import Model
+from worker.targets import solid_depth_mm
+from worker.train import Run
+
+SAMPLED_FRAMES = 8
+"""Training frames that are looked at, spread over the clip: enough to compare, cheap to render."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame as the model renders it from the endoscope's own pose.
+
+    rgb [H, W, 3] float32, unclamped; depth_mm [H, W] float32, 0 where alpha < 0.5; alpha [H, W] float32
+    """
+
+    rgb: NDArray[np.float32]
+    depth_mm: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+
+
+def sample_frames(frames: Sequence[int], count: int = SAMPLED_FRAMES) -> list[int]:
+    """At most `count` of the frames, evenly spread, first and last among them."""
+    if len(frames) <= count:
+        return list(frames)
+    return [frames[index] for index in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+
+
+def view_function(run: Run, scale: float, model: Model | None = None) -> Callable[[int], View]:
+    """Renders frame i from the endoscope's pose, in mm, of this model instead of the run's own if there is one."""
+
+    def view_of(index: int) -> View:
+        image = (model or run.model).render(run.frames.cameras[index], float(run.frames.t[index])).copy()
+        return View(image[:3].transpose(1, 2, 0), solid_depth_mm(image[3], image[4], scale), image[4])
+
+    return view_of
+
+
+def held_out_psnr(
+    clip: DepthClip, split: FrameSplit, view_of: Callable[[int], View], hooks: Hooks | None = None
+) -> float:
+    """Mean psnr_tissue over at most sixteen held-out frames, evenly spread; NaN without any."""
+    scores = []
+    for index in sample_frames(split.held_out, 16):
+        view = view_of(index)
+        if hooks is not None:
+            hooks.on_held_out(index, view)
+        if clip.tissue[index].any():  # else it has no score
+            scores.append(psnr_tissue(view.rgb, clip.rgb[index], clip.tissue[index]))
+    return float(np.mean(scores)) if scores else math.nan
