@@ -16,6 +16,7 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
 from tests.helpers import assert_close
+from tests.worker.raster import replays
 from tests.worker.raster.scenes import random_scene
 from worker.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis
 from worker.gaussians import Gaussians
@@ -247,8 +248,27 @@ def test_a_step_on_several_frames_is_a_step_on_the_sum_of_their_losses(device: s
         two.step(frame, LOSS, RATES, 2)
 
 
-@pytest.mark.parametrize("kind", ["shared with colour", "fdm-gaussian"])
-def test_gaussians_taken_train_on_as_on_the_cpu(kind: str, device: str) -> None:
+def test_what_is_replayed_ends_as_what_is_launched(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = replays.emulate(monkeypatch) if device == "cpu" else None
+    cpu = FusedModel(gaussians(1), deformation("shared with colour"), WIDTH, HEIGHT)
+    cuda = model(device, sh_degree=1)
+    cuda._store.row(frames(1)[0])  # else the first step makes room, and the second is the first with these addresses
+    columns = np.r_[np.arange(COUNT)[::-1], 5, 7, 7]
+    for trained in (cpu, cuda):
+        train(trained, frames(4), sh_degree=1)
+        trained.render(CAMERA, 0.6)
+        trained.take(columns, np.arange(len(columns)) >= COUNT)
+        train(trained, frames(3), sh_degree=1, first=5)
+        trained.render(CAMERA, 0.6)
+    wanted = cpu.arrays()
+    for name, each in stored(cuda).items():
+        assert_close(each, wanted[name], relative=1e-4, absolute=1e-9, name=name)
+    if graph is not None:
+        assert (graph.made, graph.replayed) == (2, 4)
+
+
+def test_gaussians_taken_train_on_as_on_the_cpu(device: str) -> None:
+    kind = "fdm-gaussian"
     models = (FusedModel(gaussians(), deformation(kind), WIDTH, HEIGHT), model(device, kind))
     columns = np.r_[np.arange(COUNT)[::-1], 5, 7, 7]
     for trained in models:

@@ -11,6 +11,11 @@ _one_capture = Lock()
 """Torch captures on one stream for the whole process, and scenes are rendered while another is trained."""
 
 
+def can_capture(device: torch.device) -> bool:
+    """Whether there are CUDA graphs there."""
+    return device.type == "cuda"
+
+
 class Captured:
     """Routines that only launch, by a key: run as they are at first, captured at the second run, replayed from then on.
 
@@ -28,7 +33,7 @@ class Captured:
         """Launch a routine without waiting for it."""
         if key in self._graphs:
             self._graphs[key].replay()
-        elif self._device.type == "cuda" and key in self._was_run:
+        elif key in self._was_run and can_capture(self._device):
             self._graphs[key] = _capture(routine)
             self._graphs[key].replay()
         else:
