@@ -170,6 +170,13 @@ def test_a_pair_is_matched_the_same_alone_and_among_others(rng: np.random.Genera
         assert torch.equal(both[1], one[0])
 
 
+def test_large_frames_go_through_by_few_and_small_ones_by_many() -> None:
+    plan = MatchPlan(15.0, 48.0)
+    assert 1 <= cuda.frames_at_once(2160, 4096, plan) <= 8
+    assert cuda.frames_at_once(512, 640, plan) > 32
+    assert cuda.frames_at_once(512, 640, MatchPlan(0.0, 600.0)) < 32
+
+
 def test_depth_is_as_true_as_on_the_cpu() -> None:
     jump = np.full((HEIGHT, WIDTH), 7.0, np.float32)
     jump[12:34, 36:66] = 12.0

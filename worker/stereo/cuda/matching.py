@@ -55,6 +55,8 @@ LEAST_WEIGHT = 1e-8
 LEAST_LANES = 32
 VOLUME_BYTES = 1 << 30
 """Of the cost volumes at a time: some seventy frames, whose lines are enough for a large GPU."""
+PIXELS_AT_ONCE = 1 << 25
+"""Of full resolution, for the same reason: refining keeps about a dozen float32 of each."""
 BYTES_A_COST = 5
 """int16 for the cost and the sum, and the uint8 of the sums over columns."""
 
@@ -76,7 +78,7 @@ INTERPRETED = _Share(pixels=4096, costs=4096, paths=512, lines=512)  # it takes 
 def frames_at_once(height: int, width: int, plan: MatchPlan) -> int:
     """How many pairs of H x W pixels go through match_frames together."""
     (h, w), _, count = _reduced(height, width, plan)
-    return max(1, VOLUME_BYTES // (BYTES_A_COST * h * w * count))
+    return max(1, min(VOLUME_BYTES // (BYTES_A_COST * h * w * count), PIXELS_AT_ONCE // (height * width)))
 
 
 def depth_of(
