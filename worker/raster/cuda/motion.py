@@ -89,6 +89,10 @@ class Motion(Protocol):
         """The first count Gaussians' deformation as tensors on the CPU (copies)."""
 
 
+TIMES_KEPT = 4096
+"""Times whose bases are remembered: more than frames of a clip, and a bound for a scene that is watched for days."""
+
+
 def kept_where_old(moments: Tensor, columns: Tensor, fresh: Tensor) -> Tensor:
     """These columns of Adam's moments, 0 where fresh."""
     return moments.index_select(-1, columns).masked_fill_(fresh, 0.0)
@@ -96,6 +100,32 @@ def kept_where_old(moments: Tensor, columns: Tensor, fresh: Tensor) -> Tensor:
 
 def _grid(columns: int, *frames: int) -> tuple[int, ...]:
     return (columns // COLUMNS, *frames)
+
+
+class Moments:
+    """Adam's two moments of a motion's weights, [2, ...]: memory that a scene which is only rendered does without."""
+
+    def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
+        self._shape, self._device = shape, device
+        self._tensor: Tensor | None = None
+
+    @property
+    def both(self) -> tuple[Tensor, Tensor]:
+        """The first and the second; zeros at first."""
+        if self._tensor is None:
+            self._tensor = torch.zeros(2, *self._shape, device=self._device)
+        return self._tensor[0], self._tensor[1]
+
+    def arrays(self, count: int) -> dict[str, Tensor]:
+        """Of the first count Gaussians, by name; views."""
+        first, second = self.both
+        return {"motion.first": first[..., :count], "motion.second": second[..., :count]}
+
+    def take(self, columns: Tensor, fresh: Tensor) -> None:
+        """Keep these columns, 0 where fresh."""
+        self._shape = (*self._shape[:-1], len(columns))
+        if self._tensor is not None:
+            self._tensor = kept_where_old(self._tensor, columns, fresh)
 
 
 class LinearMotion:
@@ -109,7 +139,7 @@ class LinearMotion:
         self._form = dataclasses.replace(deformation, weight=deformation.weight[:0])  # for its bases, not its weights
         self.weight = torch.zeros(self._bases, self._channels, columns, device=device)
         self.weight[:, :, :count] = deformation.weight.permute(2, 1, 0).to(device)
-        self.first, self.second = torch.zeros_like(self.weight), torch.zeros_like(self.weight)
+        self._moments = Moments(tuple(self.weight.shape), device)
         self.steps = torch.zeros(self._bases, dtype=torch.int64)
         self._counts = self.steps.numpy()  # the same memory
         self._found: dict[float, tuple[np.ndarray, int, int]] = {}
@@ -117,6 +147,8 @@ class LinearMotion:
     def _alive(self, t: float) -> tuple[np.ndarray, int, int]:
         """The bases' values at t, and the first of those in use and the one after the last; 0 outside of them."""
         if t not in self._found:
+            if len(self._found) == TIMES_KEPT:
+                self._found.clear()
             values = self._form.basis(t).numpy()
             alive = np.flatnonzero(np.abs(values) >= NEGLIGIBLE)
             first, last = (int(alive[0]), int(alive[-1]) + 1) if alive.size else (0, 0)
@@ -161,20 +193,20 @@ class LinearMotion:
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
         tensors = trained.tensors()
         kernels.update_linear[_grid(trained.columns)](
-            *tensors[:2], self.weight, self.first, self.second, *tensors[2:], *(control[name] for name in ADAM),
+            *tensors[:2], self.weight, *self._moments.both, *tensors[2:], *(control[name] for name in ADAM),
             *(control[name] for name in ("basis", "alive", "basis_size", "basis_floor", "channel_rate")),
             trained.columns, self._bases, trained.tiles, CHANNELS=self._channels, FRAMES=trained.frames,
         )  # fmt: skip
 
     def take(self, columns: Tensor, fresh: Tensor) -> None:
         self.weight = self.weight.index_select(-1, columns)
-        self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
+        self._moments.take(columns, fresh)
 
     def parameters(self, count: int) -> dict[str, Tensor]:
-        return _views(self, ("weight",), count)
+        return {"motion.weight": self.weight[..., :count]}
 
     def arrays(self, count: int) -> dict[str, Tensor]:
-        return _views(self, ("weight", "first", "second"), count) | {"motion.steps": self.steps}
+        return self.parameters(count) | self._moments.arrays(count) | {"motion.steps": self.steps}
 
     def export(self, count: int) -> LinearDeformation:
         weight = _host_copy(self.weight[:, :, :count].permute(2, 1, 0))
@@ -190,8 +222,7 @@ class FdmMotion:
             _columns_last(tensor, columns, fill, device)
             for tensor, fill in ((deformation.weight, 0.0), (deformation.centre, 0.5), (deformation.width, 1.0))
         )
-        self.first = torch.zeros(3, *self.weight.shape, device=device)
-        self.second = torch.zeros_like(self.first)
+        self._moments = Moments((3, *self.weight.shape), device)
 
     def fields(self, frames: int) -> dict[str, Field]:
         return {"time": Field((frames,)), "motion_size": Field((1,))}
@@ -212,7 +243,7 @@ class FdmMotion:
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
         tensors = trained.tensors()
         kernels.update_fdm[_grid(trained.columns)](
-            *tensors[:2], self.weight, self.centre, self.width, self.first, self.second, *tensors[2:],
+            *tensors[:2], self.weight, self.centre, self.width, *self._moments.both, *tensors[2:],
             *(control[name] for name in ADAM), control["time"], control["motion_size"],
             trained.columns, self.weight.shape[1], trained.tiles,
             QUARTIC=self._form == "quartic", FRAMES=trained.frames,
@@ -221,24 +252,19 @@ class FdmMotion:
     def take(self, columns: Tensor, fresh: Tensor) -> None:
         for name in ("weight", "centre", "width"):
             setattr(self, name, getattr(self, name).index_select(-1, columns))
-        self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
+        self._moments.take(columns, fresh)
 
     def parameters(self, count: int) -> dict[str, Tensor]:
-        return _views(self, ("weight", "centre", "width"), count)
+        return {f"motion.{name}": getattr(self, name)[..., :count] for name in ("weight", "centre", "width")}
 
     def arrays(self, count: int) -> dict[str, Tensor]:
-        return _views(self, ("weight", "centre", "width", "first", "second"), count)
+        return self.parameters(count) | self._moments.arrays(count)
 
     def export(self, count: int) -> FlexibleDeformation:
         weight, centre, width = (
             _host_copy(each[..., :count].permute(2, 0, 1)) for each in (self.weight, self.centre, self.width)
         )
         return FlexibleDeformation(weight, centre, width, form=self._form)
-
-
-def _views(motion: LinearMotion | FdmMotion, names: Sequence[str], count: int) -> dict[str, Tensor]:
-    """Tensors of a motion by name, the columns that only fill the rows left out."""
-    return {f"motion.{name}": getattr(motion, name)[..., :count] for name in names}
 
 
 def _host_copy(tensor: Tensor) -> Tensor:
