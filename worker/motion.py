@@ -102,7 +102,7 @@ def track(
     threads = cores() if threads is None else threads
     length = -(-len(train) // CHAINS)
     chains = [range(max(first, 1), min(first + length, len(train))) for first in range(0, len(train), length)]
-    with one_opencv_thread(), ThreadPoolExecutor(CHAINS) as pool, _Helpers(threads - CHAINS) as helped:
+    with one_opencv_thread(), ThreadPoolExecutor(min(CHAINS, threads)) as pool, _Helpers(threads - CHAINS) as helped:
         list(pool.map(follow, chains))
     return Tracks(displacement, colour, confidence, step)
 
