@@ -3,18 +3,18 @@
 Symbols: K splats of a chunk (axis 0), P pixels of a tile (axis 1); for one pixel and its splats i, nearest first,
     alpha_i = min(MAX_ALPHA, 2**power2_i), 0 below MIN_ALPHA or once T < MIN_TRANSMITTANCE
     T_i     = product over j < i of (1 - alpha_j);  w_i = alpha_i T_i
-    odds_i  = alpha_i / (1 - alpha_i), so that w_i = odds_i T_(i+1): an inclusive product is all that is needed
     s_i     = g_C . c_i + g_Z z_i + g_A, with g the loss gradient at this pixel
-    R_i     = sum over j > i of w_j s_j, what the pixel's gradient holds behind splat i
-    dL/dpower_i = w_i (s_i - R_i / T_(i+1)) = odds_i (T_(i+1) s_i - R_i), 0 where alpha was capped
-R is summed from the back, so it holds no difference of large numbers, and 1 / (1 - alpha) is never more than 100.
-Derivations: docs/rasterizer.md; the loss: worker/loss.py, as in worker/raster/cpu/blend.py.
+    B_(i-1) = alpha_i s_i + (1 - alpha_i) B_i,  B_last = 0: what lies behind splat i - 1, as if it were alone
+    dL/dpower_i = w_i (s_i - B_i), 0 where alpha was capped
+as in worker/raster/cpu/blend.py. The forward pass leaves T before each chunk in memory, and the backward pass computes
+a chunk's alphas again. Derivations: docs/rasterizer.md; the loss: worker/loss.py.
 
-Layout. Pixels lie along the lanes and all K splats of a pixel in one thread: products and sums over splats need no
-shuffle. A program is one warp, so its barriers cost nothing; what keeps the processor busy is the K P / 32 independent
-numbers a thread works on. Sums over pixels are matrix products on the tensor cores: dL/dpower times the monomials 1 x y
-xx xy yy of the pixel (relative to the tile's middle), and w times g. One operand is split into two parts of 11 bits,
-hence exact to 2^-22; the monomials have few enough bits to be exact, and g is split too, into 8 columns.
+Layout. Pixels lie along the lanes and all K splats of a pixel in one thread: products, sums and steps from splat to
+splat need no shuffle. A program is one warp, so its barriers cost nothing; what keeps the processor busy is the
+K P / 32 independent numbers a thread works on. Sums over pixels are matrix products on the tensor cores: dL/dpower
+times the monomials 1 x y xx xy yy of the pixel (relative to the tile's middle), and w times g. One operand is split
+into two parts of 11 bits, hence exact to 2^-22; the monomials have few enough bits to be exact, and g is split too,
+into 8 columns.
 
 Each instance's gradient goes to its own slot (bins.py). No atomics, so the same inputs give the same bits.
 """
@@ -61,42 +61,49 @@ def _pair(records, row, part: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _weights(records, row, there, x, y, before, k):  # type: ignore[no-untyped-def]
-    """2^power2, odds and T after each splat [K, P] of a chunk in front of which T is before [P]; k = 0 ... K - 1."""
+def _row(values, k, which: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Row which of values [K, P]: [P]. A name for registers, no instruction: the compiler knows each thread's k, and in
+    integers that x + 0 is x.
+    """
+    return tl.sum(tl.where(k == which, values.to(tl.int32, bitcast=True), 0), 0).to(tl.float32, bitcast=True)
+
+
+@triton.jit
+def _one_later(values, first, k, K: tl.constexpr, P: tl.constexpr):  # type: ignore[no-untyped-def]
+    """values [K, P] moved on by one row, first [P] in row 0. Other names for the same registers, too.
+
+    Row k - 1 is row k with its lowest set bit and all below it turned over; two rows are exchanged as (a + b) - a = b,
+    in integers, where that is exact and the compiler sees through it.
+    """
+    bits = values.to(tl.int32, bitcast=True)
+    moved = tl.where(k == 0, first[None, :].to(tl.int32, bitcast=True), bits)
+    for i in tl.static_range(K.bit_length() - 1):
+        bits = tl.reshape(bits, (K // 2 ** (i + 1), 2, 2**i, P))
+        bits = tl.reshape(tl.sum(bits, 1, keep_dims=True) - bits, (K, P))
+        moved = tl.where(k % 2 ** (i + 1) == 2**i, bits, moved)
+    return moved.to(tl.float32, bitcast=True)
+
+
+@triton.jit
+def _alphas(records, row, there, x, y):  # type: ignore[no-untyped-def]
+    """2^power2 and alpha [K, P] of a chunk, before the rule of the full pixel."""
     mean_x, mean_y = _pair(records, row, 0)
     k_xx, k_xy = _pair(records, row, 1)
     k_yy, lo = _pair(records, row, 2)
     lo = tl.where(there[:, None], lo, _NOWHERE)
     dx, dy = x[None, :] - mean_x, y[None, :] - mean_y
-    power2 = tl.fma(dx, tl.fma(k_xx, dx, k_xy * dy), tl.fma(k_yy * dy, dy, lo))
-    raw = tl.exp2(power2)
-    alpha = tl.where(raw < _MIN_ALPHA, 0.0, tl.minimum(raw, _MAX_ALPHA))
-    root = tl.rsqrt(1.0 - alpha)
-    inverse = root * root
+    raw = tl.exp2(tl.fma(dx, tl.fma(k_xx, dx, k_xy * dy), tl.fma(k_yy * dy, dy, lo)))
+    return raw, tl.where(raw < _MIN_ALPHA, 0.0, tl.minimum(raw, _MAX_ALPHA))
+
+
+@triton.jit
+def _blended(alpha, before, k, K: tl.constexpr, P: tl.constexpr):  # type: ignore[no-untyped-def]
+    """alpha where the pixel is not full yet, the weights, and T behind the chunk, in front of which T is before [P]."""
     after = tl.cumprod((1.0 - alpha) * tl.where(k == 0, before[None, :], 1.0), 0)
+    here = _one_later(after, before, k, K, P)
     # Beyond a full pixel T only gets smaller, so the products may go on (worker/raster/reference.py).
-    odds = tl.where(after * inverse < _STOP, 0.0, alpha * inverse)
-    return raw, odds, after
-
-
-@triton.jit
-def _row(values, k, which: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Row which of values [K, P]. Adding -0.0 is no instruction, since a thread's k are known to the compiler."""
-    return tl.sum(tl.where(k == which, values, -0.0), 0)
-
-
-@triton.jit
-def _upside_down(values, K: tl.constexpr, P: tl.constexpr):  # type: ignore[no-untyped-def]
-    """values [K, P] with the last row first: a name for other registers, no instruction.
-
-    Rows are exchanged by halves, quarters and so on, each as (a + b) - a = b in integers, where that is exact and the
-    compiler sees through it. (A scan with reverse=True would send every number through the warp five times over.)
-    """
-    bits = values.to(tl.int32, bitcast=True)
-    for i in tl.static_range(K.bit_length() - 1):
-        bits = tl.reshape(bits, (2**i, 2, K // 2 ** (i + 1), P))
-        bits = tl.sum(bits, 1, keep_dims=True) - bits
-    return tl.reshape(bits, (K, P)).to(tl.float32, bitcast=True)
+    alpha = tl.where(here < _STOP, 0.0, alpha)
+    return alpha, alpha * here, _row(after, k, K - 1)
 
 
 @triton.jit
@@ -200,8 +207,11 @@ def blend(  # type: ignore[no-untyped-def]
     while (i < end) & (tl.max(transmittance) >= _STOP):
         there = i + in_chunk < end
         row = tl.load(owner + tl.minimum(i + in_chunk, end - 1))
-        _, odds, after = _weights(records, row, there, x, y, transmittance, k)
-        w = odds * after
+        if MODE != _RENDER:
+            tl.store(scratch + pixel, transmittance)
+            scratch += P
+        _, alpha = _alphas(records, row, there, x, y)
+        _, w, transmittance = _blended(alpha, transmittance, k, K, P)
         c_red, c_green = _pair(records, row, 3)
         c_blue, c_depth = _pair(records, row, 4)
         red += tl.sum(w * c_red, 0)
@@ -212,10 +222,6 @@ def blend(  # type: ignore[no-untyped-def]
         if VALUES:
             c_value, _ = _pair(records, row, 5)
             value += tl.sum(w * c_value, 0)
-        if MODE != _RENDER:
-            tl.store(scratch + pixel, transmittance)
-            scratch += P
-        transmittance = _row(after, k, K - 1)
         i += K
 
     if MODE == _RENDER:
@@ -274,19 +280,19 @@ def blend(  # type: ignore[no-untyped-def]
             row = tl.load(owner + tl.minimum(j + in_chunk, end - 1))
             place = tl.load(slot + j + in_chunk, mask=there, other=0)
             out = slots + place.to(tl.int64)[:, None] * _SLOT + part
-            transmittance = tl.load(scratch + pixel)
-            raw, odds, after = _weights(records, row, there, x, y, transmittance, k)
-            tl.store(out + 8, _sum_split(odds * after, of_colour), mask=there[:, None])
+            raw, alpha = _alphas(records, row, there, x, y)
+            alpha, w, _ = _blended(alpha, tl.load(scratch + pixel), k, K, P)
+            tl.store(out + 8, _sum_split(w, of_colour), mask=there[:, None])
             c_red, c_green = _pair(records, row, 3)
             c_blue, c_depth = _pair(records, row, 4)
-            score = tl.fma(g_red[None, :], c_red, g_green[None, :] * c_green)
-            score += tl.fma(g_blue[None, :], c_blue, tl.fma(g_depth[None, :], c_depth, g_cover[None, :]))
-            reach = after * score
-            shown = odds * reach
-            last = shown + tl.where(k == K - 1, behind[None, :], -0.0)
-            summed = _upside_down(tl.cumsum(_upside_down(last, K, P), 0), K, P)
-            behind = _row(summed, k, 0)
-            v_power = tl.where(raw < _MAX_ALPHA, odds * (reach - (summed - shown)), 0.0)
+            own = tl.fma(g_red[None, :], c_red, g_green[None, :] * c_green)
+            own += tl.fma(g_blue[None, :], c_blue, tl.fma(g_depth[None, :], c_depth, g_cover[None, :]))
+            v_power = tl.zeros((K, P), tl.float32)
+            for back in tl.static_range(1, K + 1):
+                score = _row(own, k, K - back) - behind
+                v_power = tl.where(k == K - back, score[None, :], v_power)
+                behind = tl.fma(_row(alpha, k, K - back), score, behind)
+            v_power = tl.where(raw < _MAX_ALPHA, w * v_power, 0.0)
             tl.store(out, _sum_split(v_power, monomials) + middle, mask=there[:, None])
         while i < end:  # what lies behind a full tile
             there = i + in_chunk < end
