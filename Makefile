@@ -3,7 +3,8 @@
 #   TORCH_INDEX  package index for torch alone, e.g. https://download.pytorch.org/whl/cpu (small, no GPU);
 #                empty: pip's own index, which on Linux is usually a CUDA build of several GB;
 #                to change the build later, `make clean` first
-#   PYTHON       the interpreter that makes .venv (default: the first of python3, python3.13, 3.12, 3.11 that is new enough)
+#   PYTHON       the interpreter that makes .venv, or that gpu-check uses if it has torch with CUDA
+#                (default: the first of python3, python3.13, 3.12, 3.11 that is new enough)
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
@@ -25,10 +26,10 @@ EVALUATE := $(BIN)/intrasplat evaluate
 # the folder of the recordings: d4d_endonerf/ and so on
 evaluate capacity: export INTRASPLAT_DATA ?= ../shared/data
 
-.PHONY: help setup demo test check bench evaluate capacity chaos sbom clean
+.PHONY: help setup demo test check bench gpu-check evaluate capacity chaos sbom clean
 
 help: ## this list
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
 
 setup: $(STAMP) ## make .venv and install everything into it (TORCH_INDEX=URL chooses the torch build)
 	@$(BIN)/python -c 'import torch; print(f"torch {torch.__version__}:", f"CUDA {torch.version.cuda} build" if torch.version.cuda else "CPU build")'
@@ -63,6 +64,11 @@ bench: setup ## every benchmarks/bm_*.py, one after the other
 	@set -e; for each in benchmarks/bm_*.py; do \
 		[ -e "$$each" ] || { echo "bench: benchmarks/ holds no bm_*.py" >&2; exit 1; }; \
 		echo "== $$each"; $(BIN)/python "$$each"; done
+
+gpu-check: ## with an NVIDIA GPU: are its kernels right, how fast are they; 8 minutes at most, docs/gpu.md
+	@# PYTHON itself where its torch is a CUDA build: nothing is installed then, and no .venv is made
+	@python="$(PYTHON)"; "$$python" -c 'import sys, torch; sys.exit(torch.version.cuda is None)' 2>/dev/null \
+		|| { [ ! -x $(BIN)/python ] || python=$(BIN)/python; }; "$$python" benchmarks/gpu_check.py $(ARGS)
 
 evaluate: setup ## every preset on every clip, and the charts; hours, and it goes on where it was (CLIPS="phantom:pull ...")
 	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out docs/results

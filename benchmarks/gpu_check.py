@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
+RESULTS = HERE.parent / "docs" / "results"
 UNAVAILABLE = 5
 """As contract/exits.py has it."""
 GRACE_S = 5.0
@@ -41,18 +42,24 @@ LOOK = (
 
 @dataclass(frozen=True)
 class Part:
-    """A part: its module, and the seconds that it adds to what the parts before it left over."""
+    """A part: its program, and the seconds that it adds to what the parts before it left over."""
 
     name: str
     seconds: float
+    folder: Path = HERE
 
     @property
     def program(self) -> Path:
-        return HERE / f"gpu_{self.name}.py"
+        return self.folder / f"gpu_{self.name}.py"
+
+    def files(self, out: Path) -> list[Path]:
+        """What it writes."""
+        names = [self.name, "curves"] if self.name == "train" else [self.name]
+        return [out / f"gpu-{name}.csv" for name in names]
 
 
-PARTS = (Part("correct", 120), Part("speed", 120), Part("train", 130), Part("variants", 70), Part("rival", 25))
-"""465 s in all, of the 480 there are."""
+PARTS = (Part("correct", 140), Part("speed", 115), Part("train", 120), Part("variants", 65), Part("rival", 20))
+"""460 s in all, of the 480 there are."""
 
 
 def main() -> int:
@@ -63,13 +70,13 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="of all that is random (default: another every time; it is printed)")
     parser.add_argument("--interpret", action="store_true", help="tiny sizes in Triton's interpreter; needs --out")
     arguments = parser.parse_args()
-    if arguments.interpret and arguments.out is None:
+    if arguments.interpret and (arguments.out or RESULTS).resolve() == RESULTS:
         parser.error("--interpret measures nothing: name a folder for its files with --out, other than docs/results")
     if not arguments.interpret and (missing := what_is_missing()):
         print(f"gpu-check: {missing}; nothing was checked and nothing was written.", file=sys.stderr)
         return UNAVAILABLE
     seed = int(time.time()) if arguments.seed is None else arguments.seed
-    out = (arguments.out or HERE.parent / "docs" / "results").resolve()
+    out = (arguments.out or RESULTS).resolve()
     out.mkdir(parents=True, exist_ok=True)
     chosen = [part for part in PARTS if arguments.only is None or part.name in arguments.only]
     print(f"gpu-check: seed {seed}, rows in {out}", flush=True)
@@ -144,7 +151,7 @@ def _failure(command: list[str], variables: dict[str, str], deadline: float) -> 
     except subprocess.TimeoutExpired:
         return "did not end in time and was killed"
     if status == 1:
-        return "found something wrong; see above"
+        return "found something wrong, or broke off; see above"
     return "" if status == 0 else f"ended with status {status}"
 
 

@@ -55,7 +55,7 @@ class Sizes:
 
 
 REAL = Sizes(1500, 96, 80, 4000, 160, 128, 70)
-SMALL = Sizes(24, 9, 10, 24, 16, 9, 2)
+SMALL = Sizes(16, 9, 7, 12, 9, 8, 2)
 """In Triton's interpreter; of a width that ends within a tile."""
 
 

@@ -238,12 +238,10 @@ class Speed:
     def floors(self, peaks: Peaks) -> None:
         """What the step's bytes and multiply-adds take at the card's peaks, and how near steps come to them."""
         self._part.wait_for(KERNELS_READY)
+        cpu = FusedModel(self.gaussians, self.motion("shared"), self._width, self._height)
+        counts = count(cpu, self.camera, TIME, (rasters.TILE_WIDTH, rasters.TILE_HEIGHT), rasters.CHUNK)
         for (motion, frames), step_ms in self.step_ms.items():
-            deformation = self.motion(motion)
-            cpu = FusedModel(self.gaussians, deformation, self._width, self._height)
-            shape = rasters.TILE_WIDTH, rasters.TILE_HEIGHT
-            counts = count(cpu, self.camera, TIME, shape, rasters.CHUNK)
-            sizes = _sizes(self.model(motion, frames), deformation, self._width * self._height)
+            sizes = _sizes(self.model(motion, frames), self.motion(motion), self._width * self._height)
             moved = sum(bytes_by_kernel(sizes, counts).values())
             made = frames * (PAIR_FMA["step"] * counts.blended + GAUSSIAN_FMA["step"] * sizes.gaussians)
             place: dict[str, Any] = {"scene": motion, "frames": frames}

@@ -14,6 +14,7 @@ from pathlib import Path
 from statistics import median
 
 from evaluation_page import origin, sections, table, write_readme
+from gpu_page import gpu_sections
 from stability_page import stability_sections
 
 from worker.evaluate.stability import STABILITY
@@ -97,6 +98,7 @@ def main() -> None:
         parts += [_RASTER, _raster_table(rows)]
     if (RESULTS / "raster-scene.txt").exists():
         parts += [_SCENE, f"\n```\n{(RESULTS / 'raster-scene.txt').read_text().strip()}\n```\n"]
+    parts += gpu_sections(RESULTS)
     if (RESULTS / "stereo.txt").exists():
         parts += [_STEREO, f"\n```\n{(RESULTS / 'stereo.txt').read_text().strip()}\n```\n"]
     if rows := _read("service.csv"):

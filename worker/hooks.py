@@ -41,7 +41,7 @@ class Hooks:
 
     wants_snapshot is asked between steps of training; if it says so, on_snapshot is given the model as it is then, a
     Scene of worker/checkpoint.py, and how many iterations made it. on_held_out is given each held-out frame that is
-    rendered to be scored while training goes on: its number and the View of worker/quality.py; training's clock stands
+    rendered to be scored while training goes on: its number and the View of worker/looking.py; training's clock stands
     still meanwhile. None of these changes what training comes to.
     """
 

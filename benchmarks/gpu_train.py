@@ -1,0 +1,123 @@
+"""Part of gpu_check.py: how soon training on the device is how good, against `paper` to its end and the CPU's `fast`.
+
+A run is what `reconstruct` makes of a clip with depth, without what follows training: points, tracks, a model, steps.
+Seconds are t_train_s as docs/conventions.md defines it, so they have what is done on the processor before the first
+step, and neither compilation nor scoring. Held-out frames are scored at many moments of it; a threshold counts as
+reached at the first of them that is above it, so a figure is late by at most the distance to the moment before.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import traceback
+
+import numpy as np
+from gpu_prepare import load_clip
+from gpu_rows import CLIP, CLIP_READY, KERNELS_READY, Part
+
+from contract.errors import Cancelled
+from worker import train as training
+from worker.backend import CPU, Device
+from worker.clip import DepthClip, split_frames
+from worker.hooks import Hooks
+from worker.looking import held_out_psnr, view_function
+from worker.prepare import prepare
+from worker.presets import PRESETS, Preset
+from worker.request import ReconstructionRequest
+from worker.train import CurvePoint, Run, Stopwatch, train
+
+STAGES = ("motion_s", "capacity_s", "fusion_s", "start_s", "targets_s", "optimise_s", "compile_s")
+THRESHOLDS_DB = (34, 36, 38)
+FIELDS = (
+    "clip", "preset", "device", "seed", "iterations", "gaussians", "final_db",
+    *(f"s_to_{db}_db" for db in THRESHOLDS_DB), "s_to_paper_db", "t_train_s", *STAGES, "step_ms", "note",
+)  # fmt: skip
+CURVE_FIELDS = ("clip", "preset", "device", "seed", "t_train_s", "iteration", "psnr_tissue_db")
+MOMENTS_S = (*np.arange(0.1, 2.0, 0.1), *np.arange(2.0, 6.0, 0.25), *np.arange(6.0, 60.0, 2.0))
+"""Of t_train_s, at which held-out frames are scored: closer than those of a report, for a run is over in seconds."""
+FAST_BUDGET_S, CPU_BUDGET_S = 20.0, 45.0
+LEAST_S = {"paper": 45.0, "fast": 30.0, "cpu": 35.0}
+"""Seconds that have to be left of the part to begin a run."""
+
+
+def main() -> None:
+    part = Part.begin("train", FIELDS)
+    told = part.wait_for(CLIP_READY)
+    clip = load_clip(part.work / CLIP, told["camera"])  # type: ignore[arg-type]
+    trials = Trials(part, str(told["name"]), clip)
+    device = Device("cuda", str(part.origin["gpu"]), part.device)
+    if part.interpret:
+        trials.run(_tiny("fast"), device, 0, iterations=2)
+        return
+    if part.has(LEAST_S["paper"], "paper"):
+        trials.run(PRESETS["paper"], device, 0, iterations=PRESETS["paper"].iterations)
+    for seed in (0, 1):
+        if part.has(LEAST_S["fast"], f"fast, seed {seed}"):
+            trials.run(PRESETS["fast"], device, seed, budget_s=FAST_BUDGET_S)
+    if part.has(LEAST_S["cpu"], "the CPU's fast"):
+        part.wait_for(KERNELS_READY)
+        trials.run(PRESETS["fast"], CPU, 0, budget_s=min(CPU_BUDGET_S, part.left_s - 15))
+
+
+def _tiny(name: str) -> Preset:
+    """For the interpreter: the same way with next to nothing to do."""
+    return dataclasses.replace(PRESETS[name], tracks=False, bases=2, points_per_image=9, points_by_budget=False)
+
+
+class Trials:
+    """Runs on one clip; what `paper` ended with is the last threshold of those after it."""
+
+    def __init__(self, part: Part, name: str, clip: DepthClip) -> None:
+        self._part, self._name, self._clip = part, name, clip
+        self._curves = dataclasses.replace(part, name="curves", fields=CURVE_FIELDS)
+        self._paper_db: float | None = None
+        training.CURVE_SECONDS = MOMENTS_S  # type: ignore[assignment]
+
+    def run(self, preset: Preset, device: Device, seed: int, **length: float | None) -> None:
+        """One run, its row and its curve; one that breaks off has a row that says so."""
+        place = {"clip": self._name, "preset": preset.name, "device": device.kind, "seed": seed}
+        try:
+            run, seconds, note = self._trained(preset, device, seed, length)
+        except Exception as error:
+            traceback.print_exc()
+            self._part.add(**place, note=f"{type(error).__name__}: {error}"[:200])
+            return
+        for point in run.curve:
+            self._curves.add(**place, **dataclasses.asdict(point))
+        final_db = run.curve[-1].psnr_tissue_db if run.curve else None
+        if preset.name == "paper" and not note:
+            self._paper_db = final_db
+        reached = {f"s_to_{db}_db": first_s(run.curve, db) for db in THRESHOLDS_DB}
+        reached["s_to_paper_db"] = None if self._paper_db is None else first_s(run.curve, self._paper_db)
+        row = {**place, "iterations": run.iteration, "gaussians": run.model.count, "final_db": final_db, **reached}
+        row |= {name: round(seconds.get(name, 0.0), 3) for name in ("t_train_s", *STAGES)}
+        row["step_ms"] = 1e3 * seconds["optimise_s"] / max(run.iteration, 1)
+        self._part.add(**row, note=note)
+        print("  " + "  ".join(f"{name} {value}" for name, value in row.items() if value is not None), flush=True)
+
+    def _trained(
+        self, preset: Preset, device: Device, seed: int, length: dict[str, float | None]
+    ) -> tuple[Run, dict[str, float], str]:
+        """The run, seconds by stage, and why it was cut short if it was."""
+        split = split_frames(self._clip, "every8")
+        request = ReconstructionRequest(self._clip, preset=preset, seed=seed, **length)  # type: ignore[arg-type]
+        clock, seconds = Stopwatch(), {}
+        hooks = Hooks(should_stop=lambda: self._part.left_s < 4)
+        run, scale = prepare(self._clip, split, preset, request, clock, hooks, seconds, device)
+        view_of, begun_s, note = view_function(run, scale), clock.elapsed_s, ""
+        try:
+            train(run, clock, lambda: held_out_psnr(self._clip, split, view_of), hooks)
+        except Cancelled:
+            run.model.wait()
+            note = f"cut short after {run.iteration} of {run.iterations} iterations"
+        seconds |= {"optimise_s": clock.elapsed_s - begun_s, "t_train_s": clock.elapsed_s}
+        return run, seconds, note
+
+
+def first_s(curve: list[CurvePoint], psnr_db: float) -> float | None:
+    """The first moment at which so much was reached; None if it never was."""
+    return next((point.t_train_s for point in curve if point.psnr_tissue_db >= psnr_db), None)
+
+
+if __name__ == "__main__":
+    main()

