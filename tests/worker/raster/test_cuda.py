@@ -314,6 +314,35 @@ def test_parameters_beyond_all_training_give_what_they_give_on_the_cpu(memory: s
         assert_close(getattr(got, name)[0], getattr(wanted, name), name=name)
 
 
+@pytest.mark.parametrize("row", [0, 2, 4, 8, "opacity"])
+def test_a_gaussian_with_a_parameter_that_is_no_number_is_not_drawn(row: int | str, memory: str) -> None:
+    view = View([scene_of(12, pixels=3.0)], memory)
+    camera, state, logit, colour = view.arguments()
+    without = view.rasterizer()
+    without.project(camera, state, torch.where(torch.arange(12, device=memory) == 5, -30.0, logit), colour)
+    state, logit = state.clone(), logit.clone()
+    if isinstance(row, int):
+        state[0, row, 5] = float("nan")
+    else:
+        logit[5] = float("nan")
+    rasterizer = view.rasterizer()
+    rasterizer.project(camera, state, logit, colour)
+    assert int(rasterizer.count[0, 5]) == 0
+    assert torch.equal(rasterizer.render(), without.render())
+
+
+def test_more_tiles_than_16_bits_can_number_are_sorted_with_32(memory: str) -> None:
+    width, frames = 8 * 2100, MOST_FRAMES
+    scene = random_scene(3, width=width, height=1, seed=3, pixels=4.0).to(torch.float32)
+    rasterizer = CudaRasterizer(width, 1, memory, frames=frames)
+    rasterizer.project(*View([scene] * frames, memory).arguments())
+    of_frame = rasterizer._tile_start[:-1].reshape(frames, 2100).diff(dim=0)
+    touched = int(rasterizer.count[0].sum())
+    assert touched > 0
+    assert bool((of_frame == touched).all())
+    assert int(rasterizer._tile_start[-1]) == frames * touched
+
+
 def test_more_frames_than_can_be_sorted_are_refused(memory: str) -> None:
     with pytest.raises(ValueError, match=f"{MOST_FRAMES + 1} frames at once"):
         CudaRasterizer(WIDTH, HEIGHT, memory, frames=MOST_FRAMES + 1)

@@ -18,8 +18,9 @@ _LEAST, _MOST = tl.constexpr(-200.0), tl.constexpr(13.862943611198906)  # 0 as a
 
 @triton.jit
 def exp(x):  # type: ignore[no-untyped-def]
-    """e^x of a float32, at most 2**20."""
-    return tl.exp2(tl.minimum(tl.maximum(x, _LEAST), _MOST) * _LOG2E)
+    """e^x of a float32, at most 2**20; NaN of NaN."""
+    held = tl.maximum(x, _LEAST, propagate_nan=tl.PropagateNan.ALL)
+    return tl.exp2(tl.minimum(held, _MOST, propagate_nan=tl.PropagateNan.ALL) * _LOG2E)
 
 
 @triton.jit

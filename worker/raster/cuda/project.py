@@ -78,14 +78,17 @@ def project(  # type: ignore[no-untyped-def]
     cxy = dot(b00 * b10, b01 * b11, b02 * b12, v0, v1, v2)
     cyy = dot(b10 * b10, b11 * b11, b12 * b12, v0, v1, v2) + _EPS2D
     det = cxx * cyy - cxy * cxy
-    inverse_det = 1.0 / det
-    mean_x, mean_y = (j0 * x + tl.load(camera + 2)).to(tl.float32), (j1 * y + tl.load(camera + 3)).to(tl.float32)
     logit = tl.load(opacity_logit + n, mask=there, other=0.0)
     log2_opacity = -tl.log2(1.0 + exp(-logit))
 
     extent2 = (log2_opacity - _LOG2_MIN_ALPHA) * (2.0 * _LN2) + _EXTENT_SLACK
     drawn = in_front & (extent2 >= 0.0) & (det > 0.0) & (det < _LARGEST)
-    extent2 = tl.maximum(extent2, 0.0).to(tl.float64)
+    # What is not drawn has numbers all the same, lest a NaN become a tile.
+    cxx, cxy, cyy = tl.where(drawn, cxx, 1.0), tl.where(drawn, cxy, 0.0), tl.where(drawn, cyy, 1.0)
+    x, y, det = tl.where(drawn, x, 0.0), tl.where(drawn, y, 0.0), tl.where(drawn, det, 1.0)
+    inverse_det = 1.0 / det
+    mean_x, mean_y = (j0 * x + tl.load(camera + 2)).to(tl.float32), (j1 * y + tl.load(camera + 3)).to(tl.float32)
+    extent2 = tl.where(drawn, extent2, 0.0).to(tl.float64)
     reach = tl.sqrt(extent2 * cyy).to(tl.float32)
     turn = (cxy * tl.sqrt(extent2 / cxx)).to(tl.float32)
     lean = (cxy / cyy).to(tl.float32)
