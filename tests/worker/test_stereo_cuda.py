@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -178,29 +179,28 @@ def test_large_frames_go_through_by_few_and_small_ones_by_many() -> None:
 
 
 def test_depth_is_as_true_as_on_the_cpu() -> None:
-    jump = np.full((HEIGHT, WIDTH), 7.0, np.float32)
-    jump[12:34, 36:66] = 12.0
-    truths = [slanted(13.0, 7.0, WIDTH, HEIGHT), jump]
-    pairs = [draw_pair(truth, seed) for seed, truth in enumerate(truths)]
-    pairs[0][0][40:] = pairs[0][1][40:] = 2  # black
+    truth = slanted(10.0, 7.0, WIDTH, HEIGHT)
+    truth[12:34, 36:66] += 4
+    pair = draw_pair(truth)
+    for eye in pair:
+        eye[40:] = 2  # black
     seen: list[Progress] = []
-    ours = estimate_depth(clip_of(pairs), Hooks(on_progress=seen.append), device="cuda")
-    theirs = estimate_depth(clip_of(pairs))
+    ours = estimate_depth(clip_of([pair]), Hooks(on_progress=seen.append), device="cuda")
+    theirs = estimate_depth(clip_of([pair]))
     assert seen[-1].fraction == 1.0
-    for f, truth in enumerate(truths):
-        error_px, their_error_px = np.abs(errors_px(ours, truth, f)), np.abs(errors_px(theirs, truth, f))
-        for percentile in (50, 90):
-            assert np.percentile(error_px, percentile) < 1.1 * np.percentile(their_error_px, percentile) + 0.02
-        valid, confidence = ours.depth_mm[f] > 0, ours.depth_confidence[f]
-        assert valid.mean() > (theirs.depth_mm[f] > 0).mean() - 0.01
-        assert np.array_equal(confidence > 0, valid)
-        assert (error_px[confidence[valid] >= 200] < 1).mean() > 0.98
-        assert (confidence[np.arange(WIDTH) - truth < -1] == 0).mean() > 0.98  # what the right eye does not see
-    assert not ours.depth_confidence[0, 42:].any()
-    assert ours.measurements["min_disparity_px"] < 7 < 13 < ours.measurements["max_disparity_px"] < 26
+    error_px, their_error_px = np.abs(errors_px(ours, truth)), np.abs(errors_px(theirs, truth))
+    for percentile in (50, 90):
+        assert np.percentile(error_px, percentile) < 1.1 * np.percentile(their_error_px, percentile) + 0.02
+    valid, confidence = ours.depth_mm[0] > 0, ours.depth_confidence[0]
+    assert valid.mean() > (theirs.depth_mm[0] > 0).mean() - 0.01
+    assert np.array_equal(confidence > 0, valid)
+    assert (error_px[confidence[valid] >= 200] < 1).mean() > 0.98
+    assert (confidence[np.arange(WIDTH) - truth < -1] == 0).mean() > 0.98  # what the right eye does not see
+    assert not confidence[42:].any()
+    assert ours.measurements["min_disparity_px"] < 7 < 14 < ours.measurements["max_disparity_px"] < 26
 
 
-def test_every_kernel_compiles_for_sm_90_and_keeps_its_numbers_in_registers(tmp_path: Path) -> None:
+def test_kernels_compile_for_sm_90_within_its_registers_once_for_clips_of_every_size(tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     environment |= {"PYTHONPATH": str(REPOSITORY), "TRITON_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-m", "tests.worker.stereo_probe"]
@@ -209,7 +209,9 @@ def test_every_kernel_compiles_for_sm_90_and_keeps_its_numbers_in_registers(tmp_
     )
     assert answer.returncode == 0, answer.stderr
     found = json.loads(answer.stdout)
-    names = {"census", "column_costs", "block_costs", "add_paths", "winners", "smooth_lines"}
-    assert {each["kernel"] for each in found} == names
+    lanes = 2
+    forms = {"census": 1, "smooth_lines": 1, "add_paths": 2 * lanes}
+    forms |= dict.fromkeys(("column_costs", "block_costs", "winners"), lanes)
+    assert Counter(each["kernel"] for each in found) == forms
     for each in found:
         assert each["stack"] == each["local"] == 0, f"spills: {each}"

@@ -7,19 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from contract.errors import Cancelled, InputError
-from worker.calibration import RectifiedClip
 from worker.clip.types import DepthClip
 from worker.hooks import Hooks, Progress
 from worker.opencv import cores, one_opencv_thread
 from worker.stereo.alignment import RowShift, agreed_disparities, choose_range, feature_matches, measure_row_shift
 from worker.stereo.matching import MAX_DEPTH_MM, MIN_CONFIDENCE, Grey, MatchPlan, match
+
+if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
+    from worker.calibration import RectifiedClip
 
 STAGE = "stereo"
 DECODING_SHARE, MEASURING_SHARE = 0.15, 0.05  # of the stage's progress

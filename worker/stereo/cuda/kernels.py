@@ -26,6 +26,14 @@ BEYOND = 1 << 12
 PACKED = 512
 """Sums and indices are compared together, as sum * PACKED + index: no range has more disparities."""
 
+_kernel = triton.jit(
+    do_not_specialize=[
+        "pixels", "height", "width", "count", "low", "lines", "length",
+        "line_stride", "step_stride", "frame_size", "small", "large",
+    ]
+)  # fmt: skip
+"""A clip of another size is matched by the kernels that are compiled already."""
+
 _RADIUS = tl.constexpr(BLOCK_PX // 2)
 _BEYOND = tl.constexpr(BEYOND)
 _PACKED = tl.constexpr(PACKED)
@@ -39,7 +47,7 @@ def _shifted(pixel, dy, dx, height, width):  # type: ignore[no-untyped-def]
     return pixel + (to_y - y) * width + to_x - x
 
 
-@triton.jit
+@_kernel
 def census(image, words, pixels, height, width, PIXELS: tl.constexpr):  # type: ignore[no-untyped-def]
     """words int32 [F, h, w]: a bit for each of the 24 neighbours of a pixel of image uint8 [F, h, w] that is darker."""
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
@@ -62,7 +70,7 @@ def _bits_by_byte(word):  # type: ignore[no-untyped-def]
     return (word + (word >> 4)) & 0x0F0F0F
 
 
-@triton.jit
+@_kernel
 def column_costs(  # type: ignore[no-untyped-def]
     left, right, costs, low, pixels, height, width, count, PIXELS: tl.constexpr, LANES: tl.constexpr
 ):  # fmt: skip
@@ -81,7 +89,7 @@ def column_costs(  # type: ignore[no-untyped-def]
     tl.store(costs + pixel * count + lane, total.to(tl.uint8), mask=there)
 
 
-@triton.jit
+@_kernel
 def block_costs(  # type: ignore[no-untyped-def]
     columns, costs, pixels, height, width, count, PIXELS: tl.constexpr, LANES: tl.constexpr
 ):  # fmt: skip
@@ -128,7 +136,7 @@ def _follow(  # type: ignore[no-untyped-def]
     return cost_at - stride, sum_at - stride
 
 
-@triton.jit
+@_kernel
 def add_paths(  # type: ignore[no-untyped-def]
     costs, sums, lines, length, line_stride, step_stride, frame_size, count, small, large,
     ADD: tl.constexpr, LINES: tl.constexpr, LANES: tl.constexpr,
@@ -156,7 +164,7 @@ def _winner(sums, at, there, lane):  # type: ignore[no-untyped-def]
     return least % _PACKED, least // _PACKED
 
 
-@triton.jit
+@_kernel
 def winners(  # type: ignore[no-untyped-def]
     sums, left, right, low, pixels, width, count, PIXELS: tl.constexpr, LANES: tl.constexpr
 ):  # fmt: skip
@@ -183,7 +191,7 @@ def winners(  # type: ignore[no-untyped-def]
     tl.store(right + pixel, (low + best).to(tl.float32), mask=inside)
 
 
-@triton.jit
+@_kernel
 def smooth_lines(  # type: ignore[no-untyped-def]
     guide, first, second, kept, lines, length, line_stride, step_stride, frame_size, strength, steepness,
     LINES: tl.constexpr,

@@ -169,13 +169,13 @@ def path_sums(left: Tensor, right: Tensor, low: int, count: int) -> Tensor:
     share = _share()
     frames, h, w = left.shape
     pixels, lanes = left.numel(), _lanes(count)
-    words = torch.empty((2, *left.shape), dtype=torch.int32, device=left.device)
+    words = [torch.empty(left.shape, dtype=torch.int32, device=left.device) for _ in range(2)]
     for image, word in zip((left.contiguous(), right.contiguous()), words, strict=True):
         kernels.census[(triton.cdiv(pixels, share.pixels),)](image, word, pixels, h, w, share.pixels)
     columns = torch.empty((frames, h, w, count), dtype=torch.uint8, device=left.device)
     costs, sums = (torch.empty(columns.shape, dtype=torch.int16, device=left.device) for _ in range(2))
     grid = (triton.cdiv(pixels, share.costs),)
-    kernels.column_costs[grid](words[0], words[1], columns, low, pixels, h, w, count, share.costs, lanes)
+    kernels.column_costs[grid](*words, columns, low, pixels, h, w, count, share.costs, lanes)
     kernels.block_costs[grid](columns, costs, pixels, h, w, count, share.costs, lanes)
     for add, (lines, length, line_stride, step_stride) in enumerate(((h, w, w, 1), (w, h, 1, w))):
         kernels.add_paths[(triton.cdiv(lines, share.paths), frames)](
