@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 from gpu_rows import KERNELS_READY, Part
-from gpu_scenes import LOSS, Noise, poison, stirred_motion
+from gpu_scenes import LOSS, Noise, poison, stereo_pairs, stirred_motion
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -31,6 +31,7 @@ from worker.raster.cuda import rasterize
 from worker.raster.cuda.model import CudaModel
 from worker.raster.cuda.rasterizer import CudaRasterizer
 from worker.raster.step import TrainingFrame, camera_vector
+from worker.stereo.cuda import match_frames
 
 FIELDS = ("check", "worst", "limit", "ok", "seconds", "detail")
 LIMIT = 1e-3
@@ -43,7 +44,8 @@ Differences = dict[str, float]
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """Of the scenes: Gaussians and pixels of the reference's, and of the models', and steps that a model is trained."""
+    """Of the scenes: Gaussians and pixels of the reference's and of the models', and steps that a model is trained; and
+    of stereo pairs: pixels, error in px that is accepted."""
 
     count: int
     width: int
@@ -52,10 +54,13 @@ class Sizes:
     model_width: int
     model_height: int
     steps: int
+    stereo_width: int
+    stereo_height: int
+    stereo_px: float
 
 
-REAL = Sizes(1500, 96, 80, 4000, 160, 128, 70)
-SMALL = Sizes(16, 9, 7, 12, 9, 8, 2)
+REAL = Sizes(1500, 96, 80, 4000, 160, 128, 70, 640, 512, 0.1)
+SMALL = Sizes(16, 9, 7, 12, 9, 8, 2, 64, 24, 0.25)
 """In Triton's interpreter; of a width that ends within a tile."""
 
 
@@ -70,6 +75,7 @@ def main() -> None:
         checks.make("deformation", LIMIT, lambda: checks.deformed(kinds)),
         checks.make("the same steps give the same bits", 0.0, checks.same_bits),
         checks.make("with little room as with ample room", 0.0, checks.little_room),
+        checks.make("disparity of textured planes, px", checks.sizes.stereo_px, checks.stereo),
     ]
     part.wait_for(KERNELS_READY)
     for kind in kinds:
@@ -86,7 +92,7 @@ class Checks:
     """The checks; each returns the worst difference of everything it compares, by name."""
 
     def __init__(self, part: Part, sizes: Sizes) -> None:
-        self._part, self._sizes, self._device = part, sizes, part.device
+        self._part, self.sizes, self._device = part, sizes, part.device
         self._made = 0
 
     def make(self, name: str, limit: float, check: Callable[[], Differences]) -> bool:
@@ -115,7 +121,7 @@ class Checks:
     # The rasteriser
 
     def _scene(self, pixels: float = 2.0, opacities: tuple[float, ...] = (0.05, 0.4, 0.999)) -> Scene:
-        size = self._sizes
+        size = self.sizes
         made = random_scene(
             size.count, width=size.width, height=size.height, seed=self._random(), pixels=pixels, opacities=opacities
         )
@@ -142,7 +148,7 @@ class Checks:
         scenes[1] = dataclasses.replace(scenes[1], opacity=scenes[0].opacity)
         frames = [Noise(scene, self._random()) for scene in scenes]
         moved = [_arguments(scenes, self._device)]
-        rasterizer = CudaRasterizer(self._sizes.width, self._sizes.height, self._device, frames=2)
+        rasterizer = CudaRasterizer(self.sizes.width, self.sizes.height, self._device, frames=2)
         rasterizer.project(*moved[0])
         poison(rasterizer)
         rasterizer.project(*moved[0])
@@ -165,11 +171,11 @@ class Checks:
 
     def _model(self, kind: str, sh_degree: int = 0, frames: int = 1) -> CudaModel:
         made = self._parts(kind, sh_degree)
-        return CudaModel(*made, self._sizes.model_width, self._sizes.model_height, self._device, frames)
+        return CudaModel(*made, self.sizes.model_width, self.sizes.model_height, self._device, frames)
 
     def _parts(self, kind: str, sh_degree: int = 0) -> tuple[Gaussians, Deformation]:
         """The same for the same run, and another in the next."""
-        size, random = self._sizes, torch.Generator().manual_seed(self._part.seed)
+        size, random = self.sizes, torch.Generator().manual_seed(self._part.seed)
         count = size.model_count
         scene = random_scene(
             count, width=size.model_width, height=size.model_height, seed=self._part.seed, opacities=(0.05, 0.4, 0.95)
@@ -183,7 +189,7 @@ class Checks:
         return gaussians, stirred_motion(kind, count, random)
 
     def _frames(self, count: int) -> list[TrainingFrame]:
-        size = self._sizes
+        size = self.sizes
         scene = random_scene(1, width=size.model_width, height=size.model_height)
         return [
             Noise(scene, self._part.seed + k).frame(0.2 + 0.6 * k / count, camera_vector(scene.camera))
@@ -214,7 +220,7 @@ class Checks:
 
     def steps(self, kind: str, sh_degree: int = 0) -> Differences:
         """How far a few steps take every parameter, beside how far they take the CPU's."""
-        size = self._sizes
+        size = self.sizes
         cpu = FusedModel(*self._parts(kind, sh_degree), size.model_width, size.model_height)
         cuda = self._model(kind, sh_degree)
         before = {name: each.clone() for name, each in cpu.parameters().items()}
@@ -231,7 +237,7 @@ class Checks:
         """Two models after the same steps, some of them replayed as a graph."""
         first, second = self._model("shared"), self._model("shared")
         for model in (first, second):
-            self._train(model, self._sizes.steps)
+            self._train(model, self.sizes.steps)
         return _different(first, second)
 
     def little_room(self) -> Differences:
@@ -244,9 +250,22 @@ class Checks:
             raise ValueError("the buffers never had to grow")
         return _different(ample, tight)
 
+    def stereo(self) -> Differences:
+        """Disparities beside the planes' own; and how many differ when the same pairs are matched again."""
+        size = self.sizes
+        left, right, disparity, plan = stereo_pairs(2, size.stereo_width, size.stereo_height, self._random())
+        eyes = [torch.from_numpy(each).to(self._device) for each in (left, right)]
+        found, confidence = match_frames(*eyes, plan)
+        again = found if self._part.interpret else match_frames(*eyes, plan)[0]  # nothing there happens at once
+        error = np.abs(found.cpu().numpy() - disparity)
+        seen = (confidence.cpu().numpy() > 0) & (np.arange(size.stereo_width) > disparity)
+        if seen.mean() < 0.5:
+            raise ValueError(f"only {seen.mean():.0%} of the pixels have a disparity")
+        return {"median error": float(np.median(error[seen])), "differ": float((found != again).double().mean())}
+
     def trained(self) -> Differences:
         """Pictures of a model that was trained here, on the CPU and here, alone and several at once."""
-        size, model = self._sizes, self._model("shared")
+        size, model = self.sizes, self._model("shared")
         self._train(model, size.steps)
         cpu = FusedModel(*model.export(), size.model_width, size.model_height)
         camera = camera_vector(random_scene(1, width=size.model_width, height=size.model_height).camera)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from worker.raster import reference
 from worker.raster.cpu import padded
 from worker.raster.cuda.rasterizer import CudaRasterizer
 from worker.raster.step import Target, TrainingFrame
+from worker.stereo.matching import MatchPlan
 
 LOSS = LossSettings(depth_weight=20.0, colour_zone=0.05, depth_zone=1e-3)
 NOT_BUFFERS = frozenset({"ok", "needed", "_borders", "_camera", "_state", "_opacity_logit"})
@@ -101,3 +103,23 @@ def stirred_motion(kind: str, count: int, random: torch.Generator) -> Deformatio
         return dataclasses.replace(polynomial, weight=stirred(polynomial.weight))
     shared = SharedBasis.initial(count, bases=5, colour=True)
     return dataclasses.replace(shared, weight=stirred(shared.weight))
+
+
+def stereo_pairs(
+    count: int, width: int, height: int, seed: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32], MatchPlan]:
+    """Left and right [F, H, W] of textured planes, their disparity [H, W] in px, and where to look for it."""
+    random = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    near, far = 0.09 * width, 0.04 * width
+    disparity = far + (near - far) * (0.4 * x / width + 0.6 * y / height)
+    beyond = int(near) + 2
+    left, right = (np.zeros((count, height, width), np.uint8) for _ in range(2))
+    for k in range(count):
+        drawn = np.full((height, width + 2 * beyond), 110.0, np.float32)
+        for sigma_px, contrast in ((1.2, 18.0), (3.0, 15.0), (10.0, 25.0)):
+            layer = cv2.GaussianBlur(random.standard_normal(drawn.shape).astype(np.float32), (0, 0), sigma_px)
+            drawn += contrast * layer / layer.std()
+        for eye, at in ((left, x + beyond - disparity), (right, x + beyond)):
+            eye[k] = np.clip(cv2.remap(drawn, at, y, cv2.INTER_CUBIC), 0, 255).round()
+    return left, right, disparity, MatchPlan(far - 2, near + 2)

@@ -23,6 +23,7 @@ from bm_raster import BASES, GAUSSIAN_FMA, GRID_STEP_PX, HEIGHT, PAIR_FMA, RATES
 from gpu_counts import count
 from gpu_peaks import Peaks, measure_peaks
 from gpu_rows import KERNELS_READY, Part, Stamp, device_ms, synchronize, wall_ms
+from gpu_scenes import stereo_pairs
 from gpu_work import Sizes, bytes_by_kernel
 
 from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
@@ -33,6 +34,7 @@ from worker.raster.cpu.motion import NEGLIGIBLE
 from worker.raster.cuda import rasterizer as rasters
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
 from worker.raster.step import Target, TrainingFrame, camera_vector
+from worker.stereo.cuda import match_frames
 
 FIELDS = ("what", "scene", "frames", "value", "unit", "clock", "note")
 SMALL = 8, 8, 4.0
@@ -57,6 +59,8 @@ def main() -> None:
                 speed.steps(motion, frames)
     if part.has(0 if part.interpret else 15, "pictures"):
         speed.pictures()
+    if part.has(0 if part.interpret else 10, "stereo"):
+        speed.stereo()
     if part.has(0 if part.interpret else 10, "floors"):
         speed.floors(peaks)
 
@@ -232,6 +236,17 @@ class Speed:
             self.add(
                 "pictures, replayed", 1e3 * frames / replayed, "a second", scene="shared", frames=frames, clock="device"
             )
+
+    # Stereo
+
+    def stereo(self) -> None:
+        """Pairs that are matched a second, on the device already."""
+        count, width, height = (1, 64, 24) if self._part.interpret else (64, WIDTH, HEIGHT)
+        left, right, _, plan = stereo_pairs(count, width, height, self._part.seed)
+        eyes = [torch.from_numpy(each).to(self._device) for each in (left, right)]
+        rounds = 1 if self._part.interpret else 5
+        ms = device_ms(lambda: match_frames(*eyes, plan), self._device, calls=1, rounds=rounds)
+        self.add("stereo pairs", 1e3 * count / ms, "a second", scene=f"{width}x{height}", frames=count, clock="device")
 
     # Floors
 
