@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from worker.raster.cuda.update import COLOUR_ROW, CONSTANT_HARMONIC, STATE_ROWS, adam
+from worker.raster.cuda.update import COLOUR_ROW, CONSTANT_HARMONIC, STATE_ROWS, adam, load_trained, store_trained
 
 BLOCK = 128
 """Gaussians a program, one a thread: a direction and its slopes stay in registers."""
@@ -83,6 +83,22 @@ def _term(K: tl.constexpr, x, y, z):  # type: ignore[no-untyped-def]
         value = -C3_YYY * x * (x * x - 3 * y * y)
         by_x, by_y, by_z = -3 * C3_YYY * (x * x - y * y), 6 * C3_YYY * x * y, none
     return value, by_x, by_y, by_z
+
+
+@triton.jit
+def _term_number(k, x, y, z, TERMS: tl.constexpr):  # type: ignore[no-untyped-def]
+    """The value of _term where the program has to tell which."""
+    value = tl.zeros_like(x)
+    for K in tl.static_range(1, TERMS):
+        if k == K:
+            value += _value(K, x, y, z)
+    return value
+
+
+@triton.jit
+def _value(K: tl.constexpr, x, y, z):  # type: ignore[no-untyped-def]
+    value, _, _, _ = _term(K, x, y, z)
+    return value
 
 
 @triton.jit
@@ -167,30 +183,34 @@ def update_rest(  # type: ignore[no-untyped-def]
     TERMS: tl.constexpr, FRAMES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adam on the coefficients in use, 1 <= k < TERMS. moments [2, coefficients, columns] with coefficients =
-    3 (K - 1), size and floor [1]. Grid (blocks,). After colour_from_sh_backward, which reads what this changes."""
+    3 (K - 1), size and floor [1]. Grid (blocks, TERMS - 1): a program has one k. After colour_from_sh_backward, which
+    reads what this changes."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    inside = at < columns
+    inside, k = at < columns, 1 + tl.program_id(1)
     if tl.load(ok) != 0:
         step, low = tl.load(size), tl.load(floor)
         if step != 0.0:
-            for k in tl.static_range(1, TERMS):
-                red = tl.zeros(at.shape, tl.float32)
-                green = tl.zeros(at.shape, tl.float32)
-                blue = tl.zeros(at.shape, tl.float32)
-                for frame in tl.static_range(FRAMES):
-                    x, y, z, _ = _direction(state, centre, frame, at, inside, columns)
-                    value, _, _, _ = _term(k, x, y, z)
-                    red += value * _colour_gradient(v_colour, colour, frame, 0, at, inside, columns)
-                    green += value * _colour_gradient(v_colour, colour, frame, 1, at, inside, columns)
-                    blue += value * _colour_gradient(v_colour, colour, frame, 2, at, inside, columns)
-                second, place = moments + coefficients * columns, (k - 1) * 3 * columns + at
-                adam(rest, moments, second, place, inside, red, step, low, betas)
-                adam(rest, moments, second, place + columns, inside, green, step, low, betas)
-                adam(rest, moments, second, place + 2 * columns, inside, blue, step, low, betas)
+            second, place = moments + coefficients * columns, (k - 1) * 3 * columns + at
+            r, r_m, r_v = load_trained(rest, moments, second, place, inside)
+            g, g_m, g_v = load_trained(rest, moments, second, place + columns, inside)
+            b, b_m, b_v = load_trained(rest, moments, second, place + 2 * columns, inside)
+            red, green, blue = tl.zeros_like(r), tl.zeros_like(r), tl.zeros_like(r)
+            for frame in tl.static_range(FRAMES):
+                x, y, z, _ = _direction(state, centre, frame, at, inside, columns)
+                value = _term_number(k, x, y, z, TERMS)
+                red += value * _colour_gradient(v_colour, colour, frame, 0, at, inside, columns)
+                green += value * _colour_gradient(v_colour, colour, frame, 1, at, inside, columns)
+                blue += value * _colour_gradient(v_colour, colour, frame, 2, at, inside, columns)
+            r, r_m, r_v = adam(r, r_m, r_v, red, step, low, betas)
+            g, g_m, g_v = adam(g, g_m, g_v, green, step, low, betas)
+            b, b_m, b_v = adam(b, b_m, b_v, blue, step, low, betas)
+            store_trained(rest, moments, second, place, inside, r, r_m, r_v)
+            store_trained(rest, moments, second, place + columns, inside, g, g_m, g_v)
+            store_trained(rest, moments, second, place + 2 * columns, inside, b, b_m, b_v)
 
 
-def _grid(columns: int, *frames: int) -> tuple[int, ...]:
-    return (triton.cdiv(columns, BLOCK), *frames)
+def _grid(columns: int, *beside: int) -> tuple[int, ...]:
+    return (triton.cdiv(columns, BLOCK), *beside)
 
 
 def show(rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, degree: int) -> None:
@@ -222,7 +242,8 @@ def update(
 ) -> None:
     """One step of Adam on the harmonics up to a degree, after carry_back; control has adam_fields (control.py)."""
     frames, _, columns = state.shape
-    update_rest[_grid(columns)](
+    terms = (degree + 1) ** 2
+    update_rest[_grid(columns, terms - 1)](
         rest, moments, state, centre, colour, v_colour, ok, control["rest_size"], control["floor"],
-        control["betas"], columns, rest.shape[0] * 3, TERMS=(degree + 1) ** 2, FRAMES=frames, BLOCK=BLOCK,
+        control["betas"], columns, rest.shape[0] * 3, TERMS=terms, FRAMES=frames, BLOCK=BLOCK,
     )  # fmt: skip

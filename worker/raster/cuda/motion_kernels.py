@@ -18,7 +18,9 @@ from worker.raster.cuda.update import (
     TILE_ROWS,
     adam,
     gradient_of_values,
+    load_trained,
     report_step,
+    store_trained,
     update_values,
 )
 
@@ -86,6 +88,8 @@ def update_linear(  # type: ignore[no-untyped-def]
         used, left = rate != 0.0, tl.load(alive)
         while left > 0:
             j = tl.load(alive + left)
+            place = (j * CHANNELS + row) * columns + at
+            value, m, v = load_trained(weight, first, second, place, used)
             if FRAMES == 1:
                 gradient = tl.load(basis + j) * total
             else:
@@ -94,7 +98,8 @@ def update_linear(  # type: ignore[no-untyped-def]
                     share = gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, columns)
                     gradient += tl.load(basis + frame * bases + j) * share
             step, low = tl.load(basis_size + j) * rate, tl.load(basis_floor + j)
-            adam(weight, first, second, (j * CHANNELS + row) * columns + at, used, gradient, step, low, betas)
+            value, m, v = adam(value, m, v, gradient, step, low, betas)
+            store_trained(weight, first, second, place, used, value, m, v)
             left -= 1
 
 
@@ -167,22 +172,25 @@ def update_fdm(  # type: ignore[no-untyped-def]
         while left > 0:
             left -= 1
             place = (row * bases + left) * columns + at
-            centres = tl.load(centre + place, mask=used, other=0.0)
-            widths = tl.load(width + place, mask=used, other=1.0)
-            weights = tl.load(weight + place, mask=used, other=0.0)
-            value, by_centre, by_width = fdm_basis(tl.load(time), centres, widths, QUARTIC)
+            w, w_m, w_v = load_trained(weight, first, second, place, used)
+            c, c_m, c_v = load_trained(centre, first + group, second + group, place, used)
+            s, s_m, s_v = load_trained(width, first + 2 * group, second + 2 * group, place, used)
+            value, by_centre, by_width = fdm_basis(tl.load(time), c, s, QUARTIC)
             if FRAMES == 1:
                 share = total * value
             else:
                 share = value * gradient_of_values(v_state, v_opacity, v_colour, colour, 0, row, at, columns)
-            to_weight, to_centre, to_width = share, share * weights * by_centre, share * weights * by_width
+            to_w, to_c, to_s = share, share * w * by_centre, share * w * by_width
             for frame in tl.static_range(1, FRAMES):
-                value, by_centre, by_width = fdm_basis(tl.load(time + frame), centres, widths, QUARTIC)
+                value, by_centre, by_width = fdm_basis(tl.load(time + frame), c, s, QUARTIC)
                 share = gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, columns)
                 share = share * value
-                to_weight += share
-                to_centre += share * weights * by_centre
-                to_width += share * weights * by_width
-            adam(weight, first, second, place, used, to_weight, step, low, betas)
-            adam(centre, first + group, second + group, place, used, to_centre, step, low, betas)
-            adam(width, first + 2 * group, second + 2 * group, place, used, to_width, step, low, betas)
+                to_w += share
+                to_c += share * w * by_centre
+                to_s += share * w * by_width
+            w, w_m, w_v = adam(w, w_m, w_v, to_w, step, low, betas)
+            c, c_m, c_v = adam(c, c_m, c_v, to_c, step, low, betas)
+            s, s_m, s_v = adam(s, s_m, s_v, to_s, step, low, betas)
+            store_trained(weight, first, second, place, used, w, w_m, w_v)
+            store_trained(centre, first + group, second + group, place, used, c, c_m, c_v)
+            store_trained(width, first + 2 * group, second + 2 * group, place, used, s, s_m, s_v)

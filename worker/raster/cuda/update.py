@@ -42,15 +42,31 @@ def padded(count: int) -> int:
 
 
 @triton.jit
-def adam(value, first, second, at, mask, gradient, size, floor, betas):  # type: ignore[no-untyped-def]
-    """One step of Adam on value[at]; first and second are the moments, betas their decays."""
+def load_trained(value, first, second, at, mask):  # type: ignore[no-untyped-def]
+    """A value and its two moments. All at once, and before anything is stored: a load waits for no other, but no
+    compiler moves it ahead of a store."""
+    return (
+        tl.load(value + at, mask=mask, other=0.0),
+        tl.load(first + at, mask=mask, other=0.0),
+        tl.load(second + at, mask=mask, other=0.0),
+    )
+
+
+@triton.jit
+def adam(value, m, v, gradient, size, floor, betas):  # type: ignore[no-untyped-def]
+    """One step of Adam: the value and its moments m, v after it; betas [2] are the moments' decays."""
     beta1, beta2 = tl.load(betas), tl.load(betas + 1)
-    m = beta1 * tl.load(first + at, mask=mask, other=0.0) + (1.0 - beta1) * gradient
-    v = beta2 * tl.load(second + at, mask=mask, other=0.0) + (1.0 - beta2) * gradient * gradient
+    m = beta1 * m + (1.0 - beta1) * gradient
+    v = beta2 * v + (1.0 - beta2) * gradient * gradient
+    return value - size * m / (tl.sqrt(v) + floor), m, v
+
+
+@triton.jit
+def store_trained(value, first, second, at, mask, new, m, v):  # type: ignore[no-untyped-def]
+    """What load_trained loaded, after a step."""
+    tl.store(value + at, new, mask=mask)
     tl.store(first + at, m, mask=mask)
     tl.store(second + at, v, mask=mask)
-    moved = tl.load(value + at, mask=mask, other=0.0) - size * m / (tl.sqrt(v) + floor)
-    tl.store(value + at, moved, mask=mask)
 
 
 @triton.jit
@@ -73,12 +89,14 @@ def update_values(  # type: ignore[no-untyped-def]
     values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, columns, FRAMES: tl.constexpr
 ):
     """Adam on a program's values; returns their gradient. moments [2, VALUES, columns], size [VALUES], floor [1]."""
+    rate = tl.load(size + row, mask=row < VALUE_ROWS, other=0.0)
+    second, place = moments + VALUE_ROWS * columns, row * columns + at
+    value, m, v = load_trained(values, moments, second, place, rate != 0.0)
     gradient = gradient_of_values(v_state, v_opacity, v_colour, colour, 0, row, at, columns)
     for frame in tl.static_range(1, FRAMES):
         gradient += gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, columns)
-    rate = tl.load(size + row, mask=row < VALUE_ROWS, other=0.0)
-    second = moments + VALUE_ROWS * columns
-    adam(values, moments, second, row * columns + at, rate != 0.0, gradient, rate, tl.load(floor), betas)
+    value, m, v = adam(value, m, v, gradient, rate, tl.load(floor), betas)
+    store_trained(values, moments, second, place, rate != 0.0, value, m, v)
     return gradient
 
 
