@@ -84,14 +84,12 @@ def main() -> int:
         options = ["--out", str(out), "--work", work, "--seed", str(seed)]
         options += ["--clip", str(arguments.clip.resolve())] if arguments.clip else []
         options += ["--interpret"] if arguments.interpret else []
-        for part in chosen:
-            (out / f"gpu-{part.name}.csv").unlink(
-                missing_ok=True
-            )  # what an earlier run left must not pass for this one's
+        for path in [path for part in chosen for path in part.files(out)]:
+            path.unlink(missing_ok=True)  # an earlier run's rows must not pass for this one's
         failures = run_parts(chosen, options, environment(Path(work), arguments.interpret))
     print_table(out, [part.name for part in chosen])
     for failure in failures:
-        print(f"gpu-check: {failure}", file=sys.stderr)
+        print(f"gpu-check: part {failure}; see above.", file=sys.stderr)
     return 1 if failures else 0
 
 
@@ -135,9 +133,11 @@ def run_parts(parts: list[Part], options: list[str], variables: dict[str, str]) 
                 command = [sys.executable, str(part.program), *options, "--deadline", str(deadline), "--doubt", doubt]
                 # what is compiled for the tests must not make the time of compilation look short
                 own = variables | {"TRITON_CACHE_DIR": f"{variables['TRITON_CACHE_DIR']}-{part.name == 'correct'}"}
-                if problem := _failure(command, own, deadline):
+                problem = _failure(command, own, deadline)
+                if problem:
                     failures.append(f"{part.name} {problem}")
-                    doubt = doubt or ("a kernel is wrong" if part.name == "correct" else "")
+                if problem and part.name == "correct":
+                    doubt = f"the checks of the kernels {problem}"
         finally:
             prepared.kill()
     return failures
@@ -151,7 +151,7 @@ def _failure(command: list[str], variables: dict[str, str], deadline: float) -> 
     except subprocess.TimeoutExpired:
         return "did not end in time and was killed"
     if status == 1:
-        return "found something wrong, or broke off; see above"
+        return "found something wrong, or broke off"
     return "" if status == 0 else f"ended with status {status}"
 
 
