@@ -49,15 +49,36 @@ _NOWHERE = tl.constexpr(-1000.0)  # log2 of an opacity that is never drawn
 
 
 @triton.jit
-def _pair(records, row, part: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Floats 2 part and 2 part + 1 of K records, each [K, 1].
+def _rows(owner, i, first, end, in_chunk):  # type: ignore[no-untyped-def]
+    """Records of the instances i + in_chunk; beyond the tile's own [first, end), of its last.
 
-    Two floats are read as one int64, of which every thread wants both halves: half as many loads as floats.
+    Read a chunk ahead, so that no load waits for another that says where to read.
     """
-    both = tl.load(records + row * (_RECORD // 2) + part)
-    first = both.to(tl.int32).to(tl.float32, bitcast=True)
-    second = (both >> 32).to(tl.int32).to(tl.float32, bitcast=True)
-    return first[:, None], second[:, None]
+    at = tl.minimum(tl.maximum(i, first) + in_chunk, end - 1)
+    return tl.load(owner + at, mask=at >= first, other=0)
+
+
+@triton.jit
+def _both(pair):  # type: ignore[no-untyped-def]
+    """The two float32 of which int64 [K] are made, each [K, 1]."""
+    low, high = pair.to(tl.int32), (pair >> 32).to(tl.int32)
+    return low.to(tl.float32, bitcast=True)[:, None], high.to(tl.float32, bitcast=True)[:, None]
+
+
+@triton.jit
+def _two(records, row, part: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Floats 2 part and 2 part + 1 of K records, each [K, 1]."""
+    return _both(tl.load(records + row * (_RECORD // 2) + part))
+
+
+@triton.jit
+def _four(records, row, part: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Floats 2 part to 2 part + 3 of K records, each [K, 1]: two lanes read a record, every thread gets all."""
+    columns = tl.arange(0, 2)[None, :] + part
+    low, high = tl.split(tl.load(records + row[:, None] * (_RECORD // 2) + columns))
+    first, second = _both(low)
+    third, fourth = _both(high)
+    return first, second, third, fourth
 
 
 @triton.jit
@@ -87,9 +108,8 @@ def _one_later(values, first, k, K: tl.constexpr, P: tl.constexpr):  # type: ign
 @triton.jit
 def _alphas(records, row, there, x, y):  # type: ignore[no-untyped-def]
     """2^power2 and alpha [K, P] of a chunk, before the rule of the full pixel."""
-    mean_x, mean_y = _pair(records, row, 0)
-    k_xx, k_xy = _pair(records, row, 1)
-    k_yy, lo = _pair(records, row, 2)
+    mean_x, mean_y, k_xx, k_xy = _four(records, row, 0)
+    k_yy, lo = _two(records, row, 2)
     lo = tl.where(there[:, None], lo, _NOWHERE)
     dx, dy = x[None, :] - mean_x, y[None, :] - mean_y
     raw = tl.exp2(tl.fma(dx, tl.fma(k_xx, dx, k_xy * dy), tl.fma(k_yy * dy, dy, lo)))
@@ -204,24 +224,25 @@ def blend(  # type: ignore[no-untyped-def]
     red = tl.zeros((P,), tl.float32)
     green, blue, depth, cover, value = red, red, red, red, red
     i = first
+    row = _rows(owner, i, first, end, in_chunk)
     while (i < end) & (tl.max(transmittance) >= _STOP):
         there = i + in_chunk < end
-        row = tl.load(owner + tl.minimum(i + in_chunk, end - 1))
+        next_row = _rows(owner, i + K, first, end, in_chunk)
         if MODE != _RENDER:
             tl.store(scratch + pixel, transmittance)
             scratch += P
         _, alpha = _alphas(records, row, there, x, y)
         _, w, transmittance = _blended(alpha, transmittance, k, K, P)
-        c_red, c_green = _pair(records, row, 3)
-        c_blue, c_depth = _pair(records, row, 4)
+        c_red, c_green, c_blue, c_depth = _four(records, row, 4)
         red += tl.sum(w * c_red, 0)
         green += tl.sum(w * c_green, 0)
         blue += tl.sum(w * c_blue, 0)
         depth += tl.sum(w * c_depth, 0)
         cover += tl.sum(w, 0)
         if VALUES:
-            c_value, _ = _pair(records, row, 5)
+            c_value, _ = _two(records, row, 3)
             value += tl.sum(w * c_value, 0)
+        row = next_row
         i += K
 
     if MODE == _RENDER:
@@ -273,18 +294,18 @@ def blend(  # type: ignore[no-untyped-def]
         behind = tl.zeros((P,), tl.float32)
         tl.debug_barrier()  # scratch was perhaps written by another thread of the warp than the one that reads it
         j = i
+        row = _rows(owner, j - K, first, end, in_chunk)
         while j > first:
             j -= K
+            next_row = _rows(owner, j - K, first, end, in_chunk)
             scratch -= P
             there = j + in_chunk < end
-            row = tl.load(owner + tl.minimum(j + in_chunk, end - 1))
             place = tl.load(slot + j + in_chunk, mask=there, other=0)
             out = slots + place.to(tl.int64)[:, None] * _SLOT + part
             raw, alpha = _alphas(records, row, there, x, y)
             alpha, w, _ = _blended(alpha, tl.load(scratch + pixel), k, K, P)
             tl.store(out + 8, _sum_split(w, of_colour), mask=there[:, None])
-            c_red, c_green = _pair(records, row, 3)
-            c_blue, c_depth = _pair(records, row, 4)
+            c_red, c_green, c_blue, c_depth = _four(records, row, 4)
             own = tl.fma(g_red[None, :], c_red, g_green[None, :] * c_green)
             own += tl.fma(g_blue[None, :], c_blue, tl.fma(g_depth[None, :], c_depth, g_cover[None, :]))
             v_power = tl.zeros((K, P), tl.float32)
@@ -294,6 +315,7 @@ def blend(  # type: ignore[no-untyped-def]
                 behind = tl.fma(_row(alpha, k, K - back), score, behind)
             v_power = tl.where(raw < _MAX_ALPHA, w * v_power, 0.0)
             tl.store(out, _sum_split(v_power, monomials) + middle, mask=there[:, None])
+            row = next_row
         while i < end:  # what lies behind a full tile
             there = i + in_chunk < end
             place = tl.load(slot + i + in_chunk, mask=there, other=0)

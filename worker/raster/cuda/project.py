@@ -5,10 +5,10 @@ N Gaussians, F frames; rows of N floats: state [F, 10 or more, N] = mean 0:3, qu
     0 1   mean2d x, y in px
     2 3 4 the conic times -log2(e) / 2, -log2(e), -log2(e) / 2: power2 = lo + k_xx dx^2 + k_xy dx dy + k_yy dy^2
     5     lo = log2(opacity), so that alpha = 2**power2
-    6 7 8 colour
-    9     camera z
-    10    a value of the caller's that is blended as colour is
-    11    spare
+    6     a value of the caller's that is blended as colour is
+    7     spare
+    8 9 10  colour
+    11    camera z
 Arithmetic is float64 as on the CPU (geometry.py), storage float32.
 """
 
@@ -119,6 +119,6 @@ def project(  # type: ignore[no-untyped-def]
     _store_pair(at, mean_x, mean_y, there)
     _store_pair(at + 1, k_xx.to(tl.float32), k_xy.to(tl.float32), there)
     _store_pair(at + 2, k_yy.to(tl.float32), log2_opacity, there)
-    _store_pair(at + 3, red, green, there)
-    _store_pair(at + 4, blue, depth, there)
-    _store_pair(at + 5, tl.zeros_like(depth), tl.zeros_like(depth), there)
+    _store_pair(at + 3, tl.zeros_like(depth), tl.zeros_like(depth), there)
+    _store_pair(at + 4, red, green, there)
+    _store_pair(at + 5, blue, depth, there)

@@ -223,7 +223,7 @@ class CudaRasterizer:
         """
         planes = 5 if values is None else 6
         if values is not None:
-            self._records.view(self.frames, self.gaussians, RECORD)[:, :, 10] = values
+            self._records.view(self.frames, self.gaussians, RECORD)[:, :, 6] = values
         image = self._image.view(-1)[: self.frames * planes * self.height * self.width]
         self._blend(RENDER, image, values is not None)
         return image.view(self.frames, planes, self.height, self.width)
