@@ -252,6 +252,9 @@ class CudaModel:
         """R G B Z A at several times at once, [F, 5, H, W] on the device; a view that the next render overwrites.
 
         With values [N], a number a Gaussian, they are blended as colour is, and [F, 6, H, W] ends with them.
+
+        Raises:
+            ValueError: more times than the rasteriser draws at once (bins.MOST_FRAMES).
         """
         view = self._shown = self._steer(camera, times)
         with_values = values is not None
