@@ -25,6 +25,7 @@ from gpu_peaks import Peaks, measure_peaks
 from gpu_rows import KERNELS_READY, Part, Stamp, device_ms, synchronize, wall_ms
 from gpu_scenes import stereo_pairs
 from gpu_work import Sizes, bytes_by_kernel
+from torch.profiler import ProfilerActivity, profile
 
 from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
 from worker.loss import LossSettings
@@ -41,7 +42,8 @@ SMALL = 8, 8, 4.0
 """Width, height and distance of Gaussians in the interpreter."""
 QUEUED_TICKS = 6_000_000
 """The device sleeps so long, some 3 ms, while the launches of a step are queued."""
-CAMERAS = 8
+CAMERAS, PROFILED = 8, 8
+"""Frames to choose from; steps the profiler sees."""
 TIME = 0.4
 
 
@@ -110,13 +112,7 @@ class Speed:
         if self._part.interpret:
             return
         self.add("compilation, cache empty", self.first_step_s(), "s", clock="host")
-        program = "import gpu_speed; gpu_speed.compile_again()"
-        found = subprocess.run(
-            [sys.executable, "-c", program, *sys.argv[1:]], capture_output=True, text=True, check=False, timeout=60,
-            env={**os.environ, "PYTHONPATH": f"{Path(__file__).parent}{os.pathsep}{os.environ['PYTHONPATH']}"},
-        )  # fmt: skip
-        seconds = float(found.stdout.split()[-1]) if found.returncode == 0 else float("nan")
-        self.add("compilation, cache full", seconds, "s", clock="host")
+        self.add("compilation, cache full", _seconds_of_another_process(), "s", clock="host")
 
     def first_step_s(self) -> float:
         """Of a step, a picture and an image's gradient of a new model."""
@@ -164,6 +160,8 @@ class Speed:
             self.add("step, without a graph", alone_ms, "ms", clock="host", **place)
         for name, ms in self._parts(model).items():
             self.add(f"part: {name}", ms, "ms", clock="device", **place)
+        if frames == 1 and self._device == "cuda":
+            self._kernels(model, place)
         if self._device == "cuda":
             self.add("peak memory", torch.cuda.max_memory_allocated() / 2**20, "MiB", **place)
         needed, capacity = int(model._training.rasterizer.needed), model._training.rasterizer.capacity
@@ -208,6 +206,24 @@ class Speed:
                     delattr(owner, name)
         model._report.zero_()
         return _nested({name: median(values) for name, values in found.items()})
+
+    def _kernels(self, model: CudaModel, place: dict[str, Any]) -> None:
+        """What the profiler sees of a step, kernel by kernel; nothing where it does not work."""
+        try:
+            with profile(activities=[ProfilerActivity.CUDA]) as seen:
+                for _ in range(PROFILED):
+                    model._launch(0)
+                synchronize(self._device)
+            found = [each for each in seen.key_averages() if each.self_device_time_total > 0]
+        except Exception as error:  # of the profiler's own
+            print(f"  the profiler gives nothing here: {type(error).__name__}: {error}", flush=True)
+            return
+        finally:
+            model._report.zero_()
+        for each in sorted(found, key=lambda each: -each.self_device_time_total):
+            name = f"kernel: {each.key[:60]}"
+            launches = f"{each.count / PROFILED:g} launches"
+            self.add(name, each.self_device_time_total / PROFILED, "us", clock="device", note=launches, **place)
 
     # Pictures
 
@@ -265,6 +281,20 @@ class Speed:
             self.add("floor: multiply-adds", floor_ms, "ms", note=f"{made / 1e6:.1f} million", **place)
             self.add("reached: bytes", 1e3 * moved / step_ms, "a second", **place)
             self.add("reached: multiply-adds", 1e3 * made / step_ms, "a second", **place)
+
+
+def _seconds_of_another_process() -> float:
+    """What compile_again prints there; NaN if it fails."""
+    path = f"{Path(__file__).parent}{os.pathsep}{os.environ['PYTHONPATH']}"
+    command = [sys.executable, "-c", "import gpu_speed; gpu_speed.compile_again()", *sys.argv[1:]]
+    try:
+        found = subprocess.run(
+            command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True, timeout=60
+        )
+        return float(found.stdout.split()[-1])
+    except (subprocess.SubprocessError, ValueError, IndexError) as error:
+        print(f"  no seconds of a process that finds the cache full: {error}", flush=True)
+        return float("nan")
 
 
 def compile_again() -> None:
