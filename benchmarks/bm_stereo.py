@@ -28,7 +28,7 @@ from worker.clip import DepthClip, StereoClip, open_clip
 from worker.evaluate.rows import commit
 from worker.phantom import PhantomSettings, make_phantom
 from worker.stereo import estimate_depth
-from worker.stereo.alignment import RowShift, feature_matches, measure_row_shift
+from worker.stereo.alignment import RowShift, find_features, match_features, measure_row_shift
 from worker.stereo.matching import shift_rows
 
 ROW_CHECKED_PAIRS = 5
@@ -140,7 +140,8 @@ def _print_rows(clip: RectifiedClip, correction_px: float) -> None:
         found = []
         for left, right in pairs:
             greys = [cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in (left, right)]
-            found.append(feature_matches(greys[0], shift_rows(greys[1], shift_px), at_most_px=left.shape[1]))
+            eyes = (greys[0], shift_rows(greys[1], shift_px))
+            found.append(match_features(*(find_features(eye, at_most_px=left.shape[1]) for eye in eyes)))
         matches = np.concatenate(found)
         shift: RowShift = measure_row_shift(matches, clip.disparity_offset_px)
         dy = np.abs(matches[:, 3] - matches[:, 1])

@@ -52,26 +52,35 @@ class RowShift:
         return self.shift_px if worth_it else 0.0
 
 
-def feature_matches(left: Grey, right: Grey, at_most_px: int = FEATURE_WIDTH) -> NDArray[np.float64]:
-    """[M, 4] x_left, y_left, x_right, y_right of SIFT matches that pass the ratio test and lie on similar rows.
+@dataclass(frozen=True, eq=False)
+class Features:
+    """SIFT features of an image: points [N, 2] x, y in its pixels, descriptors [N, 128] float32."""
 
-    Features are found on images made at_most_px wide; the coordinates are the full images'.
-    """
-    scale = min(1.0, at_most_px / left.shape[1])
-    finder = cv2.SIFT.create(nfeatures=FEATURES)
-    found = []
-    for image in (left, right):
-        small = image if scale == 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        found.append(finder.detectAndCompute(small, None))
-    (left_points, left_features), (right_points, right_features) = found
-    if left_features is None or right_features is None or len(right_points) < 2:
+    points: NDArray[np.float64]
+    descriptors: NDArray[np.float32]
+
+
+def find_features(image: Grey, at_most_px: int = FEATURE_WIDTH) -> Features:
+    """Features of the image made at_most_px wide."""
+    scale = min(1.0, at_most_px / image.shape[1])
+    small = image if scale == 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    points, descriptors = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(small, None)
+    if descriptors is None:
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    return Features(np.array([point.pt for point in points], np.float64) / scale, descriptors)
+
+
+def match_features(left: Features, right: Features) -> NDArray[np.float64]:
+    """[M, 4] x_left, y_left, x_right, y_right of matches that pass the ratio test and lie on similar rows."""
+    if not len(left.points) or len(right.points) < 2:
         return np.zeros((0, 4))
-    rows = [
-        (*left_points[best.queryIdx].pt, *right_points[best.trainIdx].pt)
-        for best, second in cv2.BFMatcher(cv2.NORM_L2).knnMatch(left_features, right_features, k=2)
+    pairs = [
+        (best.queryIdx, best.trainIdx)
+        for best, second in cv2.BFMatcher(cv2.NORM_L2).knnMatch(left.descriptors, right.descriptors, k=2)
         if best.distance < RATIO * second.distance
     ]
-    matches: NDArray[np.float64] = np.array(rows, dtype=np.float64).reshape(-1, 4) / scale
+    one, other = np.array(pairs, np.intp).reshape(-1, 2).T
+    matches = np.concatenate([left.points[one], right.points[other]], axis=1)
     near: NDArray[np.float64] = matches[np.abs(matches[:, 3] - matches[:, 1]) <= MAX_SEARCHED_SHIFT_PX]
     return near
 

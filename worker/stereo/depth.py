@@ -17,7 +17,14 @@ from contract.errors import Cancelled, InputError
 from worker.clip.types import DepthClip
 from worker.hooks import Hooks, Progress
 from worker.opencv import cores, one_opencv_thread
-from worker.stereo.alignment import RowShift, agreed_disparities, choose_range, feature_matches, measure_row_shift
+from worker.stereo.alignment import (
+    RowShift,
+    agreed_disparities,
+    choose_range,
+    find_features,
+    match_features,
+    measure_row_shift,
+)
 from worker.stereo.matching import MAX_DEPTH_MM, MIN_CONFIDENCE, Grey, MatchPlan, match
 
 if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
@@ -121,7 +128,8 @@ def _plan(
         chosen = np.unique(np.linspace(0, len(measured) - 1, count).round().astype(int))
         return [(_grey(rgb[measured[k]]), right[measured[k]]) for k in chosen]
 
-    matches = np.concatenate(list(pool.map(lambda pair: feature_matches(*pair), spread(ALIGNMENT_PAIRS))))
+    features = list(pool.map(find_features, [eye for pair in spread(ALIGNMENT_PAIRS) for eye in pair]))
+    matches = np.concatenate(list(pool.map(match_features, features[::2], features[1::2])))
     shift = measure_row_shift(matches, clip.disparity_offset_px, clip.equal_rows_px)
     agreed = agreed_disparities
     if device == "cuda":
