@@ -18,14 +18,16 @@ _ESTIMATE = """
 one**. What a frame has the rasteriser do is counted on the CPU: of the standard grid, and of the model that `intrasplat
 reconstruct CLIP --iterations 600 --out s600` ends with on `d4d-a`. Bytes and instructions are those of the kernels as
 Triton compiles them for an H200 (sm_90), over its data sheet: 4.3 TB/s, 67 TFLOP/s, and 1.5 to 2.5 us a launch within a
-graph. The floor is what no step can undercut; the forecast, twice the floor and 2.5 us a launch, is a judgement.
+graph. The floor issues every instruction without waiting, and takes every byte from memory, though what fits into the
+cache may come sooner; the forecast, twice the floor and 2.5 us a launch, is a judgement. Launches of torch's sorts are
+counted in its source.
 """
 _KERNELS = """
 Where the floor of {scene} lies, kernel by kernel; `at once` are the warps that fit on a multiprocessor of 64:
 """
 _SHAPES = """
-Of the tiles compiled, {best} promise most on the
-grid. Whether they keep it is the first thing to measure ([gpu.md](../gpu.md)).
+Of the tiles compiled, {best} promise most on the grid: {least} us, {usual} us
+with those in use. What a program waits for is in neither, so this is to be measured first ([gpu.md](../gpu.md)).
 """
 _MEASURED = """
 ## On a GPU
@@ -80,8 +82,8 @@ def _estimate(rows: list[Row]) -> list[str]:
     compared = [row for row in steps if row["scene"] == usual["scene"]]
     if len(compared) > 1:
         best = min(compared, key=lambda row: float(row["forecast_us"]))
-        shape = f"{best['tile']} in chunks of {best['chunk']}, by {best['warps']} warp{'s' * (best['warps'] != '1')},"
-        sections.append(_SHAPES.format(best=shape))
+        shape = f"{best['tile']} in chunks of {best['chunk']}, by {best['warps']} warp{'s' * (best['warps'] != '1')}"
+        sections.append(_SHAPES.format(best=shape, least=best["forecast_us"], usual=usual["forecast_us"]))
     return [*sections, f"\nCommit {usual['commit']}.\n"]
 
 
