@@ -36,7 +36,8 @@ from worker.raster.cuda.project_backward import (
 )
 
 _FIRST_GUESS = 8
-"""Slots a Gaussian and frame for which there is room at first: sorting takes as long for empty ones."""
+"""Slots a Gaussian and frame for which there is room at first: sorting takes as long for empty ones. At least one a
+tile, for a few Gaussians that cover the image."""
 _SPARE = 1.25
 """Room beyond what was needed, so that a scene that grows slowly seldom needs more."""
 _MOST_NUMBERS = 2**31 - 1
@@ -96,7 +97,7 @@ class CudaRasterizer:
         self._image = self._floats(frames, 6, height, width)
         self._nothing = self._floats(1)
         self.reset()
-        self.reserve(0)
+        self.reserve(0, 1)
 
     def _floats(self, *shape: int) -> Tensor:
         return torch.zeros(shape, dtype=torch.float32, device=self.device)
@@ -112,9 +113,10 @@ class CudaRasterizer:
         """
         if gaussians != self.gaussians:
             self._allocate_splats(gaussians)
-        wanted = _FIRST_GUESS * self.frames * gaussians if capacity is None else capacity
-        if self.capacity < max(wanted, 1):
-            self._allocate_slots(max(wanted, 1))
+        guess = self.frames * max(_FIRST_GUESS * gaussians, self.tiles)
+        wanted = max(guess if capacity is None else capacity, 1)
+        if self.capacity < wanted:
+            self._allocate_slots(wanted)
 
     def _allocate_splats(self, gaussians: int) -> None:
         frames, splats = self.frames, self.frames * gaussians
