@@ -10,10 +10,18 @@ import time
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from tests.conftest import REPOSITORY
+from tests.worker.raster.scenes import Scene, random_scene
+from worker.deformation import SharedBasis
+from worker.gaussians import Gaussians
+from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, reference
+from worker.raster.cpu.model import FusedModel
+from worker.raster.step import camera_vector
 
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
@@ -25,13 +33,13 @@ NOT_THERE = (
 """What a machine that is lent with torch and Triton need not have."""
 
 
-def gpu_check() -> ModuleType:
-    """benchmarks/ is no package: its programs are run."""
-    spec = importlib.util.spec_from_file_location("gpu_check", BENCHMARKS / "gpu_check.py")
+def benchmark(name: str) -> ModuleType:
+    """A module of benchmarks/, which is no package: its programs are run."""
+    spec = importlib.util.spec_from_file_location(name, BENCHMARKS / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules["gpu_check"] = module  # dataclasses look their module up
+    sys.modules[name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
 
@@ -81,7 +89,7 @@ def test_without_a_gpu_it_says_so_and_writes_nothing(tmp_path: Path) -> None:
 
 
 def test_a_wrong_kernel_casts_doubt_on_what_follows_and_a_part_without_end_is_killed(tmp_path: Path) -> None:
-    module = gpu_check()
+    module = benchmark("gpu_check")
     programs = {
         "correct": "sys.exit(1)",
         "speed": "open(sys.argv[0] + '.doubt', 'w').write(sys.argv[sys.argv.index('--doubt') + 1])",
@@ -102,3 +110,38 @@ def test_a_wrong_kernel_casts_doubt_on_what_follows_and_a_part_without_end_is_ki
     doubt = (tmp_path / "gpu_speed.py.doubt").read_text()
     assert doubt == "the checks of the kernels found something wrong, or broke off"
     assert time.monotonic() - begun < 40
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (16, 4)])
+def test_the_work_that_is_counted_on_the_cpu_is_what_a_frame_takes(shape: tuple[int, int]) -> None:
+    scene = random_scene(60, width=37, height=21, seed=4, pixels=3.0)
+    parts = (scene.mean, scene.quaternion, scene.scale.log(), torch.logit(scene.opacity), torch.zeros(60, 1, 3))
+    gaussians = Gaussians(*(each.float() for each in parts))
+    still = SharedBasis.initial(60, bases=2, colour=False)
+    model = FusedModel(gaussians, still, 37, 21)
+    camera = camera_vector(scene.camera)
+    counted = benchmark("gpu_counts").count(model, camera, 0.3, shape, 16)
+
+    alpha = alphas(scene)
+    before = np.cumprod(np.concatenate([np.ones((1, 21, 37)), 1 - alpha[:-1]]), axis=0)
+    assert counted.blended == int(((alpha > 0) & (before >= MIN_TRANSMITTANCE)).sum())
+    down, across = -(-21 // shape[1]), -(-37 // shape[0])
+    wide = np.zeros((60, down * shape[1], across * shape[0]), bool)
+    wide[:, :21, :37] = alpha > 0
+    touched = wide.reshape(60, down, shape[1], across, shape[0]).any((2, 4)).sum()
+    assert touched <= counted.instances <= 1.1 * touched  # rows of an ellipse, not its pixels, decide
+    assert counted.visited <= counted.instances
+    assert counted.evaluated == counted.chunks * 16 * shape[0] * shape[1]
+
+
+def alphas(scene: Scene) -> NDArray[np.float64]:
+    """[N, H, W] alpha of every Gaussian, nearest first, cut as worker.raster says."""
+    projected = reference.project(*scene.tensors()[:4], scene.camera)
+    i, j = np.mgrid[0.5 : scene.camera.height, 0.5 : scene.camera.width]
+    order = projected.depth.argsort()
+    x, y = projected.mean2d[order].numpy().T[:, :, None, None]
+    a, b, c = projected.conic[order].numpy().T[:, :, None, None]
+    dx, dy = j - x, i - y
+    raw = projected.opacity[order].numpy()[:, None, None] * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+    raw[~projected.visible[order].numpy()] = 0.0
+    return np.where(raw >= MIN_ALPHA, np.minimum(raw, MAX_ALPHA), 0.0)
