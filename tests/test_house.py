@@ -15,7 +15,9 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("docker/*.md")])
-TARGETS = ("help", "setup", "demo", "test", "check", "bench", "gpu-check", "evaluate", "capacity", "chaos", "sbom", "clean")
+TARGETS = (
+    "help", "setup", "demo", "test", "check", "bench", "gpu-check", "evaluate", "capacity", "chaos", "sbom", "clean",
+)  # fmt: skip
 MAX_LINES = 400
 LINK = re.compile(r"\[(?:[^\[\]]|\\.)*\]\(([^)\s]+)\)")
 
