@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Literal, get_args
@@ -109,6 +110,20 @@ def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OP
     raise UnavailableError(problem, f"{gpu.remedy}, or train on the CPU: {cpu_by}.")
 
 
+def examine(device: Device) -> float:
+    """See once a process that a GPU splats as the reference does; seconds it took, nearly all of them for compilation.
+
+    Raises:
+        UnavailableError: it does not.
+    """
+    start = time.perf_counter()
+    if device.kind == "cuda":
+        from worker.raster.cuda import agreement
+
+        agreement.check(device.memory, device.name)
+    return time.perf_counter() - start
+
+
 def gpu_is_lost() -> bool:
     """Whether an error has ended what this process may do with its GPU: from then on every use of it fails."""
     if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
@@ -140,6 +155,9 @@ def make_model(gaussians: Gaussians, deformation: Deformation, width: int, heigh
     """The Gaussians (on the host) and their motion in the form that the device trains and renders.
 
     A motion without kernels of its own lies on the CPU, whatever the device. Triton is imported for a GPU alone.
+
+    Raises:
+        UnavailableError: as examine.
     """
     if isinstance(deformation, HexPlane):
         return UnfusedModel(gaussians, deformation, width, height)
@@ -147,5 +165,6 @@ def make_model(gaussians: Gaussians, deformation: Deformation, width: int, heigh
         return FusedModel(gaussians, deformation, width, height)
     from worker.raster.cuda.model import CudaModel
 
+    examine(device)
     model: Model = CudaModel(gaussians, deformation, width, height, device.memory)
     return model

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TypeVar
 
 from contract.errors import Cancelled
-from worker.backend import CPU, Device
+from worker.backend import CPU, Device, examine
 from worker.clip import DepthClip, FrameSplit
 from worker.densify import Densifier
 from worker.fusion import fuse
@@ -58,6 +58,9 @@ def prepare(
     """Fuse points, start the model, and settle how many iterations are made; seconds by stage go into `seconds`."""
     hooks, seconds = hooks or Hooks(), {} if seconds is None else seconds
     scale = units_per_mm(clip, split.train)
+    if device != CPU:  # what a GPU's kernels take to be compiled, here and below, is no part of training
+        report_stage(hooks, "compile", 0.0)
+        seconds["compile_s"] = seconds.get("compile_s", 0.0) + clock.pause(lambda: examine(device))
     tracks = None
     if preset.tracks and len(split.train) > 1:
         tracks = timed(
@@ -73,9 +76,10 @@ def prepare(
     )
     frames = timed(seconds, "targets_s", lambda: TrainingFrames(clip, split.train, scale))
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
-    if device != CPU:  # kernels of a GPU are compiled for the model; what that takes is no part of training
-        compiled_s = clock.pause(lambda: warm_up(model, frames, preset, partial(report_stage, hooks, "compile")))
-        seconds["compile_s"] = seconds.get("compile_s", 0.0) + compiled_s
+    if device != CPU:
+        seconds["compile_s"] += clock.pause(
+            lambda: warm_up(model, frames, preset, partial(report_stage, hooks, "compile"))
+        )
     schedule, asked = schedule_of(model, frames, preset, request, clock, hooks)
     run = Run(model, frames, preset, schedule, request.seed, asked, densifier=densifier, device=device, chosen=chosen)
     return run, scale
