@@ -1,7 +1,7 @@
 """From the gradients of every instance to those of every Gaussian, on the device.
 
-Two kernels: sum_slots adds up a splat's slots (blend.py) in their order, one warp a splat, so that a splat with a
-thousand of them is a matter of some thirty rounds; project_backward carries the sums back through project.py.
+Two kernels: sum_slots adds up a splat's slots (blend.py), always in the same order, and project_backward carries the
+sums back through project.py.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from worker.raster.cuda.geometry import dot, exp, image_row, limits, mean_of, ro
 
 SUMS = 10
 """What a splat's slots add up to: the moments 1, x, y, xx, xy, yy of dL/dpower about mean2d, dL/d(r, g, b, z)."""
-SPLATS_BLOCK, LANES = 16, 32
-"""sum_slots: splats a program, and slots of each that are added at once."""
+SPLATS_BLOCK, LANES, SUM_WARPS = 16, 8, 1
+"""sum_slots: splats a program, slots of each that are added at once, warps. A splat has some five to ten slots; one
+with hundreds keeps only its own program waiting."""
 BACKWARD_BLOCK = 128
 POSE = 12
 

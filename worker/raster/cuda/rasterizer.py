@@ -30,6 +30,7 @@ from worker.raster.cuda.project_backward import (
     LANES,
     POSE,
     SPLATS_BLOCK,
+    SUM_WARPS,
     SUMS,
     project_backward,
     sum_slots,
@@ -275,6 +276,7 @@ class CudaRasterizer:
         sum_slots[(triton.cdiv(splats, SPLATS_BLOCK),)](
             self._slots.view(torch.int64), self._key, self._slot_start, self.count, self._records, self._sums,
             self.capacity, splats, self.frames * self.tiles, RECORD=RECORD, BLOCK=SPLATS_BLOCK, LANES=LANES,
+            num_warps=SUM_WARPS,
         )  # fmt: skip
         project_backward[(self._programs, self.frames)](
             self._camera, self._state, self._opacity_logit, self.count, self._sums,
