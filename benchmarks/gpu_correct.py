@@ -16,13 +16,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from bm_raster import BASES, GRID_STEP_PX, HEIGHT, WIDTH, grid_scene
 from gpu_rows import KERNELS_READY, Part
 from gpu_scenes import LOSS, Noise, poison, stereo_pairs, stirred_motion
 from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.worker.raster.scenes import Scene, pixels_near_a_cut, random_scene
-from worker.deformation import Deformation
+from worker.deformation import Deformation, SharedBasis
 from worker.gaussians import Gaussians
 from worker.optimize import StepRates
 from worker.raster import reference
@@ -83,6 +84,7 @@ def main() -> None:
         failed.append(checks.make(name, LIMIT, lambda kind=kind: checks.steps(kind)))  # type: ignore[misc]
     if not part.interpret:
         failed.append(checks.make("steps with harmonics beside the CPU's", LIMIT, lambda: checks.steps("shared", 3)))
+        failed.append(checks.make("at full size beside the CPU's", LIMIT, checks.full_size))
     failed.append(checks.make("trained here, rendered on the CPU, of white", EIGHT_BITS, checks.trained))
     print(f"  {failed.count(False)} of {len(failed)} checks passed", flush=True)
     sys.exit(1 if any(failed) else 0)
@@ -233,6 +235,28 @@ class Checks:
             if start.numel()
         }
 
+    def full_size(self, width: int = WIDTH, height: int = HEIGHT, frames: int = 16) -> Differences:
+        """Steps and pictures of the scene that is timed: numbers as large as they get, several frames at once."""
+        gaussians, camera = grid_scene(width, height, GRID_STEP_PX)
+        view, shared = camera_vector(camera), SharedBasis.initial(len(gaussians), bases=BASES, colour=True)
+        noise = Noise(random_scene(1, width=width, height=height), self._random())
+        seen = [noise.frame(t, view) for t in (0.2, 0.25, 0.3)]
+        cpu = FusedModel(gaussians, shared, width, height)
+        cuda = CudaModel(gaussians, shared, width, height, self._device)
+        before = {name: each.clone() for name, each in cpu.parameters().items()}
+        for model in (cpu, cuda):
+            for iteration, frame in enumerate(seen, start=1):
+                model.step(frame, LOSS, dataclasses.replace(RATES, eps=1e-6), iteration)
+        got, wanted = cuda.parameters(), cpu.parameters()
+        worst = {
+            name: _moved(got[name].cpu() - start, wanted[name] - start)
+            for name, start in before.items()
+            if start.numel()
+        }
+        images = cuda.render_times(view, [0.2 + 0.1 * k / frames for k in range(frames)]).cpu()
+        last = torch.from_numpy(cpu.render(view, 0.2 + 0.1 * (frames - 1) / frames).copy())
+        return worst | {"picture": _moved(images[-1], last)}
+
     def same_bits(self) -> Differences:
         """Two models after the same steps, some of them replayed as a graph."""
         first, second = self._model("shared"), self._model("shared")
@@ -254,9 +278,9 @@ class Checks:
         """Disparities beside the planes' own; and how many differ when the same pairs are matched again."""
         size = self.sizes
         left, right, disparity, plan = stereo_pairs(2, size.stereo_width, size.stereo_height, self._random())
-        eyes = [torch.from_numpy(each).to(self._device) for each in (left, right)]
-        found, confidence = match_frames(*eyes, plan)
-        again = found if self._part.interpret else match_frames(*eyes, plan)[0]  # nothing there happens at once
+        one, other = (torch.from_numpy(each).to(self._device) for each in (left, right))
+        found, confidence = match_frames(one, other, plan)
+        again = found if self._part.interpret else match_frames(one, other, plan)[0]  # nothing there happens at once
         error = np.abs(found.cpu().numpy() - disparity)
         seen = (confidence.cpu().numpy() > 0) & (np.arange(size.stereo_width) > disparity)
         if seen.mean() < 0.5:
@@ -293,7 +317,7 @@ def _rendered(
         for layer, cotangent in zip(layers.values(), cotangents, strict=True)
     ]
     leaves = live.leaves()
-    gradients = torch.autograd.grad(sum(weighted), list(leaves.values()))  # type: ignore[arg-type]
+    gradients = torch.autograd.grad(sum(weighted), list(leaves.values()))
     found = {name: layer.detach() for name, layer in layers.items()}
     found |= {f"d {name}": each for name, each in zip(leaves, gradients, strict=True)}
     return {name: each.cpu().double() for name, each in found.items()}

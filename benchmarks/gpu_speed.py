@@ -32,7 +32,8 @@ from worker.loss import LossSettings
 from worker.raster.cpu import padded
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.motion import NEGLIGIBLE
-from worker.raster.cuda import rasterizer as rasters
+from worker.raster.cuda.bins import TILE_HEIGHT, TILE_WIDTH
+from worker.raster.cuda.blend import CHUNK
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
 from worker.raster.step import Target, TrainingFrame, camera_vector
 from worker.stereo.cuda import match_frames
@@ -132,7 +133,8 @@ class Speed:
         if self._device == "cuda":
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats()
-        model, place = self.model(motion, frames), {"scene": motion, "frames": frames}
+        model = self.model(motion, frames)
+        place: dict[str, Any] = {"scene": motion, "frames": frames}
         seen = [self.frame(k / CAMERAS) for k in range(CAMERAS)]
         iteration = 0
 
@@ -190,7 +192,7 @@ class Speed:
             for _ in range(self._rounds):
                 stamps.clear()
                 if self._device == "cuda":
-                    torch.cuda._sleep(QUEUED_TICKS)
+                    torch.cuda._sleep(QUEUED_TICKS)  # type: ignore[no-untyped-call]
                 model._launch(0)
                 synchronize(self._device)
                 ms: dict[str, float] = {}
@@ -259,9 +261,9 @@ class Speed:
         """Pairs that are matched a second, on the device already."""
         count, width, height = (1, 64, 24) if self._part.interpret else (64, WIDTH, HEIGHT)
         left, right, _, plan = stereo_pairs(count, width, height, self._part.seed)
-        eyes = [torch.from_numpy(each).to(self._device) for each in (left, right)]
+        one, other = (torch.from_numpy(each).to(self._device) for each in (left, right))
         rounds = 1 if self._part.interpret else 5
-        ms = device_ms(lambda: match_frames(*eyes, plan), self._device, calls=1, rounds=rounds)
+        ms = device_ms(lambda: match_frames(one, other, plan), self._device, calls=1, rounds=rounds)
         self.add("stereo pairs", 1e3 * count / ms, "a second", scene=f"{width}x{height}", frames=count, clock="device")
 
     # Floors
@@ -270,7 +272,7 @@ class Speed:
         """What the step's bytes and multiply-adds take at the card's peaks, and how near steps come to them."""
         self._part.wait_for(KERNELS_READY)
         cpu = FusedModel(self.gaussians, self.motion("shared"), self._width, self._height)
-        counts = count(cpu, self.camera, TIME, (rasters.TILE_WIDTH, rasters.TILE_HEIGHT), rasters.CHUNK)
+        counts = count(cpu, self.camera, TIME, (TILE_WIDTH, TILE_HEIGHT), CHUNK)
         for (motion, frames), step_ms in self.step_ms.items():
             sizes = _sizes(self.model(motion, frames), self.motion(motion), self._width * self._height)
             moved = sum(bytes_by_kernel(sizes, counts).values())

@@ -71,7 +71,7 @@ class Trials:
         self._part, self._name, self._clip = part, name, clip
         self._curves = dataclasses.replace(part, name="curves", fields=CURVE_FIELDS)
         self._paper_db: float | None = None
-        training.CURVE_SECONDS = MOMENTS_S  # type: ignore[assignment]
+        training.CURVE_SECONDS = MOMENTS_S
 
     def run(self, preset: Preset, device: Device, seed: int, **length: float | None) -> None:
         """One run, its row and its curve; one that breaks off has a row that says so."""
@@ -101,7 +101,8 @@ class Trials:
         """The run, seconds by stage, and why it was cut short if it was."""
         split = split_frames(self._clip, "every8")
         request = ReconstructionRequest(self._clip, preset=preset, seed=seed, **length)  # type: ignore[arg-type]
-        clock, seconds = Stopwatch(), {}
+        clock = Stopwatch()
+        seconds: dict[str, float] = {}
         hooks = Hooks(should_stop=lambda: self._part.left_s < 4)
         run, scale = prepare(self._clip, split, preset, request, clock, hooks, seconds, device)
         view_of, begun_s, note = view_function(run, scale), clock.elapsed_s, ""

@@ -9,11 +9,12 @@ from __future__ import annotations
 import traceback
 from typing import Any
 
+from bm_raster import RATES
 from gpu_compile import shaped
 from gpu_correct import LIMIT, REAL, SMALL, Checks
 from gpu_estimate import SHAPES
 from gpu_rows import Part, device_ms
-from gpu_speed import CAMERAS, RATES, Speed
+from gpu_speed import CAMERAS, Speed
 
 from worker.loss import LossSettings
 from worker.raster.cuda.blend import blend
