@@ -26,8 +26,9 @@ _KERNELS = """
 Where the floor of {scene} lies, kernel by kernel; `at once` are the warps that fit on a multiprocessor of 64:
 """
 _SHAPES = """
-Of the tiles compiled, {best} promise most on the grid: {least} us, {usual} us
-with those in use. What a program waits for is in neither, so this is to be measured first ([gpu.md](../gpu.md)).
+Of the tiles compiled, by this forecast: {order}. In use are {usual}. What a program
+waits for is in no forecast, so shapes that lie close together are among the first things to measure
+([gpu.md](../gpu.md)).
 """
 _MEASURED = """
 ## On a GPU
@@ -81,10 +82,15 @@ def _estimate(rows: list[Row]) -> list[str]:
             sections += [_KERNELS.format(scene=scene), _kernels(rows, scene, usual)]
     compared = [row for row in steps if row["scene"] == usual["scene"]]
     if len(compared) > 1:
-        best = min(compared, key=lambda row: float(row["forecast_us"]))
-        shape = f"{best['tile']} in chunks of {best['chunk']}, by {best['warps']} warp{'s' * (best['warps'] != '1')}"
-        sections.append(_SHAPES.format(best=shape, least=best["forecast_us"], usual=usual["forecast_us"]))
+        ordered = sorted(compared, key=lambda row: float(row["forecast_us"]))[:3]
+        order = ", ".join(f"{_shape(row)} {row['forecast_us']} us" for row in ordered)
+        sections.append(_SHAPES.format(order=order, usual=_shape(usual)))
     return [*sections, f"\nCommit {usual['commit']}.\n"]
+
+
+def _shape(row: Row) -> str:
+    """Tile, chunk and warps in words."""
+    return f"{row['tile']} in chunks of {row['chunk']} by {row['warps']} warp{'s' * (row['warps'] != '1')}"
 
 
 def _kernels(rows: list[Row], scene: str, usual: Row) -> str:
