@@ -157,17 +157,17 @@ def _failure(command: list[str], variables: dict[str, str], deadline: float) -> 
 
 
 def print_table(out: Path, names: list[str]) -> None:
-    """What the parts wrote, for people."""
+    """What the parts wrote, for people; details and single kernels are in the files alone."""
+    origin = ("believed", "machine", "gpu", "driver", "torch", "triton", "commit")
     for name in names:
         path = out / f"gpu-{name}.csv"
         if not path.exists():
             print(f"{name}: no rows")
             continue
         with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        origin = ("believed", "machine", "gpu", "driver", "torch", "triton", "commit")
+            rows = [row for row in csv.DictReader(file) if not row.get("what", "").startswith("kernel: ")]
         print(f"\n{name}: " + ", ".join(f"{key} {rows[0][key]}" for key in origin if rows[0][key]))
-        columns = [key for key in rows[0] if key not in origin and any(row[key] for row in rows)]
+        columns = [key for key in rows[0] if key not in (*origin, "detail") and any(row[key] for row in rows)]
         widths = {key: max(len(key), *(len(row[key]) for row in rows)) for key in columns}
         for row in [dict(zip(columns, columns, strict=True)), *rows]:
             print("  " + "  ".join(f"{row[key]:<{widths[key]}}" for key in columns).rstrip())
