@@ -84,11 +84,12 @@ class Part:
     @cached_property
     def origin(self) -> dict[str, str]:
         """What the rows were measured on."""
+        believed = f"no: {self.doubt}" if self.doubt else "yes"
         if self.interpret:
             gpu, driver = "none: Triton's interpreter", ""
+            believed = "yes, but for durations" if believed == "yes" else believed
         else:
             gpu, driver = torch.cuda.get_device_name(0), _driver()
-        believed = f"no: {self.doubt}" if self.doubt else "yes"
         values = (believed, machine(), gpu, driver, torch.__version__, triton.__version__, commit())
         return dict(zip(ORIGIN, values, strict=True))
 
