@@ -35,7 +35,7 @@ def check(memory: str, name: str) -> None:
     worst, part = disagreement(torch.device(memory))
     if not worst <= LIMIT:  # so that NaN is wrong, too
         raise UnavailableError(
-            f"{name or memory} is not to be trusted: its {part} of a test scene is off by {worst:.1e} of the right one.",
+            f"{name or memory} is not to be trusted: its {part} of a test scene is off by {worst:.1e}.",
             "Use the CPU (--device cpu, INTRASPLAT_DEVICE=cpu), and send what `make gpu-check` prints.",
         )
 
