@@ -62,7 +62,7 @@ def main() -> int:
         return exit_code_of(error)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
-    print(f"\nThe demo took {time.monotonic() - started_s:.0f} s. Its pictures:")
+    print(f"\nThe demo took {time.monotonic() - started_s:.0f} s, without what was installed before. Its pictures:")
     for path, what in written.items():
         print(f"  {path}  {what}")
     print("Send your own clip: .venv/bin/intrasplat up, then http://127.0.0.1:8765/ in a browser.")

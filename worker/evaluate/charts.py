@@ -80,6 +80,9 @@ def _draw(groups: Sequence[Group], draw_panel: Callable[[Any, Sequence[Group]], 
     figure, axes = figure_of(len(places), _columns(places), _handles(groups, name))
     for place, axis in zip(places, axes, strict=True):
         here = [group for group in groups if group.place == place]
+        if not here:
+            _leave_empty(axis, place)
+            continue
         _name(axis, place, here, _missing(here))
         axis.set_ylabel(OVER_TIME.get(name, ("", DECIBEL))[1])
         draw_panel(axis, here)
@@ -180,8 +183,10 @@ def _copies(axis: Any, groups: Sequence[Group]) -> None:
         known = [group.median(name) for group in groups if not math.isnan(group.median(name))]
         if known:
             axis.axhline(known[0], color=GREY, linewidth=1.0, dashes=dashes, zorder=1)
-            text: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "fontsize": 7, "color": GREY, "ha": aligned}
-            axis.annotate(f"copying: {what}", (side, known[0]), (4 - 8 * side, 2), textcoords="offset points", **text)
+            text: dict[str, Any] = {"fontsize": 7, "color": GREY, "ha": aligned, "annotation_clip": True}
+            text["xycoords"] = ("axes fraction", "data")
+            inside = (0.995 * side + 0.0025, known[0])  # a label on the very edge would count as outside
+            axis.annotate(f"copying: {what}", inside, (4 - 8 * side, 2), textcoords="offset points", **text)
 
 
 def _missing(groups: Sequence[Group]) -> str:
@@ -269,6 +274,12 @@ def _columns(places: Sequence[Place]) -> int:
     """A column a way of holding out; two where there is only one way."""
     holdouts = len({holdout for _, holdout in places})
     return holdouts if holdouts > 1 else min(2, len(places))
+
+
+def _leave_empty(axis: Any, place: Place) -> None:
+    """A panel of a place where nothing was run."""
+    axis.set_axis_off()
+    axis.text(0, 1.0, f"{', '.join(place)}: not measured", transform=axis.transAxes, fontsize=7, color=GREY, va="top")
 
 
 def _name(axis: Any, place: Place, groups: Sequence[Group], missing: str) -> None:

@@ -233,13 +233,15 @@ class Ordering:
 
 
 def orderings(groups: Sequence[Group]) -> list[Ordering]:
-    """For each place where any series of the paper's ablation was run, in which order they stand."""
+    """For each place where at least two series of the paper's ablation were run, in which order they stand."""
     found = []
     for place in dict.fromkeys(group.place for group in groups if group.series in ABLATION):
         here = [group for group in groups if group.place == place and group.series in ABLATION and group.rows]
         here.sort(key=lambda group: group.median("iterations"))  # the longest run of a series is the one that counts
         medians = {group.series: group.median("psnr_tissue_db") for group in here}
         known = {name: score for name, score in medians.items() if not math.isnan(score)}
+        if len(known) < 2:
+            continue
         ordered = dict(sorted(known.items(), key=lambda each: -each[1]))
         pairs = [pair for pair in itertools.combinations(ABLATION, 2) if set(pair) <= set(known)]
         agreeing = sum((known[a] > known[b]) == (ABLATION[a] > ABLATION[b]) for a, b in pairs)

@@ -32,8 +32,8 @@ def test_the_page_makes_its_claims_from_rows(tmp_path: Path) -> None:
 def test_the_page_says_what_failed_and_what_is_missing(tmp_path: Path) -> None:
     page = "".join(sections(results(tmp_path / "results")))
     assert "failed: TrainingDiverged: no more" in page
-    assert "| phantom-pull | paper | missing |" in page
-    assert "not decided: without_mapf, hexplane, pfs missing" in page
+    assert "Not run. d4d-a: instant" in page
+    assert "; phantom-pull: instant, quality, small, paper" in page
 
 
 def test_without_rows_there_is_nothing_to_say(tmp_path: Path) -> None:
