@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import logging
 
-import torch
-
 from contract.errors import InputError, IntrasplatError, UnavailableError
 from contract.job import JobError
 
@@ -25,7 +23,8 @@ def describe(error: Exception) -> JobError:
         return JobError(problem=error.problem, remedy=error.remedy)
     if isinstance(error, IntrasplatError):
         return JobError(problem=str(error), remedy="The worker's log has the details.")
-    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):  # of this machine, or of its GPU
+    # Of this machine, or of its GPU: torch's own error, by its name, because who describes it need not have loaded torch.
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return JobError(problem="The worker ran out of memory.", remedy="Send a shorter or smaller clip.")
     logger.error("a fault while a job ran", exc_info=error)
     return JobError(problem=f"A fault in the worker ({type(error).__name__}).", remedy=FAULT_REMEDY)
