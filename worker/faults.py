@@ -23,7 +23,7 @@ def describe(error: Exception) -> JobError:
         return JobError(problem=error.problem, remedy=error.remedy)
     if isinstance(error, IntrasplatError):
         return JobError(problem=str(error), remedy="The worker's log has the details.")
-    # Of this machine, or of its GPU: that error is torch's, and known by its name, for not everyone here has loaded torch.
+    # Of this machine, or of its GPU: torch's own error, known by its name, for not everyone here has loaded torch.
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return JobError(problem="The worker ran out of memory.", remedy="Send a shorter or smaller clip.")
     logger.error("a fault while a job ran", exc_info=error)
