@@ -18,7 +18,6 @@ were moved twice; beside it stands what share of the least time it is.
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import os
 import platform
@@ -36,6 +35,7 @@ from numpy.typing import NDArray
 
 from worker.checkpoint import load_scene
 from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
+from worker.evaluate.rows import write_rows
 from worker.gaussians import Gaussians
 from worker.loss import LossSettings
 from worker.optimize import StepRates
@@ -323,12 +323,8 @@ def _fastest(call: Callable[..., object], *arguments: Any) -> float:
 
 
 def _write(path: Path, rows: list[Row]) -> None:
-    columns = list(dict.fromkeys(name for row in rows for name in row))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(path, dict.fromkeys(name for row in rows for name in row), rows)
 
 
 def _cpu_model() -> str:

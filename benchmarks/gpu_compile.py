@@ -73,7 +73,7 @@ class Compiled:
         return Multiprocessor().programs_at_once(self.warps, self.registers, self.shared_bytes)
 
 
-class _NoDevice:
+class NoDevice:
     """A driver of Triton that knows what to compile for."""
 
     def get_current_target(self) -> GPUTarget:
@@ -100,7 +100,7 @@ def compiled(work: Callable[[], object]) -> list[Compiled]:
         return binary
 
     active = driver._active
-    driver.set_active(_NoDevice())
+    driver.set_active(NoDevice())
     JITFunction.run = compile_alone
     try:
         work()

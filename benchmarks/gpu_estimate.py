@@ -14,7 +14,6 @@ the floors is given twice over, with 2.5 us for each launch; nearest to the floo
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from worker.checkpoint import load_scene
 from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
-from worker.evaluate.rows import commit
+from worker.evaluate.rows import commit, write_rows
 from worker.gaussians import Gaussians
 from worker.loss import LossSettings
 from worker.raster.cpu import padded
@@ -199,12 +198,8 @@ def _print(whole: Row, rows: list[Row]) -> None:
 
 
 def _write(path: Path, rows: list[Row]) -> None:
-    columns = list(dict.fromkeys(name for row in rows for name in row))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(path, dict.fromkeys(name for row in rows for name in row), rows)
 
 
 if __name__ == "__main__":

@@ -5,10 +5,6 @@ F frames of h w pixels, D disparities.
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -20,8 +16,8 @@ from numpy.typing import NDArray
 
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
-from tests.conftest import REPOSITORY
 from tests.helpers import assert_close
+from tests.worker.probes import kernels_compiled_by
 from tests.worker.test_stereo import clip_of, draw_pair, errors_px, slanted
 from worker.hooks import Hooks, Progress
 from worker.stereo import cuda, estimate_depth, matching
@@ -201,14 +197,7 @@ def test_depth_is_as_true_as_on_the_cpu() -> None:
 
 
 def test_kernels_compile_for_sm_90_within_its_registers_once_for_clips_of_every_size(tmp_path: Path) -> None:
-    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
-    environment |= {"PYTHONPATH": str(REPOSITORY), "TRITON_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "tests.worker.stereo_probe"]
-    answer = subprocess.run(
-        command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert answer.returncode == 0, answer.stderr
-    found = json.loads(answer.stdout)
+    found = kernels_compiled_by("tests.worker.stereo_probe", tmp_path)
     lanes = 2
     forms = {"census": 1, "smooth_lines": 1, "add_paths": 2 * lanes}
     forms |= dict.fromkeys(("column_costs", "block_costs", "winners"), lanes)

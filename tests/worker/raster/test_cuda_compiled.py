@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
-from tests.conftest import REPOSITORY
+from tests.worker.probes import kernels_compiled_by
 
 SHARED_BYTES = 48 * 1024
 """What every GPU gives a program without being asked for more."""
 
 
 def test_every_kernel_compiles_for_sm_90_and_keeps_its_numbers_in_registers(tmp_path: Path) -> None:
-    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
-    environment |= {"PYTHONPATH": str(REPOSITORY), "TRITON_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "tests.worker.raster.cuda_probe"]
-    answer = subprocess.run(
-        command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert answer.returncode == 0, answer.stderr
-    kernels = json.loads(answer.stdout)
+    kernels = kernels_compiled_by("tests.worker.raster.cuda_probe", tmp_path)
     assert {each["kernel"] for each in kernels} == {
         "project", "fill_slots", "blend", "sum_slots", "project_backward",
         "deform_linear", "update_linear", "deform_fdm", "update_fdm",

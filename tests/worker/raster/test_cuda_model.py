@@ -16,12 +16,12 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
 from tests.helpers import assert_close
+from tests.worker import models
 from tests.worker.raster import replays
 from tests.worker.raster.scenes import random_scene
 from worker.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis
 from worker.gaussians import Gaussians
 from worker.loss import LossSettings
-from worker.optimize import StepRates
 from worker.raster.cpu import padded
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
@@ -30,19 +30,7 @@ from worker.raster.step import Target, TrainingFrame, camera_vector
 WIDTH, HEIGHT, COUNT = 20, 16, 32
 Fused = SharedBasis | PolynomialFourier | FlexibleDeformation
 LOSS = LossSettings(depth_weight=20.0, colour_zone=0.05, depth_zone=1e-3)
-RATES = StepRates(
-    mean=2e-3,
-    quaternion=3e-3,
-    log_scale=4e-3,
-    opacity=5e-3,
-    colour=6e-3,
-    sh_rest=1e-3,
-    motion_mean=7e-3,
-    motion_quaternion=7e-3,
-    motion_log_scale=7e-3,
-    motion_colour=7e-3,
-    eps=1e-6,
-)
+RATES = dataclasses.replace(models.RATES, eps=1e-6)
 """eps is far above rounding, so that gradients that are nothing but rounding do not become whole steps."""
 SCENE = random_scene(COUNT, width=WIDTH, height=HEIGHT, seed=50, pixels=2.5)
 CAMERA = camera_vector(SCENE.camera)

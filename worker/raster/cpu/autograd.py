@@ -10,12 +10,16 @@ import torch
 from torch import Tensor
 
 from worker.raster import Camera, Rendered
+from worker.raster.autograd import (
+    LARGEST_LOGIT,
+    logit_of,
+    opacity_gradient,
+    pose_gradient,
+    rasterize_by,
+    stacked,
+)
 from worker.raster.cpu.rasterizer import Floats, Rasterizer, padded
-from worker.raster.reference import check_shapes
 from worker.raster.step import camera_vector
-
-_LARGEST_LOGIT = 30.0
-"""Stands for opacities 0 and 1, which have no finite logit; sigmoid(30) differs from 1 by 1e-13."""
 
 
 class _Rasterize(torch.autograd.Function):
@@ -31,10 +35,10 @@ class _Rasterize(torch.autograd.Function):
         camera: Camera,
     ) -> tuple[Tensor, Tensor, Tensor]:
         count = padded(max(1, mean.shape[0]))
-        logit = torch.logit(opacity.double()).clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT).float()
+        logit = logit_of(opacity)
         state = np.concatenate([_rows(mean, count), _rows(quaternion, count, 1.0), _rows(scale.log(), count)])
         rasterizer = Rasterizer(camera.width, camera.height)
-        rasterizer.project(camera_vector(camera), state, _rows(logit, count, -_LARGEST_LOGIT)[0], _rows(colour, count))
+        rasterizer.project(camera_vector(camera), state, _rows(logit, count, -LARGEST_LOGIT)[0], _rows(colour, count))
         image = torch.from_numpy(rasterizer.render().copy())
         ctx.rasterizer, ctx.count = rasterizer, mean.shape[0]
         ctx.save_for_backward(scale, logit, camera_from_world)
@@ -43,21 +47,16 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         scale, logit, camera_from_world = ctx.saved_tensors
-        v_rgb, v_depth, v_alpha = cotangents
-        stacked = torch.cat([v_rgb.permute(2, 0, 1), v_depth[None], v_alpha[None]]).contiguous().float()
-        gradients = ctx.rasterizer.cotangent_backward(stacked.numpy())
+        gradients = ctx.rasterizer.cotangent_backward(stacked(*cotangents).numpy())
         state = torch.from_numpy(gradients.state[:, : ctx.count].T.copy())
-        v_logit = torch.from_numpy(gradients.opacity_logit[: ctx.count].copy()).double()
-        slope = torch.sigmoid(logit.double()) * torch.sigmoid(-logit.double())
-        pose = torch.zeros_like(camera_from_world)
-        pose[:3] = torch.from_numpy(gradients.pose.sum(0).reshape(3, 4)).to(pose)
+        v_logit = torch.from_numpy(gradients.opacity_logit[: ctx.count].copy())
         return (
             state[:, 0:3],
             state[:, 3:7],
             state[:, 7:10] / scale,
-            (v_logit / slope).float(),
+            opacity_gradient(v_logit, logit),
             torch.from_numpy(gradients.colour[:, : ctx.count].T.copy()),
-            pose,
+            pose_gradient(torch.from_numpy(gradients.pose.sum(0)), camera_from_world),
             None,
         )
 
@@ -78,8 +77,4 @@ def rasterize(
     Raises:
         ValueError: shapes that do not belong together.
     """
-    check_shapes(mean, quaternion, scale, opacity, colour)
-    pose = camera.pose(mean)
-    arguments = (mean, quaternion, scale, opacity, colour, pose, camera)
-    rgb, depth, alpha = _Rasterize.apply(*arguments)  # type: ignore[no-untyped-call]
-    return Rendered(rgb, depth, alpha)
+    return rasterize_by(_Rasterize, mean, quaternion, scale, opacity, colour, camera)

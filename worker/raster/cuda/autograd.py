@@ -8,11 +8,8 @@ import torch
 from torch import Tensor
 
 from worker.raster import Camera, Rendered
+from worker.raster.autograd import logit_of, opacity_gradient, pose_gradient, rasterize_by, stacked
 from worker.raster.cuda.rasterizer import CudaRasterizer
-from worker.raster.reference import check_shapes
-
-_LARGEST_LOGIT = 30.0
-"""Stands for opacities 0 and 1, which have no finite logit; sigmoid(30) differs from 1 by 1e-13."""
 
 
 def camera_rows(camera: Camera, device: torch.device) -> Tensor:
@@ -34,7 +31,7 @@ class _Rasterize(torch.autograd.Function):
         camera_from_world: Tensor,
         camera: Camera,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        logit = torch.logit(opacity.double()).clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT).float()
+        logit = logit_of(opacity)
         state = torch.cat([mean, quaternion, scale.log()], dim=1).float().T.contiguous()[None]
         rasterizer = CudaRasterizer(camera.width, camera.height, mean.device)
         rows = camera_rows(camera, mean.device)
@@ -49,20 +46,15 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         scale, logit, camera_from_world = ctx.saved_tensors
-        v_rgb, v_depth, v_alpha = cotangents
-        stacked = torch.cat([v_rgb.permute(2, 0, 1), v_depth[None], v_alpha[None]])[None].float().contiguous()
-        gradients = ctx.rasterizer.cotangent_backward(stacked, pose=True)
+        gradients = ctx.rasterizer.cotangent_backward(stacked(*cotangents)[None], pose=True)
         state = gradients.state[0].T.clone()
-        slope = torch.sigmoid(logit.double()) * torch.sigmoid(-logit.double())
-        pose = torch.zeros_like(camera_from_world)
-        pose[:3] = gradients.pose.sum((0, 1)).reshape(3, 4).to(pose)
         return (
             state[:, 0:3],
             state[:, 3:7],
             state[:, 7:10] / scale,
-            (gradients.opacity_logit[0].double() / slope).float(),
+            opacity_gradient(gradients.opacity_logit[0], logit),
             gradients.colour[0].T.clone(),
-            pose,
+            pose_gradient(gradients.pose.sum((0, 1)), camera_from_world),
             None,
         )
 
@@ -75,8 +67,4 @@ def rasterize(
     Raises:
         ValueError: shapes that do not belong together.
     """
-    check_shapes(mean, quaternion, scale, opacity, colour)
-    pose = camera.pose(mean)
-    arguments = (mean, quaternion, scale, opacity, colour, pose, camera)
-    rgb, depth, alpha = _Rasterize.apply(*arguments)  # type: ignore[no-untyped-call]
-    return Rendered(rgb, depth, alpha)
+    return rasterize_by(_Rasterize, mean, quaternion, scale, opacity, colour, camera)
