@@ -11,8 +11,8 @@ from contract.job import JobProgress
 STAGE_LIMITS_S: Mapping[str, float] = MappingProxyType(
     {
         "decode": 20.0,  # a frame has 10 s, which the decoding process's own watch (worker/decode) sees to first
-        "stereo": 120.0,  # a pair of 4096 x 2160 takes 3 s on a slow core; a GPU compiles its kernels first
-        "compile": 300.0,  # a part takes seconds, on a machine without room minutes; a GPU's kernels are one part
+        "stereo": 10.0,  # a pair of 4096 x 2160 takes about 3 s on one slow core
+        "compile": 120.0,  # a part of the kernels takes seconds; on a machine without room, minutes
         "fusion": 60.0,  # all frames at once, about 10 ms each
         "motion": 10.0,  # a frame takes some 10 ms
         "start": 120.0,  # least squares for every Gaussian, and the targets of all frames, without a word between

@@ -5,6 +5,7 @@ F frames of h w pixels, D disparities.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from pathlib import Path
 
@@ -184,6 +185,8 @@ def test_depth_is_as_true_as_on_the_cpu() -> None:
     ours = estimate_depth(clip_of([pair]), Hooks(on_progress=seen.append), device="cuda")
     theirs = estimate_depth(clip_of([pair]))
     assert seen[-1].fraction == 1.0
+    stages = [stage for stage, _ in itertools.groupby(each.stage for each in seen)]
+    assert stages == ["stereo", "compile", "stereo"], "kernels have the time that compiling is given"
     error_px, their_error_px = np.abs(errors_px(ours, truth)), np.abs(errors_px(theirs, truth))
     for percentile in (50, 90):
         assert np.percentile(error_px, percentile) < 1.1 * np.percentile(their_error_px, percentile) + 0.02

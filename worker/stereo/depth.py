@@ -31,6 +31,8 @@ if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
     from worker.calibration import RectifiedClip
 
 STAGE = "stereo"
+COMPILATION = "compile"
+"""The stage until a GPU's kernels have been used once: they may have to be compiled then."""
 DECODING_SHARE, MEASURING_SHARE = 0.15, 0.05  # of the stage's progress
 RANGE_PAIRS, ALIGNMENT_PAIRS = (
     7,
@@ -68,6 +70,8 @@ def estimate_depth(
     if not measured or measured[0] < 0 or measured[-1] >= clip.frame_count:
         raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
     rgb, right = _decode(clip, hooks)
+    if device == "cuda":
+        hooks.on_progress(Progress(COMPILATION, 0.0))
     with one_opencv_thread(), _pool() as pool:
         shift, plan = _plan(clip, rgb, right, measured, pool, device)
         if device == "cuda":
@@ -179,6 +183,7 @@ def _match_on_device(
     confidence = np.empty(right.shape, np.uint8)
     at_once = frames_at_once(clip.intrinsics.height, clip.intrinsics.width, plan)
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
+    hooks.on_progress(Progress(COMPILATION, 0.5))
     for first in range(0, len(right), at_once):
         _check_stop(hooks)
         some = slice(first, first + at_once)
