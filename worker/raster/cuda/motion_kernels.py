@@ -113,14 +113,14 @@ def fdm_basis(t, centre, width, QUARTIC: tl.constexpr):  # type: ignore[no-untyp
     if QUARTIC:
         spread = width * width + QUARTIC_FLOOR
         ratio = d * d / spread
-        value = tl.exp2(-LOG2E * ratio * ratio)
+        value = tl.exp2(ratio * ratio * -LOG2E)
         slope = 4.0 * ratio / spread
         by_centre, by_width = slope * d, slope * ratio * width
     else:
         size = tl.abs(width)
         inverse = 1.0 / tl.maximum(size, MIN_WIDTH)
         along = d * inverse
-        value = tl.exp2(-0.5 * LOG2E * along * along)
+        value = tl.exp2(along * along * (-0.5 * LOG2E))
         sign = tl.where(width < 0.0, -1.0, 1.0)
         by_centre = along * inverse
         by_width = tl.where(size < MIN_WIDTH, 0.0, along * along * inverse * sign)  # no gradient through the floor

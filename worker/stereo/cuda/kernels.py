@@ -120,7 +120,7 @@ def _follow(  # type: ignore[no-untyped-def]
         before = tl.load(sum_at, mask=there, other=0).to(tl.int32)
     k = 1
     while k <= length:
-        more = there & (k < length)
+        more = tl.where(there, k, length) < length  # Triton 3.9 interprets no mask made of a scalar comparison
         cost_at += stride
         next_cost, next_before = tl.load(cost_at, mask=more, other=_BEYOND).to(tl.int32), before
         if ADD:
@@ -213,7 +213,7 @@ def smooth_lines(  # type: ignore[no-untyped-def]
     k = 1
     while k <= length:
         v_one, v_two = tl.load(first_at, mask=there, other=0.0), tl.load(second_at, mask=there, other=0.0)
-        more = there & (k < length)
+        more = tl.where(there, k, length) < length  # Triton 3.9 interprets no mask made of a scalar comparison
         guide_at += step_stride
         following = tl.load(guide_at, mask=more, other=0).to(tl.float32)
         behind = tl.where(more, strength * tl.exp2(-steepness * tl.abs(here - following)), 0.0)
