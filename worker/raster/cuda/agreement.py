@@ -1,4 +1,4 @@
-"""Whether the device splats as the reference does: asked once a process, before anything is made on it.
+"""Whether the device splats as the reference does: asked once a process, before a model is made on it.
 
 No GPU, driver or version of Triton is believed unseen. A small fixed scene is rendered and differentiated on the device
 and by worker/raster/reference.py in float64.
@@ -17,6 +17,7 @@ from torch import Tensor
 from contract.errors import UnavailableError
 from worker.raster import Camera, Rendered, reference
 from worker.raster.cuda.autograd import rasterize
+from worker.raster.cuda.captured import one_at_a_time
 
 LIMIT = 1e-2
 """Norm of a difference over the norm of what is right. Rounding gives 1e-5; a pixel where it decides about a faint
@@ -32,7 +33,8 @@ def check(memory: str, name: str) -> None:
     Raises:
         UnavailableError: they differ by more than LIMIT; nothing that this device computes is to be believed.
     """
-    worst, part = disagreement(torch.device(memory))
+    with one_at_a_time:  # the first scene may be rendered while the first job begins
+        worst, part = disagreement(torch.device(memory))
     if not worst <= LIMIT:  # so that NaN is wrong, too
         raise UnavailableError(
             f"{name or memory} is not to be trusted: its {part} of a test scene is off by {worst:.1e}.",

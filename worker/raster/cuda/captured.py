@@ -7,8 +7,10 @@ from threading import Lock
 
 import torch
 
-_one_capture = Lock()
-"""Torch captures on one stream for the whole process, and scenes are rendered while another is trained."""
+one_at_a_time = Lock()
+"""Held while kernels may be launched for the first time, and while launches are captured: scenes are rendered while
+another is trained. Triton would hand one thread a kernel that another has not yet loaded onto the device, and torch
+captures on one stream for the whole process."""
 
 
 def can_capture(device: torch.device) -> bool:
@@ -21,7 +23,7 @@ class Captured:
 
     The first run compiles the kernels, which a capture must not. What a routine's launches depend on, beside the
     contents of memory on the device, is in the key, or is followed by forget(). Where there is no GPU a routine is just
-    run.
+    run. Only a replay does not wait for other threads' first runs and captures.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -31,14 +33,14 @@ class Captured:
 
     def run(self, key: Hashable, routine: Callable[[], None]) -> None:
         """Launch a routine without waiting for it."""
-        if key in self._graphs:
-            self._graphs[key].replay()
-        elif key in self._was_run and can_capture(self._device):
-            self._graphs[key] = _capture(routine)
-            self._graphs[key].replay()
-        else:
-            routine()
-            self._was_run.add(key)
+        if key not in self._graphs:
+            with one_at_a_time:
+                if key not in self._was_run or not can_capture(self._device):
+                    routine()
+                    self._was_run.add(key)
+                    return
+                self._graphs[key] = _capture(routine)
+        self._graphs[key].replay()
 
     def forget(self) -> None:
         """Addresses or sizes have changed. Waits: a graph must not be destroyed while it runs."""
@@ -51,6 +53,6 @@ class Captured:
 def _capture(routine: Callable[[], None]) -> torch.cuda.CUDAGraph:
     """The launches, recorded and not made. Other threads may use the device meanwhile."""
     graph = torch.cuda.CUDAGraph()
-    with _one_capture, torch.cuda.graph(graph, capture_error_mode="thread_local"):
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
         routine()
     return graph
