@@ -129,7 +129,8 @@ def gpu_is_lost() -> bool:
     if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
         return False
     try:
-        torch.cuda.synchronize()
+        # Not the whole device: another thread may be capturing a graph, which nobody may wait for.
+        torch.cuda.current_stream().synchronize()
     except RuntimeError:
         return True
     return False

@@ -99,6 +99,22 @@ def test_a_process_that_has_used_no_gpu_has_lost_none() -> None:
     assert not gpu_is_lost()
 
 
+@pytest.mark.parametrize("lost", [False, True])
+def test_whether_a_gpu_is_lost_is_asked_of_the_threads_own_stream(lost: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stream:
+        def synchronize(self) -> None:
+            if lost:
+                raise RuntimeError("CUDA error: an illegal memory access was encountered")
+
+    def whole_device() -> None:
+        raise RuntimeError("CUDA error: operation not permitted when stream is capturing")
+
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_stream", Stream)
+    monkeypatch.setattr(torch.cuda, "synchronize", whole_device)
+    assert gpu_is_lost() == lost
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_this_machine_without_a_gpu_is_seen_as_one() -> None:
     gpu = find_gpu()
