@@ -294,6 +294,7 @@ def test_more_frames_than_there_was_room_for_and_frames_of_another_size(
         crowded.step(frames(1, width=40)[0], LOSS, RATES, 4)
 
 
+@pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype feature:UserWarning")
 def test_steps_between_two_looks_make_the_host_wait_for_nothing(device: str) -> None:
     if device == "cpu":
         pytest.skip("without a GPU there is nothing to wait for; run with --device cuda")
