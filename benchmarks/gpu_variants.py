@@ -65,8 +65,10 @@ def measured(part: Part, checks: Checks, speed: Speed) -> dict[str, Any]:
 
 
 def _compiled(interpret: bool) -> dict[Any, Any]:
-    """Forms of blend that this process has loaded."""
-    return {} if interpret else dict(blend.device_caches[0][0])
+    """Forms of blend that this process has loaded; one that asks for too much is compiled and cannot be."""
+    if interpret:
+        return {}
+    return {key: each for key, each in blend.device_caches[0][0].items() if each.module is not None}
 
 
 if __name__ == "__main__":
