@@ -170,7 +170,7 @@ def measure(
     frame = TrainingFrame(view, TIME, _target(model.rasterizer), pixels, pixels)
     works: dict[str, Callable[[], object]] = {
         "render": lambda: model.render(view, TIME),
-        "step": lambda: model.step(frame, LossSettings(), RATES, 1, model.sh_degree),
+        "step": lambda: model.step([frame], LossSettings(), RATES, 1, model.sh_degree),
     }
     blended = blended_per_pixel(model, view)
     rows = []

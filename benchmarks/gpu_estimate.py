@@ -105,11 +105,11 @@ def estimate(
     counts = count(FusedModel(gaussians, deformation, width, height), camera, TIME, shape[:2], shape[2])
     operations = _Operations()
     with shaped(*shape):
-        model = CudaModel(gaussians, deformation, width, height, "cpu", frames)  # type: ignore[arg-type]
+        model = CudaModel(gaussians, deformation, width, height, "cpu")  # type: ignore[arg-type]
         seen = [_frame(camera, TIME + k / 100) for k in range(frames)]
-        compiled(lambda: model.step_frames(seen, LossSettings(), RATES, 1))  # the first step alone copies its frames
+        compiled(lambda: model.step(seen, LossSettings(), RATES, 1))  # the first step alone copies its frames
         with operations:
-            kernels = compiled(lambda: model.step_frames(seen, LossSettings(), RATES, 2))
+            kernels = compiled(lambda: model.step(seen, LossSettings(), RATES, 2))
     sizes = _sizes(model, deformation, width * height)
     launches = torch_launches(operations.seen)
     floors = {}

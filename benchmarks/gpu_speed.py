@@ -69,7 +69,7 @@ def main() -> None:
 
 
 class Speed:
-    """The measurements of a part; step_ms by (motion, frames) is kept for the floors."""
+    """The measurements of a part; milliseconds and sizes of a step by (motion, frames) are kept for the floors."""
 
     def __init__(self, part: Part) -> None:
         self._part, self._device = part, part.device
@@ -78,16 +78,16 @@ class Speed:
         self.camera = camera_vector(camera)
         self._rounds = 1 if part.interpret else 11
         self._block = 2 if part.interpret else CHECK_EVERY
-        self.step_ms: dict[tuple[str, int], float] = {}
+        self.measured: dict[tuple[str, int], tuple[float, Sizes]] = {}
 
     def add(self, what: str, value: float, unit: str, *, scene: str = "", frames: int = 1, **more: str) -> None:
         """Keep and print a figure."""
         print(f"  {what}{f', {scene}' if scene else ''}, {frames} frames: {value:.6g} {unit}", flush=True)
         self._part.add(what=what, scene=scene, frames=frames, value=value, unit=unit, **more)
 
-    def model(self, motion: str, frames: int = 1) -> CudaModel:
+    def model(self, motion: str) -> CudaModel:
         """The standard scene's, at its start."""
-        return CudaModel(self.gaussians, self.motion(motion), self._width, self._height, self._device, frames)
+        return CudaModel(self.gaussians, self.motion(motion), self._width, self._height, self._device)
 
     def motion(self, name: str) -> Deformation:
         number = len(self.gaussians)
@@ -120,7 +120,7 @@ class Speed:
         model, frame = self.model("shared"), self.frame(TIME)
         synchronize(self._device)
         start = time.perf_counter()
-        model.step(frame, LossSettings(), RATES, 1)
+        model.step([frame], LossSettings(), RATES, 1)
         model.render(self.camera, TIME)
         model.image_gradient(self.camera, TIME, np.zeros((5, self._height, self._width), np.float32))
         synchronize(self._device)
@@ -133,7 +133,7 @@ class Speed:
         if self._device == "cuda":
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats()
-        model = self.model(motion, frames)
+        model = self.model(motion)
         place: dict[str, Any] = {"scene": motion, "frames": frames}
         seen = [self.frame(k / CAMERAS) for k in range(CAMERAS)]
         iteration = 0
@@ -143,12 +143,13 @@ class Speed:
             for _ in range(self._block):
                 iteration += 1
                 chosen = [seen[(iteration + k) % CAMERAS] for k in range(frames)]
-                model.step_frames(chosen, LossSettings(), RATES, iteration)
+                model.step(chosen, LossSettings(), RATES, iteration)
             model.wait()
 
         block()
         trained_ms = wall_ms(block, self._device, calls=1, rounds=self._rounds) / self._block
-        self.step_ms[motion, frames] = trained_ms
+        sizes = _sizes(model, self.motion(motion), self._width * self._height)
+        self.measured[motion, frames] = trained_ms, sizes
         self.add("step, as trained", trained_ms, "ms", clock="host", **place)
         self.add("step, as trained, a frame", trained_ms / frames, "ms", clock="host", **place)
         launches = model._training.launches
@@ -273,8 +274,7 @@ class Speed:
         self._part.wait_for(KERNELS_READY)
         cpu = FusedModel(self.gaussians, self.motion("shared"), self._width, self._height)
         counts = count(cpu, self.camera, TIME, (TILE_WIDTH, TILE_HEIGHT), CHUNK)
-        for (motion, frames), step_ms in self.step_ms.items():
-            sizes = _sizes(self.model(motion, frames), self.motion(motion), self._width * self._height)
+        for (motion, frames), (step_ms, sizes) in self.measured.items():
             moved = sum(bytes_by_kernel(sizes, counts).values())
             made = frames * (PAIR_FMA["step"] * counts.blended + GAUSSIAN_FMA["step"] * sizes.gaussians)
             place: dict[str, Any] = {"scene": motion, "frames": frames}

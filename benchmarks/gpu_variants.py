@@ -53,7 +53,7 @@ def measured(part: Part, checks: Checks, speed: Speed) -> dict[str, Any]:
     model = speed.model("shared")
     frame = speed.frame(0.4)
     for iteration in range(1, 2 if part.interpret else CAMERAS):
-        model.step(frame, LossSettings(), RATES, iteration)
+        model.step([frame], LossSettings(), RATES, iteration)
     model.wait()
     calls, rounds = (1, 1) if part.interpret else (32, 11)
     launches = model._training.launches

@@ -55,6 +55,7 @@ class Report(BaseModel):
     seed: int
     device: str
     iterations: int = Field(ge=0)
+    frames_seen: int | None = Field(default=None, ge=0, description="by training, each as often as it was in a step")
     seconds: dict[str, float] = Field(description="by stage; t_train_s and t_post_s as docs/conventions.md has them")
     gaussians: int = Field(ge=0)
     bases: int = Field(ge=0, description="of a channel's motion; 0 if the model has no such number")

@@ -1,6 +1,6 @@
 """What training needs of a model, whatever computes its steps: Gaussians, their deformation and Adam's moments.
 
-Symbols: N Gaussians; H W pixels, as many as the camera says.
+Symbols: N Gaussians; H W pixels, as many as the camera says; F frames a step.
 Implementations: worker/raster/cpu/model.py, worker/raster/cuda/model.py, and worker/unfused.py for deformations without
 kernels of their own. worker/backend.py makes the one for a device.
 
@@ -11,6 +11,7 @@ number and any Gaussian in view, comes with the next answer.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -27,7 +28,7 @@ Floats = NDArray[np.float32]
 
 
 class Model(Protocol):
-    """A scene that can be trained a frame at a time, rendered, and edited between two steps.
+    """A scene that can be trained, on one frame a step or several, rendered, and edited between two steps.
 
     Tensors lie on the model's device; NumPy arrays on the host.
     """
@@ -43,11 +44,13 @@ class Model(Protocol):
         ...
 
     def step(
-        self, frame: TrainingFrame, loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
+        self, frames: Sequence[TrainingFrame], loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
     ) -> StepSums | None:
-        """One iteration (counted from 1) on one frame.
+        """One iteration (counted from 1): one step of Adam down the sum of the frames' losses.
 
         Args:
+            frames: F of one size, a frame among them more than once if it likes. Buffers are for the F of the last
+                step; another F makes new ones.
             sh_degree: the harmonics in use at this iteration.
 
         Returns:
@@ -61,12 +64,14 @@ class Model(Protocol):
 
     @property
     def gradient_norm(self) -> Tensor:
-        """[N] float32 |dL/dmean2d| of the last step in NDC (the image is 2 wide and 2 high); a view."""
+        """[N] float32 |dL/dmean2d| of the last step in NDC (the image is 2 wide and 2 high), the largest of its frames;
+        a view."""
         ...
 
     @property
     def visible(self) -> Tensor:
-        """[N] bool, whether the last frame could see each: in front of the camera, in the image, not too faint."""
+        """[N] bool, whether any of the last step's frames could see each: in front of the camera, in the image, not too
+        faint."""
         ...
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:

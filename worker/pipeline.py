@@ -218,6 +218,7 @@ def training_of(
         seed=run.seed,
         device=str(run.device),
         iterations=run.iteration,
+        frames_seen=run.frames_seen,
         gaussians=len(scene.gaussians),
         bases=scene.deformation.bases,
         scene_bytes=scene.file_bytes,
@@ -233,7 +234,7 @@ def training_of(
 def training_warnings(run: Run, request: ReconstructionRequest) -> tuple[str, ...]:
     """What the run itself has to say."""
     said = []
-    if fixed_iterations(request, run.preset) is None and run.schedule.planned == len(run.frames.indices):
+    if fixed_iterations(request, run.preset) is None and run.schedule.planned == run.schedule.epoch:
         said.append("The time given allowed less than one step a training frame; one a frame was made all the same.")
     if run.device != choose_device(request.device):
         said.append(f"The motion of preset {run.preset.name} trains on the CPU only, so the GPU was left idle.")

@@ -20,7 +20,7 @@ from worker.request import ReconstructionRequest
 from worker.schedule import Schedule, left_out
 from worker.start import fusion_for, settled, start_model
 from worker.targets import TrainingFrames, units_per_mm
-from worker.train import Run, Stopwatch, iterations_within, warm_up
+from worker.train import Run, Stopwatch, iterations_within, steps_an_epoch, warm_up
 
 _Result = TypeVar("_Result")
 Seconds = dict[str, float]  # by stage; each stage that is timed adds its own
@@ -94,13 +94,13 @@ def schedule_of(
     model: Model, frames: TrainingFrames, preset: Preset, request: ReconstructionRequest, clock: Stopwatch, hooks: Hooks
 ) -> tuple[Schedule, str]:
     """How many iterations are made and how rates fall in them; and, in words, the length that was asked for."""
-    count = len(frames.indices)
+    epoch = steps_an_epoch(frames, preset)
     fixed = fixed_iterations(request, preset)
     if fixed is not None:
-        return Schedule(fixed, preset.cycles, frames=count), f"{fixed} iterations"
+        return Schedule(fixed, preset.cycles, epoch=epoch), f"{fixed} iterations"
     budget_s = request.budget_s or preset.budget_s
     assert budget_s is not None
     report_stage(hooks, "calibrate", 0.0)
     planned = iterations_within(model, frames, preset, request.seed, budget_s, clock.elapsed_s)
     worth_db = preset.worth_db if left_out(frames.indices) else None
-    return Schedule(planned, preset.cycles, worth_db, count), f"{budget_s} s"
+    return Schedule(planned, preset.cycles, worth_db, epoch), f"{budget_s} s"

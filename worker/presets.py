@@ -32,7 +32,8 @@ class Preset:
     start_width      sigma at the start, model time; None where the deformation places its own
     opacity, spread  of a Gaussian at the start; spread is its standard deviation over the distance to its neighbours
     sh_degree        of the colour; from 1 on, a degree is added every sh_every iterations
-    order            "epochs": every training frame once, shuffled, again and again; "random": one drawn each iteration
+    order            "epochs": every training frame once, shuffled, again and again; "random": drawn each iteration
+    frames_a_step    training frames of which an iteration sees so many: one step down the sum of their losses
     cycles           whether rates rise again when the steps have doubled, if there are enough for two cycles, and the
                      last models of each are averaged (worker/schedule.py); else rates fall once and nothing is averaged
     worth_db         a run with budget_s ends where a doubling of its steps is worth less; None: never before its time
@@ -40,7 +41,7 @@ class Preset:
     budget_s         seconds of training of a run without either
 
     Raises:
-        ValueError: cycles with densification, or worth_db without cycles.
+        ValueError: cycles with densification, worth_db without cycles, or frames_a_step that no device takes.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Preset:
     sh_degree: int
     sh_every: int
     order: Literal["epochs", "random"]
+    frames_a_step: int
     cycles: bool
     worth_db: float | None
     rates: Rates
@@ -70,8 +72,12 @@ class Preset:
             raise ValueError("cycles end in an average of models, which are not of one size with densification")
         if self.worth_db is not None and not self.cycles:
             raise ValueError("worth_db compares the ends of cycles, so it needs cycles")
+        if not 1 <= self.frames_a_step <= MOST_FRAMES_A_STEP:
+            raise ValueError(f"frames_a_step is {self.frames_a_step}; 1 to {MOST_FRAMES_A_STEP} can be drawn at once")
 
 
+MOST_FRAMES_A_STEP = 16
+"""As many as a GPU's kernels draw at once (worker/raster/cuda/bins.py)."""
 FEWEST_POINTS, FEW_POINTS, MANY_POINTS = 20_000, 40_000, 80_000
 PAYS_FROM_S = 9.0
 """From this budget on, twice the points are worth the time they take (docs/decisions/015)."""
@@ -107,6 +113,7 @@ _PAPER = Preset(
     sh_degree=3,
     sh_every=500,
     order="random",
+    frames_a_step=1,
     cycles=False,
     worth_db=None,
     rates=_PAPER_RATES,
@@ -152,6 +159,7 @@ _FAST = Preset(
     sh_degree=0,
     sh_every=0,
     order="epochs",
+    frames_a_step=1,
     cycles=True,
     worth_db=0.25,
     rates=_FAST_RATES,

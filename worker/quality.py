@@ -69,6 +69,7 @@ class Training:
     seed: int
     device: str
     iterations: int
+    frames_seen: int
     gaussians: int
     bases: int
     scene_bytes: int

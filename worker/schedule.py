@@ -14,14 +14,14 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 SHORTEST_CYCLE, SHORTEST_CYCLE_EPOCHS = 250, 3
-"""Iterations, and steps a training frame: a cycle has as many as both ask for."""
+"""Iterations, and epochs: a cycle has as many as both ask for."""
 RESTART = 0.6
 """How far rates have fallen already where every cycle but the first begins."""
 AVERAGED_SHARE, AVERAGED = 1 / 8, 6
 """The last share of a cycle from which models are averaged, and how many of them."""
 CLOSING_SHARE, CLOSING_EPOCHS = 0.25, 2
-"""Iterations after a stop, in which the frames left out are learnt too, over those before it; and the fewest a training
-frame: wherever in an epoch they begin, a whole one follows."""
+"""Iterations after a stop, in which the frames left out are learnt too, over those before it; and the fewest epochs:
+wherever in one they begin, a whole one follows."""
 JUDGE_EVERY = 14
 FEWEST_FRAMES_TO_JUDGE = 28
 """Of fewer training frames none is left out, and a run takes the time it is given."""
@@ -35,20 +35,20 @@ class Schedule:
     cycles    whether there are several, if planned is long enough for two, and averages end them
     worth_db  a doubling of the steps that brings the frames left out less than this is the last; None: no frame is left
               out, and nothing stops the run
-    frames    training frames, those left out among them; a long clip needs long cycles
+    epoch     iterations that show every training frame, those left out among them; a long clip needs long cycles
     scores    psnr_tissue of the frames left out, dB, at the ends of the cycles so far
     """
 
     planned: int
     cycles: bool = False
     worth_db: float | None = None
-    frames: int = 1
+    epoch: int = 1
     scores: tuple[float, ...] = ()
 
     @property
     def _planned_ends(self) -> tuple[int, ...]:
         ends = [self.planned]
-        shortest = max(SHORTEST_CYCLE, SHORTEST_CYCLE_EPOCHS * self.frames)
+        shortest = max(SHORTEST_CYCLE, SHORTEST_CYCLE_EPOCHS * self.epoch)
         while self.cycles and ends[0] // 2 >= shortest:
             ends.insert(0, ends[0] // 2)
         return tuple(ends)
@@ -67,7 +67,7 @@ class Schedule:
         stopped_at = self.stopped_at
         if stopped_at is None:
             return self._planned_ends
-        closed_at = max(round(stopped_at * (1 + CLOSING_SHARE)), stopped_at + CLOSING_EPOCHS * self.frames)
+        closed_at = max(round(stopped_at * (1 + CLOSING_SHARE)), stopped_at + CLOSING_EPOCHS * self.epoch)
         return (*self._planned_ends[: len(self.scores)], min(self.planned, closed_at))
 
     @property

@@ -103,17 +103,26 @@ class Run:
         """Of the whole run, as far as is known."""
         return self.schedule.iterations
 
+    @property
+    def frames_seen(self) -> int:
+        """Frames trained on so far, each as often as it was in a step."""
+        return self.iteration * self.preset.frames_a_step
 
-def frame_at(run: Run, iteration: int) -> int:
-    """The training frame of an iteration (from 1): a function of seed, schedule and iteration, so a run can resume."""
-    indices = run.frames.indices
+
+def frames_at(run: Run, iteration: int) -> list[int]:
+    """The training frames of an iteration (from 1): a function of preset, seed, schedule and iteration, so a run can
+    resume. Epochs follow each other without a gap, so a step may have the end of one and the beginning of the next."""
+    indices, count = run.frames.indices, run.preset.frames_a_step
     if run.schedule.leaves_out(iteration):
         judging = left_out(indices)
         indices = [index for index in indices if index not in judging]
     if run.preset.order == "random":
-        return indices[int(np.random.default_rng([run.seed, iteration]).integers(len(indices)))]
-    epoch, place = divmod(iteration - 1, len(indices))
-    return indices[int(np.random.default_rng([run.seed, epoch]).permutation(len(indices))[place])]
+        drawn = np.random.default_rng([run.seed, iteration]).integers(len(indices), size=count)
+        return [indices[place] for place in drawn]
+    seen = (iteration - 1) * count
+    epochs = (divmod(each, len(indices)) for each in range(seen, seen + count))
+    orders = ((np.random.default_rng([run.seed, epoch]).permutation(len(indices)), place) for epoch, place in epochs)
+    return [indices[order[place]] for order, place in orders]
 
 
 def step(run: Run, iteration: int) -> None:
@@ -123,10 +132,10 @@ def step(run: Run, iteration: int) -> None:
         TrainingDiverged: the loss is not finite, or no Gaussian is in view; a model that does not answer at every step
             tells it some steps later.
     """
-    preset, frame = run.preset, run.frames.frame(frame_at(run, iteration))
+    preset, frames = run.preset, [run.frames.frame(index) for index in frames_at(run, iteration)]
     sh_degree = min(preset.sh_degree, iteration // preset.sh_every) if preset.sh_degree else 0
     rates = rates_at(preset.rates, run.schedule.progress(iteration))
-    _check(run.model.step(frame, preset.loss, rates, iteration, sh_degree), iteration)
+    _check(run.model.step(frames, preset.loss, rates, iteration, sh_degree), iteration)
 
 
 def _check(sums: StepSums | None, iteration: int) -> None:
@@ -158,9 +167,10 @@ def warm_up(model: Model, frames: TrainingFrames, preset: Preset, on_progress: C
     the steps are taken back. Returns seconds; on_progress is told the share done, in (0, 1]."""
     start = time.perf_counter()
     frame = frames.frame(frames.indices[0])
+    seen = [frame] * preset.frames_a_step
     nothing = np.zeros((5, int(frame.camera[5]), int(frame.camera[4])), np.float32)
     parts: list[Callable[[], object]] = [
-        lambda degree=degree: model.step(frame, preset.loss, rates_at(preset.rates, 1.0), 1, degree)  # type: ignore[misc]
+        lambda degree=degree: model.step(seen, preset.loss, rates_at(preset.rates, 1.0), 1, degree)  # type: ignore[misc]
         for degree in range(preset.sh_degree + 1)
     ]
     parts += [
@@ -180,7 +190,7 @@ def iterations_within(
 ) -> int:
     """How many iterations of a new model fit into what is left of budget_s, by timing a few and taking them back.
 
-    One a training frame are made even if fewer fit.
+    As many as show every training frame once are made even if fewer fit.
     """
     start = time.perf_counter()
     at_once = model.answers_every
@@ -195,7 +205,12 @@ def iterations_within(
                 ends.append(time.perf_counter())
     step_s = float(np.median(np.diff(ends)[untimed:])) / at_once * LATER_STEPS
     left_s = budget_s - elapsed_s - (time.perf_counter() - start)
-    return max(len(frames.indices), int(left_s / step_s))
+    return max(steps_an_epoch(frames, preset), int(left_s / step_s))
+
+
+def steps_an_epoch(frames: TrainingFrames, preset: Preset) -> int:
+    """The fewest iterations in which every training frame is seen."""
+    return -(-len(frames.indices) // preset.frames_a_step)
 
 
 def train(
@@ -292,8 +307,11 @@ def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], float]) -> float |
 
 
 def write_curve(path: Path, run: Run) -> None:
-    """curve.csv: t_train_s, iteration, psnr_tissue_db of the held-out frames."""
+    """curve.csv: t_train_s, iteration, psnr_tissue_db of the held-out frames, training frames seen by then."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["t_train_s", "iteration", "psnr_tissue_db"])
-        writer.writerows([f"{p.t_train_s:.3f}", p.iteration, f"{p.psnr_tissue_db:.4f}"] for p in run.curve)
+        writer.writerow(["t_train_s", "iteration", "psnr_tissue_db", "frames_seen"])
+        writer.writerows(
+            [f"{p.t_train_s:.3f}", p.iteration, f"{p.psnr_tissue_db:.4f}", p.iteration * run.preset.frames_a_step]
+            for p in run.curve
+        )

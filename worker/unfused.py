@@ -3,11 +3,13 @@
 The blend, its loss and the canonical parameters' Adam are those of the fused step, so that two deformations compared
 with each other differ in nothing else. Only the time a step takes is not comparable: tables of speed must say so.
 
-Symbols: N Gaussians (padded to whole vectors), rows of N floats; canonical and state [13, N] as in
+Symbols: N Gaussians (padded to whole vectors), rows of N floats, F frames a step; canonical and state [13, N] as in
 raster/cpu/update.py.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -37,6 +39,11 @@ class UnfusedModel(FusedModel):
         with torch.no_grad():  # no step follows: keep no graph
             return super().render(camera, t, values)
 
+    def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
+        """Gradient of sum(cotangents * render(camera, t)) to the Gaussians as they are at t, [14, N]."""
+        with torch.no_grad():
+            return super().image_gradient(camera, t, cotangents)
+
     def deformed_mean(self, t: float) -> Floats:
         """Centres at time t, [3, N] in units, as a copy."""
         with torch.no_grad():
@@ -53,6 +60,7 @@ class AutogradMotion:
         padding = torch.zeros(columns - count, dtype=torch.int64)  # whose motion it is does not matter: never drawn
         self._adopt(deformation.select(torch.cat([torch.arange(count), padding])))
         self._moments = {name: torch.zeros(2, *each.shape) for name, each in self._parameters.items()}
+        self._graphs: list[tuple[Tensor, Tensor]] = []  # a step's canonical states, and what became of each
 
     def _adopt(self, deformation: Deformation) -> None:
         """Train copies of this deformation's parameters from here on."""
@@ -69,19 +77,25 @@ class AutogradMotion:
         """
         if not np.isfinite(canonical[MEAN]).all():
             raise TrainingDiverged("A Gaussian's place is no longer a number.")
-        self._canonical = torch.from_numpy(canonical.T.copy()).requires_grad_()
-        self._moved = _deformed(self._deformation, self._canonical, t)
-        state[:] = self._moved.detach().T.numpy()
+        rows = torch.from_numpy(canonical.T.copy()).requires_grad_()
+        moved = _deformed(self._deformation, rows, t)
+        if torch.is_grad_enabled():
+            self._graphs.append((rows, moved))
+        state[:] = moved.detach().T.numpy()
 
-    def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
-        """One Adam step, given dL/dstate at the t last deformed to; turns v_state into dL/dcanonical.
+    def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
+        """One Adam step, given dL/dstate [F, 13, N] at the times deformed to since the last; turns it into
+        dL/dcanonical.
 
         The two differ where offsets depend on the canonical state: a field of offsets is sampled at the mean.
         """
-        inputs = [self._canonical, *self._parameters.values()]
-        cotangent = torch.from_numpy(v_state.T.copy())
-        v_canonical, *gradients = torch.autograd.grad(self._moved, inputs, cotangent)
-        v_state[:] = v_canonical.T.numpy()
+        starts, moved = zip(*self._graphs, strict=True)
+        self._graphs.clear()
+        cotangents = [torch.from_numpy(each.T.copy()) for each in v_state]
+        found = torch.autograd.grad(moved, [*starts, *self._parameters.values()], cotangents)
+        of_starts, gradients = found[: len(starts)], found[len(starts) :]
+        for each, v_canonical in zip(v_state, of_starts, strict=True):
+            each[:] = v_canonical.T.numpy()
         if rates.motion_mean == 0.0:
             return
         adam = adam_step(rates.motion_mean, rates, iteration)

@@ -154,7 +154,7 @@ def take_steps(
     """One step on every frame, iterations counted from first."""
     seen_from = camera_vector(camera or endoscope())
     sums = [
-        model.step(each.seen_from(seen_from), loss, rates, iteration, sh_degree)
+        model.step([each.seen_from(seen_from)], loss, rates, iteration, sh_degree)
         for iteration, each in enumerate(frames, start=first)
     ]
     return [each for each in sums if each is not None]

@@ -22,7 +22,7 @@ from worker.request import ReconstructionRequest
 from worker.resume import load_run, save_run
 from worker.schedule import AVERAGED, Schedule, left_out
 from worker.targets import TrainingFrames
-from worker.train import Run, Stopwatch, frame_at, train
+from worker.train import Run, Stopwatch, frames_at, train
 
 SHORTEST, PLANNED = 24, 192
 """Cycles that end at 24, 48, 96 and 192."""
@@ -111,16 +111,16 @@ def test_frames_left_out_are_not_shown_before_the_decision_and_are_after_it(
     """Of clips of any length: which frame an iteration shows depends on how many there are alone."""
     run = judged(clip, split)
     run.seed, run.frames.indices = seed, list(range(count))
-    planned = Schedule(24 * count + seed, cycles=True, worth_db=NEVER_ENOUGH_DB, frames=count)
+    planned = Schedule(24 * count + seed, cycles=True, worth_db=NEVER_ENOUGH_DB, epoch=count)
     run.schedule = planned.with_score(30.0).with_score(30.0)
     stopped_at, judges = run.schedule.stopped_at, set(left_out(range(count)))
     assert stopped_at is not None
-    before = [frame_at(run, iteration) for iteration in range(1, stopped_at + 1)]
+    before = [frames_at(run, iteration)[0] for iteration in range(1, stopped_at + 1)]
     assert set(before) == set(range(count)) - judges
-    closing = {frame_at(run, iteration) for iteration in range(stopped_at + 1, run.iterations + 1)}
+    closing = {frames_at(run, iteration)[0] for iteration in range(stopped_at + 1, run.iterations + 1)}
     assert closing == set(range(count))
     run.schedule = planned
-    assert before == [frame_at(run, iteration) for iteration in range(1, stopped_at + 1)]
+    assert before == [frames_at(run, iteration)[0] for iteration in range(1, stopped_at + 1)]
 
 
 def test_what_frames_left_out_show_trains_nothing_until_the_decision(

@@ -111,7 +111,7 @@ def test_gradients_are_in_device_coordinates() -> None:
         camera = camera_vector(endoscope())
         camera[2:4] += shift
         seen, colours = frame.seen_from(camera), LossSettings(depth_weight=0.0)
-        sums = model.step(seen, colours, RATES, 1)
+        sums = model.step([seen], colours, RATES, 1)
         return sums.colour_l1 * float(seen.loss_settings(colours)[0]), float(model.gradient_norm[0])
 
     nudge = 0.1  # pixels

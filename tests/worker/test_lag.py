@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,9 +31,9 @@ class LaggingModel(FusedModel):
     steps_made = 0
 
     def step(  # type: ignore[override]
-        self, frame: TrainingFrame, loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
+        self, frames: Sequence[TrainingFrame], loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
     ) -> StepSums | None:
-        self._unanswered = [*getattr(self, "_unanswered", []), super().step(frame, loss, rates, iteration, sh_degree)]
+        self._unanswered = [*getattr(self, "_unanswered", []), super().step(frames, loss, rates, iteration, sh_degree)]
         self.steps_made += 1
         return self.wait() if len(self._unanswered) == LAG else None
 

@@ -25,6 +25,7 @@ TRAINING = Training(
     seed=0,
     device="cpu",
     iterations=500,
+    frames_seen=500,
     gaussians=1000,
     bases=9,
     scene_bytes=123_456,

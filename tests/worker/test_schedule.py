@@ -191,7 +191,7 @@ def test_no_run_stops_before_it_has_seen_its_frames_or_closes_without_those_left
 
 @pytest.mark.parametrize("planned", LENGTHS)
 def test_a_clip_that_250_steps_show_three_times_needs_no_longer_cycles(planned: int) -> None:
-    assert Schedule(planned, True, WORTH_DB, frames=83).ends == Schedule(planned, True, WORTH_DB).ends
+    assert Schedule(planned, True, WORTH_DB, epoch=83).ends == Schedule(planned, True, WORTH_DB).ends
 
 
 @pytest.mark.parametrize("scores", [(), (30.0, 31.5), (30.0, 30.1), (30.0, math.nan)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import math
 from collections.abc import Callable
@@ -20,7 +21,17 @@ from worker.metrics import psnr_tissue
 from worker.optimize import Rate
 from worker.presets import PRESETS, Preset
 from worker.resume import load_run, save_run
-from worker.train import CALIBRATION_STEPS, LATER_STEPS, CurvePoint, Run, Stopwatch, frame_at, iterations_within, train
+from worker.train import (
+    CALIBRATION_STEPS,
+    LATER_STEPS,
+    CurvePoint,
+    Run,
+    Stopwatch,
+    frames_at,
+    iterations_within,
+    train,
+    write_curve,
+)
 
 SOON = DensifySettings(from_iteration=6, every=6, gradient_threshold=1e-5)
 """Splits early enough to happen in these short runs; so does splitting_soon add harmonics."""
@@ -106,16 +117,53 @@ def test_training_brings_the_model_nearer_to_its_frames(name: str) -> None:
 def test_an_epoch_shows_every_frame_once_in_another_order_each_time() -> None:
     run, split = prepared(phantom_clip(), "fast")
     count = len(split.train)
-    epochs = [[frame_at(run, epoch * count + place + 1) for place in range(count)] for epoch in range(3)]
+    epochs = [[frames_at(run, epoch * count + place + 1)[0] for place in range(count)] for epoch in range(3)]
     assert all(sorted(epoch) == split.train for epoch in epochs)
     assert epochs[0] != epochs[1]
 
 
 def test_random_order_draws_training_frames_alone() -> None:
     run, split = prepared(phantom_clip(), "paper")
-    drawn = [frame_at(run, iteration) for iteration in range(1, 400)]
+    drawn = [frames_at(run, iteration)[0] for iteration in range(1, 400)]
     assert set(drawn) == set(split.train)
-    assert drawn == [frame_at(run, iteration) for iteration in range(1, 400)]
+    assert drawn == [frames_at(run, iteration)[0] for iteration in range(1, 400)]
+
+
+@pytest.mark.parametrize("frames_a_step", [2, 5, 16])
+def test_frames_are_seen_in_one_order_however_many_make_a_step(frames_a_step: int) -> None:
+    run, _ = prepared(phantom_clip(), "fast")
+    one_by_one = [frames_at(run, iteration)[0] for iteration in range(1, 1 + 4 * frames_a_step)]
+    run.preset = dataclasses.replace(run.preset, frames_a_step=frames_a_step)
+    steps = [frames_at(run, iteration) for iteration in range(1, 5)]
+    assert {len(step) for step in steps} == {frames_a_step}
+    assert [index for step in steps for index in step] == one_by_one
+
+
+@pytest.mark.parametrize("name", ["fast", "paper", "hexplane"])
+def test_steps_on_several_frames_keep_their_bits_over_a_stop(name: str, tmp_path: Path) -> None:
+    clip, preset = phantom_clip(), dataclasses.replace(splitting_soon(name), frames_a_step=3)
+    whole, split = prepared(clip, preset, iterations=9)
+    stopped, _ = prepared(clip, preset, iterations=9)
+    with pytest.raises(Cancelled):
+        trained(stopped, stopping_after(4))
+    save_run(tmp_path, stopped, 1.5)
+    again, _ = prepared(clip, preset, iterations=9)
+    load_run(tmp_path, again)
+    assert again.frames_seen == 12
+    assert bits(trained(again), clip, split) == bits(trained(whole), clip, split)
+    with pytest.raises(ValueError, match="another settings of the preset"):
+        load_run(tmp_path, prepared(clip, splitting_soon(name), iterations=9)[0])
+
+
+def test_the_curve_tells_iterations_and_the_frames_they_saw(tmp_path: Path) -> None:
+    preset = dataclasses.replace(PRESETS["fast"], frames_a_step=2)
+    run, split = prepared(phantom_clip(), preset, iterations=5)
+    assert run.schedule.epoch == -(-len(split.train) // 2)
+    train(run, Stopwatch(), lambda: 31.5, Hooks())
+    write_curve(tmp_path / "curve.csv", run)
+    with (tmp_path / "curve.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["iteration"], row["frames_seen"], row["psnr_tissue_db"]) == ("5", "10", "31.5000")
 
 
 def fitting(run: Run, budget_s: float, elapsed_s: float = 0.0) -> int:

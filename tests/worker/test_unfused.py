@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from tests.helpers import assert_close
 from tests.worker.models import (
@@ -32,7 +33,7 @@ from worker.gaussians import Gaussians
 from worker.loss import LossSettings, training_loss
 from worker.raster import reference
 from worker.raster.cpu.model import FusedModel
-from worker.raster.step import camera_vector
+from worker.raster.step import StepSums, TrainingFrame, camera_vector
 from worker.unfused import UnfusedModel
 
 LOSSES = pytest.mark.parametrize("loss", [PAPER, NORMALISED], ids=["paper", "normalised"])
@@ -89,6 +90,32 @@ def test_the_first_moments_of_hexplane_are_the_gradients_of_the_loss(loss: LossS
     assert_close(canonical[:, 10:13], wanted["sh"][:, 0], relative=2e-3, name="sh")
     for name in parameters:
         assert_close(10 * arrays[f"motion.moments.{name}"][0], wanted[name], relative=2e-3, name=name)
+
+
+@pytest.mark.parametrize("moving", [moving_shared, moving_fdm, moving_hexplane])
+def test_a_step_on_several_frames_has_the_gradients_of_all_added(moving: Callable[[Gaussians], Deformation]) -> None:
+    gaussians, camera = wall(stride=6, sh_degree=1), camera_vector(endoscope())
+    frames = [each.seen_from(camera) for each in training_frames(2)]
+
+    def after(seen: list[TrainingFrame]) -> tuple[FusedModel, StepSums]:
+        kind = UnfusedModel if moving is moving_hexplane else FusedModel
+        model = kind(gaussians, moving(gaussians), WIDTH, HEIGHT)
+        return model, model.step(seen, PAPER, RATES, 1, 1)
+
+    def gradients(model: FusedModel) -> dict[str, Tensor]:
+        """Adam's first moments after one step: a tenth of them."""
+        arrays = model.arrays()
+        found = {name: each[0] for name, each in arrays.items() if "moments." in name}
+        return found | {name: each for name, each in arrays.items() if name == "motion.first"}
+
+    (one, one_sums), (other, other_sums), (both, both_sums) = after(frames[:1]), after(frames[1:]), after(frames)
+    for name, each in gradients(both).items():
+        assert float(each.abs().max()) > 0
+        assert_close(each, gradients(one)[name] + gradients(other)[name], relative=1e-5, name=name)
+    assert bool((both.gradient_norm == torch.maximum(one.gradient_norm, other.gradient_norm)).all())
+    assert bool((both.visible == one.visible | other.visible).all())
+    assert both_sums.squared_error == pytest.approx(one_sums.squared_error + other_sums.squared_error)
+    assert both_sums.visible == int(both.visible.sum())
 
 
 def test_a_render_is_the_fused_models_of_the_moved_gaussians() -> None:

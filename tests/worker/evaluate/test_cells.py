@@ -15,6 +15,7 @@ def test_a_series_is_a_preset_with_its_changes_made() -> None:
     assert (changed.bases, changed.order, changed.budget_s) == (9, "random", 9.0)
     assert not preset_of("fast:cycles=false,worth_db=none").cycles
     assert preset_of("fast:start_width=0.1").start_width == 0.1
+    assert preset_of("fast:frames_a_step=2").frames_a_step == 2
     assert preset_of("paper") is PRESETS["paper"]
     assert base_of("fast:tracks=false") == "fast"
 
@@ -32,7 +33,10 @@ def test_what_no_preset_has_is_refused_with_its_name(series: str) -> None:
         preset_of(series)
 
 
-@pytest.mark.parametrize("series", ["paper:cycles=true", "paper:worth_db=0.1", "fast:cycles=false"])
+@pytest.mark.parametrize(
+    "series",
+    ["paper:cycles=true", "paper:worth_db=0.1", "fast:cycles=false", "fast:frames_a_step=0", "fast:frames_a_step=17"],
+)
 def test_changes_that_do_not_go_together_are_refused(series: str) -> None:
     with pytest.raises(InputError, match=series) as refused:
         preset_of(series)

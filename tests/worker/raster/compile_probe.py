@@ -64,7 +64,7 @@ def use_everything(digest: hashlib._Hash) -> None:
         for iteration in range(1, 5):
             frame = TrainingFrame(camera, 0.3 * iteration % 1, target, pixels, pixels)
             loss = LossSettings(normalised_depth=bool(iteration % 2))
-            model.step(frame, loss, StepRates(*[1e-3] * 11), iteration, min(degree, iteration - 1))
+            model.step([frame], loss, StepRates(*[1e-3] * 11), iteration, min(degree, iteration - 1))
             model.take(np.arange(model.count)[::-1].copy(), np.zeros(model.count, np.bool_))
         digest.update(model.render(camera, 0.4).tobytes())
     one = gaussians(0)

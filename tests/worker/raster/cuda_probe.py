@@ -77,9 +77,9 @@ def train_everything() -> None:
     """Steps of every form of motion; of one with a harmonic more and of one on several frames. No kernel runs."""
     seen = frames(2)
     for kind in ("shared with colour", "fdm-gaussian", "fdm-quartic"):
-        model("cpu", kind).step(seen[0], LOSS, RATES, 1)
+        model("cpu", kind).step(seen[:1], LOSS, RATES, 1)
     for kind in ("shared with colour", "fdm-gaussian"):
-        model("cpu", kind, sh_degree=1, frames_a_step=2).step_frames(seen, LOSS, RATES, 1, sh_degree=1)
+        model("cpu", kind, sh_degree=1).step(seen, LOSS, RATES, 1, sh_degree=1)
 
 
 def main() -> None:

@@ -260,7 +260,7 @@ def test_a_fused_step_has_the_gradients_of_the_stages_one_by_one(kind: str, sh_d
     wanted = dict(zip([*leaves, *motion], gradients, strict=True))
 
     model = FusedModel(gaussians, deformation, camera.width, camera.height)
-    model.step(frame.seen_from(camera, t, model.rasterizer), NORMALISED, RATES, 1, sh_degree)
+    model.step([frame.seen_from(camera, t, model.rasterizer)], NORMALISED, RATES, 1, sh_degree)
     stored = {name: 10 * np.asarray(each) for name, each in model.arrays().items()}
 
     canonical = torch.cat([wanted["mean"], wanted["quaternion"], wanted["log_scale"], wanted["sh"][:, 0]], dim=1)
@@ -321,13 +321,15 @@ def test_motion_takes_the_steps_of_torchs_adam(kind: str) -> None:
     same = {f"motion_{channels}": RATES.motion_mean for channels in ("quaternion", "log_scale", "colour")}
     rates = dataclasses.replace(RATES, **same)
     random = np.random.default_rng(6)
-    for iteration, t in enumerate([0.4, 0.45, 0.35], start=1):
-        cotangent = random.normal(size=(13, columns)).astype(np.float32)
-        motion.update(cotangent, t, rates, iteration)
-        moved = restore(deformation.kind, leaves | constants).deform(canonical, t)
-        channels = torch.cat([moved.mean, moved.quaternion, moved.log_scale, moved.sh[:, 0]], dim=1)
+    for iteration, times in enumerate([[0.4], [0.45, 0.35], [0.35, 0.4, 0.45]], start=1):
+        cotangents = random.normal(size=(len(times), 13, columns)).astype(np.float32)
+        motion.update(cotangents, times, rates, iteration)
         optimiser.zero_grad()
-        (channels * torch.from_numpy(cotangent[:, :count].T).double()).sum().backward()  # type: ignore[no-untyped-call]
+        for cotangent, t in zip(cotangents, times, strict=True):
+            moved = restore(deformation.kind, leaves | constants).deform(canonical, t)
+            channels = torch.cat([moved.mean, moved.quaternion, moved.log_scale, moved.sh[:, 0]], dim=1)
+            to_sum = channels * torch.from_numpy(cotangent[:, :count].T).double()
+            to_sum.sum().backward()  # type: ignore[no-untyped-call]
         optimiser.step()
     for name, each in motion.export(count).parameters().items():
         assert_close(each, leaves[name], name=name)
@@ -342,7 +344,7 @@ def test_bases_that_are_negligible_are_left_out_of_deformation_and_training() ->
     motion.deform(np.zeros((13, 16), np.float32), 0.26, state)
     bound = NEGLIGIBLE * float(weight.abs().sum(-1).max())
     assert_close(state.T, weight @ deformation.basis(0.26), relative=0.0, absolute=bound)
-    motion.update(np.ones((13, 16), np.float32), 0.26, RATES, 1)
+    motion.update(np.ones((1, 13, 16), np.float32), [0.26], RATES, 1)
     changed = (motion.export(16).weight != weight).any(dim=0).any(dim=0)
     alive = deformation.basis(0.26) >= NEGLIGIBLE
     assert 0 < int(alive.sum()) < 9
@@ -366,7 +368,7 @@ def test_a_model_that_took_some_of_its_gaussians_trains_on_as_they_did(kind: str
     order = np.random.default_rng(3).permutation(90)
     for iteration in (1, 2, 3):
         for model in models:
-            model.step(frame.seen_from(camera, 0.4, model.rasterizer), NORMALISED, RATES, iteration, 1)
+            model.step([frame.seen_from(camera, 0.4, model.rasterizer)], NORMALISED, RATES, iteration, 1)
         if iteration == 1:
             models[1].take(order, np.zeros(90, np.bool_))
     kept, permuted = ((exported.tensors(), motion.parameters()) for exported, motion in (m.export() for m in models))
@@ -379,7 +381,7 @@ def test_gaussians_taken_afresh_start_with_no_moments() -> None:
     gaussians, deformation, camera = moving_gaussians("shared with colour", 0)
     frame = random_frame(camera, np.zeros((camera.height, camera.width), bool))
     model = FusedModel(gaussians, deformation, camera.width, camera.height)
-    model.step(frame.seen_from(camera, 0.4, model.rasterizer), NORMALISED, RATES, 1)
+    model.step([frame.seen_from(camera, 0.4, model.rasterizer)], NORMALISED, RATES, 1)
     model.take(np.array([5, 5, 7]), np.array([False, True, True]))
     moments = [each for name, each in model.arrays().items() if name.startswith("moments.") or name[7:] == "first"]
     assert all(not each[..., 1:].any() for each in moments)

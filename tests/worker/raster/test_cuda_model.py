@@ -22,8 +22,10 @@ from tests.worker.raster.scenes import random_scene
 from worker.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis
 from worker.gaussians import Gaussians
 from worker.loss import LossSettings
+from worker.presets import MOST_FRAMES_A_STEP
 from worker.raster.cpu import padded
 from worker.raster.cpu.model import FusedModel
+from worker.raster.cuda.bins import MOST_FRAMES
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
 from worker.raster.step import Target, TrainingFrame, camera_vector
 
@@ -89,13 +91,13 @@ def frames(count: int = 3, width: int = WIDTH) -> list[TrainingFrame]:
 AnyModel = CudaModel | FusedModel
 
 
-def model(device: str, kind: str = "shared with colour", sh_degree: int = 0, frames_a_step: int = 1) -> CudaModel:
-    return CudaModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT, device, frames_a_step)
+def model(device: str, kind: str = "shared with colour", sh_degree: int = 0) -> CudaModel:
+    return CudaModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT, device)
 
 
 def train(trained: AnyModel, seen: Sequence[TrainingFrame], sh_degree: int = 0, first: int = 1) -> None:
     for iteration, frame in enumerate(seen, start=first):
-        trained.step(frame, LOSS, RATES, iteration, min(sh_degree, iteration - 1))
+        trained.step([frame], LOSS, RATES, iteration, min(sh_degree, iteration - 1))
 
 
 def stored(trained: AnyModel) -> dict[str, Tensor]:
@@ -202,10 +204,10 @@ def test_a_model_with_too_little_room_ends_as_one_with_ample_room(three_steps: d
 def test_steps_are_answered_for_once_and_together(device: str) -> None:
     cpu = FusedModel(gaussians(), deformation("shared"), WIDTH, HEIGHT)
     seen = frames(2)
-    answers = [cpu.step(frame, LOSS, RATES, k + 1) for k, frame in enumerate(seen)]
+    answers = [cpu.step([frame], LOSS, RATES, k + 1) for k, frame in enumerate(seen)]
     cuda = model(device, "shared")
     assert cuda.answers_every == CHECK_EVERY
-    assert [cuda.step(frame, LOSS, RATES, k + 1) for k, frame in enumerate(seen)] == [None] * 2
+    assert [cuda.step([frame], LOSS, RATES, k + 1) for k, frame in enumerate(seen)] == [None] * 2
     answer = cuda.wait()
     assert answer is not None
     for name in ("colour_l1", "depth_l1", "squared_error", "holes"):
@@ -216,24 +218,33 @@ def test_steps_are_answered_for_once_and_together(device: str) -> None:
 
 def test_what_was_learnt_while_waiting_for_something_else_comes_with_the_next_step(device: str) -> None:
     cuda, seen = model(device, "shared"), frames(2)
-    assert cuda.step(seen[0], LOSS, RATES, 1) is None
+    assert cuda.step(seen[:1], LOSS, RATES, 1) is None
     assert cuda.visible.shape == (COUNT,)
-    answer = cuda.step(seen[1], LOSS, RATES, 2)
+    answer = cuda.step(seen[1:], LOSS, RATES, 2)
     assert answer is not None
     assert answer.visible == int(cuda.visible.sum())
 
 
-def test_a_step_on_several_frames_is_a_step_on_the_sum_of_their_losses(device: str) -> None:
-    frame = frames(1)[0]
-    halved = dataclasses.replace(LOSS, colour_weight=LOSS.colour_weight / 2, depth_weight=LOSS.depth_weight / 2)
-    one, two = model(device, sh_degree=1), model(device, sh_degree=1, frames_a_step=2)
-    one.step(frame, LOSS, RATES, 1, 1)
-    two.step_frames([frame, frame], halved, RATES, 1, 1)
-    wanted = stored(one)
-    for name, each in stored(two).items():
+@pytest.mark.parametrize(("kind", "sh_degree"), [("shared with colour", 0), ("fdm-gaussian", 1)])
+def test_steps_on_several_frames_change_a_model_as_they_do_on_the_cpu(kind: str, sh_degree: int, device: str) -> None:
+    cpu = FusedModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT)
+    cuda, seen = model(device, kind, sh_degree), frames()
+    squared_errors = []
+    for trained in (cpu, cuda):
+        answers = [trained.step(seen[:1], LOSS, RATES, 1), trained.step(seen[1:], LOSS, RATES, 2, sh_degree)]
+        squared_errors.append(sum(each.squared_error for each in [*answers, trained.wait()] if each is not None))
+    assert squared_errors[1] == pytest.approx(squared_errors[0], rel=1e-4)  # those of no step are lost
+    wanted = cpu.arrays()
+    for name, each in stored(cuda).items():
         assert_close(each, wanted[name], relative=1e-4, absolute=1e-9, name=name)
-    with pytest.raises(ValueError, match="a step on 1 frames, this model was made for 2"):
-        two.step(frame, LOSS, RATES, 2)
+    assert_close(cuda.gradient_norm, cpu.gradient_norm, relative=1e-3)
+
+
+def test_more_frames_than_can_be_drawn_at_once_are_refused_and_no_preset_asks_for_them(device: str) -> None:
+    assert MOST_FRAMES_A_STEP == MOST_FRAMES
+    for count in (0, MOST_FRAMES + 1):
+        with pytest.raises(ValueError, match=f"{count} frames at once"):
+            model(device).step(frames(1) * count, LOSS, RATES, 1)
 
 
 def test_what_is_replayed_ends_as_what_is_launched(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,11 +286,11 @@ def test_gaussians_taken_train_on_as_on_the_cpu(device: str) -> None:
 def test_parameters_may_be_written_between_two_steps(device: str) -> None:
     written, frame = model(device), frames(1)[0]
     start = stored(written)
-    written.step(frame, LOSS, RATES, 1)
+    written.step([frame], LOSS, RATES, 1)
     after = stored(written)
     for name, values in written.arrays().items():  # as a trial run is taken back
         values.copy_(start[name])
-    written.step(frame, LOSS, RATES, 1)
+    written.step([frame], LOSS, RATES, 1)
     assert_same_bits(stored(written), after)
 
 
@@ -291,7 +302,7 @@ def test_more_frames_than_there_was_room_for_and_frames_of_another_size(
     train(crowded, frames())
     assert_same_bits(stored(crowded), three_steps)
     with pytest.raises(ValueError, match="a frame of 40 x 16 pixels, the others have 20 x 16"):
-        crowded.step(frames(1, width=40)[0], LOSS, RATES, 4)
+        crowded.step(frames(1, width=40), LOSS, RATES, 4)
 
 
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype feature:UserWarning")

@@ -49,7 +49,7 @@ def train(kind: str, steps: int) -> list[NDArray[np.float32]]:
     model = FusedModel(gaussians, deformation, camera.width, camera.height)
     seen = frame.seen_from(camera, 0.4, model.rasterizer)
     for iteration in range(1, steps + 1):
-        model.step(seen, NORMALISED, RATES, iteration)
+        model.step([seen], NORMALISED, RATES, iteration)
     return [np.array(each) for each in model.arrays().values()]
 
 

@@ -1,11 +1,12 @@
 """The fused training step: deform, project, bin, blend with loss and gradients, then Adam on every parameter.
 
-N Gaussians (padded to whole vectors), rows of N floats; canonical and state [13, N] as in update.py.
+N Gaussians (padded to whole vectors), rows of N floats, F frames a step; canonical and state [13, N] as in update.py.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import astuple
 
 import numpy as np
@@ -30,7 +31,7 @@ SIZES_KEPT = 3
 
 
 class FusedModel:
-    """Canonical Gaussians, their deformation and Adam's moments, trained a frame at a time on the CPU."""
+    """Canonical Gaussians, their deformation and Adam's moments, trained on the CPU. See worker/model.py."""
 
     answers_every = 1
 
@@ -59,11 +60,15 @@ class FusedModel:
     def _parameters(self) -> dict[str, Floats]:
         return {"canonical": self.canonical, "opacity_logit": self.opacity_logit, "sh_rest": self.sh_rest}
 
-    def _allocate(self) -> None:
+    def _allocate(self, frames: int = 1) -> None:
+        """Room for the Gaussians at one time, and for their gradients in so many frames a step."""
         columns = self.canonical.shape[1]
         self.state = np.zeros((update.ROWS, columns), np.float32)
         self.colour = np.zeros((3, columns), np.float32)
-        self._v_rest = np.zeros_like(self.sh_rest)
+        self._v_state = np.zeros((frames, update.ROWS, columns), np.float32)
+        self._v_rest = np.zeros((frames, *self.sh_rest.shape), np.float32)
+        self._gradients = [Gradients.room(v_state) for v_state in self._v_state]
+        self._seen = np.zeros(columns, np.bool_)
 
     def _rasterizer(self, width: int, height: int) -> Rasterizer:
         """The buffers of an image size; the few sizes used last are kept."""
@@ -76,13 +81,13 @@ class FusedModel:
 
     @property
     def gradient_norm(self) -> Tensor:
-        """[N] |dL/dmean2d| of the last step in NDC; a view."""
-        return torch.from_numpy(self.rasterizer.gradients.mean2d_norm[: self.count])
+        """[N] |dL/dmean2d| of the last step in NDC, the largest of its frames; a view."""
+        return torch.from_numpy(self._gradients[0].mean2d_norm[: self.count])
 
     @property
     def visible(self) -> Tensor:
-        """[N] whether the last frame could see each Gaussian."""
-        return torch.from_numpy(self.rasterizer.radius2[: self.count] >= 0)
+        """[N] whether any of the last step's frames could see each Gaussian."""
+        return torch.from_numpy(self._seen[: self.count].copy())
 
     def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
         """The Gaussians at time t on this camera's image."""
@@ -119,24 +124,44 @@ class FusedModel:
         return self.state[:3, : self.count].copy()
 
     def step(
-        self, frame: TrainingFrame, loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
+        self, frames: Sequence[TrainingFrame], loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
     ) -> StepSums:
-        """One iteration (counted from 1) on one frame; sh_degree: the harmonics in use at this iteration."""
+        """One iteration (counted from 1) on the sum of the frames' losses; sh_degree: the harmonics in use at it."""
+        if len(frames) != len(self._gradients):
+            self._allocate(len(frames))
+        self._seen[:] = False
+        sums = [self._backward(place, frame, loss, sh_degree) for place, frame in enumerate(frames)]
+        self.motion.update(self._v_state, [frame.t for frame in frames], rates, iteration)
+        self._add_frames()
+        self.update_canonical(self._gradients[0], rates, iteration, sh_degree)
+        colour_l1, depth_l1, squared_error, holes = np.sum(sums, axis=0).tolist()
+        return StepSums(colour_l1, depth_l1, squared_error, holes, int(np.count_nonzero(self._seen[: self.count])))
+
+    def _backward(self, place: int, frame: TrainingFrame, loss: LossSettings, sh_degree: int) -> NDArray[np.float64]:
+        """The gradients of a frame's loss, to its place among those of the step; the loss's sums (StepSums)."""
+        gradients = self._gradients[place]
         self.project(frame.camera, frame.t, sh_degree)
-        gradients = self.rasterizer.loss_backward(frame.target, frame.loss_settings(loss))
+        self.rasterizer.loss_backward(frame.target, frame.loss_settings(loss), gradients)
         if sh_degree == 0:
             np.multiply(gradients.colour, np.float32(SH_C0), out=gradients.state[10:13])
             gradients.state[10:13] *= self.colour > 0
         else:
             run(
                 harmonics.colour_from_sh_backward, sh_degree, _centre(frame.camera), self.state, self.sh_rest,
-                self.colour, gradients.colour, self._v_rest, gradients.state,
+                self.colour, gradients.colour, self._v_rest[place], gradients.state,
             )  # fmt: skip
-        self.motion.update(gradients.state, frame.t, rates, iteration)
-        self.update_canonical(gradients, rates, iteration, sh_degree)
-        colour_l1, depth_l1, squared_error, holes = self.rasterizer.statistics.sum(0, dtype=np.float64).tolist()
-        visible = int(np.count_nonzero(self.rasterizer.radius2[: self.count] >= 0))
-        return StepSums(colour_l1, depth_l1, squared_error, holes, visible)
+        self._seen |= self.rasterizer.radius2 >= 0
+        sums: NDArray[np.float64] = self.rasterizer.statistics.sum(0, dtype=np.float64)
+        return sums
+
+    def _add_frames(self) -> None:
+        """Make the first frame's gradients those of all, frame by frame in order, and its norms the largest."""
+        total = self._gradients[0]
+        for place, each in enumerate(self._gradients[1:], start=1):
+            total.state += each.state
+            total.opacity_logit += each.opacity_logit
+            np.maximum(total.mean2d_norm, each.mean2d_norm, out=total.mean2d_norm)
+            self._v_rest[0] += self._v_rest[place]
 
     def wait(self) -> None:
         """Every step has been waited for, and answered."""
@@ -152,7 +177,7 @@ class FusedModel:
         _adam(self.opacity_logit, gradients.opacity_logit, opacity_moments, rates.opacity, rates, iteration)
         if sh_degree > 0:
             rest, used = self._moments["sh_rest"], slice(0, (sh_degree + 1) ** 2 - 1)
-            _adam(self.sh_rest[used], self._v_rest[used], rest[:, used], rates.sh_rest, rates, iteration)
+            _adam(self.sh_rest[used], self._v_rest[0, used], rest[:, used], rates.sh_rest, rates, iteration)
 
     def take(self, columns: NDArray[np.int64], fresh: NDArray[np.bool_]) -> None:
         """Keep these Gaussians, in this order (repeats are copies); Adam's moments start at 0 where fresh."""

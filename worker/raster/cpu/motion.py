@@ -1,6 +1,6 @@
 """The deformation of the fused step: shared bases or FDM, with Adam's moments beside the weights.
 
-N Gaussians (padded), B bases, C channels (10, or 13 where colour moves too), rows of N floats.
+N Gaussians (padded), F frames a step, B bases, C channels (10, or 13 where colour moves too), rows of N floats.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ class Motion(Protocol):
     def deform(self, canonical: Floats, t: float, state: Floats) -> None:
         """state [13, N] = canonical + psi(t)."""
 
-    def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
-        """One Adam step of the weights that reach t, given dL/dstate at t; turns it into dL/dcanonical.
+    def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
+        """One Adam step of the weights that reach any of F times, those deformed to last, given dL/dstate at each.
 
-        iteration counts from 1.
+        Turns v_state [F, 13, N] into dL/dcanonical, frame by frame. iteration counts from 1.
         """
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
@@ -63,7 +63,7 @@ def _channel_rates(rates: StepRates) -> Floats:
 
 
 class LinearMotion:
-    """Bases of t common to all Gaussians; only the weights of those alive at t are read or written in a step.
+    """Bases of t common to all Gaussians; only the weights of those alive at a step's times are read or written in it.
 
     Adam's moments of a weight advance only in steps that use it, with its own count of them.
     """
@@ -86,17 +86,21 @@ class LinearMotion:
         values, first, last = self._alive(t)
         run(update.deform_shared, canonical, self.weight, values, first, last, state)
 
-    def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
-        values, first, last = self._alive(t)
-        self.steps[first:last] += 1
+    def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
         channel_rates = _channel_rates(rates)
         bases, channels, _ = self.weight.shape
+        values, reached = np.zeros((len(times), bases), np.float32), np.zeros(bases, np.bool_)
+        for frame, t in enumerate(times):
+            at_t, first, last = self._alive(t)
+            values[frame, first:last], reached[first:last] = at_t[first:last], True
+        alive = np.flatnonzero(reached)
+        self.steps[alive] += 1
         rate, eps = np.zeros((2, bases, channels), np.float32)
-        for j in range(first, last):
+        for j in alive:
             adam = adam_step(1.0, rates, int(self.steps[j]))
             rate[j], eps[j] = channel_rates[:channels] * adam.size, adam.floor
         run(
-            update.update_shared, self.weight, self.first, self.second, v_state, values, first, last, rate, eps,
+            update.update_shared, self.weight, self.first, self.second, v_state, values, alive, rate, eps,
             np.float32(rates.beta1), np.float32(rates.beta2),
         )  # fmt: skip
 
@@ -131,11 +135,11 @@ class FdmMotion:
         quartic = self.form == "quartic"
         run(update.deform_fdm, canonical, self.weight, self.centre, self.width, np.float32(t), quartic, state)
 
-    def update(self, v_state: Floats, t: float, rates: StepRates, iteration: int) -> None:
+    def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
         adam = adam_step(rates.motion_mean, rates, iteration)
         run(
             update.update_fdm, self.weight, self.centre, self.width, self.first, self.second, v_state,
-            np.float32(t), self.form == "quartic", *map(np.float32, dataclasses.astuple(adam)),
+            np.array(times, np.float32), self.form == "quartic", *map(np.float32, dataclasses.astuple(adam)),
         )  # fmt: skip
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:

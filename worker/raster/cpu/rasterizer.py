@@ -42,6 +42,13 @@ class Gradients:
     mean2d_norm: Floats  # [N], in normalised device coordinates
     pose: NDArray[np.float64]  # [threads, 12], to be summed
 
+    @classmethod
+    def room(cls, state: Floats) -> Gradients:
+        """Zeros for as many Gaussians as state has, [13, N], which becomes a part of them."""
+        count = state.shape[1]
+        logit, norm = np.zeros((2, count), np.float32)
+        return cls(state, logit, np.zeros((3, count), np.float32), norm, np.zeros((thread_count(), 12)))
+
 
 class Rasterizer:
     """Buffers for one image size; they grow with the scene and are reused from step to step. Not thread-safe."""
@@ -74,13 +81,7 @@ class Rasterizer:
         self._homes = np.zeros((count, 4), np.int32)
         self._order = np.zeros((2, count), np.int32)
         self._keys = np.zeros((2, count), np.uint32)
-        self.gradients = Gradients(
-            np.zeros((13, count), np.float32),
-            np.zeros(count, np.float32),
-            np.zeros((3, count), np.float32),
-            np.zeros(count, np.float32),
-            np.zeros((self.threads, 12)),
-        )
+        self.gradients = Gradients.room(np.zeros((13, count), np.float32))
 
     def _allocate_slots(self, slots: int, homes: int) -> None:
         """Room for so many a thread."""
@@ -174,10 +175,13 @@ class Rasterizer:
         planes = 5 if values is None else 6
         return self.image.reshape(6, self.height, self.stride)[:planes, :, : self.width]
 
-    def loss_backward(self, target: Target, loss_settings: Floats) -> Gradients:
-        """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums a tile."""
+    def loss_backward(self, target: Target, loss_settings: Floats, out: Gradients | None = None) -> Gradients:
+        """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums a tile.
+
+        out: where they are written; None: where the next ones will be, too.
+        """
         self.blend(LOSS, target, loss_settings, self.image)
-        return self.carry_back()
+        return self.carry_back(out)
 
     def cotangent_backward(self, cotangents: Floats) -> Gradients:
         """Gradients of sum(cotangents * image), cotangents [5, H, W]."""
@@ -186,9 +190,9 @@ class Rasterizer:
         self.blend(COTANGENT, self._no_target, _NO_LOSS, padded_cotangents.ravel())
         return self.carry_back()
 
-    def carry_back(self) -> Gradients:
+    def carry_back(self, out: Gradients | None = None) -> Gradients:
         """The slots' gradients, left by blend, to the parameters of their Gaussians."""
-        out = self.gradients
+        out = out or self.gradients
         run(
             project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,
             self._homes, self._sums,

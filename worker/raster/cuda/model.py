@@ -58,9 +58,7 @@ class CudaModel:
         width: int,
         height: int,
         device: str | torch.device = "cuda",
-        frames: int = 1,
     ) -> None:
-        """frames: how many a step trains on (step_frames); step is for one."""
         self.count, self.device = len(gaussians), torch.device(device)
         columns = padded(self.count)
         values = torch.zeros(VALUES, columns)
@@ -76,8 +74,7 @@ class CudaModel:
         )
         self.motion: Motion = motion_of(deformation, columns, self.device)
         self._size = width, height
-        self._training = View(width, height, frames, self.motion, self.device, rows=CHECK_EVERY)
-        self._training.fit(columns)
+        self._training = self._training_view(1)
         self._views: OrderedDict[tuple[int, int, int], View] = OrderedDict()
         self._store = FrameStore(width, height, self.device)
         self._report = torch.zeros(SEEN + CHECK_EVERY, dtype=torch.int32, device=self.device)
@@ -89,26 +86,20 @@ class CudaModel:
     # Steps
 
     def step(
-        self, frame: TrainingFrame, loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
+        self, frames: Sequence[TrainingFrame], loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
     ) -> StepSums | None:
-        """One iteration (counted from 1) on one frame; sh_degree: the harmonics in use at this iteration.
+        """One iteration (counted from 1) on the sum of the frames' losses; sh_degree: the harmonics in use at it.
 
         Returns:
             What the steps since the last answer add up to, where the host has looked.
-        """
-        return self.step_frames([frame], loss, rates, iteration, sh_degree)
 
-    def step_frames(
-        self,
-        frames: Sequence[TrainingFrame],
-        loss: LossSettings,
-        rates: StepRates,
-        iteration: int,
-        sh_degree: int = 0,
-    ) -> StepSums | None:
-        """One iteration on the sum of the losses of so many frames as the model was made for."""
+        Raises:
+            ValueError: no frame, or more than the rasteriser draws at once (bins.MOST_FRAMES).
+        """
         if len(frames) != self._training.frames:
-            raise ValueError(f"a step on {len(frames)} frames, this model was made for {self._training.frames}")
+            self._settle()
+            self._training.launches.forget()
+            self._training = self._training_view(len(frames))
         room, slot = self._store.room, len(self._sent)
         row, times = self._training.control.rows[slot], [frame.t for frame in frames]
         self._training.write_cameras(slot, [frame.camera for frame in frames])
@@ -124,6 +115,12 @@ class CudaModel:
         if len(self._sent) == CHECK_EVERY:
             self._settle()
         return self._answer()
+
+    def _training_view(self, frames: int) -> View:
+        """What steps on so many frames need."""
+        view = View(*self._size, frames, self.motion, self.device, rows=CHECK_EVERY)
+        view.fit(self._values.shape[1])
+        return view
 
     def wait(self) -> StepSums | None:
         """Return when every step is made: their sums, or None if there was none since the last answer."""
