@@ -18,7 +18,7 @@ from worker.raster import Camera
 def camera_vector(camera: Camera) -> NDArray[np.float64]:
     """fx, fy, cx, cy, W, H and camera_from_world [3, 4] row-major, as the kernels read a camera."""
     given = camera.camera_from_world
-    matrix = given.detach().double().numpy() if isinstance(given, torch.Tensor) else given
+    matrix = given.detach().double().cpu().numpy() if isinstance(given, torch.Tensor) else given
     pose = np.asarray(matrix, np.float64)[:3].ravel()
     return np.concatenate([[camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], pose])
 

@@ -10,13 +10,7 @@ from torch import Tensor
 from worker.raster import Camera, Rendered
 from worker.raster.autograd import logit_of, opacity_gradient, pose_gradient, rasterize_by, stacked
 from worker.raster.cuda.rasterizer import CudaRasterizer
-
-
-def camera_rows(camera: Camera, device: torch.device) -> Tensor:
-    """float64 [1, 18]: fx, fy, cx, cy, W, H and camera_from_world [3, 4] row-major, as the kernels read a camera."""
-    pose = camera.pose(torch.zeros((), dtype=torch.float64, device=device)).detach()
-    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
-    return torch.cat([torch.tensor(numbers, dtype=torch.float64, device=device), pose[:3].reshape(12)])[None]
+from worker.raster.step import camera_vector
 
 
 class _Rasterize(torch.autograd.Function):
@@ -34,10 +28,11 @@ class _Rasterize(torch.autograd.Function):
         logit = logit_of(opacity)
         state = torch.cat([mean, quaternion, scale.log()], dim=1).float().T.contiguous()[None]
         rasterizer = CudaRasterizer(camera.width, camera.height, mean.device)
-        rows = camera_rows(camera, mean.device)
-        rasterizer.project(rows, state, logit, colour.float().T.contiguous()[None])
+        row = torch.from_numpy(camera_vector(camera)).to(mean.device)
+        given = row[None], state, logit, colour.float().T.contiguous()[None]
+        rasterizer.project(*given)
         if rasterizer.grown():
-            rasterizer.project(rows, state, logit, colour.float().T.contiguous()[None])
+            rasterizer.project(*given)
         image = rasterizer.render()[0].clone()
         ctx.rasterizer = rasterizer
         ctx.save_for_backward(scale, logit, camera_from_world)

@@ -51,7 +51,7 @@ class Trained:
     @property
     def tiles(self) -> int:
         """Of all frames."""
-        return self.statistics.numel() // 4
+        return self.statistics[..., 0].numel()
 
     def tensors(self) -> tuple[Tensor, ...]:
         """In the order in which the kernels take them, without those of the motion, which come after the second."""
