@@ -67,7 +67,7 @@ class TrainingFrame:
 class StepSums:
     """Sums over the tissue pixels, before the update, of the steps since the last answer; one step on the CPU.
 
-    visible  Gaussians in view; of several steps the least
+    visible  Gaussians in view of any frame of a step; of several steps the least
     """
 
     colour_l1: float

@@ -147,7 +147,7 @@ def test_one_frame_moves_and_trains_as_on_the_cpu(kind: str, device: str) -> Non
         v_state = torch.cat([made.trained.v_state[0], v_constant]).cpu().numpy()
         no_canonical = dataclasses.replace(SAME_RATE, mean=0, quaternion=0, log_scale=0, opacity=0, colour=0)
         made.update(no_canonical, iteration)
-        cpu.update(v_state, t, SAME_RATE, iteration)
+        cpu.update(v_state[None], (t,), SAME_RATE, iteration)
     assert bool((made.trained.values[:ROWS].cpu() == torch.from_numpy(canonical)).all())
     stored = made.motion.arrays(COUNT)
     for name, wanted in cpu.arrays(COUNT).items():
