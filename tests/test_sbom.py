@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,19 @@ from pathlib import Path
 from tests.test_house import REPOSITORY, project, requirement_name
 
 
+def without_parsing_addresses(folder: Path) -> dict[str, str]:
+    """The environment of a process whose jsonschema finds no parser of web addresses, and so checks all but those of
+    the packages that others made: parsing those takes nine tenths of the time.
+    """
+    folder.mkdir()
+    (folder / "rfc3987_syntax.py").write_text("raise ImportError\n")
+    return {**os.environ, "PYTHONPATH": str(folder)}
+
+
 def test_the_bill_names_every_direct_dependency_and_the_ffmpeg_that_reads_clips(tmp_path: Path) -> None:
     path = tmp_path / "build" / "sbom.json"
-    subprocess.run([sys.executable, REPOSITORY / "docker" / "sbom.py", path], check=True, timeout=120)
+    command = [sys.executable, REPOSITORY / "docker" / "sbom.py", path]
+    subprocess.run(command, env=without_parsing_addresses(tmp_path / "absent"), check=True, timeout=120)
     bill = json.loads(path.read_text())
     assert bill["bomFormat"] == "CycloneDX"
     versions = {each["name"].lower().replace("_", "-"): each["version"] for each in bill["components"]}

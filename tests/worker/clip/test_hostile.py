@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,21 @@ from contract.clip_limits import ClipLimits
 from contract.errors import InputError
 from contract.sniff import check_file
 from tests.worker.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile, endonerf, npy
+from worker.clip import DepthClip
 from worker.decode import StereoRecording, decode_clip
+
+AT_ONCE = 2
+"""Decoding processes: most of a refusal is the time that one takes to start."""
+
+
+@pytest.fixture(scope="module")
+def decoded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[StereoRecording | DepthClip]]]:
+    """What becomes of every file of the corpus."""
+    with ThreadPoolExecutor(AT_ONCE) as threads:
+        yield {
+            name: threads.submit(decode_clip, **given(tmp_path_factory.mktemp("hostile"), hostile))
+            for name, hostile in CORPUS.items()
+        }
 
 
 def given(tmp_path: Path, hostile: Hostile) -> dict[str, Path]:
@@ -21,10 +37,12 @@ def given(tmp_path: Path, hostile: Hostile) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("name", CORPUS)
-def test_a_hostile_file_is_refused_with_its_field_and_a_remedy(tmp_path: Path, name: str) -> None:
+def test_a_hostile_file_is_refused_with_its_field_and_a_remedy(
+    decoded: dict[str, Future[StereoRecording | DepthClip]], name: str
+) -> None:
     hostile = CORPUS[name]
     with pytest.raises(InputError, match=hostile.problem) as caught:
-        decode_clip(**given(tmp_path, hostile))
+        decoded[name].result()
     assert caught.value.field == hostile.part
     assert caught.value.remedy
     assert "crashed" not in caught.value.problem

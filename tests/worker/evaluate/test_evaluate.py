@@ -99,10 +99,11 @@ def test_what_has_its_row_is_not_measured_again(measured: Path, capsys: pytest.C
     assert (measured / RUNS).read_bytes() == before
 
 
-def test_rows_alone_are_enough_to_draw(measured: Path, tmp_path: Path) -> None:
+def test_rows_alone_are_enough_to_draw_also_while_others_are_added(measured: Path, tmp_path: Path) -> None:
     for name in (RUNS, CURVES):
         (tmp_path / name).write_bytes((measured / name).read_bytes())
-    assert main(["evaluate", "--redraw", "--out", str(tmp_path)]) == ExitCode.OK
+    with adding_alone(tmp_path):
+        assert main(["evaluate", "--redraw", "--out", str(tmp_path)]) == ExitCode.OK
     assert {"pareto.png", "curves.svg", "frames.png", SUMMARY} <= {path.name for path in tmp_path.iterdir()}
 
 
@@ -134,11 +135,6 @@ def test_a_second_process_that_would_add_rows_to_a_folder_is_refused(
         assert main([*command, "--out", str(tmp_path)]) == ExitCode.BAD_INPUT
     assert "another process is adding rows" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == [LOCK]
-
-
-def test_rows_are_drawn_while_others_are_added(measured: Path) -> None:
-    with adding_alone(measured):
-        assert main(["evaluate", "--redraw", "--out", str(measured)]) == ExitCode.OK
 
 
 def test_a_process_that_was_killed_leaves_the_folder_to_the_next(tmp_path: Path) -> None:
