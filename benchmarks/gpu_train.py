@@ -4,6 +4,8 @@ A run is what `reconstruct` makes of a clip with depth, without what follows tra
 Seconds are t_train_s as docs/conventions.md defines it, so they have what is done on the processor before the first
 step, and neither compilation nor scoring. Held-out frames are scored at many moments of it; a threshold counts as
 reached at the first of them that is above it, so a figure is late by at most the distance to the moment before.
+
+`fast` is trained on one frame a step and on several, which fill the device better: the seconds tell what that is worth.
 """
 
 from __future__ import annotations
@@ -29,10 +31,10 @@ from worker.train import CurvePoint, Run, Stopwatch, train
 STAGES = ("motion_s", "capacity_s", "fusion_s", "start_s", "targets_s", "optimise_s", "compile_s")
 THRESHOLDS_DB = (34, 36, 38)
 FIELDS = (
-    "clip", "preset", "device", "seed", "iterations", "gaussians", "final_db",
+    "clip", "preset", "frames_a_step", "device", "seed", "iterations", "frames_seen", "gaussians", "final_db",
     *(f"s_to_{db}_db" for db in THRESHOLDS_DB), "s_to_paper_db", "t_train_s", *STAGES, "step_ms", "note",
 )  # fmt: skip
-CURVE_FIELDS = ("clip", "preset", "device", "seed", "t_train_s", "iteration", "psnr_tissue_db")
+CURVE_FIELDS = ("clip", "preset", "frames_a_step", "device", "seed", "t_train_s", "iteration", "psnr_tissue_db")
 MOMENTS_S = (*np.arange(0.1, 2.0, 0.1), *np.arange(2.0, 6.0, 0.25), *np.arange(6.0, 60.0, 2.0))
 """Of t_train_s, at which held-out frames are scored: closer than those of a report, for a run is over in seconds."""
 FAST_BUDGET_S, CPU_BUDGET_S = 20.0, 45.0
@@ -47,16 +49,24 @@ def main() -> None:
     trials = Trials(part, str(told["name"]), clip)
     device = Device("cuda", str(part.origin["gpu"]), part.device)
     if part.interpret:
-        trials.run(_tiny("fast"), device, 0, iterations=2)
+        for frames_a_step in (1, 2):
+            trials.run(on_several(_tiny("fast"), frames_a_step), device, 0, iterations=2)
         return
     if part.has(LEAST_S["paper"], "paper"):
         trials.run(PRESETS["paper"], device, 0, iterations=PRESETS["paper"].iterations)
-    for seed in (0, 1):
-        if part.has(LEAST_S["fast"], f"fast, seed {seed}"):
-            trials.run(PRESETS["fast"], device, seed, budget_s=FAST_BUDGET_S)
+    for frames_a_step, seed in ((1, 0), (4, 0), (1, 1)):
+        if part.has(LEAST_S["fast"], f"fast, {frames_a_step} frames a step, seed {seed}"):
+            trials.run(on_several(PRESETS["fast"], frames_a_step), device, seed, budget_s=FAST_BUDGET_S)
     if part.has(LEAST_S["cpu"], "the CPU's fast"):
         part.wait_for(KERNELS_READY)
         trials.run(PRESETS["fast"], CPU, 0, budget_s=min(CPU_BUDGET_S, part.left_s - 15))
+    if part.has(LEAST_S["fast"], "fast, 2 frames a step, seed 0"):
+        trials.run(on_several(PRESETS["fast"], 2), device, 0, budget_s=FAST_BUDGET_S)
+
+
+def on_several(preset: Preset, frames_a_step: int) -> Preset:
+    """The preset, with so many frames a step."""
+    return dataclasses.replace(preset, frames_a_step=frames_a_step)
 
 
 def _tiny(name: str) -> Preset:
@@ -75,7 +85,8 @@ class Trials:
 
     def run(self, preset: Preset, device: Device, seed: int, **length: float | None) -> None:
         """One run, its row and its curve; one that breaks off has a row that says so."""
-        place = {"clip": self._name, "preset": preset.name, "device": device.kind, "seed": seed}
+        place = {"clip": self._name, "preset": preset.name, "frames_a_step": preset.frames_a_step}
+        place |= {"device": device.kind, "seed": seed}
         try:
             run, seconds, note = self._trained(preset, device, seed, length)
         except Exception as error:
@@ -89,7 +100,8 @@ class Trials:
             self._paper_db = final_db
         reached = {f"s_to_{db}_db": first_s(run.curve, db) for db in THRESHOLDS_DB}
         reached["s_to_paper_db"] = None if self._paper_db is None else first_s(run.curve, self._paper_db)
-        row = {**place, "iterations": run.iteration, "gaussians": run.model.count, "final_db": final_db, **reached}
+        row = {**place, "iterations": run.iteration, "frames_seen": run.frames_seen, "gaussians": run.model.count}
+        row |= {"final_db": final_db, **reached}
         row |= {name: round(seconds.get(name, 0.0), 3) for name in ("t_train_s", *STAGES)}
         row["step_ms"] = 1e3 * seconds["optimise_s"] / max(run.iteration, 1)
         self._part.add(**row, note=note)
