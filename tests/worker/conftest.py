@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,3 +16,12 @@ def _one_torch_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def triton_cache(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
+    """Where Triton finds what it compiled for these tests before: it knows a kernel by its source, its constants and
+    the compiler. An empty folder where pytest keeps nothing between runs.
+    """
+    kept = getattr(pytestconfig, "cache", None)
+    return tmp_path if kept is None else Path(kept.mkdir("triton"))

@@ -199,8 +199,8 @@ def test_depth_is_as_true_as_on_the_cpu() -> None:
     assert ours.measurements["min_disparity_px"] < 7 < 14 < ours.measurements["max_disparity_px"] < 26
 
 
-def test_kernels_compile_for_sm_90_within_its_registers_once_for_clips_of_every_size(tmp_path: Path) -> None:
-    found = kernels_compiled_by("tests.worker.stereo_probe", tmp_path)
+def test_kernels_compile_for_sm_90_within_its_registers_once_for_clips_of_every_size(triton_cache: Path) -> None:
+    found = kernels_compiled_by("tests.worker.stereo_probe", triton_cache)
     lanes = 2
     forms = {"census": 1, "smooth_lines": 1, "add_paths": 2 * lanes}
     forms |= dict.fromkeys(("column_costs", "block_costs", "winners"), lanes)

@@ -14,8 +14,8 @@ SHARED_BYTES = 48 * 1024
 """What every GPU gives a program without being asked for more."""
 
 
-def test_every_kernel_compiles_for_sm_90_and_keeps_its_numbers_in_registers(tmp_path: Path) -> None:
-    kernels = kernels_compiled_by("tests.worker.raster.cuda_probe", tmp_path)
+def test_every_kernel_compiles_for_sm_90_and_keeps_its_numbers_in_registers(triton_cache: Path) -> None:
+    kernels = kernels_compiled_by("tests.worker.raster.cuda_probe", triton_cache)
     assert {each["kernel"] for each in kernels} == {
         "project", "fill_slots", "blend", "sum_slots", "project_backward",
         "deform_linear", "update_linear", "deform_fdm", "update_fdm",
