@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -30,17 +31,19 @@ NEVER_ENOUGH_DB, ALWAYS_ENOUGH_DB = 1000.0, -1000.0
 STOPPED_AT, CLOSED_AT = 48, 60
 
 
-@pytest.fixture(autouse=True)
-def short_cycles(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.schedule.SHORTEST_CYCLE", SHORTEST)
+@pytest.fixture(scope="module", autouse=True)
+def short_cycles() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("worker.schedule.SHORTEST_CYCLE", SHORTEST)
+        yield
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def clip() -> DepthClip:
     return phantom_clip(frames=34)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def split(clip: DepthClip) -> FrameSplit:
     found = split_frames(clip, "every8")
     assert len(left_out(found.train)) == 2
@@ -52,6 +55,18 @@ def judged(clip: DepthClip, split: FrameSplit, worth_db: float | None = NEVER_EN
     run = prepared_on(clip, split, "fast", iterations=PLANNED)
     run.schedule = Schedule(PLANNED, cycles=True, worth_db=worth_db)
     return run
+
+
+@pytest.fixture(scope="module")
+def straight(clip: DepthClip, split: FrameSplit) -> Run:
+    """A run that judged itself and ended: to be looked at."""
+    return trained(judged(clip, split))
+
+
+@pytest.fixture(scope="module")
+def untrained(clip: DepthClip, split: FrameSplit) -> Run:
+    """A run of which the tests change seed, frames and schedule before they look, and nothing else."""
+    return judged(clip, split)
 
 
 def until(iteration: int, run: Run) -> Run:
@@ -106,10 +121,10 @@ def test_a_score_is_how_near_the_finished_model_is_to_the_frames_left_out(clip: 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("count", [28, 47, 63, 64, 83, 84, 131, 200])
 def test_frames_left_out_are_not_shown_before_the_decision_and_are_after_it(
-    clip: DepthClip, split: FrameSplit, count: int, seed: int
+    untrained: Run, count: int, seed: int
 ) -> None:
     """Of clips of any length: which frame an iteration shows depends on how many there are alone."""
-    run = judged(clip, split)
+    run = untrained
     run.seed, run.frames.indices = seed, list(range(count))
     planned = Schedule(24 * count + seed, cycles=True, worth_db=NEVER_ENOUGH_DB, epoch=count)
     run.schedule = planned.with_score(30.0).with_score(30.0)
@@ -149,15 +164,14 @@ def test_frames_without_tissue_decide_nothing(
 
 
 def test_held_out_frames_do_not_decide_when_a_run_ends(
-    clip: DepthClip, split: FrameSplit, rng: np.random.Generator
+    straight: Run, clip: DepthClip, split: FrameSplit, rng: np.random.Generator
 ) -> None:
     spoilt = poisoned(clip, split.held_out, rng)
-    first = trained(judged(clip, split))
     for score in (10.0, 50.0):
         run = judged(spoilt, split)
         train(run, Stopwatch(), lambda score=score: score, Hooks())  # type: ignore[misc]
-        assert run.schedule == first.schedule
-        assert bits(run, spoilt, split) == bits(first, clip, split)
+        assert run.schedule == straight.schedule
+        assert bits(run, spoilt, split) == bits(straight, clip, split)
 
 
 @pytest.mark.parametrize(
@@ -174,13 +188,12 @@ def test_held_out_frames_do_not_decide_when_a_run_ends(
     ],
 )
 def test_a_judged_run_goes_on_to_the_bits_of_an_unstopped_one(
-    clip: DepthClip, split: FrameSplit, stopped_after: int, tmp_path: Path
+    straight: Run, clip: DepthClip, split: FrameSplit, stopped_after: int, tmp_path: Path
 ) -> None:
     save_run(tmp_path, until(stopped_after, judged(clip, split)), 1.5)
     again = judged(clip, split)
     load_run(tmp_path, again)
     assert again.iteration == stopped_after
-    straight = trained(judged(clip, split))
     assert bits(trained(again), clip, split) == bits(straight, clip, split)
     assert again.schedule == straight.schedule
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 from typing import cast
 
 import numpy as np
@@ -22,12 +23,26 @@ TRAIN = [index for index in range(FRAMES) if index not in HELD_OUT]
 TRUSTED = 0.5
 
 
+@cache
 def phantom(motion: Motion, *, moving_camera: bool = False, noise: bool = True) -> tuple[DepthClip, Trajectories]:
+    """A clip and where its points go. Callers share the arrays: copy before you write."""
     settings = PhantomSettings(
         width=WIDTH, height=HEIGHT, frames=FRAMES, motion=motion, moving_camera=moving_camera, noise=noise,
     )  # fmt: skip
     made = make_phantom(settings)
     return made.depth_clip(), made.trajectories(stride_px=4)
+
+
+@cache
+def tracks_of(motion: Motion, *, moving_camera: bool = False) -> Tracks:
+    """What is followed on the phantom's training frames, shared likewise."""
+    return track(phantom(motion, moving_camera=moving_camera)[0], TRAIN)
+
+
+def copied(clip: DepthClip) -> DepthClip:
+    """With pictures of its own, to be written."""
+    layers = ("rgb", "tissue", "depth_mm", "depth_confidence")
+    return dataclasses.replace(clip, **{layer: getattr(clip, layer).copy() for layer in layers})
 
 
 def on_tissue(clip: DepthClip, truth: Trajectories) -> NDArray[np.bool_]:
@@ -53,7 +68,7 @@ def bare(displacement_mm: NDArray[np.floating], confidence: NDArray[np.floating]
 )
 def test_trusted_tracks_follow_the_true_points(motion: Motion, moving_camera: bool) -> None:
     clip, truth = phantom(motion, moving_camera=moving_camera)
-    tracks = track(clip, TRAIN)
+    tracks = tracks_of(motion, moving_camera=moving_camera)
     assert tracks.step_px == 1
     rows, columns = truth.pixels.T
     moved = truth.points_mm[TRAIN] - truth.points_mm[0]
@@ -70,7 +85,7 @@ def test_fitted_tracks_also_hold_at_frames_they_never_saw(motion: Motion) -> Non
     clip, truth = phantom(motion)
     basis = basis_of(clip, 9)
     pixels = cast(NDArray[np.intp], truth.pixels[:, 0] * WIDTH + truth.pixels[:, 1])
-    weights, support = fit_tracks(track(clip, TRAIN), basis[TRAIN], pixels, WIDTH)
+    weights, support = fit_tracks(tracks_of(motion), basis[TRAIN], pixels, WIDTH)
     fitted = np.einsum("tb,nbc->tnc", basis, weights[..., :3])
     moved = truth.points_mm - truth.points_mm[0]
     # where the instrument never passes and the flow never fails
@@ -82,8 +97,7 @@ def test_fitted_tracks_also_hold_at_frames_they_never_saw(motion: Motion) -> Non
 
 
 def test_held_out_frames_are_never_looked_at() -> None:
-    clip, _ = phantom("breathing")
-    expected = track(clip, TRAIN)
+    clip, expected = copied(phantom("breathing")[0]), tracks_of("breathing")
     for layer in (clip.rgb, clip.tissue, clip.depth_mm, clip.depth_confidence):
         layer[list(HELD_OUT)] = 0
     found = track(clip, TRAIN)
@@ -93,15 +107,14 @@ def test_held_out_frames_are_never_looked_at() -> None:
 
 
 def test_a_still_clip_does_not_move() -> None:
-    clip, _ = phantom("still")
-    tracks = track(clip, TRAIN)
+    tracks = tracks_of("still")
     length_mm = np.linalg.norm(tracks.displacement_mm, axis=-1)
     assert np.median(length_mm[tracks.confidence > TRUSTED]) < 0.05
     assert np.quantile(length_mm[tracks.confidence > TRUSTED], 0.99) < 0.5
 
 
 def test_nothing_is_trusted_under_the_instrument_or_without_depth() -> None:
-    clip, _ = phantom("breathing")
+    clip = copied(phantom("breathing")[0])
     clip.depth_mm[:, :32] = 0
     tracks = track(clip, TRAIN)
     assert not tracks.confidence[:, :32].any()
