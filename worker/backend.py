@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass
 from importlib.util import find_spec
+from shutil import which
 from typing import Literal, get_args
 
 import torch
@@ -49,14 +51,16 @@ CPU = Device("cpu")
 class Gpu:
     """What training on a GPU takes, as far as it is there.
 
-    build       the CUDA version that torch was built for; None: it is a CPU build
-    name        of the GPU that torch sees; None: it sees none
-    has_triton  whether Triton is installed
+    build         the CUDA version that torch was built for; None: it is a CPU build
+    name          of the GPU that torch sees; None: it sees none
+    has_triton    whether Triton is installed
+    has_compiler  whether there is a C compiler, by which Triton makes what launches its kernels
     """
 
     build: str | None
     name: str | None
     has_triton: bool
+    has_compiler: bool = True
 
     @property
     def missing(self) -> str:
@@ -68,6 +72,8 @@ class Gpu:
             lacks.append("torch sees no NVIDIA GPU")
         if not self.has_triton:
             lacks.append("Triton is not installed")
+        elif not self.has_compiler:
+            lacks.append("Triton finds no C compiler")
         return " and ".join(lacks)
 
     @property
@@ -77,13 +83,16 @@ class Gpu:
             return "Install torch's CUDA build (`make setup TORCH_INDEX=https://download.pytorch.org/whl/cu128`)"
         if self.name is None:
             return "See whether `nvidia-smi` lists the GPU, and whether its driver is as new as torch's CUDA"
-        return "Install Triton (`pip install 'intrasplat[gpu]'`)"
+        if not self.has_triton:
+            return "Install Triton (`pip install 'intrasplat[gpu]'`)"
+        return "Install a C compiler and the headers of Python (`apt install gcc python3-dev`), or name one in CC"
 
 
 def find_gpu() -> Gpu:
     """What there is on this machine."""
     name = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
-    return Gpu(torch.version.cuda, name, has_triton=find_spec("triton") is not None)
+    compilers = os.environ.get("CC"), which("gcc"), which("clang")  # where Triton looks
+    return Gpu(torch.version.cuda, name, find_spec("triton") is not None, has_compiler=any(compilers))
 
 
 def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OPTION) -> Device:
@@ -102,7 +111,7 @@ def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OP
     if asked == "cpu":
         return CPU
     gpu = gpu or find_gpu()
-    if gpu.name is not None and gpu.has_triton:
+    if gpu.name is not None and not gpu.missing:
         return Device("cuda", gpu.name, "cuda")
     if asked == "auto":
         return CPU

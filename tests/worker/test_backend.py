@@ -30,11 +30,12 @@ H200 = Gpu(build="13.0", name="NVIDIA H200", has_triton=True)
 CPU_BUILD = Gpu(build=None, name=None, has_triton=False)
 NO_GPU = Gpu(build="13.0", name=None, has_triton=True)
 NO_TRITON = Gpu(build="13.0", name="NVIDIA H200", has_triton=False)
+NO_COMPILER = Gpu(build="13.0", name="NVIDIA H200", has_triton=True, has_compiler=False)
 
 
 def test_auto_takes_the_gpu_where_everything_is_there_and_else_the_cpu() -> None:
     assert choose_device("auto", H200) == Device("cuda", "NVIDIA H200", "cuda")
-    for gpu in (CPU_BUILD, NO_GPU, NO_TRITON):
+    for gpu in (CPU_BUILD, NO_GPU, NO_TRITON, NO_COMPILER):
         assert choose_device("auto", gpu) == CPU
 
 
@@ -49,6 +50,7 @@ def test_what_is_asked_for_by_name_is_taken() -> None:
         (CPU_BUILD, "torch is a CPU build and Triton is not installed", "TORCH_INDEX"),
         (NO_GPU, "torch sees no NVIDIA GPU", "nvidia-smi"),
         (NO_TRITON, "Triton is not installed", "intrasplat[gpu]"),
+        (NO_COMPILER, "Triton finds no C compiler", "apt install gcc"),
     ],
 )
 def test_a_gpu_that_cannot_be_used_is_refused_with_what_is_missing_and_the_remedy(
@@ -113,6 +115,18 @@ def test_whether_a_gpu_is_lost_is_asked_of_the_threads_own_stream(lost: bool, mo
     monkeypatch.setattr(torch.cuda, "current_stream", Stream)
     monkeypatch.setattr(torch.cuda, "synchronize", whole_device)
     assert gpu_is_lost() == lost
+
+
+def test_a_c_compiler_is_looked_for_where_triton_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert not find_gpu().has_compiler
+    monkeypatch.setenv("CC", "cc")
+    assert find_gpu().has_compiler
+    monkeypatch.delenv("CC")
+    compiler = tmp_path / "clang"
+    compiler.touch(mode=0o755)
+    assert find_gpu().has_compiler
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
