@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
 from contract.errors import UnavailableError
+from worker.backend import Device
+from worker.hooks import Hooks
+from worker.phantom import PhantomSettings, make_phantom, write_stereomis
+from worker.pipeline import depth_clip_of
 from worker.raster import Rendered
 from worker.raster.cuda import agreement, rasterize
+from worker.request import ReconstructionRequest
 
 
 def test_the_device_agrees_with_the_reference(device: str) -> None:
@@ -18,17 +25,36 @@ def test_the_device_agrees_with_the_reference(device: str) -> None:
     agreement.check(device, "a GPU")
 
 
-@pytest.mark.parametrize("factor", [1.05, float("nan")])
-def test_one_that_does_not_is_refused_by_its_name_with_a_remedy(
-    factor: float, device: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def render_brighter(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
+    """Have the device splat wrongly from here to the test's end."""
+
     def wrong(*arguments: object) -> Rendered:
         found = rasterize(*arguments)  # type: ignore[arg-type]
         return Rendered(found.rgb * factor, found.depth, found.alpha)
 
     monkeypatch.setattr(agreement, "rasterize", wrong)
+
+
+@pytest.mark.parametrize("factor", [1.05, float("nan")])
+def test_one_that_does_not_is_refused_by_its_name_with_a_remedy(
+    factor: float, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    render_brighter(monkeypatch, factor)
     with pytest.raises(
         UnavailableError, match=r"GPU 9000 .* is not to be trusted: its .* of a test scene is"
     ) as raised:
         agreement.check(device, f"GPU 9000 {factor}")
     assert "INTRASPLAT_DEVICE=cpu" in raised.value.remedy
+
+
+def test_one_that_does_not_matches_no_stereo_clip_either(
+    device: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    write_stereomis(make_phantom(PhantomSettings(width=96, height=80, frames=2, period_frames=2)), tmp_path)
+    render_brighter(monkeypatch, 1.05)
+    stages: list[str] = []
+    hooks = Hooks(on_progress=lambda progress: stages.append(progress.stage))
+    with pytest.raises(UnavailableError, match="GPU 9001 is not to be trusted"):
+        depth_clip_of(ReconstructionRequest(clip=tmp_path), hooks, {}, Device("cuda", "GPU 9001", device))
+    assert stages[-1] == "compile"
+    assert "stereo" not in stages

@@ -1,4 +1,4 @@
-"""Whether the device splats as the reference does: asked once a process, before a model is made on it.
+"""Whether the device splats as the reference does: asked once a process, before a job computes on it.
 
 No GPU, driver or version of Triton is believed unseen. A small fixed scene is rendered and differentiated on the device
 and by worker/raster/reference.py in float64.
