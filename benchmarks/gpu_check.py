@@ -19,6 +19,7 @@ import argparse
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -104,7 +105,10 @@ def what_is_missing() -> str:
         return f"torch of {sys.executable} is a CPU build"
     if found["gpu"] is None:
         return f"torch of {sys.executable} sees no NVIDIA GPU"
-    return "" if found["triton"] else f"{sys.executable} has no Triton"
+    if not found["triton"]:
+        return f"{sys.executable} has no Triton"
+    compilers = os.environ.get("CC"), shutil.which("gcc"), shutil.which("clang")
+    return "" if any(compilers) else "there is no C compiler (gcc or clang), by which Triton makes its launchers"
 
 
 def environment(work: Path, interpret: bool) -> dict[str, str]:
