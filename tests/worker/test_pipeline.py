@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import dataclasses
 import shutil
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,17 +35,48 @@ from worker.targets import camera_in_units
 SCENE_FILES = {"manifest.json", "scene.safetensors", "report.json", "curve.csv"}
 ITERATIONS = 20
 STEREO = PhantomSettings(width=192, height=160, frames=10, period_frames=12)
+Drawn = Callable[..., Path]
+Whole = Callable[[str], tuple[Report, Path]]
 
 
 @pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return endonerf(tmp_path_factory.mktemp("clip"), FRAMES)
+def endonerf(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
+    """Draws a clip of so many frames (and width, height, settings of the phantom), once; it is read and not written."""
+
+    @cache
+    def drawn(frames: int, width: int = WIDTH, height: int = HEIGHT, **settings: Any) -> Path:
+        folder = tmp_path_factory.mktemp("clip")
+        made = make_phantom(PhantomSettings(width=width, height=height, frames=frames, period_frames=12, **settings))
+        write_endonerf(made, folder)
+        return folder
+
+    return drawn
 
 
-def endonerf(folder: Path, frames: int, width: int = WIDTH, height: int = HEIGHT, **settings: Any) -> Path:
-    made = make_phantom(PhantomSettings(width=width, height=height, frames=frames, period_frames=12, **settings))
-    write_endonerf(made, folder)
-    return folder
+@pytest.fixture(scope="module")
+def clip(endonerf: Drawn) -> Path:
+    return endonerf(FRAMES)
+
+
+@pytest.fixture(scope="module")
+def whole(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """Makes the clip's scene with a preset, once: its report and its folder, to be read."""
+
+    @cache
+    def made(preset: str) -> tuple[Report, Path]:
+        out = tmp_path_factory.mktemp(preset)
+        return run(clip, out, preset=preset), out
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def stopped(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that was stopped after two steps: copy it before you go on in it."""
+    out = tmp_path_factory.mktemp("stopped")
+    with pytest.raises(Cancelled):
+        run(clip, out, stopping_after(2))
+    return out
 
 
 @pytest.fixture(scope="module")
@@ -81,10 +114,10 @@ def stopping_after(iterations: int) -> Hooks:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_makes_a_scene_that_renders(name: str, clip: Path, tmp_path: Path) -> None:
-    report = run(clip, tmp_path, preset=name)
-    assert files(tmp_path) == SCENE_FILES
-    scene = load_scene(tmp_path)
+def test_every_preset_makes_a_scene_that_renders(name: str, whole: Whole) -> None:
+    report, out = whole(name)
+    assert files(out) == SCENE_FILES
+    scene = load_scene(out)
     assert (scene.preset, report.preset) == (name, name)
     assert report.gaussians == len(scene.gaussians)
     assert report.iterations == ITERATIONS
@@ -121,36 +154,37 @@ def test_the_report_tells_what_was_done(clip: Path, tmp_path: Path) -> None:
     ]
 
 
-def test_the_same_request_gives_the_same_scene(clip: Path, tmp_path: Path) -> None:
-    reports = [run(clip, tmp_path / name) for name in "ab"]
-    assert tensor_bits(tmp_path / "a") == tensor_bits(tmp_path / "b")
-    assert reports[0].frames == reports[1].frames
+def test_the_same_request_gives_the_same_scene(clip: Path, whole: Whole, tmp_path: Path) -> None:
+    first, out = whole("fast")
+    again = run(clip, tmp_path)
+    assert tensor_bits(tmp_path) == tensor_bits(out)
+    assert again.frames == first.frames
 
 
 @pytest.mark.parametrize("name", ["fast", "paper"])
-def test_a_stopped_run_goes_on_in_its_folder(name: str, clip: Path, tmp_path: Path) -> None:
-    whole = run(clip, tmp_path / "whole", preset=name)
+def test_a_stopped_run_goes_on_in_its_folder(name: str, clip: Path, whole: Whole, tmp_path: Path) -> None:
+    straight, out = whole(name)
     with pytest.raises(Cancelled):
         run(clip, tmp_path / "stopped", stopping_after(7), preset=name)
     assert files(tmp_path / "stopped") == {RESUME_FILE}
     resumed = run(clip, tmp_path / "stopped", preset=name)
     assert files(tmp_path / "stopped") == SCENE_FILES
-    assert tensor_bits(tmp_path / "stopped") == tensor_bits(tmp_path / "whole")
-    assert (resumed.frames, resumed.iterations) == (whole.frames, whole.iterations)
+    assert tensor_bits(tmp_path / "stopped") == tensor_bits(out)
+    assert (resumed.frames, resumed.iterations) == (straight.frames, straight.iterations)
 
 
-def test_a_run_stopped_while_it_is_scored_goes_on_from_there(clip: Path, tmp_path: Path) -> None:
-    whole = run(clip, tmp_path / "whole", preset="fast")
+def test_a_run_stopped_while_it_is_scored_goes_on_from_there(clip: Path, whole: Whole, tmp_path: Path) -> None:
+    straight, out = whole("fast")
     stages: set[str] = set()
     hooks = Hooks(lambda progress: stages.add(progress.stage), lambda: "score" in stages)
     with pytest.raises(Cancelled, match="scoring"):
         run(clip, tmp_path / "stopped", hooks, preset="fast")
     assert load_resume(tmp_path / "stopped")[1]["iteration"] == ITERATIONS
     resumed = run(clip, tmp_path / "stopped", preset="fast")
-    assert tensor_bits(tmp_path / "stopped") == tensor_bits(tmp_path / "whole")
-    assert resumed.frames == whole.frames
+    assert tensor_bits(tmp_path / "stopped") == tensor_bits(out)
+    assert resumed.frames == straight.frames
     assert len((tmp_path / "stopped" / "curve.csv").read_text().splitlines()) == len(
-        (tmp_path / "whole" / "curve.csv").read_text().splitlines()
+        (out / "curve.csv").read_text().splitlines()
     )
 
 
@@ -175,12 +209,13 @@ def test_a_budget_too_short_for_its_frames_is_told(name: str, clip: Path, tmp_pa
 @pytest.mark.parametrize(
     "change", [{"preset": "paper"}, {"seed": 1}, {"iterations": ITERATIONS + 1}, {"holdout": "2"}, {"clip": "another"}]
 )
-def test_a_stopped_run_does_not_go_on_as_something_else(change: dict[str, Any], clip: Path, tmp_path: Path) -> None:
-    with pytest.raises(Cancelled):
-        run(clip, tmp_path / "out", stopping_after(2))
+def test_a_stopped_run_does_not_go_on_as_something_else(
+    change: dict[str, Any], clip: Path, endonerf: Drawn, stopped: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(stopped, tmp_path / "out")
     stored = (tmp_path / "out" / RESUME_FILE).read_bytes()
     if "clip" in change:
-        change = {"clip": endonerf(tmp_path / "another", FRAMES, seed=1)}
+        change = {"clip": endonerf(FRAMES, seed=1)}
     with pytest.raises(InputError, match="was started with another") as refused:
         run(**{"clip": clip, "out": tmp_path / "out", **change})
     assert refused.value.field == "--out"
@@ -239,8 +274,10 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_read(tmp_path:
 
 @pytest.mark.parametrize("name", ["fast", "paper", "hexplane"])
 @pytest.mark.parametrize("frames", [1, 2, 4, 8])
-def test_a_short_clip_trains_without_a_measured_quality(frames: int, name: str, tmp_path: Path) -> None:
-    report = run(endonerf(tmp_path / "clip", frames), tmp_path / "out", preset=name, iterations=3)
+def test_a_short_clip_trains_without_a_measured_quality(
+    frames: int, name: str, endonerf: Drawn, tmp_path: Path
+) -> None:
+    report = run(endonerf(frames), tmp_path / "out", preset=name, iterations=3)
     assert (report.held_out, report.train_count) == ((), frames)
     assert report.psnr_tissue_db is None
     assert report.depth_agreement_mm is None
@@ -250,15 +287,15 @@ def test_a_short_clip_trains_without_a_measured_quality(frames: int, name: str, 
 
 
 @pytest.mark.parametrize("name", ["fast", "paper"])
-def test_odd_sizes_are_no_trouble(name: str, tmp_path: Path) -> None:
-    report = run(endonerf(tmp_path / "clip", 10, 97, 81), tmp_path / "out", preset=name)
+def test_odd_sizes_are_no_trouble(name: str, endonerf: Drawn, tmp_path: Path) -> None:
+    report = run(endonerf(10, 97, 81), tmp_path / "out", preset=name)
     assert (report.width, report.height) == (97, 81)
     assert report.train_psnr_tissue_db is not None
     assert render_frame(load_scene(tmp_path / "out"), 0.0).rgb.shape == (81, 97, 3)
 
 
-def test_a_moving_camera_is_read_from_its_poses(tmp_path: Path) -> None:
-    clip = endonerf(tmp_path / "clip", 10, moving_camera=True)
+def test_a_moving_camera_is_read_from_its_poses(endonerf: Drawn, tmp_path: Path) -> None:
+    clip = endonerf(10, moving_camera=True)
     truth = make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=10, period_frames=12, moving_camera=True))
     placed = {}
     for convention in ("opengl", "llff"):
@@ -322,20 +359,21 @@ def test_a_stopped_run_on_a_stereo_clip_goes_on_with_the_same_depth(stereo: Path
     assert tensor_bits(tmp_path / "stopped") == tensor_bits(tmp_path / "whole")
 
 
-def test_the_pipeline_and_the_loop_make_the_same_model(clip: Path, tmp_path: Path) -> None:
+def test_the_pipeline_and_the_loop_make_the_same_model(clip: Path, whole: Whole) -> None:
     opened = open_clip(clip)
     assert isinstance(opened, DepthClip)
     split = split_frames(opened)
-    run(clip, tmp_path)
     loop = trained(prepared_on(opened, split, "fast", iterations=ITERATIONS))
     shrunk = shrink(scene_of(loop, opened, split, loop.frames.scale, loop.seed), opened, loop.frames)
     assert shrunk is not None
-    assert tensor_bits(tmp_path) == {name: each.numpy().tobytes() for name, each in shrunk.scene.tensors().items()}
+    assert tensor_bits(whole("fast")[1]) == {
+        name: each.numpy().tobytes() for name, each in shrunk.scene.tensors().items()
+    }
 
 
-def test_what_is_stored_is_what_was_scored_and_the_report_tells_its_price(clip: Path, tmp_path: Path) -> None:
-    report = run(clip, tmp_path)
-    opened, scene = open_clip(clip), load_scene(tmp_path)
+def test_what_is_stored_is_what_was_scored_and_the_report_tells_its_price(clip: Path, whole: Whole) -> None:
+    report, out = whole("fast")
+    opened, scene = open_clip(clip), load_scene(out)
     assert isinstance(opened, DepthClip)
     model = model_of(scene)
     for score in report.frames:
@@ -344,7 +382,7 @@ def test_what_is_stored_is_what_was_scored_and_the_report_tells_its_price(clip: 
         image = model.render(camera, float(opened.t[score.frame]))[:3].transpose(1, 2, 0)
         expected = psnr_tissue(image, opened.rgb[score.frame], opened.tissue[score.frame])
         assert score.psnr_tissue_db == pytest.approx(expected, abs=1e-6)
-    assert report.scene_bytes == (tmp_path / "scene.safetensors").stat().st_size
+    assert report.scene_bytes == (out / "scene.safetensors").stat().st_size
     assert report.scene_bytes < 0.25 * scene.byte_count
     assert 0 <= report.measurements["stored_loss_db"] <= TOLERANCE_DB
     assert any("All scores are of the stored scene" in each for each in report.assumptions)
