@@ -224,13 +224,14 @@ class Checks:
         model.wait()
 
     def steps(self, kind: str, sh_degree: int = 0) -> Differences:
-        """How far a few steps take every parameter, beside how far they take the CPU's."""
+        """How far a few steps, the last on two frames, take every parameter, beside how far they take the CPU's."""
         size = self.sizes
         cpu = FusedModel(*self._parts(kind, sh_degree), size.model_width, size.model_height)
         cuda = self._model(kind, sh_degree)
         before = {name: each.clone() for name, each in cpu.parameters().items()}
         for model in (cpu, cuda):
             self._train(model, 4, sh_degree)
+            model.step(self._frames(2), LOSS, RATES, 5, sh_degree)
         got, wanted = cuda.parameters(), cpu.parameters()
         return {
             name: _moved(got[name].cpu() - start, wanted[name] - start)
