@@ -50,6 +50,7 @@ STAGES = (
     "export",
     "presets",
     "request",
+    "trials",
     "capacity",
     "start",
     "targets",

@@ -201,6 +201,19 @@ def _averaged(values: Floats, confidence: Floats, over_px: float) -> Floats:
     return np.asarray(mean, np.float32)
 
 
+def resting(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> Tracks:
+    """What the tracks would be if nothing had moved: no displacement, colour as it changed in place, as trusted where
+    tissue alone is seen there."""
+    step, colour, confidence = tracks.step_px, np.empty_like(tracks.colour), np.empty_like(tracks.confidence)
+    start = cell_means(clip.rgb[train[0]], step).astype(np.float32)
+    for place, index in enumerate(train):
+        tissue = cell_means(clip.tissue[index].astype(np.uint8) * np.uint8(255), step) == 255
+        confidence[place] = np.where(tissue, tracks.confidence[place], 0)
+        change = (cell_means(clip.rgb[index], step) - start) / np.float32(255)
+        colour[place] = _averaged(change, confidence[place], COLOUR_SMOOTH_PX)
+    return Tracks(np.zeros_like(tracks.displacement_mm), colour, confidence, step)
+
+
 def fit_tracks(
     tracks: Tracks, basis: NDArray[np.float64], pixels: NDArray[np.intp], width: int, *, share_px: int = 1
 ) -> tuple[Floats, Floats]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from contract.camera import Intrinsics
 from worker.backend import CPU, Device, make_model
-from worker.capacity import MOST_POINTS, choose_bases, choose_stride, errors_by_bases, floor_error
+from worker.capacity import MOST_POINTS, Tried, choose_bases, choose_stride, floor_error, try_bases
 from worker.clip import DepthClip
 from worker.deformation import Deformation, FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
 from worker.deformation.base import CHANNELS, MEAN
@@ -45,21 +45,23 @@ def settled(
     """The preset with what it leaves to the scene settled (decisions 014, 018), and why, in words for the report."""
     words = []
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
-    errors = errors_by_bases(tracks, clip, train, preset.most_bases) if tracks is not None and left_open else {}
+    tried = try_bases(tracks, clip, train, preset.most_bases) if tracks is not None and left_open else Tried({})
     fusion = fusion_for(preset, clip.intrinsics)
     if fusion.mode == "fill" and preset.points_per_image is not None:
         words.append(f"Gaussians start {fusion.stride} pixels apart: nearest to {preset.points_per_image} an image.")
     elif fusion.mode == "fill":
         finest = _stride_for(MOST_POINTS, clip.intrinsics)
-        choice = choose_stride(clip, train[0], finest, min((each.total for each in errors.values()), default=0.0))
+        choice = choose_stride(
+            clip, train[0], finest, min((each.total for each in tried.believed.values()), default=0.0)
+        )
         fusion = dataclasses.replace(fusion, stride=choice.count)
         preset = dataclasses.replace(preset, fusion=fusion)
         words.append(f"Gaussians start {choice.count} pixels apart: {choice.reason}.")
     if preset.bases is None:
         floor = floor_error(clip, train[0], fusion.stride)
-        choice = choose_bases(errors, floor, len(train), preset.most_bases)
+        choice = choose_bases(tried, floor, len(train), preset.most_bases)
         preset = dataclasses.replace(preset, bases=choice.count)
-        words.append(f"Motion has {choice.count} bases: {choice.reason}.")
+        words.append(f"Motion has {choice.count} {'basis' if choice.count == 1 else 'bases'}: {choice.reason}.")
     return preset, tuple(words)
 
 

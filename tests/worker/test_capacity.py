@@ -14,17 +14,19 @@ from worker.capacity import (
     BASES,
     COARSEST,
     FEWEST_FRAMES_TO_TRY,
+    REST,
     WORTH_DB,
-    Missed,
+    Tried,
     choose_bases,
-    errors_by_bases,
     floor_error,
+    try_bases,
 )
 from worker.clip import DepthClip, split_frames
 from worker.motion import Tracks, track
 from worker.phantom import Motion
 from worker.presets import PRESETS
 from worker.start import MIN_STRIDE, fusion_for, settled
+from worker.trials import Missed
 
 FAST = PRESETS["fast"]
 FRAMES = 40
@@ -44,9 +46,9 @@ def bases_for(motion: Motion) -> int:
     return bases
 
 
-def motion_left(errors: dict[int, float]) -> dict[int, Missed]:
+def motion_left(errors: dict[int, float]) -> Tried:
     """The same errors, all of motion."""
-    return {bases: Missed(motion=error, light=0.0) for bases, error in errors.items()}
+    return Tried({bases: Missed(motion=error, light=0.0) for bases, error in errors.items()})
 
 
 def faster(clip: DepthClip, every: int) -> DepthClip:
@@ -56,12 +58,30 @@ def faster(clip: DepthClip, every: int) -> DepthClip:
 
 
 def test_a_still_clip_gets_the_fewest_bases() -> None:
-    assert bases_for("still") == BASES[0]
+    assert bases_for("still") == REST
 
 
 @pytest.mark.parametrize("motion", ["breathing", "pull", "cut"])
 def test_a_clip_that_moves_gets_more(motion: Motion) -> None:
     assert bases_for(motion) > BASES[0]
+    clip, train, tracks = followed(motion)
+    assert not try_bases(tracks, clip, train).resting
+
+
+def test_displacements_that_the_pictures_do_not_confirm_ask_for_no_bases() -> None:
+    clip, train, tracks = followed("still")
+    drift_mm = np.random.default_rng(0).normal(0, 0.1, (len(train), 1, 1, 3)).cumsum(0).astype(np.float32)
+    drifting = dataclasses.replace(tracks, displacement_mm=tracks.displacement_mm + drift_mm)
+    tried = try_bases(drifting, clip, train)
+    assert settled(FAST, drifting, clip, train)[0].bases == REST
+    assert choose_bases(dataclasses.replace(tried, resting={}), 0.1, len(train)).count > REST
+
+
+def test_light_that_changes_on_tissue_at_rest_gets_bases() -> None:
+    clip, train, _ = followed("still")
+    brightness = 1 + 0.3 * np.sin(np.linspace(0, 2 * np.pi, FRAMES))[:, None, None, None]
+    fading = dataclasses.replace(clip, rgb=np.clip(clip.rgb * brightness, 0, 255).astype(np.uint8))
+    assert (settled(FAST, track(fading, train), fading, train)[0].bases or 0) > REST
 
 
 def test_faster_motion_never_gets_fewer_bases_for_as_many_frames() -> None:
@@ -79,7 +99,7 @@ def test_held_out_frames_are_never_read() -> None:
     held_out = sorted(set(range(clip.frame_count)) - set(train))
     poisoned = dataclasses.replace(clip, rgb=clip.rgb.copy(), tissue=clip.tissue.copy(), depth_mm=clip.depth_mm.copy())
     poisoned.rgb[held_out], poisoned.tissue[held_out], poisoned.depth_mm[held_out] = 255, False, np.nan
-    assert errors_by_bases(track(poisoned, train), poisoned, train) == errors_by_bases(tracks, clip, train)
+    assert try_bases(track(poisoned, train), poisoned, train) == try_bases(tracks, clip, train)
     assert settled(FAST, tracks, poisoned, train) == settled(FAST, tracks, clip, train)
 
 
@@ -109,11 +129,11 @@ def test_light_that_no_number_follows_gets_no_more_bases() -> None:
     clip, train, _ = followed("still")
     brightness = 1 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (FRAMES, 1, 1, 1))
     flickering = dataclasses.replace(clip, rgb=np.clip(clip.rgb * brightness, 0, 255).astype(np.uint8))
-    errors = errors_by_bases(track(flickering, train), flickering, train)
+    tried = try_bases(track(flickering, train), flickering, train)
     floor = floor_error(flickering, train[0], MIN_STRIDE)
-    assert min(each.light for each in errors.values()) > max(floor, errors[BASES[0]].light / 2)
-    choice = choose_bases(errors, floor, len(train))
-    assert choice.count == BASES[0]
+    assert min(each.light for each in tried.tracked.values()) > max(floor, tried.tracked[REST].light / 2)
+    choice = choose_bases(tried, floor, len(train))
+    assert choice.count <= BASES[0]
     assert "follows the motion" not in choice.reason
 
 
@@ -144,8 +164,8 @@ def test_the_most_is_called_by_what_limits_it(frames: int, most: int | None, tri
 def test_there_are_more_than_two_training_frames_for_each_basis(frames: int) -> None:
     clip = phantom_clip("pull", frames=frames)
     train = list(range(frames))
-    tried = errors_by_bases(track(clip, train), clip, train)
-    assert frames / max(tried) > 2
+    tried = try_bases(track(clip, train), clip, train)
+    assert frames / max(tried.tracked) > 2
 
 
 def test_gaussians_farther_apart_leave_more_of_the_picture() -> None:
@@ -184,7 +204,7 @@ def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: 
 
 @pytest.mark.parametrize(("frames", "bases"), [(1, 1), (2, 2), (12, 4), (1000, 33)])
 def test_where_nothing_could_be_followed_bases_come_by_the_frames_up_to_the_most(frames: int, bases: int) -> None:
-    assert choose_bases({}, 10.0, frames).count == bases
+    assert choose_bases(Tried({}), 10.0, frames).count == bases
 
 
 @pytest.mark.parametrize("most", [2, 5, 12, 1000])
@@ -195,12 +215,12 @@ def test_a_preset_may_allow_fewer_bases_than_the_scene_would_get(most: int) -> N
     assert limited.bases <= most
     assert limited.bases == bases_for("breathing") or most < bases_for("breathing")
     assert words[-1].startswith(f"Motion has {limited.bases} bases: ")
-    assert max(errors_by_bases(tracks, clip, train, most)) <= most
+    assert max(try_bases(tracks, clip, train, most).tracked) <= most
 
 
 @pytest.mark.parametrize("most", [1, 2, 17])
 def test_where_nothing_could_be_followed_a_preset_gets_no_more_bases_than_it_allows(most: int) -> None:
-    assert choose_bases({}, 10.0, 1000, most).count == most
+    assert choose_bases(Tried({}), 10.0, 1000, most).count == most
 
 
 @pytest.mark.parametrize("bases", [3, 9, 33])
@@ -214,5 +234,5 @@ def test_the_report_is_told_what_was_chosen() -> None:
     clip = phantom_clip()
     run = prepared_on(clip, split_frames(clip))
     bases = run.model.export()[1].bases
-    assert any(each.startswith(f"Motion has {bases} bases: ") for each in run.chosen)
+    assert any(each.startswith(f"Motion has {bases} bas") for each in run.chosen)
     assert prepared_on(clip, split_frames(clip)).chosen == run.chosen
