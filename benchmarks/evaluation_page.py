@@ -298,18 +298,21 @@ def _published() -> str:
 
 def _capacity(found: Sequence[Capacity]) -> str:
     header = ["clip", "held out", "preset", "limit", "chosen, dB", "best of the grid", "its dB", "difference",
-              "deviation", "seeds", "chosen, MB", "best, MB"]  # fmt: skip
+              "deviation", "seeds", "chosen, MB", "best, MB", "difference from the best at no more bytes"]  # fmt: skip
     rows = [
         [*each.chosen.place, each.chosen.series, each.chosen.limit, _number(each.chosen.median("psnr_tissue_db"), 2),
          each.best.series.partition(":")[2], _number(each.best.median("psnr_tissue_db"), 2),
          f"{each.difference_db:+.2f}", _number(each.deviation_db, 2), str(each.seeds),
-         _number(each.chosen.median("scene_bytes") / 1e6, 2), _number(each.best.median("scene_bytes") / 1e6, 2)]
+         _number(each.chosen.median("scene_bytes") / 1e6, 2), _number(each.best.median("scene_bytes") / 1e6, 2),
+         "none so small" if math.isnan(each.at_bytes_db) else f"{each.at_bytes_db:+.2f}"]
         for each in found
     ]  # fmt: skip
     within = [each for each in found if each.difference_db >= -0.1]
     smaller = sum(each.chosen.median("scene_bytes") <= each.best.median("scene_bytes") for each in within)
     said = (
-        f"\nWithin 0.1 dB of the best or above it: {len(within)} of {len(found)}, of them {smaller} at no more bytes."
+        f"\nWithin 0.1 dB of the best or above it: {len(within)} of {len(found)}, of them {smaller} at no more bytes. "
+        f"Within 0.1 dB of the best that takes no more bytes than the choice, or above it: "
+        f"{sum(each.at_bytes_db >= -0.1 for each in found)} of {len(found)}."
     )
     return f"{said}\n{table(header, rows)}"
 

@@ -172,6 +172,7 @@ class Capacity:
     difference_db is the mean over seeds of chosen - best, each seed with itself; deviation_db the standard deviation of
     these differences, estimated from the seeds there are; NaN of one.
     The best is the grid's highest mean of the same held-out frames, so that it is flattered and the choice is not.
+    at_bytes_db is the difference from the best of those of the grid that take no more bytes; NaN if all take more.
     """
 
     chosen: Group
@@ -179,17 +180,17 @@ class Capacity:
     seeds: int
     difference_db: float
     deviation_db: float
+    at_bytes_db: float
 
 
 def capacities(groups: Sequence[Group]) -> list[Capacity]:
     """For each place, preset and limit with variants, how the preset's own choice compares."""
     found = []
     for chosen in groups:
-        of_chosen = chosen.by_seed("psnr_tissue_db")
-        if chosen.series != base_of(chosen.series) or not of_chosen:
+        if chosen.series != base_of(chosen.series) or not chosen.by_seed("psnr_tissue_db"):
             continue
         grid = [
-            (fmean(group.by_seed("psnr_tissue_db").values()), -group.median("scene_bytes"), group)
+            group
             for group in groups
             if (*group.place, group.limit) == (*chosen.place, chosen.limit)
             and group.series != chosen.series
@@ -198,13 +199,20 @@ def capacities(groups: Sequence[Group]) -> list[Capacity]:
         ]
         if not grid:
             continue
-        best = max(grid, key=lambda each: each[:2])[2]  # of equals the smallest
-        of_best = best.by_seed("psnr_tissue_db")
-        pairs = [of_chosen[seed] - of_best[seed] for seed in of_chosen if seed in of_best]
+        best, pairs = _best_beside(chosen, grid)
+        as_small = [each for each in grid if each.median("scene_bytes") <= chosen.median("scene_bytes")]
         if pairs:
             deviation_db = stdev(pairs) if len(pairs) > 1 else math.nan
-            found.append(Capacity(chosen, best, len(pairs), fmean(pairs), deviation_db))
+            at_bytes_db = fmean(_best_beside(chosen, as_small)[1] or [math.nan]) if as_small else math.nan
+            found.append(Capacity(chosen, best, len(pairs), fmean(pairs), deviation_db, at_bytes_db))
     return found
+
+
+def _best_beside(chosen: Group, grid: Sequence[Group]) -> tuple[Group, list[float]]:
+    """Of the grid the one with the highest mean, of equals the smallest; and chosen - best, dB, seed by seed."""
+    best = max(grid, key=lambda each: (fmean(each.by_seed("psnr_tissue_db").values()), -each.median("scene_bytes")))
+    of_chosen, of_best = chosen.by_seed("psnr_tissue_db"), best.by_seed("psnr_tissue_db")
+    return best, [of_chosen[seed] - of_best[seed] for seed in of_chosen if seed in of_best]
 
 
 @dataclass(frozen=True)

@@ -76,6 +76,17 @@ def test_the_automatic_choice_is_compared_seed_by_seed_with_the_best_of_the_grid
     assert found.deviation_db == pytest.approx(0.1 * math.sqrt(2))
 
 
+def test_it_is_also_compared_with_the_best_that_takes_no_more_bytes() -> None:
+    sizes = {"fast": 2e6, "fast:bases=3": 1e6, "fast:bases=9": 2e6, "fast:bases=17": 3e6}
+    scores = {"fast": 30.0, "fast:bases=3": 29.0, "fast:bases=9": 29.8, "fast:bases=17": 31.0}
+    rows = [run_row(series, scores[series], scene_bytes=str(size)) for series, size in sizes.items()]
+    (found,) = capacities(groups_of(rows))
+    assert (found.best.series, found.difference_db) == ("fast:bases=17", pytest.approx(-1.0))
+    assert found.at_bytes_db == pytest.approx(0.2)
+    (found,) = capacities(groups_of([rows[0], rows[-1]]))
+    assert math.isnan(found.at_bytes_db)
+
+
 @pytest.mark.parametrize(
     ("scores", "verdict"),
     [
