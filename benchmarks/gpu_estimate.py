@@ -5,7 +5,8 @@
 The frame's work is counted on the CPU (gpu_counts.py): of the standard grid of bm_raster.py, 640x512 with 40,096
 Gaussians, and with --scene of a trained scene. The kernels of the step are compiled for sm_90 and their machine code is
 read (gpu_compile.py). Both together give bytes, instructions and launches of every kernel, and the least time that the
-card's data sheet allows them (gpu_work.py). Tiles of other shapes are compiled and counted too; --quick omits them.
+card's data sheet allows them (gpu_work.py). Pictures are estimated likewise, one and sixteen at once. Tiles of other
+shapes are compiled and counted too; --quick omits them, and whatever draws several frames.
 
 A floor is not a forecast: kernels wait for memory, and the last programs of each run alone. As a forecast the sum of
 the floors is given twice over, with 2.5 us for each launch; nearest to the floor would be once, with 1.5 us.
@@ -14,20 +15,22 @@ the floors is given twice over, with 2.5 us for each launch; nearest to the floo
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import triton
 from bm_raster import BASES, GRID_STEP_PX, HEIGHT, RATES, TIME, WIDTH, grid_scene
 from gpu_compile import Compiled, compiled, shaped
 from gpu_counts import Counts, count
-from gpu_work import H200, PARTS, Floor, Sizes, bytes_by_kernel, floor_of, torch_launches
+from gpu_work import H200, PARTS, Floor, Sizes, bytes_by_kernel, floor_of, picture_bytes_by_kernel, torch_launches
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from worker.checkpoint import load_scene
 from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
-from worker.evaluate.rows import commit, write_rows
+from worker.evaluate.rows import commit, machine, write_rows
 from worker.gaussians import Gaussians
 from worker.loss import LossSettings
 from worker.raster.cpu import padded
@@ -36,6 +39,7 @@ from worker.raster.cpu.motion import NEGLIGIBLE
 from worker.raster.cuda.bins import TILE_HEIGHT, TILE_WIDTH
 from worker.raster.cuda.blend import CHUNK, WARPS
 from worker.raster.cuda.model import CudaModel
+from worker.raster.cuda.rasterizer import CudaRasterizer
 from worker.raster.step import Target, TrainingFrame, camera_vector
 from worker.targets import camera_in_units
 
@@ -70,8 +74,10 @@ def main() -> None:
     shared = SharedBasis.initial(number, bases=BASES, colour=True)
     usual = (TILE_WIDTH, TILE_HEIGHT, CHUNK, WARPS)
     rows = estimate("grid, shared", grid, shared, view, 1, usual)
+    rows += estimate("grid, shared, a picture", grid, shared, view, 1, usual, part="picture")
     if not arguments.quick:
         rows += estimate("grid, shared, 4 frames a step", grid, shared, view, 4, usual)
+        rows += estimate("grid, shared, 16 pictures at once", grid, shared, view, 16, usual, part="picture")
     fdm = FlexibleDeformation.initial(number, bases=BASES)
     rows += estimate("grid, fdm", grid, fdm, view, 1, usual)
     if arguments.scene:
@@ -98,28 +104,38 @@ def estimate(
     frames: int,
     shape: tuple[int, int, int, int],
     *,
+    part: str = "step",
     parts: bool = True,
 ) -> list[Row]:
-    """Rows of the step's kernels, then one of the whole step; printed, with the kernels if parts are wanted."""
+    """Rows of the kernels of a "step" or a "picture", then one of the whole; printed, with the kernels if wanted."""
     width, height = int(camera[4]), int(camera[5])
     counts = count(FusedModel(gaussians, deformation, width, height), camera, TIME, shape[:2], shape[2])
     operations = _Operations()
     with shaped(*shape):
         model = CudaModel(gaussians, deformation, width, height, "cpu")  # type: ignore[arg-type]
-        seen = [_frame(camera, TIME + k / 100) for k in range(frames)]
-        compiled(lambda: model.step(seen, LossSettings(), RATES, 1))  # the first step alone copies its frames
+        work = _work(model, camera, [TIME + k / 100 for k in range(frames)], part)
+        compiled(work)  # the first step alone copies its frames
         with operations:
-            kernels = compiled(lambda: model.step(seen, LossSettings(), RATES, 2))
-    sizes = _sizes(model, deformation, width * height)
+            kernels = compiled(work)
+    sizes = _sizes((model._shown or model._training).rasterizer, deformation, width * height)
     launches = torch_launches(operations.seen)
     floors = {}
-    for kernel, moved in bytes_by_kernel(sizes, counts).items():
+    for kernel, moved in (picture_bytes_by_kernel if part == "picture" else bytes_by_kernel)(sizes, counts).items():
         code = next((each for each in kernels if each.name == kernel), None)
         floors[kernel] = floor_of(code, moved, launches.get(kernel, 1), counts, frames, H200)
     rows = [_row(name, counts, sizes, kernel, floor, kernels) for kernel, floor in floors.items()]
-    whole = _whole(name, counts, sizes, list(floors.values()), next(each for each in kernels if each.name == "blend"))
+    blend = next(each for each in kernels if each.name == "blend")
+    whole = {**_whole(name, counts, sizes, list(floors.values()), blend), "part": part}
     _print(whole, rows if parts else [])
     return [*rows, whole]
+
+
+def _work(model: CudaModel, camera: np.ndarray, times: list[float], part: str) -> Callable[[], object]:
+    """A step, or a picture, of so many frames."""
+    if part == "picture":
+        return lambda: model.render_times(camera, times)
+    seen = [_frame(camera, t) for t in times]
+    return lambda: model.step(seen, LossSettings(), RATES, 1)
 
 
 def _frame(camera: np.ndarray, t: float) -> TrainingFrame:
@@ -129,8 +145,7 @@ def _frame(camera: np.ndarray, t: float) -> TrainingFrame:
     return TrainingFrame(camera, t, target, pixels, pixels)
 
 
-def _sizes(model: CudaModel, deformation: Deformation, pixels: int) -> Sizes:
-    rasterizer = model._training.rasterizer
+def _sizes(rasterizer: CudaRasterizer, deformation: Deformation, pixels: int) -> Sizes:
     weight = deformation.parameters()["weight"]
     is_fdm = isinstance(deformation, FlexibleDeformation)
     alive = 0 if is_fdm else int((deformation.basis(TIME).abs() >= NEGLIGIBLE).sum())  # type: ignore[attr-defined]
@@ -161,17 +176,17 @@ def _common(name: str, counts: Counts, sizes: Sizes) -> Row:
         "scene": name, "tile": f"{counts.tile_width}x{counts.tile_height}", "chunk": counts.chunk,
         "gaussians": sizes.gaussians, "frames": sizes.frames, "bases_alive": sizes.alive,
         "instances": counts.instances, "evaluated": counts.evaluated, "blended": counts.blended,
-        "commit": commit(),
+        "triton": triton.__version__, "machine": machine(), "commit": commit(),
     }  # fmt: skip
 
 
 def _whole(name: str, counts: Counts, sizes: Sizes, floors: list[Floor], blend: Compiled) -> Row:
-    """The step's row, with what distinguishes shapes of tiles beside it."""
+    """The row of all kernels, with what distinguishes shapes of tiles beside it."""
     launches, floor_us = sum(each.launches for each in floors), sum(each.us for each in floors)
     soonest, latest = H200.launch_us
     moved = sum(each.bytes for each in floors)
     return _common(name, counts, sizes) | {
-        "part": "step", "kernel": "all", "launches": launches, "megabytes": round(moved / 1e6, 1),
+        "kernel": "all", "launches": launches, "megabytes": round(moved / 1e6, 1),
         "floor_us": round(floor_us, 1), "least_us": round(floor_us + soonest * launches, 1),
         "forecast_us": round(FORECAST * floor_us + latest * launches, 1), "warps": blend.warps,
         "registers": blend.registers, "spilled_bytes": blend.spilled_bytes, "evidence": "estimate",
@@ -181,7 +196,8 @@ def _whole(name: str, counts: Counts, sizes: Sizes, floors: list[Floor], blend: 
 
 def _print(whole: Row, rows: list[Row]) -> None:
     print(
-        f"{whole['scene']}, tiles {whole['tile']}, chunks of {whole['chunk']}, {whole['warps']} warps: "
+        f"{whole['scene']}, Triton {whole['triton']}, tiles {whole['tile']}, chunks of {whole['chunk']}, "
+        f"{whole['warps']} warp{'s' * (whole['warps'] != 1)}: "
         f"{whole['gaussians']} Gaussians, {whole['instances']} instances, {whole['evaluated'] / 1e6:.1f} M pairs "
         f"evaluated, {whole['blended'] / 1e6:.1f} M blended, {whole['megabytes']:.0f} MB, {whole['launches']} launches"
     )

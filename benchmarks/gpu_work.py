@@ -1,4 +1,4 @@
-"""What each kernel of a training step must move and compute, and the least time that takes on a given card.
+"""What each kernel of a training step or a picture must move and compute, and the least time that takes on a card.
 
 Symbols: N Gaussians (padded), F frames a step, B bases, A of them in use, C channels that move, M slots there is room
 for. Bytes count every array once for each time it is read or written; what stays in the cache is counted alike, so the
@@ -25,6 +25,7 @@ PARTS = {
     "project_backward": "project backward", "update_linear": "update", "update_fdm": "update", "control": "control",
 }  # fmt: skip
 """Part of the step by kernel; what torch launches has names with a blank."""
+IN_PICTURES = ("deform", "project", "sort", "bin", "blend", "control")
 RADIX_BITS = 8
 """Of a key that one pass of torch.sort (CUB's onesweep) puts in order."""
 SORT_LAUNCHES = 4
@@ -98,6 +99,14 @@ def bytes_by_kernel(sizes: Sizes, counts: Counts) -> dict[str, float]:
         update: n * FLOAT * (f * (10 + 1 + 3 + 3 + 1) + 2 * VALUES + 4 * VALUES + 6 * sizes.motion),
         "control": 1000.0,
     }
+
+
+def picture_bytes_by_kernel(sizes: Sizes, counts: Counts) -> dict[str, float]:
+    """Likewise of pictures: no step's way back, and five planes a pixel written."""
+    of_step = bytes_by_kernel(sizes, counts)
+    kept = {kernel: moved for kernel, moved in of_step.items() if PARTS[kernel] in IN_PICTURES}
+    read = counts.visited * (FLOAT + FLOAT * RECORD) + 2 * FLOAT * counts.tiles
+    return kept | {"blend": sizes.frames * (read + 5 * FLOAT * sizes.pixels)}
 
 
 @dataclass(frozen=True)
