@@ -17,6 +17,7 @@ import numpy as np
 from gpu_rows import CLIP, CLIP_READY, KERNELS_READY, Part
 
 from contract.camera import Intrinsics
+from contract.errors import InputError
 from worker.clip import DepthClip, open_clip
 from worker.phantom import PhantomSettings, make_phantom
 from worker.raster.cpu import compile_kernels
@@ -28,23 +29,31 @@ SMALL_PHANTOM = PhantomSettings(width=64, height=48, frames=9, motion="breathing
 
 def main() -> None:
     part = Part.begin("prepare", ())
-    failed = [_said(part.work / KERNELS_READY, lambda: {"seconds": compile_kernels()})]
-    failed.append(_said(part.work / CLIP_READY, lambda: _clip(part)))
-    sys.exit(1 if any(failed) else 0)
+    works: list[tuple[str, Callable[[], dict[str, object]]]] = [
+        (KERNELS_READY, lambda: {"seconds": compile_kernels()}),
+        (CLIP_READY, lambda: _clip(part)),
+    ]
+    if part.clip:
+        works.reverse()  # what is wrong with a recording is said at once
+    succeeded = [_said(part.work / name, work) for name, work in works]
+    sys.exit(0 if all(succeeded) else 1)
 
 
 def _said(path: Path, work: Callable[[], dict[str, object]]) -> bool:
-    """Write what work says, or what it failed with; whether it did."""
+    """Write what work says, or what it failed with; whether it succeeded."""
     told: dict[str, object]
     try:
         told = work()
+    except InputError as error:
+        told = {"error": str(error)}
+        print(f"gpu-check: {error}", file=sys.stderr, flush=True)
     except Exception as error:
         traceback.print_exc()
         told = {"error": f"{type(error).__name__}: {error}"}
     aside = path.with_suffix(".part")
     aside.write_text(json.dumps(told))
     aside.replace(path)
-    return "error" in told
+    return "error" not in told
 
 
 def _clip(part: Part) -> dict[str, object]:
@@ -52,7 +61,7 @@ def _clip(part: Part) -> dict[str, object]:
     if part.clip:
         clip = open_clip(Path(part.clip))
         if not isinstance(clip, DepthClip):
-            raise ValueError(f"{part.clip} has no depth: a folder in the EndoNeRF layout is needed")
+            raise InputError("clip", f"{part.clip} has no depth.", "Name a folder in the EndoNeRF layout.")
         name = Path(part.clip).name
     else:
         settings = SMALL_PHANTOM if part.interpret else PHANTOM
