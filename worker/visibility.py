@@ -25,22 +25,62 @@ BEHIND = 0.03
 
 WIDEST_UNSEEN = 3.0
 """Units, a twentieth of the median depth: a Gaussian that nothing saw may be no wider at any time of the clip."""
+MISSED_IN_FRAMES, MISSED_DB = 8, 0.02
+"""Training frames, evenly spread, of which none may lose more of its psnr_tissue with a Gaussian that is taken out."""
+HIDDEN_LOGIT = -30.0
+"""Opacity at which nothing is drawn."""
 
 
 def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
-    """Take Gaussians out of model that lay on tissue in no training frame and that grew wide; returns how many.
+    """Take Gaussians out of model that lay on tissue in no training frame, grew wide, and are not missed there; returns
+    how many.
 
     Where an instrument never leaves, nothing holds a Gaussian in place but its tail on the tissue beside it. A few are
-    pulled wide at the times nobody sees them, and from another pose they hang over the tissue like a veil.
+    pulled wide at the times nobody sees them, and from another pose they hang over the tissue like a veil. Of few and
+    large Gaussians, though, one may show much tissue from a place where there is none.
     """
     unseen = np.flatnonzero(~_ever_on_tissue(model, clip, frames))
     widest = _widest(model, unseen, [float(frames.t[index]) for index in spread(frames.indices, SAMPLED_FRAMES)])
-    kept = np.ones(model.count, np.bool_)
-    kept[unseen] = widest <= WIDEST_UNSEEN
-    if kept.all() or not kept.any():
+    strays = _not_missed(model, clip, frames, unseen[widest > WIDEST_UNSEEN])
+    if not 0 < len(strays) < model.count:
         return 0
-    model.take(np.flatnonzero(kept).astype(np.int64), np.zeros(int(kept.sum()), np.bool_))
-    return int((~kept).sum())
+    kept = np.setdiff1d(np.arange(model.count), strays)
+    model.take(kept.astype(np.int64), np.zeros(len(kept), np.bool_))
+    return len(strays)
+
+
+def _not_missed(model: Model, clip: DepthClip, frames: TrainingFrames, wide: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Those of wide [M] without which every frame looked at stays as good: all, or those found one after the other."""
+    opacity_logit = model.parameters()["opacity_logit"]
+    trained = opacity_logit.clone()
+    most = _squared_errors(model, clip, frames) * 10 ** (MISSED_DB / 10) if len(wide) else np.zeros(0)
+
+    def without(these: NDArray[np.intp]) -> bool:
+        rows = torch.from_numpy(these).to(trained.device)
+        opacity_logit[rows] = HIDDEN_LOGIT
+        if bool((_squared_errors(model, clip, frames) <= most).all()):
+            return True
+        opacity_logit[rows] = trained[rows]
+        return False
+
+    with torch.no_grad():
+        found = (
+            wide
+            if not len(wide) or without(wide)
+            else np.array([each for each in wide if without(each[None])], np.intp)
+        )
+        opacity_logit.copy_(trained)
+    return found
+
+
+def _squared_errors(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.float64]:
+    """Mean squared error of the tissue, colours in [0, 1], in each of a few training frames."""
+    errors = []
+    for index in spread(frames.indices, MISSED_IN_FRAMES):
+        rgb = model.render(frames.cameras[index], float(frames.t[index]))[:3].transpose(1, 2, 0)
+        off = (rgb - clip.rgb[index] / np.float32(255))[clip.tissue[index]]
+        errors.append(float(np.square(off).mean()) if off.size else 0.0)
+    return np.array(errors)
 
 
 def _ever_on_tissue(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.bool_]:

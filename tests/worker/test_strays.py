@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -47,3 +49,21 @@ def test_what_was_seen_may_be_wide_and_what_is_narrow_may_be_unseen(clip: DepthC
     run.model.canonical[LOG_SCALE, int(seen.argmax())] = np.log(2 * WIDEST_UNSEEN)
     assert drop_strays(run.model, clip, run.frames) == 0
     assert run.model.count == count
+
+
+def test_a_wide_gaussian_that_alone_shows_the_tissue_around_it_stays(clip: DepthClip) -> None:
+    run = prepared(clip, "fast", holdout="none")[0]
+    camera = run.frames.cameras[run.frames.indices[0]]
+    x, y, z = run.model.deformed_mean(0.0)
+    off_centre_px = np.hypot(camera[0] * x / z, camera[1] * y / z)
+    middle = int(off_centre_px.argmin())
+    elsewhere = np.flatnonzero(off_centre_px > 20)
+    run.model.take(np.array([middle, *elsewhere], np.int64), np.zeros(1 + len(elsewhere), np.bool_))
+    run.model.canonical[LOG_SCALE, 0] = np.log(2 * WIDEST_UNSEEN)
+    height, width = clip.tissue.shape[1:]
+    rows, columns = np.mgrid[:height, :width]
+    hidden = np.hypot(columns + 0.5 - camera[2], rows + 0.5 - camera[3]) < 5
+    under_a_tool = dataclasses.replace(clip, tissue=clip.tissue & ~hidden)
+    opacity_logit = run.model.opacity_logit.copy()
+    assert drop_strays(run.model, under_a_tool, run.frames) == 0
+    np.testing.assert_array_equal(run.model.opacity_logit, opacity_logit)
