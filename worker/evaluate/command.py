@@ -15,6 +15,7 @@ from contract.job import JobProgress
 from contract.names import DeviceName, Layout, MaskPolarity, PoseConvention
 from contract.processes import heeding_signals
 from contract.progress_bar import ProgressBar
+from worker.backend import choose_device
 from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
 from worker.evaluate.measure import Bench
@@ -64,7 +65,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         default="auto",
         help="rows of another device belong into a folder of their own (default: auto)",
     )
-    parser.add_argument("--again", action="store_true", help="measure anew what failed")
+    parser.add_argument("--again", action="store_true", help="measure anew what failed, which has its rows otherwise")
     parser.add_argument("--redraw", action="store_true", help="measure nothing; sum up and draw the rows in DIR")
     for name in ("calibration", "masks"):
         parser.add_argument(f"--{name}", type=Path, metavar="F", help="of the clips that are paths")
@@ -74,29 +75,37 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_cli(options: argparse.Namespace) -> int:
-    """Measures what is asked for and has no row; returns the exit code.
+    """Measures what is asked for and has no row; returns the exit code: FAILED if every cell asked for has failed.
 
     Raises:
         InputError: a clip, a series or an option is not known, or another process adds rows to the folder.
+        UnavailableError: the device is not there, which is seen before anything is measured, or something else that
+            this machine lacks; what was measured until then is kept.
         Cancelled: a signal came; what was measured until then is kept.
     """
     out: Path = options.out
     if options.redraw == bool(options.clips):
         remedy = "Name one or more clips, or say --redraw alone."
         raise InputError("CLIP", "either clips are measured or rows redrawn.", remedy)
+    cells: list[Cell] = []
     if options.clips:
         bench, cells = _asked(options)
+        choose_device(options.device)
         with adding_alone(out):
             measure_missing(bench, cells, Results(out), again=options.again)
     results = Results(out)
     if not results.runs:
         raise InputError("--out", f"{out} holds no rows.", "Name clips to measure.")
     conclude(results, out)
-    return ExitCode.OK
+    failed = results.failed(cell.key for cell in cells)
+    if failed:
+        print(f"{len(failed)} of {len(cells)} cells failed, the first because of {failed[0]['error']}")
+        print("The same command with --again measures them anew.")
+    return ExitCode.FAILED if failed and len(failed) == len(cells) else ExitCode.OK
 
 
 def measure_missing(bench: Bench, cells: Sequence[Cell], results: Results, *, again: bool = False) -> None:
-    """Measure the cells that have no row, or whose row says that they failed if `again`. Raises Cancelled."""
+    """Measure the cells that have no row, or whose row says that they failed if `again`. Raises as measure_all."""
     if again:
         results.forget_failed()
     waiting = [cell for cell in cells if not results.has(cell.key)]
@@ -105,7 +114,7 @@ def measure_missing(bench: Bench, cells: Sequence[Cell], results: Results, *, ag
 
 
 def measure_all(bench: Bench, cells: Sequence[Cell], results: Results) -> None:
-    """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM."""
+    """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM, and as Bench.measure."""
     with heeding_signals() as end:
         for place, cell in enumerate(cells):
             with ProgressBar(sys.stderr) as bar:

@@ -20,14 +20,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.errors import Cancelled
 from contract.names import CURVE, REPORT, DeviceName
 from contract.report import Report
 from worker.backend import Device, choose_device
 from worker.checkpoint import Scene, load_scene
 from worker.clip import DepthClip
 from worker.evaluate.cells import Cell, preset_of
-from worker.evaluate.rows import KEY, commit, machine
+from worker.evaluate.rows import KEY, NO_RESULT, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
 from worker.evaluate.truth import ShownScene, Truth
 from worker.hooks import Hooks
@@ -65,6 +64,7 @@ class Bench:
 
         Raises:
             Cancelled: hooks.should_stop said so.
+            UnavailableError: this machine lacks something, such as the device or room on the disk.
         """
         source = self.sources[cell.clip]
         row: Values = {
@@ -75,9 +75,9 @@ class Bench:
         row |= {"machine": machine(), "commit": self._commit}
         try:
             values, curve = self._measured(cell, source, hooks)
-        except Cancelled:
+        except NO_RESULT:
             raise
-        except Exception as error:  # whatever a method breaks on is a result of its own
+        except Exception as error:
             problem = " ".join(str(error).split())
             return {**row, "error": f"{type(error).__name__}: {problem}"[:LONGEST_ERROR]}, []
         return {**row, **values}, curve

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from contract.errors import InputError
+from contract.errors import Cancelled, InputError, UnavailableError
 from contract.locks import FolderLock
 
 Row = dict[str, str]
@@ -39,6 +39,9 @@ RUN_FIELDS = (*KEY, *SCORES, *COPIES, *TRUTH, *SIZE, *SPEED, *ORIGIN)
 SIZE in _size and _stored_loss_held_out_db, SPEED in seconds_of and _speed. seconds is JSON, load_1min before the run.
 """
 CURVE_FIELDS = (*KEY, "t_train_s", "iteration", "psnr_tissue_db", "ssim", "depth_agreement_mm")
+NO_RESULT = (Cancelled, UnavailableError, ModuleNotFoundError)
+"""Errors of the caller or of this machine: the method had no part in them, so no row holds them, and where they come
+measuring ends. Any other error is what a method breaks on: a result of its own, with a row."""
 
 
 def key_of(row: Mapping[str, str]) -> tuple[str, ...]:
@@ -58,6 +61,11 @@ class Results:
     def has(self, key: tuple[str, ...]) -> bool:
         """Whether the run has a row, of success or of failure."""
         return any(key_of(row) == key for row in self.runs)
+
+    def failed(self, keys: Iterable[tuple[str, ...]]) -> list[Row]:
+        """The rows of these runs that say why there is no result."""
+        asked = set(keys)
+        return [row for row in self.runs if row["error"] and key_of(row) in asked]
 
     def forget_failed(self) -> None:
         """Let what failed be measured again; the files keep those rows until something is added."""

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.errors import Cancelled, InputError
+from contract.errors import InputError
 from contract.report import Report
 from worker.checkpoint import Scene, load_scene
 from worker.evaluate.cells import preset_of
@@ -39,7 +39,7 @@ from worker.evaluate.conditions import (
     clean_given,
     write_recording,
 )
-from worker.evaluate.rows import Row, commit, machine, read_rows, write_rows
+from worker.evaluate.rows import NO_RESULT, Row, commit, machine, read_rows, write_rows
 from worker.hooks import Hooks
 from worker.metrics import psnr_tissue
 from worker.phantom import PhantomSettings
@@ -140,6 +140,7 @@ class Atlas:
 
         Raises:
             Cancelled: hooks.should_stop said so.
+            UnavailableError: this machine lacks something, such as room on the disk.
         """
         if cell.seed not in self._clean:
             self._clean.clear()  # one at a time: cells come seed by seed
@@ -156,7 +157,11 @@ class Atlas:
 
 
 def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: Hooks) -> Row:
-    """The row of a cell, without its verdict and origin; a failure's row says why in `error`."""
+    """The row of a cell, without its verdict and origin; a failure's row says why in `error`.
+
+    Raises:
+        Cancelled, UnavailableError: as Atlas.measure.
+    """
     condition = CONDITIONS.get(cell.condition)
     row = dict(zip(KEY, cell.key(grid), strict=True)) | {name: "" for name in FIELDS if name not in KEY}
     row["level"] = "" if condition is None else f"{condition.level(cell.severity):g}"
@@ -169,9 +174,9 @@ def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: Hooks) ->
         )
         start = time.perf_counter()  # drawing the clip is not the method's work
         row |= _reconstructed(given, cell, grid, hooks)
-    except Cancelled:
+    except NO_RESULT:
         raise
-    except Exception as error:  # whatever a method breaks on is a result of its own
+    except Exception as error:
         row["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
     return row | {"seconds": f"{time.perf_counter() - start:.2f}"}
 

@@ -54,6 +54,7 @@ def run_cli(options: argparse.Namespace) -> int:
     Raises:
         InputError: a condition or series is not known, another process adds rows to the folder, or there is nothing
             to draw.
+        UnavailableError: this machine lacks something; what was measured until then is kept.
         Cancelled: a signal came; what was measured until then is kept.
     """
     out: Path = options.out
@@ -73,7 +74,7 @@ def run_cli(options: argparse.Namespace) -> int:
 
 
 def measure_all(atlas: Atlas, cells: Sequence[StabilityCell]) -> None:
-    """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM."""
+    """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM, and as Atlas.measure."""
     with heeding_signals() as end:
         for place, cell in enumerate(cells):
             with ProgressBar(sys.stderr) as bar:

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+import torch
 
-from contract.errors import Cancelled, InputError
+from contract.errors import Cancelled, InputError, UnavailableError
 from contract.exits import ExitCode
 from worker.__main__ import main
 from worker.evaluate.cells import Cell, plan
@@ -19,7 +20,7 @@ from worker.evaluate.command import SUMMARY, measure_all
 from worker.evaluate.measure import Bench, Values, command_of, seconds_of
 from worker.evaluate.rows import CURVES, KEY, LOCK, RUN_FIELDS, RUNS, Results, adding_alone, read_rows
 from worker.evaluate.sources import DATA_VARIABLE, source_of
-from worker.hooks import Hooks
+from worker.hooks import Hooks, Progress
 
 CLIP = "phantom:pull:96x80:12frames"
 NAME = "phantom-pull-96x80-12frames"
@@ -108,10 +109,48 @@ def test_rows_alone_are_enough_to_draw_also_while_others_are_added(measured: Pat
 
 
 def test_a_cell_that_fails_is_a_row_that_says_why(tmp_path: Path) -> None:
-    assert main(["evaluate", CLIP, "--series", "fast", "--holdout", "99", "--out", str(tmp_path)]) == ExitCode.OK
+    assert main(["evaluate", CLIP, "--series", "fast", "--holdout", "99", "--out", str(tmp_path)]) == ExitCode.FAILED
     (row,) = read_rows(tmp_path / RUNS)
     assert row["error"].startswith("InputError: options.holdout: frame 99 is not in a clip of 12 frames")
     assert read_rows(tmp_path / CURVES) == []
+
+
+def test_the_last_lines_count_what_failed_and_only_a_call_without_any_result_has_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["evaluate", CLIP, "--series", "fast", "--iterations", "3", "--out", str(tmp_path), "--holdout"]
+    says = "cells failed, the first because of InputError: options.holdout: frame 99 is not in a clip of 12 frames"
+    for _ in range(2):  # the second call finds the row
+        assert main([*asked, "99"]) == ExitCode.FAILED
+        counted, remedy = capsys.readouterr().out.splitlines()[-2:]
+        assert counted.startswith(f"1 of 1 {says}")
+        assert "--again" in remedy
+    assert main([*asked, "99", "every8"]) == ExitCode.OK
+    assert f"1 of 2 {says}" in capsys.readouterr().out
+    assert main([*asked, "every8"]) == ExitCode.OK
+    assert "--again" not in capsys.readouterr().out
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_said_before_anything_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(tmp_path / "out", "--series", "fast", "--device", "cuda") == ExitCode.UNAVAILABLE
+    assert "--device cpu" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "lacking", [UnavailableError("The disk is full.", "Make room."), ModuleNotFoundError("No module named 'triton'")]
+)
+def test_what_this_machine_lacks_ends_measuring_and_is_no_row(tmp_path: Path, lacking: Exception) -> None:
+    def fail(_: Progress) -> None:
+        raise lacking
+
+    source = source_of(CLIP)
+    (cell,) = plan([source.name], ["fast"], ["every8"], [0], iterations=[3])
+    with pytest.raises(type(lacking), match=str(lacking)):
+        Bench({source.name: source}).measure(cell, Hooks(on_progress=fail))
 
 
 def test_what_failed_is_measured_again_only_if_asked_to(tmp_path: Path) -> None:
@@ -119,7 +158,7 @@ def test_what_failed_is_measured_again_only_if_asked_to(tmp_path: Path) -> None:
     (cell,) = plan([source.name], ["fast"], ["every8"], [0], iterations=[12])
     failed = {**dict(zip(KEY, cell.key, strict=True)), "error": "RuntimeError: the disk was full"}
     Results(tmp_path).add(failed, [])
-    assert evaluate(tmp_path, "--series", "fast") == ExitCode.OK
+    assert evaluate(tmp_path, "--series", "fast") == ExitCode.FAILED
     assert [row["error"] for row in read_rows(tmp_path / RUNS)] == ["RuntimeError: the disk was full"]
     assert evaluate(tmp_path, "--series", "fast", "--again") == ExitCode.OK
     assert [row["error"] for row in read_rows(tmp_path / RUNS)] == [""]

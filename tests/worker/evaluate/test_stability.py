@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.stability_page import stability_sections
-from contract.errors import Cancelled, InputError
+from contract.errors import Cancelled, InputError, UnavailableError
 from contract.exits import ExitCode
 from worker.__main__ import main
 from worker.evaluate.atlas import count_outcomes, draw_map, places_of, told_table
@@ -26,7 +26,7 @@ from worker.evaluate.stability import (
     plan,
     verdict,
 )
-from worker.hooks import Hooks
+from worker.hooks import Hooks, Progress
 
 SMALL = Grid(width=96, height=80, frames=12, iterations=15)
 
@@ -121,6 +121,16 @@ def test_a_cell_that_is_interrupted_leaves_no_row(tmp_path: Path) -> None:
     atlas = Atlas(tmp_path, SMALL)
     with pytest.raises(Cancelled):
         atlas.measure(StabilityCell(CLEAN, 0, "fast", 0), Hooks(should_stop=lambda: True))
+    assert not (tmp_path / STABILITY).exists()
+
+
+def test_what_this_machine_lacks_ends_measuring_and_is_no_row(tmp_path: Path) -> None:
+    def fail(_: Progress) -> None:
+        raise UnavailableError("The disk is full.", "Make room.")
+
+    atlas = Atlas(tmp_path, SMALL)
+    with pytest.raises(UnavailableError, match="The disk is full"):
+        atlas.measure(StabilityCell(CLEAN, 0, "fast", 0), Hooks(on_progress=fail))
     assert not (tmp_path / STABILITY).exists()
 
 
