@@ -2,20 +2,31 @@
 #
 #   TORCH_INDEX  package index for torch alone, e.g. https://download.pytorch.org/whl/cpu (small, no GPU);
 #                empty: pip's own index, which on Linux is usually a CUDA build of several GB;
-#                to change the build later, `make clean` first
-#   PYTHON       the interpreter that makes .venv, or that gpu-check uses if it has torch with CUDA
-#                (default: the first of python3, python3.13, 3.12, 3.11 that is new enough)
+#                default: the one .venv was made with; another one than that installs torch anew
+#   PYTHON       the interpreter that makes .venv, and that gpu-check uses
+#                (default: the first of python3, python3.13, 3.12, 3.11 that is new enough;
+#                gpu-check takes .venv's where that one's torch is no CUDA build)
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 
-TORCH_INDEX ?=
 VENV := .venv
 BIN := $(VENV)/bin
+# says that .venv is finished, and holds the TORCH_INDEX it was made with
 STAMP := $(VENV)/.installed
+INSTALLED_INDEX := $(shell cat $(STAMP) 2>/dev/null)
+TORCH_INDEX ?= $(INSTALLED_INDEX)
+ifneq ($(TORCH_INDEX),$(INSTALLED_INDEX))
+.PHONY: $(STAMP)
+# else pip would be content with the build that is there
+REINSTALL := --force-reinstall
+endif
 # -qq: errors only; pip warns once per package for every local index it is configured with
 PIP := $(BIN)/python -m pip --disable-pip-version-check
+# an index of torch's builds has of everything else the versions it likes; those of constraints.txt come after it
+TORCH_CONSTRAINTS := <(grep -E '^(torch|triton)[<>=]' constraints.txt)
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
+HAS_CUDA := import sys, torch; sys.exit(torch.version.cuda is None)
 PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do \
 	"$$each" -c '$(NEW_ENOUGH)' 2>/dev/null && { echo "$$each"; break; }; done)
 
@@ -41,12 +52,12 @@ $(STAMP): pyproject.toml constraints.txt
 	@if ! $(BIN)/python -c '$(NEW_ENOUGH)' 2>/dev/null; then \
 		echo "setup: making $(VENV) with $$("$(PYTHON)" --version)"; \
 		"$(PYTHON)" -m venv --clear $(VENV) || { echo "setup: the venv module is incomplete; on Debian or Ubuntu: apt-get install python3-venv" >&2; exit 1; }; fi
-	@if [ -n "$(TORCH_INDEX)" ]; then \
-		echo "setup: installing torch from $(TORCH_INDEX)"; \
-		$(PIP) install -qq --constraint constraints.txt --index-url "$(TORCH_INDEX)" torch; fi
+	@if [ -n "$(TORCH_INDEX)$(REINSTALL)" ]; then \
+		echo "setup: installing torch from $(or $(TORCH_INDEX),pip's own index)"; \
+		$(PIP) install -qq $(REINSTALL) --constraint $(TORCH_CONSTRAINTS) $(TORCH_INDEX:%=--index-url "%") torch; fi
 	@echo "setup: installing intrasplat and what it needs (download sizes are in README.md; minutes on a slow line)"
 	@$(PIP) install -qq --constraint constraints.txt --editable '.[dev]'
-	@touch $@
+	@echo "$(TORCH_INDEX)" >$@
 
 demo: setup ## reconstruct a synthetic clip of tissue and render it without the instrument
 	@$(BIN)/python -m client.demo
@@ -66,9 +77,13 @@ bench: setup ## every benchmarks/bm_*.py, one after the other
 		echo "== $$each"; $(BIN)/python "$$each"; done
 
 gpu-check: ## with an NVIDIA GPU: are its kernels right, how fast are they; 8 minutes at most, docs/gpu.md
-	@# PYTHON itself where its torch is a CUDA build: nothing is installed then, and no .venv is made
-	@python="$(PYTHON)"; "$$python" -c 'import sys, torch; sys.exit(torch.version.cuda is None)' 2>/dev/null \
-		|| { [ ! -x $(BIN)/python ] || python=$(BIN)/python; }; "$$python" benchmarks/gpu_check.py $(ARGS)
+	@# nothing is installed and no .venv is made; a PYTHON that is named is used whatever it has
+	@python="$(PYTHON)"; \
+	if [ "$(origin PYTHON)" = file ] && [ -x $(BIN)/python ] && ! "$$python" -c '$(HAS_CUDA)' 2>/dev/null; then \
+		python=$(BIN)/python; fi; \
+	if ! "$$python" -c '$(NEW_ENOUGH)' 2>/dev/null; then \
+		echo "gpu-check: '$$python' is no Python of 3.11 or newer; name one: make gpu-check PYTHON=/path/to/python3" >&2; exit 1; fi; \
+	"$$python" benchmarks/gpu_check.py $(ARGS)
 
 evaluate: setup ## every preset on every clip, and the charts; hours, and it goes on where it was (CLIPS="phantom:pull ...")
 	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out docs/results

@@ -7,7 +7,7 @@ In this order: whether the kernels are right (gpu_correct.py), what a step and a
 peaks are (gpu_speed.py), how soon training is how good (gpu_train.py), tiles of other shapes (gpu_variants.py), and
 gsplat beside it where it is installed (gpu_rival.py). Each part is a process with a time to end at, and writes
 OUT/gpu-*.csv row by row. If a kernel is wrong, the rest is measured all the same, says so in every row, and the exit
-code is 1. Without a GPU there is nothing to check: exit code 5.
+code is 1. Without a GPU there is nothing to check: exit code 5. make prints either, and itself ends with 2.
 
 --clip names a recording in the EndoNeRF layout (its depth is in it); without it, synthetic tissue is made on the spot.
 This file needs the standard library alone, so that it can say what is missing.
@@ -19,7 +19,6 @@ import argparse
 import csv
 import json
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -33,12 +32,7 @@ UNAVAILABLE = 5
 """As contract/exits.py has it."""
 GRACE_S = 5.0
 """After its deadline a part may write what it holds; then it is killed."""
-LOOK = (
-    "import importlib.util, json, torch; "
-    "seen = torch.cuda.is_available(); "
-    "print(json.dumps({'build': torch.version.cuda, 'gpu': torch.cuda.get_device_name(0) if seen else None, "
-    "'triton': importlib.util.find_spec('triton') is not None}))"
-)
+LOOK = "import json; from worker.gpu import find_gpu; gpu = find_gpu(); print(json.dumps([gpu.missing, gpu.remedy]))"
 
 
 @dataclass(frozen=True)
@@ -73,8 +67,10 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.interpret and (arguments.out or RESULTS).resolve() == RESULTS:
         parser.error("--interpret measures nothing: name a folder for its files with --out, other than docs/results")
-    if not arguments.interpret and (missing := what_is_missing()):
-        print(f"gpu-check: {missing}; nothing was checked and nothing was written.", file=sys.stderr)
+    missing, remedy = ("", "") if arguments.interpret else what_is_missing()
+    if missing:
+        print(f"gpu-check: {missing}, as {sys.executable} has it. {remedy}.", file=sys.stderr)
+        print("gpu-check: nothing was checked and nothing was written.", file=sys.stderr)
         return UNAVAILABLE
     seed = int(time.time()) if arguments.seed is None else arguments.seed
     out = (arguments.out or RESULTS).resolve()
@@ -94,21 +90,18 @@ def main() -> int:
     return 1 if failures else 0
 
 
-def what_is_missing() -> str:
-    """Why nothing can be checked here; empty if everything is there."""
-    look = subprocess.run([sys.executable, "-c", LOOK], capture_output=True, text=True, check=False)
+def what_is_missing() -> tuple[str, str]:
+    """Why nothing can be checked here, and what to do about it; empty if everything is there."""
+    command = [sys.executable, "-c", LOOK]
+    look = subprocess.run(command, cwd=HERE.parent, capture_output=True, text=True, check=False)
     if look.returncode != 0:
         last = look.stderr.strip().splitlines()[-1:] or ["it ended without a word"]
-        return f"{sys.executable} cannot import torch ({last[0]})"
-    found = json.loads(look.stdout)
-    if found["build"] is None:
-        return f"torch of {sys.executable} is a CPU build"
-    if found["gpu"] is None:
-        return f"torch of {sys.executable} sees no NVIDIA GPU"
-    if not found["triton"]:
-        return f"{sys.executable} has no Triton"
-    compilers = os.environ.get("CC"), shutil.which("gcc"), shutil.which("clang")
-    return "" if any(compilers) else "there is no C compiler (gcc or clang), by which Triton makes its launchers"
+        return (
+            f"torch cannot be imported ({last[0]})",
+            "Name a Python that has it: make gpu-check PYTHON=/path/to/python3",
+        )
+    missing, remedy = json.loads(look.stdout)
+    return missing, remedy
 
 
 def environment(work: Path, interpret: bool) -> dict[str, str]:

@@ -10,7 +10,9 @@ WORKDIR /app
 RUN python -m venv /venv
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 # torch first and alone: it is most of the download, and its layer outlives every change of ours.
-RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt --index-url "$TORCH_INDEX" torch
+# Its index has of everything else the versions it likes; those of constraints.txt come with the next step.
+RUN grep -E '^(torch|triton)[<>=]' constraints.txt >torch.txt \
+    && /venv/bin/pip install --no-cache-dir --constraint torch.txt --index-url "$TORCH_INDEX" torch
 COPY contract contract
 COPY worker worker
 RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt ".[$EXTRAS]"

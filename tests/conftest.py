@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from worker.gpu import find_gpu
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 SEED = 20240527
 
@@ -22,22 +24,23 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Triton decides when it is imported whether its kernels are interpreted, so that is said before any test is."""
+    """Triton decides when it is imported whether its kernels are interpreted, so that is said before any test is.
+
+    A GPU that is asked for and missing ends the run at once, so that it cannot pass empty.
+    """
     if config.getoption("--device") == "cpu":
         os.environ["TRITON_INTERPRET"] = "1"
-    else:
-        os.environ.pop("TRITON_INTERPRET", None)
+        return
+    os.environ.pop("TRITON_INTERPRET", None)
+    gpu = find_gpu()
+    if gpu.missing:
+        raise pytest.UsageError(f"--device cuda was asked for, but {gpu.missing}. {gpu.remedy}.")
 
 
 @pytest.fixture(scope="session")
 def device(pytestconfig: pytest.Config) -> str:
-    """The device asked for; a GPU that is asked for and missing is a failure, so that a GPU run cannot pass empty."""
+    """The device asked for."""
     chosen: str = pytestconfig.getoption("--device")
-    if chosen == "cuda":
-        import torch
-
-        if not torch.cuda.is_available():
-            pytest.fail("--device cuda was asked for, but torch sees no GPU")
     return chosen
 
 

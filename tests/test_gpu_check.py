@@ -19,6 +19,7 @@ from tests.conftest import REPOSITORY
 from tests.worker.raster.scenes import Scene, random_scene
 from worker.deformation import SharedBasis
 from worker.gaussians import Gaussians
+from worker.gpu import find_gpu
 from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, reference
 from worker.raster.cpu.model import FusedModel
 from worker.raster.step import camera_vector
@@ -83,8 +84,10 @@ def test_without_a_gpu_it_says_so_and_writes_nothing(tmp_path: Path) -> None:
     answer = run(str(BENCHMARKS / "gpu_check.py"), "--out", str(tmp_path / "out"))
     assert answer.returncode == 5
     assert answer.stdout == ""
-    assert answer.stderr.startswith("gpu-check: torch of ")
-    assert answer.stderr.endswith("; nothing was checked and nothing was written.\n")
+    gpu = find_gpu()
+    said, nothing = answer.stderr.splitlines()
+    assert said == f"gpu-check: {gpu.missing}, as {sys.executable} has it. {gpu.remedy}."
+    assert nothing == "gpu-check: nothing was checked and nothing was written."
     assert not (tmp_path / "out").exists()
 
 

@@ -13,6 +13,8 @@ from urllib.parse import unquote
 
 import pytest
 
+from worker.gpu import NEWEST_TRITON, OLDEST_TRITON, triton_range
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("docker/*.md")])
 TARGETS = (
@@ -119,6 +121,17 @@ def test_every_direct_dependency_has_a_constraint_and_no_other_has() -> None:
 def test_the_constraint_on_torch_is_the_projects_range() -> None:
     torch = [each for each in project()["dependencies"] if requirement_name(each) == "torch"]
     assert torch[0] in (REPOSITORY / "constraints.txt").read_text(encoding="utf-8").splitlines()
+
+
+def test_triton_is_asked_for_in_the_range_that_a_gpu_is_held_to() -> None:
+    after = f"{NEWEST_TRITON[0]}.{NEWEST_TRITON[1] + 1}"
+    wanted = f"triton>={OLDEST_TRITON[0]}.{OLDEST_TRITON[1]},<{after}"
+    extras = project()["optional-dependencies"]
+    lines = (REPOSITORY / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    asked = [each.split(";")[0] for each in [*extras["gpu"], *extras["dev"], *lines] if each.startswith("triton")]
+    assert asked == [wanted] * 3
+    for page in ("docs/gpu.md", "docs/operations.md"):
+        assert f"Triton {triton_range()}" in (REPOSITORY / page).read_text(encoding="utf-8"), page
 
 
 def test_long_files_say_why_they_are_long() -> None:

