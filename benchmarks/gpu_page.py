@@ -11,7 +11,7 @@ Row = dict[str, str]
 ORIGIN = ("machine", "gpu", "driver", "torch", "triton", "commit")
 
 _ESTIMATE = """
-## A training step on a GPU, estimated
+## Steps and pictures on a GPU, estimated
 
 `python benchmarks/gpu_estimate.py --scene s600 --csv docs/results/gpu-estimate.csv`
 ([gpu-estimate.csv](gpu-estimate.csv)), made on a machine without a GPU: **nothing in this section was measured on
@@ -20,10 +20,11 @@ reconstruct CLIP --iterations 600 --out s600` ends with on `d4d-a`. Bytes and in
 Triton compiles them for an H200 (sm_90), over its data sheet: 4.3 TB/s, 67 TFLOP/s, and 1.5 to 2.5 us a launch within a
 graph. The floor issues every instruction without waiting, and takes every byte from memory, though what fits into the
 cache may come sooner; the forecast, twice the floor and 2.5 us a launch, is a judgement. Launches of torch's sorts are
-counted in its source.
+counted in its source. A row is of a training step, or of pictures where it says so, and of all its frames together.
 """
 _KERNELS = """
-Where the floor of {scene} lies, kernel by kernel; `at once` are the warps that fit on a multiprocessor of 64:
+Where the floor of `{scene}` lies, kernel by kernel; registers are those of Triton {triton}, `at once` the warps that
+fit on a multiprocessor of 64:
 """
 _SHAPES = """
 Of the tiles compiled, by this forecast: {order}. In use are {usual}. What a program
@@ -66,26 +67,25 @@ def _read(path: Path) -> list[Row]:
 
 
 def _estimate(rows: list[Row]) -> list[str]:
-    steps = [row for row in rows if row["part"] == "step"]
+    whole = [row for row in rows if row["kernel"] == "all"]
     header = ["scene", "tile", "chunk", "warps", "Gaussians", "instances", "evaluated, M", "blended, M", "MB",
               "launches", "floor, us", "with launches, us", "forecast, us"]  # fmt: skip
     cells = [
         [row["scene"], row["tile"], row["chunk"], row["warps"], row["gaussians"], row["instances"],
          f"{int(row['evaluated']) / 1e6:.1f}", f"{int(row['blended']) / 1e6:.1f}", row["megabytes"], row["launches"],
          row["floor_us"], row["least_us"], row["forecast_us"]]
-        for row in steps
+        for row in whole
     ]  # fmt: skip
     sections = [_ESTIMATE, table(header, cells)]
-    usual = steps[0]
-    for scene in dict.fromkeys(row["scene"] for row in steps):
-        if "frames" not in scene:
-            sections += [_KERNELS.format(scene=scene), _kernels(rows, scene, usual)]
-    compared = [row for row in steps if row["scene"] == usual["scene"]]
+    usual = whole[0]
+    for scene in dict.fromkeys(row["scene"] for row in whole if row["frames"] == "1"):
+        sections += [_KERNELS.format(scene=scene, triton=usual["triton"]), _kernels(rows, scene, usual)]
+    compared = [row for row in whole if row["scene"] == usual["scene"]]
     if len(compared) > 1:
         ordered = sorted(compared, key=lambda row: float(row["forecast_us"]))[:3]
         order = ", ".join(f"{_shape(row)} {row['forecast_us']} us" for row in ordered)
         sections.append(_SHAPES.format(order=order, usual=_shape(usual)))
-    return [*sections, f"\nCommit {usual['commit']}.\n"]
+    return [*sections, f"\nCompiled by Triton {usual['triton']} on {usual['machine']}, commit {usual['commit']}.\n"]
 
 
 def _shape(row: Row) -> str:
@@ -100,7 +100,7 @@ def _kernels(rows: list[Row], scene: str, usual: Row) -> str:
         [row[name] or "–" for name in names]
         for row in rows
         if row["scene"] == scene
-        and row["part"] != "step"
+        and row["kernel"] != "all"
         and (row["tile"], row["chunk"]) == (usual["tile"], usual["chunk"])
     ]
     seen = {cell[0]: cell for cell in reversed(cells)}  # the usual shape is the first of those of its tile
