@@ -10,6 +10,7 @@ OUT/gpu-*.csv row by row. If a kernel is wrong, the rest is measured all the sam
 code is 1. Without a GPU there is nothing to check: exit code 5. make prints either, and itself ends with 2.
 
 --clip names a recording in the EndoNeRF layout (its depth is in it); without it, synthetic tissue is made on the spot.
+An option that cannot be used is refused before anything is done: exit code 2.
 This file needs the standard library alone, so that it can say what is missing.
 """
 
@@ -30,6 +31,8 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE.parent / "docs" / "results"
 UNAVAILABLE = 5
 """As contract/exits.py has it."""
+CLIP_HAS = ("images", "depth", "poses_bounds.npy")
+"""In the folder of a recording in the EndoNeRF layout."""
 GRACE_S = 5.0
 """After its deadline a part may write what it holds; then it is killed."""
 LOOK = "import json; from worker.gpu import find_gpu; gpu = find_gpu(); print(json.dumps([gpu.missing, gpu.remedy]))"
@@ -67,6 +70,8 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.interpret and (arguments.out or RESULTS).resolve() == RESULTS:
         parser.error("--interpret measures nothing: name a folder for its files with --out, other than docs/results")
+    if arguments.clip and (problem := clip_problem(arguments.clip)):
+        parser.error(problem)
     missing, remedy = ("", "") if arguments.interpret else what_is_missing()
     if missing:
         print(f"gpu-check: {missing}, as {sys.executable} has it. {remedy}.", file=sys.stderr)
@@ -88,6 +93,19 @@ def main() -> int:
     for failure in failures:
         print(f"gpu-check: part {failure}; see above.", file=sys.stderr)
     return 1 if failures else 0
+
+
+def clip_problem(path: Path) -> str:
+    """Why --clip cannot be what it names, and what to do; empty if it looks like it."""
+    lacking = [name for name in CLIP_HAS if not (path / name).exists()]
+    if not lacking:
+        return ""
+    problem = "does not exist" if not path.exists() else f"has no {', no '.join(lacking)}"
+    problem = "is no folder" if path.is_file() else problem
+    return (
+        f"--clip: {path.resolve()} {problem}. Name the folder that holds {', '.join(CLIP_HAS)} of a recording "
+        "in the EndoNeRF layout, or leave --clip out to train on synthetic tissue."
+    )
 
 
 def what_is_missing() -> tuple[str, str]:

@@ -79,6 +79,34 @@ def test_figures_of_the_interpreter_do_not_pass_for_results() -> None:
     assert "--interpret measures nothing" in answer.stderr
 
 
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [("nowhere", "does not exist"), ("file", "is no folder"), ("clip", "has no depth, no poses_bounds.npy")],
+)
+def test_a_clip_that_is_none_is_refused_before_anything_is_done(tmp_path: Path, name: str, problem: str) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "clip" / "images").mkdir(parents=True)
+    earlier = tmp_path / "gpu-train.csv"
+    earlier.write_text("kept\n")
+    answer = run(str(BENCHMARKS / "gpu_check.py"), "--clip", str(tmp_path / name), "--out", str(tmp_path))
+    assert answer.returncode == 2
+    assert f"--clip: {tmp_path.resolve() / name} {problem}. Name the folder that holds images, depth, " in answer.stderr
+    assert "Traceback" not in answer.stderr
+    assert earlier.read_text() == "kept\n"
+
+
+def test_how_soon_training_is_good_is_told_by_what_paper_ends_with() -> None:
+    code = (
+        f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r})\n"
+        "from gpu_train import seconds_to\n"
+        "from worker.train import CurvePoint\n"
+        "curve = [CurvePoint(t, 10, db) for t, db in ((0.5, 24.0), (1.0, 27.5), (2.0, 30.0))]\n"
+        "print(list(seconds_to(curve, 29.0).values()), list(seconds_to(curve, None).values()))\n"
+    )
+    answer = run("-c", code)
+    assert answer.stdout == "[1.0, 1.0, 2.0, None] [None, None, None, None]\n", answer.stderr
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_it_says_so_and_writes_nothing(tmp_path: Path) -> None:
     answer = run(str(BENCHMARKS / "gpu_check.py"), "--out", str(tmp_path / "out"))
