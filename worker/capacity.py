@@ -114,7 +114,7 @@ def choose_bases(tried: Tried, floor: float, frames: int, most: int | None = Non
     best = min(total, key=lambda each: total[each])
     allowed = (total[best] + floor) * 10 ** (WORTH_DB / 10)
     bases = min(each for each, error in total.items() if error + floor <= allowed)
-    left = ", ".join(f"{each} leave {math.sqrt(total[each] + floor):.1f}" for each in sorted({fewest, bases, best}))
+    left = ", ".join(f"{each} leave {math.sqrt(total[each] + floor):.2f}" for each in sorted({fewest, bases, best}))
     seen = "no motion shows in the pictures; " if tried.resting else ""
     reason = f"{seen}the fewest within {WORTH_DB} dB of the best; in frames left out {left} of 255 grey levels"
     return Choice(bases, reason)

@@ -124,7 +124,7 @@ class Schedule:
         return (
             f"Training ended after {self.iterations} of {self.planned} iterations that the time allowed: doubling the "
             f"first {self.stopped_at // 2} was worth {self.scores[-1] - self.scores[-2]:.2f} dB on training frames "
-            "left out until then.",
+            f"left out until then, less than {self.worth_db} dB.",
         )
 
 

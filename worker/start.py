@@ -48,7 +48,9 @@ def settled(
     tried = try_bases(tracks, clip, train, preset.most_bases) if tracks is not None and left_open else Tried({})
     fusion = fusion_for(preset, clip.intrinsics)
     if fusion.mode == "fill" and preset.points_per_image is not None:
-        words.append(f"Gaussians start {fusion.stride} pixels apart: nearest to {preset.points_per_image} an image.")
+        least = ", the least there is" if fusion.stride == MIN_STRIDE else ""
+        wanted = preset.points_per_image
+        words.append(f"Gaussians start {fusion.stride} pixels apart{least}: {wanted} an image were asked for.")
     elif fusion.mode == "fill":
         finest = _stride_for(MOST_POINTS, clip.intrinsics)
         choice = choose_stride(

@@ -212,7 +212,7 @@ def test_a_stop_is_told_in_words() -> None:
     schedule = after(Schedule(4000, True, WORTH_DB), 30.0, 31.0, 31.13)
     assert schedule.words == (
         "Training ended after 1250 of 4000 iterations that the time allowed: doubling the first 500 was worth 0.13 dB "
-        "on training frames left out until then.",
+        f"on training frames left out until then, less than {WORTH_DB} dB.",
     )
     assert after(Schedule(4000, True), 30.0, 30.0).words == ()
 

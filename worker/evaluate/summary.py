@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean, median, stdev
 
 from worker.evaluate.cells import base_of
@@ -68,10 +68,11 @@ def groups_of(runs: Sequence[Row]) -> list[Group]:
 
 @dataclass(frozen=True)
 class Sooner:
-    """How soon `ours` reaches the final psnr_tissue of `theirs` at a place; None where it does not.
+    """How soon `ours`, in runs of our_limit, first reaches the final psnr_tissue of `theirs` at a place; None where it
+    does not.
 
-    All figures are medians over seeds; theirs of the longest runs they were given. our_limit is the length, of those
-    that were run, with which it is reached soonest.
+    All figures are medians over seeds; theirs of the longest runs they were given. their_first_s is when theirs first
+    is as good as it ends: a run that over-fits is so long before its end.
     """
 
     clip: str
@@ -81,13 +82,18 @@ class Sooner:
     target_db: float
     their_s: float
     their_iterations: float
+    their_first_s: float
+    our_limit: str
     our_s: float | None = None
     our_iterations: float | None = None
-    our_limit: str = ""
 
     @property
     def times_in_seconds(self) -> float | None:
         return None if self.our_s is None else self.their_s / self.our_s
+
+    @property
+    def times_from_their_first(self) -> float | None:
+        return None if self.our_s is None else self.their_first_s / self.our_s
 
     @property
     def times_in_iterations(self) -> float | None:
@@ -99,24 +105,25 @@ Point = tuple[float, float, float]
 
 
 def sooner(curves: Sequence[Row], ours: str = "fast", theirs: str = "paper") -> list[Sooner]:
-    """The headline: for each place where both were run, how soon ours is as good as theirs ends."""
+    """The headline: for each place where both were run and each length of ours, how soon ours is as good as theirs
+    ends."""
     runs = _curves_by_run(curves)
     found = []
     for place in dict.fromkeys((clip, holdout) for clip, holdout, *_ in runs):
         of_theirs, of_ours = (_by_limit(runs, (*place, series)) for series in (theirs, ours))
-        if not of_theirs or not of_ours:
+        if not of_theirs:
             continue
-        ends = [_median_end(alike) for alike in of_theirs.values()]
-        their_s, their_iterations, target_db = max(ends, key=lambda end: end[1])
-        crossings = []
+        their_s, their_iterations, target_db, longest = max(
+            ((*_median_end(alike), alike) for alike in of_theirs.values()), key=lambda end: end[1]
+        )
+        first_s = median(min(reach(points, target_db)[0], points[-1][0]) for points in longest)
         for limit, alike in of_ours.items():
-            reached = [reach(points, target_db) for points in alike]
-            crossings.append((median(s for s, _ in reached), median(n for _, n in reached), limit))
-        our_s, our_iterations, limit = min(crossings)
-        row = Sooner(*place, ours, theirs, target_db, their_s, their_iterations)
-        if math.isfinite(our_s):
-            row = Sooner(*place, ours, theirs, target_db, their_s, their_iterations, our_s, our_iterations, limit)
-        found.append(row)
+            our_s, our_iterations = (
+                median(values) for values in zip(*(reach(p, target_db) for p in alike), strict=True)
+            )
+            row = Sooner(*place, ours, theirs, target_db, their_s, their_iterations, first_s, limit)
+            there = math.isfinite(our_s)
+            found.append(replace(row, our_s=our_s, our_iterations=our_iterations) if there else row)
     return found
 
 

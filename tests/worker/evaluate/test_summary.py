@@ -35,12 +35,23 @@ def test_the_headline_compares_medians_over_seeds_at_the_rivals_final_score() ->
     assert found.times_in_iterations == pytest.approx(7.5)
 
 
-def test_of_several_lengths_the_one_that_is_there_soonest_counts() -> None:
+def test_each_length_of_ours_is_a_comparison_of_its_own() -> None:
     curves = curve_rows(run_row("paper", 33.0), [(240.0, 3000, 33.0)])
     curves += curve_rows(run_row("fast", 36.0, limit="60 s"), [(20.0, 900, 32.0), (60.0, 2800, 36.0)])
-    curves += curve_rows(run_row("fast", 33.5, limit="10 s"), [(5.0, 200, 32.0), (10.0, 400, 34.0)])
-    (found,) = sooner(curves)
-    assert found.our_limit == "10 s"
+    curves += curve_rows(run_row("fast", 33.5, limit="10 s"), [(5.0, 200, 32.0), (10.0, 400, 33.0)])
+    long, short = sooner(curves)
+    assert (long.our_limit, short.our_limit) == ("60 s", "10 s")
+    assert short.times_in_seconds == pytest.approx(24.0)
+    assert (long.times_in_seconds or 0.0) < 12.0
+
+
+def test_a_rival_that_over_fits_is_also_compared_from_when_it_was_as_good_first() -> None:
+    curves = curve_rows(run_row("paper", 33.0), [(10.0, 100, 30.0), (40.0, 500, 33.0), (240.0, 3000, 33.0)])
+    curves += curve_rows(run_row("paper", 33.0, seed=1), [(10.0, 100, 30.0), (60.0, 500, 34.0), (240.0, 3000, 33.0)])
+    (found,) = sooner(curves + curve_rows(run_row("fast", 36.0), [(8.0, 300, 33.0), (60.0, 2800, 36.0)]))
+    assert found.their_s == 240.0
+    assert 38.0 < found.their_first_s < 50.0
+    assert found.times_from_their_first == pytest.approx(found.their_first_s / 8.0)
 
 
 def test_the_rivals_longest_runs_are_what_counts_as_its_final_score() -> None:
