@@ -3,6 +3,10 @@
 If `up` itself is killed, service and workers are killed with it: what was accepted is on disk, and what was training
 goes on from its last checkpoint at the next start. The queue's server alone stays; the next `up` of the same data
 directory takes it over, and ends it when it ends itself.
+
+A child that ends is started again, but for one: what it needs is not there. That would end the next one, too, so it
+ends `up`, with the remedy. Once a child has been sound, what it needed was there and may come back (room on the disk,
+a queue, a device): then it is started again like any other, and the rest keeps working meanwhile.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from pathlib import Path
 from client.api import Client
 from contract.embedded import EmbeddedServer
 from contract.errors import UnavailableError
+from contract.exits import LAST_WORDS_VARIABLE, ExitCode, take_last_words
 from contract.keys import check_keys
 from contract.locks import FolderLock
 from contract.processes import die_with_parent, end_process, told_to_end
@@ -39,12 +44,17 @@ EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 class WatchedProcess:
-    """A child that is started again when it ends by itself, after pauses that double."""
+    """A child that is started again when it ends by itself, after pauses that double.
 
-    def __init__(self, name: str, command: list[str], environment: dict[str, str]) -> None:
+    In the folder it leaves what it lacks, if that is why it ends (contract/exits.py).
+    """
+
+    def __init__(self, name: str, command: list[str], environment: dict[str, str], folder: Path) -> None:
         self._name = name
         self._command = command
-        self._environment = environment
+        self._last_words = folder / f"{name}.last-words"
+        self._environment = {**environment, LAST_WORDS_VARIABLE: str(self._last_words)}
+        self._was_sound = False
         self._process: subprocess.Popen[bytes] | None = None
         self._pause_s = FIRST_PAUSE_S
         self._started_s = 0.0
@@ -56,18 +66,20 @@ class WatchedProcess:
         return self._process.pid if self._process else None
 
     def watch(self) -> None:
-        """Start the child if it is not there and its pause is over."""
+        """Start the child if it is not there and its pause is over.
+
+        Raises:
+            UnavailableError: it ended because something that it needs is not there, and has never been sound.
+        """
         now_s = time.monotonic()
         if self._process is not None:
             status = self._process.poll()
             if status is None:
                 return
-            self._pause_s = FIRST_PAUSE_S if now_s - self._started_s > STEADY_S else self._pause_s
-            self._start_at_s = now_s + self._pause_s
-            say(f"the {self._name} ended with status {status}; starting it again in {self._pause_s:g} s")
-            self._pause_s = min(LONGEST_PAUSE_S, 2 * self._pause_s)
             self._process = None
+            self._bury(status, now_s)
         if now_s >= self._start_at_s:
+            self._last_words.unlink(missing_ok=True)  # a launcher that was killed may have left them
             # A session of its own: Ctrl-C reaches the launcher alone, which ends the others in order.
             self._process = subprocess.Popen(
                 self._command,
@@ -77,6 +89,20 @@ class WatchedProcess:
                 preexec_fn=die_with_parent if os.name == "posix" else None,
             )
             self._started_s = now_s
+
+    def _bury(self, status: int, now_s: float) -> None:
+        """Say that the child has ended, and when another starts; raises as watch."""
+        if now_s - self._started_s > STEADY_S:
+            self._was_sound, self._pause_s = True, FIRST_PAUSE_S
+        lack = take_last_words(self._last_words)
+        if status == ExitCode.UNAVAILABLE and not self._was_sound:
+            if lack is None:
+                problem = f"The {self._name} ended with status {status}: something that it needs is not there."
+                raise UnavailableError(problem, "Its messages are above; try `intrasplat doctor`.")
+            raise UnavailableError(f"The {self._name} cannot work here: {lack.problem}", lack.remedy)
+        self._start_at_s = now_s + self._pause_s
+        say(f"the {self._name} ended with status {status}; starting it again in {self._pause_s:g} s")
+        self._pause_s = min(LONGEST_PAUSE_S, 2 * self._pause_s)
 
     def ask_to_end(self) -> None:
         """Send SIGTERM, and do not wait."""
@@ -88,6 +114,7 @@ class WatchedProcess:
         if self._process is None:
             return
         end_process(self._process, STOP_TIMEOUT_S)
+        self._last_words.unlink(missing_ok=True)
         self._process = None
 
 
@@ -104,10 +131,11 @@ class Installation:
             update={"data_dir": data_dir, "redis_url": redis_url, "dashboard_dir": DASHBOARD}
         )
         environment = {**os.environ, **self.settings.to_environment()}
-        self.service = WatchedProcess("service", [sys.executable, "-m", "service"], environment)
+        folder = data_dir / "run"
+        self.service = WatchedProcess("service", [sys.executable, "-m", "service"], environment, folder)
         command = [sys.executable, "-m", "worker", "consume"]
         self.workers = [
-            WatchedProcess(name, command, {**environment, WORKER_NAME_VARIABLE: name})
+            WatchedProcess(name, command, {**environment, WORKER_NAME_VARIABLE: name}, folder)
             for name in worker_names(settings.worker_name, worker_count)
         ]
 
@@ -137,14 +165,14 @@ class Installation:
         self._lock.release()
 
     def watch(self) -> None:
-        """Start again what has died; call it often."""
+        """Start again what has died; call it often. Raises UnavailableError for what cannot work here at all."""
         if self._queue is not None and self._queue.ensure_running():
             say("the queue's server had died and was started again; nothing it had accepted is lost")
         for process in (self.service, *self.workers):
             process.watch()
 
     def wait_until_ready(self, is_ended: Callable[[], bool], timeout_s: float) -> bool:
-        """Watch until a clip would be trained; False if that takes too long or the caller ends."""
+        """Watch until a clip would be trained; False if that takes too long or the caller ends. Raises as watch."""
         deadline_s = time.monotonic() + timeout_s
         asked_s = 0.0
         with Client(self.url) as client:
@@ -181,8 +209,8 @@ def run(settings: Settings, worker_count: int = 1, ready_timeout_s: float = 300.
     """Start everything, say where it is, and watch until SIGINT or SIGTERM.
 
     Raises:
-        UnavailableError: there is no key to let anybody in, the port is taken, there is no queue, or nothing becomes
-            ready.
+        UnavailableError: there is no key to let anybody in, the port is taken, there is no queue, the service or a
+            worker lacks something, or nothing becomes ready.
     """
     end = told_to_end()
     check_keys(settings)

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
+import sys
 from enum import IntEnum
+from pathlib import Path
 
 from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableError
 
@@ -33,3 +38,27 @@ def exit_code_of(error: IntrasplatError) -> ExitCode:
     if isinstance(error, Cancelled):
         return ExitCode.INTERRUPTED
     return ExitCode.FAILED
+
+
+LAST_WORDS_VARIABLE = "INTRASPLAT_LAST_WORDS"
+"""Set by whoever starts a process and wants to tell what it lacked: the file that it leaves that in."""
+
+
+def end_by(error: IntrasplatError) -> ExitCode:
+    """Say on stderr why this process ends, leave what is not there to whoever started it, and return the exit code."""
+    print(f"intrasplat: {error}", file=sys.stderr)
+    path = os.environ.get(LAST_WORDS_VARIABLE)
+    if path and isinstance(error, UnavailableError):
+        with contextlib.suppress(OSError):  # room on the disk may be what is not there; stderr has it all the same
+            Path(path).write_text(json.dumps({"problem": error.problem, "remedy": error.remedy}))
+    return exit_code_of(error)
+
+
+def take_last_words(path: Path) -> UnavailableError | None:
+    """What a process that has ended left in its file, which is removed; None if it left nothing."""
+    try:
+        return UnavailableError(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
+    finally:
+        path.unlink(missing_ok=True)

@@ -7,7 +7,7 @@ import logging
 import sys
 
 from contract.errors import IntrasplatError, UnavailableError
-from contract.exits import ExitCode, exit_code_of
+from contract.exits import ExitCode, end_by
 from contract.keys import check_keys
 from contract.logs import configure
 from contract.queue_redis import RedisQueue
@@ -26,11 +26,9 @@ def main() -> int:
         settings = Settings.from_environment()
         check_keys(settings)
     except IntrasplatError as error:
-        print(error, file=sys.stderr)
-        return exit_code_of(error)
+        return end_by(error)
     if settings.redis_url is None:
-        print("REDIS_URL is not set; `intrasplat up` starts a queue of its own.", file=sys.stderr)
-        return ExitCode.UNAVAILABLE
+        return end_by(UnavailableError("REDIS_URL is not set.", "`intrasplat up` starts a queue of its own."))
     configure(settings, "service")
     queue = RedisQueue(settings.redis_url)
     try:
@@ -38,8 +36,7 @@ def main() -> int:
         renderer = ZmqRenderer(queue, settings.render_timeout_s, settings.render_secret)
         app = create_app(settings, queue, open_store(settings), renderer)
     except UnavailableError as error:
-        print(error, file=sys.stderr)
-        return ExitCode.UNAVAILABLE
+        return end_by(error)
     logger.info("listening on port %d", settings.port)
     server = Server(app, settings)
     with contextlib.suppress(KeyboardInterrupt):

@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from contract.arguments import Commands, add_command, finite, positive
 from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableError
-from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
+from contract.exits import EXIT_CODES_HELP, ExitCode, end_by
 from contract.logs import configure
 from contract.names import MANIFEST, REPORT, DeviceName, Layout, MaskPolarity, PoseConvention, PresetName
 from contract.processes import told_to_end
@@ -47,11 +47,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return command(options)
     except IntrasplatError as error:
-        print(f"intrasplat: {error}", file=sys.stderr)
-        return exit_code_of(error)
+        return end_by(error)
     except ModuleNotFoundError as error:
-        print(f"intrasplat: {error.name} is not installed; `intrasplat doctor` tells the remedy", file=sys.stderr)
-        return ExitCode.UNAVAILABLE
+        return end_by(UnavailableError(f"{error.name} is not installed.", "`intrasplat doctor` tells the remedy."))
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from contract.clip_limits import ClipLimits
 from contract.embedded import short_socket_path
 from contract.errors import Cancelled, InputError, UnavailableError
+from contract.exits import exit_code_of
 from contract.job import JobRecord
 from contract.processes import die_with_parent
 from contract.settings import Settings
@@ -51,11 +52,13 @@ logger = logging.getLogger("intrasplat.worker")
 
 
 def run_device(settings: Settings) -> None:
-    """Obey the orders on stdin; never returns but by an error at the start, for the end of the orders ends the process.
+    """Obey the orders on stdin; never returns, for the end of the orders ends the process.
+
+    What keeps it from starting (a device or data directory that cannot be used, an endpoint that is none) is reported
+    to the supervisor, which tells the user.
 
     Raises:
-        UnavailableError: the device is not one to train on, or the data directory cannot be used.
-        InputError: the endpoint is not one to listen at.
+        SystemExit: with that error's code.
     """
     die_with_parent()
     channel = Channel.instead_of_stdout()
@@ -64,7 +67,7 @@ def run_device(settings: Settings) -> None:
         _serve(settings, channel, orders)
     except (UnavailableError, InputError) as error:
         channel.send(Unable(problem=error.problem, remedy=error.remedy))
-        raise
+        raise SystemExit(exit_code_of(error)) from error
 
 
 def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:

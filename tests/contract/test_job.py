@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from contract.errors import Cancelled, InputError, LimitError, SceneError, UnavailableError
-from contract.exits import ExitCode, exit_code_of
+from contract.exits import LAST_WORDS_VARIABLE, ExitCode, end_by, exit_code_of, take_last_words
 from contract.job import (
     TERMINAL_STATES,
     TRANSITIONS,
@@ -92,6 +92,32 @@ def test_exit_codes_tell_bad_input_from_failure_and_from_absence() -> None:
     assert exit_code_of(UnavailableError("no queue.", "start it")) is ExitCode.UNAVAILABLE
     assert exit_code_of(Cancelled()) is ExitCode.INTERRUPTED
     assert exit_code_of(SceneError("gone")) is ExitCode.FAILED
+
+
+def test_what_a_process_lacks_is_left_once_for_whoever_started_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = tmp_path / "words"
+    assert end_by(UnavailableError("No queue.", "Start it.")) is ExitCode.UNAVAILABLE  # nobody asked for it
+    monkeypatch.setenv(LAST_WORDS_VARIABLE, str(words))
+    assert end_by(InputError("clip", "too long.", "Cut it.")) is ExitCode.BAD_INPUT
+    assert take_last_words(words) is None
+    assert end_by(UnavailableError("No room.", "Make some.")) is ExitCode.UNAVAILABLE
+    left = take_last_words(words)
+    assert left is not None
+    assert (left.problem, left.remedy) == ("No room.", "Make some.")
+    assert take_last_words(words) is None
+    monkeypatch.setenv(LAST_WORDS_VARIABLE, str(tmp_path / "no folder" / "words"))
+    assert end_by(UnavailableError("No disk.", "Mount it.")) is ExitCode.UNAVAILABLE
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "intrasplat: No queue. Start it."
+    assert len(said) == 4
+
+
+@pytest.mark.parametrize("damage", ["", "half a li", "[]", '{"problem": "No room."}'])
+def test_last_words_that_cannot_be_read_are_none(damage: str, tmp_path: Path) -> None:
+    (tmp_path / "words").write_text(damage)
+    assert take_last_words(tmp_path / "words") is None
 
 
 def test_the_progress_line_shows_stage_share_decibels_and_seconds_left() -> None:
