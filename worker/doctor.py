@@ -46,7 +46,7 @@ OPTIONAL_PACKAGES = {
     "fsspec": "only needed for a store in a bucket",
     "s3fs": "only needed for a store in a bucket",
 }
-INSTALL_REMEDY = "run `make setup`, or `pip install intrasplat`"
+INSTALL_REMEDY = "in a checkout, run `make setup`, or `pip install .`"
 
 FIXED_FFMPEG = (8, 1, 2)
 """First FFmpeg without CVE-2026-8461, a write out of bounds in one of its video decoders."""
