@@ -36,8 +36,7 @@ _TRAIN = """
 `python benchmarks/bm_train.py --csv docs/results/train.csv` ([train.csv](train.csv)). Copying is the better of blending
 the neighbouring frames and warping them half-way by optical flow, with the masks respected: a picture without a model.
 With a camera at rest and frames held out one by one (`every8`) copying is hard to beat; it cannot show another pose,
-depth, or what the instrument hides. These rows are of an older `fast`, with half the points and without cycles
-([decision 017](../decisions/017-cycles-averages-and-an-end.md)); the first part of this page has today's. {passing}
+depth, or what the instrument hides. {passing}
 """
 _ABLATION = """
 ## What each part of fast is worth
