@@ -5,8 +5,9 @@ goes on from its last checkpoint at the next start. The queue's server alone sta
 directory takes it over, and ends it when it ends itself.
 
 A child that ends is started again, but for one: what it needs is not there. That would end the next one, too, so it
-ends `up`, with the remedy. Once a child has been sound, what it needed was there and may come back (room on the disk,
-a queue, a device): then it is started again like any other, and the rest keeps working meanwhile.
+ends `up`, with the remedy. A queue or a bucket elsewhere that does not answer is waited for, as it may start later.
+Once a child has been sound, what it needed was there and may come back (room on the disk, a device): then it is started
+again like any other, and the rest keeps working meanwhile.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ class WatchedProcess:
         if now_s - self._started_s > STEADY_S:
             self._was_sound, self._pause_s = True, FIRST_PAUSE_S
         lack = take_last_words(self._last_words)
-        if status == ExitCode.UNAVAILABLE and not self._was_sound:
+        if status == ExitCode.UNAVAILABLE and not self._was_sound and not (lack and lack.may_return):
             if lack is None:
                 problem = f"The {self._name} ended with status {status}: something that it needs is not there."
                 raise UnavailableError(problem, "Its messages are above; try `intrasplat doctor`.")

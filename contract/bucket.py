@@ -145,7 +145,8 @@ def _bucket_errors() -> Iterator[None]:
     except (OSError, botocore.BotoCoreError, botocore.ClientError) as error:
         if isinstance(error, OSError) and error.errno in NO_ROOM:
             raise  # of this machine's disk, where a copy was to be
-        raise UnavailableError(f"The bucket does not answer ({type(error).__name__}).", BUCKET_REMEDY) from error
+        problem = f"The bucket does not answer ({type(error).__name__})."
+        raise UnavailableError(problem, BUCKET_REMEDY, may_return=True) from error
 
 
 class BucketStore(Store):

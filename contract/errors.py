@@ -55,9 +55,11 @@ class UnavailableError(IntrasplatError):
 
     Attributes:
         remedy: one line that mends it.
+        may_return: it may be there again without anything done here, like a queue on another machine that starts later.
     """
 
-    def __init__(self, problem: str, remedy: str) -> None:
+    def __init__(self, problem: str, remedy: str, *, may_return: bool = False) -> None:
         super().__init__(f"{problem} {remedy}")
         self.problem = problem
         self.remedy = remedy
+        self.may_return = may_return

@@ -50,7 +50,8 @@ def end_by(error: IntrasplatError) -> ExitCode:
     path = os.environ.get(LAST_WORDS_VARIABLE)
     if path and isinstance(error, UnavailableError):
         with contextlib.suppress(OSError):  # room on the disk may be what is not there; stderr has it all the same
-            Path(path).write_text(json.dumps({"problem": error.problem, "remedy": error.remedy}))
+            words = {"problem": error.problem, "remedy": error.remedy, "may_return": error.may_return}
+            Path(path).write_text(json.dumps(words))
     return exit_code_of(error)
 
 

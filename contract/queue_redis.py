@@ -335,7 +335,8 @@ def _reachable() -> Iterator[None]:
         raise UnavailableError("The queue refuses this user or password.", "Correct REDIS_URL.") from error
     except (redis.ConnectionError, redis.TimeoutError) as error:
         problem = f"The queue does not answer ({type(error).__name__})."
-        raise UnavailableError(problem, "Start it with `intrasplat up`, or correct REDIS_URL.") from error
+        remedy = "Start it with `intrasplat up`, or correct REDIS_URL."
+        raise UnavailableError(problem, remedy, may_return=True) from error
     except redis.exceptions.OutOfMemoryError as error:
         raise UnavailableError("The queue's memory is full.", "Raise its maxmemory or delete old jobs.") from error
     except redis.ResponseError as error:

@@ -73,6 +73,16 @@ def test_a_child_that_lacks_something_is_not_started_again_and_says_what_it_lack
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_child_whose_queue_does_not_answer_yet_is_started_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    away = LACKS.replace('"Set INTRASPLAT_DEVICE."', '"Start it.", may_return=True')
+    child = child_that_runs(away, tmp_path)
+    watch_until_ended(child)
+    assert "starting it again" in capsys.readouterr().err
+    child.stop()
+
+
 def test_words_that_an_earlier_child_left_are_not_taken_for_those_of_the_next(tmp_path: Path) -> None:
     (tmp_path / "worker.last-words").write_text('{"problem": "There was no queue.", "remedy": "Start one."}')
     with pytest.raises(UnavailableError, match=r"ended with status 5.*messages are above"):
