@@ -44,8 +44,7 @@ _ABLATION = """
 `python benchmarks/bm_ablation.py --iterations 300 --csv docs/results/ablation.csv` ([ablation.csv](ablation.csv)):
 held-out psnr_tissue in dB after the same number of iterations, one part changed at a time. The synthetic clips are
 320x256, where the finest grid has 20 k points, so rows that name fewer points than `fast` equal its own there. More
-points gain where the picture is larger, and cost time and bytes in proportion. Measured before
-[decisions 017 and 018](../decisions/README.md): without averages, and with more bases on the synthetic clips.
+points gain where the picture is larger, and cost time and bytes in proportion. Runs as short as these are one cycle.
 """
 _RASTER = """
 ## Splatting on the CPU
