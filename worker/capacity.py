@@ -85,11 +85,12 @@ def try_bases(tracks: Tracks, clip: DepthClip, train: Sequence[int], most: int |
         return Tried({})
     cap = _cap(len(train), most).count
     numbers = sorted({REST, min(cap, BASES[0]), *(each for each in BASES if each <= cap)})
-    nearer = at_rest.picture_error(numbers[-1]) > trial.picture_error(numbers[-1]) * 10 ** (WORTH_DB / 10)
-    return Tried(
-        {bases: trial.missed(bases) for bases in numbers},
-        {} if nearer else {bases: at_rest.missed(bases) for bases in numbers},
-    )
+    tracked = {bases: trial.missed(bases) for bases in numbers}
+    if len(at_rest.places) < FEWEST_CELLS_TO_TRY:  # tissue that is hardly ever seen alone in place says nothing of rest
+        return Tried(tracked)
+    if at_rest.picture_error(numbers[-1]) > trial.picture_error(numbers[-1]) * 10 ** (WORTH_DB / 10):
+        return Tried(tracked)
+    return Tried(tracked, {bases: at_rest.missed(bases) for bases in numbers})
 
 
 def choose_bases(tried: Tried, floor: float, frames: int, most: int | None = None) -> Choice:

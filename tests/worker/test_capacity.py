@@ -77,6 +77,15 @@ def test_displacements_that_the_pictures_do_not_confirm_ask_for_no_bases() -> No
     assert choose_bases(dataclasses.replace(tried, resting={}), 0.1, len(train)).count > REST
 
 
+def test_tissue_that_is_never_seen_in_place_is_not_said_to_rest() -> None:
+    clip, train, tracks = followed("breathing")
+    tissue = np.zeros_like(clip.tissue)
+    tissue[train[0]] = clip.tissue[train[0]]
+    tried = try_bases(tracks, dataclasses.replace(clip, tissue=tissue), train)
+    assert not tried.resting
+    assert tried.tracked == try_bases(tracks, clip, train).tracked
+
+
 def test_light_that_changes_on_tissue_at_rest_gets_bases() -> None:
     clip, train, _ = followed("still")
     brightness = 1 + 0.3 * np.sin(np.linspace(0, 2 * np.pi, FRAMES))[:, None, None, None]
