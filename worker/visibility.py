@@ -41,7 +41,7 @@ def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
     """
     unseen = np.flatnonzero(~_ever_on_tissue(model, clip, frames))
     widest = _widest(model, unseen, [float(frames.t[index]) for index in spread(frames.indices, SAMPLED_FRAMES)])
-    strays = _not_missed(model, clip, frames, unseen[widest > WIDEST_UNSEEN])
+    strays = _not_missed(model, frames, unseen[widest > WIDEST_UNSEEN])
     if not 0 < len(strays) < model.count:
         return 0
     kept = np.setdiff1d(np.arange(model.count), strays)
@@ -49,38 +49,29 @@ def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
     return len(strays)
 
 
-def _not_missed(model: Model, clip: DepthClip, frames: TrainingFrames, wide: NDArray[np.intp]) -> NDArray[np.intp]:
+def _not_missed(model: Model, frames: TrainingFrames, wide: NDArray[np.intp]) -> NDArray[np.intp]:
     """Those of wide [M] without which every frame looked at stays as good: all, or those found one after the other."""
+    if not len(wide):
+        return wide
     opacity_logit = model.parameters()["opacity_logit"]
     trained = opacity_logit.clone()
-    most = _squared_errors(model, clip, frames) * 10 ** (MISSED_DB / 10) if len(wide) else np.zeros(0)
+    judged = spread(frames.indices, MISSED_IN_FRAMES)
 
-    def without(these: NDArray[np.intp]) -> bool:
-        rows = torch.from_numpy(these).to(trained.device)
+    def scores_db() -> NDArray[np.float64]:
+        renders = ((index, model.render(frames.cameras[index], float(frames.t[index]))) for index in judged)
+        return np.array([frames.psnr_tissue_db(index, image) for index, image in renders])
+
+    def goes(rows: torch.Tensor) -> bool:
         opacity_logit[rows] = HIDDEN_LOGIT
-        if bool((_squared_errors(model, clip, frames) <= most).all()):
-            return True
-        opacity_logit[rows] = trained[rows]
-        return False
+        if (with_all_db - scores_db() > MISSED_DB).any():
+            opacity_logit[rows] = trained[rows]
+            return False
+        return True
 
-    with torch.no_grad():
-        found = (
-            wide
-            if not len(wide) or without(wide)
-            else np.array([each for each in wide if without(each[None])], np.intp)
-        )
-        opacity_logit.copy_(trained)
+    with_all_db, rows = scores_db(), torch.from_numpy(wide)
+    found = wide if goes(rows) else np.array([int(row) for row in rows if goes(row[None])], np.intp)
+    opacity_logit.copy_(trained)
     return found
-
-
-def _squared_errors(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.float64]:
-    """Mean squared error of the tissue, colours in [0, 1], in each of a few training frames."""
-    errors = []
-    for index in spread(frames.indices, MISSED_IN_FRAMES):
-        rgb = model.render(frames.cameras[index], float(frames.t[index]))[:3].transpose(1, 2, 0)
-        off = (rgb - clip.rgb[index] / np.float32(255))[clip.tissue[index]]
-        errors.append(float(np.square(off).mean()) if off.size else 0.0)
-    return np.array(errors)
 
 
 def _ever_on_tissue(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.bool_]:
