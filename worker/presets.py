@@ -5,6 +5,7 @@ A preset is data only; train.py reads it. Rates are in optimiser units (median d
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -13,6 +14,7 @@ from typing import Literal
 from contract.errors import InputError
 from worker.densify import DensifySettings
 from worker.fusion import FusionSettings
+from worker.gaussians import MAX_SH_DEGREE
 from worker.loss import LossSettings
 from worker.optimize import Rate, Rates
 
@@ -41,7 +43,7 @@ class Preset:
     budget_s         seconds of training of a run without either
 
     Raises:
-        ValueError: cycles with densification, worth_db without cycles, or frames_a_step that no device takes.
+        ValueError: cycles with densification, worth_db without cycles, or a number that nothing can be trained with.
     """
 
     name: str
@@ -72,12 +74,28 @@ class Preset:
             raise ValueError("cycles end in an average of models, which are not of one size with densification")
         if self.worth_db is not None and not self.cycles:
             raise ValueError("worth_db compares the ends of cycles, so it needs cycles")
-        if not 1 <= self.frames_a_step <= MOST_FRAMES_A_STEP:
-            raise ValueError(f"frames_a_step is {self.frames_a_step}; 1 to {MOST_FRAMES_A_STEP} can be drawn at once")
+        least_bases = 0 if self.deformation == "hexplane" else 1
+        ranges: tuple[tuple[str, float, float], ...] = (
+            ("bases", least_bases, math.inf),
+            ("most_bases", least_bases, math.inf),
+            ("points_per_image", 1, math.inf),
+            ("frames_a_step", 1, MOST_FRAMES_A_STEP),
+            ("sh_degree", 0, MAX_SH_DEGREE),
+            ("opacity", SMALLEST, 1 - SMALLEST),
+            ("spread", SMALLEST, math.inf),
+            ("start_width", SMALLEST, math.inf),
+        )
+        for name, least, most in ranges:
+            value = getattr(self, name)
+            if value is not None and not least <= value <= most:
+                trainable = f"{least:g} or more" if most == math.inf else f"{least:g} to {most:g}"
+                raise ValueError(f"{name} is {value}, and {trainable} can be trained with")
 
 
 MOST_FRAMES_A_STEP = 16
 """As many as a GPU's kernels draw at once (worker/raster/cuda/bins.py)."""
+SMALLEST = 1e-3
+"""Of an opacity, a spread and a width at the start; an opacity stays as far below 1, for its logit is trained."""
 FEWEST_POINTS, FEW_POINTS, MANY_POINTS = 20_000, 40_000, 80_000
 PAYS_FROM_S = 9.0
 """From this budget on, twice the points are worth the time they take (docs/decisions/015)."""

@@ -49,5 +49,10 @@ def check_options(request: ReconstructionRequest) -> None:
         raise InputError("options.budget_s", f"{budget_s:g} s is no time to train in.", "Give seconds above 0.")
     if iterations is not None and iterations < 1:
         raise InputError("options.iterations", f"{iterations} is less than one step.", "Give 1 or more.")
-    if request.seed < 0:
-        raise InputError("options.seed", f"{request.seed} is negative.", "Give 0 or more.")
+    check_seed(request.seed)
+
+
+def check_seed(seed: int) -> None:
+    """Refuse a seed that no generator takes; InputError names it."""
+    if seed < 0:
+        raise InputError("options.seed", f"{seed} is negative.", "Give 0 or more.")

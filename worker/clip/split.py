@@ -17,6 +17,7 @@ from worker.clip.types import DepthClip
 
 FEWEST_FRAMES = 9  # shorter clips cannot spare a frame
 REPEAT_LEVELS = 0.2  # mean |difference| in 8-bit levels below which two frames are the same picture
+RULES = ("every8", "blocks8", "none")
 _FIELD = "options.holdout"
 _REMEDY = 'Say "every8", "blocks8", "none", or frame numbers like "1,9,17".'
 
@@ -67,6 +68,16 @@ def held_out_frames(frame_count: int, holdout: str) -> list[int]:
     return sorted(wanted) if frame_count >= FEWEST_FRAMES else []
 
 
+def check_holdout(holdout: str) -> None:
+    """Refuse what is neither a rule of split_frames nor a list of frames; whether a clip has those, it cannot know.
+
+    Raises:
+        InputError: names the field.
+    """
+    if holdout not in RULES and not re.fullmatch(r"\s*\d+\s*(,\s*\d+\s*)*", holdout):
+        raise InputError(_FIELD, f"{holdout!r} is not known.", _REMEDY)
+
+
 def find_repeats(rgb: NDArray[np.uint8], train: list[int], held_out: list[int]) -> list[int]:
     """Training frames of rgb [T, H, W, 3] whose mean |difference| to some held-out frame is below REPEAT_LEVELS of 255.
 
@@ -97,14 +108,13 @@ def _column_sums(frame: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 
 def _held_out_by_rule(holdout: str, count: int) -> set[int]:
+    check_holdout(holdout)
     if holdout == "none":
         return set()
     if holdout == "every8":
         return {index for index in range(count) if (index - 1) % 8 == 0}
     if holdout == "blocks8":
         return {index for index in range(8, count - 8) if (index // 8) % 3 == 1}
-    if not re.fullmatch(r"\s*\d+\s*(,\s*\d+\s*)*", holdout):
-        raise InputError(_FIELD, f"{holdout!r} is not known.", _REMEDY)
     wanted = {int(number) for number in holdout.split(",")}
     if max(wanted) >= count:
         raise InputError(_FIELD, f"frame {max(wanted)} is not in a clip of {count} frames.", f"Use 0 to {count - 1}.")

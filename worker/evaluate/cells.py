@@ -7,12 +7,15 @@ that of capacity too, is a list of series.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from contract.errors import InputError
+from worker.clip.split import check_holdout
 from worker.presets import PRESETS, Preset, preset_named
+from worker.request import check_seed
 
 OURS = tuple(name for name in ("instant", "fast", "quality", "small") if name in PRESETS)
 RIVALS = ("paper", "paper-released", "without_mapf", "pfs", "hexplane")
@@ -57,13 +60,19 @@ def plan(
 ) -> list[Cell]:
     """Every combination, clip by clip so that each is opened once; without budgets and iterations as the presets say.
 
+    Cells bear the series' names as _read writes them, so that one series is one row however it was spelt.
+
     Args:
         series: also "ours" and "rivals".
 
     Raises:
-        InputError: a series is not known.
+        InputError: a series is not known, or no reconstruction takes a holdout or a seed.
     """
-    presets = {name: preset_of(name) for each in series for name in SHORTHANDS.get(each, (each,))}
+    for holdout in holdouts:
+        check_holdout(holdout)
+    for seed in seeds:
+        check_seed(seed)
+    presets = dict(_read(name) for each in series for name in SHORTHANDS.get(each, (each,)))
     cells = []
     for clip in clips:
         for holdout in holdouts:
@@ -83,26 +92,9 @@ def preset_of(series: str) -> Preset:
     """The preset that a series names, with its changes made.
 
     Raises:
-        InputError: there is no such preset, no such plain value in it, or it makes no use of one.
+        InputError: there is no such preset, no such plain value in it, it makes no use of one, or none can train so.
     """
-    name, _, changes = series.partition(":")
-    preset = preset_named(name)
-    values: dict[str, Any] = {}
-    for change in filter(None, changes.split(",")):
-        field, _, text = change.partition("=")
-        plain = _plain_fields()
-        if field not in plain:
-            problem = f"{change!r} in {series!r} changes no plain value of a preset."
-            raise InputError("--series", problem, f"Use FIELD=VALUE with one of: {', '.join(plain)}.")
-        if field == "points_per_image" and preset.fusion.mode != "fill":
-            problem = f"{name!r} does not choose how many points an image gives, so {change!r} would change nothing."
-            raise InputError("--series", problem, "Leave it out.")
-        values[field] = _value(series, field, text, getattr(preset, field))
-    try:
-        return dataclasses.replace(preset, **values) if values else preset
-    except ValueError as error:
-        problem = f"{series!r} cannot be trained: {error}."
-        raise InputError("--series", problem, "Change what it needs too, or leave the change out.") from None
+    return _read(series)[1]
 
 
 def base_of(series: str) -> str:
@@ -116,10 +108,37 @@ def capacity_grid(preset: str) -> list[str]:
     return [preset, *fixed]
 
 
+def _read(series: str) -> tuple[str, Preset]:
+    """The one name of a series, its changes in the order of the alphabet, and its preset. Raises as preset_of."""
+    name, _, changes = series.partition(":")
+    preset = preset_named(name)
+    values: dict[str, Any] = {}
+    for change in filter(None, changes.split(",")):
+        field, _, text = change.partition("=")
+        plain = _plain_fields()
+        if field not in plain:
+            problem = f"{change!r} in {series!r} changes no plain value of a preset."
+            raise InputError("--series", problem, f"Use FIELD=VALUE with one of: {', '.join(plain)}.")
+        if field == "points_per_image" and preset.fusion.mode != "fill":
+            problem = f"{name!r} does not choose how many points an image gives, so {change!r} would change nothing."
+            raise InputError("--series", problem, "Leave it out.")
+        values[field] = _value(series, field, text, getattr(preset, field))
+    if not values:
+        return name, preset
+    written = ",".join(f"{field}={str(values[field]).lower()}" for field in sorted(values))
+    try:
+        return f"{name}:{written}", dataclasses.replace(preset, **values)
+    except ValueError as error:
+        problem = f"{series!r} cannot be trained: {error}."
+        raise InputError("--series", problem, "Change what it needs too, or leave the change out.") from None
+
+
 def _plain_fields() -> list[str]:
     """The fields of a preset that are numbers, words or switches in every preset, but for those that a name stands for:
-    the name itself, and whether a budget chooses the points, which nothing does of a changed preset."""
-    names = [each.name for each in dataclasses.fields(Preset) if each.name not in ("name", "points_by_budget")]
+    the name itself, and whether a budget chooses the points, which nothing does of a changed preset. How long a cell
+    trains is its limit and not its series."""
+    others = ("name", "points_by_budget", "iterations", "budget_s")
+    names = [each.name for each in dataclasses.fields(Preset) if each.name not in others]
     return [name for name in names if not any(dataclasses.is_dataclass(getattr(x, name)) for x in PRESETS.values())]
 
 
@@ -134,7 +153,10 @@ def _value(series: str, field: str, text: str, current: object) -> object:
             return {"true": True, "false": False}[text]
         if words:
             return words[words.index(text)]
-        return float(text) if float in (kind, *get_args(kind)) else int(text)
+        value = float(text) if float in (kind, *get_args(kind)) else int(text)
+        if not math.isfinite(value):
+            raise ValueError(text)
+        return value
     except (KeyError, ValueError):
         problem = f"{text!r} in {series!r} is no value in place of {current!r}."
         known = ", ".join(words) or "a number, true, false or, where there need not be any, none"

@@ -10,9 +10,9 @@ from worker.presets import PRESETS
 
 
 def test_a_series_is_a_preset_with_its_changes_made() -> None:
-    changed = preset_of("fast:tracks=false,spread=0.5,start_width=none,bases=9,order=random,budget_s=9")
+    changed = preset_of("fast:tracks=false,spread=0.5,start_width=none,bases=9,order=random")
     assert (changed.tracks, changed.spread, changed.start_width) == (False, 0.5, None)
-    assert (changed.bases, changed.order, changed.budget_s) == (9, "random", 9.0)
+    assert (changed.bases, changed.order) == (9, "random")
     assert not preset_of("fast:cycles=false,worth_db=none").cycles
     assert preset_of("fast:start_width=0.1").start_width == 0.1
     assert preset_of("fast:frames_a_step=2").frames_a_step == 2
@@ -25,7 +25,7 @@ def test_a_series_is_a_preset_with_its_changes_made() -> None:
     [
         "slow", "fast:speed=3", "fast:rates=1", "fast:densify=1", "fast:name=best", "fast:tracks=maybe",
         "fast:bases=few", "fast:bases", "fast:spread=none", "fast:order=sorted", "paper:points_per_image=9000",
-        "fast:points_by_budget=false",
+        "fast:points_by_budget=false", "fast:spread=nan", "fast:iterations=20", "fast:budget_s=9",
     ],
 )  # fmt: skip
 def test_what_no_preset_has_is_refused_with_its_name(series: str) -> None:
@@ -35,8 +35,12 @@ def test_what_no_preset_has_is_refused_with_its_name(series: str) -> None:
 
 @pytest.mark.parametrize(
     "series",
-    ["paper:cycles=true", "paper:worth_db=0.1", "fast:cycles=false", "fast:frames_a_step=0", "fast:frames_a_step=17"],
-)
+    [
+        "paper:cycles=true", "paper:worth_db=0.1", "fast:cycles=false", "fast:frames_a_step=0", "fast:frames_a_step=17",
+        "fast:bases=0", "fast:bases=-1", "hexplane:bases=-1", "fast:most_bases=0", "fast:points_per_image=0",
+        "fast:opacity=1", "fast:spread=0", "paper:start_width=0", "paper:sh_degree=4",
+    ],
+)  # fmt: skip
 def test_changes_that_do_not_go_together_are_refused(series: str) -> None:
     with pytest.raises(InputError, match=series) as refused:
         preset_of(series)
@@ -54,6 +58,27 @@ def test_the_plan_is_every_combination_and_no_two_cells_share_a_key() -> None:
     cells = plan(["a", "b"], ["fast", "paper"], ["every8", "blocks8"], [0, 1, 2], iterations=[10, 20])
     assert len({cell.key for cell in cells}) == len(cells) == 2 * 2 * 2 * 3 * 2
     assert [cell.clip for cell in cells] == sorted(cell.clip for cell in cells), "each clip is opened once"
+
+
+def test_a_series_is_one_row_however_it_is_spelt() -> None:
+    spelt = ["fast:bases=03,spread=0.50", "fast:spread=.5,bases=3", "fast:bases=5,bases=3,spread=0.5", "fast:"]
+    names = [cell.series for cell in plan(["a"], spelt, ["every8"], [0])]
+    assert names == ["fast:bases=3,spread=0.5", "fast"]
+    assert preset_of(names[0]) == preset_of(spelt[0])
+    (free,) = plan(["a"], ["fast:cycles=false,worth_db=none"], ["every8"], [0])
+    assert free.series == "fast:cycles=false,worth_db=none"
+
+
+@pytest.mark.parametrize(("holdouts", "seeds", "field"), [
+    (["every8", "every9"], [0], "options.holdout"), (["1,x"], [0], "options.holdout"),
+    (["every8"], [0, -1], "options.seed"),
+])  # fmt: skip
+def test_what_no_reconstruction_takes_is_refused_before_the_first_cell(
+    holdouts: list[str], seeds: list[int], field: str
+) -> None:
+    with pytest.raises(InputError) as refused:
+        plan(["a"], ["fast"], holdouts, seeds)
+    assert refused.value.field == field
 
 
 def test_the_grid_of_capacities_has_every_pair_beside_the_presets_own_choice() -> None:
