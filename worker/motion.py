@@ -1,8 +1,8 @@
 """Motion known before training: optical flow from the first training frame, lifted to 3D by stereo depth.
 
 Dense flow (DIS) from the reference to every training frame, checked forward against backward, gives each reference
-pixel a track; its displacements and changes of colour are smoothed where they are trusted and fitted by a
-deformation's bases. Held-out frames are never read.
+pixel a track; its displacements and changes of colour are smoothed where they are trusted, guessed from what surrounds
+them where they are not (docs/decisions/024), and fitted by a deformation's bases. Held-out frames are never read.
 
 Symbols: K training frames, h w pixels of the coarse grid on which flow is computed, N points, B bases.
 """
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.clip import DepthClip
-from worker.fusion import unproject
+from worker.fusion import Moved, unproject
 from worker.opencv import cores, one_opencv_thread
 
 Floats = NDArray[np.float32]
@@ -38,6 +38,10 @@ COLOUR_SMOOTH_PX = 2.0
 """The same for changes of colour: light falls in smaller patches than tissue moves."""
 STEADINESS = 0.02
 """Weight of a difference between neighbouring bases against one fully trusted frame; it carries motion across gaps."""
+SURROUNDINGS = 0.1
+"""Weight of the mean of wider surroundings, against 1 of full trust, in an average over SMOOTH_PX."""
+GUESSED = 0.02
+"""Confidence at which a guess from the surroundings counts where the motion starts: as much as steadiness."""
 RIDGE = 1e-3
 """Weight of the basis weights themselves, only to keep the system solvable."""
 CHAINS = 2
@@ -51,8 +55,9 @@ POINTS_AT_ONCE = 4096
 class Tracks:
     """Displacement of reference pixels to every training frame, and how their colour changed on the way.
 
-    displacement_mm [K, h, w, 3]  camera frame of the reference (world), mm; smoothed
-    colour          [K, h, w, 3]  colour there less colour here, RGB in [0, 1]; smoothed
+    displacement_mm [K, h, w, 3]  camera frame of the reference (world), mm; smoothed; where confidence is 0, what the
+                                  surroundings have, near or far
+    colour          [K, h, w, 3]  colour there less colour here, RGB in [0, 1]; likewise
     confidence      [K, h, w]     in [0, 1]; 0 where the track is lost, hidden or without depth
     step_px                       clip pixels between neighbouring cells of the grid
     """
@@ -61,6 +66,11 @@ class Tracks:
     colour: Floats
     confidence: Floats
     step_px: int
+
+    def cells(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Row and column in the coarse grid of the clip's pixels, the nearest of the grid where that ends sooner."""
+        last_row, last_column = self.confidence.shape[1] - 1, self.confidence.shape[2] - 1
+        return np.minimum(rows // self.step_px, last_row), np.minimum(columns // self.step_px, last_column)
 
 
 def track(
@@ -195,10 +205,32 @@ def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats
 
 
 def _averaged(values: Floats, confidence: Floats, over_px: float) -> Floats:
-    """Normalised convolution: a Gaussian mean [h, w, 3] in which only trusted neighbours count."""
-    weight = cv2.GaussianBlur(confidence, (0, 0), over_px)
-    mean = cv2.GaussianBlur(values * confidence[..., None], (0, 0), over_px) / np.maximum(weight, 1e-4)[..., None]
-    return np.asarray(mean, np.float32)
+    """Normalised convolution: a Gaussian mean [h, w, 3] in which only trusted neighbours count, completed from wider
+    and wider surroundings as far as there are none."""
+    weight = np.asarray(cv2.GaussianBlur(confidence, (0, 0), over_px), np.float32)
+    return _completed(cv2.GaussianBlur(values * confidence[..., None], (0, 0), over_px), weight)
+
+
+def _completed(total: Floats, weight: Floats) -> Floats:
+    """total [h, w, 3] by weight [h, w], with the same of a grid half as fine as one more observation (pull-push)."""
+    height, width = weight.shape
+    if min(height, width) < 2:
+        return np.broadcast_to(total.sum((0, 1)) / max(float(weight.sum()), 1e-9), total.shape).astype(np.float32)
+    half = ((width + 1) // 2, (height + 1) // 2)
+    coarse = _completed(*(np.asarray(cv2.resize(x, half, interpolation=cv2.INTER_AREA)) for x in (total, weight)))
+    wider = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray((total + SURROUNDINGS * wider) / (weight + SURROUNDINGS)[..., None], np.float32)
+
+
+def followed(tracks: Tracks, train: Sequence[int], width: int) -> Moved:
+    """The tracks as fusion asks for them; train are the clip's frames that they are of, width the clip's in px."""
+    place_of = {index: place for place, index in enumerate(train)}
+
+    def moved(index: int, pixels: NDArray[np.intp]) -> Floats:
+        found: Floats = tracks.displacement_mm[place_of[index]][tracks.cells(*np.divmod(pixels, width))]
+        return found
+
+    return moved
 
 
 def resting(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> Tracks:
@@ -215,7 +247,13 @@ def resting(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> Tracks:
 
 
 def fit_tracks(
-    tracks: Tracks, basis: NDArray[np.float64], pixels: NDArray[np.intp], width: int, *, share_px: int = 1
+    tracks: Tracks,
+    basis: NDArray[np.float64],
+    pixels: NDArray[np.intp],
+    width: int,
+    *,
+    share_px: int = 1,
+    guessed: float = 0.0,
 ) -> tuple[Floats, Floats]:
     """Weights of the bases for points of the reference frame, by weighted least squares over the training frames.
 
@@ -226,6 +264,7 @@ def fit_tracks(
         pixels: [N] flat pixel indices (row * width + column) of the points in the reference frame.
         width: of the clip, px.
         share_px: points in the same square of this many pixels get the same weights, those of its first pixel.
+        guessed: the least a frame counts, whatever its confidence c_k: what the surroundings do is better than nothing.
 
     Returns:
         weights [N, B, 6], of the displacement in mm and of the colour; support [N], the mean confidence of the
@@ -233,8 +272,7 @@ def fit_tracks(
     """
     rows, columns = (place // share_px * share_px for place in np.divmod(pixels, width))
     shared, member = np.unique(rows * width + columns, return_inverse=True)
-    row = np.minimum(shared // width // tracks.step_px, tracks.confidence.shape[1] - 1)
-    column = np.minimum(shared % width // tracks.step_px, tracks.confidence.shape[2] - 1)
+    row, column = tracks.cells(*np.divmod(shared, width))
     weights = np.zeros((len(shared), basis.shape[1], 6), np.float32)
     support = np.zeros(len(shared), np.float32)
 
@@ -242,7 +280,7 @@ def fit_tracks(
         some = slice(first, first + POINTS_AT_ONCE)
         confidence = tracks.confidence[:, row[some], column[some]]  # [K, points]
         changes = [values[:, row[some], column[some]] for values in (tracks.displacement_mm, tracks.colour)]
-        weights[some] = fit_series(np.concatenate(changes, axis=-1), confidence, basis)
+        weights[some] = fit_series(np.concatenate(changes, axis=-1), np.maximum(confidence, guessed), basis)
         support[some] = confidence.mean(0)
 
     with ThreadPoolExecutor(2) as pool:

@@ -14,7 +14,7 @@ from worker.densify import Densifier
 from worker.fusion import fuse
 from worker.hooks import Hooks, Progress
 from worker.model import Model
-from worker.motion import track
+from worker.motion import followed, track
 from worker.presets import Preset
 from worker.request import ReconstructionRequest
 from worker.schedule import Schedule, left_out
@@ -69,7 +69,8 @@ def prepare(
     report_stage(hooks, "fusion", 0.0)
     preset, chosen = timed(seconds, "capacity_s", lambda: settled(preset, tracks, clip, split.train))
     fusion = fusion_for(preset, clip.intrinsics)
-    cloud = timed(seconds, "fusion_s", lambda: fuse(clip, split.train, fusion, seed=request.seed))
+    moved = followed(tracks, split.train, clip.intrinsics.width) if tracks is not None else None
+    cloud = timed(seconds, "fusion_s", lambda: fuse(clip, split.train, fusion, seed=request.seed, moved=moved))
     report_stage(hooks, "start", 0.0)
     model = timed(
         seconds, "start_s", lambda: start_model(cloud, tracks, clip, split.train, preset, scale, request.seed, device)

@@ -19,7 +19,7 @@ from worker.deformation.base import CHANNELS, MEAN
 from worker.fusion import FusionSettings, PointCloud
 from worker.gaussians import SH_C0, Gaussians, initial_gaussians
 from worker.model import Model
-from worker.motion import Tracks, fit_tracks
+from worker.motion import GUESSED, Tracks, fit_tracks
 from worker.presets import Preset
 
 SHARE_PX = 4
@@ -125,7 +125,8 @@ def _follow_tracks(
     so that they pass through their point and its colour at the time of the frame it was taken from."""
     basis = np.stack([motion.basis(float(clip.t[i])).double().numpy() for i in range(clip.frame_count)])
     pixels = _reference_pixels(cloud, clip, train[0])
-    weights, _ = fit_tracks(tracks, basis[list(train)], pixels, clip.intrinsics.width, share_px=SHARE_PX)
+    width = clip.intrinsics.width
+    weights, _ = fit_tracks(tracks, basis[list(train)], pixels, width, share_px=SHARE_PX, guessed=GUESSED)
     weights *= np.repeat(np.array([scale, 1 / SH_C0], np.float32), 3)
     by_channel = torch.from_numpy(weights).permute(0, 2, 1)
     motion.weight[:, MEAN], motion.weight[:, CHANNELS:] = by_channel[:, :3], by_channel[:, 3:]
@@ -135,9 +136,9 @@ def _follow_tracks(
 
 
 def _reference_pixels(cloud: PointCloud, clip: DepthClip, reference: int) -> NDArray[np.intp]:
-    """[N] flat index of the pixel of the reference frame each point projects into, the nearest one if outside."""
+    """[N] flat index of the pixel of the reference frame each point lay in, the nearest one if outside."""
     pose, k = clip.world_from_camera[reference], clip.intrinsics
-    x, y, z = ((cloud.points_mm - pose[:3, 3]) @ pose[:3, :3]).T
+    x, y, z = ((cloud.reference_mm - pose[:3, 3]) @ pose[:3, :3]).T
     z = np.maximum(z, 1e-6)
     column = np.clip(np.floor(k.fx * x / z + k.cx), 0, k.width - 1)
     row = np.clip(np.floor(k.fy * y / z + k.cy), 0, k.height - 1)

@@ -14,12 +14,14 @@ from worker.clip.types import DepthClip
 from worker.fusion import (
     COMPLETED_CONFIDENCE,
     FusionSettings,
+    Moved,
     PointCloud,
     complete_depth,
     fuse,
     motion_mask,
     unproject,
 )
+from worker.fusion.fill import MARGIN
 
 TRAIN = [0, 2, 3, 4, 5, 6, 7, 8, 10, 11]
 HELD_OUT = [1, 9]
@@ -258,3 +260,88 @@ def test_unprojection_goes_through_pixel_centres() -> None:
 def test_settings_that_mean_nothing_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"must"):
         FusionSettings(**wrong)  # type: ignore[arg-type]
+
+
+STEP_PX = 2
+"""By how much the tissue of drifting_clip moves to the right from frame to frame."""
+
+
+def drifting_clip() -> tuple[DepthClip, NDArray[np.uint8]]:
+    """A plane facing a camera at rest, drifting right under a tool that wanders faster; and its texture, of which frame
+    0 shows the columns from STEP_PX * frames on."""
+    clip = plane_clip()
+    beyond = STEP_PX * clip.frame_count
+    texture = np.random.default_rng(1).integers(60, 200, (HEIGHT, WIDTH + beyond, 3)).astype(np.uint8)
+    clip.depth_mm[:] = 60
+    for index in range(clip.frame_count):
+        left = beyond - STEP_PX * index
+        clip.rgb[index] = np.where(clip.tissue[index][..., None], texture[:, left : left + WIDTH], 230)
+    return clip, texture
+
+
+def drift(clip: DepthClip) -> Moved:
+    """The truth about drifting_clip."""
+
+    def moved(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
+        step_mm = STEP_PX * index * 60 / clip.intrinsics.fx
+        return np.tile(np.array([step_mm, 0, 0], np.float32), (len(pixels), 1))
+
+    return moved
+
+
+def at_first(clip: DepthClip, cloud: PointCloud) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and column of the first frame, or beside it, in which each point's tissue lay then."""
+    x, y, z = cloud.reference_mm.T
+    k = clip.intrinsics
+    row, column = (np.floor(place + 1e-3).astype(np.intp) for place in (k.fy * y / z + k.cy, k.fx * x / z + k.cx))
+    return row, column
+
+
+def test_hidden_tissue_is_taken_from_where_it_has_moved_to() -> None:
+    clip, texture = drifting_clip()
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=1), seed=0, moved=drift(clip))
+    row, column = at_first(clip, cloud)
+    hits = np.zeros((HEIGHT, WIDTH), int)
+    in_view = (column >= 0) & (column < WIDTH)
+    np.add.at(hits, (row[in_view], column[in_view]), 1)
+    assert (hits == 1).all(), "every cell of the first frame once, those under the tool too"
+    expected = texture[row, column + STEP_PX * clip.frame_count] / np.float32(255)
+    np.testing.assert_array_equal(cloud.rgb, expected)
+    hidden = ~clip.tissue[0, row[in_view], column[in_view]]
+    assert (cloud.frame[in_view] > 0).tolist() == hidden.tolist()
+    step_mm = cloud.points_mm - cloud.reference_mm
+    np.testing.assert_allclose(step_mm[:, 0], STEP_PX * cloud.frame * 60 / clip.intrinsics.fx, atol=1e-4)
+
+
+def test_tissue_that_comes_into_view_later_gets_points_beside_the_first_frame() -> None:
+    clip, _ = drifting_clip()
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=1), seed=0, moved=drift(clip))
+    _, column = at_first(clip, cloud)
+    margin = int(WIDTH * MARGIN)
+    assert set(column[column < 0]) == set(range(-margin, 0)), "all that came in from the left, as far as is looked"
+    assert column.max() == WIDTH - 1, "nothing came in from the right"
+
+
+def test_where_nothing_moves_the_first_frame_is_filled_as_without_tracks() -> None:
+    clip = plane_clip()
+    settings = FusionSettings(mode="fill", stride=2)
+
+    def at_rest(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
+        return np.zeros((len(pixels), 3), np.float32)
+
+    bare, followed = (fuse(clip, TRAIN, settings, seed=0, moved=moved) for moved in (None, at_rest))
+    order = [np.lexsort(np.floor(pixels_of(clip, each)).T) for each in (bare, followed)]
+    np.testing.assert_array_equal(bare.frame[order[0]], followed.frame[order[1]])
+    np.testing.assert_array_equal(bare.points_mm[order[0]], followed.points_mm[order[1]])
+
+
+def test_a_moving_camera_still_fills_what_lies_beyond_the_margin() -> None:
+    clip = plane_clip(step_mm=2.0)
+
+    def at_rest(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
+        return np.zeros((len(pixels), 3), np.float32)
+
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=2), seed=0, moved=at_rest)
+    assert pixels_of(clip, cloud, 11)[:, 1].max() > WIDTH - 4
+    tissue_once = np.unique(np.round(cloud.reference_mm / 0.5).astype(int), axis=0)
+    assert len(tissue_once) > 0.95 * len(cloud), "hardly anything twice"

@@ -14,7 +14,7 @@ from contract.errors import Cancelled
 from tests.helpers import assert_close
 from worker.clip import DepthClip
 from worker.deformation import SharedBasis
-from worker.motion import Tracks, cell_means, fit_tracks, track
+from worker.motion import GUESSED, Tracks, cell_means, fit_tracks, track
 from worker.phantom import Motion, PhantomSettings, Trajectories, make_phantom
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 24
@@ -198,6 +198,34 @@ def test_light_that_fades_is_told_from_motion() -> None:
     assert trusted.mean() > 0.5
     assert np.median(np.abs(tracks.colour[-1] - expected)[trusted]) < 0.01
     assert np.median(np.linalg.norm(tracks.displacement_mm[-1], axis=-1)[trusted]) < 0.1
+
+
+def test_what_is_never_seen_moves_like_what_surrounds_it() -> None:
+    clip, truth = phantom("breathing")
+    tracks = tracks_of("breathing")
+    rows, columns = truth.pixels.T
+    hidden = ~on_tissue(clip, truth)
+    moved_mm = (truth.points_mm[TRAIN] - truth.points_mm[0])[:, hidden]
+    off_mm = np.linalg.norm(tracks.displacement_mm[:, rows, columns][:, hidden] - moved_mm, axis=-1)
+    assert hidden.mean() > 0.03
+    assert not tracks.confidence[:, rows, columns][:, hidden].any()
+    assert np.linalg.norm(moved_mm, axis=-1).max() > 3
+    assert np.median(off_mm) < 0.2 * np.median(np.linalg.norm(moved_mm, axis=-1))
+
+
+def test_a_guess_fills_what_no_frame_knows_and_hardly_bends_what_is_known(rng: np.random.Generator) -> None:
+    times = np.linspace(0, 1, 40, endpoint=False)
+    shared = SharedBasis.initial(1, bases=9)
+    basis = np.stack([shared.basis(float(t)).double().numpy() for t in times])
+    drift = np.zeros((40, 2, 3))
+    drift[:, :, 0] = 8 * times[:, None]
+    drift[:, 1, 1] = rng.normal(0, 1, 40)  # the second is known, and some of what it does nobody guesses
+    confidence = np.stack([np.zeros(40), np.ones(40)], axis=1)
+    guessed, support = fit_tracks(bare(drift, confidence), basis, np.arange(2), 2, guessed=GUESSED)
+    known, _ = fit_tracks(bare(drift, confidence), basis, np.arange(2), 2)
+    assert np.abs(basis @ guessed[0, :, 0] - 8 * times).max() < 0.8
+    np.testing.assert_array_equal(guessed[1], known[1])
+    assert support.tolist() == [0.0, 1.0]
 
 
 def test_tracks_nobody_trusts_move_nothing(rng: np.random.Generator) -> None:

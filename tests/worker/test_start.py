@@ -14,7 +14,7 @@ from tests.worker.phantoms import phantom_clip
 from worker.clip import DepthClip
 from worker.fusion import PointCloud, fuse
 from worker.model import Model
-from worker.motion import track
+from worker.motion import followed, track
 from worker.presets import PRESETS, Preset
 from worker.start import MIN_STRIDE, fusion_for, settled, start_model
 from worker.targets import units_per_mm
@@ -31,7 +31,8 @@ def started(clip: DepthClip, preset: Preset, train: list[int] | None = None) -> 
     scale = units_per_mm(clip, frames)
     tracks = track(clip, frames) if preset.tracks and len(frames) > 1 else None
     preset, _ = settled(preset, tracks, clip, frames)
-    cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0)
+    moved = followed(tracks, frames, clip.intrinsics.width) if tracks is not None else None
+    cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0, moved=moved)
     return start_model(cloud, tracks, clip, frames, preset, scale, seed=0), cloud, scale
 
 
@@ -81,6 +82,22 @@ def test_with_tracks_each_gaussian_passes_through_its_point_at_the_time_it_was_s
         moved = np.maximum(moved, np.linalg.norm(placed - model.deformed_mean(0.0).T, axis=1))
     assert len(np.unique(cloud.frame)) > 1
     assert np.linalg.norm(model.deformed_mean(0.4) - model.deformed_mean(0.0), axis=0).mean() / scale > 0.2  # mm
+
+
+def test_what_the_instrument_hides_at_first_moves_like_the_tissue_about_it() -> None:
+    clip = phantom_clip()
+    model, cloud, _ = started(clip, PRESETS["fast"])
+    k, (x, y, z) = clip.intrinsics, cloud.reference_mm.T
+    in_view = (abs(k.fx * x / z) < k.width / 2) & (abs(k.fy * y / z) < k.height / 2)
+    later = (cloud.frame > 0) & in_view
+    at_first, at_end = (model.deformed_mean(t).T for t in (0.0, float(clip.t[-1])))
+    moved = at_end - at_first
+    seen = cloud.frame == 0
+    nearest = np.linalg.norm(at_first[later][:, None] - at_first[seen][None], axis=-1).argmin(axis=1)
+    apart = np.linalg.norm(moved[later] - moved[seen][nearest], axis=1)
+    assert later.sum() > 20
+    assert np.median(np.linalg.norm(moved[seen][nearest], axis=1)) > 1
+    assert np.median(apart) < 0.3 * np.median(np.linalg.norm(moved[later], axis=1))
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 12])

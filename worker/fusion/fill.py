@@ -1,0 +1,173 @@
+"""Points for everything the clip shows: the first frame's tissue, and what an instrument hides there from later frames.
+
+What later frames show is taken from where it has moved to by then, as tracks know or guess it, and keeps its place
+among its neighbours of the first frame (docs/decisions/024).
+
+Symbols: H W pixels (row i, column j), M cells, k stride in pixels. Lengths in mm, points in the world frame.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.camera import Intrinsics
+from worker.clip.types import DepthClip
+from worker.fusion.complete import complete_depth
+from worker.fusion.points import (
+    CLEAR_CONFIDENCE,
+    PointCloud,
+    cells_of,
+    concatenated,
+    is_measured,
+    points_at,
+    same_pose,
+    unproject_at,
+)
+
+Moved = Callable[[int, NDArray[np.intp]], NDArray[np.float32]]
+"""Where what the first frame's pixels (flat, [M]) show has gone in a training frame: displacements [M, 3] mm, world."""
+
+EDGE_PX = 5
+"""Masks and stereo are unsure this near to an instrument: hidden regions are filled from farther away if possible."""
+MARGIN = 0.125
+"""Share of the image's sides by which tissue is looked for beyond the first frame: some comes into view later."""
+HIDDEN, COMPLETED, MEASURED, CLEAR = range(4)
+"""How well a frame shows a place, rising: not, with completed depth, with depth, with confidence and well inside."""
+
+
+def fill(clip: DepthClip, frames: Sequence[int], stride: int, moved: Moved | None) -> PointCloud:
+    """The grid of the first frame's tissue, then each cell that it does not show, from the frame that shows it best,
+    the earliest of those that are alike.
+
+    A cell is k x k pixels, its candidate the pixel in the middle, or the one its tissue has moved to.
+    """
+    first, later = frames[0], frames[1:]
+    coverage = _Coverage(clip.intrinsics, stride)
+    parts = [coverage.add(clip, first, coverage.pixels[clip.tissue[first].reshape(-1)[coverage.pixels]])]
+    if moved is not None:
+        parts += _followed(clip, first, later, stride, moved)
+        coverage.also(parts[1:])
+        later = [index for index in later if not same_pose(clip, index, first)]
+    for least in (CLEAR, MEASURED, COMPLETED):
+        for index in later:
+            pixels = coverage.open_pixels(clip.world_from_camera[index])
+            if pixels.size:
+                pixels = pixels[_shown(clip, index).reshape(-1)[pixels] >= least]
+            if pixels.size:
+                parts.append(coverage.add(clip, index, pixels))
+    return concatenated(parts)
+
+
+def _shown(clip: DepthClip, index: int) -> NDArray[np.uint8]:
+    """[H, W] HIDDEN to CLEAR. Depth can be completed only in a frame that has some."""
+    tissue, measured = clip.tissue[index], is_measured(clip, index)
+    if not measured.any():
+        return np.zeros(tissue.shape, np.uint8)
+    box = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
+    inside = cv2.erode(tissue.view(np.uint8), box).view(np.bool_)
+    clear = inside & measured & (clip.depth_confidence[index] >= CLEAR_CONFIDENCE)
+    return np.asarray(tissue.astype(np.uint8) + measured + clear, np.uint8)
+
+
+def _followed(clip: DepthClip, first: int, later: Sequence[int], stride: int, moved: Moved) -> Iterator[PointCloud]:
+    """Points for the cells that the first frame does not show, each where it has moved to by the time it is seen, so
+    that neighbouring cells get neighbouring tissue whenever that is."""
+    cells = _hidden_cells(clip, first, stride)
+    best = np.zeros(len(cells.pixels), np.uint8)
+    frame, seen_at = np.zeros((2, len(cells.pixels)), np.intp)
+    for index in later:
+        open_ = np.flatnonzero(best < CLEAR)
+        there_mm = cells.world_mm[open_] + moved(index, cells.pixels[open_])
+        pixels, found = cells_of(there_mm, clip.intrinsics, clip.world_from_camera[index], stride=1)
+        shown = _shown(clip, index).reshape(-1)[pixels]
+        better = shown > best[open_[found]]
+        chosen = open_[found[better]]
+        best[chosen], frame[chosen], seen_at[chosen] = shown[better], index, pixels[better]
+    for index in np.unique(frame[best > HIDDEN]):
+        of_frame = np.flatnonzero((frame == index) & (best > HIDDEN))
+        points = points_at(clip, int(index), seen_at[of_frame])
+        yield dataclasses.replace(points, reference_mm=cells.world_mm[of_frame].astype(np.float32))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Cells:
+    """Cells of the first frame, or beside it.
+
+    world_mm  [M, 3]  where the tissue in their middle lies in that frame; its depth is completed from what is seen
+    pixels    [M]     flat index of the middle, of the nearest pixel where that lies beyond the image
+    """
+
+    world_mm: NDArray[np.float64]
+    pixels: NDArray[np.intp]
+
+
+def _hidden_cells(clip: DepthClip, first: int, stride: int) -> _Cells:
+    """The cells that show no tissue in the first frame, and those of MARGIN around it."""
+    k, measured = clip.intrinsics, is_measured(clip, first)
+    sides = (k.height, k.width)
+    beyond = [-(-int(side * MARGIN) // stride) * stride for side in sides]
+    border = [(extra, extra) for extra in beyond]
+    seen = np.pad(measured, border)
+    depth_mm = complete_depth(np.pad(clip.depth_mm[first], border), seen, np.ones_like(seen))
+    middles = [np.arange(stride // 2 - extra, side + extra, stride) for side, extra in zip(sides, beyond, strict=True)]
+    row, column = (each.reshape(-1) for each in np.meshgrid(*middles, indexing="ij"))
+    nearest_row, nearest_column = np.clip(row, 0, k.height - 1), np.clip(column, 0, k.width - 1)
+    in_view = (nearest_row == row) & (nearest_column == column)
+    hidden = ~(in_view & clip.tissue[first][nearest_row, nearest_column])
+    row, column = row[hidden], column[hidden]
+    at_mm = depth_mm[row + beyond[0], column + beyond[1]]
+    world_mm = unproject_at(column + 0.5, row + 0.5, at_mm, k, clip.world_from_camera[first])
+    return _Cells(world_mm, (nearest_row * k.width + nearest_column)[hidden])
+
+
+class _Coverage:
+    """Which cells of a view the points taken so far already cover."""
+
+    def __init__(self, intrinsics: Intrinsics, stride: int) -> None:
+        self._intrinsics, self._stride = intrinsics, stride
+        rows, columns = (np.arange(-(-size // stride)) for size in (intrinsics.height, intrinsics.width))
+        self._shape = (rows.size, columns.size)
+        middle_row = np.minimum(rows * stride + stride // 2, intrinsics.height - 1)
+        middle_column = np.minimum(columns * stride + stride // 2, intrinsics.width - 1)
+        self.pixels: NDArray[np.intp] = (middle_row[:, None] * intrinsics.width + middle_column).reshape(-1)
+        """Flat index of each cell's middle pixel."""
+        self._covered = np.zeros(self.pixels.size, dtype=np.bool_)
+        self._pose: NDArray[np.float64] | None = None
+        self._points_mm: list[NDArray[np.float32]] = []
+
+    def open_pixels(self, world_from_camera: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Middle pixels of the cells that no point covers as seen from this pose."""
+        self._look_from(world_from_camera)
+        return self.pixels[~self._covered]
+
+    def add(self, clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> PointCloud:
+        """The points of these middle pixels of one frame, which cover their cells from now on."""
+        self._look_from(clip.world_from_camera[index])
+        cloud = points_at(clip, index, pixels)
+        rows, columns = np.divmod(pixels, self._intrinsics.width)
+        self._covered[rows // self._stride * self._shape[1] + columns // self._stride] = True
+        self._points_mm.append(cloud.points_mm)
+        return cloud
+
+    def also(self, clouds: Iterable[PointCloud]) -> None:
+        """These points cover what they lie in front of, in the first frame and from any other pose."""
+        self._points_mm += [cloud.reference_mm for cloud in clouds]
+
+    def _look_from(self, world_from_camera: NDArray[np.float64]) -> None:
+        if self._pose is not None and np.array_equal(self._pose, world_from_camera):
+            return
+        self._pose = world_from_camera
+        if not self._points_mm:
+            return
+        points_mm = np.concatenate(self._points_mm)
+        cells, _ = cells_of(points_mm, self._intrinsics, world_from_camera, self._stride)
+        covered = np.zeros(self._shape, dtype=np.uint8)
+        covered.reshape(-1)[cells] = 1
+        # From another pose the grid spreads unevenly: a gap of one cell between points is no hole.
+        closed = cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        self._covered = np.asarray(closed, dtype=np.bool_).reshape(-1)

@@ -1,0 +1,131 @@
+"""Points of a frame, and where they lie in others.
+
+Symbols: H W pixels (row i, column j), M and N points, k stride in pixels. Lengths in mm, points in the world frame.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.camera import Intrinsics
+from worker.clip.types import DepthClip
+from worker.fusion.complete import complete_depth
+
+COMPLETED_CONFIDENCE = 0.1
+"""Confidence of a point whose depth no stereo measured: above 0, since its place in the image is known."""
+CLEAR_CONFIDENCE = 128
+"""Of 255: left-right consistent, or nearly so."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """N points seen by training frames.
+
+    points_mm    [N, 3] float32  world
+    rgb          [N, 3] float32  in [0, 1]
+    confidence   [N]    float32  in [0, 1], of the depth; COMPLETED_CONFIDENCE where no stereo measured it
+    frame        [N]    int32    clip index of the frame each point was taken from
+    reference_mm [N, 3] float32  world: where it lay in the first training frame, as far as known, else points_mm
+    """
+
+    points_mm: NDArray[np.float32]
+    rgb: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    frame: NDArray[np.int32]
+    reference_mm: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.points_mm)
+
+
+def is_measured(clip: DepthClip, index: int) -> NDArray[np.bool_]:
+    """[H, W] tissue with valid depth."""
+    return np.asarray(clip.tissue[index] & (clip.depth_mm[index] > 0))
+
+
+def same_pose(clip: DepthClip, index: int, other: int) -> bool:
+    """Whether the camera looked at both frames from one place."""
+    return np.array_equal(clip.world_from_camera[index], clip.world_from_camera[other])
+
+
+def unproject(
+    pixels: NDArray[np.intp],
+    depth_mm: NDArray[np.float32],
+    intrinsics: Intrinsics,
+    world_from_camera: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """World points [M, 3] in mm of flat pixel indices [M] with their depths [M], through the pixels' centres."""
+    rows, columns = np.divmod(pixels, intrinsics.width)
+    return unproject_at(columns + 0.5, rows + 0.5, depth_mm, intrinsics, world_from_camera)
+
+
+def unproject_at(
+    column: NDArray[np.floating],
+    row: NDArray[np.floating],
+    depth_mm: NDArray[np.float32],
+    intrinsics: Intrinsics,
+    world_from_camera: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """World points [M, 3] in mm of places [M] in the image, or beyond its borders, with their depths [M]."""
+    x = (column - intrinsics.cx) / intrinsics.fx
+    y = (row - intrinsics.cy) / intrinsics.fy
+    camera_mm = np.stack([x, y, np.ones_like(x)], axis=1) * depth_mm[:, None].astype(np.float64)
+    return np.asarray(camera_mm @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])
+
+
+def cells_of(
+    points_mm: NDArray[np.floating], intrinsics: Intrinsics, world_from_camera: NDArray[np.float64], stride: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Flat index of the k x k cell each point projects into, and which points they are (those in the image)."""
+    camera_mm = (points_mm - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    in_front = np.flatnonzero(camera_mm[:, 2] > 0)
+    x, y, z = camera_mm[in_front].T
+    column = np.floor(intrinsics.fx * x / z + intrinsics.cx)
+    row = np.floor(intrinsics.fy * y / z + intrinsics.cy)
+    visible = (column >= 0) & (column < intrinsics.width) & (row >= 0) & (row < intrinsics.height)
+    cells_across = -(-intrinsics.width // stride)
+    cells = row[visible].astype(np.intp) // stride * cells_across + column[visible].astype(np.intp) // stride
+    return cells, in_front[visible]
+
+
+def measured_pixels(clip: DepthClip, index: int) -> NDArray[np.intp]:
+    """Flat indices of the frame's tissue pixels with valid depth."""
+    return np.flatnonzero(is_measured(clip, index))
+
+
+def points_at(clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> PointCloud:
+    """The points of one frame's pixels (flat indices on tissue); depth is completed where it was not measured."""
+    depth_mm = clip.depth_mm[index].reshape(-1)[pixels]
+    measured = depth_mm > 0
+    if not measured.all():
+        completed = complete_depth(clip.depth_mm[index], clip.depth_mm[index] > 0, clip.tissue[index])
+        depth_mm = completed.reshape(-1)[pixels]
+    confidence = clip.depth_confidence[index].reshape(-1)[pixels] / np.float32(255)
+    points_mm = unproject(pixels, depth_mm, clip.intrinsics, clip.world_from_camera[index]).astype(np.float32)
+    return PointCloud(
+        points_mm=points_mm,
+        rgb=clip.rgb[index].reshape(-1, 3)[pixels] / np.float32(255),
+        confidence=np.where(measured, confidence, np.float32(COMPLETED_CONFIDENCE)),
+        frame=np.full(pixels.size, index, dtype=np.int32),
+        reference_mm=points_mm,
+    )
+
+
+def sample(count: int, share: float, random: np.random.Generator) -> NDArray[np.intp]:
+    """A random share of range(count) without repeats, rising; at least one of any."""
+    kept = min(count, max(1, round(share * count)))
+    return np.sort(random.choice(count, kept, replace=False, shuffle=False))
+
+
+def taken(cloud: PointCloud, rows: NDArray[np.intp]) -> PointCloud:
+    return PointCloud(*(getattr(cloud, each.name)[rows] for each in dataclasses.fields(PointCloud)))
+
+
+def concatenated(parts: Sequence[PointCloud]) -> PointCloud:
+    names = [each.name for each in dataclasses.fields(PointCloud)]
+    return PointCloud(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
