@@ -20,6 +20,7 @@ from worker.clip.types import DepthClip
 from worker.fusion.complete import complete_depth
 from worker.fusion.points import (
     CLEAR_CONFIDENCE,
+    COMPLETED_CONFIDENCE,
     PointCloud,
     cells_of,
     concatenated,
@@ -76,22 +77,49 @@ def _shown(clip: DepthClip, index: int) -> NDArray[np.uint8]:
 
 def _followed(clip: DepthClip, first: int, later: Sequence[int], stride: int, moved: Moved) -> Iterator[PointCloud]:
     """Points for the cells that the first frame does not show, each where it has moved to by the time it is seen, so
-    that neighbouring cells get neighbouring tissue whenever that is."""
+    that neighbouring cells get neighbouring tissue whenever that is.
+
+    By a motion that is guessed, some cells never come into sight though others do in their place: those get a colour
+    from there, which is that of tissue near by, and no measured depth.
+    """
     cells = _hidden_cells(clip, first, stride)
-    best = np.zeros(len(cells.pixels), np.uint8)
-    frame, seen_at = np.zeros((2, len(cells.pixels)), np.intp)
+    for index, chosen, pixels in _best_views(clip, later, cells, moved):
+        points = points_at(clip, index, pixels)
+        yield dataclasses.replace(points, reference_mm=cells.world_mm[chosen])
+        cells.open[chosen] = False
+    for index, chosen, pixels in _best_views(clip, later, cells, _at_rest):
+        count, place_mm = len(chosen), cells.world_mm[chosen]
+        yield dataclasses.replace(
+            points_at(clip, index, pixels),
+            points_mm=place_mm,
+            reference_mm=place_mm,
+            frame=np.full(count, first, np.int32),
+            confidence=np.full(count, COMPLETED_CONFIDENCE, np.float32),
+        )
+
+
+def _best_views(
+    clip: DepthClip, later: Sequence[int], cells: _Cells, moved: Moved
+) -> list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]:
+    """Of each open cell that some frame shows, the best view: the frames in order, which cells [M'] and the pixels
+    [M'] that show them."""
+    best = np.where(cells.open, np.uint8(HIDDEN), np.uint8(CLEAR))
+    frame, seen_at = np.full((2, len(best)), -1, np.intp)
     for index in later:
-        open_ = np.flatnonzero(best < CLEAR)
-        there_mm = cells.world_mm[open_] + moved(index, cells.pixels[open_])
+        some = np.flatnonzero(best < CLEAR)
+        there_mm = cells.world_mm[some] + moved(index, cells.pixels[some])
         pixels, found = cells_of(there_mm, clip.intrinsics, clip.world_from_camera[index], stride=1)
         shown = _shown(clip, index).reshape(-1)[pixels]
-        better = shown > best[open_[found]]
-        chosen = open_[found[better]]
+        better = shown > best[some[found]]
+        chosen = some[found[better]]
         best[chosen], frame[chosen], seen_at[chosen] = shown[better], index, pixels[better]
-    for index in np.unique(frame[best > HIDDEN]):
-        of_frame = np.flatnonzero((frame == index) & (best > HIDDEN))
-        points = points_at(clip, int(index), seen_at[of_frame])
-        yield dataclasses.replace(points, reference_mm=cells.world_mm[of_frame].astype(np.float32))
+    found_in = ((int(index), np.flatnonzero(frame == index)) for index in np.unique(frame[frame >= 0]))
+    return [(index, chosen, seen_at[chosen]) for index, chosen in found_in]
+
+
+def _at_rest(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
+    del index
+    return np.zeros((len(pixels), 3), np.float32)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -100,10 +128,12 @@ class _Cells:
 
     world_mm  [M, 3]  where the tissue in their middle lies in that frame; its depth is completed from what is seen
     pixels    [M]     flat index of the middle, of the nearest pixel where that lies beyond the image
+    open      [M]     which have no point yet
     """
 
-    world_mm: NDArray[np.float64]
+    world_mm: NDArray[np.float32]
     pixels: NDArray[np.intp]
+    open: NDArray[np.bool_]
 
 
 def _hidden_cells(clip: DepthClip, first: int, stride: int) -> _Cells:
@@ -122,7 +152,8 @@ def _hidden_cells(clip: DepthClip, first: int, stride: int) -> _Cells:
     row, column = row[hidden], column[hidden]
     at_mm = depth_mm[row + beyond[0], column + beyond[1]]
     world_mm = unproject_at(column + 0.5, row + 0.5, at_mm, k, clip.world_from_camera[first])
-    return _Cells(world_mm, (nearest_row * k.width + nearest_column)[hidden])
+    pixels = (nearest_row * k.width + nearest_column)[hidden]
+    return _Cells(world_mm.astype(np.float32), pixels, np.ones(len(pixels), np.bool_))
 
 
 class _Coverage:
