@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.clip import DepthClip, FrameSplit
+from worker.clip import DepthClip, FrameSplit, spread
 from worker.hooks import Hooks
 from worker.metrics import psnr_tissue
 from worker.model import Model
@@ -37,9 +37,7 @@ class View:
 
 def sample_frames(frames: Sequence[int], count: int = SAMPLED_FRAMES) -> list[int]:
     """At most `count` of the frames, evenly spread, first and last among them."""
-    if len(frames) <= count:
-        return list(frames)
-    return [frames[index] for index in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+    return spread(frames, count)
 
 
 def view_function(run: Run, scale: float, model: Model | None = None) -> Callable[[int], View]:

@@ -1,8 +1,8 @@
 """Motion known before training: optical flow from the first training frame, lifted to 3D by stereo depth.
 
 Dense flow (DIS) from the reference to every training frame, checked forward against backward, gives each reference
-pixel a track; its displacements and changes of colour are smoothed where they are trusted, guessed from what surrounds
-them where they are not (docs/decisions/024), and fitted by a deformation's bases. Held-out frames are never read.
+pixel a track; its displacements and changes of colour are averages of what is trusted about it, the wider the less
+there is (docs/decisions/024), and are fitted by a deformation's bases. Held-out frames are never read.
 
 Symbols: K training frames, h w pixels of the coarse grid on which flow is computed, N points, B bases.
 """
@@ -39,9 +39,9 @@ COLOUR_SMOOTH_PX = 2.0
 STEADINESS = 0.02
 """Weight of a difference between neighbouring bases against one fully trusted frame; it carries motion across gaps."""
 SURROUNDINGS = 0.1
-"""Weight of the mean of wider surroundings, against 1 of full trust, in an average over SMOOTH_PX."""
+"""Weight of the mean of wider surroundings, against 1 of full trust, in an average over the two above."""
 GUESSED = 0.02
-"""Confidence at which a guess from the surroundings counts where the motion starts: as much as steadiness."""
+"""Confidence at which what the surroundings do counts where the motion starts: as much as steadiness."""
 RIDGE = 1e-3
 """Weight of the basis weights themselves, only to keep the system solvable."""
 CHAINS = 2
@@ -55,8 +55,8 @@ POINTS_AT_ONCE = 4096
 class Tracks:
     """Displacement of reference pixels to every training frame, and how their colour changed on the way.
 
-    displacement_mm [K, h, w, 3]  camera frame of the reference (world), mm; smoothed; where confidence is 0, what the
-                                  surroundings have, near or far
+    displacement_mm [K, h, w, 3]  camera frame of the reference (world), mm; averaged over what is trusted
+                                  near by, or farther away where nothing is; 0 in a frame of which nothing is
     colour          [K, h, w, 3]  colour there less colour here, RGB in [0, 1]; likewise
     confidence      [K, h, w]     in [0, 1]; 0 where the track is lost, hidden or without depth
     step_px                       clip pixels between neighbouring cells of the grid
@@ -222,7 +222,7 @@ def _completed(total: Floats, weight: Floats) -> Floats:
     return np.asarray((total + SURROUNDINGS * wider) / (weight + SURROUNDINGS)[..., None], np.float32)
 
 
-def followed(tracks: Tracks, train: Sequence[int], width: int) -> Moved:
+def moved_along(tracks: Tracks, train: Sequence[int], width: int) -> Moved:
     """The tracks as fusion asks for them; train are the clip's frames that they are of, width the clip's in px."""
     place_of = {index: place for place, index in enumerate(train)}
 
@@ -257,14 +257,16 @@ def fit_tracks(
 ) -> tuple[Floats, Floats]:
     """Weights of the bases for points of the reference frame, by weighted least squares over the training frames.
 
-    Minimises sum_k c_k |basis_k . w - d_k|^2 + STEADINESS sum_j |w_{j+1} - w_j|^2 + RIDGE |w|^2 for each point.
+    Minimises sum_k max(c_k, g_k) |basis_k . w - d_k|^2 + STEADINESS sum_j |w_{j+1} - w_j|^2 + RIDGE |w|^2 for each
+    point.
 
     Args:
         basis: [K, B] value of every basis at every training time.
         pixels: [N] flat pixel indices (row * width + column) of the points in the reference frame.
         width: of the clip, px.
         share_px: points in the same square of this many pixels get the same weights, those of its first pixel.
-        guessed: the least a frame counts, whatever its confidence c_k: what the surroundings do is better than nothing.
+        guessed: g_k, the least that counts of a frame as trusted as the most trusted one, for what the surroundings do
+            is better than nothing; of others as much less as they are trusted less.
 
     Returns:
         weights [N, B, 6], of the displacement in mm and of the colour; support [N], the mean confidence of the
@@ -276,11 +278,14 @@ def fit_tracks(
     weights = np.zeros((len(shared), basis.shape[1], 6), np.float32)
     support = np.zeros(len(shared), np.float32)
 
+    trust = tracks.confidence.mean((1, 2))
+    least = guessed * trust / max(float(trust.max()), 1e-9)
+
     def fit(first: int) -> None:
         some = slice(first, first + POINTS_AT_ONCE)
         confidence = tracks.confidence[:, row[some], column[some]]  # [K, points]
         changes = [values[:, row[some], column[some]] for values in (tracks.displacement_mm, tracks.colour)]
-        weights[some] = fit_series(np.concatenate(changes, axis=-1), np.maximum(confidence, guessed), basis)
+        weights[some] = fit_series(np.concatenate(changes, axis=-1), np.maximum(confidence, least[:, None]), basis)
         support[some] = confidence.mean(0)
 
     with ThreadPoolExecutor(2) as pool:

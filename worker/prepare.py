@@ -14,7 +14,7 @@ from worker.densify import Densifier
 from worker.fusion import fuse
 from worker.hooks import Hooks, Progress
 from worker.model import Model
-from worker.motion import followed, track
+from worker.motion import moved_along, track
 from worker.presets import Preset
 from worker.request import ReconstructionRequest
 from worker.schedule import Schedule, left_out
@@ -62,14 +62,14 @@ def prepare(
         report_stage(hooks, "compile", 0.0)
         seconds["compile_s"] = seconds.get("compile_s", 0.0) + clock.pause(lambda: examine(device))
     tracks = None
-    if preset.tracks and len(split.train) > 1:
+    if preset.tracks and preset.deformation == "shared" and len(split.train) > 1:
         tracks = timed(
             seconds, "motion_s", lambda: track(clip, split.train, lambda share: report_stage(hooks, "motion", share))
         )
     report_stage(hooks, "fusion", 0.0)
     preset, chosen = timed(seconds, "capacity_s", lambda: settled(preset, tracks, clip, split.train))
     fusion = fusion_for(preset, clip.intrinsics)
-    moved = followed(tracks, split.train, clip.intrinsics.width) if tracks is not None else None
+    moved = moved_along(tracks, split.train, clip.intrinsics.width) if tracks is not None else None
     cloud = timed(seconds, "fusion_s", lambda: fuse(clip, split.train, fusion, seed=request.seed, moved=moved))
     report_stage(hooks, "start", 0.0)
     model = timed(

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from worker.backend import CPU, Device
 from worker.checkpoint import Scene
-from worker.clip import DepthClip
+from worker.clip import DepthClip, spread
 from worker.compact import STATE, Compact, prepare, round_to
 from worker.deformation import SharedBasis
 from worker.model import Model
 from worker.render import model_of
 from worker.targets import TrainingFrames
-from worker.visibility import spread
 
 TOLERANCE_DB = 0.1
 """psnr_tissue that a stored scene may lose on its training frames; held-out frames lost less (docs/decisions/012)."""

@@ -80,12 +80,16 @@ def start_model(
     """Gaussians at the cloud's points (mm, scaled to optimiser units) with the preset's motion: as the tracks have it
     where the motion is "shared" and there are tracks, else at rest. The preset must be settled."""
     gaussians = initial_gaussians(
-        cloud.points_mm * np.float32(scale),
+        cloud.reference_mm * np.float32(scale),  # widths are by neighbours of one time
         cloud.rgb,
         sh_degree=preset.sh_degree,
         opacity=preset.opacity,
     )
-    gaussians = dataclasses.replace(gaussians, log_scale=gaussians.log_scale + math.log(preset.spread))
+    gaussians = dataclasses.replace(
+        gaussians,
+        mean=torch.from_numpy(cloud.points_mm * np.float32(scale)),
+        log_scale=gaussians.log_scale + math.log(preset.spread),
+    )
     motion = _at_rest(gaussians, preset, [float(clip.t[i]) for i in train], seed)
     if tracks is not None and isinstance(motion, SharedBasis):
         gaussians = _follow_tracks(gaussians, motion, cloud, tracks, clip, train, scale)

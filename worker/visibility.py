@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worker.clip import DepthClip
+from worker.clip import DepthClip, spread
 from worker.fusion import COMPLETED_CONFIDENCE
 from worker.gaussians import Gaussians
 from worker.model import Model
@@ -123,12 +123,6 @@ def _pixels(
     column, row = np.floor(camera[0] * x / z + camera[2]), np.floor(camera[1] * y / z + camera[3])
     inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return inside, row[inside].astype(np.intp), column[inside].astype(np.intp), z[inside]
-
-
-def spread(indices: Sequence[int], count: int) -> list[int]:
-    """At most count of the indices, evenly spread, the first and the last among them."""
-    places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
-    return [indices[place] for place in places]
 
 
 def _camera_points(

@@ -322,26 +322,72 @@ def test_tissue_that_comes_into_view_later_gets_points_beside_the_first_frame() 
     assert column.max() == WIDTH - 1, "nothing came in from the right"
 
 
-def test_where_nothing_moves_the_first_frame_is_filled_as_without_tracks() -> None:
+def at_rest(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
+    return np.zeros((len(pixels), 3), np.float32)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3, 7, 10])
+def test_where_nothing_moves_the_first_frame_is_filled_as_without_tracks(stride: int) -> None:
     clip = plane_clip()
-    settings = FusionSettings(mode="fill", stride=2)
-
-    def at_rest(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
-        return np.zeros((len(pixels), 3), np.float32)
-
+    clip.tissue[0, 30:, 50:] = False  # also at the border, where the last cells may be smaller
+    settings = FusionSettings(mode="fill", stride=stride)
     bare, followed = (fuse(clip, TRAIN, settings, seed=0, moved=moved) for moved in (None, at_rest))
     order = [np.lexsort(np.floor(pixels_of(clip, each)).T) for each in (bare, followed)]
     np.testing.assert_array_equal(bare.frame[order[0]], followed.frame[order[1]])
     np.testing.assert_array_equal(bare.points_mm[order[0]], followed.points_mm[order[1]])
 
 
+def test_what_a_wrong_guess_never_brings_into_sight_gets_a_colour_from_its_place_and_no_depth() -> None:
+    clip = plane_clip()
+    reach_mm = WIDTH * 60 / clip.intrinsics.fx
+
+    def out_of_sight(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
+        return np.tile(np.array([2 * reach_mm, 0, 0], np.float32), (len(pixels), 1))
+
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=1), seed=0, moved=out_of_sight)
+    rows, columns = np.floor(pixels_of(clip, cloud)).astype(int).T
+    hidden = ~clip.tissue[0, rows, columns]
+    assert hidden.sum() == (~clip.tissue[0]).sum(), "every cell that is seen in place at some time, once"
+    assert (cloud.frame == 0).all()
+    assert np.array_equal(cloud.confidence == np.float32(COMPLETED_CONFIDENCE), hidden)
+    np.testing.assert_array_equal(cloud.points_mm, cloud.reference_mm)
+    colours = clip.rgb[:, rows[hidden], columns[hidden]] / np.float32(255)  # [T, M, 3]
+    shown = (np.abs(colours - cloud.rgb[hidden]).max(-1) == 0) & clip.tissue[:, rows[hidden], columns[hidden]]
+    assert shown[TRAIN].any(axis=0).all(), "as some training frame shows it there, on tissue"
+
+
+@pytest.mark.parametrize("step_mm", [0.0, 1.0])
+def test_along_tracks_too_held_out_frames_change_no_bit(step_mm: float) -> None:
+    clip, poisoned = plane_clip(step_mm=step_mm), plane_clip(step_mm=step_mm)
+    for index in HELD_OUT:
+        poisoned.rgb[index] = 0
+        poisoned.depth_mm[index] = np.nan
+        poisoned.tissue[index] = ~poisoned.tissue[index]
+        poisoned.world_from_camera[index] = np.nan
+
+    def moved(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
+        assert index in TRAIN
+        return np.tile(np.array([0.2 * index, 0, 0], np.float32), (len(pixels), 1))
+
+    settings = FusionSettings(mode="fill", stride=2)
+    assert same_bits(*(fuse(each, TRAIN, settings, seed=3, moved=moved) for each in (clip, poisoned)))
+
+
+def test_a_first_frame_without_depth_gives_way_along_tracks_too() -> None:
+    clip = plane_clip()
+    clip.depth_mm[0] = 0
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=2), seed=0, moved=at_rest)
+    assert (cloud.frame == 2).mean() > 0.4
+    x, y, z = cloud.points_mm.T
+    np.testing.assert_allclose(z, 60 + 0.2 * x + 0.1 * y, atol=0.1)
+
+
 def test_a_moving_camera_still_fills_what_lies_beyond_the_margin() -> None:
     clip = plane_clip(step_mm=2.0)
-
-    def at_rest(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
-        return np.zeros((len(pixels), 3), np.float32)
-
     cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=2), seed=0, moved=at_rest)
     assert pixels_of(clip, cloud, 11)[:, 1].max() > WIDTH - 4
-    tissue_once = np.unique(np.round(cloud.reference_mm / 0.5).astype(int), axis=0)
-    assert len(tissue_once) > 0.95 * len(cloud), "hardly anything twice"
+    x, y, z = cloud.points_mm.T
+    np.testing.assert_allclose(z, 60 + 0.2 * x + 0.1 * y, atol=0.1)
+    beside = np.linalg.norm(cloud.points_mm[:, None] - cloud.points_mm[None], axis=-1)
+    np.fill_diagonal(beside, np.inf)
+    assert (beside.min(axis=1) < 0.5 * np.median(beside.min(axis=1))).mean() < 0.05, "hardly anything twice"

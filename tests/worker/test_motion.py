@@ -228,6 +228,17 @@ def test_a_guess_fills_what_no_frame_knows_and_hardly_bends_what_is_known(rng: n
     assert support.tolist() == [0.0, 1.0]
 
 
+def test_a_frame_in_which_nothing_is_trusted_is_no_evidence_of_rest() -> None:
+    times = np.linspace(0, 1, 40, endpoint=False)
+    shared = SharedBasis.initial(1, bases=9)
+    basis = np.stack([shared.basis(float(t)).double().numpy() for t in times])
+    drift, confidence = np.zeros((40, 2, 3)), np.ones((40, 2))
+    drift[:, :, 0] = 8 * times[:, None]
+    drift[12:26], confidence[12:26] = 0, 0  # as frames without depth are followed
+    found, _ = fit_tracks(bare(drift, confidence), basis, np.arange(2), 2, guessed=GUESSED)
+    assert np.abs(basis @ found[0, :, 0] - 8 * times).max() < 0.1
+
+
 def test_tracks_nobody_trusts_move_nothing(rng: np.random.Generator) -> None:
     basis = rng.random((6, 4))
     weights, support = fit_tracks(bare(rng.normal(0, 5, (6, 3, 3)), np.zeros((6, 3))), basis, np.arange(3), 3)

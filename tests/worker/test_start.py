@@ -14,7 +14,7 @@ from tests.worker.phantoms import phantom_clip
 from worker.clip import DepthClip
 from worker.fusion import PointCloud, fuse
 from worker.model import Model
-from worker.motion import followed, track
+from worker.motion import moved_along, track
 from worker.presets import PRESETS, Preset
 from worker.start import MIN_STRIDE, fusion_for, settled, start_model
 from worker.targets import units_per_mm
@@ -31,7 +31,7 @@ def started(clip: DepthClip, preset: Preset, train: list[int] | None = None) -> 
     scale = units_per_mm(clip, frames)
     tracks = track(clip, frames) if preset.tracks and len(frames) > 1 else None
     preset, _ = settled(preset, tracks, clip, frames)
-    moved = followed(tracks, frames, clip.intrinsics.width) if tracks is not None else None
+    moved = moved_along(tracks, frames, clip.intrinsics.width) if tracks is not None else None
     cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0, moved=moved)
     return start_model(cloud, tracks, clip, frames, preset, scale, seed=0), cloud, scale
 
@@ -98,6 +98,16 @@ def test_what_the_instrument_hides_at_first_moves_like_the_tissue_about_it() -> 
     assert later.sum() > 20
     assert np.median(np.linalg.norm(moved[seen][nearest], axis=1)) > 1
     assert np.median(apart) < 0.3 * np.median(np.linalg.norm(moved[later], axis=1))
+
+
+def test_gaussians_start_as_wide_as_their_neighbours_of_the_first_frame_are_apart() -> None:
+    clip = phantom_clip()
+    model, cloud, scale = started(clip, PRESETS["fast"])
+    width_mm = model.export()[0].log_scale.exp().numpy()[:, 0] / PRESETS["fast"].spread / scale
+    apart_mm = np.linalg.norm(cloud.reference_mm[:, None] - cloud.reference_mm[None], axis=-1)
+    nearest_mm = np.sqrt((np.sort(apart_mm, axis=1)[:, 1:4] ** 2).mean(axis=1))
+    assert (cloud.frame > 0).sum() > 50
+    np.testing.assert_allclose(width_mm, nearest_mm, rtol=1e-3)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 12])

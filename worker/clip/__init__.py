@@ -2,7 +2,7 @@
 
 from contract.clip_limits import ClipLimits
 from worker.clip.opening import find_calibration, open_clip
-from worker.clip.split import FrameSplit, held_out_frames, split_frames
+from worker.clip.split import FrameSplit, held_out_frames, split_frames, spread
 from worker.clip.types import DepthClip, StereoClip
 
 __all__ = [
@@ -14,4 +14,5 @@ __all__ = [
     "held_out_frames",
     "open_clip",
     "split_frames",
+    "spread",
 ]

@@ -6,6 +6,7 @@ Symbols: T frames, H W pixels.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -76,6 +77,12 @@ def check_holdout(holdout: str) -> None:
     """
     if holdout not in RULES and not re.fullmatch(r"\s*\d+\s*(,\s*\d+\s*)*", holdout):
         raise InputError(_FIELD, f"{holdout!r} is not known.", _REMEDY)
+
+
+def spread(indices: Sequence[int], count: int) -> list[int]:
+    """At most count of the indices, evenly spread, the first and the last among them."""
+    places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
+    return [indices[place] for place in places]
 
 
 def find_repeats(rgb: NDArray[np.uint8], train: list[int], held_out: list[int]) -> list[int]:

@@ -122,6 +122,8 @@ def _read(series: str) -> tuple[str, Preset]:
         if field == "points_per_image" and preset.fusion.mode != "fill":
             problem = f"{name!r} does not choose how many points an image gives, so {change!r} would change nothing."
             raise InputError("--series", problem, "Leave it out.")
+        if field in values:
+            raise InputError("--series", f"{series!r} gives {field!r} twice.", "Give it once.")
         values[field] = _value(series, field, text, getattr(preset, field))
     if not values:
         return name, preset
@@ -157,7 +159,7 @@ def _value(series: str, field: str, text: str, current: object) -> object:
         if not math.isfinite(value):
             raise ValueError(text)
         return value
-    except (KeyError, ValueError):
+    except (KeyError, ValueError, OverflowError):
         problem = f"{text!r} in {series!r} is no value in place of {current!r}."
         known = ", ".join(words) or "a number, true, false or, where there need not be any, none"
         raise InputError("--series", problem, f"Give {known}.") from None

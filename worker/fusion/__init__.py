@@ -49,7 +49,8 @@ class FusionSettings:
     """How points are chosen.
 
     mode               "paper": MAPF as published; "reference_only": the first training frame alone ("w/o MAPF");
-                       "fill": a grid on the first training frame, then what it does not show from later ones
+                       "fill": a grid on the first training frame, then what it does not show from later
+                       ones, from where tracks say it has moved to
     stride             "fill": pixels between neighbouring points
     motion_percentile  "paper": the threshold tau is this percentile of the nonzero differences on tissue
     frame_share        "paper": share kept of each later frame's points

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.camera import Intrinsics
+from worker.clip.split import spread
 from worker.clip.types import DepthClip
 from worker.fusion.complete import complete_depth
 from worker.fusion.points import (
@@ -35,8 +36,10 @@ Moved = Callable[[int, NDArray[np.intp]], NDArray[np.float32]]
 
 EDGE_PX = 5
 """Masks and stereo are unsure this near to an instrument: hidden regions are filled from farther away if possible."""
-MARGIN = 0.125
+MARGIN = 1 / 16
 """Share of the image's sides by which tissue is looked for beyond the first frame: some comes into view later."""
+MOST_VIEWS = 32
+"""Later frames, evenly spread, in which hidden cells are looked for along the tracks."""
 HIDDEN, COMPLETED, MEASURED, CLEAR = range(4)
 """How well a frame shows a place, rising: not, with completed depth, with depth, with confidence and well inside."""
 
@@ -51,65 +54,72 @@ def fill(clip: DepthClip, frames: Sequence[int], stride: int, moved: Moved | Non
     coverage = _Coverage(clip.intrinsics, stride)
     parts = [coverage.add(clip, first, coverage.pixels[clip.tissue[first].reshape(-1)[coverage.pixels]])]
     if moved is not None:
-        parts += _followed(clip, first, later, stride, moved)
+        parts += _along_tracks(clip, first, later, stride, moved)
         coverage.also(parts[1:])
         later = [index for index in later if not same_pose(clip, index, first)]
     for least in (CLEAR, MEASURED, COMPLETED):
         for index in later:
             pixels = coverage.open_pixels(clip.world_from_camera[index])
             if pixels.size:
-                pixels = pixels[_shown(clip, index).reshape(-1)[pixels] >= least]
+                pixels = pixels[_shown(clip, index, pixels) >= least]
             if pixels.size:
                 parts.append(coverage.add(clip, index, pixels))
     return concatenated(parts)
 
 
-def _shown(clip: DepthClip, index: int) -> NDArray[np.uint8]:
-    """[H, W] HIDDEN to CLEAR. Depth can be completed only in a frame that has some."""
-    tissue, measured = clip.tissue[index], is_measured(clip, index)
-    if not measured.any():
-        return np.zeros(tissue.shape, np.uint8)
+def _shown(clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> NDArray[np.uint8]:
+    """[M] how well a frame shows its pixels (flat, [M]). Depth can be completed only in a frame that has some."""
+    depth_mm, tissue = clip.depth_mm[index], clip.tissue[index]
+    on_tissue = tissue.reshape(-1)[pixels]
+    measured = on_tissue & (depth_mm.reshape(-1)[pixels] > 0)
+    if not (measured.any() or is_measured(clip, index).any()):
+        return np.full(len(pixels), HIDDEN, np.uint8)
     box = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
-    inside = cv2.erode(tissue.view(np.uint8), box).view(np.bool_)
-    clear = inside & measured & (clip.depth_confidence[index] >= CLEAR_CONFIDENCE)
-    return np.asarray(tissue.astype(np.uint8) + measured + clear, np.uint8)
+    inside = cv2.erode(tissue.view(np.uint8), box).view(np.bool_).reshape(-1)[pixels]
+    clear = inside & measured & (clip.depth_confidence[index].reshape(-1)[pixels] >= CLEAR_CONFIDENCE)
+    return np.asarray(on_tissue.astype(np.uint8) + measured + clear, np.uint8)
 
 
-def _followed(clip: DepthClip, first: int, later: Sequence[int], stride: int, moved: Moved) -> Iterator[PointCloud]:
+def _along_tracks(clip: DepthClip, first: int, later: Sequence[int], stride: int, moved: Moved) -> Iterator[PointCloud]:
     """Points for the cells that the first frame does not show, each where it has moved to by the time it is seen, so
     that neighbouring cells get neighbouring tissue whenever that is.
 
-    By a motion that is guessed, some cells never come into sight though others do in their place: those get a colour
-    from there, which is that of tissue near by, and no measured depth.
+    By a motion that is guessed, some cells of the first frame never come into sight though others do in their place:
+    those get a colour from there, which is that of tissue near by, and no measured depth.
     """
     cells = _hidden_cells(clip, first, stride)
-    for index, chosen, pixels in _best_views(clip, later, cells, moved):
+    unseen = cells.in_view.copy()
+    for index, chosen, pixels in _best_views(clip, spread(later, MOST_VIEWS), cells, moved):
         points = points_at(clip, index, pixels)
         yield dataclasses.replace(points, reference_mm=cells.world_mm[chosen])
-        cells.open[chosen] = False
-    for index, chosen, pixels in _best_views(clip, later, cells, _at_rest):
-        count, place_mm = len(chosen), cells.world_mm[chosen]
-        yield dataclasses.replace(
-            points_at(clip, index, pixels),
+        unseen[chosen] = False
+    cells = cells.select(unseen)
+    from_there = [index for index in later if same_pose(clip, index, first)]
+    for index, chosen, pixels in _best_views(clip, from_there, cells, _at_rest):
+        place_mm = cells.world_mm[chosen]
+        yield PointCloud(
             points_mm=place_mm,
+            rgb=clip.rgb[index].reshape(-1, 3)[pixels] / np.float32(255),
+            confidence=np.full(len(chosen), COMPLETED_CONFIDENCE, np.float32),
+            frame=np.full(len(chosen), first, np.int32),
             reference_mm=place_mm,
-            frame=np.full(count, first, np.int32),
-            confidence=np.full(count, COMPLETED_CONFIDENCE, np.float32),
         )
 
 
 def _best_views(
     clip: DepthClip, later: Sequence[int], cells: _Cells, moved: Moved
 ) -> list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]:
-    """Of each open cell that some frame shows, the best view: the frames in order, which cells [M'] and the pixels
+    """Of each cell that some frame shows, the best view: the frames in order, which cells [M'] and the pixels
     [M'] that show them."""
-    best = np.where(cells.open, np.uint8(HIDDEN), np.uint8(CLEAR))
+    best = np.full(len(cells.pixels), HIDDEN, np.uint8)
     frame, seen_at = np.full((2, len(best)), -1, np.intp)
     for index in later:
         some = np.flatnonzero(best < CLEAR)
+        if not some.size:
+            break
         there_mm = cells.world_mm[some] + moved(index, cells.pixels[some])
         pixels, found = cells_of(there_mm, clip.intrinsics, clip.world_from_camera[index], stride=1)
-        shown = _shown(clip, index).reshape(-1)[pixels]
+        shown = _shown(clip, index, pixels)
         better = shown > best[some[found]]
         chosen = some[found[better]]
         best[chosen], frame[chosen], seen_at[chosen] = shown[better], index, pixels[better]
@@ -128,12 +138,16 @@ class _Cells:
 
     world_mm  [M, 3]  where the tissue in their middle lies in that frame; its depth is completed from what is seen
     pixels    [M]     flat index of the middle, of the nearest pixel where that lies beyond the image
-    open      [M]     which have no point yet
+    in_view   [M]     which lie in the image
     """
 
     world_mm: NDArray[np.float32]
     pixels: NDArray[np.intp]
-    open: NDArray[np.bool_]
+    in_view: NDArray[np.bool_]
+
+    def select(self, rows: NDArray[np.bool_]) -> _Cells:
+        """Those of the cells [M]."""
+        return _Cells(self.world_mm[rows], self.pixels[rows], self.in_view[rows])
 
 
 def _hidden_cells(clip: DepthClip, first: int, stride: int) -> _Cells:
@@ -144,7 +158,7 @@ def _hidden_cells(clip: DepthClip, first: int, stride: int) -> _Cells:
     border = [(extra, extra) for extra in beyond]
     seen = np.pad(measured, border)
     depth_mm = complete_depth(np.pad(clip.depth_mm[first], border), seen, np.ones_like(seen))
-    middles = [np.arange(stride // 2 - extra, side + extra, stride) for side, extra in zip(sides, beyond, strict=True)]
+    middles = [_middles(side, extra, stride) for side, extra in zip(sides, beyond, strict=True)]
     row, column = (each.reshape(-1) for each in np.meshgrid(*middles, indexing="ij"))
     nearest_row, nearest_column = np.clip(row, 0, k.height - 1), np.clip(column, 0, k.width - 1)
     in_view = (nearest_row == row) & (nearest_column == column)
@@ -153,7 +167,14 @@ def _hidden_cells(clip: DepthClip, first: int, stride: int) -> _Cells:
     at_mm = depth_mm[row + beyond[0], column + beyond[1]]
     world_mm = unproject_at(column + 0.5, row + 0.5, at_mm, k, clip.world_from_camera[first])
     pixels = (nearest_row * k.width + nearest_column)[hidden]
-    return _Cells(world_mm.astype(np.float32), pixels, np.ones(len(pixels), np.bool_))
+    return _Cells(world_mm.astype(np.float32), pixels, in_view[hidden])
+
+
+def _middles(side: int, beyond: int, stride: int) -> NDArray[np.intp]:
+    """Where the cells' middles lie along one side of the image, and as far beyond its ends."""
+    inside = np.minimum(np.arange(0, side, stride) + stride // 2, side - 1)  # the last cell may be smaller
+    before, behind = (np.arange(start, start + beyond, stride) + stride // 2 for start in (-beyond, side))
+    return np.concatenate([before, inside, behind])
 
 
 class _Coverage:
@@ -161,10 +182,8 @@ class _Coverage:
 
     def __init__(self, intrinsics: Intrinsics, stride: int) -> None:
         self._intrinsics, self._stride = intrinsics, stride
-        rows, columns = (np.arange(-(-size // stride)) for size in (intrinsics.height, intrinsics.width))
-        self._shape = (rows.size, columns.size)
-        middle_row = np.minimum(rows * stride + stride // 2, intrinsics.height - 1)
-        middle_column = np.minimum(columns * stride + stride // 2, intrinsics.width - 1)
+        middle_row, middle_column = (_middles(size, 0, stride) for size in (intrinsics.height, intrinsics.width))
+        self._shape = (middle_row.size, middle_column.size)
         self.pixels: NDArray[np.intp] = (middle_row[:, None] * intrinsics.width + middle_column).reshape(-1)
         """Flat index of each cell's middle pixel."""
         self._covered = np.zeros(self.pixels.size, dtype=np.bool_)

@@ -29,7 +29,7 @@ class PointCloud:
     points_mm    [N, 3] float32  world
     rgb          [N, 3] float32  in [0, 1]
     confidence   [N]    float32  in [0, 1], of the depth; COMPLETED_CONFIDENCE where no stereo measured it
-    frame        [N]    int32    clip index of the frame each point was taken from
+    frame        [N]    int32    clip index of the frame in which each point lay there
     reference_mm [N, 3] float32  world: where it lay in the first training frame, as far as known, else points_mm
     """
 

@@ -26,6 +26,7 @@ def test_a_series_is_a_preset_with_its_changes_made() -> None:
         "slow", "fast:speed=3", "fast:rates=1", "fast:densify=1", "fast:name=best", "fast:tracks=maybe",
         "fast:bases=few", "fast:bases", "fast:spread=none", "fast:order=sorted", "paper:points_per_image=9000",
         "fast:points_by_budget=false", "fast:spread=nan", "fast:iterations=20", "fast:budget_s=9",
+        "fast:bases=3,bases=5", "fast:bases=" + 400 * "9",
     ],
 )  # fmt: skip
 def test_what_no_preset_has_is_refused_with_its_name(series: str) -> None:
@@ -61,7 +62,7 @@ def test_the_plan_is_every_combination_and_no_two_cells_share_a_key() -> None:
 
 
 def test_a_series_is_one_row_however_it_is_spelt() -> None:
-    spelt = ["fast:bases=03,spread=0.50", "fast:spread=.5,bases=3", "fast:bases=5,bases=3,spread=0.5", "fast:"]
+    spelt = ["fast:bases=03,spread=0.50", "fast:spread=.5,bases=3", "fast:"]
     names = [cell.series for cell in plan(["a"], spelt, ["every8"], [0])]
     assert names == ["fast:bases=3,spread=0.5", "fast"]
     assert preset_of(names[0]) == preset_of(spelt[0])
