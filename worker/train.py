@@ -30,7 +30,7 @@ from worker.raster.step import StepSums
 from worker.schedule import Schedule, left_out
 from worker.targets import TrainingFrames
 
-CURVE_SECONDS = (1, 2, 5, 10, 20, 40, 60, 90, 120, 180, 300, 600)
+CURVE_SECONDS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 90, 120, 180, 300, 600)
 """Training times at which held-out frames are scored; the clock stands still meanwhile."""
 CALIBRATION_STEPS = (3, 12)
 """Untimed and timed steps that tell how many fit into a budget; they are taken back. Their median counts: the first
