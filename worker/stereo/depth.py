@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.errors import Cancelled, InputError
+from worker.clip.split import spread
 from worker.clip.types import DepthClip
 from worker.hooks import Hooks, Progress
 from worker.opencv import cores, one_opencv_thread
@@ -128,18 +129,17 @@ def _plan(
 ) -> tuple[RowShift, MatchPlan]:
     """Row shift and disparity range, from a few pairs spread over the measured frames."""
 
-    def spread(count: int) -> list[tuple[Grey, Grey]]:
-        chosen = np.unique(np.linspace(0, len(measured) - 1, count).round().astype(int))
-        return [(_grey(rgb[measured[k]]), right[measured[k]]) for k in chosen]
+    def some_pairs(count: int) -> list[tuple[Grey, Grey]]:
+        return [(_grey(rgb[index]), right[index]) for index in spread(measured, count)]
 
-    features = list(pool.map(find_features, [eye for pair in spread(ALIGNMENT_PAIRS) for eye in pair]))
+    features = list(pool.map(find_features, [eye for pair in some_pairs(ALIGNMENT_PAIRS) for eye in pair]))
     matches = np.concatenate(list(pool.map(match_features, features[::2], features[1::2])))
     shift = measure_row_shift(matches, clip.disparity_offset_px, clip.equal_rows_px)
     agreed = agreed_disparities
     if device == "cuda":
         from worker.stereo.cuda import agreed_disparities as agreed
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
-    pairs = spread(RANGE_PAIRS)
+    pairs = some_pairs(RANGE_PAIRS)
     low, high = choose_range(pairs, shift.correction_px, clip.disparity_offset_px, focal_baseline, agreed)
     return shift, MatchPlan(low, high, shift.correction_px)
 
