@@ -18,16 +18,16 @@ from pathlib import Path
 import numpy as np
 from bm_train import append, commit, machine
 
-from worker.clip import DepthClip, open_clip, split_frames
-from worker.hooks import Hooks
-from worker.looking import held_out_psnr, sample_frames, view_function
-from worker.metrics import psnr_tissue
-from worker.optimize import Rate
+from worker.input.clip import DepthClip, open_clip, split_frames
+from worker.machine.hooks import Hooks
+from worker.model.metrics import psnr_tissue
+from worker.model.optimize import Rate
 from worker.phantom import PhantomSettings, make_phantom
-from worker.prepare import prepare
-from worker.presets import PRESETS, Preset
-from worker.request import ReconstructionRequest
-from worker.train import Stopwatch, train
+from worker.train.looking import held_out_psnr, sample_frames, view_function
+from worker.train.loop import Stopwatch, train
+from worker.train.prepare import prepare
+from worker.train.presets import PRESETS, Preset
+from worker.train.request import ReconstructionRequest
 
 FIELDS = (
     "change", "clip", "holdout", "iterations", "seed", "start_db", "psnr_tissue_db", "train_db", "gaussians", "bases",

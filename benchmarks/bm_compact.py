@@ -16,17 +16,17 @@ from pathlib import Path
 
 from bm_train import append
 
-from worker.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
-from worker.clip import DepthClip, open_clip, split_frames
 from worker.evaluate.rows import commit, machine
-from worker.hooks import Hooks
-from worker.looking import held_out_psnr, view_function
+from worker.input.clip import DepthClip, open_clip, split_frames
+from worker.machine.hooks import Hooks
 from worker.pipeline import scene_of
-from worker.prepare import prepare
-from worker.presets import PRESETS
-from worker.request import ReconstructionRequest
-from worker.shrink import model_of, shrink
-from worker.train import Stopwatch, train
+from worker.render.shrink import model_of, shrink
+from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
+from worker.train.looking import held_out_psnr, view_function
+from worker.train.loop import Stopwatch, train
+from worker.train.prepare import prepare
+from worker.train.presets import PRESETS
+from worker.train.request import ReconstructionRequest
 
 FIELDS = (
     "clip", "iterations", "gaussians", "bases", "held_out_db", "tolerance_db", "step", "train_loss_db",

@@ -19,8 +19,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from worker.clip import StereoClip, open_clip
-from worker.decode import decode_clip
+from worker.input.clip import StereoClip, open_clip
+from worker.input.decode import decode_clip
 
 
 def main() -> None:

@@ -33,12 +33,11 @@ from bm_train import commit
 from numba import njit
 from numpy.typing import NDArray
 
-from worker.checkpoint import load_scene
-from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
 from worker.evaluate.rows import write_rows
-from worker.gaussians import Gaussians
-from worker.loss import LossSettings
-from worker.optimize import StepRates
+from worker.model.deformation import Deformation, FlexibleDeformation, SharedBasis
+from worker.model.gaussians import Gaussians
+from worker.model.loss import LossSettings
+from worker.model.optimize import StepRates
 from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera
 from worker.raster.cpu import Rasterizer, compile_kernels
 from worker.raster.cpu.model import FusedModel
@@ -48,6 +47,7 @@ from worker.raster.cpu.simd import fma, lane_sum, load, splat
 from worker.raster.cpu.threads import run, thread_count
 from worker.raster.cpu.vectors import LANES
 from worker.raster.step import Target, TrainingFrame, camera_vector
+from worker.scene.checkpoint import load_scene
 
 WIDTH, HEIGHT, GRID_STEP_PX = 640, 512, 2.86
 SPREAD, OPACITY, DEPTH = 0.6, 0.88, 60.0

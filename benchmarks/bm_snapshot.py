@@ -21,22 +21,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 
-from contract.rendering import ImageFormat, RenderRequest
-from contract.store import Store
-from worker.checkpoint import Scene
-from worker.clip import DepthClip, split_frames
-from worker.hooks import Hooks
-from worker.pace import Pace
+from contract.store.store import Store
+from contract.wire.rendering import ImageFormat, RenderRequest
+from worker.daemon.pace import Pace
+from worker.daemon.serve import NotYetError
+from worker.daemon.snapshot import Snapshots
+from worker.daemon.views import Views
+from worker.input.clip import DepthClip, split_frames
+from worker.machine.hooks import Hooks
 from worker.phantom import PhantomSettings, make_phantom
 from worker.pipeline import snapshot_of
-from worker.prepare import prepare
-from worker.presets import PRESETS
 from worker.raster.cpu import compile_kernels
-from worker.request import ReconstructionRequest
-from worker.serve import NotYetError
-from worker.snapshot import Snapshots
-from worker.train import Stopwatch, train
-from worker.views import Views
+from worker.scene.checkpoint import Scene
+from worker.train.loop import Stopwatch, train
+from worker.train.prepare import prepare
+from worker.train.presets import PRESETS
+from worker.train.request import ReconstructionRequest
 
 CLIP = PhantomSettings(width=640, height=512, frames=24)
 JOB = "0" * 32

@@ -33,8 +33,8 @@ from bm_train import commit, machine
 from client.api import Client
 from client.demo import started_service
 from client.errors import Conflict
-from contract.errors import IntrasplatError
-from contract.job import JobState
+from contract.wire.errors import IntrasplatError
+from contract.wire.job import JobState
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 16
 ROUND_ITERATIONS = 100

@@ -23,9 +23,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.calibration import RectifiedClip, load_calibration, rectify
-from worker.clip import DepthClip, StereoClip, open_clip
 from worker.evaluate.rows import commit
+from worker.input.calibration import RectifiedClip, load_calibration, rectify
+from worker.input.clip import DepthClip, StereoClip, open_clip
 from worker.phantom import PhantomSettings, make_phantom
 from worker.stereo import estimate_depth
 from worker.stereo.alignment import RowShift, find_features, match_features, measure_row_shift

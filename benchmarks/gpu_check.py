@@ -30,12 +30,14 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE.parent / "docs" / "results"
 UNAVAILABLE = 5
-"""As contract/exits.py has it."""
+"""As contract/runtime/exits.py has it."""
 CLIP_HAS = ("images", "depth", "poses_bounds.npy")
 """In the folder of a recording in the EndoNeRF layout."""
 GRACE_S = 5.0
 """After its deadline a part may write what it holds; then it is killed."""
-LOOK = "import json; from worker.gpu import find_gpu; gpu = find_gpu(); print(json.dumps([gpu.missing, gpu.remedy]))"
+LOOK = (
+    "import json, worker.machine.gpu; gpu = worker.machine.gpu.find_gpu(); print(json.dumps([gpu.missing, gpu.remedy]))"
+)
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,9 @@ from torch import Tensor
 
 from tests.worker.raster.interpreter import hasten
 from tests.worker.raster.scenes import Scene, pixels_near_a_cut, random_scene
-from worker.deformation import Deformation, SharedBasis
-from worker.gaussians import Gaussians
-from worker.optimize import StepRates
+from worker.model.deformation import Deformation, SharedBasis
+from worker.model.gaussians import Gaussians
+from worker.model.optimize import StepRates
 from worker.raster import reference
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cuda import rasterize

@@ -28,11 +28,10 @@ from gpu_counts import Counts, count
 from gpu_work import H200, PARTS, Floor, Sizes, bytes_by_kernel, floor_of, picture_bytes_by_kernel, torch_launches
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from worker.checkpoint import load_scene
-from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
 from worker.evaluate.rows import commit, machine, write_rows
-from worker.gaussians import Gaussians
-from worker.loss import LossSettings
+from worker.model.deformation import Deformation, FlexibleDeformation, SharedBasis
+from worker.model.gaussians import Gaussians
+from worker.model.loss import LossSettings
 from worker.raster.cpu import padded
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.motion import NEGLIGIBLE
@@ -41,7 +40,8 @@ from worker.raster.cuda.blend import CHUNK, WARPS
 from worker.raster.cuda.model import CudaModel
 from worker.raster.cuda.rasterizer import CudaRasterizer
 from worker.raster.step import Target, TrainingFrame, camera_vector
-from worker.targets import camera_in_units
+from worker.scene.checkpoint import load_scene
+from worker.train.targets import camera_in_units
 
 SHAPES = ((8, 4, 16, 1), (8, 8, 16, 1), (8, 8, 16, 2), (8, 8, 32, 1), (16, 8, 16, 2), (16, 8, 16, 4), (16, 16, 16, 8))
 """Tiles that are compared: width, height, splats a chunk, warps."""

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from gpu_rows import CLIP, CLIP_READY, KERNELS_READY, Part
 
-from contract.camera import Intrinsics
-from contract.errors import InputError
-from worker.clip import DepthClip, open_clip
+from contract.wire.errors import InputError
+from worker.input.camera import Intrinsics
+from worker.input.clip import DepthClip, open_clip
 from worker.phantom import PhantomSettings, make_phantom
 from worker.raster.cpu import compile_kernels
 

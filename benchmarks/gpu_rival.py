@@ -16,7 +16,7 @@ from bm_raster import GRID_STEP_PX, HEIGHT, WIDTH, grid_scene
 from gpu_rows import Part, wall_ms
 from torch import Tensor
 
-from worker.gaussians import SH_C0
+from worker.model.gaussians import SH_C0
 from worker.raster import Camera
 from worker.raster.cuda import rasterize
 

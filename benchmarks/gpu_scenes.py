@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.worker.raster.scenes import Scene, pixels_near_a_cut
-from worker.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
-from worker.loss import LossSettings, training_loss
+from worker.model.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.model.loss import LossSettings, training_loss
 from worker.raster import reference
 from worker.raster.cpu import padded
 from worker.raster.cuda.rasterizer import CudaRasterizer

@@ -27,8 +27,8 @@ from gpu_scenes import stereo_pairs
 from gpu_work import Sizes, bytes_by_kernel
 from torch.profiler import ProfilerActivity, profile
 
-from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
-from worker.loss import LossSettings
+from worker.model.deformation import Deformation, FlexibleDeformation, SharedBasis
+from worker.model.loss import LossSettings
 from worker.raster.cpu import padded
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.motion import NEGLIGIBLE

@@ -20,16 +20,16 @@ import numpy as np
 from gpu_prepare import load_clip
 from gpu_rows import CLIP, CLIP_READY, KERNELS_READY, Part
 
-from contract.errors import Cancelled
-from worker import train as training
-from worker.backend import CPU, Device
-from worker.clip import DepthClip, split_frames
-from worker.hooks import Hooks
-from worker.looking import held_out_psnr, view_function
-from worker.prepare import prepare
-from worker.presets import PRESETS, Preset
-from worker.request import ReconstructionRequest
-from worker.train import CurvePoint, Run, Stopwatch, train
+from contract.wire.errors import Cancelled
+from worker.input.clip import DepthClip, split_frames
+from worker.machine.hooks import Hooks
+from worker.raster.backend import CPU, Device
+from worker.train import loop as training
+from worker.train.looking import held_out_psnr, view_function
+from worker.train.loop import CurvePoint, Run, Stopwatch, train
+from worker.train.prepare import prepare
+from worker.train.presets import PRESETS, Preset
+from worker.train.request import ReconstructionRequest
 
 STAGES = ("motion_s", "capacity_s", "fusion_s", "start_s", "targets_s", "optimise_s", "compile_s")
 THRESHOLDS_DB = {"s_to_paper_less_4_db": -4, "s_to_paper_less_2_db": -2, "s_to_paper_db": 0, "s_to_paper_plus_2_db": 2}

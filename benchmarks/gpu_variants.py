@@ -16,7 +16,7 @@ from gpu_estimate import SHAPES
 from gpu_rows import Part, device_ms
 from gpu_speed import CAMERAS, Speed
 
-from worker.loss import LossSettings
+from worker.model.loss import LossSettings
 from worker.raster.cuda.blend import blend
 
 FIELDS = ("tile", "chunk", "warps", "worst", "ok", "step_ms", "instances", "registers", "spilled_bytes", "note")

@@ -21,7 +21,7 @@ from client.submission import OnUpload, prepare
 from client.viewer import Talk, Viewer
 from client.views import Image, view_query
 from client.watching import has_events, settled
-from contract.job import JobState, JobView
+from contract.wire.job import JobState, JobView
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 from client import submission, views, watching
 from client.steps import Call, Steps, answered
-from contract.job import JobState, JobView
+from contract.wire.job import JobState, JobView
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from pydantic import ValidationError
 
 from client.keys import add_keys
 from client.remote import add_remote, in_commands
-from contract.arguments import Commands, add_command, count
-from contract.errors import InputError, IntrasplatError
-from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.settings import Settings, default_data_dir
+from contract.runtime.arguments import Commands, add_command, count
+from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
+from contract.runtime.settings import Settings, default_data_dir
+from contract.wire.errors import InputError, IntrasplatError
 
 LOCAL_COMMANDS = {
     "reconstruct": "train a scene from a clip, on this machine",

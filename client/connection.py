@@ -8,7 +8,7 @@ import httpx
 
 from client.errors import UNAVAILABLE_REMEDY, Unreachable
 from client.steps import Call
-from contract.errors import InputError
+from contract.wire.errors import InputError
 
 DEFAULT_URL = "http://127.0.0.1:8765"
 

@@ -19,10 +19,10 @@ from typing import Any, NoReturn
 from client.api import Client
 from client.pictures import Panel, draw_curve, draw_sheet, draw_strip
 from client.remote import progress_of
-from contract.errors import IntrasplatError, UnavailableError
-from contract.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.job import JobState, JobView
-from contract.progress_bar import ProgressBar
+from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
+from contract.runtime.progress_bar import ProgressBar
+from contract.wire.errors import IntrasplatError, UnavailableError
+from contract.wire.job import JobState, JobView
 
 FRAMES = 48
 WIDTH, HEIGHT = 480, 384

@@ -1,6 +1,6 @@
 """What can go wrong between a caller and a service.
 
-IntrasplatError (contract/errors.py)
+IntrasplatError (contract/wire/errors.py)
 ├── InputError
 │   ├── RequestRefused          the service refused the request (4xx, 507)
 │   │   ├── Unauthorized        401: a key is needed, or this one is not known
@@ -28,8 +28,8 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any
 
-from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableError
-from contract.job import JobView
+from contract.wire.errors import Cancelled, InputError, IntrasplatError, UnavailableError
+from contract.wire.job import JobView
 
 UNAVAILABLE_REMEDY = "Start one with `intrasplat up`, or correct the address."
 

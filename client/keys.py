@@ -1,7 +1,7 @@
 """`intrasplat keys`: make, list and revoke the API keys of an installation, in its data directory.
 
-The commands work on the file that the services read (contract/keys.py), so whoever may use them is whoever may read the
-clips anyway; run them as the user that runs the service.
+The commands work on the file that the services read (contract/access/keys.py), so whoever may use them is whoever may
+read the clips anyway; run them as the user that runs the service.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-from contract.arguments import Commands, add_command
-from contract.audit import AuditAction, AuditEntry, AuditLog, utc_now
-from contract.errors import InputError
-from contract.exits import ExitCode
-from contract.keys import DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope
-from contract.settings import Settings
+from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now
+from contract.access.keys import DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope
+from contract.runtime.arguments import Commands, add_command
+from contract.runtime.exits import ExitCode
+from contract.runtime.settings import Settings
+from contract.wire.errors import InputError
 
 
 def add_keys(commands: Commands) -> None:

@@ -12,12 +12,12 @@ from typing import get_args
 
 from client.api import Client
 from client.connection import DEFAULT_URL
-from contract.arguments import Commands, add_command, finite, positive
-from contract.errors import InputError
-from contract.exits import ExitCode
-from contract.job import JobProgress, JobState, JobView, Priority
-from contract.names import Layout, MaskPolarity, PoseConvention, PresetName
-from contract.progress_bar import ProgressBar
+from contract.runtime.arguments import Commands, add_command, finite, positive
+from contract.runtime.exits import ExitCode
+from contract.runtime.progress_bar import ProgressBar
+from contract.wire.errors import InputError
+from contract.wire.job import JobProgress, JobState, JobView, Priority
+from contract.wire.names import Layout, MaskPolarity, PoseConvention, PresetName
 
 URL_VARIABLE = "INTRASPLAT_URL"
 KEY_VARIABLE = "INTRASPLAT_API_KEY"

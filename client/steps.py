@@ -20,8 +20,8 @@ from typing import Any, Generic, TypeAlias, TypeVar
 import httpx
 
 from client.errors import Refusal, ServiceFault, ServiceUnavailable, Unreachable, error_of_answer
-from contract.errors import IntrasplatError
-from contract.job import JobView
+from contract.wire.errors import IntrasplatError
+from contract.wire.job import JobView
 
 DEFAULT_PATIENCE_S = 30.0
 FIRST_PAUSE_S = 0.25

@@ -19,8 +19,8 @@ import httpx
 
 from client.errors import NotFound, ServiceUnavailable, Unreachable
 from client.steps import Body, Call, Patience, Steps, answered, error_of
-from contract.errors import InputError, IntrasplatError
-from contract.job import JobView, parse_options
+from contract.wire.errors import InputError, IntrasplatError
+from contract.wire.job import JobView, parse_options
 
 IN_PIECES_FROM_BYTES = 64 * 2**20
 """A connection that is lost in a smaller upload costs seconds; a larger one goes on where it was."""

@@ -21,14 +21,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from client.api import Client
-from contract.embedded import EmbeddedServer
-from contract.errors import UnavailableError
-from contract.exits import LAST_WORDS_VARIABLE, ExitCode, take_last_words
-from contract.keys import check_keys
-from contract.locks import FolderLock
-from contract.processes import die_with_parent, end_process, told_to_end
-from contract.settings import Settings
-from contract.store import Store
+from contract.access.keys import check_keys
+from contract.queue.embedded import EmbeddedServer
+from contract.runtime.exits import LAST_WORDS_VARIABLE, ExitCode, take_last_words
+from contract.runtime.locks import FolderLock
+from contract.runtime.processes import die_with_parent, end_process, told_to_end
+from contract.runtime.settings import Settings
+from contract.store.store import Store
+from contract.wire.errors import UnavailableError
 
 DASHBOARD = Path(__file__).resolve().parent / "dashboard"
 WATCH_PERIOD_S = 0.2
@@ -47,7 +47,7 @@ EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 class WatchedProcess:
     """A child that is started again when it ends by itself, after pauses that double.
 
-    In the folder it leaves what it lacks, if that is why it ends (contract/exits.py).
+    In the folder it leaves what it lacks, if that is why it ends (contract/runtime/exits.py).
     """
 
     def __init__(self, name: str, command: list[str], environment: dict[str, str], folder: Path) -> None:

@@ -11,7 +11,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from client.connection import ANSWER_TIMEOUT_S, CONNECT_TIMEOUT_S, authorization
 from client.errors import Unreachable, error_of_answer
 from client.views import Image, image_of_message, view_query
-from contract.errors import IntrasplatError
+from contract.wire.errors import IntrasplatError
 
 if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection as AsyncConnection

@@ -12,7 +12,7 @@ import httpx
 
 from client.errors import Refusal, ServiceFault, error_of_document
 from client.steps import Call, Steps, answered
-from contract.errors import InputError, IntrasplatError
+from contract.wire.errors import InputError, IntrasplatError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

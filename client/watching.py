@@ -8,7 +8,7 @@ import httpx
 
 from client.errors import JobCancelled, JobFailed, JobRejected, ServiceUnavailable, Unreachable
 from client.steps import Call, Listen, NextLine, Patience, Pause, Show, Steps, answered, error_of
-from contract.job import TERMINAL_STATES, JobState, JobView
+from contract.wire.job import TERMINAL_STATES, JobState, JobView
 
 POLL_S = 1.0
 RECONNECT_S = 0.5

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 import urllib.request
 
-from contract.errors import UnavailableError
-from contract.queue_redis import RedisQueue
-from contract.settings import Settings
+from contract.queue.redis_queue import RedisQueue
+from contract.runtime.settings import Settings
+from contract.wire.errors import UnavailableError
 
 TIMEOUT_S = 3.0
 

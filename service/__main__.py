@@ -1,4 +1,4 @@
-"""`python -m service`: the HTTP service, with its settings from the environment (contract/settings.py)."""
+"""`python -m service`: the HTTP service, with its settings from the environment (contract/runtime/settings.py)."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import contextlib
 import logging
 import sys
 
-from contract.errors import IntrasplatError, UnavailableError
-from contract.exits import ExitCode, end_by
-from contract.keys import check_keys
-from contract.logs import configure
-from contract.queue_redis import RedisQueue
-from contract.settings import Settings
-from contract.store import open_store
+from contract.access.keys import check_keys
+from contract.queue.redis_queue import RedisQueue
+from contract.runtime.exits import ExitCode, end_by
+from contract.runtime.logs import configure
+from contract.runtime.settings import Settings
+from contract.store.store import open_store
+from contract.wire.errors import IntrasplatError, UnavailableError
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server

@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from contract.job import LOCAL_TENANT, JobRecord
-from contract.keys import ApiKey, KeyFile, KeyScope
-from contract.settings import LOOPBACK_NAMES, Settings
+from contract.access.keys import ApiKey, KeyFile, KeyScope
+from contract.runtime.settings import LOOPBACK_NAMES, Settings
+from contract.wire.job import LOCAL_TENANT, JobRecord
 from service.limits import Limiter
 from service.problems import Problem
 

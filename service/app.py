@@ -10,9 +10,9 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 
-from contract.queue import Queue
-from contract.settings import LOOPBACK_NAMES, Settings
-from contract.store import Store
+from contract.queue.promise import Queue
+from contract.runtime.settings import LOOPBACK_NAMES, Settings
+from contract.store.store import Store
 from service import jobs, reconstruct, renders, scenes, stream, system, tus
 from service.audit import install_refusal_handler
 from service.deps import Deps

@@ -1,4 +1,4 @@
-"""What the service records of its callers (contract/audit.py); the calls block for one write to disk."""
+"""What the service records of its callers (contract/access/audit.py); the calls block for one write to disk."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
-from contract.audit import AuditAction, AuditEntry, AuditLog, utc_now
-from contract.errors import UnavailableError
-from contract.logs import current_request_id
+from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now
+from contract.runtime.logs import current_request_id
+from contract.wire.errors import UnavailableError
 from service.access import Caller, Refusal
 from service.problems import Problem
 

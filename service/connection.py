@@ -15,9 +15,9 @@ import zmq.asyncio
 from pydantic import ValidationError
 from zmq.utils.monitor import parse_monitor_message
 
-from contract.curve import service_keys, worker_keys
-from contract.errors import UnavailableError
-from contract.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
+from contract.access.curve import service_keys, worker_keys
+from contract.wire.errors import UnavailableError
+from contract.wire.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
 
 CONNECT_TIMEOUT_S = 2.0
 """A worker that listens is connected to in milliseconds; one that has just died is tried for no longer than this."""

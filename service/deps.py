@@ -14,11 +14,11 @@ from typing import Annotated
 from fastapi import Depends, Query
 from starlette.requests import HTTPConnection
 
-from contract.audit import AuditLog
-from contract.job import JobRecord
-from contract.queue import LISTING_LIMIT, Queue
-from contract.settings import Settings
-from contract.store import Store, is_job_id
+from contract.access.audit import AuditLog
+from contract.queue.promise import LISTING_LIMIT, Queue
+from contract.runtime.settings import Settings
+from contract.store.store import Store, is_job_id
+from contract.wire.job import JobRecord
 from service.access import Access, Caller, Refusal, key_missing
 from service.audit import Audit
 from service.done import DoneJobs

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 
-from contract.job import JobRecord, JobState
-from contract.queue import Queue
-from contract.store import Store
+from contract.queue.promise import Queue
+from contract.store.store import Store
+from contract.wire.job import JobRecord, JobState
 
 REMEMBERED = 1_000
 """Records, of a few kilobytes each."""

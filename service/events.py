@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from fastapi.sse import format_sse_event
 from starlette.concurrency import run_in_threadpool
 
-from contract.errors import UnavailableError
-from contract.job import TERMINAL_STATES, JobRecord, JobState, JobView, Standing
-from contract.queue import EVENTS_KEPT, Queue, event_order
+from contract.queue.promise import EVENTS_KEPT, Queue, event_order
+from contract.wire.errors import UnavailableError
+from contract.wire.job import TERMINAL_STATES, JobRecord, JobState, JobView, Standing
 
 POLL_PERIOD_S = 0.4
 LOOK_PERIOD_S = 2.0

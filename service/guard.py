@@ -14,7 +14,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from contract.settings import LOOPBACK_NAMES
+from contract.runtime.settings import LOOPBACK_NAMES
 from service.problems import LENGTH_REMEDY, Problem
 
 ANY_HOST = "*"

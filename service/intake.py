@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 from starlette.requests import Request
 
-from contract.errors import LimitError
-from contract.settings import Settings
-from contract.store import Store
+from contract.runtime.settings import Settings
+from contract.store.store import Store
+from contract.wire.errors import LimitError
 from service.partial import promised_bytes
 from service.problems import LENGTH_REMEDY, Problem, no_room
 from service.upload import LIMIT_REMEDY

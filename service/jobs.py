@@ -8,10 +8,10 @@ from fastapi import APIRouter, Header, Response
 from fastapi.sse import EventSourceResponse
 from starlette.concurrency import run_in_threadpool
 
-from contract.audit import AuditAction
-from contract.job import TERMINAL_STATES, JobRecord, JobState, JobView
-from contract.keys import KeyScope
-from contract.queue import LISTING_LIMIT, event_order
+from contract.access.audit import AuditAction
+from contract.access.keys import KeyScope
+from contract.queue.promise import LISTING_LIMIT, event_order
+from contract.wire.job import TERMINAL_STATES, JobRecord, JobState, JobView
 from service.deps import AnyCaller, Deps, ListingLimit, Services, owned_job
 from service.events import NOTHING_SEEN
 from service.problems import RETRY_AFTER_S, Problem

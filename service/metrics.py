@@ -12,9 +12,9 @@ from prometheus_client.exposition import generate_latest
 from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from contract.errors import UnavailableError
-from contract.queue import Queue
-from contract.store import Store
+from contract.queue.promise import Queue
+from contract.store.store import Store
+from contract.wire.errors import UnavailableError
 from service.version import version
 
 NO_ROUTE = "none"

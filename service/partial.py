@@ -18,9 +18,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from contract.durable import flush, replace_file
-from contract.job import JOB_ID_PATTERN
-from contract.store import Store, is_job_id, new_job_id
+from contract.store.durable import flush, replace_file
+from contract.store.store import Store, is_job_id, new_job_id
+from contract.wire.job import JOB_ID_PATTERN
 
 DECLARATION = "upload.json"
 HASHED_AT_ONCE_BYTES = 2**20

@@ -11,9 +11,9 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocketState
 
-from contract.errors import InputError, LimitError, SceneError, UnavailableError
-from contract.queue import QueueFullError
-from contract.store import NO_ROOM, StoreFullError
+from contract.queue.promise import QueueFullError
+from contract.store.store import NO_ROOM, StoreFullError
+from contract.wire.errors import InputError, LimitError, SceneError, UnavailableError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2

@@ -14,12 +14,12 @@ from pathlib import Path
 
 from pydantic import BaseModel, Field
 
-from contract.audit import AuditAction, utc_now
-from contract.durable import flush
-from contract.errors import UnavailableError
-from contract.job import TERMINAL_STATES
-from contract.queue import Queue
-from contract.store import Removed, Store, StoreFullError, disk_errors, is_job_id
+from contract.access.audit import AuditAction, utc_now
+from contract.queue.promise import Queue
+from contract.store.durable import flush
+from contract.store.store import Removed, Store, StoreFullError, disk_errors, is_job_id
+from contract.wire.errors import UnavailableError
+from contract.wire.job import TERMINAL_STATES
 from service.access import Caller
 from service.audit import Audit
 from service.done import DoneJobs

@@ -16,14 +16,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from contract.audit import AuditAction
-from contract.clip_limits import MOST_MEMORY_BYTES, ClipLimits
-from contract.errors import InputError, LimitError, UnavailableError
-from contract.job import JOB_ID_PATTERN, JobOptions, JobRecord, JobView, Standing, parse_options
-from contract.keys import KeyScope
-from contract.queue import Admission, QueueFullError
-from contract.sniff import check_file
-from contract.store import new_job_id
+from contract.access.audit import AuditAction
+from contract.access.keys import KeyScope
+from contract.intake.limits import MOST_MEMORY_BYTES, ClipLimits
+from contract.intake.sniff import check_file
+from contract.queue.promise import Admission, QueueFullError
+from contract.store.store import new_job_id
+from contract.wire.errors import InputError, LimitError, UnavailableError
+from contract.wire.job import JOB_ID_PATTERN, JobOptions, JobRecord, JobView, Standing, parse_options
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
 from service.intake import declared_length

@@ -11,11 +11,11 @@ from fastapi import APIRouter, Header, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
-from contract.job import JobState
-from contract.keys import KeyScope
-from contract.pose import parse_pose
-from contract.rendering import MEDIA_TYPES, ImageFormat, IntrinsicsOverride, Layer, RenderRequest, ReplyError
-from contract.settings import Settings
+from contract.access.keys import KeyScope
+from contract.runtime.settings import Settings
+from contract.wire.job import JobState
+from contract.wire.pose import parse_pose
+from contract.wire.rendering import MEDIA_TYPES, ImageFormat, IntrinsicsOverride, Layer, RenderRequest, ReplyError
 from service.access import Caller
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services, owned_scene

@@ -8,13 +8,13 @@ import time
 
 from starlette.concurrency import run_in_threadpool
 
-from contract.audit import AuditLog
-from contract.errors import InputError, UnavailableError
-from contract.job import TERMINAL_STATES, JobOptions, JobRecord
-from contract.locks import FolderLock
-from contract.queue import Queue
-from contract.settings import Settings
-from contract.store import Store
+from contract.access.audit import AuditLog
+from contract.queue.promise import Queue
+from contract.runtime.locks import FolderLock
+from contract.runtime.settings import Settings
+from contract.store.store import Store
+from contract.wire.errors import InputError, UnavailableError
+from contract.wire.job import TERMINAL_STATES, JobOptions, JobRecord
 from service.purge import Purger, try_to_purge
 
 LOOK_PERIOD_S = 300.0

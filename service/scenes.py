@@ -10,14 +10,14 @@ from pydantic import BaseModel, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
-from contract.audit import AuditAction
-from contract.errors import SceneError
-from contract.job import JobRecord, JobState
-from contract.keys import KeyScope
-from contract.names import CURVE, REPORT
-from contract.queue import LISTING_LIMIT
-from contract.rendering import ExportRequest
-from contract.store import is_job_id
+from contract.access.audit import AuditAction
+from contract.access.keys import KeyScope
+from contract.queue.promise import LISTING_LIMIT
+from contract.store.store import is_job_id
+from contract.wire.errors import SceneError
+from contract.wire.job import JobRecord, JobState
+from contract.wire.names import CURVE, REPORT
+from contract.wire.rendering import ExportRequest
 from service.access import Caller
 from service.deps import AnyCaller, Deps, ListingLimit, Services, no_such_scene, owned_scene
 from service.problems import Problem

@@ -14,7 +14,7 @@ from uvicorn._types import ASGISendEvent
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from contract.settings import Settings
+from contract.runtime.settings import Settings
 from service.deps import Deps
 from service.problems import MEDIA_TYPE, Problem
 

@@ -25,8 +25,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json
 from starlette.types import Message
 
-from contract.job import JobState
-from contract.keys import KeyScope
+from contract.access.keys import KeyScope
+from contract.wire.job import JobState
 from service.access import Caller, Refusal, key_missing
 from service.connection import Answer
 from service.deps import Deps, EarlyCaller, Services, address_of

@@ -15,7 +15,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from contract.logs import answering
+from contract.runtime.logs import answering
 from service.problems import Problem, fault
 
 REQUEST_ID = "X-Request-Id"

@@ -17,10 +17,10 @@ from contextlib import contextmanager
 
 from starlette.concurrency import run_in_threadpool
 
-from contract.errors import UnavailableError
-from contract.job import JobRecord, JobState
-from contract.queue import Queue
-from contract.store import Store
+from contract.queue.promise import Queue
+from contract.store.store import Store
+from contract.wire.errors import UnavailableError
+from contract.wire.job import JobRecord, JobState
 
 SWEEP_PERIOD_S = 2.0
 ABANDONED_PERIOD_S = 3600.0

@@ -10,9 +10,9 @@ from pydantic import BaseModel
 from starlette.responses import JSONResponse, Response
 
 from contract import CONTRACT_VERSION
-from contract.errors import UnavailableError
-from contract.keys import KeyScope
-from contract.rendering import ImageFormat, Layer
+from contract.access.keys import KeyScope
+from contract.wire.errors import UnavailableError
+from contract.wire.rendering import ImageFormat, Layer
 from service.deps import AnyCaller, Deps, Services
 from service.problems import ROOM_REMEDY, Problem
 from service.renderer import WORKER_REMEDY

@@ -19,7 +19,7 @@ from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from contract.keys import KeyScope
+from contract.access.keys import KeyScope
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
 from service.intake import declared_length

@@ -14,9 +14,9 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
-from contract.clip_limits import MOST_CALIBRATION_BYTES
-from contract.errors import InputError, LimitError
-from contract.job import JobFiles
+from contract.intake.limits import MOST_CALIBRATION_BYTES
+from contract.wire.errors import InputError, LimitError
+from contract.wire.job import JobFiles
 from service.problems import Problem, no_room
 
 CLIP_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".zip")

@@ -19,13 +19,13 @@ import pytest
 import redis
 import yaml  # type: ignore[import-untyped]
 
-from contract.embedded import find_server
-from contract.job import JobFiles, JobProgress, JobRecord, JobState
-from contract.queue import Claim, Order
-from contract.queue_redis import RedisQueue
-from contract.rendering import WorkerAddress
-from contract.settings import Settings
-from contract.store import new_job_id
+from contract.queue.embedded import find_server
+from contract.queue.promise import Claim, Order
+from contract.queue.redis_queue import RedisQueue
+from contract.runtime.settings import Settings
+from contract.store.store import new_job_id
+from contract.wire.job import JobFiles, JobProgress, JobRecord, JobState
+from contract.wire.rendering import WorkerAddress
 from tests.test_house import project, requirement_name
 from tests.test_layers import imports_of
 

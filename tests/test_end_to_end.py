@@ -14,7 +14,7 @@ import pytest
 
 from client import Client, JobRejected
 from client.demo import started_service
-from contract.job import JobState
+from contract.wire.job import JobState
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 12
 LEAST_PSNR_DB = 20.0

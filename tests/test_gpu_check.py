@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from tests.conftest import REPOSITORY
 from tests.worker.raster.scenes import Scene, random_scene
-from worker.deformation import SharedBasis
-from worker.gaussians import Gaussians
-from worker.gpu import find_gpu
+from worker.machine.gpu import find_gpu
+from worker.model.deformation import SharedBasis
+from worker.model.gaussians import Gaussians
 from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, reference
 from worker.raster.cpu.model import FusedModel
 from worker.raster.step import camera_vector
@@ -99,7 +99,7 @@ def test_how_soon_training_is_good_is_told_by_what_paper_ends_with() -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r})\n"
         "from gpu_train import seconds_to\n"
-        "from worker.train import CurvePoint\n"
+        "from worker.train.loop import CurvePoint\n"
         "curve = [CurvePoint(t, 10, db) for t, db in ((0.5, 24.0), (1.0, 27.5), (2.0, 30.0))]\n"
         "print(list(seconds_to(curve, 29.0).values()), list(seconds_to(curve, None).values()))\n"
     )

@@ -13,7 +13,7 @@ from urllib.parse import unquote
 
 import pytest
 
-from worker.gpu import NEWEST_TRITON, OLDEST_TRITON, triton_range
+from worker.machine.gpu import NEWEST_TRITON, OLDEST_TRITON, triton_range
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("docker/*.md")])
@@ -45,9 +45,9 @@ def test_links_between_pages_and_files_lead_somewhere(page: Path) -> None:
 
 
 def names_in_the_tree() -> list[str]:
-    """What the annotated tree in the README names, as paths."""
-    readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```\w*\n(.*?)^```", readme, re.DOTALL | re.MULTILINE)
+    """What the annotated tree in docs/index.md names, as paths."""
+    page = (REPOSITORY / "docs" / "index.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```\w*\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
     tree = next(each for each in blocks if each.startswith("contract/"))
     named, folder = [], ""
     for line in tree.splitlines():
@@ -61,12 +61,12 @@ def names_in_the_tree() -> list[str]:
     return named
 
 
-def test_the_tree_in_the_readme_names_only_what_exists() -> None:
+def test_the_tree_in_the_docs_names_only_what_exists() -> None:
     assert [each for each in names_in_the_tree() if not (REPOSITORY / each).exists()] == []
 
 
-@pytest.mark.parametrize("package", ["contract", "worker", "service", "client"])
-def test_the_tree_in_the_readme_names_every_module(package: str) -> None:
+@pytest.mark.parametrize("package", ["contract", "worker"])
+def test_the_tree_in_the_docs_names_every_room(package: str) -> None:
     modules = {f"{package}/{path.name}" for path in (REPOSITORY / package).glob("[!_]*.py")}
     folders = {f"{package}/{path.parent.name}/" for path in (REPOSITORY / package).glob("*/__init__.py")}
     assert sorted((modules | folders) - {*names_in_the_tree()}) == []

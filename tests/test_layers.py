@@ -1,7 +1,7 @@
-"""The import rules: which package may import which, in what order the worker is read, and what stays light.
+"""The import rules: which package may import which, in what order its rooms are read, and what stays light.
 
-contract <- worker, service, client; those three never import each other. Inside worker/ a stage imports only stages
-that stand before it in STAGES, so that the order of imports is the order of reading.
+contract <- worker, service, client; those three never import each other. Inside a package a room imports only rooms
+that stand before it in ROOMS, so that the order of imports is the order of reading.
 """
 
 from __future__ import annotations
@@ -22,70 +22,29 @@ MAY_IMPORT = {
     "service": {"contract", "service"},
     "client": {"contract", "client"},
 }
-STAGES = (
-    "hooks",
-    "opencv",
-    "cache",
-    "clip",
-    "calibration",
-    "decode",
-    "stereo",
-    "fusion",
-    "motion",
-    "gaussians",
-    "deformation",
-    "loss",
-    "optimize",
-    "raster",
-    "model",
-    "unfused",
-    "gpu",
-    "backend",
-    "metrics",
-    "baselines",
-    "densify",
-    "differences",
-    "rangecoder",
-    "compact",
-    "checkpoint",
-    "export",
-    "presets",
-    "request",
-    "trials",
-    "capacity",
-    "start",
-    "targets",
-    "visibility",
-    "schedule",
-    "average",
-    "train",
-    "looking",
-    "prepare",
-    "resume",
-    "render",
-    "shrink",
-    "encode",
-    "doubts",
-    "quality",
-    "pipeline",
-    "phantom",
-    "evaluate",
-    "serve",
-    "snapshot",
-    "pace",
-    "views",
-    "orders",
-    "channel",
-    "faults",
-    "device",
-    "liveness",
-    "heartbeat",
-    "child",
-    "consume",
-    "supervisor",
-    "doctor",
-    "__main__",
-)
+ROOMS = {
+    "contract": ("wire", "runtime", "intake", "store", "queue", "access"),
+    "worker": (
+        "machine",
+        "input",
+        "stereo",
+        "fusion",
+        "model",
+        "motion",
+        "raster",
+        "scene",
+        "train",
+        "render",
+        "report",
+        "pipeline",
+        "phantom",
+        "evaluate",
+        "daemon",
+        "doctor",
+        "__main__",
+    ),
+}
+"""In the order in which they are read; a room is a folder or a module directly in the package."""
 FRAMEWORKS_BANNED = {
     "contract": {"torch", "numba", "cv2", "scipy", "matplotlib", "fastapi", "starlette", "uvicorn"},
     "worker": {"fastapi", "starlette", "uvicorn", "httpx"},
@@ -127,19 +86,23 @@ def imports_of(package: str) -> Iterator[Import]:
         yield from imports_of_source(path, path.read_text(encoding="utf-8"))
 
 
-def stage_of_file(path: Path) -> str:
-    """worker/raster/cpu/blend.py belongs to raster, worker/train.py to train, worker/__init__.py to no stage."""
-    first = path.relative_to(REPOSITORY / "worker").parts[0]
-    return "" if first == "__init__.py" else first.removesuffix(".py")
+def room_of(module: str) -> str:
+    """worker.raster.cpu.blend belongs to raster; worker itself and other packages' modules to no room ("")."""
+    package, *rest = module.split(".")
+    return rest[0] if rest and package in ROOMS else ""
 
 
-def stage_of_module(module: str) -> str | None:
-    parts = module.split(".")
-    return parts[1] if parts[0] == "worker" and len(parts) > 1 else None
+def module_of(path: Path) -> str:
+    parts = path.relative_to(REPOSITORY).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 def is_out_of_order(importer: str, imported: str) -> bool:
-    return STAGES.index(imported) > STAGES.index(importer)
+    """Whether a module imports one of a room that stands later in the same package."""
+    package, room, other = importer.split(".")[0], room_of(importer), room_of(imported)
+    if imported.split(".")[0] != package or room not in ROOMS[package] or other not in ROOMS[package]:
+        return False
+    return ROOMS[package].index(other) > ROOMS[package].index(room)
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)
@@ -159,26 +122,23 @@ def test_imports_are_absolute(package: str) -> None:
     assert [str(each) for each in imports_of(package) if each.level] == []
 
 
-def test_every_module_of_the_worker_has_a_place_in_the_order() -> None:
-    unplaced = {stage_of_file(path) for path in python_files("worker")} - {"", *STAGES}
-    assert unplaced == set(), f"add {sorted(unplaced)} to STAGES in {Path(__file__).name}, where it is to be read"
+@pytest.mark.parametrize("package", ROOMS)
+def test_every_module_has_a_room(package: str) -> None:
+    unplaced = {room_of(module_of(path)) for path in python_files(package)} - {"", *ROOMS[package]}
+    assert unplaced == set(), f"add {sorted(unplaced)} to ROOMS in {Path(__file__).name}, where it is to be read"
 
 
-def test_a_stage_imports_only_earlier_stages() -> None:
-    wrong = []
-    for each in imports_of("worker"):
-        importer, imported = stage_of_file(each.path), stage_of_module(each.module)
-        if importer in STAGES and imported in STAGES and is_out_of_order(importer, imported):
-            wrong.append(str(each))
-    assert wrong == []
+@pytest.mark.parametrize("package", ROOMS)
+def test_a_room_imports_only_rooms_above_it(package: str) -> None:
+    assert [str(each) for each in imports_of(package) if is_out_of_order(module_of(each.path), each.module)] == []
 
 
 def test_the_checks_see_imports_inside_functions_and_of_names() -> None:
     source = "def late() -> None:\n    from worker import train\n"
-    modules = [each.module for each in imports_of_source(REPOSITORY / "worker" / "loss.py", source)]
+    modules = [each.module for each in imports_of_source(REPOSITORY / "worker" / "model" / "loss.py", source)]
     assert "worker.train" in modules
-    assert is_out_of_order("loss", "train")
-    assert not is_out_of_order("train", "loss")
+    assert is_out_of_order("worker.model.loss", "worker.train")
+    assert not is_out_of_order("worker.train.loop", "worker.model")
 
 
 @pytest.mark.parametrize("module", ["contract", "client", "client.cli", "service.app"])

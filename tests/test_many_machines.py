@@ -15,9 +15,9 @@ from typing import Any
 import httpx
 import pytest
 
-from contract.embedded import EmbeddedServer
-from contract.processes import end_process
-from contract.settings import Settings
+from contract.queue.embedded import EmbeddedServer
+from contract.runtime.processes import end_process
+from contract.runtime.settings import Settings
 
 pytest.importorskip("s3fs")
 moto_server: Any = pytest.importorskip("moto.server")

@@ -7,14 +7,14 @@ from typing import get_args
 
 import yaml  # type: ignore[import-untyped]
 
-from contract import queue_redis
-from contract.bucket import LOOKED_FOR_S
-from contract.job import Priority
-from contract.queue import LEASE_S, MAX_ATTEMPTS
-from contract.queue_redis import PREFIX
-from contract.settings import ENVIRONMENT_PREFIX, Settings, default_data_dir
+from contract.queue import redis_queue as queue_redis
+from contract.queue.promise import LEASE_S, MAX_ATTEMPTS
+from contract.queue.redis_queue import PREFIX
+from contract.runtime.settings import ENVIRONMENT_PREFIX, Settings, default_data_dir
+from contract.store.bucket import LOOKED_FOR_S
+from contract.wire.job import Priority
 from tests.test_house import REPOSITORY
-from worker.supervisor import TIDY_PERIOD_S
+from worker.daemon.supervisor import TIDY_PERIOD_S
 
 PAGE = (REPOSITORY / "docs" / "operations.md").read_text(encoding="utf-8")
 
@@ -51,7 +51,7 @@ def test_every_variable_that_is_named_exists() -> None:
 def test_keda_watches_the_queues_own_streams() -> None:
     watched = [trigger["metadata"] for trigger in yaml.safe_load(block("yaml"))["spec"]["triggers"]]
     assert {each["stream"] for each in watched} == {f"{PREFIX}jobs:{name}" for name in get_args(Priority)}
-    scripts = (REPOSITORY / "contract" / "queue_scripts.py").read_text(encoding="utf-8")
+    scripts = (REPOSITORY / "contract" / "queue" / "scripts.py").read_text(encoding="utf-8")
     assert all(f"'{each['consumerGroup']}'" in scripts for each in watched)
 
 
@@ -76,5 +76,5 @@ def test_every_metric_that_is_named_exists() -> None:
 
 
 def test_every_area_of_the_store_is_said_to_be_copied_or_not() -> None:
-    areas = re.findall(r"[├└]── (\w+)/", (REPOSITORY / "contract" / "store.py").read_text(encoding="utf-8"))
+    areas = re.findall(r"[├└]── (\w+)/", (REPOSITORY / "contract" / "store" / "store.py").read_text(encoding="utf-8"))
     assert [area for area in areas if f"`{area}/`" not in PAGE] == []

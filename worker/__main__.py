@@ -20,15 +20,15 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from contract.arguments import Commands, add_command, finite, positive
-from contract.errors import Cancelled, InputError, IntrasplatError, UnavailableError
-from contract.exits import EXIT_CODES_HELP, ExitCode, end_by
-from contract.logs import configure
-from contract.names import MANIFEST, REPORT, DeviceName, Layout, MaskPolarity, PoseConvention, PresetName
-from contract.processes import told_to_end
-from contract.progress_bar import ProgressBar
-from contract.rendering import ImageFormat, IntrinsicsOverride, Layer
-from contract.settings import Settings
+from contract.runtime.arguments import Commands, add_command, finite, positive
+from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, end_by
+from contract.runtime.logs import configure
+from contract.runtime.processes import told_to_end
+from contract.runtime.progress_bar import ProgressBar
+from contract.runtime.settings import Settings
+from contract.wire.errors import Cancelled, InputError, IntrasplatError, UnavailableError
+from contract.wire.names import MANIFEST, REPORT, DeviceName, Layout, MaskPolarity, PoseConvention, PresetName
+from contract.wire.rendering import ImageFormat, IntrinsicsOverride, Layer
 
 SUFFIX_FORMATS = {
     ".png": ImageFormat.PNG,
@@ -182,11 +182,11 @@ def _frames(text: str) -> list[int]:
 
 
 def _reconstruct(options: argparse.Namespace) -> int:
-    from worker.checkpoint import RESUME_FILE
-    from worker.hooks import Hooks
-    from worker.orders import job_progress
+    from worker.daemon.orders import job_progress
+    from worker.machine.hooks import Hooks
     from worker.pipeline import reconstruct
-    from worker.request import ReconstructionRequest
+    from worker.scene.checkpoint import RESUME_FILE
+    from worker.train.request import ReconstructionRequest
 
     out: Path = options.out
     if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= {RESUME_FILE}):
@@ -233,12 +233,12 @@ def _print_report(report: dict[str, Any], out: Path) -> None:
 
 
 def _render(options: argparse.Namespace) -> int:
-    from contract.pose import parse_pose
-    from worker.backend import choose_device
-    from worker.checkpoint import load_scene
-    from worker.encode import encode_layer
-    from worker.render import render_frame
-    from worker.views import camera_of, pose_of
+    from contract.wire.pose import parse_pose
+    from worker.daemon.views import camera_of, pose_of
+    from worker.raster.backend import choose_device
+    from worker.render.encode import encode_layer
+    from worker.render.view import render_frame
+    from worker.scene.checkpoint import load_scene
 
     device = choose_device(options.device)
     if not (options.scene / MANIFEST).is_file():
@@ -309,7 +309,7 @@ def _consume(options: argparse.Namespace) -> int:
     configure(settings, "worker")
     if settings.redis_url is None:
         raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
-    from worker.supervisor import run_supervisor
+    from worker.daemon.supervisor import run_supervisor
 
     run_supervisor(settings, told_to_end())
     return ExitCode.OK
@@ -318,7 +318,7 @@ def _consume(options: argparse.Namespace) -> int:
 def _device(options: argparse.Namespace) -> int:
     settings = Settings.from_environment()
     configure(settings, "device")
-    from worker.device import run_device
+    from worker.daemon.device import run_device
 
     run_device(settings)
     return ExitCode.OK

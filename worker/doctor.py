@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from contract.embedded import find_server
-from contract.errors import IntrasplatError, UnavailableError
-from contract.names import DeviceName
-from contract.queue_redis import RedisQueue
-from contract.settings import GIB, Settings
-from worker.gpu import Gpu, find_gpu, triton_range
+from contract.queue.embedded import find_server
+from contract.queue.redis_queue import RedisQueue
+from contract.runtime.settings import GIB, Settings
+from contract.wire.errors import IntrasplatError, UnavailableError
+from contract.wire.names import DeviceName
+from worker.machine.gpu import Gpu, find_gpu, triton_range
 
 PACKAGES = (
     "torch",
@@ -125,7 +125,7 @@ def _device(settings: Settings) -> list[Finding]:
 
 def device_finding(asked: DeviceName, gpu: Gpu) -> Finding:
     """What would be trained on, where this is the setting and that is there."""
-    backend = importlib.import_module("worker.backend")
+    backend = importlib.import_module("worker.raster.backend")
     try:
         device = backend.choose_device(asked, gpu, cpu_by=backend.CPU_BY_VARIABLE)
     except UnavailableError as error:

@@ -14,29 +14,29 @@ from pathlib import Path
 
 import torch
 
-from contract.errors import Cancelled
-from contract.names import CURVE, REPORT
-from contract.report import Report
-from worker.backend import CPU, Device, choose_device, device_for, examine
-from worker.baselines import copy_baselines
-from worker.calibration import rectify
-from worker.checkpoint import RESUME_FILE, Scene, save_scene
-from worker.clip import DepthClip, FrameSplit, held_out_frames, split_frames
-from worker.compact import compile_coder
-from worker.decode import decode_clip
-from worker.hooks import Hooks, Progress
-from worker.looking import View, held_out_psnr, sample_frames, view_function
-from worker.prepare import Seconds, fixed_iterations, prepare, report_stage, timed
-from worker.presets import Preset, preset_named
-from worker.quality import Training, build_report, measure
+from contract.wire.errors import Cancelled
+from contract.wire.names import CURVE, REPORT
+from contract.wire.report import Report
+from worker.input.calibration import rectify
+from worker.input.clip import DepthClip, FrameSplit, held_out_frames, split_frames
+from worker.input.decode import decode_clip
+from worker.machine.hooks import Hooks, Progress
+from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
-from worker.render import model_of
-from worker.request import ReconstructionRequest, check_options
-from worker.resume import resume, save_run
-from worker.shrink import Shrunk, shrink
+from worker.render.shrink import Shrunk, shrink
+from worker.render.view import model_of
+from worker.report.baselines import copy_baselines
+from worker.report.quality import Training, build_report, measure
+from worker.report.visibility import drop_strays, seen_share
+from worker.scene.checkpoint import RESUME_FILE, Scene, save_scene
+from worker.scene.compact import compile_coder
 from worker.stereo import estimate_depth
-from worker.train import Run, Stopwatch, train, write_curve
-from worker.visibility import drop_strays, seen_share
+from worker.train.looking import View, held_out_psnr, sample_frames, view_function
+from worker.train.loop import Run, Stopwatch, train, write_curve
+from worker.train.prepare import Seconds, fixed_iterations, prepare, report_stage, timed
+from worker.train.presets import Preset, preset_named
+from worker.train.request import ReconstructionRequest, check_options
+from worker.train.resume import resume, save_run
 
 VERSIONED = ("intrasplat", "torch", "numba")
 """What decides a scene's numbers; the report names their versions."""

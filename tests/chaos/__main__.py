@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.bm_train import commit, machine
-from contract.queue import BEAT_PERIOD_S, LEASE_S
+from contract.queue.promise import BEAT_PERIOD_S, LEASE_S
 from tests.chaos.campaign import CELLS, NO_MATTER, Outcome, run_kill
 from tests.chaos.history import RERUN_WITHIN_S, ClipHistory, orphans
 from tests.chaos.house import House, Target

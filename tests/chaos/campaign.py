@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from contract.errors import UnavailableError
-from contract.job import TERMINAL_STATES, JobRecord, JobState
+from contract.wire.errors import UnavailableError
+from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
 from tests.chaos.history import ClipHistory, violations
 from tests.chaos.house import House, Target
 from tests.chaos.points import Point

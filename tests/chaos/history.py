@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from contract.job import TERMINAL_STATES, JobState
-from contract.queue import BEAT_PERIOD_S, LEASE_S, Event
-from contract.store import Store
+from contract.queue.promise import BEAT_PERIOD_S, LEASE_S, Event
+from contract.store.store import Store
+from contract.wire.job import TERMINAL_STATES, JobState
 
 RERUN_SLACK_S = 2.0
 RERUN_WITHIN_S = LEASE_S + BEAT_PERIOD_S + RERUN_SLACK_S

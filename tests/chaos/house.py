@@ -17,10 +17,10 @@ from pathlib import Path
 
 import httpx
 
-from contract.embedded import EmbeddedServer
-from contract.queue_redis import RedisQueue
-from contract.settings import Settings
-from contract.store import Store
+from contract.queue.embedded import EmbeddedServer
+from contract.queue.redis_queue import RedisQueue
+from contract.runtime.settings import Settings
+from contract.store.store import Store
 from tests.chaos.points import FOLDER_VARIABLE, Points
 
 REPOSITORY = Path(__file__).resolve().parents[2]

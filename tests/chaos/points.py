@@ -91,8 +91,8 @@ def reach(point: Point) -> None:
 
 def install_service_points() -> None:
     """SPOOLED lies after the store's accept, ENQUEUED after the queue's submit."""
-    from contract.queue_redis import RedisQueue
-    from contract.store import Store
+    from contract.queue.redis_queue import RedisQueue
+    from contract.store.store import Store
 
     _reach_after(Store, "accept", Point.SPOOLED)
     _reach_after(RedisQueue, "submit", Point.ENQUEUED)
@@ -100,8 +100,8 @@ def install_service_points() -> None:
 
 def install_worker_points() -> None:
     """CLAIMED lies after a claim that gave a job; PUBLISHING before the store's rename, PUBLISHED after it."""
-    from contract.queue_redis import RedisQueue
-    from contract.store import Store
+    from contract.queue.redis_queue import RedisQueue
+    from contract.store.store import Store
 
     _reach_after(RedisQueue, "claim", Point.CLAIMED, if_any=True)
     _reach_before(Store, "publish_scene", Point.PUBLISHING)

@@ -9,8 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from contract.job import TERMINAL_STATES, JobState
-from contract.queue import LEASE_S
+from contract.queue.promise import LEASE_S
+from contract.wire.job import TERMINAL_STATES, JobState
 from tests.chaos.campaign import Caller, wait_until_ended, watch
 from tests.chaos.history import ClipHistory, orphans, violations
 from tests.chaos.house import House, children_of

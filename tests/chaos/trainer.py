@@ -1,4 +1,4 @@
-"""A stand-in for the device child: obeys worker/orders.py, trains nothing, and is done in half a second."""
+"""A stand-in for the device child: obeys worker/daemon/orders.py, trains nothing, and is done in half a second."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import os
 import time
 from pathlib import Path
 
-from contract.job import JobProgress
-from contract.names import MANIFEST, REPORT
-from contract.processes import die_with_parent
-from contract.settings import Settings
+from contract.runtime.processes import die_with_parent
+from contract.runtime.settings import Settings
+from contract.wire.job import JobProgress
+from contract.wire.names import MANIFEST, REPORT
 from tests.chaos.points import Point, reach
-from worker.channel import Channel, Orders, Task
-from worker.orders import Advanced, Finished, Ready, Stopped
+from worker.daemon.channel import Channel, Orders, Task
+from worker.daemon.orders import Advanced, Finished, Ready, Stopped
 
 STEPS = 10
 STEP_S = 0.05

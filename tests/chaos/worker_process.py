@@ -6,9 +6,9 @@ import signal
 import sys
 import threading
 
-from contract.settings import Settings
+from contract.runtime.settings import Settings
 from tests.chaos.points import install_worker_points
-from worker.supervisor import run_supervisor
+from worker.daemon.supervisor import run_supervisor
 
 if __name__ == "__main__":
     install_worker_points()

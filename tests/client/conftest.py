@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from client import Client
-from contract.queue import Claim
+from contract.queue.promise import Claim
 from tests.client.town import CLIP, Town, town_at
 
 

@@ -23,19 +23,19 @@ from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
 from client.up import DASHBOARD
-from contract.embedded import short_socket_path
-from contract.job import JobFiles, JobProgress, JobRecord
-from contract.names import CURVE, MANIFEST, REPORT
-from contract.pose import OrbitPose
-from contract.queue import Claim
-from contract.queue_memory import MemoryQueue
-from contract.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
-from contract.settings import Settings
-from contract.store import Store, new_job_id
+from contract.queue.embedded import short_socket_path
+from contract.queue.memory import MemoryQueue
+from contract.queue.promise import Claim
+from contract.runtime.settings import Settings
+from contract.store.store import Store, new_job_id
+from contract.wire.job import JobFiles, JobProgress, JobRecord
+from contract.wire.names import CURVE, MANIFEST, REPORT
+from contract.wire.pose import OrbitPose
+from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
-from worker.serve import RequestServer, View
+from worker.daemon.serve import RequestServer, View
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 WAIT_S = 15.0

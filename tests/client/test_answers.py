@@ -19,8 +19,8 @@ from client import (
     ServiceUnavailable,
     Unauthorized,
 )
-from contract.errors import IntrasplatError, UnavailableError
-from contract.job import JobState
+from contract.wire.errors import IntrasplatError, UnavailableError
+from contract.wire.job import JobState
 
 JOB_ID = "0" * 32
 JOB = {

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from client import AsyncClient, JobCancelled, NotFound, RequestRefused, Unauthorized, submission
-from contract.errors import InputError, UnavailableError
-from contract.job import JobProgress, JobState
+from contract.wire.errors import InputError, UnavailableError
+from contract.wire.job import JobProgress, JobState
 from tests.client.town import Town, line_to
 
 

@@ -15,9 +15,9 @@ import client as client_package
 from client import Client
 from client.cli import main
 from client.remote import in_commands, progress_of
-from contract.exits import ExitCode
-from contract.job import JobError, JobState
-from contract.keys import KeyFile, KeyScope
+from contract.access.keys import KeyFile, KeyScope
+from contract.runtime.exits import ExitCode
+from contract.wire.job import JobError, JobState
 from tests.client.town import Town, town_at
 
 

@@ -23,9 +23,9 @@ from client import (
     Unauthorized,
     submission,
 )
-from contract.errors import InputError, UnavailableError
-from contract.job import JobError, JobProgress, JobState
-from contract.keys import KeyFile, KeyScope
+from contract.access.keys import KeyFile, KeyScope
+from contract.wire.errors import InputError, UnavailableError
+from contract.wire.job import JobError, JobProgress, JobState
 from tests.client.town import SNAPSHOT_ITERATION, Town, line_to, town_at
 
 

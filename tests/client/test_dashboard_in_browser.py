@@ -10,8 +10,8 @@ from selenium import webdriver
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
-from contract.job import JobError, JobState
-from contract.keys import KeyFile, KeyScope
+from contract.access.keys import KeyFile, KeyScope
+from contract.wire.job import JobError, JobState
 from tests.client.page import FAR, Page, Site, browser, grey_of, site_at
 from tests.client.town import CLIP
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from client.cli import main
-from contract.audit import AUDIT_FILE
-from contract.exits import ExitCode
-from contract.keys import KeyFile, KeyScope
+from contract.access.audit import AUDIT_FILE
+from contract.access.keys import KeyFile, KeyScope
+from contract.runtime.exits import ExitCode
 
 
 def test_a_key_is_printed_once_and_alone_and_opens_what_it_was_made_for(

@@ -14,10 +14,10 @@ import pytest
 
 from client import up
 from client.up import Installation, WatchedProcess, check_port, worker_names
-from contract.errors import UnavailableError
-from contract.exits import ExitCode
-from contract.locks import FolderLock
-from contract.settings import Settings
+from contract.runtime.exits import ExitCode
+from contract.runtime.locks import FolderLock
+from contract.runtime.settings import Settings
+from contract.wire.errors import UnavailableError
 
 WAIT_S = 10.0
 
@@ -59,8 +59,8 @@ def test_a_child_that_crashes_at_once_is_not_started_in_a_hurry(status: int, tmp
 
 
 LACKS = """
-from contract.errors import UnavailableError
-from contract.exits import end_by
+from contract.wire.errors import UnavailableError
+from contract.runtime.exits import end_by
 raise SystemExit(end_by(UnavailableError("There is no such device.", "Set INTRASPLAT_DEVICE.")))
 """
 

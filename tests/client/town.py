@@ -15,18 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from contract.embedded import short_socket_path
-from contract.job import JobError
-from contract.names import CURVE, MANIFEST, REPORT
-from contract.queue import Claim
-from contract.queue_memory import MemoryQueue
-from contract.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
-from contract.settings import Settings
-from contract.store import Store
+from contract.queue.embedded import short_socket_path
+from contract.queue.memory import MemoryQueue
+from contract.queue.promise import Claim
+from contract.runtime.settings import Settings
+from contract.store.store import Store
+from contract.wire.job import JobError
+from contract.wire.names import CURVE, MANIFEST, REPORT
+from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
-from worker.serve import RequestServer, View
+from worker.daemon.serve import RequestServer, View
 
 CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
 SNAPSHOT_ITERATION = 7

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import redis
 
-from contract.queue import LEASE_S, Queue
-from contract.queue_memory import MemoryQueue
-from contract.queue_redis import PREFIX, RedisQueue
+from contract.queue.memory import MemoryQueue
+from contract.queue.promise import LEASE_S, Queue
+from contract.queue.redis_queue import PREFIX, RedisQueue
 from tests.contract.queues import RunningServer, redis_binary, valkey_binary
 
 MakeQueue = Callable[..., Queue]

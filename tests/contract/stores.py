@@ -6,8 +6,8 @@ import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from contract.job import JobFiles, JobRecord
-from contract.store import Store, new_job_id
+from contract.store.store import Store, new_job_id
+from contract.wire.job import JobFiles, JobRecord
 
 
 def received(store: Store) -> JobRecord:

@@ -9,19 +9,19 @@ from typing import Any
 
 import httpx
 
-from contract.embedded import short_socket_path
-from contract.errors import InputError, SceneError
-from contract.job import JobRecord
-from contract.names import CURVE, MANIFEST, REPORT
-from contract.queue import Claim
-from contract.queue_memory import MemoryQueue
-from contract.rendering import ExportRequest, RenderRequest, WorkerAddress
-from contract.settings import Settings
-from contract.store import Store
+from contract.queue.embedded import short_socket_path
+from contract.queue.memory import MemoryQueue
+from contract.queue.promise import Claim
+from contract.runtime.settings import Settings
+from contract.store.store import Store
+from contract.wire.errors import InputError, SceneError
+from contract.wire.job import JobRecord
+from contract.wire.names import CURVE, MANIFEST, REPORT
+from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from tests.service.asgi import AsgiClient, serving
-from worker.serve import RequestServer, View
+from worker.daemon.serve import RequestServer, View
 
 CLIP = (Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4").read_bytes()
 EMPTY_ZIP = b"PK\x05\x06" + bytes(18)

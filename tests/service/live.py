@@ -12,19 +12,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from contract.embedded import short_socket_path
-from contract.errors import SceneError
-from contract.job import JobFiles, JobRecord
-from contract.names import MANIFEST
-from contract.queue import Claim
-from contract.queue_memory import MemoryQueue
-from contract.rendering import ExportRequest, RenderRequest, WorkerAddress
-from contract.settings import Settings
-from contract.store import Store, new_job_id
+from contract.queue.embedded import short_socket_path
+from contract.queue.memory import MemoryQueue
+from contract.queue.promise import Claim
+from contract.runtime.settings import Settings
+from contract.store.store import Store, new_job_id
+from contract.wire.errors import SceneError
+from contract.wire.job import JobFiles, JobRecord
+from contract.wire.names import MANIFEST
+from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
-from worker.serve import RequestServer, View
+from worker.daemon.serve import RequestServer, View
 
 WORKER = "worker-1"
 

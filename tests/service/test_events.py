@@ -11,11 +11,11 @@ from typing import Any
 import httpx
 import pytest
 
-from contract.errors import UnavailableError
-from contract.job import JobError, JobFiles, JobProgress, JobRecord
-from contract.queue import Event
-from contract.queue_memory import MemoryQueue
-from contract.store import new_job_id
+from contract.queue.memory import MemoryQueue
+from contract.queue.promise import Event
+from contract.store.store import new_job_id
+from contract.wire.errors import UnavailableError
+from contract.wire.job import JobError, JobFiles, JobProgress, JobRecord
 from service.events import NOTHING_SEEN, Feeds
 from tests.service.house import House, assert_problem
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from starlette.requests import HTTPConnection
 
-from contract.keys import KeyFile
-from contract.settings import LOOPBACK_NAMES, Settings
+from contract.access.keys import KeyFile
+from contract.runtime.settings import LOOPBACK_NAMES, Settings
 from service.access import WRONG_KEYS_AT_ONCE, Access
 from service.deps import address_of
 from service.guard import Guard

@@ -9,7 +9,7 @@ import pytest
 from client import Client, JobRejected, RequestRefused
 from client.demo import started_service
 from tests.service.house import House, assert_problem
-from tests.worker.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile
+from tests.worker.input.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile
 
 PLAIN = [name for name, hostile in CORPUS.items() if hostile.refused_at == "upload"]
 DECODED = [name for name, hostile in CORPUS.items() if hostile.refused_at == "decoding"]

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from contract.job import JobError, JobProgress
+from contract.wire.job import JobError, JobProgress
 from tests.service.house import House, another_clip, assert_problem, make_house
 
 

@@ -12,8 +12,8 @@ from typing import Literal
 
 import pytest
 
-from contract.logs import configure
-from contract.settings import Settings
+from contract.runtime.logs import configure
+from contract.runtime.settings import Settings
 from tests.service.house import House, make_house
 from tests.service.test_tus import TUS, metadata
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from contract.exits import ExitCode
-from contract.keys import KeyFile, KeyScope
+from contract.access.keys import KeyFile, KeyScope
+from contract.runtime.exits import ExitCode
 from service.__main__ import main
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from contract.errors import UnavailableError
-from contract.job import JobError
-from contract.keys import KeyFile, KeyScope
+from contract.access.keys import KeyFile, KeyScope
+from contract.wire.errors import UnavailableError
+from contract.wire.job import JobError
 from service.version import version
 from tests.service.house import CLIP, House, assert_problem, make_house
 

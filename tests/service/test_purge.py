@@ -14,15 +14,15 @@ from typing import Any
 import pytest
 import redis
 
-from contract.audit import AUDIT_FILE, RESERVE_FILE, AuditAction, AuditLog
-from contract.embedded import EmbeddedServer
-from contract.errors import InputError, UnavailableError
-from contract.job import JobError, JobFiles, JobOptions, JobRecord
-from contract.names import CURVE, MANIFEST, REPORT
-from contract.queue import Claim
-from contract.queue_redis import RedisQueue
-from contract.settings import Settings
-from contract.store import Store, new_job_id
+from contract.access.audit import AUDIT_FILE, RESERVE_FILE, AuditAction, AuditLog
+from contract.queue.embedded import EmbeddedServer
+from contract.queue.promise import Claim
+from contract.queue.redis_queue import RedisQueue
+from contract.runtime.settings import Settings
+from contract.store.store import Store, new_job_id
+from contract.wire.errors import InputError, UnavailableError
+from contract.wire.job import JobError, JobFiles, JobOptions, JobRecord
+from contract.wire.names import CURVE, MANIFEST, REPORT
 from service.audit import Audit
 from service.done import DoneJobs
 from service.purge import LOG_CLEARED_AFTER_S, NOTES, Purger

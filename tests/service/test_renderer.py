@@ -15,13 +15,13 @@ from typing import TypeVar
 import pytest
 import zmq
 
-from contract.embedded import short_socket_path
-from contract.errors import UnavailableError
-from contract.queue_memory import MemoryQueue
-from contract.rendering import ExportRequest, RenderRequest, WorkerAddress
+from contract.queue.embedded import short_socket_path
+from contract.queue.memory import MemoryQueue
+from contract.wire.errors import UnavailableError
+from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.connection import Answer
 from service.renderer import ZmqRenderer
-from worker.serve import RequestServer, View
+from worker.daemon.serve import RequestServer, View
 
 SCENES = [f"{number:032x}" for number in range(40)]
 SECRET, ANOTHER = "a secret of at least 32 characters", "another secret of 32 characters!"

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 import zmq
 
-from contract.embedded import short_socket_path
-from contract.errors import UnavailableError
-from contract.job import JobRecord
-from contract.keys import DEFAULT_SCOPES, KeyFile, KeyScope
-from contract.names import MANIFEST, REPORT
-from contract.queue import Claim
-from contract.queue_memory import MemoryQueue
-from contract.rendering import RenderRequest, WorkerAddress, WorkerReply
+from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
+from contract.queue.embedded import short_socket_path
+from contract.queue.memory import MemoryQueue
+from contract.queue.promise import Claim
+from contract.wire.errors import UnavailableError
+from contract.wire.job import JobRecord
+from contract.wire.names import MANIFEST, REPORT
+from contract.wire.rendering import RenderRequest, WorkerAddress, WorkerReply
 from tests.service.house import IDENTITY, House, assert_problem, make_house
 
 

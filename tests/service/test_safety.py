@@ -15,11 +15,11 @@ from fastapi.dependencies.models import Dependant
 from fastapi.routing import APIRoute, APIWebSocketRoute
 from starlette.routing import BaseRoute, Route
 
-from contract.audit import AUDIT_FILE, RESERVE_FILE
-from contract.job import JobError
-from contract.keys import KEYS_FILE, KeyFile, KeyScope
-from contract.settings import Settings
-from contract.store import Store
+from contract.access.audit import AUDIT_FILE, RESERVE_FILE
+from contract.access.keys import KEYS_FILE, KeyFile, KeyScope
+from contract.runtime.settings import Settings
+from contract.store.store import Store
+from contract.wire.job import JobError
 from service import deps
 from service.app import create_app
 from tests.service.house import CLIP, House, assert_problem, make_house

@@ -16,7 +16,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from contract.rendering import WorkerAddress
+from contract.wire.rendering import WorkerAddress
 from tests.service.live import WORKER, LiveService, live_service
 from tests.service.test_surface import OPERATIONS
 

@@ -14,10 +14,10 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from contract.keys import DEFAULT_SCOPES, KeyFile, KeyScope
-from contract.rendering import ExportRequest, RenderRequest
+from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
+from contract.wire.rendering import ExportRequest, RenderRequest
 from tests.service.live import LiveService, live_service
-from worker.serve import NotYetError, View
+from worker.daemon.serve import NotYetError, View
 
 TIMEOUT_S = 10.0
 LARGE = 4 * 2**20

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from contract.errors import UnavailableError
+from contract.wire.errors import UnavailableError
 from tests.service.house import House, assert_problem, make_house
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from contract.errors import UnavailableError
-from contract.job import JobRecord, JobState
-from contract.names import MANIFEST, SUBMISSION
-from contract.queue import Admission
-from contract.queue_memory import MemoryQueue
-from contract.store import Store
+from contract.queue.memory import MemoryQueue
+from contract.queue.promise import Admission
+from contract.store.store import Store
+from contract.wire.errors import UnavailableError
+from contract.wire.job import JobRecord, JobState
+from contract.wire.names import MANIFEST, SUBMISSION
 from service.sweep import Sweep
 from tests.service.house import House, assert_problem, make_house
 

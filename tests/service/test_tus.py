@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from contract.store import is_job_id
+from contract.store.store import is_job_id
 from service.partial import promised_bytes
 from tests.service.house import CLIP, EMPTY_ZIP, House, another_clip, assert_problem, make_house
 

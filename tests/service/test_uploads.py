@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from fastapi import FastAPI
 
-from contract.job import JobRecord
-from contract.names import SUBMISSION
-from contract.store import ABANDONED_AFTER_S, Store, new_job_id
+from contract.store.store import ABANDONED_AFTER_S, Store, new_job_id
+from contract.wire.job import JobRecord
+from contract.wire.names import SUBMISSION
 from service.problems import Problem, install_handlers
 from service.upload import UploadLimits, receive_upload
 from tests.service.asgi import serving

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.camera import Intrinsics
-from worker.clip.types import DepthClip
+from worker.input.camera import Intrinsics
+from worker.input.clip.types import DepthClip
 
 HEIGHT, WIDTH = 48, 64
 

@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from contract.job import TERMINAL_STATES, JobFiles, JobOptions, JobRecord, JobState
-from contract.queue import Queue
-from contract.store import Store, new_job_id
+from contract.queue.promise import Queue
+from contract.store.store import Store, new_job_id
+from contract.wire.job import TERMINAL_STATES, JobFiles, JobOptions, JobRecord, JobState
 
 WAIT_S = 40.0
 STANDIN = Path(__file__).with_name("standin.py")

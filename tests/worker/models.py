@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worker.deformation import FlexibleDeformation, HexPlane, SharedBasis
-from worker.gaussians import Gaussians, initial_gaussians
-from worker.loss import LossSettings
-from worker.model import Model
-from worker.optimize import StepRates
+from worker.model.deformation import FlexibleDeformation, HexPlane, SharedBasis
+from worker.model.gaussians import Gaussians, initial_gaussians
+from worker.model.loss import LossSettings
+from worker.model.optimize import StepRates
 from worker.raster import Camera
 from worker.raster.cpu import padded
 from worker.raster.cpu.model import FusedModel
+from worker.raster.model import Model
 from worker.raster.step import StepSums, Target, TrainingFrame, camera_vector
 
 WIDTH, HEIGHT = 64, 48

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from worker.clip import DepthClip, FrameSplit, split_frames
-from worker.hooks import Hooks
-from worker.looking import View, view_function
+from worker.input.clip import DepthClip, FrameSplit, split_frames
+from worker.machine.hooks import Hooks
 from worker.phantom import Motion, PhantomSettings, make_phantom
 from worker.pipeline import scene_of
-from worker.prepare import prepare
-from worker.presets import PRESETS, Preset
-from worker.request import ReconstructionRequest
-from worker.train import Run, Stopwatch, train
+from worker.train.looking import View, view_function
+from worker.train.loop import Run, Stopwatch, train
+from worker.train.prepare import prepare
+from worker.train.presets import PRESETS, Preset
+from worker.train.request import ReconstructionRequest
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 12
 

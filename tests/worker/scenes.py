@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from contract.camera import Intrinsics
-from worker.checkpoint import Scene
-from worker.deformation import Deformation, FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
-from worker.deformation.fdm import Form
-from worker.gaussians import Gaussians
+from worker.input.camera import Intrinsics
+from worker.model.deformation import Deformation, FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
+from worker.model.deformation.fdm import Form
+from worker.model.gaussians import Gaussians
+from worker.scene.checkpoint import Scene
 
 KINDS = ("fdm-gaussian", "fdm-quartic", "shared", "pfs", "hexplane")
 FRAMES = 6

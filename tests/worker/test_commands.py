@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import torch
 
-from contract.exits import ExitCode
-from contract.names import PresetName
+from contract.runtime.exits import ExitCode
+from contract.wire.names import PresetName
 from worker.__main__ import main
-from worker.checkpoint import RESUME_FILE, load_resume
-from worker.presets import PRESETS
+from worker.scene.checkpoint import RESUME_FILE, load_resume
+from worker.train.presets import PRESETS
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 10
 TRAINING_S = 1.0

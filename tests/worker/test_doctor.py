@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from contract.settings import Settings
+from contract.runtime.settings import Settings
 from worker.doctor import (
     FIXED_FFMPEG,
     OPTIONAL_PACKAGES,
@@ -21,7 +21,7 @@ from worker.doctor import (
     examine,
     format_findings,
 )
-from worker.gpu import Gpu
+from worker.machine.gpu import Gpu
 
 H200 = Gpu(build="13.0", name="NVIDIA H200", triton="3.9.0")
 

@@ -15,22 +15,22 @@ import numpy as np
 import pytest
 import torch
 
-from contract.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
-from contract.report import Report
+from contract.wire.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
+from contract.wire.report import Report
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared_on, trained, view
-from worker.checkpoint import RESUME_FILE, load_resume, load_scene
-from worker.clip import DepthClip, open_clip, split_frames
-from worker.hooks import Hooks, Progress
-from worker.metrics import coverage, psnr_tissue
-from worker.optimize import Rate
+from worker.input.clip import DepthClip, open_clip, split_frames
+from worker.machine.hooks import Hooks, Progress
+from worker.model.metrics import coverage, psnr_tissue
+from worker.model.optimize import Rate
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
 from worker.pipeline import reconstruct, scene_of
-from worker.presets import PRESETS
 from worker.raster.step import camera_vector
-from worker.render import render_frame
-from worker.request import ReconstructionRequest
-from worker.shrink import TOLERANCE_DB, model_of, shrink
-from worker.targets import camera_in_units
+from worker.render.shrink import TOLERANCE_DB, model_of, shrink
+from worker.render.view import render_frame
+from worker.scene.checkpoint import RESUME_FILE, load_resume, load_scene
+from worker.train.presets import PRESETS
+from worker.train.request import ReconstructionRequest
+from worker.train.targets import camera_in_units
 
 SCENE_FILES = {"manifest.json", "scene.safetensors", "report.json", "curve.csv"}
 ITERATIONS = 20

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from contract.errors import InputError
-from worker.clip.split import check_holdout
-from worker.presets import PRESETS, Preset, preset_named
-from worker.request import check_seed
+from contract.wire.errors import InputError
+from worker.input.clip.split import check_holdout
+from worker.train.presets import PRESETS, Preset, preset_named
+from worker.train.request import check_seed
 
 OURS = tuple(name for name in ("instant", "fast", "quality", "small") if name in PRESETS)
 RIVALS = ("paper", "paper-released", "without_mapf", "pfs", "hexplane")

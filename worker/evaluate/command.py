@@ -8,21 +8,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from contract.arguments import count, positive
-from contract.errors import InputError
-from contract.exits import ExitCode
-from contract.job import JobProgress
-from contract.names import DeviceName, Layout, MaskPolarity, PoseConvention
-from contract.processes import heeding_signals
-from contract.progress_bar import ProgressBar
-from worker.backend import choose_device
+from contract.runtime.arguments import count, positive
+from contract.runtime.exits import ExitCode
+from contract.runtime.processes import heeding_signals
+from contract.runtime.progress_bar import ProgressBar
+from contract.wire.errors import InputError
+from contract.wire.job import JobProgress
+from contract.wire.names import DeviceName, Layout, MaskPolarity, PoseConvention
 from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
 from worker.evaluate.measure import Bench
 from worker.evaluate.rows import Results, adding_alone, write_rows
 from worker.evaluate.sources import source_of
 from worker.evaluate.summary import SUMMARY_FIELDS, Sooner, capacities, groups_of, orderings, sooner
-from worker.hooks import Hooks, Progress
+from worker.machine.hooks import Hooks, Progress
+from worker.raster.backend import choose_device
 
 SUMMARY = "summary.csv"
 

@@ -20,24 +20,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.names import CURVE, REPORT, DeviceName
-from contract.report import Report
-from worker.backend import Device, choose_device
-from worker.checkpoint import Scene, load_scene
-from worker.clip import DepthClip
+from contract.wire.names import CURVE, REPORT, DeviceName
+from contract.wire.report import Report
 from worker.evaluate.cells import Cell, preset_of
 from worker.evaluate.rows import KEY, NO_RESULT, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
 from worker.evaluate.truth import ShownScene, Truth
-from worker.hooks import Hooks
-from worker.looking import View
-from worker.metrics import depth_agreement_mm, depth_errors_mm, psnr_tissue, ssim
+from worker.input.clip import DepthClip
+from worker.machine.hooks import Hooks
+from worker.model.metrics import depth_agreement_mm, depth_errors_mm, psnr_tissue, ssim
 from worker.pipeline import reconstruct
-from worker.presets import PRESETS
+from worker.raster.backend import Device, choose_device
 from worker.raster.step import camera_vector
-from worker.render import model_of
-from worker.request import ReconstructionRequest
-from worker.targets import camera_in_units
+from worker.render.view import model_of
+from worker.scene.checkpoint import Scene, load_scene
+from worker.train.looking import View
+from worker.train.presets import PRESETS
+from worker.train.request import ReconstructionRequest
+from worker.train.targets import camera_in_units
 
 UNTIMED_RENDERS, TIMED_RENDERS = 5, 40
 """Renders at different times, of which the median counts; the first fill caches."""

@@ -17,8 +17,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from contract.errors import Cancelled, InputError, UnavailableError
-from contract.locks import FolderLock
+from contract.runtime.locks import FolderLock
+from contract.wire.errors import Cancelled, InputError, UnavailableError
 
 Row = dict[str, str]
 

@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from contract.errors import InputError
-from worker.backend import CPU, Device
-from worker.clip import DepthClip
-from worker.hooks import Hooks
+from contract.wire.errors import InputError
+from worker.input.clip import DepthClip
+from worker.machine.hooks import Hooks
 from worker.phantom import MOTIONS, Phantom, PhantomSettings, make_phantom
 from worker.pipeline import depth_clip_of
-from worker.request import ReconstructionRequest
+from worker.raster.backend import CPU, Device
+from worker.train.request import ReconstructionRequest
 
 DATA_VARIABLE = "INTRASPLAT_DATA"
 PHANTOM_WIDTH, PHANTOM_HEIGHT = 320, 256

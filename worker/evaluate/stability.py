@@ -24,9 +24,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.errors import InputError
-from contract.report import Report
-from worker.checkpoint import Scene, load_scene
+from contract.wire.errors import InputError
+from contract.wire.report import Report
 from worker.evaluate.cells import preset_of
 from worker.evaluate.conditions import (
     CLEAN,
@@ -40,14 +39,15 @@ from worker.evaluate.conditions import (
     write_recording,
 )
 from worker.evaluate.rows import NO_RESULT, Row, commit, machine, read_rows, write_rows
-from worker.hooks import Hooks
-from worker.metrics import psnr_tissue
+from worker.machine.hooks import Hooks
+from worker.model.metrics import psnr_tissue
 from worker.phantom import PhantomSettings
 from worker.pipeline import reconstruct
 from worker.raster.step import camera_vector
-from worker.render import model_of
-from worker.request import ReconstructionRequest
-from worker.targets import camera_in_units, solid_depth_mm
+from worker.render.view import model_of
+from worker.scene.checkpoint import Scene, load_scene
+from worker.train.request import ReconstructionRequest
+from worker.train.targets import camera_in_units, solid_depth_mm
 
 STABILITY = "stability.csv"
 KEY = ("condition", "severity", "series", "seed", "iterations", "width", "height", "frames")

@@ -7,17 +7,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from contract.arguments import count
-from contract.errors import InputError
-from contract.exits import ExitCode
-from contract.job import JobProgress
-from contract.processes import heeding_signals
-from contract.progress_bar import ProgressBar
+from contract.runtime.arguments import count
+from contract.runtime.exits import ExitCode
+from contract.runtime.processes import heeding_signals
+from contract.runtime.progress_bar import ProgressBar
+from contract.wire.errors import InputError
+from contract.wire.job import JobProgress
 from worker.evaluate.atlas import count_outcomes, draw_map, places_of, series_in, told_table
 from worker.evaluate.conditions import CONDITIONS, SEVERITIES
 from worker.evaluate.rows import Row, adding_alone, read_rows
 from worker.evaluate.stability import STABILITY, Atlas, Grid, StabilityCell, plan
-from worker.hooks import Hooks
+from worker.machine.hooks import Hooks
 
 DEFAULT_SERIES = ("fast", "paper", "pfs", "hexplane", "without_mapf")
 TABLE = "stability.md"

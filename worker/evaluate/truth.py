@@ -5,7 +5,7 @@ Symbols: T frames, H W pixels, M material points of frame 0.
 Whatever is judged is a Shown: a scene, or the phantom itself, which scores as well as anything can.
 
 view   a held-out frame's moment from a pose 10 or 15 degrees off, to the right, up, left or down, about the point at
-       median depth on frame 0's axis (contract/pose.py). Judged are the pixels whose material point some training
+       median depth on frame 0's axis (contract/wire/pose.py). Judged are the pixels whose material point some training
        frame showed as tissue. Wet tissue mirrors the lamp, elsewhere for every eye: a clip from one place cannot tell
        where. So three figures: the view as it is; `baked`, the view with its highlights where the endoscope sees them;
        and the bound, what that baked view itself scores as the view. No model whose colours do not depend on the
@@ -31,15 +31,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.pose import OrbitPose, world_from_camera
-from worker.checkpoint import Scene
-from worker.clip import DepthClip
-from worker.looking import View, sample_frames
-from worker.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
+from contract.wire.pose import OrbitPose, world_from_camera
+from worker.input.clip import DepthClip
+from worker.model.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
 from worker.phantom import Phantom
 from worker.raster.step import camera_vector
-from worker.render import model_of
-from worker.targets import camera_in_units, solid_depth_mm
+from worker.render.view import model_of
+from worker.scene.checkpoint import Scene
+from worker.train.looking import View, sample_frames
+from worker.train.targets import camera_in_units, solid_depth_mm
 
 Pose = NDArray[np.float64]
 

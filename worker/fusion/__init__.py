@@ -13,8 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from contract.errors import InputError
-from worker.clip.types import DepthClip
+from contract.wire.errors import InputError
 from worker.fusion.complete import complete_depth
 from worker.fusion.fill import Moved, fill
 from worker.fusion.points import (
@@ -30,6 +29,7 @@ from worker.fusion.points import (
     unproject,
 )
 from worker.fusion.published import motion_mask, published_fusion
+from worker.input.clip.types import DepthClip
 
 __all__ = [
     "CLEAR_CONFIDENCE",

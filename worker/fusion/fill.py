@@ -15,9 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.camera import Intrinsics
-from worker.clip.split import spread
-from worker.clip.types import DepthClip
 from worker.fusion.complete import complete_depth
 from worker.fusion.points import (
     CLEAR_CONFIDENCE,
@@ -30,6 +27,9 @@ from worker.fusion.points import (
     same_pose,
     unproject_at,
 )
+from worker.input.camera import Intrinsics
+from worker.input.clip.split import spread
+from worker.input.clip.types import DepthClip
 
 Moved = Callable[[int, NDArray[np.intp]], NDArray[np.float32]]
 """Where what the first frame's pixels (flat, [M]) show has gone in a training frame: displacements [M, 3] mm, world."""

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.camera import Intrinsics
-from worker.clip.types import DepthClip
 from worker.fusion.complete import complete_depth
+from worker.input.camera import Intrinsics
+from worker.input.clip.types import DepthClip
 
 COMPLETED_CONFIDENCE = 0.1
 """Confidence of a point whose depth no stereo measured: above 0, since its place in the image is known."""

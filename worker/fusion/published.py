@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.clip.types import DepthClip
 from worker.fusion.points import PointCloud, cells_of, measured_pixels, points_at, same_pose, sample, unproject
+from worker.input.clip.types import DepthClip
 
 
 def motion_mask(clip: DepthClip, train: Sequence[int], percentile: float) -> NDArray[np.bool_]:

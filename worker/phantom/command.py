@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from contract.errors import InputError
+from contract.wire.errors import InputError
 from worker.phantom.scene import make_phantom
 from worker.phantom.settings import MOTIONS, PhantomSettings
 from worker.phantom.writers import write_endonerf, write_stereo_video, write_stereomis

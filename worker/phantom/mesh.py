@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.camera import Intrinsics
+from worker.input.camera import Intrinsics
 
 NEAR_MM = 2.0  # triangles with a corner nearer than this are not drawn
 SHARED_EDGE = 1e-9  # slack of a weight, so that rounding leaves no hole between two triangles

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.camera import Intrinsics
-from worker.clip.types import DepthClip
+from worker.input.camera import Intrinsics
+from worker.input.clip.types import DepthClip
 from worker.phantom.camera import endoscope_pose, right_eye
 from worker.phantom.fields import Image32
 from worker.phantom.instrument import InstrumentMesh, instrument_at

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from contract.camera import Intrinsics
-from contract.errors import InputError
+from contract.wire.errors import InputError
+from worker.input.camera import Intrinsics
 
 Motion = Literal["still", "breathing", "pull", "cut"]
 MOTIONS: tuple[Motion, ...] = get_args(Motion)

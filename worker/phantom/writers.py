@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.errors import UnavailableError
-from worker.opencv import silent_stderr
+from contract.wire.errors import UnavailableError
+from worker.machine.opencv import silent_stderr
 from worker.phantom.camera import orbit_pose
 from worker.phantom.scene import Phantom, PhantomFrame
 

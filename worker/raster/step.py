@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worker.loss import LossSettings
+from worker.model.loss import LossSettings
 from worker.raster import Camera
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.errors import InputError
+from contract.wire.errors import InputError
 from worker.stereo.matching import DISPARITY_STEPS, Grey, Image, padded, semi_global_matcher, shift_rows
 
 Agreed = Callable[[NDArray[np.uint8], NDArray[np.uint8], int, int], tuple[Image, NDArray[np.bool_]]]

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.errors import Cancelled, InputError
-from worker.clip.split import spread
-from worker.clip.types import DepthClip
-from worker.hooks import Hooks, Progress
-from worker.opencv import cores, one_opencv_thread
+from contract.wire.errors import Cancelled, InputError
+from worker.input.clip.split import spread
+from worker.input.clip.types import DepthClip
+from worker.machine.hooks import Hooks, Progress
+from worker.machine.opencv import cores, one_opencv_thread
 from worker.stereo.alignment import (
     RowShift,
     agreed_disparities,
@@ -29,7 +29,7 @@ from worker.stereo.alignment import (
 from worker.stereo.matching import MAX_DEPTH_MM, MIN_CONFIDENCE, Grey, MatchPlan, match
 
 if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
-    from worker.calibration import RectifiedClip
+    from worker.input.calibration import RectifiedClip
 
 STAGE = "stereo"
 COMPILATION = "compile"

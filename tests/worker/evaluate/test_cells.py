@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from contract.errors import InputError
+from contract.wire.errors import InputError
 from worker.evaluate.cells import GRID_BASES, GRID_POINTS, Cell, base_of, capacity_grid, plan, preset_of
-from worker.presets import PRESETS
+from worker.train.presets import PRESETS
 
 
 def test_a_series_is_a_preset_with_its_changes_made() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from worker.clip import DepthClip
 from worker.evaluate.conditions import CONDITIONS, SEVERITIES, CleanClip, Given, Recording, clean_clip, write_recording
+from worker.input.clip import DepthClip
 from worker.phantom import PhantomSettings
 
 CLEAN_FRAMES = 12

@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from contract.errors import Cancelled, InputError, UnavailableError
-from contract.exits import ExitCode
+from contract.runtime.exits import ExitCode
+from contract.wire.errors import Cancelled, InputError, UnavailableError
 from worker.__main__ import main
 from worker.evaluate.cells import Cell, plan
 from worker.evaluate.command import SUMMARY, measure_all
 from worker.evaluate.measure import Bench, Values, command_of, seconds_of
 from worker.evaluate.rows import CURVES, KEY, LOCK, RUN_FIELDS, RUNS, Results, adding_alone, read_rows
 from worker.evaluate.sources import DATA_VARIABLE, source_of
-from worker.hooks import Hooks, Progress
+from worker.machine.hooks import Hooks, Progress
 
 CLIP = "phantom:pull:96x80:12frames"
 NAME = "phantom-pull-96x80-12frames"

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.stability_page import stability_sections
-from contract.errors import Cancelled, InputError, UnavailableError
-from contract.exits import ExitCode
+from contract.runtime.exits import ExitCode
+from contract.wire.errors import Cancelled, InputError, UnavailableError
 from worker.__main__ import main
 from worker.evaluate.atlas import count_outcomes, draw_map, places_of, told_table
 from worker.evaluate.conditions import CLEAN, CLEAN_STEREO, CONDITIONS, clean_clip
@@ -26,7 +26,7 @@ from worker.evaluate.stability import (
     plan,
     verdict,
 )
-from worker.hooks import Hooks, Progress
+from worker.machine.hooks import Hooks, Progress
 
 SMALL = Grid(width=96, height=80, frames=12, iterations=15)
 

@@ -10,15 +10,15 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from worker.checkpoint import Scene
-from worker.clip import DepthClip
-from worker.deformation import SharedBasis
 from worker.evaluate.truth import MOVING_MM, ShownScene, Truth
-from worker.gaussians import initial_gaussians
-from worker.looking import View
-from worker.metrics import BEST_PSNR_DB
+from worker.input.clip import DepthClip
+from worker.model.deformation import SharedBasis
+from worker.model.gaussians import initial_gaussians
+from worker.model.metrics import BEST_PSNR_DB
 from worker.phantom import Phantom, PhantomSettings, make_phantom
-from worker.targets import MEDIAN_DEPTH_UNITS
+from worker.scene.checkpoint import Scene
+from worker.train.looking import View
+from worker.train.targets import MEDIAN_DEPTH_UNITS
 
 FRAMES = 12
 HELD_OUT = [1, 5, 9]

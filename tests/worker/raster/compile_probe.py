@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from numba.core.dispatcher import Dispatcher
 
-from worker.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
-from worker.gaussians import Gaussians
-from worker.loss import LossSettings
-from worker.optimize import StepRates
+from worker.model.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.model.gaussians import Gaussians
+from worker.model.loss import LossSettings
+from worker.model.optimize import StepRates
 from worker.raster import Camera
 from worker.raster.cpu import compile_kernels, rasterize
 from worker.raster.cpu.model import FusedModel

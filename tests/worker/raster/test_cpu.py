@@ -17,10 +17,10 @@ from torch import Tensor
 
 from tests.helpers import assert_close
 from tests.worker.raster.scenes import Scene, opaque_wall, pixels_near_a_cut, random_scene
-from worker.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis, restore
-from worker.gaussians import Gaussians
-from worker.loss import LossSettings, training_loss
-from worker.optimize import StepRates
+from worker.model.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis, restore
+from worker.model.gaussians import Gaussians
+from worker.model.loss import LossSettings, training_loss
+from worker.model.optimize import StepRates
 from worker.raster import Camera
 from worker.raster.cpu import Rasterizer, padded
 from worker.raster.cpu.model import FusedModel
@@ -73,7 +73,7 @@ class Frame:
         return Target(rgb.ravel(), weight.ravel(), inverse_depth.ravel())
 
     def kernel_settings(self, settings: LossSettings) -> NDArray[np.float32]:
-        """The kernel's loss is a sum over pixels: worker.loss's means need this frame's counts."""
+        """The kernel's loss is a sum over pixels: worker.model.loss's means need this frame's counts."""
         with_depth = int((self.tissue & (self.depth > 0)).sum())
         return np.array(
             [
@@ -92,7 +92,7 @@ class Frame:
         return TrainingFrame(camera_vector(camera), t, self.target(rasterizer), *counts)
 
     def loss(self, scene: Scene, settings: LossSettings) -> Tensor:
-        """worker.loss on the reference's render."""
+        """worker.model.loss on the reference's render."""
         rendered = scene.render()
         true_rgb = torch.from_numpy(self.rgb).double() / 255
         true_depth, tissue = torch.from_numpy(self.depth).double(), torch.from_numpy(self.tissue)

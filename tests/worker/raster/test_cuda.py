@@ -21,7 +21,7 @@ from tests.helpers import assert_close
 from tests.worker.raster.scenes import INTERPRETED, Scene, pixels_near_a_cut, random_scene, unproject
 from tests.worker.raster.test_backends import random_cotangent, values_and_gradients
 from tests.worker.raster.test_cpu import LOSSES, NORMALISED, Frame, random_frame
-from worker.loss import LossSettings
+from worker.model.loss import LossSettings
 from worker.raster import Camera, cpu, reference
 from worker.raster.cpu import padded
 from worker.raster.cuda import rasterize

@@ -9,14 +9,14 @@ import torch
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
-from contract.errors import UnavailableError
-from worker.backend import Device
-from worker.hooks import Hooks
+from contract.wire.errors import UnavailableError
+from worker.machine.hooks import Hooks
 from worker.phantom import PhantomSettings, make_phantom, write_stereomis
 from worker.pipeline import depth_clip_of
 from worker.raster import Rendered
+from worker.raster.backend import Device
 from worker.raster.cuda import agreement, rasterize
-from worker.request import ReconstructionRequest
+from worker.train.request import ReconstructionRequest
 
 
 def test_the_device_agrees_with_the_reference(device: str) -> None:

@@ -19,15 +19,15 @@ from tests.helpers import assert_close
 from tests.worker import models
 from tests.worker.raster import replays
 from tests.worker.raster.scenes import random_scene
-from worker.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis
-from worker.gaussians import Gaussians
-from worker.loss import LossSettings
-from worker.presets import MOST_FRAMES_A_STEP
+from worker.model.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.model.gaussians import Gaussians
+from worker.model.loss import LossSettings
 from worker.raster.cpu import padded
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cuda.bins import MOST_FRAMES
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
 from worker.raster.step import Target, TrainingFrame, camera_vector
+from worker.train.presets import MOST_FRAMES_A_STEP
 
 WIDTH, HEIGHT, COUNT = 20, 16, 32
 Fused = SharedBasis | PolynomialFourier | FlexibleDeformation

@@ -17,9 +17,9 @@ pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA 
 
 from tests.helpers import assert_close
 from tests.worker.raster.test_cpu import KINDS, RATES, Fused, moving_gaussians
-from worker.deformation import FlexibleDeformation, SharedBasis, restore
-from worker.gaussians import SH_C0, Gaussians
-from worker.optimize import StepRates
+from worker.model.deformation import FlexibleDeformation, SharedBasis, restore
+from worker.model.gaussians import SH_C0, Gaussians
+from worker.model.optimize import StepRates
 from worker.raster.cpu.motion import NEGLIGIBLE
 from worker.raster.cpu.motion import motion_of as cpu_motion_of
 from worker.raster.cuda import harmonics

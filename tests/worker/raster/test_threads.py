@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from contract.errors import InputError
+from contract.wire.errors import InputError
 from tests.worker.raster.test_cpu import NORMALISED, RATES, moving_gaussians, random_frame
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.threads import THREADS_VARIABLE, run, thread_count

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.clip.types import DepthClip
 from worker.evaluate.conditions.recording import Recording
+from worker.input.clip.types import DepthClip
 from worker.phantom import Phantom, PhantomSettings, make_phantom
 
 REFERENCE_WIDTH = 640

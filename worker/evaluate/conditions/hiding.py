@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.clip.types import DepthClip
 from worker.evaluate.conditions.clean import CleanClip, Given, given
 from worker.evaluate.conditions.recording import recording_of
+from worker.input.clip.types import DepthClip
 from worker.phantom import PhantomFrame
 
 STEEL = (118, 121, 124)

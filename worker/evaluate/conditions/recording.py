@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from worker.phantom import Phantom, PhantomFrame, write_stereomis
-from worker.request import ReconstructionRequest
+from worker.train.request import ReconstructionRequest
 
 Spoil = Callable[[PhantomFrame, int], PhantomFrame]
 STEREOMIS_CALIBRATION = "StereoCalibration.ini"

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from worker.clip.types import DepthClip
 from worker.evaluate.conditions.clean import CleanClip, Given, given
+from worker.input.clip.types import DepthClip
 
 
 def few_frames(clean: CleanClip, level: float, random: np.random.Generator) -> Given:

@@ -4,7 +4,7 @@ vectors -> simd -> bins -> project -> blend -> rasterizer (buffers and calls) ->
 update, harmonics -> motion -> model (the fused training step) -> compilation.
 """
 
-from worker.cache import use_kernel_cache
+from worker.machine.cache import use_kernel_cache
 
 use_kernel_cache()
 

@@ -309,7 +309,7 @@ def _depth_loss(planes, p, tissue, wanted, normalised, sharpness, depth_weight):
 def _loss(  # type: ignore[no-untyped-def]
     planes, statistics, target, weight, inverse_depth, loss_settings, origin, stride, size, rows
 ):
-    """Loss of the tile into statistics, its gradient into the planes (worker/loss.py has the same in plain torch).
+    """Loss of the tile into statistics, its gradient into the planes (worker/model/loss.py: the same in torch).
 
     target [3, H, stride] uint8, weight [H, stride] uint8 (255 = tissue), inverse_depth [H, stride] float32 (0 = none),
     flattened. loss_settings float32 [5]: colour weight a channel, depth weight, 1 / width of the quadratic zone of the

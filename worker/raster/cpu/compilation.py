@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from worker.deformation import Deformation, FlexibleDeformation, SharedBasis
-from worker.gaussians import Gaussians
-from worker.loss import LossSettings
-from worker.optimize import StepRates
+from worker.model.deformation import Deformation, FlexibleDeformation, SharedBasis
+from worker.model.gaussians import Gaussians
+from worker.model.loss import LossSettings
+from worker.model.optimize import StepRates
 from worker.raster import Camera
 from worker.raster.cpu.model import FusedModel
 from worker.raster.cpu.rasterizer import padded

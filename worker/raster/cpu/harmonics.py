@@ -1,4 +1,4 @@
-"""Spherical harmonics to colour and back, for scenes whose camera moves (worker/gaussians.py has the same in torch).
+"""Spherical harmonics to colour and back, for scenes whose camera moves (worker/model/gaussians.py: the same in torch).
 
 N Gaussians, K = (degree + 1)^2 coefficients a channel: the constant one in state[10:13], the others in
 rest [K - 1, 3, N]; colour [3, N], mean in state[0:3].
@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from worker.gaussians import SH_C0  # a kernel keeps its value: no other will ever be right
+from worker.model.gaussians import SH_C0  # a kernel keeps its value: no other will ever be right
 
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)

@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from worker.deformation import Deformation
-from worker.gaussians import SH_C0, Gaussians
-from worker.loss import LossSettings
-from worker.optimize import StepRates, adam_step
+from worker.model.deformation import Deformation
+from worker.model.gaussians import SH_C0, Gaussians
+from worker.model.loss import LossSettings
+from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu import harmonics, update
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
 from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, padded
@@ -31,7 +31,7 @@ SIZES_KEPT = 3
 
 
 class FusedModel:
-    """Canonical Gaussians, their deformation and Adam's moments, trained on the CPU. See worker/model.py."""
+    """Canonical Gaussians, their deformation and Adam's moments, trained on the CPU. See worker/raster/model.py."""
 
     answers_every = 1
 

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from worker.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
-from worker.optimize import StepRates, adam_step
+from worker.model.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu import update
 from worker.raster.cpu.rasterizer import Floats
 from worker.raster.cpu.threads import run
@@ -179,4 +179,4 @@ def motion_of(deformation: Deformation, columns: int) -> LinearMotion | FdmMotio
         return FdmMotion(deformation, columns)
     if isinstance(deformation, LinearDeformation):
         return LinearMotion(deformation, columns)
-    raise ValueError(f"deformation {deformation.kind!r} has no kernels of its own: worker/unfused.py trains it")
+    raise ValueError(f"deformation {deformation.kind!r} has no kernels of its own: worker/raster/unfused.py trains it")

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 
-from contract.errors import InputError
+from contract.wire.errors import InputError
 
 THREADS_VARIABLE = "INTRASPLAT_THREADS"
 

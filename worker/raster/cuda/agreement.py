@@ -14,7 +14,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from contract.errors import UnavailableError
+from contract.wire.errors import UnavailableError
 from worker.raster import Camera, Rendered, reference
 from worker.raster.cuda.autograd import rasterize
 from worker.raster.cuda.captured import one_at_a_time

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from worker.optimize import StepRates, adam_step
+from worker.model.optimize import StepRates, adam_step
 from worker.raster.cuda.update import VALUES
 
 ALIGNMENT = 16

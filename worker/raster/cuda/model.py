@@ -23,10 +23,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from worker.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation
-from worker.gaussians import SH_C0, Gaussians
-from worker.loss import LossSettings
-from worker.optimize import StepRates
+from worker.model.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation
+from worker.model.gaussians import SH_C0, Gaussians
+from worker.model.loss import LossSettings
+from worker.model.optimize import StepRates
 from worker.raster.cuda import harmonics
 from worker.raster.cuda.control import write_adam
 from worker.raster.cuda.frames import FrameStore
@@ -47,7 +47,7 @@ SIZES_KEPT = 3
 
 
 class CudaModel:
-    """Canonical Gaussians, their deformation and Adam's moments, trained on the device. See worker/model.py."""
+    """Canonical Gaussians, their deformation and Adam's moments, trained on the device. See worker/raster/model.py."""
 
     answers_every = CHECK_EVERY
 

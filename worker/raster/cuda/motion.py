@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from worker.deformation import Deformation, FlexibleDeformation
-from worker.optimize import StepRates, adam_step
+from worker.model.deformation import Deformation, FlexibleDeformation
+from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu.motion import NEGLIGIBLE, LinearDeformation
 from worker.raster.cuda import motion_kernels as kernels
 from worker.raster.cuda.control import ADAM, Field
@@ -284,4 +284,4 @@ def motion_of(deformation: Deformation, columns: int, device: torch.device) -> L
         return FdmMotion(deformation, columns, device)
     if isinstance(deformation, LinearDeformation):
         return LinearMotion(deformation, columns, device)
-    raise ValueError(f"deformation {deformation.kind!r} has no kernels of its own: worker/unfused.py trains it")
+    raise ValueError(f"deformation {deformation.kind!r} has no kernels of its own: worker/raster/unfused.py trains it")

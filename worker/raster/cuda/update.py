@@ -5,9 +5,9 @@ of the canonical state, as in raster/cpu/update.py, and the opacity's logit. A p
 of their rows, so tensors in it are [TILE_ROWS, COLUMNS]. A gradient is a sum over the frames.
 
 Whatever changes from step to step is read from tensors on the device (control.py), so that a launch never changes.
-Rates come as sizes and floors that have Adam's bias corrections folded in (worker/optimize.py); a size of 0 leaves a
-parameter and its moments untouched. Every kernel that changes the model reads `ok` first and does nothing where it is
-0: the step had no room (rasterizer.py, model.py).
+Rates come as sizes and floors that have Adam's bias corrections folded in (worker/model/optimize.py); a size of 0
+leaves a parameter and its moments untouched. Every kernel that changes the model reads `ok` first and does nothing
+where it is 0: the step had no room (rasterizer.py, model.py).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from worker.gaussians import SH_C0
+from worker.model.gaussians import SH_C0
 
 COLUMNS = 32
 """Rows are padded to a multiple of so many floats, 128 bytes: they begin where lines of memory begin. A program has one

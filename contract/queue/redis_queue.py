@@ -1,0 +1,383 @@
+"""The queue on Redis 7+ or Valkey Streams. This file and contract/queue/scripts.py are all that touches keys.
+
+Keys (the braces put all of them in one cluster slot, so that a script may touch several):
+    {intrasplat}:jobs:high|standard     stream; an entry has one field, `job` = job id. Group `workers`; an entry stays
+                                        pending from its first claim until the job has ended, idle since the last beat
+    {intrasplat}:job:<id>               hash; the truth about one job:
+        document                        the JobRecord as submitted, JSON; never changes
+        state                           a JobState; changes only along TRANSITIONS
+        attempt, released, owner        as in JobRecord; with attempt and owner a worker's report must agree
+        cancel                          "1" once a cancel was asked for
+        progress, error                 JSON of JobProgress, JobError
+        started, finished, queued       UNIX s by the server's clock; queued: since when it waits
+        tenant, priority                of the document, for the scripts
+        entry, sequence                 its stream entry, and its place among the jobs of its priority
+        restored                        token of the call that put it back
+    {intrasplat}:events:<id>            stream; each entry is what a change left of the hash (EVENT_FIELDS)
+Indexes, written by the same scripts as the hashes:
+    {intrasplat}:index                  sorted set of job ids by time of submission; and tenant:<tenant>:index
+    {intrasplat}:waiting:high|standard  sorted set of queued jobs by sequence: the order in which they will be claimed
+    {intrasplat}:queued                 sorted set of the same jobs by `queued`; and set tenant:<tenant>:waiting
+    {intrasplat}:held                   hash of the running jobs, by owner
+    {intrasplat}:dead                   sorted set of dead letters, by time of failure
+    {intrasplat}:ended                  hash, jobs that ever came to each terminal state
+    {intrasplat}:durations              list, seconds that the last done jobs ran
+    {intrasplat}:sequence               counter
+    {intrasplat}:workers                set of names that may have a {intrasplat}:worker:<name>
+These expire:
+    {intrasplat}:worker:<name>          JSON of WorkerAddress
+    {intrasplat}:idempotency:<tenant>:<hash>  id of the job submitted under that key
+    {intrasplat}:yield:<id>             owner that was told to make way for that job
+    {intrasplat}:forgotten:<id>         token of the call that removed it
+
+A user who may do this and nothing else:
+    ACL SETUSER intrasplat on >PASSWORD ~{intrasplat}:* resetchannels +@all -@dangerous +bgrewriteaof
+
+Every change of state is one script, and every script gives the same answer when it is run twice, so the client may
+repeat a command whose reply was lost. Claiming, too, is one script; what blocks is a plain XREAD, which takes nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import redis
+from redis.backoff import ExponentialBackoff
+from redis.retry import Retry
+
+from contract.queue import scripts
+from contract.queue.promise import (
+    DURATIONS_KEPT,
+    EVENTS_KEPT,
+    IDEMPOTENCY_S,
+    LEASE_S,
+    LISTING_LIMIT,
+    MAX_ATTEMPTS,
+    PREEMPT_AFTER_S,
+    WORKER_TTL_S,
+    YIELD_S,
+    Admission,
+    Claim,
+    Event,
+    Order,
+    QueueFigures,
+    check_admission,
+    correct_end_s,
+    estimate_end_s,
+    event_order,
+    worker_died,
+)
+from contract.queue.redis_hash import EVENT_FIELDS, introduced, record_of, table_of
+from contract.wire.errors import UnavailableError
+from contract.wire.job import TERMINAL_STATES, JobError, JobProgress, JobRecord, JobState, Standing, sources_of
+from contract.wire.rendering import WorkerAddress
+
+PREFIX = "{intrasplat}:"
+INDEX = PREFIX + "index"
+HIGH, STANDARD = PREFIX + "jobs:high", PREFIX + "jobs:standard"
+HELD = PREFIX + "held"
+QUEUED = PREFIX + "queued"
+WORKERS = PREFIX + "workers"
+
+BLOCK_S = 2.0
+"""Longest single blocking read: a cut connection is noticed within this and the socket's timeout."""
+
+LEASE_CHECK_S = 0.5
+"""Longest one while jobs run: a lease that runs out makes no sound."""
+
+SOCKET_TIMEOUT_S = 4.0
+CONNECT_TIMEOUT_S = 2.0
+RETRIES = 2
+
+REFUSALS = (
+    "MISCONF",
+    "NOREPLICAS",
+    "MASTERDOWN",
+    "CLUSTERDOWN",
+    "TRYAGAIN",
+    "BUSY",
+    "UNKILLABLE",
+    "NOPERM",
+    "READONLY",
+)
+"""First words of errors by which a server says that it, or its disk, cannot or may not serve now."""
+
+UNREADABLE = JobError(problem="The queue's record of this job cannot be read.", remedy="Submit the clip again.")
+
+logger = logging.getLogger("intrasplat.queue")
+
+
+class RedisQueue:
+    """A Queue on a Redis 7+ or Valkey server (`redis://`, `rediss://` or `unix://`); safe to share among threads.
+
+    lease_s and preempt_after_s are for tests that cannot wait; all clients of one queue have to agree on them.
+    """
+
+    def __init__(self, url: str, *, lease_s: float = LEASE_S, preempt_after_s: float = PREEMPT_AFTER_S) -> None:
+        self._client: Any = _connect(url)
+        self._rules = _rules(lease_s, preempt_after_s)
+        self._submit = self._script(scripts.SUBMIT, when_full=False)
+        self._restore = self._script(scripts.RESTORE, when_full=False)
+        self._retry = self._script(scripts.RETRY, when_full=False)
+        self._claim = self._script(scripts.CLAIM, when_full=True)
+        self._beat = self._script(scripts.BEAT, when_full=True)
+        self._end = self._script(scripts.SETTLE, when_full=True)
+        self._release = self._script(scripts.RELEASE, when_full=True)
+        self._cancel = self._script(scripts.CANCEL, when_full=True)
+        self._forget = self._script(scripts.FORGET, when_full=True)
+        self._announce = self._script(scripts.ANNOUNCE, when_full=True)
+
+    def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
+        most = (admission.queued, admission.queued_per_tenant) if admission else ("", "")
+        answer = self._submit(*introduced(record), IDEMPOTENCY_S * 1000, *most)
+        if answer[0] == "full" and admission is not None:
+            check_admission(admission, *answer[1:])
+        standing = record_of(answer[1], table_of(answer[2]))
+        if standing is None:
+            raise UnavailableError(f"The queue's record of job {answer[1]} cannot be read.", "Submit under a new key.")
+        return standing
+
+    def restore(self, record: JobRecord) -> bool:
+        if record.state not in TERMINAL_STATES:
+            raise ValueError(f"Job {record.job_id} is {record.state}; only ended jobs are restored.")
+        remaining_s = record.created_at_s + IDEMPOTENCY_S - time.time()
+        return bool(self._restore(*introduced(record), round(remaining_s * 1000), uuid.uuid4().hex))
+
+    def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            found, *answer = self._claim(owner)
+            if found:
+                record = self._usable(owner, *answer)
+                if record is not None:
+                    return record
+                continue
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                return None
+            last_high, last_standard, pending = answer
+            block_s = min(left_s, LEASE_CHECK_S if pending else BLOCK_S)
+            with _reachable():
+                self._client.xread({HIGH: last_high, STANDARD: last_standard}, 1, max(1, round(block_s * 1000)))
+
+    def beat(self, claim: Claim, progress: JobProgress | None = None) -> Order:
+        document = progress.model_dump_json() if progress else ""
+        return Order(self._beat(claim.job_id, claim.owner, claim.attempt, document))
+
+    def finish(self, claim: Claim) -> bool:
+        return self._settle(claim, JobState.DONE)
+
+    def fail(self, claim: Claim, error: JobError) -> bool:
+        return self._settle(claim, JobState.FAILED, error.model_dump_json())
+
+    def confirm_cancel(self, claim: Claim) -> bool:
+        return self._settle(claim, JobState.CANCELLED)
+
+    def release(self, claim: Claim, *, died: bool = False) -> bool:
+        return bool(self._release(claim.job_id, claim.owner, claim.attempt, "1" if died else ""))
+
+    def cancel(self, job_id: str) -> JobRecord | None:
+        return record_of(job_id, table_of(self._cancel(job_id)))
+
+    def retry(self, job_id: str) -> JobRecord | None:
+        record = self.get(job_id)
+        return record and record_of(job_id, table_of(self._retry(job_id, record.attempt)))
+
+    def get(self, job_id: str) -> JobRecord | None:
+        return self._get_all([job_id]).get(job_id)
+
+    def standing(self, job_id: str) -> Standing:
+        record = self.get(job_id)
+        if record is None or record.state in TERMINAL_STATES:
+            return Standing(position=None, eta_s=None)
+        with _reachable(), self._client.pipeline(transaction=True) as batch:
+            batch.zrank(f"{PREFIX}waiting:{record.options.priority}", job_id)
+            batch.zcard(f"{PREFIX}waiting:high")
+            batch.hvals(HELD)
+            batch.lrange(f"{PREFIX}durations", 0, -1)
+            batch.time()
+            rank, high, held, durations, (clock_s, _) = batch.execute()
+        before = high if rank is not None and record.options.priority == "standard" else 0
+        position = None if rank is None else rank + before
+        running = self._get_all(held)
+        ran_s = {other: clock_s - (of.started_at_s or clock_s) for other, of in running.items()}
+        durations_s = [float(duration) for duration in durations]
+        workers = len(self.workers())
+        eta_s = estimate_end_s(durations_s, position, ran_s.get(job_id, 0.0), list(ran_s.values()), workers)
+        return Standing(position=position, eta_s=correct_end_s(record, eta_s))
+
+    def records(self, tenant: str | None = None, limit: int | None = LISTING_LIMIT) -> list[JobRecord]:
+        index = INDEX if tenant is None else f"{PREFIX}tenant:{tenant}:index"
+        if limit == 0:
+            return []
+        with _reachable():
+            job_ids = self._client.zrevrange(index, 0, -1 if limit is None else limit - 1)
+        return list(self._get_all(job_ids).values())
+
+    def events(self, job_id: str, after: str = "0") -> list[Event]:
+        milliseconds, count = event_order(after)
+        with _reachable(), self._client.pipeline(transaction=True) as batch:
+            batch.hget(_job_key(job_id), "document")
+            batch.xrange(f"{PREFIX}events:{job_id}", min=f"({milliseconds}-{count}")
+            document, entries = batch.execute()
+        found = ((number, record_of(job_id, {**fields, "document": document})) for number, fields in entries)
+        return [Event(number, record) for number, record in found if record is not None]
+
+    def forget(self, job_id: str) -> bool:
+        record = self.get(job_id)
+        terminal = json.dumps(dict.fromkeys(sorted(TERMINAL_STATES), True))
+        idempotency_key = (record and record.idempotency_key) or ""
+        return bool(self._forget(job_id, terminal, idempotency_key, uuid.uuid4().hex))
+
+    def rewrite_log(self) -> bool:
+        try:
+            with _reachable():
+                self._client.bgrewriteaof()
+        except (UnavailableError, redis.ResponseError):  # one is under way, or this user may not
+            return False
+        return True
+
+    def announce(self, address: WorkerAddress) -> None:
+        self._announce(address.name, address.model_dump_json(), round(WORKER_TTL_S * 1000))
+
+    def withdraw(self, name: str) -> None:
+        with _reachable():
+            self._client.delete(_worker_key(name))
+
+    def workers(self) -> list[WorkerAddress]:
+        with _reachable():
+            names = sorted(self._client.smembers(WORKERS))
+            documents = self._client.mget([_worker_key(name) for name in names]) if names else []
+        found = [_address(name, document) for name, document in zip(names, documents, strict=True) if document]
+        return [address for address in found if address is not None]
+
+    def figures(self) -> QueueFigures:
+        with _reachable(), self._client.pipeline(transaction=True) as batch:
+            batch.zcard(QUEUED)
+            batch.zrange(QUEUED, 0, 0, withscores=True)
+            batch.hlen(HELD)
+            batch.hgetall(f"{PREFIX}ended")
+            batch.time()
+            queued, oldest, running, ended, (seconds, microseconds) = batch.execute()
+        since_s = oldest[0][1] if oldest else float("inf")
+        counts = {state: int(ended.get(state, 0)) for state in TERMINAL_STATES}
+        return QueueFigures(queued, running, max(0.0, seconds + microseconds / 1e6 - since_s), counts)
+
+    def ping(self) -> None:
+        with _reachable():
+            self._client.ping()
+
+    def close(self) -> None:
+        self._client.close()
+
+    def _script(self, body: str, *, when_full: bool) -> Callable[..., Any]:
+        run: Any = self._client.register_script(scripts.script_text(body, when_full=when_full))
+
+        def call(*arguments: Any) -> Any:
+            with _reachable():
+                return run(keys=[PREFIX], args=[self._rules, *arguments])
+
+        return call
+
+    def _settle(self, claim: Claim, target: JobState, error: str = "") -> bool:
+        return bool(self._end(claim.job_id, claim.owner, claim.attempt, target.value, error))
+
+    def _usable(self, owner: str, job_id: str, answer: Sequence[str]) -> JobRecord | None:
+        """The claimed record; if it cannot be read the job fails, so that it is in nobody's way."""
+        fields = table_of(answer)
+        record = record_of(job_id, fields)
+        if record is None:
+            claim = Claim(job_id, int(fields["attempt"]), owner)
+            if not self.fail(claim, UNREADABLE):
+                self.confirm_cancel(claim)
+        return record
+
+    def _get_all(self, job_ids: list[str]) -> dict[str, JobRecord]:
+        """The records that there are and that can be read, in the order of their ids here."""
+        with _reachable():
+            batch = self._client.pipeline(transaction=False)
+            for job_id in job_ids:
+                batch.hgetall(_job_key(job_id))
+            answers = batch.execute(raise_on_error=False)
+            for i, answer in enumerate(answers):
+                if isinstance(answer, redis.RedisError):
+                    if not str(answer).startswith("WRONGTYPE"):
+                        raise answer
+                    answers[i] = {"document": "something that is no hash"}
+        found = {job_id: record_of(job_id, answer) for job_id, answer in zip(job_ids, answers, strict=True)}
+        return {job_id: record for job_id, record in found.items() if record is not None}
+
+
+def _connect(url: str) -> Any:
+    """A client with every default that has changed between releases of redis-py stated."""
+    return redis.Redis.from_url(
+        url,
+        decode_responses=True,
+        protocol=2,
+        retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), RETRIES),
+        socket_timeout=SOCKET_TIMEOUT_S,
+        socket_connect_timeout=CONNECT_TIMEOUT_S,
+    )
+
+
+@contextmanager
+def _reachable() -> Iterator[None]:
+    """Turn trouble with the connection or the server into the error that names the remedy."""
+    try:
+        yield
+    except redis.exceptions.AuthenticationError as error:
+        raise UnavailableError("The queue refuses this user or password.", "Correct REDIS_URL.") from error
+    except (redis.ConnectionError, redis.TimeoutError) as error:
+        problem = f"The queue does not answer ({type(error).__name__})."
+        remedy = "Start it with `intrasplat up`, or correct REDIS_URL."
+        raise UnavailableError(problem, remedy, may_return=True) from error
+    except redis.exceptions.OutOfMemoryError as error:
+        raise UnavailableError("The queue's memory is full.", "Raise its maxmemory or delete old jobs.") from error
+    except redis.ResponseError as error:
+        word = "READONLY" if isinstance(error, redis.exceptions.ReadOnlyError) else str(error).partition(" ")[0]
+        if isinstance(error, redis.exceptions.NoPermissionError):
+            word = "NOPERM"
+        if word not in REFUSALS:
+            raise
+        remedy = "Look at the log of its server: REDIS_URL must name one that is no replica and whose disk has room."
+        raise UnavailableError(f"The queue's server refuses ({word}).", remedy) from error
+
+
+def _rules(lease_s: float, preempt_after_s: float) -> str:
+    """The contract's numbers and its table of transitions, as the scripts read them."""
+    rules = {
+        "sources": {state: dict.fromkeys(sorted(sources_of(state)), True) for state in JobState},
+        "lease_ms": round(lease_s * 1000),
+        "preempt_ms": round(preempt_after_s * 1000),
+        "yield_ms": round(YIELD_S * 1000),
+        "max_attempts": MAX_ATTEMPTS,
+        "worker_died": worker_died().model_dump_json(),
+        "unreadable": UNREADABLE.model_dump_json(),
+        "events_kept": EVENTS_KEPT,
+        "event_fields": EVENT_FIELDS,
+        "durations_kept": DURATIONS_KEPT,
+    }
+    return json.dumps(rules)
+
+
+def _address(name: str, document: str) -> WorkerAddress | None:
+    """What a worker announced; None if it cannot be read, which is logged."""
+    try:
+        return WorkerAddress.model_validate_json(document)
+    except ValueError as error:
+        logger.error("A worker's address cannot be read.", extra={"worker": name, "error": type(error).__name__})
+        return None
+
+
+def _job_key(job_id: str) -> str:
+    return f"{PREFIX}job:{job_id}"
+
+
+def _worker_key(name: str) -> str:
+    return f"{PREFIX}worker:{name}"

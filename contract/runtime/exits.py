@@ -1,0 +1,65 @@
+"""Exit codes of every intrasplat command, the same whether the work runs here or on a server."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from enum import IntEnum
+from pathlib import Path
+
+from contract.wire.errors import Cancelled, InputError, IntrasplatError, UnavailableError
+
+
+class ExitCode(IntEnum):
+    """What a command's exit status says; scripts may rely on it."""
+
+    OK = 0
+    USAGE = 2
+    BAD_INPUT = 3
+    FAILED = 4
+    UNAVAILABLE = 5
+    INTERRUPTED = 130
+
+
+EXIT_CODES_HELP = (
+    "exit codes: 0 ok, 2 wrong usage, 3 the input cannot be used, 4 the work failed, "
+    "5 something needed is not there, 130 interrupted"
+)
+
+
+def exit_code_of(error: IntrasplatError) -> ExitCode:
+    """The exit code that tells of `error`."""
+    if isinstance(error, InputError):
+        return ExitCode.BAD_INPUT
+    if isinstance(error, UnavailableError):
+        return ExitCode.UNAVAILABLE
+    if isinstance(error, Cancelled):
+        return ExitCode.INTERRUPTED
+    return ExitCode.FAILED
+
+
+LAST_WORDS_VARIABLE = "INTRASPLAT_LAST_WORDS"
+"""Set by whoever starts a process and wants to tell what it lacked: the file that it leaves that in."""
+
+
+def end_by(error: IntrasplatError) -> ExitCode:
+    """Say on stderr why this process ends, leave what is not there to whoever started it, and return the exit code."""
+    print(f"intrasplat: {error}", file=sys.stderr)
+    path = os.environ.get(LAST_WORDS_VARIABLE)
+    if path and isinstance(error, UnavailableError):
+        with contextlib.suppress(OSError):  # room on the disk may be what is not there; stderr has it all the same
+            words = {"problem": error.problem, "remedy": error.remedy, "may_return": error.may_return}
+            Path(path).write_text(json.dumps(words))
+    return exit_code_of(error)
+
+
+def take_last_words(path: Path) -> UnavailableError | None:
+    """What a process that has ended left in its file, which is removed; None if it left nothing."""
+    try:
+        return UnavailableError(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
+    finally:
+        path.unlink(missing_ok=True)

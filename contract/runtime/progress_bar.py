@@ -1,0 +1,57 @@
+"""The progress bar of every command: one line on a terminal, one line a stage in a log file."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import TextIO
+
+from contract.wire.job import JobProgress
+
+BAR_CELLS = 24
+LINE_COLUMNS = 78
+
+
+def format_progress(progress: JobProgress) -> str:
+    """`train      [######..................]  25 %  31.24 dB  42 s left`; parts that are unknown are left out."""
+    filled = round(progress.fraction * BAR_CELLS)
+    parts = [f"{progress.stage:<10} [{'#' * filled}{'.' * (BAR_CELLS - filled)}] {progress.fraction:4.0%}"]
+    if progress.psnr_db is not None:
+        parts.append(f"{progress.psnr_db:.2f} dB")
+    if progress.seconds_left is not None:
+        parts.append(f"{progress.seconds_left:.0f} s left")
+    return "  ".join(parts)
+
+
+class ProgressBar:
+    """Writes progress to `stream`; use as a context so that the line is closed whatever happens."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._on_terminal = stream.isatty()
+        self._last_stage: str | None = None
+        self._line_open = False
+
+    def show(self, progress: JobProgress) -> None:
+        """Redraw the line; where nothing can be redrawn, write once a stage."""
+        if self._on_terminal:
+            self._stream.write(f"\r{format_progress(progress):<{LINE_COLUMNS}}")
+            self._line_open = True
+        elif progress.stage != self._last_stage:
+            self._stream.write(f"{progress.stage}\n")
+        self._last_stage = progress.stage
+        self._stream.flush()
+
+    def close(self) -> None:
+        """End the line, if one is open."""
+        if self._line_open:
+            self._stream.write("\n")
+            self._stream.flush()
+            self._line_open = False
+
+    def __enter__(self) -> ProgressBar:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

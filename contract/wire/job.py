@@ -1,0 +1,229 @@
+"""A job: what was asked for, where it stands, and the one table of how its state may change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from contract.wire.errors import InputError
+from contract.wire.names import Layout, MaskPolarity, PoseConvention, PresetName
+
+JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
+"""Job ids are made by the service, never by a caller, so they are safe as file names and key parts."""
+
+Priority = Literal["standard", "high"]
+"""high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
+
+MOST_HOLDOUT_CHARACTERS = 8000
+"""A thousand frame numbers of up to six digits, and what stands between them. A record must be small enough to go
+through a pipe to a process that does not read just now."""
+
+LOCAL_TENANT = "local"
+"""Whose jobs they are where no key is asked for."""
+
+TENANT_PATTERN = r"^[a-z0-9-]{1,40}$"
+
+
+class JobState(StrEnum):
+    """Where a job stands."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+TRANSITIONS: Mapping[JobState, frozenset[JobState]] = MappingProxyType(
+    {
+        JobState.QUEUED: frozenset({JobState.RUNNING, JobState.CANCELLED}),
+        # Back to queued: its worker died or handed it back, and another attempt may start.
+        JobState.RUNNING: frozenset({JobState.QUEUED, JobState.DONE, JobState.FAILED, JobState.CANCELLED}),
+        JobState.DONE: frozenset(),
+        # Only because a caller asked to try again: by itself a failed job stays where it is.
+        JobState.FAILED: frozenset({JobState.QUEUED}),
+        JobState.CANCELLED: frozenset(),
+    }
+)
+"""The only changes of state there are; the queue's scripts are given their rows of it, so no second copy exists."""
+
+TERMINAL_STATES = frozenset({JobState.DONE, JobState.FAILED, JobState.CANCELLED})
+"""States that a job does not leave by itself."""
+
+
+def sources_of(target: JobState) -> frozenset[JobState]:
+    """The states from which `target` may be reached."""
+    return frozenset(state for state, following in TRANSITIONS.items() if target in following)
+
+
+class JobOptions(BaseModel):
+    """What the caller may choose about a reconstruction; the `options` field of POST /reconstruct."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    preset: PresetName = "fast"
+    budget_s: float | None = Field(
+        default=None, gt=0, le=7200, description="about how many seconds to train, often less; not with iterations"
+    )
+    iterations: int | None = Field(default=None, ge=1, le=1_000_000, description="fixed schedule; not with budget_s")
+    mask_polarity: MaskPolarity = "auto"
+    layout: Layout = "auto"
+    pose_convention: PoseConvention = Field(default="opengl", description="axes of poses_bounds.npy")
+    holdout: str = Field(
+        default="every8",
+        max_length=MOST_HOLDOUT_CHARACTERS,
+        pattern=r"^(every8|blocks8|none|\d{1,6}(,\d{1,6})*)$",
+        description="every8, blocks8, none, or frame numbers such as 1,9,17",
+    )
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    priority: Priority = Field(default="standard", description="high: before, and in place of, standard jobs")
+    retention_hours: float | None = Field(
+        default=None, gt=0, le=87_600, description="clip, scene and record are purged so long after the job ended"
+    )
+
+    @field_validator("holdout", mode="before")
+    @classmethod
+    def _frames_as_text(cls, value: object) -> object:
+        """A JSON list of frame numbers means the same as their comma-separated text."""
+        return ",".join(str(frame) for frame in value) if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _one_limit(self) -> JobOptions:
+        if self.budget_s is not None and self.iterations is not None:
+            raise ValueError("budget_s and iterations exclude each other; give one of them")
+        return self
+
+
+def parse_options(given: str | Mapping[str, object]) -> JobOptions:
+    """Options from JSON text or from values by name.
+
+    Raises:
+        InputError: names the option at fault, as options.NAME.
+    """
+    try:
+        return JobOptions.model_validate_json(given) if isinstance(given, str) else JobOptions.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(["options", *(str(part) for part in first["loc"])])
+        problem = f"{first['msg']} (given: {str(first['input'])[:80]!r})."
+        known = ", ".join(JobOptions.model_fields)
+        raise InputError(field, problem, f"The options are {known}; /openapi.json describes them.") from error
+
+
+class JobFiles(BaseModel):
+    """File names inside the job's spool folder, made by the service (`clip.mp4`), never the caller's."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    clip: str
+    right: str | None = None
+    calibration: str | None = None
+    masks: str | None = None
+
+
+class JobProgress(BaseModel):
+    """The last report of progress. fraction is of the stage, in [0, 1]; psnr_db is the last held-out psnr_tissue."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    stage: str
+    fraction: float = Field(ge=0, le=1)
+    iteration: int = 0
+    iterations: int = 0
+    psnr_db: float | None = None
+    seconds_left: float | None = None
+
+
+class JobError(BaseModel):
+    """Why a job failed: one sentence, the field at fault if it was the input, and what to do about it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    problem: str
+    field: str | None = None
+    remedy: str | None = None
+
+
+class JobRecord(BaseModel):
+    """All that is known of a job; the queue holds it, and it alone is the truth about the state. Times are UNIX s."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    job_id: str = Field(pattern=JOB_ID_PATTERN)
+    state: JobState = JobState.QUEUED
+    options: JobOptions = JobOptions()
+    files: JobFiles
+    tenant: str = Field(default=LOCAL_TENANT, pattern=TENANT_PATTERN)
+    """Whose it is; nobody else learns that it exists."""
+    input_bytes: int = Field(default=0, ge=0)
+    input_sha256: str = ""
+    """Of all files in the order of their parts' names."""
+    idempotency_key: str | None = None
+    """SHA-256 of the caller's Idempotency-Key: a second submission under it yields this job."""
+    created_at_s: float
+    started_at_s: float | None = None
+    finished_at_s: float | None = None
+    attempt: int = 0
+    """Counts claims; a worker's report is accepted only for the attempt it holds."""
+    released: int = 0
+    """How many of the attempts are not held against the job: handed back, made way, or forgiven by a retry."""
+    owner: str | None = None
+    """Name of the worker that holds, or last held, the job."""
+    cancel_requested: bool = False
+    progress: JobProgress | None = None
+    error: JobError | None = None
+
+
+class Standing(BaseModel):
+    """Where a queued or running job stands: how many will be claimed before it, and when it may be done."""
+
+    model_config = ConfigDict(frozen=True)
+
+    position: int | None
+    eta_s: float | None
+
+
+class JobView(BaseModel):
+    """A job as the API shows it."""
+
+    id: str
+    state: JobState
+    stage: str | None = None
+    fraction: float | None = None
+    iteration: int | None = None
+    iterations: int | None = None
+    psnr_db: float | None = None
+    seconds_left: float | None = None
+    position: int | None = Field(default=None, description="jobs that will be claimed before this one; while queued")
+    eta_s: float | None = Field(default=None, description="estimated seconds until it is done; None if unknown")
+    error: JobError | None = None
+    cancel_requested: bool = False
+    attempt: int = 0
+    options: JobOptions
+    input_bytes: int
+    created_at_s: float
+    started_at_s: float | None = None
+    finished_at_s: float | None = None
+    links: dict[str, str]
+
+    @classmethod
+    def of(cls, record: JobRecord, standing: Standing | None = None) -> JobView:
+        """The view of one record; `links` names what may be asked for next."""
+        links = {"self": f"/jobs/{record.job_id}", "events": f"/jobs/{record.job_id}/events"}
+        if record.state is JobState.FAILED:
+            links["retry"] = f"/jobs/{record.job_id}/retry"
+        if record.state in (JobState.RUNNING, JobState.DONE):
+            links["render"] = f"/render?scene={record.job_id}"
+        if record.state is JobState.DONE:
+            links["scene"] = f"/scenes/{record.job_id}"
+        progress = record.progress.model_dump() if record.progress else {}
+        shared = record.model_dump(
+            include={"state", "error", "cancel_requested", "attempt", "options", "input_bytes"}
+            | {"created_at_s", "started_at_s", "finished_at_s"}
+        )
+        progress |= {"position": standing.position, "eta_s": standing.eta_s} if standing else {}
+        return cls(id=record.job_id, links=links, **shared, **progress)

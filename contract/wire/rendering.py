@@ -1,0 +1,130 @@
+"""What the service asks of the worker that holds a scene, and what comes back, over ZeroMQ.
+
+Wire, service (DEALER) to worker (ROUTER):  [request id, WorkerRequest as JSON]
+Wire, worker to service:                    [request id, WorkerReply as JSON, body]
+The body is the encoded image or file; requests on one connection may be answered in any order.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from contract.wire.job import JOB_ID_PATTERN
+from contract.wire.pose import MatrixPose, OrbitPose
+
+
+class Layer(StrEnum):
+    """rgb; depth along the camera's z; confidence in [0, 1]."""
+
+    RGB = "rgb"
+    DEPTH = "depth"
+    CONFIDENCE = "confidence"
+
+
+class ImageFormat(StrEnum):
+    """png and npy are exact (depth: 16-bit PNG in 0.01 mm, npy float32 mm); jpeg and webp are for eyes."""
+
+    PNG = "png"
+    JPEG = "jpeg"
+    WEBP = "webp"
+    NPY = "npy"
+
+
+MEDIA_TYPES = {
+    ImageFormat.PNG: "image/png",
+    ImageFormat.JPEG: "image/jpeg",
+    ImageFormat.WEBP: "image/webp",
+    ImageFormat.NPY: "application/x-npy",
+}
+
+
+class IntrinsicsOverride(BaseModel):
+    """Parts of the camera the caller wants otherwise than the clip's left eye; what is None follows the scene.
+
+    With only a width or a height the other keeps the aspect; focal lengths and centre scale along unless given.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    width: int | None = Field(default=None, ge=8, le=8192)
+    height: int | None = Field(default=None, ge=8, le=8192)
+    fx: float | None = Field(default=None, gt=0, le=1e5)
+    fy: float | None = Field(default=None, gt=0, le=1e5)
+    cx: float | None = Field(default=None, ge=-1e5, le=1e5)
+    cy: float | None = Field(default=None, ge=-1e5, le=1e5)
+
+
+class RenderRequest(BaseModel):
+    """One view of one scene. t in [0, 1], later times clamp with a warning; pose None is the endoscope's own at t.
+
+    attempt is the one whose scene was published; None asks for the newest snapshot of the job while it trains.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["render"] = "render"
+    scene_id: str = Field(pattern=JOB_ID_PATTERN)
+    attempt: int | None = None
+    t: float = Field(ge=0, le=1e6)
+    pose: MatrixPose | OrbitPose | None = Field(default=None, discriminator="kind")
+    camera: IntrinsicsOverride = IntrinsicsOverride()
+    layer: Layer = Layer.RGB
+    format: ImageFormat = ImageFormat.PNG
+    quality: int = Field(default=90, ge=1, le=100)
+    """Of jpeg and webp."""
+    max_pixels: int = Field(default=4096 * 2160, gt=0)
+
+
+class ExportRequest(BaseModel):
+    """The scene's Gaussians at time t as a file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["export"] = "export"
+    scene_id: str = Field(pattern=JOB_ID_PATTERN)
+    attempt: int
+    t: float = Field(ge=0, le=1e6)
+    format: Literal["ply"] = "ply"
+
+
+class WorkerRequest(BaseModel):
+    """The envelope: one of the requests above."""
+
+    request: RenderRequest | ExportRequest = Field(discriminator="kind")
+
+
+class ReplyError(BaseModel):
+    """A request that could not be answered; `kind` decides the HTTP status."""
+
+    kind: Literal["input", "scene", "not-yet", "internal"]
+    """not-yet: the job runs here and has no snapshot so far."""
+    problem: str
+    field: str | None = None
+    remedy: str | None = None
+
+
+class WorkerReply(BaseModel):
+    """The head of an answer; exactly one of error and a body is there."""
+
+    error: ReplyError | None = None
+    media_type: str = "application/octet-stream"
+    t: float = 0.0
+    warnings: tuple[str, ...] = ()
+    iteration: int | None = None
+    """Of the snapshot that is shown; None: the scene is finished."""
+    render_ms: float = 0.0
+
+
+class WorkerAddress(BaseModel):
+    """What a live worker announces: where it answers requests, on which device, and what it has at hand."""
+
+    name: str
+    endpoint: str
+    device: str
+    job_id: str | None = None
+    """The job it runs."""
+    scenes: tuple[str, ...] = ()
+    """Scenes it holds in memory."""

@@ -1,0 +1,94 @@
+"""The audit: nothing it was given is lost, on a full disk or after a cut either."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from contract.access.audit import (
+    AUDIT_FILE,
+    RESERVE_BYTES,
+    RESERVE_FILE,
+    RESERVE_PIECE_BYTES,
+    AuditAction,
+    AuditEntry,
+    AuditLog,
+    utc_now,
+)
+from contract.store.store import StoreFullError
+from contract.wire.errors import UnavailableError
+from tests.contract.stores import files_no_larger_than
+
+
+def entry(job_id: str = "a" * 32) -> AuditEntry:
+    return AuditEntry(time=utc_now(), action=AuditAction.VIEWED, tenant="t", job_id=job_id)
+
+
+def lines(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / AUDIT_FILE).read_text().splitlines()]
+
+
+def test_a_line_is_appended_and_the_file_is_the_owners_alone(tmp_path: Path) -> None:
+    for number in range(3):
+        AuditLog(tmp_path).append(entry(f"{number:032x}"))
+    assert [line["job_id"] for line in lines(tmp_path)] == [f"{number:032x}" for number in range(3)]
+    assert (tmp_path / AUDIT_FILE).stat().st_mode & 0o777 == 0o600
+    assert "address" not in lines(tmp_path)[0]
+
+
+def test_a_line_after_one_that_was_cut_off_stands_by_itself(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path)
+    log.append(entry())
+    with (tmp_path / AUDIT_FILE).open("ab") as file:
+        file.write(b'{"time": "20')
+    log.append(entry("b" * 32))
+    first, cut_off, last = (tmp_path / AUDIT_FILE).read_text().splitlines()
+    assert (json.loads(first)["job_id"], cut_off, json.loads(last)["job_id"]) == ("a" * 32, '{"time": "20', "b" * 32)
+
+
+def test_a_file_that_was_moved_away_is_begun_anew(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path)
+    log.append(entry())
+    (tmp_path / AUDIT_FILE).rename(tmp_path / "audit.1")
+    log.append(entry())
+    assert len(lines(tmp_path)) == 1
+
+
+def test_a_disk_that_takes_only_half_a_line_refuses_it_and_the_next_is_whole(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path)
+    log.append(entry())
+    size = (tmp_path / AUDIT_FILE).stat().st_size
+    with files_no_larger_than(size + 20), pytest.raises(StoreFullError):
+        log.append(entry("b" * 32))
+    log.append(entry("c" * 32))
+    text = (tmp_path / AUDIT_FILE).read_text().splitlines()
+    assert [json.loads(text[0])["job_id"], json.loads(text[-1])["job_id"]] == ["a" * 32, "c" * 32]
+
+
+def test_the_reserve_is_given_up_piece_by_piece_before_anything_is_refused(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path)
+    log.fill_reserve()
+    reserve = tmp_path / RESERVE_FILE
+    assert reserve.stat().st_size == RESERVE_BYTES
+    assert reserve.stat().st_blocks * 512 >= RESERVE_BYTES
+    pieces = RESERVE_BYTES // RESERVE_PIECE_BYTES
+    assert [log._give_up_a_piece() for _ in range(pieces + 1)] == [True] * pieces + [False]
+    log.fill_reserve()
+    assert reserve.stat().st_size == RESERVE_BYTES
+
+
+def test_an_audit_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+    (tmp_path / AUDIT_FILE).mkdir()
+    with pytest.raises(UnavailableError):
+        AuditLog(tmp_path).append(entry())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_without_a_reserve_refuses(tmp_path: Path) -> None:
+    os.symlink("/dev/full", tmp_path / AUDIT_FILE)
+    with pytest.raises(StoreFullError):
+        AuditLog(tmp_path).append(entry())

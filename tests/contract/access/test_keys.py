@@ -1,0 +1,110 @@
+"""Keys: made once, kept as hashes, refused at once when revoked, and never open by accident."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from contract.access.keys import KEYS_FILE, KeyFile, KeyScope, check_keys
+from contract.runtime.settings import Settings
+from contract.wire.errors import InputError, UnavailableError
+
+
+def test_a_key_is_found_by_its_text_and_by_nothing_else(tmp_path: Path) -> None:
+    keys = KeyFile(tmp_path)
+    key, text = keys.create("ward-3", {KeyScope.VIEW}, "theatre 2")
+    assert text.startswith(f"isp_{key.key_id}_")
+    assert keys.find(text) == key
+    wrong = (
+        text[:-1],
+        text + "0",
+        text.upper(),
+        text.replace("isp_", "xyz_"),
+        f"isp_{key.key_id}_",
+        f"isp_{key.key_id}_\ud800",
+        "isp",
+        "",
+        "é" * 9,
+    )
+    assert [keys.find(other) for other in wrong] == [None] * len(wrong)
+
+
+def test_the_file_is_the_owners_alone_and_holds_no_secret(tmp_path: Path) -> None:
+    keys = KeyFile(tmp_path)
+    _, text = keys.create("ward-3")
+    path = tmp_path / KEYS_FILE
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert text.rpartition("_")[2] not in path.read_text()
+    assert text.rpartition("_")[2] not in repr(keys.list())
+
+
+def test_a_revoked_key_is_refused_at_once_by_services_that_run(tmp_path: Path) -> None:
+    service, command = KeyFile(tmp_path), KeyFile(tmp_path)
+    first, first_text = command.create("a")
+    second, second_text = command.create("b")
+    assert (service.find(first_text), service.find(second_text)) == (first, second)
+    assert command.revoke(first.key_id) == first
+    assert command.revoke(first.key_id) is None
+    assert (service.find(first_text), service.find(second_text)) == (None, second)
+    assert service.list() == (second,)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{}x", b'{"version": 2, "keys": []}', b'{"keys": [{"key_id": "1"}]}', b"\xff"]
+)
+def test_a_damaged_file_lets_nobody_in_and_is_not_overwritten(tmp_path: Path, content: bytes) -> None:
+    keys = KeyFile(tmp_path)
+    _, text = keys.create("a")
+    assert keys.find(text) is not None
+    (tmp_path / KEYS_FILE).write_bytes(content)
+    for _ in range(2):
+        with pytest.raises(UnavailableError, match="no key is accepted"):
+            keys.find(text)
+    with pytest.raises(UnavailableError):
+        keys.create("b")
+    assert (tmp_path / KEYS_FILE).read_bytes() == content
+
+
+def test_a_file_that_is_gone_holds_no_keys(tmp_path: Path) -> None:
+    keys = KeyFile(tmp_path)
+    _, text = keys.create("a")
+    assert keys.find(text) is not None
+    (tmp_path / KEYS_FILE).unlink()
+    assert keys.find(text) is None
+    assert keys.list() == ()
+
+
+@pytest.mark.parametrize(
+    ("tenant", "scopes", "label", "field"),
+    [
+        ("Ward 3", {KeyScope.VIEW}, None, "tenant"),
+        ("", {KeyScope.VIEW}, None, "tenant"),
+        ("a", set(), None, "scopes"),
+        ("a", {KeyScope.VIEW}, "x" * 61, "label"),
+    ],
+)
+def test_a_key_that_cannot_be_meant_is_named(
+    tmp_path: Path, tenant: str, scopes: set[KeyScope], label: str | None, field: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        KeyFile(tmp_path).create(tenant, scopes, label)
+    assert caught.value.field == field
+
+
+def test_a_write_that_was_cut_off_leaves_the_old_keys_and_does_not_block_new_ones(tmp_path: Path) -> None:
+    keys = KeyFile(tmp_path)
+    key, _ = keys.create("a")
+    (tmp_path / f"{KEYS_FILE}.new").write_bytes(b'{"keys": [')
+    assert KeyFile(tmp_path).list() == (key,)
+    keys.create("b")
+    assert [each.tenant for each in KeyFile(tmp_path).list()] == ["a", "b"]
+
+
+def test_others_are_let_in_only_once_there_is_a_key(tmp_path: Path) -> None:
+    check_keys(Settings(data_dir=tmp_path))
+    abroad = Settings(data_dir=tmp_path, host="0.0.0.0")
+    with pytest.raises(UnavailableError, match="intrasplat keys create"):
+        check_keys(abroad)
+    KeyFile(tmp_path).create("ward")
+    check_keys(abroad)

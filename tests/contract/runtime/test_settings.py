@@ -1,0 +1,48 @@
+"""Settings come from the environment, secrets from files, and children read what their parent did."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from contract.runtime.settings import Settings
+from contract.wire.errors import InputError
+
+
+def test_settings_are_read_from_their_variables_and_empty_ones_count_as_unset(tmp_path: Path) -> None:
+    read = Settings.from_environment(
+        {"INTRASPLAT_DATA_DIR": str(tmp_path), "INTRASPLAT_PORT": "", "INTRASPLAT_HOSTS": "a.example, b.example"}
+    )
+    assert read == Settings(data_dir=tmp_path, hosts=("a.example", "b.example"))
+
+
+def test_a_secret_can_be_given_as_a_file(tmp_path: Path) -> None:
+    (tmp_path / "url").write_text("redis://user:word@queue:6379/0\n")
+    (tmp_path / "secret").write_text("s" * 40 + "\n")
+    read = Settings.from_environment(
+        {"REDIS_URL_FILE": str(tmp_path / "url"), "INTRASPLAT_RENDER_SECRET_FILE": str(tmp_path / "secret")}
+    )
+    assert read.redis_url == "redis://user:word@queue:6379/0"
+    assert read.render_secret == "s" * 40
+
+
+def test_a_variable_goes_before_its_file(tmp_path: Path) -> None:
+    read = Settings.from_environment({"REDIS_URL": "redis://here", "REDIS_URL_FILE": str(tmp_path / "absent")})
+    assert read.redis_url == "redis://here"
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="REDIS_URL_FILE"):
+        Settings.from_environment({"REDIS_URL_FILE": str(tmp_path / "absent")})
+
+
+@pytest.mark.parametrize(("variable", "value"), [("INTRASPLAT_PORT", "no"), ("INTRASPLAT_STORE_URL", "ftp://x")])
+def test_a_value_that_is_not_accepted_is_named_with_its_variable(variable: str, value: str) -> None:
+    with pytest.raises(InputError, match=variable):
+        Settings.from_environment({variable: value})
+
+
+def test_a_child_process_reads_the_settings_of_its_parent(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, redis_url="redis://here", hosts=("a.example",), retention_hours=2.5)
+    assert Settings.from_environment(settings.to_environment()) == settings

@@ -1,0 +1,206 @@
+"""The device child: what a job asks for reaches the reconstruction whole, and no order, error or death upsets it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from contract.runtime.exits import ExitCode
+from contract.runtime.settings import Settings
+from contract.store.store import new_job_id
+from contract.wire.errors import InputError, TrainingDiverged, UnavailableError
+from contract.wire.job import JobFiles, JobOptions, JobRecord
+from contract.wire.names import REPORT
+from worker.__main__ import main
+from worker.daemon.child import DeviceChild
+from worker.daemon.device import request_of, run_or_start_anew
+from worker.daemon.faults import describe
+from worker.daemon.orders import Advanced, Failed, Finished, Run, Stop, Stopped
+from worker.machine.hooks import Hooks
+from worker.scene.checkpoint import RESUME_FILE, load_resume, load_scene
+from worker.train.request import ReconstructionRequest
+
+SPOOL = Path("spool")
+CHOSEN = {
+    "preset": "paper",
+    "budget_s": 12.5,
+    "mask_polarity": "tissue",
+    "layout": "sbs",
+    "pose_convention": "llff",
+    "holdout": "1,9",
+    "seed": 4,
+}
+
+
+def request(files: JobFiles, options: dict[str, object]) -> ReconstructionRequest:
+    record = JobRecord(job_id=new_job_id(), files=files, options=JobOptions.model_validate(options), created_at_s=0.0)
+    return request_of(record, SPOOL, "cpu")
+
+
+@pytest.mark.parametrize("chosen", [CHOSEN, {"iterations": 7}])
+def test_every_option_of_a_job_is_one_of_the_request(chosen: dict[str, object]) -> None:
+    asked = request(JobFiles(clip="clip.mp4"), chosen)
+    for name, value in JobOptions.model_validate(chosen):
+        if name not in ("priority", "retention_hours"):  # they are the queue's and the service's business
+            assert getattr(asked, name) == value, name
+    assert asked.device == "cpu"
+
+
+def test_files_lie_where_the_store_keeps_them() -> None:
+    all_files = JobFiles(clip="clip.mp4", right="right.mp4", calibration="calibration.json", masks="masks.zip")
+    asked = request(all_files, {})
+    assert (asked.clip, asked.right) == (SPOOL / "clip.mp4", SPOOL / "right.mp4")
+    assert (asked.calibration, asked.masks) == (SPOOL / "calibration.json", SPOOL / "masks.zip")
+    alone = request(JobFiles(clip="clip.zip"), {})
+    assert (alone.right, alone.calibration, alone.masks) == (None, None, None)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A zip in the EndoNeRF layout."""
+    folder = tmp_path_factory.mktemp("phantom") / "clip"
+    size = ["--width", "96", "--height", "80", "--frames", "8"]
+    assert main(["phantom", *size, "--format", "endonerf", "--out", str(folder)]) == ExitCode.OK
+    return Path(shutil.make_archive(str(folder), "zip", folder))
+
+
+@pytest.fixture
+def device(tmp_path: Path) -> Iterator[DeviceChild]:
+    """`python -m worker device`, ready."""
+    settings = Settings(data_dir=tmp_path / "data")
+    child = DeviceChild([sys.executable, "-m", "worker", "device"], {**os.environ, **settings.to_environment()})
+    wait_until(lambda: child.ready is not None)
+    yield child
+    child.end()
+
+
+def wait_until(holds: Callable[[], bool], timeout_s: float = 60.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not holds():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def order(clip: Path, out: Path, **options: object) -> Run:
+    chosen = JobOptions.model_validate(options)
+    record = JobRecord(job_id="a" * 32, files=JobFiles(clip=clip.name), options=chosen, created_at_s=time.time())
+    out.mkdir(exist_ok=True)
+    return Run(record=record, spool=clip.parent, out=out)
+
+
+def end_of_job(child: DeviceChild, stop_after: int | None = None) -> tuple[object, list[Advanced]]:
+    """The job's last report and those before it; it is stopped after so many iterations."""
+    advances: list[Advanced] = []
+    while True:
+        report = child.next_report(60.0)
+        if not isinstance(report, Advanced):
+            return report, advances
+        advances.append(report)
+        if stop_after is not None and report.progress.iteration > stop_after:
+            child.send(Stop())
+            stop_after = None
+
+
+def test_a_stopped_job_goes_on_to_the_same_bits_and_the_process_does_any_number_of_jobs(
+    device: DeviceChild, tmp_path: Path, clip: Path
+) -> None:
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    device.send(order(clip, whole, iterations=600))
+    assert end_of_job(device)[0] == Finished()
+    device.send(order(clip, tmp_path / "no", holdout="99", iterations=3))
+    failed, _ = end_of_job(device)
+    assert isinstance(failed, Failed)
+    assert (failed.fault, failed.error.field) == ("InputError", "options.holdout")
+    device.send(order(clip, out, iterations=600))
+    assert end_of_job(device, stop_after=1)[0] == Stopped(checkpointed=True)
+    assert [path.name for path in out.iterdir()] == [RESUME_FILE]
+    stopped_at = load_resume(out)[1]["iteration"]
+    device.send(Stop())  # too late for the last job, and not meant for the next
+    device.send(order(clip, out, iterations=600))
+    finished, advances = end_of_job(device)
+    assert finished == Finished()
+    assert min(each.progress.iteration for each in advances if each.progress.stage == "train") == stopped_at
+    assert tensor_bits(out) == tensor_bits(whole)
+
+
+def tensor_bits(folder: Path) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in load_scene(folder).tensors().items()}
+
+
+def test_a_job_that_trains_dies_with_the_process_that_ordered_it(tmp_path: Path, clip: Path) -> None:
+    spool, out = clip.parent, tmp_path / "out"
+    program = (
+        "import os, sys; from pathlib import Path;"
+        "from worker.daemon.child import DeviceChild; from worker.daemon.orders import *;"
+        "child = DeviceChild([sys.executable, '-m', 'worker', 'device'], os.environ);"
+        "child.send(read_order(sys.argv[1].encode())); report = None\n"
+        "while report is None or report.progress.stage != 'train': report = child.next_report(60)\n"
+        "print(child.process_id, flush=True); child.next_report(60)"
+    )
+    settings = Settings(data_dir=tmp_path / "data").to_environment()
+    ordered = order(spool / clip.name, out, iterations=1_000_000).model_dump_json()
+    command = [sys.executable, "-c", program, ordered]
+    with subprocess.Popen(command, env={**os.environ, **settings}, stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        process_id = int(parent.stdout.readline())
+        parent.kill()
+    wait_until(lambda: not is_alive(process_id), timeout_s=5.0)
+
+
+def is_alive(process_id: int) -> bool:
+    """Whether it runs; a dead process that nobody has waited for does not."""
+    try:
+        return Path(f"/proc/{process_id}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_a_state_of_another_version_is_left_behind_and_training_starts_anew(tmp_path: Path, clip: Path) -> None:
+    request_here = ReconstructionRequest(clip=clip, iterations=3)
+    (tmp_path / RESUME_FILE).write_bytes(b"of another version")
+    run_or_start_anew(request_here, tmp_path, Hooks())
+    assert (tmp_path / REPORT).exists()
+    assert not (tmp_path / RESUME_FILE).exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (TrainingDiverged("NaN after 12 iterations."), "NaN after 12"),
+        (UnavailableError("No CUDA device.", "Use --device cpu."), "No CUDA device"),
+        (MemoryError("smith.mp4"), "out of memory"),
+        (torch.OutOfMemoryError("smith.mp4"), "out of memory"),
+        (ValueError("smith.mp4"), "A fault in the worker (ValueError)"),
+    ],
+)
+def test_every_error_is_told_with_a_remedy_and_without_what_nobody_wrote_for_the_caller(
+    error: Exception, says: str
+) -> None:
+    told = describe(error)
+    assert says in told.problem
+    assert told.remedy
+    assert "smith" not in told.model_dump_json()
+
+
+def test_other_trouble_with_the_input_is_not_tried_twice(tmp_path: Path) -> None:
+    (tmp_path / RESUME_FILE).write_bytes(b"kept")
+    with pytest.raises(InputError, match="clip"):
+        run_or_start_anew(ReconstructionRequest(clip=tmp_path / "no.zip", iterations=3), tmp_path, Hooks())
+    assert (tmp_path / RESUME_FILE).read_bytes() == b"kept"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_worker_for_a_device_it_cannot_train_on_ends_at_once_with_the_remedy(tmp_path: Path) -> None:
+    environment = Settings(data_dir=tmp_path, device="cuda", redis_url="unix:///nobody.sock").to_environment()
+    command = [sys.executable, "-m", "worker", "consume"]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+    assert ended.returncode == ExitCode.UNAVAILABLE
+    assert ended.stderr.count("INTRASPLAT_DEVICE=cpu") == 1

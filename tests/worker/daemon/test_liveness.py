@@ -1,0 +1,94 @@
+"""What counts as an advance, what as a hang, and that no stage of a reconstruction is silent for too long."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from contract.wire.job import JobProgress
+from worker.daemon.liveness import LONGEST_LOOK_S, OTHER_LIMIT_S, STAGE_LIMITS_S, Watch
+from worker.daemon.orders import job_progress
+from worker.machine.hooks import Hooks, Progress
+from worker.phantom import PhantomSettings, make_phantom, write_stereo_video
+from worker.pipeline import reconstruct
+from worker.train.request import ReconstructionRequest
+
+
+class Clock:
+    """Time that passes when it is told to; the watch looks all the while."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def pass_by(self, watch: Watch, seconds: float) -> bool:
+        for _ in range(round(10 * seconds)):
+            self.now_s += 0.1
+            if watch.is_hung():
+                return True
+        return False
+
+
+def trained(iteration: int) -> JobProgress:
+    return JobProgress(stage="train", fraction=iteration / 1000, iteration=iteration, iterations=1000)
+
+
+def test_a_job_that_advances_does_not_hang_however_long_it_takes() -> None:
+    clock = Clock()
+    watch = Watch(clock)
+    for iteration in range(20):
+        watch.hear(trained(iteration))
+        assert not clock.pass_by(watch, STAGE_LIMITS_S["train"] - 1)
+
+
+def test_repeating_oneself_is_no_advance() -> None:
+    clock = Clock()
+    watch = Watch(clock)
+    watch.hear(trained(5))
+    assert not clock.pass_by(watch, STAGE_LIMITS_S["train"] / 2)
+    watch.hear(trained(5))
+    assert clock.pass_by(watch, STAGE_LIMITS_S["train"] / 2 + 1)
+    watch.hear(trained(6))
+    assert not watch.is_hung()
+
+
+@pytest.mark.parametrize("stage", [*STAGE_LIMITS_S, "of another version"])
+def test_every_stage_has_its_own_limit(stage: str) -> None:
+    clock = Clock()
+    watch = Watch(clock)
+    watch.hear(JobProgress(stage=stage, fraction=0.5))
+    limit_s = STAGE_LIMITS_S.get(stage, OTHER_LIMIT_S)
+    assert not clock.pass_by(watch, limit_s - 1)
+    assert clock.pass_by(watch, 2)
+
+
+def test_time_in_which_the_supervisor_itself_was_stopped_is_not_held_against_the_job() -> None:
+    clock = Clock()
+    watch = Watch(clock)
+    watch.hear(trained(1))
+    clock.now_s += 3600
+    assert not watch.is_hung()
+    assert clock.pass_by(watch, STAGE_LIMITS_S["train"] - LONGEST_LOOK_S + 1)
+
+
+def test_progress_holds_only_numbers_that_json_can() -> None:
+    odd = Progress("train", 1.5, psnr_db=float("nan"), seconds_left=float("inf"))
+    assert job_progress(odd) == JobProgress(stage="train", fraction=1.0)
+
+
+def test_a_reconstruction_from_stereo_advances_with_every_frame_and_knows_no_stage_without_a_limit(
+    tmp_path: Path,
+) -> None:
+    frames = 10
+    write_stereo_video(make_phantom(PhantomSettings(width=192, height=160, frames=frames)), tmp_path / "clip")
+    told: list[Progress] = []
+    request = ReconstructionRequest(clip=tmp_path / "clip", iterations=5)
+    reconstruct(request, tmp_path / "out", Hooks(on_progress=told.append))
+    places = {stage: {each.fraction for each in told if each.stage == stage} for stage in STAGE_LIMITS_S}
+    assert {each.stage for each in told} <= set(STAGE_LIMITS_S)
+    assert len(places["stereo"]) >= frames
+    assert len(places["motion"]) >= frames / 2 - 2  # in two halves side by side, less what is held out
+    assert len(places["score"]) >= 3

@@ -1,0 +1,84 @@
+"""Pace: a lone view at once, a share of the time for those who ask without pause, and no limit while nothing trains."""
+
+from __future__ import annotations
+
+import pytest
+
+from worker.daemon.pace import SAVED_S, SHARE, Pace
+
+VIEW_S = 0.05
+ROUNDING_S = 1e-9
+
+
+class Clock:
+    """Time that passes when it is told to."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def views_within(seconds: float, view_s: float, clock: Clock, pace: Pace) -> int:
+    """How many are made by somebody who asks without pause."""
+    end_s, made = clock.now_s + seconds, 0
+    while clock.now_s < end_s:
+        rest_s = pace.rest_s()
+        clock.now_s += rest_s
+        if rest_s < ROUNDING_S:
+            with pace.rendering():
+                clock.now_s += view_s
+            made += 1
+    return made
+
+
+@pytest.mark.parametrize("view_s", [0.004, 0.05, 2.0])
+def test_views_without_pause_take_their_share_of_the_time_and_what_was_saved(view_s: float) -> None:
+    clock = Clock()
+    pace, seconds = Pace(clock), 100.0
+    with pace.training():
+        spent_s = view_s * views_within(seconds, view_s, clock, pace)
+    assert spent_s == pytest.approx(SHARE * seconds + SAVED_S, abs=2 * view_s)
+
+
+def test_a_lone_view_is_made_at_once_and_the_next_after_a_rest() -> None:
+    clock = Clock()
+    pace = Pace(clock)
+    with pace.training():
+        for _ in range(3):
+            assert pace.rest_s() == 0.0
+            with pace.rendering():
+                clock.now_s += SAVED_S + VIEW_S
+            assert 0.0 < pace.rest_s() < VIEW_S / SHARE
+            clock.now_s += (SAVED_S + VIEW_S) / SHARE
+
+
+def test_while_nothing_trains_nobody_rests() -> None:
+    clock = Clock()
+    pace = Pace(clock)
+    with pace.training():
+        views_within(1.0, VIEW_S, clock, pace)
+    assert views_within(1.0, VIEW_S, clock, pace) == pytest.approx(1.0 / VIEW_S, abs=1)
+
+
+def test_what_was_rendered_before_a_job_is_not_held_against_those_who_watch_it() -> None:
+    clock = Clock()
+    pace = Pace(clock)
+    views_within(5.0, VIEW_S, clock, pace)
+    with pace.training():
+        assert pace.rest_s() == 0.0
+
+
+def test_a_job_that_fails_rations_nobody_any_more() -> None:
+    clock = Clock()
+    pace = Pace(clock)
+
+    def fail() -> None:
+        with pace.training(), pace.rendering():
+            clock.now_s += 10.0
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert pace.rest_s() == 0.0

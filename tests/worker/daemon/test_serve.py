@@ -1,0 +1,203 @@
+"""The worker's ear: whatever arrives, each request gets one answer and the thread lives on."""
+
+from __future__ import annotations
+
+import contextlib
+import socket as socket_module
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zmq
+
+from contract.access.curve import CurveKeys, service_keys, worker_keys
+from contract.queue.embedded import short_socket_path
+from contract.wire.errors import InputError, SceneError, UnavailableError
+from contract.wire.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
+from worker.daemon.serve import LONGEST_REQUEST_BYTES, NotYetError, RequestServer, View
+
+SCENE = "0" * 32
+SECRET = "a secret of at least 32 characters"
+
+
+def answer(request: RenderRequest | ExportRequest) -> View:
+    if request.t == 1:
+        raise InputError("t", "1 is odd.", "Use another.")
+    if request.t == 2:
+        raise SceneError("It is damaged.")
+    if request.t == 3:
+        raise ZeroDivisionError("patient Smith")
+    if request.t == 4:
+        raise NotYetError("Nothing to show yet.")
+    return View(b"image", "image/png", request.t, ("a warning",), iteration=12)
+
+
+@contextmanager
+def connected(endpoint: str, keys: CurveKeys | None = None, server: bytes = b"") -> Iterator[zmq.Socket[bytes]]:
+    """A DEALER to the endpoint, with CURVE if there are keys."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    socket = context.socket(zmq.DEALER)
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.RCVTIMEO, 5000)
+    if keys is not None:
+        socket.curve_serverkey, socket.curve_publickey, socket.curve_secretkey = server, keys.public, keys.secret
+    socket.connect(endpoint)
+    try:
+        yield socket
+    finally:
+        socket.close()
+        context.term()
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> str:
+    return f"ipc://{short_socket_path(tmp_path, 'worker.sock')}"
+
+
+@pytest.fixture
+def socket(endpoint: str) -> Iterator[zmq.Socket[bytes]]:
+    with RequestServer(endpoint, answer), connected(endpoint) as socket:
+        yield socket
+
+
+def ask(socket: zmq.Socket[bytes], document: bytes, request_id: bytes = b"7") -> tuple[WorkerReply, bytes]:
+    socket.send_multipart([request_id, document])
+    answered_id, head, body = socket.recv_multipart()
+    assert answered_id == request_id
+    return WorkerReply.model_validate_json(head), body
+
+
+def request(t: float) -> bytes:
+    return WorkerRequest(request=RenderRequest(scene_id=SCENE, t=t)).model_dump_json().encode()
+
+
+def test_an_answer_carries_the_bytes_the_time_and_the_warnings(socket: zmq.Socket[bytes]) -> None:
+    head, body = ask(socket, request(0.5))
+    assert body == b"image"
+    assert head.render_ms > 0
+    expected = WorkerReply(media_type="image/png", t=0.5, warnings=("a warning",), iteration=12)
+    assert head.model_copy(update={"render_ms": 0.0}) == expected
+
+
+@pytest.mark.parametrize(
+    ("t", "kind", "field"), [(1, "input", "t"), (2, "scene", "scene"), (3, "internal", None), (4, "not-yet", "scene")]
+)
+def test_an_error_is_told_and_the_next_request_is_answered(
+    socket: zmq.Socket[bytes], t: float, kind: str, field: str | None
+) -> None:
+    head, body = ask(socket, request(t))
+    assert head.error is not None
+    assert (head.error.kind, head.error.field, body) == (kind, field, b"")
+    assert "Smith" not in head.error.problem
+    assert ask(socket, request(0))[0].error is None
+
+
+@pytest.mark.parametrize("document", [b"", b"{}", b'{"request": {"kind": "shutdown"}}', b"\xff\xfe"])
+def test_a_request_that_does_not_fit_is_told_so(socket: zmq.Socket[bytes], document: bytes) -> None:
+    head, _ = ask(socket, document)
+    assert head.error is not None
+    assert head.error.kind == "internal"
+    assert ask(socket, request(0))[0].error is None
+
+
+@pytest.mark.parametrize("parts", [[b""], [b"1", b""], [b"1", b"2", b"3", b"4"], [b"\xff" * 300, b"\x00" * 5000]])
+def test_a_message_of_any_shape_leaves_the_thread_alive(socket: zmq.Socket[bytes], parts: list[bytes]) -> None:
+    socket.send_multipart(parts)
+    if len(parts) == 2:
+        head = WorkerReply.model_validate_json(socket.recv_multipart()[1])
+        assert head.error is not None
+    assert ask(socket, request(0))[0].error is None
+
+
+def test_who_sends_too_much_is_cut_off_and_others_are_answered(endpoint: str) -> None:
+    with RequestServer(endpoint, answer), connected(endpoint) as flooding, connected(endpoint) as other:
+        flooding.send_multipart([b"1", b" " * (LONGEST_REQUEST_BYTES + 1)])
+        assert ask(other, request(0))[0].error is None
+
+
+def test_requests_of_one_caller_are_answered_in_their_order(socket: zmq.Socket[bytes]) -> None:
+    for number in range(20):
+        socket.send_multipart([bytes([number]), request(0)])
+    assert [socket.recv_multipart()[0] for _ in range(20)] == [bytes([number]) for number in range(20)]
+
+
+def test_what_is_to_be_done_between_requests_is_done_and_its_failure_ends_nothing(endpoint: str) -> None:
+    called = threading.Event()
+
+    def fail() -> None:
+        called.set()
+        raise OSError("the disk")
+
+    with RequestServer(endpoint, answer, between=fail), connected(endpoint) as socket:
+        assert called.wait(5)
+        assert ask(socket, request(0))[0].error is None
+
+
+@pytest.fixture
+def tcp_endpoint() -> str:
+    with contextlib.closing(socket_module.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+
+
+def test_over_tcp_the_services_of_the_same_secret_are_answered(tcp_endpoint: str) -> None:
+    with (
+        RequestServer(tcp_endpoint, answer, render_secret=SECRET),
+        connected(tcp_endpoint, service_keys(SECRET), worker_keys(SECRET).public) as socket,
+    ):
+        assert ask(socket, request(0))[1] == b"image"
+
+
+@pytest.mark.parametrize(
+    ("keys", "server"),
+    [
+        (None, b""),
+        (service_keys("another secret of 32 characters."), worker_keys(SECRET).public),
+        (worker_keys(SECRET), worker_keys(SECRET).public),
+        (service_keys(SECRET), worker_keys("another secret of 32 characters.").public),
+    ],
+)
+def test_over_tcp_nobody_else_is(tcp_endpoint: str, keys: CurveKeys | None, server: bytes) -> None:
+    asked: list[RenderRequest | ExportRequest] = []
+
+    def note(request: RenderRequest | ExportRequest) -> View:
+        asked.append(request)
+        return answer(request)
+
+    with RequestServer(tcp_endpoint, note, render_secret=SECRET), connected(tcp_endpoint, keys, server) as socket:
+        socket.setsockopt(zmq.RCVTIMEO, 300)
+        socket.send_multipart([b"7", request(0)])
+        with pytest.raises(zmq.Again):
+            socket.recv_multipart()
+    assert asked == []
+
+
+def test_tcp_without_a_secret_is_refused_before_anything_listens() -> None:
+    with pytest.raises(InputError, match="INTRASPLAT_RENDER_SECRET"):
+        RequestServer("tcp://127.0.0.1:7000", answer)
+
+
+def test_keys_follow_from_the_secret_and_each_side_has_its_own() -> None:
+    assert service_keys(SECRET) == service_keys(SECRET)
+    assert len({service_keys(SECRET).public, worker_keys(SECRET).public, service_keys(SECRET + "!").public}) == 3
+    assert service_keys(SECRET).secret.decode() not in repr(service_keys(SECRET))
+
+
+def test_who_asks_while_the_worker_rests_is_answered_afterwards(endpoint: str) -> None:
+    rests = [0.01, 0.02, 0.0]
+    with RequestServer(endpoint, answer, rest_s=lambda: rests.pop(0) if rests else 0.0), connected(endpoint) as socket:
+        document = WorkerRequest(request=RenderRequest(scene_id=SCENE, t=0.25)).model_dump_json().encode()
+        _, body = ask(socket, document)
+    assert body == b"image"
+    assert not rests
+
+
+def test_an_address_that_is_taken_is_an_error_with_a_remedy(tcp_endpoint: str) -> None:
+    with (
+        RequestServer(tcp_endpoint, answer, render_secret=SECRET),
+        pytest.raises(UnavailableError, match="INTRASPLAT_RENDER_ENDPOINT"),
+        RequestServer(tcp_endpoint, answer, render_secret=SECRET),
+    ):
+        pass

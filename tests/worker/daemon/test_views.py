@@ -1,0 +1,208 @@
+"""Views of stored scenes: the camera a caller means, and no picture of a scene that is gone."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from contract.store.store import Store, new_job_id
+from contract.wire.errors import LimitError, SceneError
+from contract.wire.pose import parse_pose
+from contract.wire.rendering import ExportRequest, ImageFormat, IntrinsicsOverride, Layer, RenderRequest
+from worker.daemon.serve import NotYetError
+from worker.daemon.snapshot import Snapshots
+from worker.daemon.views import COPIES, Views, camera_of, pose_of, shown_time
+from worker.input.camera import Intrinsics
+from worker.model.deformation import FlexibleDeformation
+from worker.model.gaussians import Gaussians
+from worker.scene.checkpoint import Scene, save_scene
+
+CLIP = Intrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
+FRAMES = 10
+UNITS_PER_MM = 1.5
+MAX_PIXELS = 10_000
+
+
+def scene() -> Scene:
+    """A flat sheet of Gaussians at the median depth."""
+    across, down = torch.meshgrid(torch.linspace(-25, 25, 12), torch.linspace(-20, 20, 10), indexing="ij")
+    mean = torch.stack([across.flatten(), down.flatten(), torch.full((120,), 60.0)], dim=1)
+    gaussians = Gaussians(
+        mean=mean,
+        quaternion=torch.tensor([[1.0, 0, 0, 0]]).repeat(120, 1),
+        log_scale=torch.full((120, 3), 1.0),
+        opacity_logit=torch.full((120,), 3.0),
+        sh=torch.rand(120, 1, 3, generator=torch.Generator().manual_seed(0)),
+    )
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    return Scene(
+        gaussians=gaussians,
+        deformation=FlexibleDeformation.initial(len(gaussians)),
+        intrinsics=CLIP,
+        world_from_camera=poses,
+        frame_times_s=np.arange(FRAMES) / 25,
+        units_per_mm=UNITS_PER_MM,
+        preset="fast",
+        trained_t=tuple(i / FRAMES for i in range(FRAMES)),
+        seen=torch.ones(120),
+    )
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path)
+
+
+@pytest.fixture
+def scene_id(store: Store) -> str:
+    job_id = new_job_id()
+    publish(store, job_id)
+    return job_id
+
+
+def publish(store: Store, job_id: str, attempt: int = 1, *, dimmed: float = 0.0) -> Scene:
+    """A stored scene; its colours are dimmed by so much, so that attempts can be told apart."""
+    made = scene()
+    made.gaussians.sh.sub_(dimmed)
+    save_scene(store.work_folder(job_id, attempt), made)
+    store.publish_scene(job_id, attempt)
+    return made
+
+
+def request_of(scene_id: str, attempt: int | None = 1, t: float = 0.0) -> RenderRequest:
+    return RenderRequest(scene_id=scene_id, attempt=attempt, t=t, format=ImageFormat.NPY)
+
+
+def test_a_stored_scene_is_rendered_at_the_size_of_the_clip(store: Store, scene_id: str) -> None:
+    view = Views(store).answer(
+        RenderRequest(scene_id=scene_id, attempt=1, t=0.25, layer=Layer.DEPTH, format=ImageFormat.NPY)
+    )
+    assert view.media_type == "application/x-npy"
+    assert view.t == 0.25
+    depth_mm = np.load(io.BytesIO(view.body))
+    assert depth_mm.shape == (CLIP.height, CLIP.width)
+    assert np.median(depth_mm[depth_mm > 0]) == pytest.approx(60 / UNITS_PER_MM, rel=0.05)
+
+
+def test_a_time_after_the_clip_shows_its_last_frame_and_warns(store: Store, scene_id: str) -> None:
+    view = Views(store).answer(request_of(scene_id, t=3))
+    assert view.t == (FRAMES - 1) / FRAMES
+    assert view.warnings
+
+
+def test_a_deleted_scene_is_not_shown_from_memory(store: Store, scene_id: str) -> None:
+    views = Views(store)
+    views.answer(request_of(scene_id))
+    shutil.rmtree(store.scene_folder(scene_id, 1))
+    with pytest.raises(SceneError):
+        views.answer(request_of(scene_id))
+    assert views.held == ()
+
+
+def test_a_deleted_scene_is_let_go_of_although_nobody_asks(store: Store, scene_id: str) -> None:
+    views, other = Views(store), new_job_id()
+    publish(store, other)
+    views.answer(request_of(scene_id))
+    views.answer(request_of(other))
+    store.purge(scene_id)
+    views.forget_purged()
+    assert views.held == (other,)
+
+
+def test_the_attempt_that_is_named_is_shown(store: Store, scene_id: str) -> None:
+    views = Views(store)
+    first = views.answer(request_of(scene_id, attempt=1)).body
+    publish(store, scene_id, attempt=2, dimmed=0.4)
+    assert views.answer(request_of(scene_id, attempt=2)).body != first
+    assert views.answer(request_of(scene_id, attempt=1)).body == first
+    with pytest.raises(SceneError):
+        views.answer(request_of(scene_id, attempt=3))
+
+
+def test_no_more_scenes_are_held_than_their_bytes_allow_and_the_one_used_longest_ago_goes(store: Store) -> None:
+    scene_ids = [new_job_id() for _ in range(4)]
+    size = max(publish(store, each).byte_count for each in scene_ids)
+    views = Views(store, hot_bytes=COPIES * size * 3)
+    for each in (*scene_ids[:3], scene_ids[0], scene_ids[3]):
+        views.answer(request_of(each))
+    assert views.held == (scene_ids[2], scene_ids[0], scene_ids[3])
+
+
+def test_a_scene_larger_than_all_that_may_be_held_is_shown(store: Store, scene_id: str) -> None:
+    views = Views(store, hot_bytes=1)
+    assert views.answer(request_of(scene_id)).body
+    assert views.held == (scene_id,)
+
+
+def test_a_running_job_is_shown_by_its_snapshot_which_vouches_for_nothing(store: Store, scene_id: str) -> None:
+    snapshots = Snapshots()
+    views = Views(store, snapshots)
+    running = new_job_id()
+    snapshots.begin(running)
+    with pytest.raises(NotYetError):
+        views.answer(request_of(running, attempt=None))
+    snapshots.offer(dataclasses.replace(scene(), seen=torch.zeros(120)), 40)
+    view = views.answer(request_of(running, attempt=None))
+    assert view.iteration == 40
+    (warning,) = view.warnings
+    assert "Training goes on" in warning
+    layer = RenderRequest(scene_id=running, t=0, layer=Layer.CONFIDENCE, format=ImageFormat.NPY)
+    assert not np.load(io.BytesIO(views.answer(layer).body)).any()
+    assert views.answer(request_of(scene_id)).iteration is None
+
+
+def test_a_finished_scene_is_not_taken_for_a_running_job(store: Store, scene_id: str) -> None:
+    with pytest.raises(NotYetError):
+        Views(store).answer(request_of(scene_id, attempt=None))
+
+
+def test_an_export_holds_every_gaussian(store: Store, scene_id: str) -> None:
+    view = Views(store).answer(ExportRequest(scene_id=scene_id, attempt=1, t=0.5))
+    assert b"element vertex 120\n" in view.body
+    assert (view.t, view.warnings) == (0.5, ())
+
+
+def test_an_export_after_the_clip_is_of_its_last_frame_and_says_so(store: Store, scene_id: str) -> None:
+    view = Views(store).answer(ExportRequest(scene_id=scene_id, attempt=1, t=1))
+    last = Views(store).answer(ExportRequest(scene_id=scene_id, attempt=1, t=(FRAMES - 1) / FRAMES))
+    assert view.t == last.t == (FRAMES - 1) / FRAMES
+    assert view.body == last.body
+    assert view.warnings
+    assert not last.warnings
+
+
+def test_an_orbit_turns_about_the_median_depth() -> None:
+    still = pose_of(scene(), parse_pose("orbit:0,0,1"))
+    nearer = pose_of(scene(), parse_pose("orbit:0,0,2"))
+    assert still is not None
+    assert nearer is not None
+    np.testing.assert_array_equal(still, np.eye(4))
+    assert nearer[2, 3] == pytest.approx(60 / UNITS_PER_MM / 2)
+    assert pose_of(scene(), None) is None
+
+
+def test_time_is_clamped_to_the_last_frame() -> None:
+    assert shown_time(scene(), 0.3) == 0.3
+    assert shown_time(scene(), 1.0) == 0.9
+
+
+def test_one_side_given_keeps_the_aspect_and_the_field_of_view() -> None:
+    assert camera_of(CLIP, IntrinsicsOverride(width=128), MAX_PIXELS * 9) == CLIP.resized(128, 96)
+    assert camera_of(CLIP, IntrinsicsOverride(height=24), MAX_PIXELS) == CLIP.resized(32, 24)
+    assert camera_of(CLIP, IntrinsicsOverride(), MAX_PIXELS) == CLIP
+
+
+def test_focal_length_and_centre_are_taken_as_given() -> None:
+    camera = camera_of(CLIP, IntrinsicsOverride(width=32, fx=99, cy=1), MAX_PIXELS)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (99, 30, 16, 1)
+
+
+def test_an_image_over_the_limit_is_refused() -> None:
+    with pytest.raises(LimitError, match="more than 10000 pixels"):
+        camera_of(CLIP, IntrinsicsOverride(width=200), MAX_PIXELS)

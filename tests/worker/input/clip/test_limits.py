@@ -1,0 +1,73 @@
+"""What a clip may take: the limit counts what is really held, and follows the machine's memory."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from contract.intake.limits import HELD_BYTES_PER_PIXEL, MOST_MEMORY_BYTES, memory_for_clip_bytes
+from contract.runtime.settings import Settings
+from contract.wire.errors import LimitError
+from tests.worker.clips import HEIGHT, WIDTH, plane_clip
+from worker.input.clip import ClipLimits, open_clip
+from worker.train.targets import TrainingFrames
+
+GIB = 1024**3
+
+
+def arrays_bytes(value: object) -> int:
+    return sum(array.nbytes for array in vars(value).values() if isinstance(array, np.ndarray))
+
+
+def test_a_pixel_takes_what_the_clip_and_its_training_frames_hold_of_it() -> None:
+    clip = plane_clip(12)
+    held = arrays_bytes(clip) + arrays_bytes(TrainingFrames(clip, range(12), 1.0))
+    pixels = 12 * HEIGHT * WIDTH
+    assert HELD_BYTES_PER_PIXEL - 2 < held / pixels <= HELD_BYTES_PER_PIXEL
+
+
+@pytest.mark.parametrize(("memory_bytes", "share_bytes"), [(4 * GIB, 2 * GIB), (64 * GIB, 8 * GIB), (-1, 8 * GIB)])
+def test_a_clip_may_take_half_of_the_memory_and_at_most_eight_gib(
+    monkeypatch: pytest.MonkeyPatch, memory_bytes: int, share_bytes: int
+) -> None:
+    answers = {"SC_PAGE_SIZE": 1, "SC_PHYS_PAGES": memory_bytes}
+    monkeypatch.setattr(os, "sysconf", answers.__getitem__)
+    assert ClipLimits().decoded_bytes == memory_for_clip_bytes() == share_bytes
+
+
+def test_where_the_system_does_not_tell_its_memory_eight_gib_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sysconf")
+    assert memory_for_clip_bytes() == MOST_MEMORY_BYTES
+
+
+def test_a_clip_that_does_not_fit_is_told_how_many_of_its_frames_do() -> None:
+    limits = ClipLimits(decoded_bytes=GIB)
+    fitting = GIB // (1280 * 1024 * HELD_BYTES_PER_PIXEL)
+    limits.check_clip("clip", "it", fitting, 1280, 1024, eyes=1)
+    with pytest.raises(LimitError, match=r"1280x1024 pixels; .* limit of 1024.0 MiB holds 45") as caught:
+        limits.check_clip("clip", "it", fitting + 1, 1280, 1024, eyes=1)
+    assert caught.value.remedy == "Cut it to 45 frames, or scale it down."
+    limits.check_clip("clip", "it", 2 * fitting, 1280, 1024, eyes=2)
+    with pytest.raises(LimitError, match="holds 0") as caught:
+        ClipLimits(decoded_bytes=1000).check_clip("clip", "it", 1, 1280, 1024)
+    assert caught.value.remedy == "Scale it down."
+
+
+def test_the_limits_are_the_deployments() -> None:
+    limits = ClipLimits.of(Settings(max_frames=7, max_clip_s=2.5, max_frame_pixels=1000))
+    with pytest.raises(LimitError, match="the limit is 7"):
+        limits.check_clip("clip", "it", 8, 20, 20)
+    with pytest.raises(LimitError, match=r"lasts 2\.6 s; the limit is 2\.5 s"):
+        limits.check_duration("clip", "it", 2.6)
+    limits.check_frame("clip", "it", 80, 25)  # two eyes side by side
+    limits.check_clip("clip", "it", 1, 40, 25, eyes=1)
+    with pytest.raises(LimitError, match="an eye of it has 80x25 pixels; the limit is 1000"):
+        limits.check_clip("clip", "it", 1, 80, 25, eyes=1)
+
+
+def test_a_video_that_lasts_too_long_is_refused(studio) -> None:
+    clip = studio.video("clip.webm", np.concatenate(studio.eyes(6), axis=2), rate_hz=2.0)
+    with pytest.raises(LimitError, match="the limit is 2 s"):
+        open_clip(clip, limits=ClipLimits(duration_s=2.0))

@@ -1,0 +1,168 @@
+"""Masks: where they come from, what white means, and when nobody can tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from contract.wire.errors import InputError
+from worker.input.clip import StereoClip, open_clip
+
+
+@pytest.fixture
+def frames(studio) -> Path:
+    """Six stereo frames without masks."""
+    left, right = studio.eyes()
+    studio.images("clip/left/{}.png", left)
+    studio.images("clip/right/{}.png", right)
+    return studio.root / "clip"
+
+
+def tissue_of(path: Path, **options) -> NDArray[np.bool_]:
+    clip = open_clip(path, **options)
+    assert isinstance(clip, StereoClip)
+    assert clip.tissue is not None
+    return clip.tissue
+
+
+def test_without_masks_there_is_no_tissue_map_and_the_clip_says_so(frames: Path) -> None:
+    clip = open_clip(frames)
+    assert isinstance(clip, StereoClip)
+    assert clip.tissue is None
+    assert "masks: none given, every pixel is tissue" in clip.assumptions
+
+
+def test_folder_zip_and_video_of_masks_agree(studio, frames: Path) -> None:
+    tool = studio.tool()
+    folder = studio.masks("masks", tool)
+    video = studio.video("masks.webm", np.repeat(np.where(tool, np.uint8(255), np.uint8(0))[..., None], 3, axis=3))
+    for masks in (folder, studio.zip(folder, "masks.zip"), studio.zip(folder, "deep.zip", "some/folder/")):
+        np.testing.assert_array_equal(tissue_of(frames, masks=masks), ~tool)
+    assert (tissue_of(frames, masks=video) != ~tool).mean() < 0.01
+
+
+def test_masks_that_lie_beside_the_frames_are_used(studio, frames: Path) -> None:
+    studio.masks("clip/masks", studio.tool())
+    np.testing.assert_array_equal(tissue_of(frames), ~studio.tool())
+
+
+@pytest.mark.parametrize("white", ["tool", "tissue"])
+def test_the_class_on_the_border_with_the_smaller_area_is_the_tool(studio, frames: Path, white: str) -> None:
+    tool = studio.tool()
+    masks = studio.masks("masks", tool if white == "tool" else ~tool)
+    clip = open_clip(frames, masks=masks)
+    np.testing.assert_array_equal(clip.tissue, ~tool)
+    assert any(f"white is {white}" in assumption for assumption in clip.assumptions)
+
+
+def test_what_was_told_wins_over_the_look(studio, frames: Path) -> None:
+    clip = open_clip(frames, masks=studio.masks("masks", studio.tool()), mask_polarity="tissue")
+    np.testing.assert_array_equal(clip.tissue, studio.tool())
+    assert "masks: white is tissue (as told)" in clip.assumptions
+
+
+def test_a_small_class_that_touches_no_border_asks_for_the_polarity(studio, frames: Path) -> None:
+    island = np.zeros((6, 80, 96), dtype=np.bool_)
+    island[:, 30:50, 30:50] = True
+    for marked in (island, ~island):
+        with pytest.raises(InputError, match="cannot tell whether white or black") as caught:
+            open_clip(frames, masks=studio.masks("masks", marked))
+        assert "mask_polarity" in caught.value.remedy
+
+
+def test_classes_of_like_area_ask_for_the_polarity(studio, frames: Path) -> None:
+    half = np.zeros((6, 80, 96), dtype=np.bool_)
+    half[:, :40] = True
+    with pytest.raises(InputError, match="cannot tell whether white or black"):
+        open_clip(frames, masks=studio.masks("masks", half))
+
+
+def test_masks_that_contradict_their_layout_ask_for_the_polarity(studio) -> None:
+    folder = studio.endonerf()
+    studio.masks("endonerf/masks", ~studio.tool(3, 64, 80))
+    with pytest.raises(InputError, match="the masks look inverted"):
+        open_clip(folder)
+    np.testing.assert_array_equal(tissue_of_depth(folder, "tissue"), ~studio.tool(3, 64, 80))
+
+
+def tissue_of_depth(folder: Path, polarity: str) -> NDArray[np.bool_]:
+    return open_clip(folder, mask_polarity=polarity).tissue
+
+
+@pytest.mark.parametrize("white", [False, True])
+def test_masks_that_mark_nothing_are_refused(studio, frames: Path, white: bool) -> None:
+    masks = studio.masks("masks", np.full((6, 80, 96), white))
+    with pytest.raises(InputError, match="nothing is marked") as caught:
+        open_clip(frames, masks=masks)
+    assert caught.value.field == "masks"
+
+
+def test_told_masks_may_mark_no_tool_but_not_everything(studio, frames: Path) -> None:
+    masks = studio.masks("masks", np.zeros((6, 80, 96), dtype=np.bool_))
+    clip = open_clip(frames, masks=masks, mask_polarity="tool")
+    assert clip.tissue is not None
+    assert clip.tissue.all()
+    assert "the masks mark no instrument in any frame" in clip.warnings
+    with pytest.raises(InputError, match="every pixel of every mask is tool"):
+        open_clip(frames, masks=masks, mask_polarity="tissue")
+
+
+def test_a_frame_that_is_all_tool_is_warned_about(studio, frames: Path) -> None:
+    tool = studio.tool()
+    tool[2] = True
+    clip = open_clip(frames, masks=studio.masks("masks", tool))
+    assert "1 of 6 frames are all tool in their masks and cannot be learnt from" in clip.warnings
+
+
+def test_grey_edges_are_cut_at_half(studio, frames: Path) -> None:
+    tool = studio.tool()
+    grey = np.where(tool, np.uint8(128), np.uint8(127))
+    np.testing.assert_array_equal(tissue_of(frames, masks=studio.images("masks/{}.png", grey)), ~tool)
+
+
+def test_coloured_and_16_bit_masks_are_read(studio, frames: Path) -> None:
+    tool = studio.tool()
+    red = np.zeros((6, 80, 96, 3), dtype=np.uint8)
+    red[..., 0] = np.where(tool, 255, 0)
+    np.testing.assert_array_equal(tissue_of(frames, masks=studio.images("red/{}.png", red)), ~tool)
+    deep = np.where(tool, np.uint16(65535), np.uint16(0))
+    np.testing.assert_array_equal(tissue_of(frames, masks=studio.images("deep/{}.png", deep)), ~tool)
+
+
+def test_masks_of_ones_instead_of_255_are_refused_rather_than_read_as_empty(studio, frames: Path) -> None:
+    masks = studio.images("masks/{}.png", studio.tool().astype(np.uint8))
+    with pytest.raises(InputError, match="largest value in the masks is 1 of 255"):
+        open_clip(frames, masks=masks)
+
+
+def test_masks_of_another_count_or_size_are_refused(studio, frames: Path) -> None:
+    with pytest.raises(InputError, match="5 masks for 6 frames"):
+        open_clip(frames, masks=studio.masks("few", studio.tool(5)))
+    with pytest.raises(InputError, match="masks are 48x40 pixels, the left eye is 96x80"):
+        open_clip(frames, masks=studio.masks("small", studio.tool(6, 40, 48)))
+
+
+def test_masks_that_do_not_fit_are_refused_before_they_are_decoded(studio, frames: Path) -> None:
+    """Their pixels are cut off, which nobody notices: number and size stand in the headers."""
+    for name, shape in (("few", (5, 80, 96)), ("small", (6, 40, 48))):
+        folder = studio.masks(name, studio.tool(*shape))
+        for path in folder.iterdir():
+            path.write_bytes(path.read_bytes()[:40])
+        with pytest.raises(InputError, match=r"5 masks for 6 frames|48x40 pixels"):
+            open_clip(frames, masks=folder)
+    endonerf = studio.endonerf(frames=3)
+    for masks in (studio.root / "few", studio.root / "small"):
+        with pytest.raises(InputError, match="masks for 3 frames"):
+            open_clip(endonerf, masks=masks)
+
+
+def test_masks_that_are_missing_or_unreadable_are_refused(frames: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist") as caught:
+        open_clip(frames, masks=tmp_path / "nowhere")
+    assert caught.value.field == "masks"
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match="holds no PNG or JPEG images"):
+        open_clip(frames, masks=tmp_path / "none")

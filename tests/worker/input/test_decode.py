@@ -1,0 +1,343 @@
+"""The decoding process: the same bits as without it, and whatever it does, the worker gets an answer."""
+
+from __future__ import annotations
+
+import errno
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from contract.wire.errors import Cancelled, InputError, LimitError
+from tests.worker.input.clip.conftest import Studio
+from worker.input.calibration import load_calibration
+from worker.input.clip import ClipLimits, DepthClip, open_clip
+from worker.input.decode import StereoRecording, decode_clip
+from worker.input.decode.contained import Patience, private_folder, run_contained
+from worker.input.decode.guard import PROTECTIONS, Allowance
+from worker.input.decode.handover import map_array
+from worker.machine.hooks import Hooks, Progress
+
+CALIBRATION = (
+    '{"model": "rectified", "width": 96, "height": 80, "fx_px": 90, "fy_px": 90, "cx_px": 48, "cy_px": 40, '
+    '"baseline_mm": 4}'
+)
+ALLOWANCE = Allowance(memory_bytes=1 << 30, file_bytes=1 << 20, cpu_s=60)
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the kernel's protections are Linux's")
+
+
+@pytest.fixture
+def studio(tmp_path: Path) -> Studio:
+    return Studio(tmp_path)
+
+
+@pytest.fixture
+def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where decoded frames lie for a while."""
+    folder = tmp_path / "scratch"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+def calibrated(studio: Studio) -> Path:
+    path = studio.root / "calibration.json"
+    path.write_text(CALIBRATION)
+    return path
+
+
+def side_by_side(studio: Studio) -> Path:
+    return studio.video("clip.webm", np.concatenate(studio.eyes(), axis=2))
+
+
+def assert_same(actual: Any, expected: Any) -> None:
+    np.testing.assert_array_equal(np.asarray(actual), np.asarray(expected))
+
+
+def test_a_stereo_clip_comes_out_of_the_process_bit_for_bit(studio: Studio, scratch: Path) -> None:
+    clip, calibration = side_by_side(studio), calibrated(studio)
+    masks = studio.masks("masks", studio.tool())
+    expected = open_clip(clip, masks=masks)
+    assert not isinstance(expected, DepthClip)
+    decoded = decode_clip(clip, calibration=calibration, masks=masks)
+    assert isinstance(decoded, StereoRecording)
+    for pair, other in zip(decoded.clip.pairs(), expected.pairs(), strict=True):
+        assert_same(pair[0], other[0])
+        assert_same(pair[1], other[1])
+    assert_same(decoded.clip.tissue, expected.tissue)
+    assert_same(decoded.clip.frame_times_s, expected.frame_times_s)
+    assert decoded.clip.assumptions[:-1] == expected.assumptions
+    assert decoded.clip.warnings == expected.warnings
+    assert decoded.calibration == load_calibration(calibration, eye_width=96, eye_height=80)
+    assert list(scratch.iterdir()) == []
+    assert len(list(decoded.clip.pairs())) == 6  # what is mapped outlives its files, and can be read again
+
+
+def test_a_clip_with_depth_comes_out_of_the_process_bit_for_bit(studio: Studio, scratch: Path) -> None:
+    folder = studio.endonerf()
+    expected, decoded = open_clip(folder), decode_clip(studio.zip(folder))
+    assert isinstance(expected, DepthClip)
+    assert isinstance(decoded, DepthClip)
+    for name, array in vars(expected).items():
+        if isinstance(array, np.ndarray):
+            assert_same(getattr(decoded, name), array)
+            assert getattr(decoded, name).dtype == array.dtype
+    assert decoded.intrinsics == expected.intrinsics
+    assert list(scratch.iterdir()) == []
+
+
+def test_a_folder_may_link_to_where_its_frames_lie(studio: Studio) -> None:
+    folder = studio.endonerf()
+    (folder / "images").rename(studio.root / "elsewhere")
+    (folder / "images").symlink_to(studio.root / "elsewhere")
+    mask = next((folder / "masks").iterdir())
+    mask.rename(studio.root / "mask.png")
+    mask.symlink_to("../../mask.png")
+    decoded = decode_clip(folder)
+    assert isinstance(decoded, DepthClip)
+    expected = open_clip(folder)
+    assert isinstance(expected, DepthClip)
+    assert_same(decoded.rgb, expected.rgb)
+
+
+def test_a_calibration_inside_the_clips_zip_is_found(studio: Studio) -> None:
+    left, right = studio.eyes()
+    studio.images("clip/left/{}.png", left)
+    studio.images("clip/right/{}.png", right)
+    (studio.root / "clip/calibration.json").write_text(CALIBRATION)
+    decoded = decode_clip(studio.zip(studio.root / "clip"))
+    assert isinstance(decoded, StereoRecording)
+    assert decoded.calibration.width == 96
+
+
+def test_a_stereo_clip_without_a_calibration_says_that_it_needs_one(studio: Studio) -> None:
+    with pytest.raises(InputError, match="came without one") as caught:
+        decode_clip(side_by_side(studio))
+    assert caught.value.field == "calibration"
+
+
+def test_what_is_found_wrong_in_the_process_is_told_as_it_is_outside(studio: Studio, scratch: Path) -> None:
+    clip = side_by_side(studio)
+    with pytest.raises(LimitError, match="the limit is 3") as caught:
+        decode_clip(clip, calibration=calibrated(studio), limits=ClipLimits(frames=3))
+    assert caught.value.field == "clip"
+    assert caught.value.remedy == "Cut a shorter clip."
+    assert list(scratch.iterdir()) == []
+
+
+def test_frames_are_reported_as_they_are_decoded(studio: Studio) -> None:
+    seen: list[Progress] = []
+    decode_clip(side_by_side(studio), calibration=calibrated(studio), hooks=Hooks(on_progress=seen.append))
+    shares = [progress.fraction for progress in seen]
+    assert {progress.stage for progress in seen} == {"decode"}
+    assert shares == sorted(shares)
+    assert len(shares) >= 2
+
+
+def test_a_stopped_job_ends_the_process_and_leaves_nothing(studio: Studio, scratch: Path) -> None:
+    clip, calibration = side_by_side(studio), calibrated(studio)
+    stop = threading.Event()
+    hooks = Hooks(on_progress=lambda progress: stop.set(), should_stop=stop.is_set)
+    with pytest.raises(Cancelled):
+        decode_clip(clip, calibration=calibration, hooks=hooks)
+    assert list(scratch.iterdir()) == []
+
+
+@linux
+def test_the_report_says_what_protected_the_worker(studio: Studio) -> None:
+    decoded = decode_clip(studio.endonerf(), limits=ClipLimits(decoded_bytes=1 << 30))
+    assert isinstance(decoded, DepthClip)
+    assert decoded.assumptions[-1].startswith("decoding: in a process of its own (limited memory of 3.0 GiB")
+    for word in PROTECTIONS:
+        assert word in decoded.assumptions[-1]  # as held, or as what the kernel did not grant
+
+
+def run_stand_in(tmp_path: Path, work: str, **more: Any) -> dict[str, Any]:
+    """The result of a process that does `work` where the decoder would be."""
+    script = tmp_path / "stand_in.py"
+    lines = "\n    ".join(work.splitlines())
+    script.write_text(
+        "from worker.input.decode.child import serve\n"
+        f"def work(request, folder, reports):\n    {lines}\n    return {{}}\n"
+        "serve(lambda: work)\n"
+    )
+    with private_folder() as folder:
+        request = {"readable": more.pop("readable", [])}
+        return run_contained(request, more.pop("allowance", ALLOWANCE), folder, program=(str(script),), **more)
+
+
+@pytest.mark.parametrize(
+    ("work", "problem"),
+    [
+        ("import ctypes; ctypes.string_at(0)", "the decoder crashed .SIGSEGV."),
+        ("import os; os.abort()", "the decoder crashed .SIGABRT."),
+        ("import os; os._exit(3)", "the decoder crashed .status 3."),
+        ("bytearray(2 << 30)", "needed more than 1.0 GiB of memory"),
+        ("(folder / 'left').write_bytes(bytes(2 << 20))", "its frames take more than 1048576 bytes"),
+        ("raise ValueError('a file name')", "the decoder failed .ValueError."),
+        ("import os; os.write(3, b'nonsense\\n' * 9)\nimport time; time.sleep(9)", "the decoder talks nonsense"),
+        ("import os; os.write(3, b'x' * (5 << 20))", "the decoder talks nonsense"),
+        ("import os; os.write(3, b'[' * 100_000 + b'\\n')", "the decoder talks nonsense"),
+        ('import os; os.write(3, b\'{"pictures": Infinity, "share": 0}\\n\')', "the decoder talks nonsense"),
+        ("reports.end({'result': 3})", "the decoder talks nonsense"),
+        ("reports.end({'error': {'kind': 'input'}})", "the decoder talks nonsense"),
+    ],
+)
+def test_a_decoder_that_misbehaves_is_an_error_of_its_clip(tmp_path: Path, work: str, problem: str) -> None:
+    with pytest.raises(InputError, match=problem) as caught:
+        run_stand_in(tmp_path, work.replace("os.write(3", "os.write(reports._stream.fileno()"))
+    assert caught.value.field == "clip"
+    assert "H.264" in caught.value.remedy
+
+
+def test_a_decoder_that_computes_without_end_is_ended(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="took more than 1 s of computing"):
+        run_stand_in(tmp_path, "while True: pass", allowance=Allowance(1 << 30, 1 << 20, cpu_s=1))
+
+
+def test_a_decoder_that_hangs_is_ended(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"made no progress for 0\.5 s"):
+        run_stand_in(tmp_path, "import time; time.sleep(60)", patience=Patience(silence_s=0.5))
+
+
+def test_a_decoder_that_never_ends_its_line_is_ended(tmp_path: Path) -> None:
+    work = "import time\nwhile True: reports._stream.write(b' '); reports._stream.flush(); time.sleep(0.02)"
+    with pytest.raises(InputError, match=r"made no progress for 0\.5 s"):
+        run_stand_in(tmp_path, work, patience=Patience(silence_s=0.5))
+
+
+def test_a_decoder_that_only_pretends_to_advance_is_ended_too(tmp_path: Path) -> None:
+    work = "import time\nwhile True: reports.picture(); time.sleep(0.02)"
+    with pytest.raises(InputError, match="took more than 1 s"):
+        run_stand_in(tmp_path, work, patience=Patience(longest_s=1.0))
+
+
+def test_a_crash_over_the_calibration_names_the_calibration(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="crashed") as caught:
+        run_stand_in(tmp_path, "reports.reading('calibration')\nimport os; os.abort()")
+    assert caught.value.field == "calibration"
+
+
+@linux
+@pytest.mark.parametrize(
+    ("work", "protection"),
+    [
+        ("import socket; socket.create_connection(('127.0.0.1', PORT))", "no network"),
+        ("import os; os.fork()", "no other program"),
+        ("import os; os.execv('/bin/true', ['true'])", "no other program"),
+        ("import os; os.kill(os.getppid(), 0)", "no other program"),
+        ("import os, resource; resource.prlimit(os.getppid(), resource.RLIMIT_CPU)", "no other program"),
+        ("import os; os.setpriority(os.PRIO_PROCESS, os.getppid(), 19)", "no other program"),
+        ("import os; os.chmod('SECRET', 0o666)", "no other program"),
+        ("import os; os.chown('SECRET', -1, -1)", "no other program"),
+        ("import os; os.utime('SECRET', (0, 0))", "no other program"),
+        ("import os; os.setxattr('SECRET', 'user.a', b'')", "no other program"),
+        ("import os; os.chroot('.')", "no other program"),
+        ("open('SECRET').read()", "no files but its own"),
+        ("open('SECRET', 'a')", "no files but its own"),
+        ("import os; os.truncate('SECRET', 0)", "no files but its own"),
+        ("import os; os.listdir('/')", "no files but its own"),
+        ("open(f'/proc/{__import__(\"os\").getppid()}/mem', 'r+b')", "no files but its own"),
+    ],
+)
+def test_a_decoder_that_was_taken_over_reaches_nothing(tmp_path: Path, work: str, protection: str) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text("another's clip")
+    tried = f"try:\n    {work.replace('SECRET', str(secret)).replace('PORT', '9')}\nexcept OSError as error:\n"
+    told = run_stand_in(tmp_path, tried + "    return {'refused': type(error).__name__}")
+    if protection not in told["granted"]:
+        pytest.skip(f"this kernel does not grant: {protection}")
+    assert told["refused"] == "PermissionError"
+    assert secret.read_text() == "another's clip"
+
+
+@linux
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the calls' numbers are those of x86-64")
+@pytest.mark.parametrize("call", ["234, parent, parent, 0", "129, parent, 0, None"])  # tgkill, rt_sigqueueinfo
+def test_no_way_of_sending_a_signal_reaches_another_process(tmp_path: Path, call: str) -> None:
+    work = (
+        "import ctypes, os\n"
+        "parent, libc = os.getppid(), ctypes.CDLL(None, use_errno=True)\n"
+        f"return {{'value': libc.syscall({call}), 'errno': ctypes.get_errno()}}"
+    )
+    told = run_stand_in(tmp_path, work)
+    if "no other program" not in told["granted"]:
+        pytest.skip("this kernel does not grant: no other program")
+    assert (told["value"], told["errno"]) == (-1, errno.EPERM)
+
+
+@linux
+def test_a_decoder_of_roots_is_not_root(tmp_path: Path) -> None:
+    work = (
+        "import ctypes, struct\n"
+        "held = ctypes.create_string_buffer(24)\n"
+        "ctypes.CDLL(None).capget(struct.pack('=Ii', 0x20080522, 0), held)\n"
+        "return {'capabilities': struct.unpack('=6I', held)}"
+    )
+    may_read_any = 1 << 2
+    assert set(run_stand_in(tmp_path, work)["capabilities"]) <= {0, may_read_any}
+
+
+def test_a_decoder_that_stays_after_its_answer_is_ended(tmp_path: Path) -> None:
+    work = "import os, time\nreports.end({'result': {'pid': os.getpid()}})\ntime.sleep(60)"
+    pid = run_stand_in(tmp_path, work, patience=Patience(parting_s=0.3))["pid"]
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def test_a_decoder_reads_what_it_is_given_and_writes_in_its_folder(tmp_path: Path) -> None:
+    given = tmp_path / "given"
+    given.write_text("a clip")
+    work = f"(folder / 'left').write_text(open({str(given)!r}).read())\nreturn {{'left': open('left').read()}}"
+    assert run_stand_in(tmp_path, work, readable=[str(given)])["left"] == "a clip"
+
+
+def test_a_decoder_gets_nothing_of_the_workers_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REDIS_URL", "redis://:secret@queue")
+    work = "import os\nreturn {'names': sorted(os.environ), 'files': sorted(os.listdir('.'))}"
+    told = run_stand_in(tmp_path, work)
+    assert "REDIS_URL" not in told["names"]
+    assert told["files"] == []
+
+
+@linux
+def test_a_decoder_ends_with_its_worker(tmp_path: Path) -> None:
+    """The kernel kills it as soon as its parent is gone, however that went."""
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import os, sys, threading\n"
+        "from pathlib import Path\n"
+        "from tests.worker.input.test_decode import run_stand_in\n"
+        "work = 'import time, os\\n' 'while True: (folder / \"beat\").write_text(str(time.time())); time.sleep(0.02)'\n"
+        "threading.Timer(1.5, os._exit, (0,)).start()\n"
+        f"run_stand_in(Path({str(tmp_path)!r}), work)\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3]), "TMPDIR": str(tmp_path)}
+    subprocess.run([sys.executable, str(script)], env=environment, check=True, timeout=60)
+    beats = list(tmp_path.glob("intrasplat-*/beat"))
+    assert beats
+    last = beats[0].read_text()
+    time.sleep(0.3)
+    assert beats[0].read_text() == last
+
+
+@pytest.mark.parametrize("left", [b"", bytes(11), bytes(13)])
+def test_an_array_of_the_wrong_size_is_refused(tmp_path: Path, left: bytes) -> None:
+    (tmp_path / "left").write_bytes(left)
+    with pytest.raises(ValueError, match="bytes, not 12"):
+        map_array(tmp_path, "left", (1, 2, 2))
+
+
+def test_a_link_in_the_place_of_an_array_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "secret").write_bytes(bytes(12))
+    (tmp_path / "left").symlink_to(tmp_path / "secret")
+    with pytest.raises(OSError, match="symbolic links"):
+        map_array(tmp_path, "left", (1, 2, 2))

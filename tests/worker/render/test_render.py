@@ -1,0 +1,177 @@
+"""Renders of a scene: held within the clip, honest about what was never seen, the same from disk as from memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.helpers import assert_close
+from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared, trained, view
+from tests.worker.scenes import random_scene
+from worker.input.camera import Intrinsics
+from worker.model.metrics import psnr_tissue
+from worker.phantom import orbit_pose
+from worker.pipeline import scene_of
+from worker.render.view import FAR_POSE, endoscope_pose, render_frame
+from worker.scene.checkpoint import Scene, load_scene, save_scene
+from worker.train.loop import Run
+from worker.train.presets import PRESETS
+
+LAST = (FRAMES - 1) / FRAMES
+
+
+def made(preset: str = "fast", *, moving_camera: bool = False, iterations: int = 20) -> tuple[Run, Scene]:
+    clip = phantom_clip(moving_camera=moving_camera)
+    run, split = prepared(clip, preset, iterations=iterations)
+    trained(run)
+    return run, scene_of(run, clip, split, run.frames.scale, run.seed)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return made()[1]
+
+
+def shifted(right_mm: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    pose = np.eye(4)
+    pose[0, 3] = right_mm
+    return pose
+
+
+@pytest.mark.parametrize("t", [-0.5, 1.0, 1e6])
+def test_a_time_outside_the_clip_shows_its_first_or_last_frame_and_warns(scene: Scene, t: float) -> None:
+    frame = render_frame(scene, t)
+    np.testing.assert_array_equal(frame.rgb, render_frame(scene, 0.0 if t < 0 else LAST).rgb)
+    assert any("outside the clip" in warning for warning in frame.warnings)
+
+
+def test_the_endoscopes_own_view_needs_no_warning(scene: Scene) -> None:
+    assert render_frame(scene, 0.4).warnings == ()
+
+
+@pytest.mark.parametrize("size", [(97, 81), (33, 17), (8, 8), (200, 150)])
+def test_every_layer_has_the_asked_size(scene: Scene, size: tuple[int, int]) -> None:
+    width, height = size
+    frame = render_frame(scene, 0.3, None, scene.intrinsics.resized(width, height))
+    assert (frame.rgb.shape, frame.rgb.dtype.name) == ((height, width, 3), "uint8")
+    for layer in (frame.depth_mm, frame.confidence):
+        assert (layer.shape, layer.dtype.name) == ((height, width), "float32")
+    assert frame.confidence.min() >= 0
+    assert frame.confidence.max() <= 1
+    assert np.isfinite(frame.depth_mm).all()
+    solid = frame.depth_mm > 0
+    assert solid.mean() > 0.9
+    assert not frame.confidence[~solid].any()
+
+
+def test_another_camera_looks_at_the_same_tissue(scene: Scene) -> None:
+    camera = scene.intrinsics
+    right_half = Intrinsics(
+        width=WIDTH // 2, height=HEIGHT, fx=camera.fx, fy=camera.fy, cx=camera.cx - WIDTH // 2, cy=camera.cy
+    )
+    whole, half = render_frame(scene, 0.5), render_frame(scene, 0.5, None, right_half)
+    assert_close(half.rgb, whole.rgb[:, WIDTH // 2 :], absolute=1, relative=0)
+    assert_close(half.depth_mm, whole.depth_mm[:, WIDTH // 2 :], relative=1e-4)
+
+
+def test_depth_is_in_mm(scene: Scene) -> None:
+    clip = phantom_clip()
+    for index in (1, 9):  # held out
+        tissue = clip.tissue[index]
+        error_mm = np.abs(render_frame(scene, float(clip.t[index])).depth_mm - clip.depth_mm[index])[tissue]
+        assert np.median(error_mm) < 2
+
+
+def test_confidence_falls_with_the_distance_from_the_endoscope(scene: Scene) -> None:
+    depth_mm = 60 / scene.units_per_mm
+    means = [render_frame(scene, 0.5, shifted(share * depth_mm)).confidence for share in (0, 0.1, 0.2, 0.3, 0.6)]
+    levels = [float(np.median(each[each > 0])) for each in means]
+    assert levels == sorted(levels, reverse=True)
+    assert levels[0] > 0.7
+    assert levels[-1] < 0.1
+
+
+def test_a_pose_far_from_the_endoscope_warns(scene: Scene) -> None:
+    depth_mm = 60 / scene.units_per_mm
+    near = render_frame(scene, 0.5, shifted(0.5 * FAR_POSE * depth_mm))
+    far = render_frame(scene, 0.5, shifted(1.1 * FAR_POSE * depth_mm))
+    assert not any("most of it is a guess" in warning for warning in near.warnings)
+    assert any("most of it is a guess" in warning for warning in far.warnings)
+
+
+def test_a_view_of_nothing_is_empty_and_says_so(scene: Scene) -> None:
+    away = np.eye(4)
+    away[:3, :3] = np.diag([-1.0, 1.0, -1.0])  # turned about
+    frame = render_frame(scene, 0.5, away)
+    assert not frame.depth_mm.any()
+    assert not frame.confidence.any()
+    assert any("hardly seen" in warning for warning in frame.warnings)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_stored_scene_renders_as_the_model_did(preset: str, tmp_path: Path) -> None:
+    run, scene = made(preset)
+    save_scene(tmp_path, scene)
+    stored = load_scene(tmp_path)
+    for index in (0, 5, 11):
+        shown = view(run, index)
+        frame = render_frame(stored, index / FRAMES)
+        assert np.abs(np.clip(shown.rgb, 0, 1) * 255 - frame.rgb).max() <= 1
+        assert_close(frame.depth_mm, shown.depth_mm, relative=1e-4)
+
+
+def test_sizes_come_and_go_without_changing_a_picture(scene: Scene) -> None:
+    first = render_frame(scene, 0.2).rgb
+    for width in range(40, 48):
+        render_frame(scene, 0.7, None, scene.intrinsics.resized(width, 30))
+    np.testing.assert_array_equal(render_frame(scene, 0.2).rgb, first)
+
+
+def test_a_scene_that_is_dropped_takes_its_renderer_along() -> None:
+    scene = random_scene()
+    render_frame(scene, 0.0)
+    alive = weakref.ref(scene)
+    del scene
+    gc.collect()
+    assert alive() is None
+
+
+def test_a_moving_camera_is_followed() -> None:
+    clip = phantom_clip(moving_camera=True)
+    _, scene = made(moving_camera=True, iterations=60)
+    assert not np.array_equal(clip.world_from_camera[9], np.eye(4))
+    held_out = 9
+    t = float(clip.t[held_out])
+    assert_close(endoscope_pose(scene, t), clip.world_from_camera[held_out])
+    own, standing = (render_frame(scene, t, pose).rgb / np.float32(255) for pose in (None, np.eye(4)))
+    own_db, standing_db = (psnr_tissue(each, clip.rgb[held_out], clip.tissue[held_out]) for each in (own, standing))
+    assert own_db > max(standing_db + 1, 22)
+
+
+def test_between_frames_the_endoscope_is_half_way() -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[2] = orbit_pose(20, 0)
+    poses[2, :3, 3] = [4.0, 2.0, 0.0]
+    scene = dataclasses.replace(random_scene(), world_from_camera=poses, frame_times_s=np.arange(4) / 30)
+    half = endoscope_pose(scene, 1.5 / 4)
+    assert_close(half[:3, 3], np.array([2.0, 1.0, 0.0]))
+    turned = Rotation.from_matrix(half[:3, :3]).magnitude()
+    assert turned == pytest.approx(Rotation.from_matrix(poses[2, :3, :3]).magnitude() / 2)
+    for frame in range(4):
+        assert_close(endoscope_pose(scene, frame / 4), poses[frame])
+    assert_close(endoscope_pose(scene, 5.0), poses[3])
+    assert_close(endoscope_pose(scene, -5.0), poses[0])
+
+
+def test_a_scene_of_one_frame_stands_still() -> None:
+    scene = dataclasses.replace(
+        random_scene(), world_from_camera=np.eye(4)[None], frame_times_s=np.zeros(1), trained_t=(0.0,)
+    )
+    assert_close(endoscope_pose(scene, 0.7), np.eye(4))
+    assert render_frame(scene, 0.7).rgb.shape == (48, 64, 3)

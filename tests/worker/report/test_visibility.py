@@ -1,0 +1,82 @@
+"""How often a Gaussian was seen: on tissue, in the image, not behind the surface, as sure as its depth was."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.helpers import assert_close
+from tests.worker.clips import WIDTH, plane_clip
+from tests.worker.phantoms import prepared
+from worker.fusion import COMPLETED_CONFIDENCE
+from worker.input.clip import DepthClip
+from worker.report.visibility import SAMPLED_FRAMES, WIDEST_UNSEEN, drop_strays, seen_share
+from worker.train.loop import Run
+
+
+@pytest.fixture
+def clip() -> DepthClip:
+    """A plane across which a tool wanders; the camera stands still."""
+    return plane_clip(12)
+
+
+def start(clip: DepthClip) -> Run:
+    return prepared(clip, "paper", holdout="none")[0]
+
+
+def pixels(run: Run, clip: DepthClip) -> NDArray[np.intp]:
+    """Flat index of the pixel each Gaussian's centre lies on; the camera is the world."""
+    x, y, z = run.model.deformed_mean(0.0)
+    camera = clip.intrinsics
+    column, row = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
+    return np.asarray(row * WIDTH + column, np.intp)
+
+
+def test_a_gaussian_counts_in_the_frames_that_show_its_tissue(clip: DepthClip) -> None:
+    run = start(clip)
+    shown = clip.tissue.reshape(clip.frame_count, -1).mean(0)[pixels(run, clip)]
+    assert shown.min() < 0.9
+    assert_close(seen_share(run.model, clip, run.frames), shown, name="shares")
+
+
+def test_unsure_depth_makes_a_gaussian_less_seen(clip: DepthClip) -> None:
+    run = start(clip)
+    unsure = dataclasses.replace(clip, depth_confidence=np.full_like(clip.depth_confidence, 51))
+    assert_close(seen_share(run.model, unsure, run.frames), seen_share(run.model, clip, run.frames) / 5)
+
+
+def test_behind_the_surface_behind_the_camera_and_outside_the_image_nothing_is_seen(clip: DepthClip) -> None:
+    run = prepared(clip, "fast", holdout="none")[0]
+    before = seen_share(run.model, clip, run.frames)
+    row, column = np.divmod(pixels(run, clip), WIDTH)
+    chosen = np.flatnonzero((row > 32) & (row < 44) & (column > 8) & (column < WIDTH - 8))[::17]
+    behind, turned_away, outside = chosen[0::3], chosen[1::3], chosen[2::3]
+    run.model.canonical[:3, behind] *= 1.2
+    run.model.canonical[2, turned_away] *= -1
+    run.model.canonical[0, outside] += 200
+    seen = seen_share(run.model, clip, run.frames)
+    assert before[chosen].min() > 0.9
+    assert not seen[chosen].any()
+    others = np.setdiff1d(np.arange(run.model.count), chosen)
+    assert seen[others].mean() > 0.95 * before[others].mean()
+
+
+def test_a_wide_gaussian_on_tissue_without_depth_is_no_stray(clip: DepthClip) -> None:
+    run = start(clip)
+    run.model.canonical[7:10] = np.log(2 * WIDEST_UNSEEN)
+    unsure = dataclasses.replace(clip, depth_confidence=np.zeros_like(clip.depth_confidence))
+    seen = seen_share(run.model, unsure, run.frames)
+    assert seen.any()
+    assert (seen <= COMPLETED_CONFIDENCE + 1e-6).all()
+    assert drop_strays(run.model, unsure, run.frames) == 0
+
+
+def test_a_long_clip_is_sampled_evenly() -> None:
+    clip = plane_clip(2 * SAMPLED_FRAMES)
+    clip.tissue[:] = True
+    clip.tissue[: clip.frame_count // 2] = False
+    run = prepared(clip, "fast", holdout="none")[0]
+    assert np.median(seen_share(run.model, clip, run.frames)) == pytest.approx(0.5, abs=0.05)

@@ -1,0 +1,293 @@
+"""The loop's promises: the same bits again, also after a stop; held-out frames without influence; no silent NaN."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from contract.wire.errors import Cancelled, SceneError, TrainingDiverged
+from tests.worker.phantoms import bits, phantom_clip, prepared, prepared_on, trained, view
+from worker.input.clip import DepthClip, split_frames
+from worker.machine.hooks import Hooks, Progress
+from worker.model.metrics import psnr_tissue
+from worker.model.optimize import Rate
+from worker.train.densify import DensifySettings
+from worker.train.loop import (
+    CALIBRATION_STEPS,
+    LATER_STEPS,
+    CurvePoint,
+    Run,
+    Stopwatch,
+    frames_at,
+    iterations_within,
+    train,
+    write_curve,
+)
+from worker.train.presets import PRESETS, Preset
+from worker.train.resume import load_run, save_run
+
+SOON = DensifySettings(from_iteration=6, every=6, gradient_threshold=1e-5)
+"""Splits early enough to happen in these short runs; so does splitting_soon add harmonics."""
+ITERATIONS, STOPPED_AFTER = 24, 11
+
+
+def splitting_soon(name: str) -> Preset:
+    preset = PRESETS[name]
+    return dataclasses.replace(preset, densify=SOON, sh_every=7) if preset.densify else preset
+
+
+def stopping_after(iterations: int) -> Hooks:
+    """Hooks that ask to stop once so many iterations are made."""
+    asked = 0
+
+    def should_stop() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > iterations
+
+    return Hooks(should_stop=should_stop)
+
+
+def run_bits(clip: DepthClip, preset: Preset, *, iterations: int = ITERATIONS, seed: int = 0) -> dict[str, bytes]:
+    run, split = prepared(clip, preset, iterations=iterations, seed=seed)
+    return bits(trained(run), clip, split)
+
+
+@cache
+def straight_bits(name: str) -> dict[str, bytes]:
+    """What an unstopped run of this preset makes."""
+    return run_bits(phantom_clip(), splitting_soon(name))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_same_seed_gives_the_same_bits_and_another_seed_others(name: str) -> None:
+    clip, preset = phantom_clip(), splitting_soon(name)
+    assert run_bits(clip, preset) == straight_bits(name)
+    assert run_bits(clip, preset, seed=1) != straight_bits(name)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_stopped_run_goes_on_to_the_bits_of_an_unstopped_one(name: str, tmp_path: Path) -> None:
+    clip, preset = phantom_clip(), splitting_soon(name)
+    run, split = prepared(clip, preset, iterations=ITERATIONS)
+    count = run.model.count
+    with pytest.raises(Cancelled):
+        trained(run, stopping_after(STOPPED_AFTER))
+    assert run.iteration == STOPPED_AFTER
+    assert preset.densify is None or run.model.count > count  # the stored model is larger than a fresh one
+    save_run(tmp_path, run, 1.5)
+    again, _ = prepared(clip, preset, iterations=ITERATIONS)
+    assert load_run(tmp_path, again) == 1.5
+    assert bits(trained(again), clip, split) == straight_bits(name)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_held_out_frames_change_nothing_in_a_trained_model(name: str, rng: np.random.Generator) -> None:
+    clip, preset = phantom_clip(frames=18), splitting_soon(name)
+    split = split_frames(clip, "every8")
+    assert len(split.held_out) == 3
+    poisoned = dataclasses.replace(
+        clip, **{layer: getattr(clip, layer).copy() for layer in ("rgb", "tissue", "depth_mm", "depth_confidence")}
+    )
+    shape = poisoned.tissue[split.held_out].shape
+    poisoned.rgb[split.held_out] = rng.integers(0, 256, (*shape, 3))
+    poisoned.tissue[split.held_out] = rng.random(shape) < 0.5
+    poisoned.depth_mm[split.held_out] = rng.uniform(1, 500, shape)
+    poisoned.depth_confidence[split.held_out] = rng.integers(0, 256, shape)
+    clean_run = trained(prepared_on(clip, split, preset, iterations=ITERATIONS))
+    poisoned_run = trained(prepared_on(poisoned, split, preset, iterations=ITERATIONS))
+    assert bits(poisoned_run, poisoned, split) == bits(clean_run, clip, split)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_training_brings_the_model_nearer_to_its_frames(name: str) -> None:
+    clip = phantom_clip()
+    run, split = prepared(clip, name, iterations=40)
+
+    def fit_db() -> float:
+        return float(np.mean([psnr_tissue(view(run, i).rgb, clip.rgb[i], clip.tissue[i]) for i in split.train]))
+
+    before_db = fit_db()
+    trained(run)
+    assert fit_db() > before_db + 1
+
+
+def test_an_epoch_shows_every_frame_once_in_another_order_each_time() -> None:
+    run, split = prepared(phantom_clip(), "fast")
+    count = len(split.train)
+    epochs = [[frames_at(run, epoch * count + place + 1)[0] for place in range(count)] for epoch in range(3)]
+    assert all(sorted(epoch) == split.train for epoch in epochs)
+    assert epochs[0] != epochs[1]
+
+
+def test_random_order_draws_training_frames_alone() -> None:
+    run, split = prepared(phantom_clip(), "paper")
+    drawn = [frames_at(run, iteration)[0] for iteration in range(1, 400)]
+    assert set(drawn) == set(split.train)
+    assert drawn == [frames_at(run, iteration)[0] for iteration in range(1, 400)]
+
+
+@pytest.mark.parametrize("frames_a_step", [2, 5, 16])
+def test_frames_are_seen_in_one_order_however_many_make_a_step(frames_a_step: int) -> None:
+    run, _ = prepared(phantom_clip(), "fast")
+    one_by_one = [frames_at(run, iteration)[0] for iteration in range(1, 1 + 4 * frames_a_step)]
+    run.preset = dataclasses.replace(run.preset, frames_a_step=frames_a_step)
+    steps = [frames_at(run, iteration) for iteration in range(1, 5)]
+    assert {len(step) for step in steps} == {frames_a_step}
+    assert [index for step in steps for index in step] == one_by_one
+
+
+@pytest.mark.parametrize("name", ["fast", "paper", "hexplane"])
+def test_steps_on_several_frames_keep_their_bits_over_a_stop(name: str, tmp_path: Path) -> None:
+    clip, preset = phantom_clip(), dataclasses.replace(splitting_soon(name), frames_a_step=3)
+    whole, split = prepared(clip, preset, iterations=9)
+    stopped, _ = prepared(clip, preset, iterations=9)
+    with pytest.raises(Cancelled):
+        trained(stopped, stopping_after(4))
+    save_run(tmp_path, stopped, 1.5)
+    again, _ = prepared(clip, preset, iterations=9)
+    load_run(tmp_path, again)
+    assert again.frames_seen == 12
+    assert bits(trained(again), clip, split) == bits(trained(whole), clip, split)
+    with pytest.raises(ValueError, match="another settings of the preset"):
+        load_run(tmp_path, prepared(clip, splitting_soon(name), iterations=9)[0])
+
+
+def test_the_curve_tells_iterations_and_the_frames_they_saw(tmp_path: Path) -> None:
+    preset = dataclasses.replace(PRESETS["fast"], frames_a_step=2)
+    run, split = prepared(phantom_clip(), preset, iterations=5)
+    assert run.schedule.epoch == -(-len(split.train) // 2)
+    train(run, Stopwatch(), lambda: 31.5, Hooks())
+    write_curve(tmp_path / "curve.csv", run)
+    with (tmp_path / "curve.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["iteration"], row["frames_seen"], row["psnr_tissue_db"]) == ("5", "10", "31.5000")
+
+
+def fitting(run: Run, budget_s: float, elapsed_s: float = 0.0) -> int:
+    return iterations_within(run.model, run.frames, run.preset, run.seed, budget_s, elapsed_s)
+
+
+def test_a_budget_allows_what_is_left_of_it_over_the_median_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, split = prepared(phantom_clip(), "fast")
+    untimed, timed = CALIBRATION_STEPS
+    storing_s, step_s, later_s = 0.5, 0.02, 0.25
+    steps_s = [0.9] * untimed + [step_s] * (timed - 2) + [step_s / 2, 3.0]
+    durations_s = [storing_s, *steps_s, later_s]
+    times_s = [sum(durations_s[:place]) for place in range(len(durations_s) + 1)]
+
+    def fitting_by_this_clock(budget_s: float) -> int:
+        clock = iter(times_s)
+        monkeypatch.setattr("worker.train.loop.time", SimpleNamespace(perf_counter=lambda: next(clock)))
+        return fitting(run, budget_s, elapsed_s=1.0)
+
+    for budget_s in (10.0, 30.0, 61.0):
+        assert fitting_by_this_clock(budget_s) == int((budget_s - 1.0 - times_s[-1]) / (LATER_STEPS * step_s))
+    assert fitting_by_this_clock(1.0) == len(split.train)
+
+
+def test_calibration_leaves_the_model_as_it_was() -> None:
+    for name in ("fast", "paper", "hexplane"):
+        run, split = prepared(phantom_clip(), name)
+        before = {key: values.clone() for key, values in run.model.arrays().items()}
+        for budget_s in (1e-9, 0.5):
+            assert fitting(run, budget_s, elapsed_s=0.1) >= len(split.train)
+        after = run.model.arrays()
+        assert before.keys() == after.keys()
+        for key, values in before.items():
+            np.testing.assert_array_equal(after[key], values, err_msg=f"{name}: {key}")
+        assert run.iteration == 0
+
+
+def test_calibration_does_not_change_what_training_makes() -> None:
+    clip = phantom_clip()
+    for name in ("fast", "hexplane"):
+        run, split = prepared(clip, name, iterations=ITERATIONS)
+        fitting(run, 1.0)
+        assert bits(trained(run), clip, split) == run_bits(clip, PRESETS[name])
+
+
+def spoil(run: Run) -> None:
+    run.model.canonical[10, 5] = math.nan
+
+
+def explode(run: Run) -> None:
+    run.preset = dataclasses.replace(run.preset, rates=dataclasses.replace(run.preset.rates, mean=Rate(1e30)))
+
+
+def lose_one(run: Run) -> None:
+    """A Gaussian whose place is no number is not drawn: the loss stays finite."""
+    run.model.canonical[0, 5] = math.nan
+
+
+@pytest.mark.parametrize("break_it", [spoil, explode, lose_one])
+@pytest.mark.parametrize("name", ["fast", "hexplane"])
+def test_training_that_leaves_the_numbers_is_an_error(name: str, break_it: Callable[[Run], None]) -> None:
+    run, _ = prepared(phantom_clip(), name)
+    break_it(run)
+    with np.errstate(all="ignore"), pytest.raises(TrainingDiverged):
+        trained(run)
+
+
+def test_a_stop_before_the_first_step_makes_none() -> None:
+    run, _ = prepared(phantom_clip())
+    with pytest.raises(Cancelled, match="iteration 0 of 20"):
+        trained(run, Hooks(should_stop=lambda: True))
+    assert run.iteration == 0
+
+
+def test_the_last_iteration_is_scored_and_reported() -> None:
+    run, _ = prepared(phantom_clip(), iterations=5)
+    told: list[Progress] = []
+    train(run, Stopwatch(), lambda: 31.5, Hooks(on_progress=told.append))
+    assert [(point.iteration, point.psnr_tissue_db) for point in run.curve] == [(5, 31.5)]
+    assert told
+    assert all(each.stage == "train" and 0 <= each.fraction <= 1 and each.iterations == 5 for each in told)
+
+
+def test_without_held_out_frames_there_is_no_curve() -> None:
+    run, _ = prepared(phantom_clip(), iterations=3)
+    assert trained(run).curve == []
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"preset": "paper-wide"}, "another preset"),
+        ({"preset": dataclasses.replace(PRESETS["paper"], opacity=0.2)}, "another settings of the preset"),
+        ({"seed": 3}, "another seed"),
+        ({"iterations": 9}, "another length"),
+        ({"holdout": "1,2,9"}, "another clip"),
+    ],
+)
+def test_a_run_goes_on_only_with_what_it_was_started_with(change: dict[str, object], said: str, tmp_path: Path) -> None:
+    started: dict[str, object] = {"preset": "paper", "iterations": 8, "seed": 0, "holdout": "every8"}
+    save_run(tmp_path, prepared(phantom_clip(), **started)[0], 0.0)  # type: ignore[arg-type]
+    other, _ = prepared(phantom_clip(), **(started | change))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=said):
+        load_run(tmp_path, other)
+
+
+def test_a_run_does_not_go_on_with_another_clip(tmp_path: Path) -> None:
+    save_run(tmp_path, prepared(phantom_clip("breathing"), "fast")[0], 0.0)
+    with pytest.raises(ValueError, match="another clip"):
+        load_run(tmp_path, prepared(phantom_clip("pull"), "fast")[0])
+    with pytest.raises(SceneError):
+        load_run(tmp_path / "nothing", prepared(phantom_clip(), "fast")[0])
+
+
+def test_the_curve_is_kept_over_a_stop(tmp_path: Path) -> None:
+    run, _ = prepared(phantom_clip())
+    run.curve.append(CurvePoint(1.25, 7, 30.5))
+    save_run(tmp_path, run, 2.0)
+    again, _ = prepared(phantom_clip())
+    load_run(tmp_path, again)
+    assert again.curve == run.curve

@@ -1,0 +1,265 @@
+"""The job loop: claim, let the device child reconstruct, settle. No torch in here: nothing in this process can hang.
+
+A job ends in exactly one of done, failed and cancelled. If the child dies the job is handed back and held against it;
+if this process is told to end, or to make way, it is handed back and a later attempt goes on from there; if this
+process dies its child dies with it, the claim runs out, and any worker takes the job again (contract/queue/promise.py).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+from contract.queue.promise import Claim, Order, Queue
+from contract.store.store import Store
+from contract.wire.errors import IntrasplatError, UnavailableError
+from contract.wire.job import JobProgress, JobRecord, JobState
+from contract.wire.names import RESUME
+from worker.daemon.child import DeviceChild, Ended, Keeper
+from worker.daemon.faults import describe
+from worker.daemon.heartbeat import Heartbeat
+from worker.daemon.liveness import Watch
+from worker.daemon.orders import Advanced, Failed, Finished, Run, Stop, Stopped
+
+CLAIM_TIMEOUT_S = 1.0
+"""How soon an idle worker notices that it should end, or that its child has."""
+
+LOOK_PERIOD_S = 0.1
+"""How soon a new order of the queue, or a hang, is acted on."""
+
+STOP_LIMIT_S = 5.0
+"""A child that is told to stop has so long to keep the job's state; then it is killed."""
+
+UNREACHABLE_PAUSE_S = 1.0
+
+STORE_PATIENCE_S = 60.0
+"""A store that fails for so long fails the job."""
+
+FETCHING = "fetch"
+PUBLISHING = "publish"
+"""The first and the last stage a caller sees: the clip is brought here, the scene put in its place."""
+
+WAIT_FOR_QUEUE = "the queue is away; the lease will run out"
+
+_Result = TypeVar("_Result")
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+@dataclass(frozen=True)
+class Died:
+    """The child is gone. excused: not because of the job; it had been told to stop, or had died before."""
+
+    cause: str
+    excused: bool
+
+
+class Consumer:
+    """Takes jobs one after the other; job_id is that of the running one and may be read from any thread."""
+
+    def __init__(self, queue: Queue, store: Store, keeper: Keeper, owner: str, end: threading.Event) -> None:
+        self._queue = queue
+        self._store = store
+        self._keeper = keeper
+        self._owner = owner
+        self._end = end
+        self.job_id: str | None = None
+
+    def run(self, claim_timeout_s: float = CLAIM_TIMEOUT_S) -> None:
+        """Until `end` is set.
+
+        Raises:
+            UnavailableError: the child says that it cannot work here.
+        """
+        away = False
+        while (child := self._keeper.child(self._end)) is not None:
+            try:
+                record = self._queue.claim(self._owner, claim_timeout_s)
+            except UnavailableError as error:
+                if not away:
+                    logger.warning("waiting for the queue: %s", error.problem)
+                away = True
+                self._end.wait(UNREACHABLE_PAUSE_S)
+                continue
+            away = False
+            if record is not None:
+                self.job_id = record.job_id
+                run_job(self._queue, self._store, child, record, self._end)
+                self.job_id = None
+
+
+def run_job(queue: Queue, store: Store, child: DeviceChild, record: JobRecord, end: threading.Event) -> None:
+    """Run one claimed job to its end; if `end` is set first, hand it back."""
+    assert record.owner is not None
+    claim = Claim(record.job_id, record.attempt, record.owner)
+    log = _log_of(claim)
+    log.info("an attempt starts")
+    started_s = time.monotonic()
+    with Heartbeat(queue, claim) as heart:
+        job = _Job(queue, store, claim, heart, end)
+        try:
+            outcome = job.settle(job.work(child, record))
+        except IntrasplatError as error:  # of the store; the child is idle
+            outcome = job.settle(job.without_store(error))
+        except Exception as error:
+            child.kill()
+            outcome = job.settle(Failed(error=describe(error), fault=type(error).__name__))
+    log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
+
+
+def _log_of(claim: Claim) -> logging.LoggerAdapter[logging.Logger]:
+    """Lines that name the job by its id."""
+    return logging.LoggerAdapter(logger, {"job_id": claim.job_id, "attempt": claim.attempt})
+
+
+class _Job:
+    """One attempt: watched while the child works on it, then settled."""
+
+    def __init__(self, queue: Queue, store: Store, claim: Claim, heart: Heartbeat, end: threading.Event) -> None:
+        self._queue = queue
+        self._store = store
+        self._claim = claim
+        self._heart = heart
+        self._end = end
+        self._log = _log_of(claim)
+
+    # the work
+
+    def work(self, child: DeviceChild, record: JobRecord) -> Finished | Stopped | Failed | Died:
+        """Let the child reconstruct, stop it if that is wanted, and kill it if it hangs."""
+        job_id, attempt = self._claim.job_id, self._claim.attempt
+        self._heart.report(JobProgress(stage=FETCHING, fraction=0.0))
+        spool = self._with_patience(lambda: self._store.fetch_clip(job_id))
+        out = self._with_patience(lambda: self._store.work_folder(job_id, attempt, keep=RESUME))
+        if child.ended is not None:
+            return Died(child.ended.cause, excused=True)
+        child.send(Run(record=record, spool=spool, out=out))
+        watch, asked_s = Watch(), None
+        while True:
+            report = child.next_report(LOOK_PERIOD_S)
+            if isinstance(report, Finished | Stopped | Failed):
+                return report
+            if isinstance(report, Ended):
+                return Died(report.cause, excused=asked_s is not None)
+            if isinstance(report, Advanced):
+                watch.hear(report.progress)
+                self._heart.report(report.progress)
+            if asked_s is None and self._is_to_stop():
+                child.send(Stop())
+                asked_s = time.monotonic()
+            if asked_s is not None and time.monotonic() - asked_s > STOP_LIMIT_S:
+                child.kill()
+                return Died(f"did not stop within {STOP_LIMIT_S:g} s and was killed", excused=True)
+            if watch.is_hung():
+                child.kill()
+                return Died(f"hung in stage {watch.stage!r} and was killed", excused=asked_s is not None)
+
+    def _is_to_stop(self) -> bool:
+        return self._heart.order is not Order.GO_ON or self._end.is_set()
+
+    def without_store(self, error: IntrasplatError) -> Failed | Died:
+        """What becomes of an attempt that the store fails: another is made if this one was to stop anyway."""
+        if self._is_to_stop():
+            return Died("waited for the store", excused=True)
+        return Failed(error=describe(error), fault=type(error).__name__)
+
+    # its end
+
+    def settle(self, result: Finished | Stopped | Failed | Died) -> str:
+        """Tell the queue how the attempt ended, and tidy up; what came of it, for the log.
+
+        A queue that is away is asked again until `end` is set; after that nothing may be touched: the claim may have
+        ended as was said, or still stand.
+        """
+        if self._heart.order in (Order.CANCEL, Order.LOST):
+            return self._withdraw()
+        accepted, outcome = self._tell(result)
+        if accepted is None:
+            return WAIT_FOR_QUEUE
+        if not accepted:
+            return self._withdraw()
+        self._tidy(result)
+        return outcome
+
+    def _tell(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
+        """Whether the queue accepts how the attempt ended, None if it cannot be reached, and the end in words."""
+        if isinstance(result, Finished):
+            return self._publish(), "done"
+        if isinstance(result, Failed):
+            return self._insist(lambda: self._queue.fail(self._claim, result.error)), f"failed ({result.fault})"
+        died = isinstance(result, Died) and not result.excused
+        if isinstance(result, Died):
+            self._log.warning("the device process %s", result.cause)
+        if isinstance(result, Stopped) and result.checkpointed:
+            self._store.hand_over(self._claim.job_id, self._claim.attempt, RESUME)
+        accepted = self._insist(lambda: self._queue.release(self._claim, died=died))
+        return accepted, "handed back, its worker's death held against it" if died else "handed back"
+
+    def _publish(self) -> bool | None:
+        """Scene first, then the record: whoever sees the record done finds the scene."""
+        self._heart.report(JobProgress(stage=PUBLISHING, fraction=1.0, seconds_left=0.0))
+        order = self._insist(self._heart.beat)
+        if order is None or order in (Order.CANCEL, Order.LOST):
+            return None if order is None else False
+        self._with_patience(lambda: self._store.publish_scene(self._claim.job_id, self._claim.attempt))
+        return self._insist(lambda: self._queue.finish(self._claim))
+
+    def _withdraw(self) -> str:
+        """The job is cancelled, or not ours any more: remove all of it, or what this attempt has made."""
+        order = self._heart.order
+        if order not in (Order.CANCEL, Order.LOST):
+            order = self._insist(self._heart.beat) or order
+        if order is Order.CANCEL:
+            self._remove(lambda: self._store.purge(self._claim.job_id))
+            confirmed = self._insist(lambda: self._queue.confirm_cancel(self._claim))
+            return WAIT_FOR_QUEUE if confirmed is None else "cancelled"
+        if order is Order.LOST:
+            self._remove(lambda: self._store.remove_attempt(self._claim.job_id, self._claim.attempt))
+            return "lost to another attempt"
+        return WAIT_FOR_QUEUE
+
+    def _tidy(self, result: Finished | Stopped | Failed | Died) -> None:
+        """Remove what nobody needs after an end that was accepted."""
+        job_id, attempt = self._claim.job_id, self._claim.attempt
+        if isinstance(result, Finished):
+            self._remove(lambda: self._store.remove_other_attempts(job_id, attempt))
+        elif isinstance(result, Failed) or (isinstance(result, Died) and self._is_given_up()):
+            self._remove(lambda: self._store.remove_attempt(job_id, attempt))
+
+    def _is_given_up(self) -> bool:
+        """Whether that was one death too many."""
+        record = self._insist(lambda: self._queue.get(self._claim.job_id))
+        return record is not None and record.state is JobState.FAILED
+
+    def _insist(self, ask: Callable[[], _Result]) -> _Result | None:
+        """Ask the queue as often as it takes to reach it; None if `end` comes first."""
+        while True:
+            try:
+                return ask()
+            except UnavailableError as error:
+                self._log.warning("waits for the queue: %s", error.problem)
+                if self._end.wait(UNREACHABLE_PAUSE_S):
+                    return None
+
+    def _with_patience(self, work: Callable[[], _Result]) -> _Result:
+        """Let the store do something, again if it fails for a while; the beats go on."""
+        deadline_s = time.monotonic() + STORE_PATIENCE_S
+        while True:
+            try:
+                return work()
+            except UnavailableError as error:
+                if time.monotonic() > deadline_s or self._is_to_stop():
+                    raise
+                self._log.warning("waits for the store: %s", error.problem)
+                self._end.wait(UNREACHABLE_PAUSE_S)
+
+    def _remove(self, work: Callable[[], object]) -> None:
+        """What cannot be removed now does not change how the job ended; the service sweeps."""
+        try:
+            work()
+        except UnavailableError as error:
+            self._log.warning("files were not removed: %s", error.problem)

@@ -1,0 +1,191 @@
+"""The device child: owns torch, kernels and models, trains one job at a time, and answers renders beside it.
+
+It belongs to a supervisor (worker/daemon/supervisor.py), obeys worker/daemon/orders.py, and dies with it, however that
+dies.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import time
+from pathlib import Path
+
+from contract.intake.limits import ClipLimits
+from contract.queue.embedded import short_socket_path
+from contract.runtime.exits import exit_code_of
+from contract.runtime.processes import die_with_parent
+from contract.runtime.settings import Settings
+from contract.store.store import Store, open_store
+from contract.wire.errors import Cancelled, InputError, UnavailableError
+from contract.wire.job import JobRecord
+from worker.daemon.channel import Channel, Orders, Task
+from worker.daemon.faults import describe
+from worker.daemon.orders import (
+    Advanced,
+    Failed,
+    Finished,
+    Holding,
+    Ready,
+    Stopped,
+    Unable,
+    job_progress,
+)
+from worker.daemon.pace import Pace
+from worker.daemon.serve import RequestServer
+from worker.daemon.snapshot import Snapshots
+from worker.daemon.views import Views
+from worker.machine.hooks import Hooks, Progress
+from worker.pipeline import reconstruct
+from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lost
+from worker.raster.cpu import compile_kernels
+from worker.scene.checkpoint import RESUME_FILE
+from worker.scene.compact import compile_coder
+from worker.train.request import ReconstructionRequest
+
+REPORT_PERIOD_S = 0.1
+"""Least time between two reports from one stage."""
+
+AFTERGLOW_S = 10.0
+"""The last snapshot of a finished job is shown for so long, until the service knows of the scene."""
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+def run_device(settings: Settings) -> None:
+    """Obey the orders on stdin; never returns, for the end of the orders ends the process.
+
+    What keeps it from starting (a device or data directory that cannot be used, an endpoint that is none) is reported
+    to the supervisor, which tells the user.
+
+    Raises:
+        SystemExit: with that error's code.
+    """
+    die_with_parent()
+    channel = Channel.instead_of_stdout()
+    orders = Orders.from_stdin()
+    try:
+        _serve(settings, channel, orders)
+    except (UnavailableError, InputError) as error:
+        channel.send(Unable(problem=error.problem, remedy=error.remedy))
+        raise SystemExit(exit_code_of(error)) from error
+
+
+def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
+    device = choose_device(settings.device, cpu_by=CPU_BY_VARIABLE)
+    store, snapshots, pace = open_store(settings), Snapshots(), Pace()
+    # What is unpacked of clips stays in the data directory, and does not outlive the next start.
+    tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
+    started_s = time.monotonic()
+    if device == CPU:  # those of a GPU are compiled for the model of a job, and kept
+        compile_kernels()
+    compile_coder()
+    logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
+    views = Views(store, snapshots, settings.hot_bytes, pace, device)
+
+    def tell_what_is_held() -> None:
+        views.forget_purged()
+        channel.send_if_new(Holding(scenes=views.held))
+
+    endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
+    with RequestServer(
+        endpoint, views.answer, between=tell_what_is_held, rest_s=pace.rest_s, render_secret=settings.render_secret
+    ):
+        channel.send(Ready(endpoint=endpoint, device=str(device)))
+        logger.info("the device process is ready on %s", device)
+        shown = ""
+        while True:
+            task = orders.next(AFTERGLOW_S)
+            if task is None:
+                snapshots.drop(shown)
+            else:
+                shown = task.run.record.job_id
+                with pace.training():
+                    end = work_on(task, settings.device, ClipLimits.of(settings), snapshots, channel)
+                channel.send(end)
+
+
+def work_on(
+    task: Task, device: str, limits: ClipLimits, snapshots: Snapshots, channel: Channel
+) -> Finished | Stopped | Failed:
+    """Run one job; every error is its end and not this process's, unless it takes the GPU along."""
+    run = task.run
+    reporter = _Reporter(channel)
+    hooks = Hooks(
+        on_progress=reporter.report,
+        should_stop=task.stop.is_set,
+        wants_snapshot=snapshots.wanted,
+        on_snapshot=snapshots.offer,
+    )
+    snapshots.begin(run.record.job_id)
+    try:
+        run_or_start_anew(request_of(run.record, run.spool, device, limits), run.out, hooks)
+    except Cancelled:
+        snapshots.drop(run.record.job_id)
+        return Stopped(checkpointed=(run.out / RESUME_FILE).exists())
+    except Exception as error:
+        snapshots.drop(run.record.job_id)
+        if gpu_is_lost():
+            logger.error("the GPU answers this process no more (%s); another takes its place", type(error).__name__)
+            raise SystemExit(1) from error
+        return Failed(error=describe(error), fault=type(error).__name__)
+    return Finished()
+
+
+class _Reporter:
+    """Passes progress on, not too often; for any thread."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+        self._stage = ""
+        self._next_s = 0.0
+
+    def report(self, progress: Progress) -> None:
+        """Send it, if it is time for another."""
+        now_s = time.monotonic()
+        if progress.stage == self._stage and now_s < self._next_s:
+            return
+        self._stage, self._next_s = progress.stage, now_s + REPORT_PERIOD_S
+        self._channel.send(Advanced(progress=job_progress(progress)))
+
+
+def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits | None = None) -> ReconstructionRequest:
+    """The reconstruction that a job asks for, with its files where the store keeps them."""
+    files, options = record.files, record.options
+    return ReconstructionRequest(
+        clip=spool / files.clip,
+        right=spool / files.right if files.right else None,
+        layout=options.layout,
+        calibration=spool / files.calibration if files.calibration else None,
+        masks=spool / files.masks if files.masks else None,
+        mask_polarity=options.mask_polarity,
+        pose_convention=options.pose_convention,
+        holdout=options.holdout,
+        preset=options.preset,
+        budget_s=options.budget_s,
+        iterations=options.iterations,
+        device=device,
+        seed=options.seed,
+        accepted_at_s=record.created_at_s,
+        limits=limits,
+    )
+
+
+def run_or_start_anew(request: ReconstructionRequest, out: Path, hooks: Hooks) -> None:
+    """Reconstruct; from the beginning if the state in `out` is damaged, or of an earlier version of this program."""
+    resumes = (out / RESUME_FILE).exists()
+    try:
+        reconstruct(request, out, hooks)
+    except InputError as error:
+        if error.field != "--out" or not resumes:
+            raise
+        logger.warning("the stored state is of no use to this version; training starts anew")
+        (out / RESUME_FILE).unlink()
+        reconstruct(request, out, hooks)
+
+
+def _socket_endpoint(store: Store, name: str) -> str:
+    """A unix socket in the data directory, cleared of what an earlier process of this name left."""
+    path = short_socket_path(store.run_dir, f"{name}.sock")
+    path.unlink(missing_ok=True)
+    return f"ipc://{path}"

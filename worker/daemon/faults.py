@@ -1,0 +1,30 @@
+"""What the caller of a job is told of an error.
+
+The text of an error that nobody foresaw may hold the names of a caller's files: neither the caller nor the log gets it.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from contract.wire.errors import InputError, IntrasplatError, UnavailableError
+from contract.wire.job import JobError
+
+FAULT_REMEDY = "This is a fault of intrasplat: please report it with the worker's log."
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+def describe(error: Exception) -> JobError:
+    """Problem and remedy; of an error that nobody foresaw only its kind, for its text may hold anything."""
+    if isinstance(error, InputError):
+        return JobError(problem=error.problem, field=error.field, remedy=error.remedy)
+    if isinstance(error, UnavailableError):
+        return JobError(problem=error.problem, remedy=error.remedy)
+    if isinstance(error, IntrasplatError):
+        return JobError(problem=str(error), remedy="The worker's log has the details.")
+    # Of this machine, or of its GPU: torch's own error, known by its name, for not everyone here has loaded torch.
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return JobError(problem="The worker ran out of memory.", remedy="Send a shorter or smaller clip.")
+    logger.error("a fault while a job ran", exc_info=error)
+    return JobError(problem=f"A fault in the worker ({type(error).__name__}).", remedy=FAULT_REMEDY)

@@ -1,0 +1,206 @@
+"""The worker's ear for renders and exports: a ZeroMQ ROUTER in a thread beside training (contract/wire/rendering.py).
+
+One request is answered at a time, in the order they came; rendering shares the cores with training, and waits when it
+has had its share (worker/daemon/pace.py). A unix socket is
+guarded by the folder it lies in. TCP is encrypted, and only who knows the installation's secret is heard.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from urllib.parse import urlsplit
+
+import zmq
+from pydantic import ValidationError
+from zmq.auth.thread import ThreadAuthenticator
+
+from contract.access.curve import service_keys, worker_keys
+from contract.wire.errors import InputError, IntrasplatError, SceneError, UnavailableError
+from contract.wire.rendering import ExportRequest, RenderRequest, ReplyError, WorkerReply, WorkerRequest
+
+POLL_MS = 50
+"""How soon the thread notices that it should end."""
+
+LONGEST_REQUEST_BYTES = 64 * 1024
+"""Of one part of a message; a request is some hundred bytes. The connection of who sends more is closed."""
+
+BETWEEN_PERIOD_S = 1.0
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+class NotYetError(IntrasplatError):
+    """The job that is asked for has nothing to show so far."""
+
+
+@dataclass(frozen=True)
+class View:
+    """An answered request: encoded bytes, the time they show (clamped), what the caller should know.
+
+    iteration is that of the snapshot that is shown, None where the scene is finished.
+    """
+
+    body: bytes
+    media_type: str
+    t: float
+    warnings: tuple[str, ...] = ()
+    iteration: int | None = None
+
+
+class RequestServer:
+    """Answers requests at `endpoint` by `answer`; a context manager that binds and unbinds.
+
+    `answer` may raise InputError, SceneError or NotYetError, which the caller is told; anything else is logged and told
+    as a fault. `between` is called about once a second, in the same thread. `rest_s` says how long to answer nobody
+    for. render_secret is needed for tcp:// alone.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        answer: Callable[[RenderRequest | ExportRequest], View],
+        *,
+        between: Callable[[], None] | None = None,
+        rest_s: Callable[[], float] = lambda: 0.0,
+        render_secret: str | None = None,
+    ) -> None:
+        if endpoint.startswith("tcp:") and render_secret is None:
+            raise InputError(
+                "INTRASPLAT_RENDER_SECRET",
+                f"{endpoint} needs a secret and has none.",
+                "Set it, to 32 or more characters.",
+            )
+        self.endpoint = endpoint
+        self._answer = answer
+        self._between = between
+        self._between_at_s = 0.0
+        self._rest_s = rest_s
+        self._render_secret = render_secret
+        self._end = threading.Event()
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._gate: ThreadAuthenticator | None = None
+        self._thread = threading.Thread(target=self._serve, name="renders", daemon=True)
+        self._socket: zmq.Socket[bytes] | None = None
+
+    def __enter__(self) -> RequestServer:
+        self._socket = self._context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_REQUEST_BYTES)
+        if self.endpoint.startswith("tcp:"):
+            assert self._render_secret is not None
+            self._gate = _encrypt(self._socket, self._render_secret)
+        try:
+            self._socket.bind(_bound(self.endpoint))
+        except zmq.ZMQError as error:
+            self._socket.close()
+            self._let_go()
+            problem = f"Renders cannot be answered at {self.endpoint} ({error.strerror})."
+            raise UnavailableError(problem, "Free the address, or set another INTRASPLAT_RENDER_ENDPOINT.") from error
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._end.set()
+        self._thread.join()
+        self._let_go()
+
+    def _let_go(self) -> None:
+        if self._gate is not None:
+            self._gate.stop()
+        self._context.term()
+
+    def _serve(self) -> None:
+        assert self._socket is not None
+        while not self._end.is_set():
+            self._do_between()
+            if (rest_s := self._rest_s()) > 0.0:
+                self._end.wait(min(rest_s, POLL_MS / 1e3))
+                continue
+            if not self._socket.poll(POLL_MS):
+                continue
+            frames = self._socket.recv_multipart()
+            if len(frames) != 3:
+                logger.warning("a message of %d parts was ignored", len(frames))
+                continue
+            caller, request_id, document = frames
+            head, body = self._reply(document)
+            self._socket.send_multipart([caller, request_id, head.model_dump_json().encode(), body])
+        self._socket.close()
+
+    def _do_between(self) -> None:
+        if self._between is None or time.monotonic() < self._between_at_s:
+            return
+        try:
+            self._between()
+        except Exception as error:  # a disk that fails for a moment must not end the thread
+            logger.error("between two requests: %s", type(error).__name__)
+        self._between_at_s = time.monotonic() + BETWEEN_PERIOD_S
+
+    def _reply(self, document: bytes) -> tuple[WorkerReply, bytes]:
+        try:
+            request = WorkerRequest.model_validate_json(document).request
+        except ValidationError as error:
+            problem = f"The request does not fit: {error.errors()[0]['msg']}."
+            return WorkerReply(error=ReplyError(kind="internal", problem=problem)), b""
+        start = time.perf_counter()
+        try:
+            view = self._answer(request)
+        except Exception as error:
+            return WorkerReply(error=_told(error)), b""
+        head = WorkerReply(
+            media_type=view.media_type,
+            t=view.t,
+            warnings=view.warnings,
+            iteration=view.iteration,
+            render_ms=(time.perf_counter() - start) * 1e3,
+        )
+        return head, view.body
+
+
+def _told(error: Exception) -> ReplyError:
+    """What the caller is told of an error; of one that nobody foresaw only its kind, for its text may hold anything."""
+    if isinstance(error, InputError):
+        return ReplyError(kind="input", problem=error.problem, field=error.field, remedy=error.remedy)
+    if isinstance(error, SceneError):
+        remedy = "GET /scenes lists what there is."
+        return ReplyError(kind="scene", problem=str(error), field="scene", remedy=remedy)
+    if isinstance(error, NotYetError):
+        return ReplyError(kind="not-yet", problem=str(error), field="scene", remedy="Ask again in a second.")
+    where = "".join(traceback.format_tb(error.__traceback__))
+    logger.error("a request could not be answered: %s\n%s", type(error).__name__, where)
+    return ReplyError(kind="internal", problem=f"The worker could not render ({type(error).__name__}).")
+
+
+def _encrypt(socket: zmq.Socket[bytes], render_secret: str) -> ThreadAuthenticator:
+    """Make the socket a CURVE server that lets in the services of this secret alone; the gate must be stopped."""
+    own = worker_keys(render_secret)
+    socket.curve_server = True
+    socket.curve_publickey, socket.curve_secretkey = own.public, own.secret
+    gate = ThreadAuthenticator(socket.context, log=logger)
+    gate.start()
+    gate.configure_curve_callback(credentials_provider=_OneKey(service_keys(render_secret).public))
+    return gate
+
+
+@dataclass(frozen=True)
+class _OneKey:
+    """Whom the gate lets in; the method's name is ZeroMQ's."""
+
+    public: bytes
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        del domain
+        return key == self.public
+
+
+def _bound(endpoint: str) -> str:
+    """Where to listen for callers of `endpoint`: a name is that of this machine only as others see it."""
+    parts = urlsplit(endpoint)
+    if parts.scheme != "tcp" or parts.hostname in ("127.0.0.1", "::1"):
+        return endpoint
+    return f"tcp://127.0.0.1:{parts.port}" if parts.hostname == "localhost" else f"tcp://*:{parts.port}"

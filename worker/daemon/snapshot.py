@@ -1,0 +1,84 @@
+"""The model of the job that trains, for whoever wants to see it now: handed from the training loop to the renders.
+
+The loop copies its model at its start, and from then on only when somebody has asked since the last copy and that is
+older than PERIOD_S: a job that nobody watches pays for one copy. Training never waits here; a render waits a moment
+for a copy that is due.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+
+from worker.scene.checkpoint import Scene
+
+PERIOD_S = 1.0
+"""Least time between two copies of one job's model."""
+
+PATIENCE_S = 0.3
+"""How long a render waits for a copy that is due: some steps of training. Longer, it shows the one that is there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The scene that so many iterations have made, and when it was copied (monotonic)."""
+
+    scene: Scene
+    iteration: int
+    taken_s: float
+
+
+class Snapshots:
+    """Of at most one job at a time, the newest copy; for one training thread and any number of others."""
+
+    def __init__(self, period_s: float = PERIOD_S, patience_s: float = PATIENCE_S) -> None:
+        self._period_s = period_s
+        self._patience_s = patience_s
+        self._changed = threading.Condition()
+        self._job_id: str | None = None
+        self._newest: Snapshot | None = None
+        self._asked = False
+        self._answers = True
+
+    def begin(self, job_id: str) -> None:
+        """A job starts; what is left of the one before is dropped."""
+        with self._changed:
+            self._job_id, self._newest, self._asked, self._answers = job_id, None, False, True
+            self._changed.notify_all()
+
+    def drop(self, job_id: str) -> None:
+        """Nothing of this job is shown any more."""
+        with self._changed:
+            if self._job_id == job_id:
+                self._job_id = self._newest = None
+                self._changed.notify_all()
+
+    def wanted(self) -> bool:
+        """Whether the training loop should offer a copy now (Hooks.wants_snapshot)."""
+        with self._changed:
+            if self._job_id is None:
+                return False
+            return self._newest is None or (self._asked and self._is_due(self._newest))
+
+    def offer(self, scene: Scene, iteration: int) -> None:
+        """Show this copy from now on (Hooks.on_snapshot)."""
+        with self._changed:
+            if self._job_id is not None:
+                self._newest = Snapshot(scene, iteration, time.monotonic())
+                self._asked, self._answers = False, True
+                self._changed.notify_all()
+
+    def newest(self, job_id: str) -> Snapshot | None:
+        """The newest copy of the job's model, and ask for a newer one; None if there is none."""
+        with self._changed:
+            if self._job_id != job_id or self._newest is None:
+                return None
+            self._asked, shown = True, self._newest
+            if self._answers and self._is_due(shown):
+                # Once in vain is enough: the loop is doing something else, such as scoring, until it offers again.
+                self._answers = self._changed.wait_for(lambda: self._newest is not shown, self._patience_s)
+            return self._newest if self._job_id == job_id else None
+
+    def _is_due(self, snapshot: Snapshot) -> bool:
+        return time.monotonic() - snapshot.taken_s >= self._period_s

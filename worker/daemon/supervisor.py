@@ -1,0 +1,128 @@
+"""The worker's process: it holds the claims, a child of its own holds the device, and either may die at any time.
+
+Nothing here imports torch or compiles anything, so this process starts at once, needs little memory and never hangs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import secrets
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+from contract.queue.promise import ANNOUNCE_PERIOD_S, Queue
+from contract.queue.redis_queue import RedisQueue
+from contract.runtime.locks import FolderLock
+from contract.runtime.settings import Settings
+from contract.store.store import Store, open_store
+from contract.wire.errors import UnavailableError
+from contract.wire.rendering import WorkerAddress
+from worker.daemon.child import Keeper
+from worker.daemon.consume import Consumer
+
+LOOK_PERIOD_S = 0.1
+"""How soon a change of what is announced is seen."""
+
+TIDY_PERIOD_S = 600.0
+"""How long a copy may outlive a scene that was purged on another machine."""
+
+DEVICE_COMMAND = (sys.executable, "-m", "worker", "device")
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+def run_supervisor(settings: Settings, end: threading.Event, child_command: Sequence[str] | None = None) -> None:
+    """Work until `end` is set; waits for a queue that is away.
+
+    Args:
+        child_command: what to start as the child instead of `python -m worker device`; it speaks
+            worker/daemon/orders.py.
+
+    Raises:
+        UnavailableError: a worker of this name works on this data directory already, or the child says that it cannot
+            work here.
+    """
+    assert settings.redis_url is not None
+    store = open_store(settings)
+    name = settings.worker_name
+    lock = FolderLock(store.run_dir / f"{name}.lock")
+    if not lock.take():
+        problem = f"A worker named {name} already works on {store.data_dir}."
+        raise UnavailableError(problem, "End it, or set another INTRASPLAT_WORKER_NAME.")
+    queue = RedisQueue(settings.redis_url)
+    keeper = Keeper(child_command or DEVICE_COMMAND, {**os.environ, **settings.to_environment()})
+    # New at each start: what an earlier process of this name still holds is given up by its silence alone.
+    consumer = Consumer(queue, store, keeper, f"{name}.{secrets.token_hex(4)}", end)
+    try:
+        with announced(queue, name, lambda: address_of(name, keeper, consumer)), kept_tidy(store):
+            consumer.run()
+    finally:
+        keeper.stop()
+        queue.close()
+        lock.release()
+
+
+def address_of(name: str, keeper: Keeper, consumer: Consumer) -> WorkerAddress | None:
+    """What is announced of a worker now; None while its child is not ready."""
+    child = keeper.live
+    if child is None or child.ready is None:
+        return None
+    ready = child.ready
+    return WorkerAddress(
+        name=name, endpoint=ready.endpoint, device=ready.device, job_id=consumer.job_id, scenes=child.scenes
+    )
+
+
+@contextlib.contextmanager
+def kept_tidy(store: Store) -> Iterator[None]:
+    """Remove what nobody needs on this machine, every TIDY_PERIOD_S for as long as the context lasts."""
+    end = threading.Event()
+
+    def tidy() -> None:
+        while not end.is_set():
+            try:
+                store.tidy()
+            except UnavailableError as error:
+                logger.warning("the store was not tidied: %s", error.problem)
+            end.wait(TIDY_PERIOD_S)
+
+    threading.Thread(target=tidy, name="tidy", daemon=True).start()  # not waited for: a bucket may answer slowly
+    try:
+        yield
+    finally:
+        end.set()
+
+
+@contextlib.contextmanager
+def announced(queue: Queue, name: str, address: Callable[[], WorkerAddress | None]) -> Iterator[None]:
+    """Say where the worker is, every ANNOUNCE_PERIOD_S and whenever that changes, for as long as the context lasts."""
+    end = threading.Event()
+
+    def announce() -> None:
+        told: WorkerAddress | None = None
+        next_s = 0.0
+        while not end.wait(LOOK_PERIOD_S):
+            now = address()
+            if now == told and (now is None or time.monotonic() < next_s):
+                continue
+            with contextlib.suppress(UnavailableError):
+                if now is None:
+                    queue.withdraw(name)
+                else:
+                    queue.announce(now)
+                told = now
+            next_s = time.monotonic() + ANNOUNCE_PERIOD_S
+
+    thread = threading.Thread(target=announce, name="announce", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join()
+        with contextlib.suppress(UnavailableError):
+            queue.withdraw(name)

@@ -1,0 +1,241 @@
+"""Calibration files: our JSON, OpenCV's FileStorage (YAML, XML, JSON), the ini of StereoMIS and SCARED.
+
+The format is told by the content, not by the file's name: a service stores uploads under names of its own.
+"""
+
+from __future__ import annotations
+
+import configparser
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from contract.intake.limits import MOST_CALIBRATION_BYTES
+from contract.intake.sniff import check_calibration_text
+from contract.wire.errors import InputError
+from worker.input.calibration.check import FIELD, check_calibration
+from worker.input.calibration.types import RectifiedCalibration, StereoCalibration, parse_calibration
+
+MAX_ASPECT_CHANGE = 0.005  # 1348x1080 read as 640x512 is still one scale; a cropped image is not
+
+FORMATS_REMEDY = (
+    "Give our JSON (model rectified or raw), an OpenCV YAML or XML with M1 D1 M2 D2 R T, "
+    "or an ini with [StereoLeft] and [StereoRight]."
+)
+
+OPENCV_KEYS = {
+    "left_k": "m1 k1 kl kleft cameramatrix1 cameramatrixleft cameramatrixl leftcameramatrix",
+    "right_k": "m2 k2 kr kright cameramatrix2 cameramatrixright cameramatrixr rightcameramatrix",
+    "left_d": "d1 dl dleft distcoeffs1 distcoeff1 distcoeffsleft distcoeffleft distcoeffsl leftdistcoeffs "
+    "distortion1 distortionleft distortioncoefficients1 distortioncoefficientsleft",
+    "right_d": "d2 dr dright distcoeffs2 distcoeff2 distcoeffsright distcoeffright distcoeffsr rightdistcoeffs "
+    "distortion2 distortionright distortioncoefficients2 distortioncoefficientsright",
+    "rotation": "r rotation rotationmatrix rmat stereorotation",
+    "translation": "t translation translationvector tvec stereotranslation",
+    "size": "imagesize size",
+    "width": "imagewidth width camerawidth",
+    "height": "imageheight height cameraheight",
+}
+"""Spellings met in files; compared without case, underscores, dots and dashes."""
+
+
+def load_calibration(path: Path | str, *, eye_width: int, eye_height: int) -> StereoCalibration:
+    """Read a calibration file and fit it to eyes of eye_width x eye_height pixels.
+
+    A file made for another size of the same view is scaled, and its `assumptions` say so; so does a file without size.
+
+    Raises:
+        InputError: unreadable, of no known format, not finite, not rigid, of another aspect, with an implausible
+            baseline, or with a principal point that does not fit the image.
+    """
+    text = _read_text(Path(path))
+    value, size_known = _parse(text, eye_width, eye_height)
+    try:
+        calibration = parse_calibration(value)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise InputError(
+            FIELD, f"{where}: {first['msg']} (given {str(first['input'])[:80]}).", FORMATS_REMEDY
+        ) from None
+    check_calibration(calibration)
+    if not size_known:
+        _check_centred(calibration)
+        return calibration.model_copy(
+            update={"assumptions": (f"calibration names no image size: taken as {eye_width}x{eye_height}",)}
+        )
+    return _fit(calibration, eye_width, eye_height)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        if path.stat().st_size > MOST_CALIBRATION_BYTES:
+            raise InputError(FIELD, f"{path.name} has {path.stat().st_size} bytes.", FORMATS_REMEDY)
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(FIELD, f"{path.name} is not a text file.", FORMATS_REMEDY) from None
+    except OSError as error:
+        problem = f"{path.name} cannot be read: {error.strerror or error}."
+        raise InputError(FIELD, problem, "Name a file that exists and may be read.") from None
+    check_calibration_text(text, FIELD, path.name)
+    return text
+
+
+def _parse(text: str, eye_width: int, eye_height: int) -> tuple[dict[str, Any], bool]:
+    """The file as a JSON-like value, and whether it names an image size."""
+    start = text.lstrip()
+    if start.startswith("{") and "opencv-matrix" not in text:
+        return _parse_json(text), True
+    if start.lower().startswith("[stereo") or "\n[stereo" in text.lower():
+        return _parse_ini(text), True
+    return _parse_opencv(text, eye_width, eye_height)
+
+
+def _parse_json(text: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(FIELD, f"it is not valid JSON: {error}.", FORMATS_REMEDY) from None
+    assert isinstance(value, dict)  # it starts with a brace
+    return value
+
+
+def _parse_ini(text: str) -> dict[str, Any]:
+    """StereoMIS and SCARED: [StereoLeft], [StereoRight] with res, fc, cc, kc; the right one's R and T (mm) count."""
+    parser = configparser.ConfigParser(interpolation=None)
+    try:
+        parser.read_string(text)
+        left, right = parser["StereoLeft"], parser["StereoRight"]
+        value = {
+            "model": "raw",
+            "width": round(float(left["res_x"])),
+            "height": round(float(left["res_y"])),
+            "left": _ini_eye(left),
+            "right": _ini_eye(right),
+            "right_from_left_rotation": [[float(right[f"R_{3 * i + j}"]) for j in range(3)] for i in range(3)],
+            "right_from_left_translation_mm": [float(right[f"T_{i}"]) for i in range(3)],
+        }
+    except (configparser.Error, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(FIELD, f"the ini lacks a number or a section: {error}.", FORMATS_REMEDY) from None
+    if any(left[key] != right[key] for key in ("res_x", "res_y") if key in right):
+        raise InputError(FIELD, "left and right eye differ in res_x or res_y.", "Give eyes of one size.")
+    return value
+
+
+def _ini_eye(section: configparser.SectionProxy) -> dict[str, Any]:
+    names = {"fx_px": "fc_x", "fy_px": "fc_y", "cx_px": "cc_x", "cy_px": "cc_y"}
+    eye: dict[str, Any] = {ours: float(section[theirs]) for ours, theirs in names.items()}
+    coefficients = [float(section.get(f"kc_{i}", "0")) for i in range(8)]
+    return eye | {"distortion": coefficients if any(coefficients[5:]) else coefficients[:5]}
+
+
+def _parse_opencv(text: str, eye_width: int, eye_height: int) -> tuple[dict[str, Any], bool]:
+    """A FileStorage file; both eyes' matrices, R and T are required, distortion and image size are not."""
+    values = _opencv_values(text)
+    missing = [name for name in ("left_k", "right_k", "rotation", "translation") if name not in values]
+    if missing:
+        spellings = ", ".join(OPENCV_KEYS[name].split()[0].upper() for name in missing)
+        raise InputError(FIELD, f"found no {spellings} in the OpenCV file.", FORMATS_REMEDY)
+    rotation = values["rotation"]
+    if rotation.size == 3:  # a rotation vector
+        rotation = cv2.Rodrigues(rotation.reshape(3, 1))[0]
+    shapes = {"left_k": (values["left_k"], 9), "right_k": (values["right_k"], 9), "R": (rotation, 9)}
+    for name, (matrix, count) in (shapes | {"T": (values["translation"], 3)}).items():
+        if matrix.size != count:
+            raise InputError(FIELD, f"{name} has {matrix.size} numbers, not {count}.", FORMATS_REMEDY)
+    size = _opencv_size(values)
+    width, height = size if size else (eye_width, eye_height)
+    return {
+        "model": "raw",
+        "width": width,
+        "height": height,
+        "left": _opencv_eye(values["left_k"], values.get("left_d")),
+        "right": _opencv_eye(values["right_k"], values.get("right_d")),
+        "right_from_left_rotation": rotation.reshape(3, 3).tolist(),
+        "right_from_left_translation_mm": values["translation"].ravel().tolist(),
+    }, size is not None
+
+
+def _opencv_values(text: str) -> dict[str, NDArray[np.float64]]:
+    """Every known key of a FileStorage text as an array of float64."""
+    head = text.lstrip()[:6]
+    if not head.startswith(("%YAML", "<?xml", "{")):
+        text = "%YAML:1.0\n---\n" + text.removeprefix("---")
+    values: dict[str, NDArray[np.float64]] = {}
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        for key in list(storage.root().keys()):
+            spelling = key.lower().translate(str.maketrans("", "", "_.-"))
+            name = next((name for name, spellings in OPENCV_KEYS.items() if spelling in spellings.split()), None)
+            if name is not None:
+                values[name] = _node_values(storage.getNode(key))
+        storage.release()
+    except (cv2.error, SystemError, UnicodeError):
+        problem = "it is neither JSON, nor a stereo ini, nor an OpenCV YAML or XML file."
+        raise InputError(FIELD, problem, FORMATS_REMEDY) from None
+    return values
+
+
+def _node_values(node: Any) -> NDArray[np.float64]:
+    if node.isMap():
+        matrix = node.mat()
+        return np.zeros(0) if matrix is None else np.asarray(matrix, dtype=np.float64)
+    if node.isSeq():
+        return np.array([node.at(i).real() for i in range(node.size())], dtype=np.float64)
+    return np.array([node.real()], dtype=np.float64)
+
+
+def _opencv_size(values: dict[str, NDArray[np.float64]]) -> tuple[int, int] | None:
+    """(width, height) if the file names them."""
+    if "size" in values and values["size"].size == 2:
+        pair: Sequence[float] = values["size"].ravel().tolist()
+    elif "width" in values and "height" in values:
+        pair = [float(values["width"].ravel()[0]), float(values["height"].ravel()[0])]
+    else:
+        return None
+    if not all(np.isfinite(pair)) or min(pair) <= 0:
+        raise InputError(FIELD, f"the image size {tuple(pair)} is not two positive numbers.", FORMATS_REMEDY)
+    return round(pair[0]), round(pair[1])
+
+
+def _opencv_eye(matrix: NDArray[np.float64], distortion: NDArray[np.float64] | None) -> dict[str, Any]:
+    k = matrix.reshape(3, 3)
+    eye: dict[str, Any] = {"fx_px": k[0, 0], "fy_px": k[1, 1], "cx_px": k[0, 2], "cy_px": k[1, 2]}
+    return eye | {"distortion": [] if distortion is None else distortion.ravel().tolist()}
+
+
+def _check_centred(calibration: StereoCalibration) -> None:
+    """A file without image size fits only if both principal points lie in the middle half of the clip's eye."""
+    if isinstance(calibration, RectifiedCalibration):
+        return
+    for name, eye in (("left", calibration.left), ("right", calibration.right)):
+        if not (0.25 <= eye.cx_px / calibration.width <= 0.75 and 0.25 <= eye.cy_px / calibration.height <= 0.75):
+            raise InputError(
+                FIELD,
+                f"it names no image size, and the {name} principal point ({eye.cx_px:.0f}, {eye.cy_px:.0f}) is not in "
+                f"the middle half of {calibration.width}x{calibration.height} pixels.",
+                "Give the calibration of these frames, or add image_width and image_height to the file.",
+            )
+
+
+def _fit(calibration: StereoCalibration, eye_width: int, eye_height: int) -> StereoCalibration:
+    """Scale to the clip's size; refuse another aspect, which would mean a crop nobody described."""
+    if (calibration.width, calibration.height) == (eye_width, eye_height):
+        return calibration
+    sx, sy = eye_width / calibration.width, eye_height / calibration.height
+    if abs(sx / sy - 1) > MAX_ASPECT_CHANGE:
+        raise InputError(
+            FIELD,
+            f"it is for {calibration.width}x{calibration.height} pixels an eye, the clip has {eye_width}x{eye_height}: "
+            "not one uniform scale.",
+            "Give the calibration of these frames, or the frames uncropped.",
+        )
+    note = f"calibration scaled by {sx:.4g} from {calibration.width}x{calibration.height} to {eye_width}x{eye_height}"
+    resized = calibration.resized(eye_width, eye_height)
+    return resized.model_copy(update={"assumptions": (*calibration.assumptions, note)})

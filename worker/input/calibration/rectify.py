@@ -1,0 +1,187 @@
+"""Lazy rectification: a stereo clip whose matching points lie on the same rows.
+
+Symbols: T frames, H W pixels of one eye.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.wire.errors import InputError
+from worker.input.calibration.check import FIELD, check_calibration
+from worker.input.calibration.types import RawCalibration, RawEye, RectifiedCalibration, StereoCalibration
+from worker.input.camera import Intrinsics
+from worker.input.clip.types import PairSource, RgbFrame, StereoClip
+
+OPENCV_PIXEL_CENTRE = 0.5  # OpenCV puts pixel centres at whole numbers, this project at +0.5 (docs/conventions.md)
+WARN_ZOOM, MAX_ZOOM = 1.2, 2.0  # of the focal length; a sound endoscope calibration stays below 1.1
+
+GRID_POINTS = 17  # a side, on which it is asked how far rectification moves rows
+
+Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]  # OpenCV's fixed-point maps: source pixel, index of its fraction
+
+
+@dataclass(frozen=True)
+class RectifiedClip:
+    """A stereo clip whose rows match: disparity_px = fx * baseline_mm / depth_mm + disparity_offset_px.
+
+    pairs yields rectified (left, right) RGB uint8 frames, remapped as they are asked for. tissue is [T, H, W] bool in
+    the pixels of the rectified left eye (a read-only view when no masks were given), False where the rectified image
+    reaches beyond the recorded one. intrinsics are the left eye's.
+
+    equal_rows_px is y_right - y_left in these frames of points that lay on one row in the recorded ones: about what is
+    measured here when frames that had been rectified were rectified again.
+    """
+
+    frame_count: int
+    intrinsics: Intrinsics
+    baseline_mm: float
+    disparity_offset_px: float
+    pairs: PairSource
+    tissue: NDArray[np.bool_]
+    frame_times_s: NDArray[np.float64]
+    assumptions: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    equal_rows_px: float = 0.0
+
+
+def rectify(clip: StereoClip, calibration: StereoCalibration) -> RectifiedClip:
+    """Bring matching points of a clip's eyes onto the same rows, frame by frame as they are asked for.
+
+    A "rectified" calibration passes the frames through. For "raw" ones the maps are computed once
+    (cv2.stereoRectify with alpha 0: no pixel of the result lies outside the recording, as far as one zoom allows); the
+    eyes keep their own principal points, whose distance becomes disparity_offset_px. OpenCV's pixel centres are
+    turned into this project's by adding 0.5 to cx and cy.
+
+    Raises:
+        InputError: the calibration is for another image size, or its eyes are not side by side.
+    """
+    if (calibration.width, calibration.height) != (clip.width, clip.height):
+        raise InputError(
+            FIELD,
+            f"it is for {calibration.width}x{calibration.height} pixels an eye, "
+            f"the clip has {clip.width}x{clip.height}.",
+            "Read it with load_calibration for the clip's size.",
+        )
+    check_calibration(calibration)
+    if isinstance(calibration, RectifiedCalibration):
+        return _pass_through(clip, calibration)
+    return _remapped(clip, calibration)
+
+
+@dataclass(frozen=True)
+class _RemappedPairs:
+    """Rectified pairs of a source, remapped one by one."""
+
+    source: PairSource
+    left_maps: Maps
+    right_maps: Maps
+
+    def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]:
+        for left, right in self.source():
+            yield (
+                cv2.remap(left, *self.left_maps, cv2.INTER_LINEAR),
+                cv2.remap(right, *self.right_maps, cv2.INTER_LINEAR),
+            )
+
+
+def _pass_through(clip: StereoClip, calibration: RectifiedCalibration) -> RectifiedClip:
+    c = calibration
+    return RectifiedClip(
+        frame_count=clip.frame_count,
+        intrinsics=Intrinsics(width=c.width, height=c.height, fx=c.fx_px, fy=c.fy_px, cx=c.cx_px, cy=c.cy_px),
+        baseline_mm=c.baseline_mm,
+        disparity_offset_px=c.disparity_offset_px,
+        pairs=clip.pairs,
+        tissue=_all_tissue(clip) if clip.tissue is None else clip.tissue,
+        frame_times_s=clip.frame_times_s,
+        assumptions=(*clip.assumptions, *c.assumptions, "frames: rectified already, as the calibration says"),
+        warnings=clip.warnings,
+    )
+
+
+def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
+    size = (clip.width, clip.height)
+    cameras = [(_matrix(eye), np.array(eye.distortion)) for eye in (calibration.left, calibration.right)]
+    rotation = np.array(calibration.right_from_left_rotation)
+    translation = np.array(calibration.right_from_left_translation_mm)
+    rotations_and_projections = cv2.stereoRectify(
+        *cameras[0], *cameras[1], size, rotation, translation, flags=0, alpha=0.0
+    )
+    left_r, right_r, left_p, right_p = rotations_and_projections[:4]
+    left_maps: Maps = cv2.initUndistortRectifyMap(*cameras[0], left_r, left_p, size, cv2.CV_16SC2)
+    right_maps: Maps = cv2.initUndistortRectifyMap(*cameras[1], right_r, right_p, size, cv2.CV_16SC2)
+    return RectifiedClip(
+        frame_count=clip.frame_count,
+        intrinsics=Intrinsics(
+            width=clip.width,
+            height=clip.height,
+            fx=float(left_p[0, 0]),
+            fy=float(left_p[1, 1]),
+            cx=float(left_p[0, 2]) + OPENCV_PIXEL_CENTRE,
+            cy=float(left_p[1, 2]) + OPENCV_PIXEL_CENTRE,
+        ),
+        baseline_mm=float(-right_p[0, 3] / right_p[0, 0]),
+        disparity_offset_px=float(left_p[0, 2] - right_p[0, 2]),
+        pairs=_RemappedPairs(clip.pairs, left_maps, right_maps),
+        tissue=_warp_tissue(clip, left_maps),
+        frame_times_s=clip.frame_times_s,
+        assumptions=(*clip.assumptions, *calibration.assumptions, "frames: as recorded, rectified by the calibration"),
+        warnings=clip.warnings + _zoom_warning(float(left_p[0, 0]) / calibration.left.fx_px),
+        equal_rows_px=float(
+            np.median(_rows(size, *cameras[1], right_r, right_p) - _rows(size, *cameras[0], left_r, left_p))
+        ),
+    )
+
+
+def _rows(
+    size: tuple[int, int],
+    k: NDArray[np.float64],
+    distortion: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    projection: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """The rectified rows of a coarse grid of recorded pixels, [M]."""
+    x, y = np.meshgrid(*(np.linspace(0, side - 1, GRID_POINTS) for side in size))
+    recorded = np.stack([x.ravel(), y.ravel()], axis=1)
+    rows: NDArray[np.float64] = cv2.undistortPoints(recorded, k, distortion, R=rotation, P=projection)[:, 0, 1]
+    return rows
+
+
+def _matrix(eye: RawEye) -> NDArray[np.float64]:
+    return np.array([[eye.fx_px, 0.0, eye.cx_px], [0.0, eye.fy_px, eye.cy_px], [0.0, 0.0, 1.0]])
+
+
+def _warp_tissue(clip: StereoClip, maps: Maps) -> NDArray[np.bool_]:
+    """Tissue in rectified pixels, nearest neighbour; beyond the recorded image there is none."""
+    if clip.tissue is None:
+        return _all_tissue(clip)
+    warped = np.empty(clip.tissue.shape, dtype=np.bool_)
+    for i, mask in enumerate(clip.tissue):
+        warped[i] = cv2.remap(mask.astype(np.uint8), *maps, cv2.INTER_NEAREST, borderValue=0) > 0
+    return warped
+
+
+def _all_tissue(clip: StereoClip) -> NDArray[np.bool_]:
+    """[T, H, W] True that takes no memory: alpha 0 leaves no pixel beyond the recording."""
+    return np.broadcast_to(np.True_, (clip.frame_count, clip.height, clip.width))
+
+
+def _zoom_warning(zoom: float) -> tuple[str, ...]:
+    """What to say of a rectification that magnifies, as it must cut away what only one eye recorded.
+
+    Raises:
+        InputError: so little is left that the calibration cannot be this recording's.
+    """
+    if zoom > MAX_ZOOM:
+        raise InputError(
+            FIELD,
+            f"rectifying with it magnifies {zoom:.1f} times and cuts most of the view away.",
+            "Give the calibration of this recording; check R, T and the distortion's order k1 k2 p1 p2 k3.",
+        )
+    return (f"rectification magnifies {zoom:.2f} times and cuts the margins away",) if zoom > WARN_ZOOM else ()

@@ -1,0 +1,168 @@
+"""The EndoNeRF layout: images/ depth/ masks/ poses_bounds.npy, decoded at once.
+
+Symbols: T frames, H W pixels.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.intake.limits import MOST_POSES_BYTES
+from contract.wire.errors import InputError
+from contract.wire.names import MaskPolarity, PoseConvention
+from worker.input.camera import Intrinsics
+from worker.input.clip.files import FileTree
+from worker.input.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
+from worker.input.clip.masks import NO_MASKS, MaskFrames, TissueMasks, tissue_from_masks
+from worker.input.clip.naming import check_aligned
+from worker.input.clip.poses import POSES_FILE, Poses, parse_poses
+from worker.input.clip.types import DepthClip
+from worker.input.clip.video import FALLBACK_RATE_HZ
+
+LAYOUT = "EndoNeRF"
+CONFIDENT = 255  # depth_confidence of every valid depth: the layout carries none of its own
+_USUAL_DEPTH_MM = (5.0, 500.0)  # working distances of endoscopes with ample room; other units fall outside
+_LEAST_DEPTH_SHARE = 0.5  # of tissue pixels with depth, below which the user should know
+_MOST_THREADS = 4  # decoding PNG releases the interpreter; more threads than this wait for the disk
+
+
+def is_endonerf(tree: FileTree) -> bool:
+    """Whether a tree means to be in this layout; what is missing is then an error."""
+    has_poses = any(name.endswith(POSES_FILE) for name in tree.names)
+    return has_poses or bool(tree.images("images") and tree.images("depth"))
+
+
+def read_endonerf(
+    tree: FileTree, given: MaskFrames | None, mask_polarity: MaskPolarity, convention: PoseConvention
+) -> DepthClip:
+    """Decodes the whole clip. The masks given, if any, replace the folder's own.
+
+    Depth images hold millimetres in 8 or 16 bit, 0 = invalid. Intrinsics are f, cx = W / 2, cy = H / 2:
+    all the layout knows.
+    Raises InputError for everything that does not fit together and LimitError when it is too large.
+    """
+    _check_files(tree)
+    images = open_images(tree, tree.images("images"))
+    tree.limits.check_clip(tree.field, tree.label, images.frame_count, images.width, images.height, eyes=1)
+    header_bytes, frame_bytes = MOST_POSES_BYTES
+    poses = parse_poses(
+        tree.read(POSES_FILE, header_bytes + frame_bytes * images.frame_count), images.frame_count, convention
+    )
+    _check_size(images, poses)
+    masks = _masks(tree, images, given, mask_polarity)
+    rgb = _decode_all(images, np.uint8, (3,), lambda name: as_rgb(images.decode(name), tree.field, name))
+    depth_mm = _read_depth(tree, images)
+    if not ((depth_mm > 0) & masks.tissue).any():
+        where = "on tissue" if (depth_mm > 0).any() else "anywhere"
+        raise InputError(
+            tree.field, f"depth/ has no valid depth {where}.", "Give millimetres as grey PNG, 0 = invalid."
+        )
+    return DepthClip(
+        rgb=rgb,
+        tissue=masks.tissue,
+        depth_mm=depth_mm,
+        depth_confidence=np.where(depth_mm > 0, np.uint8(CONFIDENT), np.uint8(0)),
+        intrinsics=Intrinsics(
+            width=images.width,
+            height=images.height,
+            fx=poses.focal_px,
+            fy=poses.focal_px,
+            cx=images.width / 2,
+            cy=images.height / 2,
+        ),
+        world_from_camera=poses.world_from_camera,
+        frame_times_s=np.arange(images.frame_count) / FALLBACK_RATE_HZ,
+        assumptions=_assumptions(masks, poses, convention),
+        warnings=(*masks.warnings, *_depth_warnings(depth_mm, masks.tissue)),
+    )
+
+
+def _assumptions(masks: TissueMasks, poses: Poses, convention: PoseConvention) -> tuple[str, ...]:
+    moves = not np.allclose(poses.world_from_camera, np.eye(4), atol=1e-6)
+    return (
+        f"layout: {LAYOUT}",
+        masks.assumption,
+        f"poses: {convention} camera-to-world, " + ("moving camera" if moves else "fixed camera"),
+        "intrinsics: principal point at the image centre",
+        "depth: millimetres",
+        f"time: {FALLBACK_RATE_HZ:g} frames a second, images carry none",
+    )
+
+
+def _check_files(tree: FileTree) -> None:
+    for folder, names in (("images", tree.images("images")), ("depth", tree.images("depth"))):
+        if not names:
+            raise InputError(
+                tree.field, f"{tree.label} has no images in {folder}/.", f"Put the frames' {folder} there."
+            )
+    if POSES_FILE not in tree.names:
+        raise InputError(tree.field, f"{tree.label} has no {POSES_FILE}.", "Put it beside images/.")
+
+
+def _check_size(images: ImageSequence, poses: Poses) -> None:
+    if (poses.height, poses.width) != (images.height, images.width):
+        raise InputError(
+            images.tree.field,
+            f"{POSES_FILE} says {poses.width}x{poses.height} pixels, the images are {images.width}x{images.height}.",
+            f"Write the images' size into {POSES_FILE}, and scale f with it.",
+        )
+
+
+def _read_depth(tree: FileTree, images: ImageSequence) -> NDArray[np.float32]:
+    """Depth [T, H, W] float32 in mm, 0 = invalid."""
+    names = tree.images("depth")
+    check_aligned(tree.field, images.names, names)
+    depth = open_images(tree, names)
+    if (depth.height, depth.width) != (images.height, images.width):
+        raise InputError(
+            tree.field,
+            f"depth is {depth.width}x{depth.height} pixels, the images are {images.width}x{images.height}.",
+            "Give depth in the images' size.",
+        )
+    return _decode_all(depth, np.float32, (), lambda name: as_depth_mm(depth.decode(name), tree.field, name))
+
+
+def _masks(tree: FileTree, images: ImageSequence, given: MaskFrames | None, told: MaskPolarity) -> TissueMasks:
+    shape = (images.frame_count, images.height, images.width)
+    if given is None:
+        names = tree.images("masks")
+        if not names:
+            return TissueMasks(np.ones(shape, dtype=np.bool_), NO_MASKS)
+        check_aligned("masks", images.names, names)
+        given = MaskFrames(open_images(tree, names))
+    return tissue_from_masks(given, shape, told, by_layout=(LAYOUT, "tool"))
+
+
+def _decode_all(
+    images: ImageSequence, dtype: type, channels: tuple[int, ...], decode: Callable[[str], NDArray[Any]]
+) -> NDArray[Any]:
+    """All frames of a sequence [T, H, W, ...], decoded by a few threads."""
+    result: NDArray[Any] = np.empty((images.frame_count, images.height, images.width, *channels), dtype=dtype)
+
+    def fill(index: int) -> None:
+        result[index] = decode(images.names[index])
+
+    with ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1)) as threads:
+        for _ in threads.map(fill, range(images.frame_count)):
+            pass
+    return result
+
+
+def _depth_warnings(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) -> tuple[str, ...]:
+    """What looks odd about depth that has some valid pixel on tissue; judged on every 4th row and column."""
+    depth_mm, tissue = depth_mm[:, ::4, ::4], tissue[:, ::4, ::4]
+    valid = (depth_mm > 0) & tissue
+    warnings = []
+    low, high = _USUAL_DEPTH_MM
+    if valid.any() and not low <= (median := float(np.median(depth_mm[valid]))) <= high:
+        warnings.append(f"depth: its median is {median:.1f} mm, unusual for an endoscope; is it in millimetres?")
+    share = np.count_nonzero(valid) / max(1, int(np.count_nonzero(tissue)))
+    if share < _LEAST_DEPTH_SHARE:
+        warnings.append(f"depth: only {100 * share:.0f} % of the tissue pixels have one")
+    return tuple(warnings)

@@ -1,0 +1,167 @@
+"""Instrument masks: which pixels are tissue, and how that was known.
+
+Symbols: T frames, H W pixels of the left eye.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.intake.limits import ClipLimits
+from contract.wire.errors import InputError
+from contract.wire.names import MaskPolarity
+from worker.input.clip.files import FileTree, check_exists, open_tree
+from worker.input.clip.images import MASK_THRESHOLD, ImageSequence, as_mask, open_images
+from worker.input.clip.naming import left_eye_only
+from worker.input.clip.video import VideoFile, open_video, open_video_in
+
+BrightClass = Literal["tool", "tissue"]  # what a white pixel means
+
+MOST_TOOL_SHARE = 0.4  # of the area: a class larger than this is not taken for the instrument unasked
+NO_MASKS = "masks: none given, every pixel is tissue"  # the assumption recorded then
+_FIELD = "masks"
+_POLARITY_REMEDY = 'Say mask_polarity "tool" if white marks instruments, "tissue" if white marks tissue.'
+
+
+@dataclass(frozen=True)
+class TissueMasks:
+    """tissue [T, H, W] bool, True = tissue, with what was assumed and what looks odd."""
+
+    tissue: NDArray[np.bool_]
+    assumption: str
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class MaskFrames:
+    """Masks whose number and size are known, but not yet their pixels: a small file may decode to gigabytes."""
+
+    frames: ImageSequence | VideoFile
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(T, H, W)."""
+        return self.frames.frame_count, self.frames.height, self.frames.width
+
+    def white(self) -> NDArray[np.bool_]:
+        """White pixels [T, H, W]. InputError when images have values, but none that is white."""
+        decoded: Iterator[NDArray[Any]]
+        if isinstance(self.frames, ImageSequence):
+            decoded = map(self.frames.decode, self.frames.names)
+        else:
+            decoded = self.frames.frames()
+        white = np.empty(self.shape, dtype=np.bool_)
+        largest = 0
+        for index, image in enumerate(decoded):
+            white[index] = as_mask(image)
+            largest = max(largest, int(image.max()) // (257 if image.dtype == np.uint16 else 1))
+        if isinstance(self.frames, ImageSequence) and 0 < largest < MASK_THRESHOLD:
+            raise InputError(
+                _FIELD, f"the largest value in the masks is {largest} of 255.", "Write masks with the values 0 and 255."
+            )
+        return white
+
+
+def open_masks(path: Path, limits: ClipLimits) -> MaskFrames:
+    """Masks given as a zip or folder of images, or as a video. InputError, LimitError."""
+    check_exists(path, _FIELD)
+    tree = open_tree(path, _FIELD, limits)
+    if tree is None:
+        return MaskFrames(open_video(path, _FIELD, limits))
+    names = mask_names(tree) or tree.images()
+    if not names and len(tree.videos()) == 1:
+        return MaskFrames(open_video_in(tree, tree.videos()[0]))
+    return MaskFrames(open_images(tree, left_eye_only(names)))
+
+
+def mask_names(tree: FileTree) -> tuple[str, ...]:
+    """Images that lie in a folder called masks or mask; of both eyes only the left."""
+    names = (name for name in tree.images() if {"masks", "mask"} & {p.lower() for p in PurePosixPath(name).parts[:-1]})
+    return left_eye_only(tuple(names))
+
+
+def tissue_from_masks(
+    masks: MaskFrames,
+    shape: tuple[int, int, int],
+    told: MaskPolarity,
+    by_layout: tuple[str, BrightClass] | None = None,
+) -> TissueMasks:
+    """Tissue pixels of a clip's masks, which are decoded only when their number and size fit its `shape` (T, H, W).
+
+    What the user told wins; then the layout (its name, what white means there), unless the masks' own look contradicts
+    it; then the look: the class that touches the border in most frames with less than 40 % of the area is the tool.
+    InputError when they do not fit, when the tool's class cannot be told, when the masks mark nothing, and when they
+    leave no tissue.
+    """
+    _check_shape(masks.shape, shape)
+    white = masks.white()
+    bright, reason = _bright_class(white, told, by_layout)
+    tissue = white if bright == "tissue" else np.logical_not(white, out=white)
+    if not tissue.any():
+        raise InputError(_FIELD, "every pixel of every mask is tool.", _POLARITY_REMEDY)
+    warnings = []
+    if tissue.all():
+        warnings.append("the masks mark no instrument in any frame")
+    covered = int((~tissue.any(axis=(1, 2))).sum())
+    if covered:
+        warnings.append(f"{covered} of {len(tissue)} frames are all tool in their masks and cannot be learnt from")
+    return TissueMasks(tissue, f"masks: white is {bright} ({reason})", tuple(warnings))
+
+
+def _bright_class(
+    white: NDArray[np.bool_], told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
+) -> tuple[BrightClass, str]:
+    """What white means, and why we think so."""
+    if told != "auto":
+        return told, "as told"
+    if white.all() or not white.any():
+        colour = "white" if white.any() else "black"
+        raise InputError(
+            _FIELD,
+            f"every mask is {colour} all over, so nothing is marked.",
+            "Leave the masks out if no instrument shows. " + _POLARITY_REMEDY,
+        )
+    look = _bright_class_by_look(white)
+    share = f"white covers {100 * white.mean():.0f} % of the area"
+    if by_layout is not None:
+        layout, bright = by_layout
+        if look in (None, bright):
+            return bright, f"the {layout} layout's rule"
+        raise InputError(
+            _FIELD, f"the {layout} layout says white is {bright}, the masks look inverted ({share}).", _POLARITY_REMEDY
+        )
+    if look is None:
+        raise InputError(
+            _FIELD, f"cannot tell whether white or black marks the instrument ({share}).", _POLARITY_REMEDY
+        )
+    return look, f"the instrument enters from the border and covers less than {100 * MOST_TOOL_SHARE:.0f} %; {share}"
+
+
+def _bright_class_by_look(white: NDArray[np.bool_]) -> BrightClass | None:
+    """The class that reaches the border in most of the frames it appears in, with little enough area to be the tool."""
+    border = np.concatenate([white[:, 0], white[:, -1], white[:, :, 0], white[:, :, -1]], axis=1)
+    if white.mean() < MOST_TOOL_SHARE:
+        touches = 2 * border.any(axis=1).sum() > white.any(axis=(1, 2)).sum()
+        return "tool" if touches else None
+    if 1.0 - white.mean() < MOST_TOOL_SHARE:
+        touches = 2 * (~border).any(axis=1).sum() > (~white.all(axis=(1, 2))).sum()
+        return "tissue" if touches else None
+    return None
+
+
+def _check_shape(given: tuple[int, int, int], shape: tuple[int, int, int]) -> None:
+    frames, height, width = shape
+    if given[0] != frames:
+        raise InputError(_FIELD, f"there are {given[0]} masks for {frames} frames.", "Give one mask for each frame.")
+    if given[1:] != (height, width):
+        raise InputError(
+            _FIELD,
+            f"the masks are {given[2]}x{given[1]} pixels, the left eye is {width}x{height}.",
+            "Give masks in the size of the left eye.",
+        )

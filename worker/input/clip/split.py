@@ -1,0 +1,134 @@
+"""Which frames teach and which are held out to measure.
+
+Symbols: T frames, H W pixels.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.wire.errors import InputError
+from worker.input.clip.types import DepthClip
+
+FEWEST_FRAMES = 9  # shorter clips cannot spare a frame
+REPEAT_LEVELS = 0.2  # mean |difference| in 8-bit levels below which two frames are the same picture
+RULES = ("every8", "blocks8", "none")
+_FIELD = "options.holdout"
+_REMEDY = 'Say "every8", "blocks8", "none", or frame numbers like "1,9,17".'
+
+
+@dataclass(frozen=True)
+class FrameSplit:
+    """Frame indices, each list rising. Held-out frames touch nothing in training.
+
+    repeated are frames in neither list: they would teach, but repeat a held-out frame.
+    """
+
+    train: list[int]
+    held_out: list[int]
+    repeated: list[int]
+    warnings: tuple[str, ...] = ()
+
+
+def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
+    """Splits the clip's T frames.
+
+    holdout  "every8": frames i with (i - 1) % 8 == 0, as in the papers; "blocks8": i in [8, T - 8) with
+             (i // 8) % 3 == 1, what a fixed camera needs to be measured honestly; "none"; or a list, "1,9,17"
+    Clips under 9 frames hold out none, with a warning. InputError for an unknown rule and for frames that do not exist.
+    """
+    count = clip.frame_count
+    held_out = held_out_frames(count, holdout)
+    if holdout == "none":
+        return FrameSplit(list(range(count)), [], [])
+    if count < FEWEST_FRAMES:
+        return _nothing_held_out(count, f"the clip has {count} frames, fewer than {FEWEST_FRAMES}")
+    if not held_out:
+        return _nothing_held_out(count, f"{holdout} finds no frame to hold out in {count}")
+    train = sorted(set(range(count)) - set(held_out))
+    repeated = find_repeats(clip.rgb, train, held_out)
+    if len(repeated) == len(train):
+        return _nothing_held_out(count, "every training frame repeats a held-out one: the picture does not change")
+    warnings = (f"frames that repeat a held-out frame are not used: {len(repeated)}",) if repeated else ()
+    gone = set(repeated)
+    return FrameSplit([index for index in train if index not in gone], held_out, repeated, warnings)
+
+
+def held_out_frames(frame_count: int, holdout: str) -> list[int]:
+    """The frames that the rule of split_frames holds out of a clip, rising; it needs no picture.
+
+    So stages before the split can leave them alone. InputError as in split_frames.
+    """
+    wanted = _held_out_by_rule(holdout, frame_count)
+    return sorted(wanted) if frame_count >= FEWEST_FRAMES else []
+
+
+def check_holdout(holdout: str) -> None:
+    """Refuse what is neither a rule of split_frames nor a list of frames; whether a clip has those, it cannot know.
+
+    Raises:
+        InputError: names the field.
+    """
+    if holdout not in RULES and not re.fullmatch(r"\s*\d+\s*(,\s*\d+\s*)*", holdout):
+        raise InputError(_FIELD, f"{holdout!r} is not known.", _REMEDY)
+
+
+def spread(indices: Sequence[int], count: int) -> list[int]:
+    """At most count of the indices, evenly spread, the first and the last among them."""
+    places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
+    return [indices[place] for place in places]
+
+
+def find_repeats(rgb: NDArray[np.uint8], train: list[int], held_out: list[int]) -> list[int]:
+    """Training frames of rgb [T, H, W, 3] whose mean |difference| to some held-out frame is below REPEAT_LEVELS of 255.
+
+    The differences of column sums bound the mean difference from below (triangle inequality), so whole frames are
+    compared only where that bound does not already rule a repeat out.
+    """
+    values_per_frame = float(np.prod(rgb.shape[1:]))
+    most = REPEAT_LEVELS * values_per_frame
+    column_sums = {index: _column_sums(rgb[index]) for index in (*train, *held_out)}
+    held_sums = np.stack([column_sums[index] for index in held_out])
+    repeats = []
+    for index in train:
+        bounds = np.abs(held_sums - column_sums[index]).sum(axis=1)
+        candidates = [held_out[k] for k in np.flatnonzero(bounds < most)]
+        if any(_closer_than(most, rgb[index], rgb[other]) for other in candidates):
+            repeats.append(index)
+    return repeats
+
+
+def _closer_than(most: float, frame: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+    """Whether the sum of |differences| is below `most`; every 8th row alone often shows that it is not."""
+    return all(cv2.norm(frame[::step], other[::step], cv2.NORM_L1) < most for step in (8, 1))
+
+
+def _column_sums(frame: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Sum over the rows of a frame [H, W, 3], flattened to [3 W]."""
+    return np.asarray(cv2.reduce(frame, 0, cv2.REDUCE_SUM, dtype=cv2.CV_32S), dtype=np.int64).ravel()
+
+
+def _held_out_by_rule(holdout: str, count: int) -> set[int]:
+    check_holdout(holdout)
+    if holdout == "none":
+        return set()
+    if holdout == "every8":
+        return {index for index in range(count) if (index - 1) % 8 == 0}
+    if holdout == "blocks8":
+        return {index for index in range(8, count - 8) if (index // 8) % 3 == 1}
+    wanted = {int(number) for number in holdout.split(",")}
+    if max(wanted) >= count:
+        raise InputError(_FIELD, f"frame {max(wanted)} is not in a clip of {count} frames.", f"Use 0 to {count - 1}.")
+    if len(wanted) == count:
+        raise InputError(_FIELD, f"all {count} frames are held out.", "Leave frames to train on.")
+    return wanted
+
+
+def _nothing_held_out(count: int, reason: str) -> FrameSplit:
+    return FrameSplit(list(range(count)), [], [], (f"no frames are held out, so quality is not measured: {reason}",))

@@ -1,0 +1,74 @@
+"""What comes out of the front of the pipeline.
+
+Symbols of the whole worker: T frames, H W pixels (rows, columns), N Gaussians, B bases, C = 10 deformed channels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.input.camera import Intrinsics
+
+RgbFrame = NDArray[np.uint8]  # [H, W, 3]
+
+
+class PairSource(Protocol):
+    """Left and right frames, decoded as they are asked for. Each call starts again from frame 0."""
+
+    def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]: ...
+
+
+@dataclass(frozen=True)
+class StereoClip:
+    """A stereo clip as it was recorded, not yet rectified. Frames are decoded lazily, RGB uint8.
+
+    tissue is [T, H, W] bool (True = tissue) in the pixels of the recorded left eye, or None when no masks were given.
+    frame_times_s is [T] float64, from the container or i / 30 when it has none.
+    """
+
+    frame_count: int
+    height: int
+    width: int
+    pairs: PairSource
+    tissue: NDArray[np.bool_] | None
+    frame_times_s: NDArray[np.float64]
+    assumptions: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class DepthClip:
+    """Rectified left frames with metric depth, tissue mask and camera: all that training reads.
+
+    rgb              [T, H, W, 3] uint8
+    tissue           [T, H, W]    bool, True = tissue (tools, labels and borders are False)
+    depth_mm         [T, H, W]    float32, camera z in mm, 0 = invalid
+    depth_confidence [T, H, W]    uint8, 255 = left-right consistent and textured, 0 where depth is invalid
+    world_from_camera [T, 4, 4]   float64, mm, OpenCV axes; the world is the camera of frame 0
+    frame_times_s    [T]          float64, seconds from frame 0
+    """
+
+    rgb: NDArray[np.uint8]
+    tissue: NDArray[np.bool_]
+    depth_mm: NDArray[np.float32]
+    depth_confidence: NDArray[np.uint8]
+    intrinsics: Intrinsics
+    world_from_camera: NDArray[np.float64]
+    frame_times_s: NDArray[np.float64]
+    assumptions: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    measurements: dict[str, float] = field(default_factory=dict)  # e.g. vertical misalignment in px, for the report
+
+    @property
+    def frame_count(self) -> int:
+        return int(self.rgb.shape[0])
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """Model time of each frame, t_i = i / T, in [0, 1)."""
+        return np.arange(self.frame_count) / self.frame_count

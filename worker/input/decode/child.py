@@ -1,0 +1,94 @@
+"""`python -m worker.input.decode.child`: the process that reads what came from outside.
+
+It gets one request as JSON on its input, locks itself in, and only then loads the decoders. It answers in lines of
+JSON: any number of {"pictures": ..., "share": ..., "field": ...}, then one {"result": ...} or {"error": ...}.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from contract.wire.errors import InputError, LimitError
+from worker.input.decode.guard import Allowance, lock_in
+
+REPORT_PERIOD_S = 0.05
+
+Work = Callable[[dict[str, Any], Path, "Reports"], dict[str, Any]]
+"""work(request, folder for the arrays, reports); returns the result."""
+
+
+class Reports:
+    """Tells the parent how far it is, not too often; any thread may call it."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._lock = threading.Lock()
+        self._pictures = 0
+        self._next_s = 0.0
+        self.field = "clip"
+        self.share = 0.0
+
+    def picture(self) -> None:
+        """Another picture was decoded."""
+        with self._lock:
+            self._pictures += 1
+            if time.monotonic() >= self._next_s:
+                self._next_s = time.monotonic() + REPORT_PERIOD_S
+                self._send({"pictures": self._pictures, "share": self.share, "field": self.field})
+
+    def reading(self, field: str) -> None:
+        """From now on it is this input that is read."""
+        with self._lock:
+            self.field = field
+            self._send({"pictures": self._pictures, "share": self.share, "field": field})
+
+    def end(self, answer: dict[str, Any]) -> None:
+        """The last line."""
+        with self._lock:
+            self._send(answer)
+
+    def _send(self, line: dict[str, Any]) -> None:
+        self._stream.write(json.dumps(line, allow_nan=False).encode() + b"\n")
+        self._stream.flush()
+
+
+def serve(work_of: Callable[[], Work]) -> None:
+    """Read the request, lock in, work, answer. work_of loads what the work needs, when it is safe to do so."""
+    with os.fdopen(os.dup(1), "wb") as stream:
+        os.dup2(2, 1)  # what a library prints is no answer
+        request = json.loads(sys.stdin.buffer.readline())
+        reports = Reports(stream)
+        folder = Path.cwd()
+        granted = lock_in(Allowance(**request["allowance"]), [Path(each) for each in request["readable"]], folder)
+        try:
+            reports.end({"result": work_of()(request, folder, reports) | {"granted": granted}})
+        except Exception as error:
+            reports.end({"error": _described(error)})
+
+
+def _described(error: Exception) -> dict[str, Any]:
+    if isinstance(error, InputError):
+        told = {"field": error.field, "problem": error.problem, "remedy": error.remedy}
+        return told | {"kind": "limit" if isinstance(error, LimitError) else "input"}
+    if isinstance(error, MemoryError):
+        return {"kind": "memory"}
+    places = "".join(traceback.format_tb(error.__traceback__))
+    return {"kind": "fault", "type": type(error).__name__, "errno": getattr(error, "errno", None), "where": places}
+
+
+def _decode() -> Work:
+    from worker.input.decode.reading import read_clip
+
+    return read_clip
+
+
+if __name__ == "__main__":
+    serve(_decode)

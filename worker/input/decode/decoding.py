@@ -1,0 +1,169 @@
+"""A clip and its calibration, read where they can do no harm: the parent's side of the decoding process.
+
+Symbols: T frames, H W pixels of one eye.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.wire.errors import InputError
+from contract.wire.names import Layout, MaskPolarity, PoseConvention
+from worker.input.calibration import check_calibration
+from worker.input.calibration.types import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
+from worker.input.camera import Intrinsics
+from worker.input.clip import ClipLimits, DepthClip, StereoClip
+from worker.input.clip.files import DEEPEST_FOLDER
+from worker.input.clip.types import RgbFrame
+from worker.input.decode.contained import MALFORMED, REMEDY, private_folder, run_contained
+from worker.input.decode.guard import LIMITED_MEMORY, PROTECTIONS, Allowance
+from worker.input.decode.handover import DEPTH, map_array
+from worker.machine.hooks import Hooks, Progress
+
+STAGE = "decode"
+LIBRARIES_BYTES = 2 * 2**30  # address space of Python, NumPy and OpenCV with a decoder's threads
+CPU_S = 1800  # of all cores together: what LONGEST_S allows one of them
+
+
+@dataclass(frozen=True)
+class StereoRecording:
+    """A stereo clip whose frames lie decoded in files that are mapped into memory, and its calibration."""
+
+    clip: StereoClip
+    calibration: StereoCalibration
+
+
+@dataclass(frozen=True)
+class _MappedPairs:
+    """Left and right frames [T, H, W, 3] as a restartable source."""
+
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+
+    def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]:
+        return zip(self.left, self.right, strict=True)
+
+
+def decode_clip(
+    clip: Path,
+    right: Path | None = None,
+    *,
+    layout: Layout = "auto",
+    calibration: Path | None = None,
+    masks: Path | None = None,
+    mask_polarity: MaskPolarity = "auto",
+    pose_convention: PoseConvention = "opengl",
+    limits: ClipLimits | None = None,
+    hooks: Hooks | None = None,
+) -> StereoRecording | DepthClip:
+    """What open_clip and load_calibration make of these files, bit for bit, without this process reading them.
+
+    A process of its own decodes every frame into a private folder below tempfile.gettempdir(); it has limited memory
+    and time and, where the kernel allows it, no network and no files but these. `assumptions` say what was in force.
+    The folder is gone when this returns; what is mapped of it stays until the clip is dropped.
+
+    Raises:
+        InputError, LimitError: what open_clip and load_calibration raise; a stereo clip came without a calibration; or
+            the decoder crashed, made no progress for 10 s, or took more memory or time than it may.
+        Cancelled: hooks.should_stop said so.
+        UnavailableError: the disk is full.
+    """
+    limits, hooks = limits or ClipLimits(), hooks or Hooks()
+    files = {"path": clip, "right": right, "masks": masks}
+    given = {name: None if path is None else str(path.absolute()) for name, path in files.items()}
+    chosen = {"layout": layout, "mask_polarity": mask_polarity, "pose_convention": pose_convention}
+    own = None if calibration is None else str(calibration.absolute())
+    request = {
+        "clip": given | chosen,
+        "calibration": own,
+        "readable": [each for path in (*given.values(), own) if path is not None for each in _reached(path)],
+        "limits": limits.numbers(),
+    }
+    allowance = Allowance(LIBRARIES_BYTES + limits.decoded_bytes, limits.decoded_bytes, CPU_S)
+    with private_folder() as folder:
+        told = run_contained(
+            request,
+            allowance,
+            folder,
+            on_report=lambda share: hooks.on_progress(Progress(STAGE, share)),
+            should_stop=hooks.should_stop,
+        )
+        try:
+            return _received(told, folder, allowance)
+        except (*MALFORMED, OSError) as error:
+            problem = f"it cannot be decoded: the decoder's answer does not fit ({type(error).__name__})."
+            raise InputError("clip", problem, REMEDY) from error
+
+
+def _reached(path: str) -> list[str]:
+    """A file or folder, and what links in the folder lead to; only who has this machine can give one with links."""
+    found = [path]
+    for folder, subfolders, files in os.walk(path, followlinks=True):
+        if len(Path(folder).relative_to(path).parts) >= DEEPEST_FOLDER:
+            subfolders.clear()
+        entries = (os.path.join(folder, name) for name in (*subfolders, *files))
+        found += [os.path.realpath(entry) for entry in entries if os.path.islink(entry)]
+    return found
+
+
+def _received(told: dict[str, Any], folder: Path, allowance: Allowance) -> StereoRecording | DepthClip:
+    frames, height, width = (int(each) for each in told["size"])
+    size = (frames, height, width)
+    if min(size) < 1 or frames * height * width > allowance.file_bytes:
+        raise ValueError(f"a clip of {size}")
+    frame_times_s = map_array(folder, "frame_times_s", size).copy()
+    if not np.isfinite(frame_times_s).all():
+        raise ValueError("frame times that are not finite")
+    assumptions = (*(str(each) for each in told["assumptions"]), _protection(told["granted"], allowance))
+    warnings = tuple(str(each) for each in told["warnings"])
+    if told["kind"] == DEPTH:
+        return DepthClip(
+            rgb=map_array(folder, "rgb", size),
+            tissue=map_array(folder, "tissue", size) != 0,
+            depth_mm=_checked_depth(map_array(folder, "depth_mm", size)),
+            depth_confidence=map_array(folder, "depth_confidence", size),
+            intrinsics=Intrinsics.parsed(told["intrinsics"]),
+            world_from_camera=_finite(map_array(folder, "world_from_camera", size).copy()),
+            frame_times_s=frame_times_s,
+            assumptions=assumptions,
+            warnings=warnings,
+        )
+    pairs = _MappedPairs(map_array(folder, "left", size), map_array(folder, "right", size))
+    tissue = map_array(folder, "tissue", size) != 0 if told["masked"] else None
+    clip = StereoClip(frames, height, width, pairs, tissue, frame_times_s, assumptions, warnings)
+    return StereoRecording(clip, _calibration(told["calibration"]))
+
+
+def _protection(granted: list[str], allowance: Allowance) -> str:
+    """What held while the clip was decoded, and what the kernel did not grant."""
+    amounts = {LIMITED_MEMORY: f" of {allowance.memory_bytes / 2**30:.1f} GiB"}
+    held = [each + amounts.get(each, "") for each in PROTECTIONS if each in granted]
+    lacking = [each for each in PROTECTIONS if each not in granted]
+    denied = f"; the kernel did not grant: {', '.join(lacking)}" if lacking else ""
+    return f"decoding: in a process of its own ({', '.join(held) or 'not confined'}{denied})"
+
+
+def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    if not np.isfinite(values).all():
+        raise ValueError("poses that are not finite")
+    return values
+
+
+def _checked_depth(depth_mm: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depth as it must be for all that indexes by it; frame by frame, for it is large."""
+    if not all(bool(np.isfinite(frame).all()) and float(frame.min()) >= 0 for frame in depth_mm):
+        raise ValueError("depth that is negative or not finite")
+    return depth_mm
+
+
+def _calibration(value: Any) -> RectifiedCalibration | RawCalibration:
+    calibration = parse_calibration(value)
+    check_calibration(calibration)
+    return calibration

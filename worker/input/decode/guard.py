@@ -1,0 +1,121 @@
+"""How the decoding process locks itself in, before it opens anything that came from outside.
+
+Its limits hold on every system. What a kernel need not grant is named when it did: without it decoding goes on, and the
+report says so. Everything here is for good: nothing in this process can take it back.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import resource
+import struct
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from contract.runtime.processes import die_with_parent
+from worker.input.decode.landlock import confine_files
+from worker.input.decode.seccomp import forbid_network_and_programs
+
+MOST_OPEN_FILES = 128  # a zip, a video, the results, and what Python loads
+
+_PR_SET_NO_NEW_PRIVS = 38
+_CLONE_NEWUSER = 0x10000000
+_CLONE_NEWNET = 0x40000000
+_CAPABILITY_VERSION = 0x20080522
+_CAP_DAC_READ_SEARCH = 1 << 2  # kept where it is there: a worker that is root is given files of other users
+
+LIMITED_MEMORY = "limited memory"
+NO_NETWORK = "no network"
+NO_PROGRAMS = "no other program"
+OWN_FILES = "no files but its own"
+PROTECTIONS = (LIMITED_MEMORY, NO_NETWORK, NO_PROGRAMS, OWN_FILES)
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """What the process may take: memory, the largest file it writes, seconds of all its cores together."""
+
+    memory_bytes: int
+    file_bytes: int
+    cpu_s: int
+
+
+def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> list[str]:
+    """Give up what decoding does not need; what was granted, in words.
+
+    Must come before the first thread. readable are the files and folders that came from outside, writable the folder
+    for the results.
+
+    Raises:
+        OSError: a limit cannot be set.
+    """
+    die_with_parent()
+    _gain_no_privileges()
+    _limit(resource.RLIMIT_CORE, 0)  # a dump would hold the clip
+    _limit(resource.RLIMIT_FSIZE, allowance.file_bytes)
+    _limit(resource.RLIMIT_CPU, allowance.cpu_s, allowance.cpu_s + 1)  # SIGXCPU tells why; SIGKILL follows
+    _limit(resource.RLIMIT_NOFILE, MOST_OPEN_FILES)
+    granted = [LIMITED_MEMORY] if _limit_memory(allowance.memory_bytes) else []
+    apart = _leave_network()
+    confined = confine_files(_libraries() + list(readable), writable)
+    _drop_capabilities()
+    filtered = forbid_network_and_programs()
+    if apart or filtered:
+        granted.append(NO_NETWORK)
+    if filtered:
+        granted.append(NO_PROGRAMS)
+    if confined:
+        granted.append(OWN_FILES)
+    return granted
+
+
+def _limit(kind: int, soft: int, hard: int | None = None) -> None:
+    """Lower a limit; one that is lower already stays."""
+    _, most = resource.getrlimit(kind)
+    hard = soft if hard is None else hard
+    hard = hard if most == resource.RLIM_INFINITY else min(hard, most)
+    resource.setrlimit(kind, (min(soft, hard), hard))
+
+
+def _limit_memory(most_bytes: int) -> bool:
+    """Whether memory is limited; macOS knows the limit and may refuse to set it."""
+    try:
+        _limit(resource.RLIMIT_AS, most_bytes)
+    except (ValueError, OSError):
+        return False
+    return True
+
+
+def _gain_no_privileges() -> None:
+    """No program that this process starts has more rights than it; what follows needs that said."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+
+
+def _drop_capabilities() -> None:
+    """Root is root no longer, and who has a user namespace of its own is not root in there."""
+    if not sys.platform.startswith("linux"):
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = struct.pack("=Ii", _CAPABILITY_VERSION, 0)
+    held = ctypes.create_string_buffer(struct.calcsize("=6I"))  # effective, permitted, inheritable; then bits 32 up
+    if libc.capget(header, held) == 0:
+        kept = struct.unpack_from("=I", held, 4)[0] & _CAP_DAC_READ_SEARCH
+        libc.capset(header, struct.pack("=6I", kept, kept, 0, 0, 0, 0))
+
+
+def _leave_network() -> bool:
+    """Move to a network of its own that leads nowhere; a user who may not do so alone gets a user namespace too."""
+    if not sys.platform.startswith("linux"):
+        return False
+    libc = ctypes.CDLL(None, use_errno=True)
+    return any(libc.unshare(flags) == 0 for flags in (_CLONE_NEWNET, _CLONE_NEWUSER | _CLONE_NEWNET))
+
+
+def _libraries() -> list[Path]:
+    """Where Python and the libraries it loads lie."""
+    package = Path(__file__).resolve().parents[2]
+    installed = (sys.prefix, sys.base_prefix, *(each for each in sys.path if "-packages" in each))
+    return [package, package.parent / "contract", *map(Path, (*installed, "/usr", "/lib", "/lib64"))]

@@ -1,0 +1,88 @@
+"""What the decoding process does: the clip is opened, its calibration read, every frame written down.
+
+Symbols: T frames, H W pixels of one eye.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from contract.wire.errors import InputError
+from worker.input.calibration import load_calibration
+from worker.input.clip import ClipLimits, DepthClip, StereoClip, find_calibration, open_clip
+from worker.input.decode.child import Reports
+from worker.input.decode.handover import DEPTH, STEREO, write_arrays
+
+_OPENING_SHARE = 0.5  # of the stage; a video is walked once to count its frames, and once to hand them over
+
+
+def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[str, Any]:
+    """Leaves the clip's arrays in `folder`; what else there is to know of it is the result, for JSON."""
+    most_frames = request["limits"]["frames"]
+    opened = 0
+
+    def picture() -> None:
+        nonlocal opened
+        opened += 1  # how many there are is not known yet: the share rises towards its end without reaching it
+        reports.share = max(reports.share, _OPENING_SHARE * opened / (opened + most_frames))
+        reports.picture()
+
+    limits = ClipLimits(**request["limits"], on_picture=picture)
+    clip = open_clip(limits=limits, **request["clip"])
+    height, width = clip.rgb.shape[1:3] if isinstance(clip, DepthClip) else (clip.height, clip.width)
+    told = {
+        "size": [clip.frame_count, height, width],
+        "assumptions": clip.assumptions,
+        "warnings": clip.warnings,
+    }
+    if isinstance(clip, DepthClip):
+        write_arrays(folder, _depth_arrays(clip, reports))
+        return told | {"kind": DEPTH, "intrinsics": clip.intrinsics.numbers()}
+    reports.reading("calibration")
+    calibration = _calibration(request, clip, folder, limits)
+    reports.reading("clip")
+    write_arrays(folder, _stereo_arrays(clip, reports))
+    masked = clip.tissue is not None
+    return told | {"kind": STEREO, "masked": masked, "calibration": calibration}
+
+
+def _depth_arrays(clip: DepthClip, reports: Reports) -> Iterator[tuple[str, NDArray[Any]]]:
+    names = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera", "frame_times_s")
+    done = 0
+    for name in names:
+        for frame in getattr(clip, name):
+            done += 1
+            share = done / (len(names) * clip.frame_count)
+            reports.share = max(reports.share, _OPENING_SHARE + (1 - _OPENING_SHARE) * share)
+            reports.picture()  # a slow disk is no decoder that hangs
+            yield name, frame
+
+
+def _stereo_arrays(clip: StereoClip, reports: Reports) -> Iterator[tuple[str, NDArray[Any]]]:
+    yield "frame_times_s", clip.frame_times_s
+    if clip.tissue is not None:
+        yield "tissue", clip.tissue
+    found = 0
+    for found, (left, right) in enumerate(clip.pairs(), start=1):
+        if found > clip.frame_count:
+            break
+        reports.share = max(reports.share, _OPENING_SHARE + (1 - _OPENING_SHARE) * found / clip.frame_count)
+        reports.picture()
+        yield "left", left
+        yield "right", right
+    if found < clip.frame_count:
+        raise InputError("clip", f"it ended after {found} of {clip.frame_count} frames.", "Give the whole recording.")
+
+
+def _calibration(request: dict[str, Any], clip: StereoClip, folder: Path, limits: ClipLimits) -> dict[str, Any]:
+    """The given calibration, or the one that lies in the clip's folder or zip."""
+    path = request["calibration"] or find_calibration(request["clip"]["path"], folder, limits)
+    if path is None:
+        problem = f"a stereo clip of {clip.width} x {clip.height} px an eye came without one."
+        remedy = "Give a calibration: our JSON (docs/conventions.md), OpenCV YAML or XML, or StereoMIS ini."
+        raise InputError("calibration", problem, remedy)
+    return load_calibration(path, eye_width=clip.width, eye_height=clip.height).model_dump(mode="json")

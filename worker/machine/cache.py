@@ -1,0 +1,54 @@
+"""Where compiled kernels are kept between runs.
+
+Numba keys a kernel's cache by its own source file and does not see a change in a module it was compiled from (a
+constant, an inlined helper, the vector type), so a stale kernel could run with a new layout of its arrays. All kernels
+therefore live in a folder named after a hash of the rasteriser's source files, the only ones that build on each other:
+any change there starts afresh.
+"""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import os
+import shutil
+import tempfile
+import warnings
+from functools import cache
+from pathlib import Path
+
+import numba
+
+
+def kernel_cache_directory() -> Path:
+    """The folder of compiled kernels: $INTRASPLAT_CACHE, else $XDG_CACHE_HOME/intrasplat, else ~/.cache/intrasplat.
+
+    Raises:
+        RuntimeError: none of them is set and this user has no home.
+    """
+    digest = hashlib.sha256(numba.__version__.encode())
+    worker = Path(__file__).resolve().parents[1]
+    for source in [Path(__file__), worker / "raster" / "__init__.py", *sorted(worker.glob("raster/cpu/*.py"))]:
+        digest.update(source.read_bytes())
+    chosen = os.environ.get("INTRASPLAT_CACHE")
+    base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "intrasplat"
+    return base / "kernels" / digest.hexdigest()[:16]
+
+
+@cache
+def use_kernel_cache() -> None:
+    """Point Numba at that folder, once a process; must run before the first kernel is declared.
+
+    Where nothing can be written there, a temporary folder takes its place until the process ends, with a warning.
+    """
+    try:
+        folder = kernel_cache_directory()
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except (OSError, RuntimeError) as error:
+        temporary = tempfile.mkdtemp(prefix="intrasplat-kernels-")
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        problem = f"compiled kernels cannot be kept, so every start compiles them anew: {error}"
+        warnings.warn(f"{problem}; set INTRASPLAT_CACHE to a folder that can be written.", RuntimeWarning, stacklevel=2)
+        folder = Path(temporary)
+    numba.config.CACHE_DIR = str(folder)

@@ -1,0 +1,117 @@
+"""FDM with one set of bases for all Gaussians: a third of the numbers, linear in them, and colour may move too.
+
+Symbols: N Gaussians, C = 10 channels, or 13 with the constant harmonic of the colour, B bases, T training frames.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from worker.model.deformation.base import CHANNELS, add_offsets
+from worker.model.gaussians import Gaussians
+
+CHANNELS_WITH_COLOUR = CHANNELS + 3
+DEFAULT_BASES = 9
+WIDTH_IN_SPACINGS = 0.6
+"""Neighbouring bases of this width cross at 0.7, so that no time is left without one."""
+MIN_WIDTH = 1e-3
+"""Model time; repeated quantiles of few frames would give a width of 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class SharedBasis:
+    """psi(t) = sum_j w_j phi_j(t), phi_j = b_j / sum_k b_k, b_j(t) = exp(-(t - theta_j)^2 / (2 sigma_j^2)).
+
+    theta and sigma are common to all and fixed.
+
+    Divided by their sum, the bases carry motion across a stretch without frames (an instrument in the way) from both of
+    its ends; undivided ones fall back to the canonical state there.
+
+    weight [N, C, B]  trained, in the channel's unit; channels 10:13, if there are any, add to the colour's harmonic 0
+    centre [B]        theta, model time
+    width  [B]        sigma > 0, model time
+    """
+
+    weight: Tensor
+    centre: Tensor
+    width: Tensor
+
+    def __post_init__(self) -> None:
+        bases, channels = self.centre.shape[0], (CHANNELS, CHANNELS_WITH_COLOUR)
+        shape = tuple(self.weight.shape)
+        if len(shape) != 3 or shape[1] not in channels or shape[2] != bases or self.width.shape != (bases,):
+            raise ValueError(
+                f"weight must be [N, {CHANNELS} or {CHANNELS_WITH_COLOUR}, B] with centre and width [B], not {shape}, "
+                f"{tuple(self.centre.shape)} and {tuple(self.width.shape)}"
+            )
+        if not bool((self.width > 0).all()):
+            raise ValueError(f"width must be positive, its least is {float(self.width.min())}")
+
+    @classmethod
+    def initial(
+        cls, count: int, *, bases: int = DEFAULT_BASES, colour: bool = False, times: Sequence[float] | None = None
+    ) -> SharedBasis:
+        """No motion yet: weights 0. Each basis is as wide as 0.6 of the larger gap beside it.
+
+        Args:
+            colour: whether the colour's constant harmonic moves too: 13 channels instead of 10.
+            times: of the training frames; centres lie at their even quantiles, without them evenly over [0, 1].
+
+        Raises:
+            ValueError: bases < 1.
+        """
+        if bases < 1:
+            raise ValueError(f"bases must be at least 1, not {bases}")
+        quantiles = np.linspace(0, 1, bases) if bases > 1 else np.array([0.5])
+        centre = np.quantile(np.asarray(times, np.float64), quantiles) if times is not None else quantiles
+        gaps = np.diff(centre) if bases > 1 else np.ones(1)
+        width = WIDTH_IN_SPACINGS * np.maximum(np.r_[gaps[:1], gaps], np.r_[gaps, gaps[-1:]])[:bases]
+        return cls(
+            weight=torch.zeros(count, CHANNELS_WITH_COLOUR if colour else CHANNELS, bases),
+            centre=torch.from_numpy(centre).float(),
+            width=torch.from_numpy(np.maximum(width, MIN_WIDTH)).float(),
+        )
+
+    @property
+    def kind(self) -> str:
+        return "shared"
+
+    @property
+    def bases(self) -> int:
+        return int(self.weight.shape[2])
+
+    @property
+    def floats_per_gaussian(self) -> int:
+        return int(self.weight.shape[1]) * self.bases
+
+    @property
+    def shared_floats(self) -> int:
+        return 2 * self.bases
+
+    def basis(self, t: float) -> Tensor:
+        """phi at t: [B] in [0, 1], summing to 1."""
+        return torch.softmax(-((t - self.centre) ** 2) / (2 * self.width**2), 0)
+
+    def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
+        """The Gaussians at time t."""
+        offsets = self.weight @ self.basis(t)
+        moved = add_offsets(gaussians, offsets[:, :CHANNELS])
+        if offsets.shape[1] == CHANNELS:
+            return moved
+        constant = moved.sh[:, :1] + offsets[:, None, CHANNELS:]
+        return dataclasses.replace(moved, sh=torch.cat([constant, moved.sh[:, 1:]], 1))
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {"weight": self.weight}
+
+    def constants(self) -> dict[str, Tensor]:
+        return {"centre": self.centre, "width": self.width}
+
+    def select(self, rows: Tensor) -> SharedBasis:
+        return SharedBasis(self.weight[rows], self.centre, self.width)

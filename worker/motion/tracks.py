@@ -1,0 +1,307 @@
+"""Motion known before training: optical flow from the first training frame, lifted to 3D by stereo depth.
+
+Dense flow (DIS) from the reference to every training frame, checked forward against backward, gives each reference
+pixel a track; its displacements and changes of colour are averages of what is trusted about it, the wider the less
+there is (docs/decisions/024), and are fitted by a deformation's bases. Held-out frames are never read.
+
+Symbols: K training frames, h w pixels of the coarse grid on which flow is computed, N points, B bases.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from threading import Lock, Semaphore
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.fusion import Moved, unproject
+from worker.input.clip import DepthClip
+from worker.machine.opencv import cores, one_opencv_thread
+
+Floats = NDArray[np.float32]
+
+FLOW_WIDTH = 320
+"""Flow is computed at the clip's size over the least whole factor that brings its width to this or less, in px."""
+LEAST_SIDE_PX = 16
+"""The coarse grid keeps at least this many cells along the shorter side where the clip has them: DIS needs them."""
+ROUND_TRIP_PX = 1.0
+"""Forward and backward flow disagreeing by this much, in px of the coarse grid, halve a track's confidence or worse."""
+SMOOTH_PX = 4.0
+"""Standard deviation, in px of the coarse grid, over which trusted displacements are averaged: depth is noisy."""
+COLOUR_SMOOTH_PX = 2.0
+"""The same for changes of colour: light falls in smaller patches than tissue moves."""
+STEADINESS = 0.02
+"""Weight of a difference between neighbouring bases against one fully trusted frame; it carries motion across gaps."""
+SURROUNDINGS = 0.1
+"""Weight of the mean of wider surroundings, against 1 of full trust, in an average over the two above."""
+GUESSED = 0.02
+"""Confidence at which what the surroundings do counts where the motion starts: as much as steadiness."""
+RIDGE = 1e-3
+"""Weight of the basis weights themselves, only to keep the system solvable."""
+CHAINS = 2
+"""Parts of the clip that are followed side by side, on any machine: which flow starts which must not depend on the
+number of cores."""
+POINTS_AT_ONCE = 4096
+"""Points fitted together: bounds the memory of their normal equations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Displacement of reference pixels to every training frame, and how their colour changed on the way.
+
+    displacement_mm [K, h, w, 3]  camera frame of the reference (world), mm; averaged over what is trusted
+                                  near by, or farther away where nothing is; 0 in a frame of which nothing is
+    colour          [K, h, w, 3]  colour there less colour here, RGB in [0, 1]; likewise
+    confidence      [K, h, w]     in [0, 1]; 0 where the track is lost, hidden or without depth
+    step_px                       clip pixels between neighbouring cells of the grid
+    """
+
+    displacement_mm: Floats
+    colour: Floats
+    confidence: Floats
+    step_px: int
+
+    def cells(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Row and column in the coarse grid of the clip's pixels, the nearest of the grid where that ends sooner."""
+        last_row, last_column = self.confidence.shape[1] - 1, self.confidence.shape[2] - 1
+        return np.minimum(rows // self.step_px, last_row), np.minimum(columns // self.step_px, last_column)
+
+
+def track(
+    clip: DepthClip,
+    train: Sequence[int],
+    on_progress: Callable[[float], None] = lambda share: None,
+    *,
+    threads: int | None = None,
+) -> Tracks:
+    """Follow the first training frame's tissue through the others; the tracks do not depend on `threads` (None: cores).
+
+    on_progress is called with the share of frames done, which grows, from threads of this function's own, one at a
+    time; what it raises ends the work and is raised here.
+    """
+    step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // LEAST_SIDE_PX))
+    grid = _Grid(clip, step)
+    reference = _Coarse(clip, train[0], grid)
+    displacement, colour = np.zeros((2, len(train), *reference.grey.shape, 3), np.float32)
+    confidence = np.zeros((len(train), *reference.grey.shape), np.float32)
+    confidence[0] = reference.trust
+    followed, counting = 0, Lock()
+
+    def lift(place: int, target: _Coarse, forward: Floats, backward: Floats) -> None:
+        nonlocal followed
+        displacement[place], colour[place], confidence[place] = _lift(reference, target, forward, backward)
+        with counting:
+            followed += 1
+            on_progress(followed / (len(train) - 1))
+
+    def follow(places: Sequence[int]) -> None:
+        flow_solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        forward: Floats | None = None
+        for place in places:  # in order of time: the last flow starts the next
+            target = _Coarse(clip, train[place], grid)
+            forward = flow_solver.calc(reference.grey, target.grey, None if forward is None else forward.copy())
+            backward = flow_solver.calc(target.grey, reference.grey, -forward)
+            helped.run(lift, place, target, forward, backward)
+
+    threads = cores() if threads is None else threads
+    length = -(-len(train) // CHAINS)
+    chains = [range(max(first, 1), min(first + length, len(train))) for first in range(0, len(train), length)]
+    with one_opencv_thread(), ThreadPoolExecutor(min(CHAINS, threads)) as pool, _Helpers(threads - CHAINS) as helped:
+        list(pool.map(follow, chains))
+    return Tracks(displacement, colour, confidence, step)
+
+
+class _Helpers:
+    """Threads that take work off others' hands while they are free: lifting a flow takes longer than finding it."""
+
+    def __init__(self, count: int) -> None:
+        self._free = Semaphore(max(count, 0))
+        self._pool = ThreadPoolExecutor(max(count, 1))
+        self._jobs: deque[Future[None]] = deque()
+
+    def run(self, work: Callable[..., None], *arguments: Any) -> None:
+        """Have work(*arguments) done, by the caller where all helpers are busy; raises what earlier work raised."""
+        if not self._free.acquire(blocking=False):
+            work(*arguments)
+            return
+        job = self._pool.submit(work, *arguments)
+        job.add_done_callback(lambda _: self._free.release())
+        self._jobs.append(job)
+        if self._jobs[0].done():
+            self._jobs.popleft().result()
+
+    def __enter__(self) -> _Helpers:
+        return self
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        self._pool.shutdown()
+        for job in self._jobs if error is None else ():
+            job.result()
+
+
+def cell_means(image: NDArray[Any], step: int) -> NDArray[Any]:
+    """[h, w, ...] means of the cells of step by step pixels, from the upper left; pixels beyond the last are left out,
+    so that cell (i, j) is of the pixels from (step i, step j) whatever the image's size."""
+    h, w = image.shape[0] // step, image.shape[1] // step
+    means: NDArray[Any] = cv2.resize(image[: h * step, : w * step], (w, h), interpolation=cv2.INTER_AREA)
+    return means
+
+
+class _Grid:
+    """The coarse grid: which pixels it samples and where they look. h w cells, step pixels apart."""
+
+    def __init__(self, clip: DepthClip, step: int) -> None:
+        height, width = clip.tissue.shape[1:]
+        self.step, self.size = step, (width // step, height // step)
+        rows, columns = np.mgrid[0 : self.size[1], 0 : self.size[0]] * step + step // 2
+        pixels = (rows * width + columns).ravel()
+        rays = unproject(pixels, np.ones(pixels.size, np.float32), clip.intrinsics, np.eye(4))
+        self.rays = rays.reshape(*rows.shape, 3).astype(np.float32)
+        """[h, w, 3] points at depth 1 in the camera's frame."""
+
+    def sample(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The cells' middle pixels of an image: [h, w]; a view."""
+        return values[self.step // 2 :: self.step, self.step // 2 :: self.step][: self.size[1], : self.size[0]]
+
+
+class _Coarse:
+    """A frame on the coarse grid: colour, grey, camera points (world, mm), and how far to trust depth and mask."""
+
+    def __init__(self, clip: DepthClip, index: int, grid: _Grid) -> None:
+        self.grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), grid.step)
+        self.rgb = np.asarray(cell_means(clip.rgb[index], grid.step) / np.float32(255), np.float32)
+        depth_mm = grid.sample(clip.depth_mm[index])
+        usable = grid.sample(clip.tissue[index]) & (depth_mm > 0)
+        pose = clip.world_from_camera[index].astype(np.float32)
+        camera_mm = grid.rays * np.where(usable, depth_mm, np.float32(1))[..., None]
+        self.points_mm: Floats = camera_mm @ pose[:3, :3].T + pose[:3, 3]
+        confidence = grid.sample(clip.depth_confidence[index]) / np.float32(255)
+        self.trust = np.where(usable, confidence, np.float32(0))
+
+
+def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats) -> tuple[Floats, Floats, Floats]:
+    """Displacement (mm), change of colour and confidence of every reference cell, given the flows there and back."""
+    rows, columns = np.mgrid[0 : forward.shape[0], 0 : forward.shape[1]].astype(np.float32)
+    x, y = columns + forward[..., 0], rows + forward[..., 1]
+
+    def at_target(values: Floats) -> Floats:
+        moved: Floats = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        return moved
+
+    round_trip = forward + at_target(backward)
+    trust = at_target(target.trust)
+    agree = 1 / (1 + (np.square(round_trip).sum(-1) / ROUND_TRIP_PX**2) ** 2)
+    confidence = reference.trust * trust * (trust > 0.5) * agree
+    point_mm = at_target(target.points_mm * target.trust[..., None]) / np.maximum(trust, 1e-3)[..., None]
+    displacement = _averaged(np.subtract(point_mm, reference.points_mm), confidence, SMOOTH_PX)
+    colour = _averaged(np.subtract(at_target(target.rgb), reference.rgb), confidence, COLOUR_SMOOTH_PX)
+    return displacement, colour, np.minimum(confidence, 1).astype(np.float32)
+
+
+def _averaged(values: Floats, confidence: Floats, over_px: float) -> Floats:
+    """Normalised convolution: a Gaussian mean [h, w, 3] in which only trusted neighbours count, completed from wider
+    and wider surroundings as far as there are none."""
+    weight = np.asarray(cv2.GaussianBlur(confidence, (0, 0), over_px), np.float32)
+    return _completed(cv2.GaussianBlur(values * confidence[..., None], (0, 0), over_px), weight)
+
+
+def _completed(total: Floats, weight: Floats) -> Floats:
+    """total [h, w, 3] by weight [h, w], with the same of a grid half as fine as one more observation (pull-push)."""
+    height, width = weight.shape
+    if min(height, width) < 2:
+        return np.broadcast_to(total.sum((0, 1)) / max(float(weight.sum()), 1e-9), total.shape).astype(np.float32)
+    half = ((width + 1) // 2, (height + 1) // 2)
+    coarse = _completed(*(np.asarray(cv2.resize(x, half, interpolation=cv2.INTER_AREA)) for x in (total, weight)))
+    wider = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray((total + SURROUNDINGS * wider) / (weight + SURROUNDINGS)[..., None], np.float32)
+
+
+def moved_along(tracks: Tracks, train: Sequence[int], width: int) -> Moved:
+    """The tracks as fusion asks for them; train are the clip's frames that they are of, width the clip's in px."""
+    place_of = {index: place for place, index in enumerate(train)}
+
+    def moved(index: int, pixels: NDArray[np.intp]) -> Floats:
+        found: Floats = tracks.displacement_mm[place_of[index]][tracks.cells(*np.divmod(pixels, width))]
+        return found
+
+    return moved
+
+
+def resting(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> Tracks:
+    """What the tracks would be if nothing had moved: no displacement, colour as it changed in place, as trusted where
+    tissue alone is seen there."""
+    step, colour, confidence = tracks.step_px, np.empty_like(tracks.colour), np.empty_like(tracks.confidence)
+    start = cell_means(clip.rgb[train[0]], step).astype(np.float32)
+    for place, index in enumerate(train):
+        tissue = cell_means(clip.tissue[index].astype(np.uint8) * np.uint8(255), step) == 255
+        confidence[place] = np.where(tissue, tracks.confidence[place], 0)
+        change = (cell_means(clip.rgb[index], step) - start) / np.float32(255)
+        colour[place] = _averaged(change, confidence[place], COLOUR_SMOOTH_PX)
+    return Tracks(np.zeros_like(tracks.displacement_mm), colour, confidence, step)
+
+
+def fit_tracks(
+    tracks: Tracks,
+    basis: NDArray[np.float64],
+    pixels: NDArray[np.intp],
+    width: int,
+    *,
+    share_px: int = 1,
+    guessed: float = 0.0,
+) -> tuple[Floats, Floats]:
+    """Weights of the bases for points of the reference frame, by weighted least squares over the training frames.
+
+    Minimises sum_k max(c_k, g_k) |basis_k . w - d_k|^2 + STEADINESS sum_j |w_{j+1} - w_j|^2 + RIDGE |w|^2 for each
+    point.
+
+    Args:
+        basis: [K, B] value of every basis at every training time.
+        pixels: [N] flat pixel indices (row * width + column) of the points in the reference frame.
+        width: of the clip, px.
+        share_px: points in the same square of this many pixels get the same weights, those of its first pixel.
+        guessed: g_k, the least that counts of a frame as trusted as the most trusted one, for what the surroundings do
+            is better than nothing; of others as much less as they are trusted less.
+
+    Returns:
+        weights [N, B, 6], of the displacement in mm and of the colour; support [N], the mean confidence of the
+        point's track.
+    """
+    rows, columns = (place // share_px * share_px for place in np.divmod(pixels, width))
+    shared, member = np.unique(rows * width + columns, return_inverse=True)
+    row, column = tracks.cells(*np.divmod(shared, width))
+    weights = np.zeros((len(shared), basis.shape[1], 6), np.float32)
+    support = np.zeros(len(shared), np.float32)
+
+    trust = tracks.confidence.mean((1, 2))
+    least = guessed * trust / max(float(trust.max()), 1e-9)
+
+    def fit(first: int) -> None:
+        some = slice(first, first + POINTS_AT_ONCE)
+        confidence = tracks.confidence[:, row[some], column[some]]  # [K, points]
+        changes = [values[:, row[some], column[some]] for values in (tracks.displacement_mm, tracks.colour)]
+        weights[some] = fit_series(np.concatenate(changes, axis=-1), np.maximum(confidence, least[:, None]), basis)
+        support[some] = confidence.mean(0)
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(fit, range(0, len(shared), POINTS_AT_ONCE)))
+    return weights[member], support[member]
+
+
+def fit_series(
+    series: NDArray[np.floating], confidence: NDArray[np.floating], basis: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The least squares of fit_tracks: series [K, N, C], confidence [K, N], basis [K, B] -> weights [N, B, C]."""
+    bases, (_, points, channels) = basis.shape[1], series.shape
+    difference = np.diff(np.eye(bases), axis=0)
+    prior = STEADINESS * difference.T @ difference + RIDGE * np.eye(bases)
+    outer = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
+    normal = (confidence.T @ outer).reshape(points, bases, bases) + prior
+    trusted = (series * confidence[..., None]).reshape(len(basis), -1)
+    right = (basis.T @ trusted).reshape(bases, points, channels).transpose(1, 0, 2)
+    return np.asarray(np.linalg.solve(normal, right), np.float64)

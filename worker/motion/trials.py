@@ -1,0 +1,150 @@
+"""Tracks of training frames that are left out, as bases fitted to the other training frames predict them.
+
+Symbols: K training frames, k of them left out, n sampled cells of the tracks' grid, B bases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.fusion import unproject
+from worker.input.clip import DepthClip
+from worker.model.deformation import SharedBasis
+from worker.motion.tracks import Tracks, cell_means, fit_series
+
+Reals = NDArray[np.float64]
+
+CELLS = 1000
+"""Tracks on which bases are tried."""
+TRIED_ON_EVERY, FIRST_TRIED_ON = 4, 2
+"""Bases are tried on every fourth training frame, from the third on, and fitted to the others."""
+TRUSTED = 0.3
+"""Mean confidence a track needs to be tried on."""
+
+
+@dataclass(frozen=True)
+class Missed:
+    """What a number of bases would leave in frames it was not fitted to, squared grey levels: of motion, by which the
+    picture changes where the track starts, and of light, the change of colour along the track."""
+
+    motion: float
+    light: float
+
+    @property
+    def total(self) -> float:
+        return self.motion + self.light
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Trusted tracks, evenly over those there are, and which training frames are left out.
+
+    places           [n]        pixels of the first training frame, flat
+    world_mm         [n, 3]     where they start
+    displacement_mm  [K, n, 3]
+    colour           [K, n, 3]  change, in grey levels
+    confidence       [K, n]
+    left_out         [K]
+    """
+
+    clip: DepthClip
+    train: Sequence[int]
+    step_px: int
+    places: NDArray[np.intp]
+    world_mm: Reals
+    displacement_mm: Reals
+    colour: Reals
+    confidence: Reals
+    left_out: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> Trial:
+        """train are the clip's frames that the tracks are of."""
+        frames, height, width = tracks.confidence.shape
+        step, reference = tracks.step_px, train[0]
+        rows, columns = np.divmod(np.arange(height * width), width)
+        places = (rows * step + step // 2) * clip.intrinsics.width + columns * step + step // 2
+        depth_mm = clip.depth_mm[reference].reshape(-1)[places]
+        trusted = np.flatnonzero((tracks.confidence.mean(0).reshape(-1) > TRUSTED) & (depth_mm > 0))
+        some = trusted[np.linspace(0, len(trusted) - 1, min(CELLS, len(trusted))).round().astype(np.intp)]
+
+        def of_some(values: NDArray[np.floating], *channels: int) -> Reals:
+            return values.reshape(frames, -1, *channels)[:, some].astype(np.float64)
+
+        left_out = np.zeros(frames, np.bool_)
+        left_out[FIRST_TRIED_ON::TRIED_ON_EVERY] = True
+        return cls(
+            clip=clip,
+            train=train,
+            step_px=step,
+            places=places[some],
+            world_mm=unproject(places[some], depth_mm[some], clip.intrinsics, clip.world_from_camera[reference]),
+            displacement_mm=of_some(tracks.displacement_mm, 3),
+            colour=255 * of_some(tracks.colour, 3),
+            confidence=of_some(tracks.confidence),
+            left_out=left_out,
+        )
+
+    def missed(self, bases: int) -> Missed:
+        """Mean squared error a channel of what so many bases predict."""
+        displacement_mm, colour = self._predicted(bases)
+        off_mm = self.displacement_mm[self.left_out] - displacement_mm
+        motion = (self._grey_per_mm() @ off_mm[..., None])[..., 0]
+        light = self.colour[self.left_out] - colour
+        return Missed(self._mean_square(motion), self._mean_square(light))
+
+    def picture_error(self, bases: int) -> float:
+        """Mean squared difference a channel, in grey levels, of the pixels of the frames left out, where so many bases
+        place the tracks, from those where the tracks start with the predicted change of colour."""
+        displacement_mm, colour = self._predicted(bases)
+        k, start = self.clip.intrinsics, self.clip.rgb[self.train[0]].reshape(-1, 3)[self.places]
+        expected, shown = start + colour, np.empty_like(colour)
+        for place, frame in enumerate(np.asarray(self.train)[self.left_out]):
+            pose = self.clip.world_from_camera[frame]
+            x, y, z = ((self.world_mm + displacement_mm[place] - pose[:3, 3]) @ pose[:3, :3]).T
+            column, row = (k.fx * x / z + k.cx - 0.5)[:, None], (k.fy * y / z + k.cy - 0.5)[:, None]
+            image, places = self.clip.rgb[frame].astype(np.float32), (column.astype(np.float32), row.astype(np.float32))
+            shown[place] = cv2.remap(image, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        return self._mean_square(shown - expected)
+
+    def _predicted(self, bases: int) -> tuple[Reals, Reals]:
+        """Displacement (mm) and change of colour (grey levels) [k, n, 3] in the frames left out, of the tracks fitted
+        to the others as motion.py fits: by as large a share of the bases as of the frames."""
+        times = np.array([float(self.clip.t[index]) for index in self.train])
+        kept = ~self.left_out
+        fitted = max(min(2, bases), round(kept.mean() * bases))
+        shared = SharedBasis.initial(1, bases=fitted, times=times[kept].tolist())
+        basis = np.stack([shared.basis(float(t)).double().numpy() for t in times])
+        series = np.concatenate([self.displacement_mm, self.colour], axis=2)
+        weights = fit_series(series[kept], self.confidence[kept], basis[kept])
+        predicted = (basis[self.left_out] @ weights).transpose(1, 0, 2)
+        return predicted[..., :3], predicted[..., 3:]
+
+    def _mean_square(self, off: Reals) -> float:
+        """[k, n, 3] of the frames left out: a track counts as far as it is trusted."""
+        weight = self.confidence[self.left_out]
+        return float((np.square(off).mean(-1) * weight).sum() / max(weight.sum(), 1e-9))
+
+    def _grey_per_mm(self) -> Reals:
+        """[n, 3 channels, 3 axes] grey levels by which the picture changes at a track's start as the tissue moves."""
+        k, pose = self.clip.intrinsics, self.clip.world_from_camera[self.train[0]]
+        across, along, z = ((self.world_mm - pose[:3, 3]) @ pose[:3, :3]).T[..., None]
+        right, down, away = pose[:3, :3].T  # camera axes in the world
+        px_per_mm = np.stack(
+            [k.fx / z * (right - across / z * away), k.fy / z * (down - along / z * away)], axis=1
+        )  # [n, 2, 3]
+        rows, columns = np.divmod(self.places, k.width)
+        slopes = _slopes(self.clip.rgb[self.train[0]], self.step_px)
+        return np.asarray(slopes[rows // self.step_px, columns // self.step_px] @ px_per_mm)
+
+
+def _slopes(rgb: NDArray[np.uint8], step: int) -> Reals:
+    """[h, w, 3, 2] grey levels a clip pixel to the right and down, on the tracks' grid of h w cells."""
+    small = cell_means(rgb, step).astype(np.float32)
+    slopes = [cv2.Scharr(small, cv2.CV_32F, int(axis == 0), int(axis == 1)) / (32 * step) for axis in range(2)]
+    return np.stack(slopes, axis=-1).astype(np.float64)

@@ -1,0 +1,129 @@
+"""Which device computes, and the model for it: an NVIDIA GPU by Triton's kernels, or the processor by Numba's."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+
+from contract.wire.errors import InputError, UnavailableError
+from contract.wire.names import DeviceName
+from worker.machine.gpu import Gpu, find_gpu
+from worker.model.deformation import Deformation, HexPlane
+from worker.model.gaussians import Gaussians
+from worker.raster.cpu.model import FusedModel
+from worker.raster.model import Model
+from worker.raster.unfused import UnfusedModel
+
+CPU_ALONE = frozenset({"hexplane"})
+"""Kinds of motion without kernels of their own: torch moves the Gaussians, on the processor."""
+
+CPU_BY_OPTION, CPU_BY_VARIABLE = "--device cpu", "INTRASPLAT_DEVICE=cpu"
+"""How the CPU is chosen for one reconstruction, and for a worker."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where a model is trained and rendered.
+
+    kind    what the user calls it
+    name    the GPU's own, in reports
+    memory  where its tensors lie, as torch calls it
+    """
+
+    kind: Literal["cpu", "cuda"]
+    name: str = ""
+    memory: str = "cpu"
+
+    def __str__(self) -> str:
+        return f"{self.kind} ({self.name})" if self.name else self.kind
+
+
+CPU = Device("cpu")
+
+
+def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OPTION) -> Device:
+    """The device for auto, cpu or cuda; auto takes the GPU where everything is there that it takes.
+
+    Args:
+        gpu: what there is; None looks.
+        cpu_by: how the caller's user chooses the CPU, for the remedy.
+
+    Raises:
+        InputError: there is no device of that name.
+        UnavailableError: cuda is asked for, and something is missing.
+    """
+    if asked not in get_args(DeviceName):
+        raise InputError("options.device", f"there is no device {asked!r}.", "Use auto, cpu or cuda.")
+    if asked == "cpu":
+        return CPU
+    gpu = gpu or find_gpu()
+    if gpu.name is not None and not gpu.missing:
+        return Device("cuda", gpu.name, "cuda")
+    if asked == "auto":
+        return CPU
+    problem = f"device 'cuda' was asked for, but {gpu.missing}."
+    raise UnavailableError(problem, f"{gpu.remedy}, or train on the CPU: {cpu_by}.")
+
+
+def examine(device: Device) -> float:
+    """See once a process that a GPU splats as the reference does; seconds it took, nearly all of them for compilation.
+
+    Raises:
+        UnavailableError: it does not.
+    """
+    start = time.perf_counter()
+    if device.kind == "cuda":
+        from worker.raster.cuda import agreement
+
+        agreement.check(device.memory, device.name)
+    return time.perf_counter() - start
+
+
+def gpu_is_lost() -> bool:
+    """Whether an error has ended what this process may do with its GPU: from then on every use of it fails."""
+    if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
+        return False
+    try:
+        # Not the whole device: another thread may be capturing a graph, which nobody may wait for.
+        torch.cuda.current_stream().synchronize()
+    except RuntimeError:
+        return True
+    return False
+
+
+def device_for(deformation: str, asked: str, gpu: Gpu | None = None) -> Device:
+    """choose_device for training a motion of this kind: auto trains one without kernels for a GPU on the CPU.
+
+    Raises:
+        InputError: cuda is asked for, and the motion trains on the CPU only; or there is no device of that name.
+        UnavailableError: as choose_device.
+    """
+    device = choose_device(asked, gpu)
+    if device.kind == "cpu" or deformation not in CPU_ALONE:
+        return device
+    if asked == "cuda":
+        problem = f"cuda was asked for, but motion {deformation!r} trains on the CPU only."
+        raise InputError("options.device", problem, "Use auto or cpu, or another preset.")
+    return CPU
+
+
+def make_model(gaussians: Gaussians, deformation: Deformation, width: int, height: int, device: Device = CPU) -> Model:
+    """The Gaussians (on the host) and their motion in the form that the device trains and renders.
+
+    A motion without kernels of its own lies on the CPU, whatever the device. Triton is imported for a GPU alone.
+
+    Raises:
+        UnavailableError: as examine.
+    """
+    if isinstance(deformation, HexPlane):
+        return UnfusedModel(gaussians, deformation, width, height)
+    if device.kind == "cpu":
+        return FusedModel(gaussians, deformation, width, height)
+    from worker.raster.cuda.model import CudaModel
+
+    examine(device)
+    model: Model = CudaModel(gaussians, deformation, width, height, device.memory)
+    return model

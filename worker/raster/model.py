@@ -1,0 +1,122 @@
+"""What training needs of a model, whatever computes its steps: Gaussians, their deformation and Adam's moments.
+
+Symbols: N Gaussians; H W pixels, as many as the camera says; F frames a step.
+Implementations: worker/raster/cpu/model.py, worker/raster/cuda/model.py, and worker/raster/unfused.py for deformations
+without kernels of their own. worker/raster/backend.py makes the one for a device.
+
+A device may lag behind: step() returns before its step is made. Every other method waits for the steps before it, so
+none ever sees a model between two steps. What has to be known of steps that nobody waited for, whether their loss is a
+number and any Gaussian in view, comes with the next answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from worker.model.deformation import Deformation
+from worker.model.gaussians import Gaussians
+from worker.model.loss import LossSettings
+from worker.model.optimize import StepRates
+from worker.raster.step import StepSums, TrainingFrame
+
+Floats = NDArray[np.float32]
+
+
+class Model(Protocol):
+    """A scene that can be trained, on one frame a step or several, rendered, and edited between two steps.
+
+    Tensors lie on the model's device; NumPy arrays on the host.
+    """
+
+    @property
+    def count(self) -> int:
+        """N."""
+        ...
+
+    @property
+    def answers_every(self) -> int:
+        """Steps from one answer to the next; 1 where every step is waited for."""
+        ...
+
+    def step(
+        self, frames: Sequence[TrainingFrame], loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
+    ) -> StepSums | None:
+        """One iteration (counted from 1): one step of Adam down the sum of the frames' losses.
+
+        Args:
+            frames: F of one size, a frame among them more than once if it likes. Buffers are for the F of the last
+                step; another F makes new ones.
+            sh_degree: the harmonics in use at this iteration.
+
+        Returns:
+            What the steps since the last answer add up to; None where the device has not been asked.
+        """
+        ...
+
+    def wait(self) -> StepSums | None:
+        """Return when every step is made: their sums, or None if there was none since the last answer."""
+        ...
+
+    @property
+    def gradient_norm(self) -> Tensor:
+        """[N] float32 |dL/dmean2d| of the last step in NDC (the image is 2 wide and 2 high), the largest of its frames;
+        a view."""
+        ...
+
+    @property
+    def visible(self) -> Tensor:
+        """[N] bool, whether any of the last step's frames could see each: in front of the camera, in the image, not too
+        faint."""
+        ...
+
+    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
+        """R G B Z A, [5, H, W], Z = sum(w z) in units; a view that the next render overwrites.
+
+        With values [N], a number a Gaussian, they are blended as colour is, and [6, H, W] ends with them.
+        """
+        ...
+
+    def blend_values(self, values: Floats) -> Floats:
+        """Further values [N], blended as colour was in the last render: [H, W]; a view."""
+        ...
+
+    def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
+        """Gradient of sum(cotangents * render(camera, t)), cotangents [5, H, W], to the Gaussians as they are at t.
+
+        [14, N]: mean 0:3, quaternion 3:7, log-scale 7:10, constant harmonic 10:13 (as if no colour were held above 0),
+        opacity logit 13. Other harmonics are left out.
+        """
+        ...
+
+    def deformed_mean(self, t: float) -> Floats:
+        """Centres at time t, [3, N] in units, as a copy."""
+        ...
+
+    def take(self, columns: NDArray[np.int64], fresh: NDArray[np.bool_]) -> None:
+        """Keep these Gaussians, in this order (repeats are copies); Adam's moments start at 0 where fresh."""
+        ...
+
+    def parameters(self) -> dict[str, Tensor]:
+        """What is trained, by name; views of the live tensors, on every device of one shape. May be written.
+
+        Among them: canonical [13, N] (mean 0:3, quaternion 3:7, log-scale 7:10, constant harmonic 10:13) and
+        opacity_logit [N].
+        """
+        ...
+
+    def arrays(self) -> dict[str, Tensor]:
+        """Everything a resumed run needs, by name; likewise."""
+        ...
+
+    def load_arrays(self, stored: dict[str, Tensor]) -> None:
+        """Put back what arrays() gave, on any device, into a model of the same size; ValueError if the sizes differ."""
+        ...
+
+    def export(self) -> tuple[Gaussians, Deformation]:
+        """The Gaussians and their deformation as tensors on the host (copies)."""
+        ...

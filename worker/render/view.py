@@ -1,0 +1,142 @@
+"""Frames of a stored scene: any time, any pose, any pinhole camera; colour, depth and how far to trust each pixel.
+
+N Gaussians, H W pixels. Scenes keep their kernels' buffers between frames, so the second frame of a size is fast.
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from worker.input.camera import Intrinsics
+from worker.model.metrics import COVERED_ALPHA
+from worker.raster.backend import CPU, Device, make_model
+from worker.raster.model import Model
+from worker.raster.step import camera_vector
+from worker.scene.checkpoint import Scene
+from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
+
+POSE_FALL_OFF = 0.25
+"""Distance from the nearest trained pose, in median depths, at which confidence has fallen to exp(-1/2): 14 degrees."""
+FAR_POSE = 0.35
+"""In the same unit: from here on the frame carries a warning, for it shows sides the clip never saw."""
+LOW_CONFIDENCE, MANY = 0.3, 0.1
+"""A frame warns when this share of its pixels lies below this confidence."""
+HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
+ROUNDING = 1e-6
+"""Model time by which t may exceed the last frame's without a warning: i / T need not survive a decimal fraction."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One rendered view.
+
+    rgb        [H, W, 3] uint8
+    depth_mm   [H, W] float32, camera z, 0 where nothing solid is
+    confidence [H, W] float32 in [0, 1]: share of training frames that saw the blended Gaussians, times their stereo
+               confidence, times a fall-off with the distance from the trained poses
+    warnings   what to distrust about this frame
+    """
+
+    rgb: NDArray[np.uint8]
+    depth_mm: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    warnings: tuple[str, ...]
+
+
+def model_of(scene: Scene, device: Device = CPU) -> Model:
+    """The scene's Gaussians and their motion in the form that the device renders."""
+    size = scene.intrinsics.width, scene.intrinsics.height
+    return make_model(scene.gaussians, scene.deformation, *size, device)
+
+
+class SceneRenderer:
+    """A scene ready to be rendered on a device. Serialises its callers: the kernels share buffers."""
+
+    def __init__(self, scene: Scene, device: Device = CPU) -> None:
+        self._scene = weakref.ref(scene)
+        self._model = model_of(scene, device)
+        self._is_vouched = bool(scene.seen.any())
+        self._lock = Lock()
+
+    def layers(
+        self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """R G B Z A [5, H, W], Z unnormalised in units, and the blended `seen` of the Gaussians [H, W], as copies."""
+        scene = self._scene()
+        assert scene is not None
+        camera = camera_vector(camera_in_units(intrinsics, world_from_camera, scene.units_per_mm))
+        with self._lock:
+            # Of a snapshot nothing is known yet: nothing is blended, and 0 is shown.
+            image = self._model.render(camera, t, scene.seen.numpy() if self._is_vouched else None).copy()
+        seen = image[5] if self._is_vouched else np.zeros_like(image[0])
+        return image[:5], seen
+
+
+_renderers: weakref.WeakKeyDictionary[Scene, dict[Device, SceneRenderer]] = weakref.WeakKeyDictionary()
+_renderers_lock = Lock()
+
+
+def renderer_of(scene: Scene, device: Device = CPU) -> SceneRenderer:
+    """The scene's renderer on a device, made at its first frame there and kept as long as the scene is."""
+    with _renderers_lock:
+        made = _renderers.setdefault(scene, {})
+        if device not in made:
+            made[device] = SceneRenderer(scene, device)
+        return made[device]
+
+
+def endoscope_pose(scene: Scene, t: float) -> NDArray[np.float64]:
+    """world_from_camera [4, 4] (mm) of the endoscope at model time t, between frames interpolated."""
+    poses, count = scene.world_from_camera, scene.frame_count
+    place = min(max(t * count, 0.0), count - 1.0)
+    before = min(int(place), max(count - 2, 0))
+    if count == 1 or np.array_equal(poses[before], poses[before + 1]):
+        return np.array(poses[before])
+    share = place - before
+    pose = np.eye(4)
+    pose[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(poses[before : before + 2, :3, :3]))(share).as_matrix()
+    pose[:3, 3] = (1 - share) * poses[before, :3, 3] + share * poses[before + 1, :3, 3]
+    return pose
+
+
+def render_frame(
+    scene: Scene,
+    t: float,
+    world_from_camera: NDArray[np.float64] | None = None,
+    intrinsics: Intrinsics | None = None,
+    device: Device = CPU,
+) -> Frame:
+    """The scene at model time t (held within the clip) from a pose (mm; None: the endoscope's) through a camera."""
+    last = (scene.frame_count - 1) / scene.frame_count
+    shown = min(max(t, 0.0), last)
+    warnings = []
+    if not 0.0 <= t <= last + ROUNDING:
+        warnings.append(f"t = {t:g} lies outside the clip; t = {shown:.4g} is shown.")
+    pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
+    image, seen = renderer_of(scene, device).layers(shown, pose, intrinsics or scene.intrinsics)
+    alpha = image[4]
+    solid = alpha >= COVERED_ALPHA
+    depth_mm = solid_depth_mm(image[3], alpha, scene.units_per_mm)
+    distance = _distance_from_trained(scene, pose)
+    fall_off = float(np.exp(-0.5 * (distance / POSE_FALL_OFF) ** 2))
+    confidence = np.where(solid, np.clip(seen / np.where(solid, alpha, 1) * fall_off, 0, 1), 0).astype(np.float32)
+    if distance > FAR_POSE:
+        warnings.append(f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess.")
+    if (confidence < LOW_CONFIDENCE).mean() > MANY:
+        warnings.append(HARDLY_SEEN)
+    rgb = np.clip(image[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255).astype(np.uint8)
+    return Frame(rgb, depth_mm, confidence, tuple(warnings))
+
+
+def _distance_from_trained(scene: Scene, pose: NDArray[np.float64]) -> float:
+    """Distance of the camera's centre from the nearest trained one, in median depths of the clip."""
+    frames = [round(t * scene.frame_count) for t in scene.trained_t]
+    centres = scene.world_from_camera[frames][:, :3, 3]
+    nearest_mm = float(np.linalg.norm(centres - pose[:3, 3], axis=1).min())
+    return nearest_mm * scene.units_per_mm / MEDIAN_DEPTH_UNITS

@@ -1,0 +1,228 @@
+"""What in the pictures, masks and poses of a clip makes its scene doubtful, in plain words.
+
+Symbols: T frames, H W pixels. Each check is one number and one bound. The bounds lie between what clean clips show,
+real and synthetic, and what harms a scene (docs/decisions/016-stability.md). Held-out frames are not looked at.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.input.clip.split import REPEAT_LEVELS
+from worker.input.clip.types import DepthClip
+
+ANALYSED_WIDTH = 640
+"""Larger pictures are shrunk to it first: 4K endoscopes are soft from pixel to pixel, and in focus all the same."""
+DARK_PERCENTILE, DARKEST_VEILED = 5.0, 85.0
+"""Of each pixel's weakest colour: at most 68 of 255 in clean clips, and 90 behind a veil that takes a quarter."""
+FOCUS_SIGMAS_PX = (1.0, 2.0)
+LEAST_FINE_DETAIL = 0.62
+"""Detail below 1 px over that of 1 to 2 px: 0.71 to 1.7 in clean clips, 0.58 where all is blurred by 1.5 px."""
+LEAST_DETAIL_LEVELS = 0.4
+"""Of 255; below it there is nothing to be sharp: that is said of the texture."""
+LEAST_EQUAL_DETAIL = 0.75
+"""Of a frame's fine detail beside that of the clip's sharpest: 0.93 and more in clean clips."""
+FEWEST_FRAMES_SEEN = 2
+"""Of the frames looked at: one alone may be an accident."""
+LARGEST_COLOUR_DRIFT = 0.25
+"""Range of the median red over green, or blue over green, over its mean."""
+BLOOD_RATIO, LARGEST_FLOODED_SHARE = 3.0, 0.1
+"""Red over green of blood, and by how much its share of the tissue may change: by 0.005 in clean clips."""
+LARGEST_REPEATED_SHARE = 0.1
+LARGEST_HIDDEN_SHARE = 0.4
+LONGEST_FLICKER = 3
+"""Frames: no instrument leaves the picture and is back so soon."""
+LEAST_INSTRUMENT = 0.02
+"""Share of the picture; less may be an instrument's tip that comes and goes."""
+SURE = 128
+"""Of depth_confidence's 255: what stereo itself doubts is told of elsewhere."""
+DEPTH_JUMP, LARGEST_JUMPING_SHARE = 0.1, 0.03
+"""Of the depth from frame to frame, and of the tissue: 0.012 at most in clean clips, 0.05 with gross errors on 0.05."""
+MOST_PAIRS = 8
+LARGEST_JITTER = 0.003
+"""Of the picture's width: how far poses that jump to and fro move the tissue in it, 2 px of 640."""
+LARGEST_ROUGHNESS = 1.0
+"""Median change of step over median step: a smooth path has far less than 1, independent errors have 1.7."""
+
+
+def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[str]:
+    """Doubts about the pictures of some training frames: veiled, out of focus, smeared, of changing colour."""
+    seen = [index for index in sampled if clip.tissue[index].any()]
+    if not seen:
+        return []
+    found = []
+    dark = [_darkest(clip, index) for index in seen]
+    if sum(each > DARKEST_VEILED for each in dark) >= min(FEWEST_FRAMES_SEEN, len(seen)):
+        found.append(
+            f"Even the dark tissue is pale, {max(dark):.0f} of 255 in every colour: smoke, a fogged lens or too much "
+            "light takes its contrast, and the model shows the veil as if it were tissue."
+        )
+    return found + _focus_doubts(clip, seen) + _colour_doubts(clip, seen)
+
+
+def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
+    """Doubts about how the training frames follow each other: repeated, hidden at first, masks or poses that jump."""
+    found = []
+    pairs = list(itertools.pairwise(train))
+    repeated = sum(_repeats(clip.rgb[earlier], clip.rgb[later]) for earlier, later in pairs)
+    if repeated > LARGEST_REPEATED_SHARE * len(train):
+        found.append(
+            f"{repeated} of {len(train)} training frames repeat the one before: motion stands still there and then "
+            "jumps. Give the frames as recorded, without those that were filled in."
+        )
+    hidden = np.zeros(clip.tissue.shape[1:], np.bool_)
+    for index in train[1:]:
+        hidden |= clip.tissue[index]
+    share = float((hidden & ~clip.tissue[train[0]]).mean()) if train else 0.0
+    if share > LARGEST_HIDDEN_SHARE:
+        found.append(
+            f"Masks hide {share:.0%} of the picture in the first frame that later ones show; there the model starts "
+            "from those."
+        )
+    flickering = _flickering(np.array([1 - clip.tissue[index].mean() for index in train]))
+    if flickering:
+        found.append(
+            f"{flickering} frames have no mask although those before and after have: their instrument is modelled as "
+            "if it were tissue."
+        )
+    return found + _depth_doubts(clip, train) + _pose_doubts(clip, train)
+
+
+def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[str]:
+    measured = [_fine_detail(clip, index) for index in frames]
+    detail = np.array([each for each in measured if each is not None])
+    if not detail.size:
+        return []
+    if np.median(detail) < LEAST_FINE_DETAIL:
+        return ["The picture has no fine detail: it is out of focus, or was enlarged; the scene is as soft."]
+    smeared = int((detail < LEAST_EQUAL_DETAIL * detail.max()).sum())
+    if smeared < FEWEST_FRAMES_SEEN:
+        return []
+    return [f"{smeared} of {detail.size} frames looked at are blurred beside the others; motion in them is guessed."]
+
+
+def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[str]:
+    """Blood that comes in, or else a white balance that drifts."""
+    flooded = float(np.ptp([_blood_share(clip, index) for index in frames]))
+    if flooded > LARGEST_FLOODED_SHARE:
+        return [
+            f"Blood covers {flooded:.0%} more of the tissue in some frames than in others: what it hides there is not "
+            "seen, and it has no texture to follow."
+        ]
+    ratios = np.array([_colour_ratios(clip, index) for index in frames])
+    drift = np.ptp(ratios, axis=0) / np.maximum(ratios.mean(axis=0), 1e-6)
+    if drift.max() <= LARGEST_COLOUR_DRIFT:
+        return []
+    worst = int(drift.argmax())
+    low, high = ratios[:, worst].min(), ratios[:, worst].max()
+    return [
+        f"The tissue's colour changes during the clip ({('red', 'blue')[worst]} over green from {low:.2f} to "
+        f"{high:.2f}): the white balance drifts, and the model shows it."
+    ]
+
+
+def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
+    """No tissue comes a tenth nearer within a frame; where depth does, on much of the tissue, it is wrong."""
+    wanted = set(train)
+    first = [index for index in train if index + 1 in wanted]
+    jumps, total = 0, 0
+    for index in first[:: -(-len(first) // MOST_PAIRS) or 1]:
+        pair = slice(index, index + 2)
+        sure = (clip.tissue[pair] & (clip.depth_confidence[pair] >= SURE)).all(axis=0)
+        before, after = clip.depth_mm[index][sure], clip.depth_mm[index + 1][sure]
+        jumps += int((np.abs(after - before) > DEPTH_JUMP * before).sum())
+        total += before.size
+    if jumps <= LARGEST_JUMPING_SHARE * total:
+        return []
+    return [
+        f"Depth jumps by more than {DEPTH_JUMP:.0%} from one frame to the next on {jumps / total:.0%} of the tissue: "
+        "much of it is wrong, and so are distances in this scene."
+    ]
+
+
+def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
+    """Poses that err independently jump to and fro: the change of step is larger than the step itself.
+
+    Looked at is the point on the optical axis at the tissue's median depth, which errors of place and of angle move.
+    """
+    wanted = set(train)
+    runs = [index for index in train if {index - 1, index + 1} <= wanted]
+    depths = [clip.depth_mm[index][clip.tissue[index] & (clip.depth_mm[index] > 0)] for index in runs]
+    known = [float(np.median(each)) for each in depths if each.size]
+    if len(runs) < FEWEST_FRAMES_SEEN or not known:
+        return []
+    depth_mm = float(np.median(known))
+    pose = clip.world_from_camera
+    looked_at = pose[:, :3, 3] + depth_mm * pose[:, :3, 2]
+    step = np.array([np.linalg.norm(looked_at[i + 1] - looked_at[i]) for i in runs])
+    change = np.array([np.linalg.norm(looked_at[i + 1] - 2 * looked_at[i] + looked_at[i - 1]) for i in runs])
+    jitter_mm = float(np.median(change)) / np.sqrt(6)  # of independent errors: the deviation of each, over its axes
+    jitter_px = clip.intrinsics.fx * jitter_mm / depth_mm
+    if jitter_px < LARGEST_JITTER * clip.intrinsics.width or np.median(change) < LARGEST_ROUGHNESS * np.median(step):
+        return []
+    return [
+        f"The camera's poses jump to and fro by about {jitter_mm:.1f} mm at the tissue from frame to frame: they seem "
+        "to be inexact, and the model takes their errors for motion."
+    ]
+
+
+def _pixels(clip: DepthClip, index: int) -> NDArray[np.uint8]:
+    """Colours [M, 3] of the tissue of every other row and column: enough to count; all of it where that is little."""
+    rgb, tissue = clip.rgb[index], clip.tissue[index]
+    sparse: NDArray[np.uint8] = rgb[::2, ::2][tissue[::2, ::2]]
+    return sparse if len(sparse) else np.asarray(rgb[tissue])
+
+
+def _darkest(clip: DepthClip, index: int) -> float:
+    return float(np.percentile(_pixels(clip, index).min(axis=1), DARK_PERCENTILE))
+
+
+def _blood_share(clip: DepthClip, index: int) -> float:
+    """Share of the tissue that is as red as blood."""
+    pixels = _pixels(clip, index).astype(np.float32)
+    return float((pixels[:, 0] > BLOOD_RATIO * np.maximum(pixels[:, 1], 1)).mean())
+
+
+def _colour_ratios(clip: DepthClip, index: int) -> tuple[float, float]:
+    """Median red over green and blue over green of the tissue."""
+    red, green, blue = np.maximum(_pixels(clip, index).astype(np.float32), 1).T
+    return float(np.median(red / green)), float(np.median(blue / green))
+
+
+def _fine_detail(clip: DepthClip, index: int) -> float | None:
+    """Deviation of the detail finer than 1 px over that of 1 to 2 px, on tissue away from masks; None without any."""
+    grey = cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY).astype(np.float32)
+    tissue = clip.tissue[index].astype(np.uint8)
+    if (width := grey.shape[1]) > ANALYSED_WIDTH:
+        size = (ANALYSED_WIDTH, round(grey.shape[0] * ANALYSED_WIDTH / width))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        tissue = cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST)
+    inside = cv2.erode(tissue, np.ones((9, 9), np.uint8)) > 0
+    if not inside.any():
+        inside = tissue > 0
+    fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in FOCUS_SIGMAS_PX)
+    coarser_levels = float((fine - coarse)[inside].std())
+    return float((grey - fine)[inside].std()) / coarser_levels if coarser_levels > LEAST_DETAIL_LEVELS else None
+
+
+def _repeats(earlier: NDArray[np.uint8], later: NDArray[np.uint8]) -> bool:
+    """Whether two frames are the same picture, as worker/input/clip/split.py means it; 8th rows first, for speed."""
+    return all(
+        cv2.norm(earlier[::step], later[::step], cv2.NORM_L1) < REPEAT_LEVELS * earlier[::step].size for step in (8, 1)
+    )
+
+
+def _flickering(instrument: NDArray[np.floating]) -> int:
+    """Frames without instrument in gaps of at most LONGEST_FLICKER between frames that have one; shares in, [T]."""
+    masked = np.flatnonzero(instrument >= LEAST_INSTRUMENT)
+    gaps = [
+        range(before + 1, after)
+        for before, after in itertools.pairwise(masked)
+        if 1 < after - before <= LONGEST_FLICKER + 1
+    ]
+    return sum(1 for gap in gaps for index in gap if instrument[index] == 0)

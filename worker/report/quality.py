@@ -1,0 +1,294 @@
+"""The quality report: held-out scores, copy baselines, and in plain words whatever looks wrong.
+
+Symbols: T frames, H W pixels. A scene that fails silently is the defect this module exists for: a doubt becomes a
+sentence in the report, and what is not finite is never published.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.wire.errors import TrainingDiverged
+from contract.wire.report import FrameScore, Report
+from worker.fusion import CLEAR_CONFIDENCE
+from worker.input.clip import FrameSplit
+from worker.input.clip.types import DepthClip
+from worker.model.metrics import coverage, depth_agreement_mm, depth_errors_mm, psnr_paper, psnr_tissue, ssim
+from worker.report.baselines import CopyBaselines
+from worker.report.doubts import course_doubts, picture_doubts
+from worker.train.looking import View, sample_frames
+
+LEAST_COVERAGE = 0.98
+LEAST_TRAIN_DB = 25.0
+"""A model that does not even reproduce its own frames this well has not learnt them; good ones reach 30 to 38."""
+LEAST_HELD_OUT_DB = 24.0
+"""An error of 6 % of white: clean clips come to 25 within a hundred iterations, what cuts or jumps stays below."""
+LARGEST_GAP_DB = 3.0
+"""Between training and held-out frames: more means frames were memorised, or the gap between frames is not bridged."""
+OUTLIER_DB = 6.0
+"""A held-out frame this far below the mean is named."""
+LARGEST_DEPTH_SHARE = 0.03
+"""Of the depth: beyond it model and stereo disagree by more than the stereo's own noise."""
+FEW_FRAMES = 16
+LEAST_CONFIDENT_SHARE = 0.8
+SMOOTH_LEVELS = 2.0
+"""Standard deviation in 9 x 9 pixels, of 255: below it there is only noise to match."""
+LARGEST_SMOOTH_SHARE = 0.4
+LEAST_TISSUE_SHARE = 0.3
+LARGEST_BRIGHTNESS_DRIFT = 0.25
+"""Range of the median brightness over its mean; beyond it, changing light and moving tissue are hard to tell apart."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of some frames; a list holds one number a frame, NaN where there was no tissue.
+
+    depth_mm is the stereo's median depth where it was compared, to judge depth_agreement_mm by; both NaN without any.
+    """
+
+    frames: tuple[int, ...]
+    psnr_tissue_db: tuple[float, ...]
+    psnr_paper_db: tuple[float, ...]
+    ssim: tuple[float, ...]
+    coverage: tuple[float, ...]
+    depth_agreement_mm: float
+    depth_mm: float
+
+
+@dataclass(frozen=True)
+class Training:
+    """What the pipeline knows of a run and the report repeats (contract.wire.report.Report has their meaning)."""
+
+    preset: str
+    seed: int
+    device: str
+    iterations: int
+    frames_seen: int
+    gaussians: int
+    bases: int
+    scene_bytes: int
+    units_per_mm: float
+    seconds: dict[str, float]
+    versions: dict[str, str]
+    assumptions: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    measurements: dict[str, float] = field(default_factory=dict)
+
+
+_MERGED_FIELDS = ("assumptions", "warnings", "measurements")  # the clip has them, too; the report holds both
+
+
+def measure(clip: DepthClip, frames: Sequence[int], view_of: Callable[[int], View]) -> Scores:
+    """Scores the views of these frames (clip indices) against the clip.
+
+    Raises:
+        TrainingDiverged: a view holds NaN or infinity.
+    """
+    tissue_db, paper_db, similarity, covered = [], [], [], []
+    errors_mm, depths_mm = [], []
+    for index in frames:
+        view, truth, tissue = view_of(index), clip.rgb[index], clip.tissue[index]
+        if not (np.isfinite(view.rgb).all() and np.isfinite(view.depth_mm).all() and np.isfinite(view.alpha).all()):
+            raise TrainingDiverged(f"Frame {index} renders as NaN or infinity: training has diverged.")
+        tissue_db.append(psnr_tissue(view.rgb, truth, tissue))
+        paper_db.append(psnr_paper(view.rgb, truth, tissue))
+        similarity.append(ssim(view.rgb, truth, tissue))
+        covered.append(coverage(view.alpha, tissue))
+        errors_mm.append(depth_errors_mm(view.depth_mm, clip.depth_mm[index], tissue))
+        depths_mm.append(clip.depth_mm[index][tissue & (clip.depth_mm[index] > 0)])
+    return Scores(
+        frames=tuple(frames),
+        psnr_tissue_db=tuple(tissue_db),
+        psnr_paper_db=tuple(paper_db),
+        ssim=tuple(similarity),
+        coverage=tuple(covered),
+        depth_agreement_mm=depth_agreement_mm(errors_mm),
+        depth_mm=depth_agreement_mm(depths_mm),
+    )
+
+
+def build_report(
+    clip: DepthClip, split: FrameSplit, held_out: Scores, trained: Scores, baselines: CopyBaselines, training: Training
+) -> Report:
+    """The report of a finished scene.
+
+    Args:
+        held_out: measure(clip, split.held_out, ...); of no frames if none was held out.
+        trained: measure(clip, sample_frames(split.train), ...), for the comparison.
+        baselines: copy_baselines(clip, split.train, split.held_out).
+    """
+    found = [*clip.warnings, *split.warnings, *training.warnings]
+    found += clip_warnings(clip, split.train)
+    found += score_warnings(held_out, trained, baselines)
+    return Report(
+        psnr_tissue_db=_mean(held_out.psnr_tissue_db),
+        psnr_paper_db=_mean(held_out.psnr_paper_db),
+        ssim=_mean(held_out.ssim),
+        baseline_blend_db=_mean(baselines.blend_db),
+        baseline_flow_db=_mean(baselines.flow_db),
+        depth_agreement_mm=_known(held_out.depth_agreement_mm),
+        coverage=_mean(held_out.coverage),
+        train_psnr_tissue_db=_mean(trained.psnr_tissue_db),
+        frames=_frame_scores(held_out, baselines),
+        warnings=tuple(dict.fromkeys(found)),
+        assumptions=tuple(dict.fromkeys((*clip.assumptions, *training.assumptions))),
+        measurements={**clip.measurements, **training.measurements},
+        **{name: value for name, value in vars(training).items() if name not in _MERGED_FIELDS},
+        width=clip.intrinsics.width,
+        height=clip.intrinsics.height,
+        frame_count=clip.frame_count,
+        train_count=len(split.train),
+        held_out=tuple(split.held_out),
+        repeated=tuple(split.repeated),
+        frame_times_s=tuple(clip.frame_times_s.tolist()),
+    )
+
+
+def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[str]:
+    """What in the clip itself makes the result doubtful; held-out frames are not looked at."""
+    sampled = sample_frames(train)
+    found = []
+    if len(train) < FEW_FRAMES:
+        found.append(f"Only {len(train)} frames were trained on; motion between them is guessed.")
+    tissue_share = float(np.mean([clip.tissue[index].mean() for index in train]))
+    if tissue_share < LEAST_TISSUE_SHARE:
+        found.append(
+            f"Only {tissue_share:.0%} of the picture counts as tissue. If the masks are inverted, set mask_polarity."
+        )
+    if all(clip.tissue[index].all() for index in train):
+        found.append("No instrument is masked anywhere: an instrument in the clip is modelled as if it were tissue.")
+    confident = _share_of_tissue(clip, sampled, lambda index: clip.depth_confidence[index] >= CLEAR_CONFIDENCE)
+    if confident < LEAST_CONFIDENT_SHARE:
+        found.append(
+            f"Stereo depth is missing or unsure on {1 - confident:.0%} of the tissue; the shape there is interpolated."
+        )
+    smooth = _share_of_tissue(clip, sampled, lambda index: _roughness(clip.rgb[index]) < SMOOTH_LEVELS)
+    if smooth > LARGEST_SMOOTH_SHARE:
+        found.append(f"{smooth:.0%} of the tissue has no texture, so stereo and motion are guessed there.")
+    return found + _brightness_warnings(clip, sampled) + picture_doubts(clip, sampled) + course_doubts(clip, train)
+
+
+def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) -> list[str]:
+    """What the scores say against the model; and why a figure is missing, where one is."""
+    model_db = _mean(held_out.psnr_tissue_db)
+    train_db = _mean(trained.psnr_tissue_db)
+    found = _missing(held_out, model_db)
+    found += _worse_than_copying(model_db, baselines)
+    if train_db is not None and train_db < LEAST_TRAIN_DB:
+        found.append(
+            f"Even frames it was trained on are reproduced at only {train_db:.1f} dB: do not rely on this scene. "
+            "Look for inverted masks, a wrong layout or calibration, or a clip in which everything moves."
+        )
+    elif model_db is not None and model_db < LEAST_HELD_OUT_DB:
+        found.append(
+            f"Held-out frames are reproduced at only {model_db:.1f} dB: do not rely on this scene between the trained "
+            "frames. Tissue that is cut, or moves far from one frame to the next, cannot be followed."
+        )
+    if model_db is not None and train_db is not None and train_db - model_db > LARGEST_GAP_DB:
+        found.append(
+            f"Held-out frames score {train_db - model_db:.1f} dB less than trained ones ({model_db:.1f} and "
+            f"{train_db:.1f} dB): between the trained frames the motion is not to be trusted."
+        )
+    found += _bad_frames(held_out, model_db)
+    judged = held_out if held_out.frames else trained
+    covered = _mean(judged.coverage)
+    if covered is not None and covered < LEAST_COVERAGE:
+        found.append(f"The model leaves {1 - covered:.1%} of the tissue uncovered: renders have holes there.")
+    if judged.depth_agreement_mm > LARGEST_DEPTH_SHARE * judged.depth_mm:
+        found.append(
+            f"Rendered and stereo depth differ by {judged.depth_agreement_mm:.1f} mm (median) at a depth of "
+            f"{judged.depth_mm:.0f} mm: distances in this scene are not to be trusted."
+        )
+    return found
+
+
+def _missing(held_out: Scores, model_db: float | None) -> list[str]:
+    if not held_out.frames:
+        return ["No frames were held out, so the quality between trained frames, where it matters, is not measured."]
+    if model_db is None:
+        return ["The held-out frames show no tissue, so quality is not measured."]
+    if math.isnan(held_out.depth_agreement_mm):
+        return ["No held-out tissue has both rendered and stereo depth, so depth agreement is not measured."]
+    return []
+
+
+def _worse_than_copying(model_db: float | None, baselines: CopyBaselines) -> list[str]:
+    """Says plainly that copying frames would have done better; a model earns its place only elsewhere then."""
+    copies = {"blending": _mean(baselines.blend_db), "warping (optical flow)": _mean(baselines.flow_db)}
+    better = {name: score for name, score in copies.items() if score is not None and model_db is not None}
+    better = {name: score for name, score in better.items() if score > (model_db or 0.0)}
+    if not better:
+        return []
+    named = " and ".join(f"{name} at {score:.1f} dB" for name, score in better.items())
+    return [
+        f"On held-out frames the model scores {model_db:.1f} dB; copying the neighbouring frames scores more: {named}. "
+        "Seen from the endoscope itself, the recorded frames are the better picture; the model adds other views, "
+        "depth and what the instrument hides."
+    ]
+
+
+def _bad_frames(held_out: Scores, model_db: float | None) -> list[str]:
+    if model_db is None:
+        return []
+    scores = zip(held_out.frames, held_out.psnr_tissue_db, strict=True)
+    bad = [f"{frame} ({score:.1f} dB)" for frame, score in scores if score < model_db - OUTLIER_DB]
+    return [f"Far below the others are held-out frames {', '.join(bad)}."] if bad else []
+
+
+def _brightness_warnings(clip: DepthClip, sampled: Iterable[int]) -> list[str]:
+    medians = [float(np.median(clip.rgb[index][clip.tissue[index]])) for index in sampled if clip.tissue[index].any()]
+    mean = float(np.mean(medians)) if medians else 0.0
+    if mean == 0 or (max(medians) - min(medians)) / mean <= LARGEST_BRIGHTNESS_DRIFT:
+        return []
+    return [
+        f"The tissue's brightness changes from {min(medians):.0f} to {max(medians):.0f} of 255 during the clip; "
+        "the model may take changing light for motion."
+    ]
+
+
+def _share_of_tissue(clip: DepthClip, frames: Iterable[int], holds: Callable[[int], NDArray[np.bool_]]) -> float:
+    """Share of all tissue pixels of these frames at which something holds; NaN without tissue."""
+    kept, total = 0, 0
+    for index in frames:
+        kept += int((clip.tissue[index] & holds(index)).sum())
+        total += int(clip.tissue[index].sum())
+    return kept / total if total else math.nan
+
+
+def _roughness(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Standard deviation of grey in 9 x 9 pixels, [H, W], of 255."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    mean = cv2.blur(grey, (9, 9))
+    variance = cv2.blur(grey * grey, (9, 9)) - mean * mean
+    return np.asarray(np.sqrt(np.maximum(variance, 0)), dtype=np.float32)
+
+
+def _frame_scores(scores: Scores, baselines: CopyBaselines) -> tuple[FrameScore, ...]:
+    columns = {
+        "psnr_tissue_db": scores.psnr_tissue_db,
+        "psnr_paper_db": scores.psnr_paper_db,
+        "ssim": scores.ssim,
+        "coverage": scores.coverage,
+        "baseline_blend_db": baselines.blend_db,
+        "baseline_flow_db": baselines.flow_db,
+    }
+    return tuple(
+        FrameScore(frame=frame, **{name: _known(column[row]) for name, column in columns.items()})
+        for row, frame in enumerate(scores.frames)
+    )
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    """Mean of those that are known."""
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else None

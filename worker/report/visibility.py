@@ -1,0 +1,135 @@
+"""Which Gaussians the clip really saw: what the confidence layer blends, and which of the others must go.
+
+Symbols: N Gaussians, H W pixels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from worker.fusion import COMPLETED_CONFIDENCE
+from worker.input.clip import DepthClip, spread
+from worker.model.gaussians import Gaussians
+from worker.raster.model import Model
+from worker.train.targets import TrainingFrames
+
+SAMPLED_FRAMES = 24
+"""Training frames looked at, evenly spread: the share is known to a few per cent."""
+BEHIND = 0.03
+"""A Gaussian farther than the rendered surface by this share of its depth is hidden there."""
+
+WIDEST_UNSEEN = 3.0
+"""Units, a twentieth of the median depth: a Gaussian that nothing saw may be no wider at any time of the clip."""
+MISSED_IN_FRAMES, MISSED_DB = 8, 0.02
+"""Training frames, evenly spread, of which none may lose more of its psnr_tissue with a Gaussian that is taken out."""
+HIDDEN_LOGIT = -30.0
+"""Opacity at which nothing is drawn."""
+
+
+def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
+    """Take Gaussians out of model that lay on tissue in no training frame, grew wide, and are not missed there; returns
+    how many.
+
+    Where an instrument never leaves, nothing holds a Gaussian in place but its tail on the tissue beside it. A few are
+    pulled wide at the times nobody sees them, and from another pose they hang over the tissue like a veil. Of few and
+    large Gaussians, though, one may show much tissue from a place where there is none.
+    """
+    unseen = np.flatnonzero(~_ever_on_tissue(model, clip, frames))
+    widest = _widest(model, unseen, [float(frames.t[index]) for index in spread(frames.indices, SAMPLED_FRAMES)])
+    strays = _not_missed(model, frames, unseen[widest > WIDEST_UNSEEN])
+    if not 0 < len(strays) < model.count:
+        return 0
+    kept = np.setdiff1d(np.arange(model.count), strays)
+    model.take(kept.astype(np.int64), np.zeros(len(kept), np.bool_))
+    return len(strays)
+
+
+def _not_missed(model: Model, frames: TrainingFrames, wide: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Those of wide [M] without which every frame looked at stays as good: all, or those found one after the other."""
+    if not len(wide):
+        return wide
+    opacity_logit = model.parameters()["opacity_logit"]
+    trained = opacity_logit.clone()
+    judged = spread(frames.indices, MISSED_IN_FRAMES)
+
+    def scores_db() -> NDArray[np.float64]:
+        renders = ((index, model.render(frames.cameras[index], float(frames.t[index]))) for index in judged)
+        return np.array([frames.psnr_tissue_db(index, image) for index, image in renders])
+
+    def goes(rows: torch.Tensor) -> bool:
+        opacity_logit[rows] = HIDDEN_LOGIT
+        if (with_all_db - scores_db() > MISSED_DB).any():
+            opacity_logit[rows] = trained[rows]
+            return False
+        return True
+
+    with_all_db, rows = scores_db(), torch.from_numpy(wide)
+    found = wide if goes(rows) else np.array([int(row) for row in rows if goes(row[None])], np.intp)
+    opacity_logit.copy_(trained)
+    return found
+
+
+def _ever_on_tissue(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.bool_]:
+    """[N] whether the centre projects onto a tissue pixel in any training frame, hidden or not."""
+    found = np.zeros(model.count, np.bool_)
+    for index in frames.indices:
+        inside, i, j, _ = _pixels(model, clip, frames, index)
+        found[inside] |= clip.tissue[index][i, j]
+    return found
+
+
+def _widest(model: Model, chosen: NDArray[np.intp], times: Sequence[float]) -> NDArray[np.float32]:
+    """The largest scale of each chosen Gaussian at any of the times, in units."""
+    everything, deformation = model.export()
+    rows = torch.from_numpy(chosen)
+    gaussians = Gaussians(*(getattr(everything, each.name)[rows] for each in dataclasses.fields(Gaussians)))
+    motion = deformation.select(rows)
+    widest = np.zeros(len(chosen), np.float32)
+    with torch.no_grad():
+        for t in times:
+            scale = motion.deform(gaussians, t).log_scale.exp()
+            widest = np.maximum(widest, scale.numpy().max(axis=1, initial=0.0))
+    return widest
+
+
+def seen_share(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.float32]:
+    """[N] in [0, 1]: share of training frames in which a Gaussian's centre lay on visible tissue, times the stereo
+    confidence of that pixel."""
+    trusted = np.zeros(model.count, np.float64)
+    sampled = spread(frames.indices, SAMPLED_FRAMES)
+    for index in sampled:
+        image = model.render(frames.cameras[index], float(frames.t[index]))
+        surface = image[3] / np.maximum(image[4], 1e-6)
+        inside, i, j, z = _pixels(model, clip, frames, index)
+        visible = clip.tissue[index][i, j] & (z <= surface[i, j] * (1 + BEHIND))
+        # Completed depth is a guess, not nothing: tissue without stereo keeps a little confidence.
+        confidence = np.maximum(clip.depth_confidence[index][i, j] / 255.0, COMPLETED_CONFIDENCE)
+        trusted[inside] += visible * confidence
+    share: NDArray[np.float32] = (trusted / len(sampled)).astype(np.float32)
+    return share
+
+
+def _pixels(
+    model: Model, clip: DepthClip, frames: TrainingFrames, index: int
+) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+    """Which centres [N] lie in frame `index`; row, column and camera z of those."""
+    camera, (height, width) = frames.cameras[index], clip.tissue[index].shape
+    x, y, z = _camera_points(model.deformed_mean(float(frames.t[index])), camera)
+    column, row = np.floor(camera[0] * x / z + camera[2]), np.floor(camera[1] * y / z + camera[3])
+    inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return inside, row[inside].astype(np.intp), column[inside].astype(np.intp), z[inside]
+
+
+def _camera_points(
+    mean: NDArray[np.float32], camera: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Camera x, y, z of means [3, N]; z that is not positive becomes -1 so that nothing divides by 0."""
+    pose = camera[6:].reshape(3, 4)
+    points = pose[:, :3] @ mean + pose[:, 3:]
+    z = np.where(points[2] > 0, points[2], -1.0)
+    return points[0], points[1], z

@@ -1,0 +1,84 @@
+"""What a stopped run leaves in its folder, and how it goes on from there to the bits of an unstopped one.
+
+What is stored names no device: a run may go on on another one, but then to bits of its own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import astuple
+from pathlib import Path
+
+import numpy as np
+
+from contract.wire.errors import InputError, SceneError
+from worker.scene.checkpoint import RESUME_FILE, load_resume, save_resume
+from worker.train.loop import CurvePoint, Run
+from worker.train.schedule import Schedule
+
+
+def resume(out_dir: Path, run: Run) -> float | None:
+    """Go on with the run stored in out_dir, if there is one; its t_train_s.
+
+    Raises:
+        InputError: it was started with another preset, seed, length or clip, or cannot be read.
+    """
+    if not (out_dir / RESUME_FILE).exists():
+        return None
+    try:
+        return load_run(out_dir, run)
+    except (ValueError, KeyError, SceneError) as error:
+        problem = f"{out_dir / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
+        raise InputError("--out", problem, "Give the options it was started with, or name a new folder.") from error
+
+
+def save_run(directory: Path, run: Run, t_train_s: float) -> None:
+    """Write what load_run needs to go on: parameters, moments, averages, densification statistics, curve."""
+    arrays = {**run.model.arrays(), **run.average.arrays(), **(run.densifier.arrays() if run.densifier else {})}
+    tensors = {name: values.cpu().contiguous() for name, values in arrays.items()}
+    state = {
+        "identity": _identity(run),
+        "iteration": run.iteration,
+        "schedule": run.schedule.settings,
+        "count": run.model.count,
+        "averaged": run.average.count,
+        "t_train_s": t_train_s,
+        "curve": [astuple(point) for point in run.curve],
+    }
+    save_resume(directory, tensors, state)
+
+
+def load_run(directory: Path, run: Run) -> float:
+    """Put a freshly built run where a stored one was; returns its t_train_s.
+
+    Raises:
+        SceneError: nothing usable is stored there.
+        ValueError: it was started with another preset, seed, length or clip.
+    """
+    tensors, state = load_resume(directory)
+    stored = state.get("identity", {})
+    differing = [f"another {name}" for name, own in _identity(run).items() if stored.get(name) != own]
+    if differing:
+        raise ValueError(f"the stored run was started with {', '.join(differing)}")
+    if state["count"] != run.model.count:  # densified since the start
+        columns = np.zeros(state["count"], np.int64)
+        run.model.take(columns, np.ones(len(columns), np.bool_))
+    run.model.load_arrays(tensors)
+    run.average.load_arrays(tensors, state["averaged"])
+    if run.densifier is not None:
+        run.densifier.load_arrays(tensors)
+    run.iteration = state["iteration"]
+    run.schedule = Schedule.of(state["schedule"])
+    run.curve = [CurvePoint(*row) for row in state["curve"]]
+    return float(state["t_train_s"])
+
+
+def _identity(run: Run) -> dict[str, str]:
+    """By the words for it, what a stored run must share with the one that goes on from it."""
+    return {
+        "preset": run.preset.name,
+        "settings of the preset": hashlib.sha256(repr(run.preset).encode()).hexdigest(),
+        "seed": str(run.seed),
+        "length": run.asked,
+        "clip, other frames of it, or depth from another device": run.frames.digest(),
+    }

@@ -1,0 +1,150 @@
+"""The model before its first step: points become Gaussians; motion starts as the tracks have it, or at rest."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from worker.fusion import FusionSettings, PointCloud
+from worker.input.camera import Intrinsics
+from worker.input.clip import DepthClip
+from worker.model.deformation import Deformation, FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
+from worker.model.deformation.base import CHANNELS, MEAN
+from worker.model.gaussians import SH_C0, Gaussians, initial_gaussians
+from worker.motion.capacity import MOST_POINTS, Tried, choose_bases, choose_stride, floor_error, try_bases
+from worker.motion.tracks import GUESSED, Tracks, fit_tracks
+from worker.raster.backend import CPU, Device, make_model
+from worker.raster.model import Model
+from worker.train.presets import Preset
+
+SHARE_PX = 4
+"""Points within such a square start with one motion: tracks are smooth over more, and fewer systems are solved."""
+MIN_STRIDE = 2
+"""Pixels between the points of a grid at the least: a Gaussian a pixel is noise, not surface."""
+
+
+def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
+    """The preset's fusion; "fill" with the stride whose grid comes nearest to points_per_image points."""
+    if preset.points_per_image is None or preset.fusion.mode != "fill":
+        return preset.fusion
+    return dataclasses.replace(preset.fusion, stride=_stride_for(preset.points_per_image, intrinsics))
+
+
+def _stride_for(points: int, intrinsics: Intrinsics) -> int:
+    return max(MIN_STRIDE, round(math.sqrt(intrinsics.width * intrinsics.height / points)))
+
+
+def settled(
+    preset: Preset, tracks: Tracks | None, clip: DepthClip, train: Sequence[int]
+) -> tuple[Preset, tuple[str, ...]]:
+    """The preset with what it leaves to the scene settled (decisions 014, 018), and why, in words for the report."""
+    words = []
+    left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
+    tried = try_bases(tracks, clip, train, preset.most_bases) if tracks is not None and left_open else Tried({})
+    fusion = fusion_for(preset, clip.intrinsics)
+    if fusion.mode == "fill" and preset.points_per_image is not None:
+        least = ", the least there is" if fusion.stride == MIN_STRIDE else ""
+        wanted = preset.points_per_image
+        words.append(f"Gaussians start {fusion.stride} pixels apart{least}: {wanted} an image were asked for.")
+    elif fusion.mode == "fill":
+        finest = _stride_for(MOST_POINTS, clip.intrinsics)
+        choice = choose_stride(
+            clip, train[0], finest, min((each.total for each in tried.believed.values()), default=0.0)
+        )
+        fusion = dataclasses.replace(fusion, stride=choice.count)
+        preset = dataclasses.replace(preset, fusion=fusion)
+        words.append(f"Gaussians start {choice.count} pixels apart: {choice.reason}.")
+    if preset.bases is None:
+        floor = floor_error(clip, train[0], fusion.stride)
+        choice = choose_bases(tried, floor, len(train), preset.most_bases)
+        preset = dataclasses.replace(preset, bases=choice.count)
+        words.append(f"Motion has {choice.count} {'basis' if choice.count == 1 else 'bases'}: {choice.reason}.")
+    return preset, tuple(words)
+
+
+def start_model(
+    cloud: PointCloud,
+    tracks: Tracks | None,
+    clip: DepthClip,
+    train: Sequence[int],
+    preset: Preset,
+    scale: float,
+    seed: int,
+    device: Device = CPU,
+) -> Model:
+    """Gaussians at the cloud's points (mm, scaled to optimiser units) with the preset's motion: as the tracks have it
+    where the motion is "shared" and there are tracks, else at rest. The preset must be settled."""
+    gaussians = initial_gaussians(
+        cloud.reference_mm * np.float32(scale),  # widths are by neighbours of one time
+        cloud.rgb,
+        sh_degree=preset.sh_degree,
+        opacity=preset.opacity,
+    )
+    gaussians = dataclasses.replace(
+        gaussians,
+        mean=torch.from_numpy(cloud.points_mm * np.float32(scale)),
+        log_scale=gaussians.log_scale + math.log(preset.spread),
+    )
+    motion = _at_rest(gaussians, preset, [float(clip.t[i]) for i in train], seed)
+    if tracks is not None and isinstance(motion, SharedBasis):
+        gaussians = _follow_tracks(gaussians, motion, cloud, tracks, clip, train, scale)
+    return make_model(gaussians, motion, clip.intrinsics.width, clip.intrinsics.height, device)
+
+
+def _at_rest(gaussians: Gaussians, preset: Preset, times: Sequence[float], seed: int) -> Deformation:
+    """The preset's motion of these Gaussians before anything is known of it; times are those of the training frames."""
+    count = len(gaussians)
+    assert preset.bases is not None
+    if preset.deformation == "hexplane":
+        bounds = torch.stack([gaussians.mean.amin(0), gaussians.mean.amax(0)])
+        return HexPlane.initial(bounds, seed=seed)
+    if preset.deformation == "pfs":
+        return PolynomialFourier.initial(count, weights=preset.bases)
+    if preset.deformation == "shared":
+        return SharedBasis.initial(count, bases=min(len(times), preset.bases), colour=True, times=times)
+    assert preset.start_width is not None
+    return FlexibleDeformation.initial(
+        count,
+        bases=preset.bases,
+        width=preset.start_width,
+        form="gaussian" if preset.deformation == "fdm" else "quartic",
+    )
+
+
+def _follow_tracks(
+    gaussians: Gaussians,
+    motion: SharedBasis,
+    cloud: PointCloud,
+    tracks: Tracks,
+    clip: DepthClip,
+    train: Sequence[int],
+    scale: float,
+) -> Gaussians:
+    """Fill motion's weights from optical-flow tracks; returns the Gaussians with each canonical mean and colour shifted
+    so that they pass through their point and its colour at the time of the frame it was taken from."""
+    basis = np.stack([motion.basis(float(clip.t[i])).double().numpy() for i in range(clip.frame_count)])
+    pixels = _reference_pixels(cloud, clip, train[0])
+    width = clip.intrinsics.width
+    weights, _ = fit_tracks(tracks, basis[list(train)], pixels, width, share_px=SHARE_PX, guessed=GUESSED)
+    weights *= np.repeat(np.array([scale, 1 / SH_C0], np.float32), 3)
+    by_channel = torch.from_numpy(weights).permute(0, 2, 1)
+    motion.weight[:, MEAN], motion.weight[:, CHANNELS:] = by_channel[:, :3], by_channel[:, 3:]
+    moved = torch.from_numpy(np.einsum("nbc,nb->nc", weights, basis[cloud.frame]).astype(np.float32))
+    colour = torch.cat([gaussians.sh[:, :1] - moved[:, None, 3:], gaussians.sh[:, 1:]], 1)
+    return dataclasses.replace(gaussians, mean=gaussians.mean - moved[:, :3], sh=colour)
+
+
+def _reference_pixels(cloud: PointCloud, clip: DepthClip, reference: int) -> NDArray[np.intp]:
+    """[N] flat index of the pixel of the reference frame each point lay in, the nearest one if outside."""
+    pose, k = clip.world_from_camera[reference], clip.intrinsics
+    x, y, z = ((cloud.reference_mm - pose[:3, 3]) @ pose[:3, :3]).T
+    z = np.maximum(z, 1e-6)
+    column = np.clip(np.floor(k.fx * x / z + k.cx), 0, k.width - 1)
+    row = np.clip(np.floor(k.fy * y / z + k.cy), 0, k.height - 1)
+    pixels: NDArray[np.intp] = (row * k.width + column).astype(np.intp)
+    return pixels
