@@ -15,7 +15,7 @@ import numpy as np
 
 from contract.wire.errors import InputError
 from worker.fusion.complete import complete_depth
-from worker.fusion.fill import Moved, fill
+from worker.fusion.fill import fill
 from worker.fusion.points import (
     CLEAR_CONFIDENCE,
     COMPLETED_CONFIDENCE,
@@ -26,21 +26,19 @@ from worker.fusion.points import (
     points_at,
     sample,
     taken,
-    unproject,
 )
 from worker.fusion.published import motion_mask, published_fusion
 from worker.input.clip.types import DepthClip
+from worker.motion.tracks import Moved
 
 __all__ = [
     "CLEAR_CONFIDENCE",
     "COMPLETED_CONFIDENCE",
     "FusionSettings",
-    "Moved",
     "PointCloud",
     "complete_depth",
     "fuse",
     "motion_mask",
-    "unproject",
 ]
 
 

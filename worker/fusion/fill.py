@@ -9,7 +9,7 @@ Symbols: H W pixels (row i, column j), M cells, k stride in pixels. Lengths in m
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -25,14 +25,11 @@ from worker.fusion.points import (
     is_measured,
     points_at,
     same_pose,
-    unproject_at,
 )
-from worker.input.camera import Intrinsics
+from worker.input.camera import Intrinsics, unproject_at
 from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip
-
-Moved = Callable[[int, NDArray[np.intp]], NDArray[np.float32]]
-"""Where what the first frame's pixels (flat, [M]) show has gone in a training frame: displacements [M, 3] mm, world."""
+from worker.motion.tracks import Moved
 
 EDGE_PX = 5
 """Masks and stereo are unsure this near to an instrument: hidden regions are filled from farther away if possible."""

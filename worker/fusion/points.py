@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.fusion.complete import complete_depth
-from worker.input.camera import Intrinsics
+from worker.input.camera import Intrinsics, unproject
 from worker.input.clip.types import DepthClip
 
 COMPLETED_CONFIDENCE = 0.1
@@ -51,31 +51,6 @@ def is_measured(clip: DepthClip, index: int) -> NDArray[np.bool_]:
 def same_pose(clip: DepthClip, index: int, other: int) -> bool:
     """Whether the camera looked at both frames from one place."""
     return np.array_equal(clip.world_from_camera[index], clip.world_from_camera[other])
-
-
-def unproject(
-    pixels: NDArray[np.intp],
-    depth_mm: NDArray[np.float32],
-    intrinsics: Intrinsics,
-    world_from_camera: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """World points [M, 3] in mm of flat pixel indices [M] with their depths [M], through the pixels' centres."""
-    rows, columns = np.divmod(pixels, intrinsics.width)
-    return unproject_at(columns + 0.5, rows + 0.5, depth_mm, intrinsics, world_from_camera)
-
-
-def unproject_at(
-    column: NDArray[np.floating],
-    row: NDArray[np.floating],
-    depth_mm: NDArray[np.float32],
-    intrinsics: Intrinsics,
-    world_from_camera: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """World points [M, 3] in mm of places [M] in the image, or beyond its borders, with their depths [M]."""
-    x = (column - intrinsics.cx) / intrinsics.fx
-    y = (row - intrinsics.cy) / intrinsics.fy
-    camera_mm = np.stack([x, y, np.ones_like(x)], axis=1) * depth_mm[:, None].astype(np.float64)
-    return np.asarray(camera_mm @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])
 
 
 def cells_of(

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.fusion.points import PointCloud, cells_of, measured_pixels, points_at, same_pose, sample, unproject
+from worker.fusion.points import PointCloud, cells_of, measured_pixels, points_at, same_pose, sample
+from worker.input.camera import unproject
 from worker.input.clip.types import DepthClip
 
 

@@ -1,9 +1,15 @@
-"""The pinhole camera that every process means: OpenCV axes (x right, y down, z forward), pixels, millimetres."""
+"""The pinhole camera that every process means: OpenCV axes (x right, y down, z forward), pixels, millimetres.
+
+Symbols: M points.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,3 +64,28 @@ class Intrinsics:
         return Intrinsics(
             width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
+
+
+def unproject(
+    pixels: NDArray[np.intp],
+    depth_mm: NDArray[np.float32],
+    intrinsics: Intrinsics,
+    world_from_camera: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """World points [M, 3] in mm of flat pixel indices [M] with their depths [M], through the pixels' centres."""
+    rows, columns = np.divmod(pixels, intrinsics.width)
+    return unproject_at(columns + 0.5, rows + 0.5, depth_mm, intrinsics, world_from_camera)
+
+
+def unproject_at(
+    column: NDArray[np.floating],
+    row: NDArray[np.floating],
+    depth_mm: NDArray[np.float32],
+    intrinsics: Intrinsics,
+    world_from_camera: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """World points [M, 3] in mm of places [M] in the image, or beyond its borders, with their depths [M]."""
+    x = (column - intrinsics.cx) / intrinsics.fx
+    y = (row - intrinsics.cy) / intrinsics.fy
+    camera_mm = np.stack([x, y, np.ones_like(x)], axis=1) * depth_mm[:, None].astype(np.float64)
+    return np.asarray(camera_mm @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])

@@ -17,7 +17,7 @@ import numpy as np
 
 from worker.input.clip import DepthClip
 from worker.motion.tracks import Tracks, resting
-from worker.motion.trials import Missed, Trial
+from worker.motion.trials import BasisValues, Missed, Trial
 
 BASES = (3, 5, 9, 13, 17, 25, 33)
 """Numbers of bases to choose from, besides REST."""
@@ -70,7 +70,9 @@ class Tried:
 # bases --------------------------------------------------------------------------------------------------------------
 
 
-def try_bases(tracks: Tracks, clip: DepthClip, train: Sequence[int], most: int | None = None) -> Tried:
+def try_bases(
+    tracks: Tracks, clip: DepthClip, train: Sequence[int], basis_values: BasisValues, most: int | None = None
+) -> Tried:
     """What each number of bases that the training frames bear, up to most, would leave in frames it was not fitted to.
 
     Every fourth training frame is left out, the tracks of the others are fitted by three quarters of B bases, and the
@@ -80,7 +82,7 @@ def try_bases(tracks: Tracks, clip: DepthClip, train: Sequence[int], most: int |
     """
     if len(train) < FEWEST_FRAMES_TO_TRY:
         return Tried({})
-    trial, at_rest = (Trial.of(each, clip, train) for each in (tracks, resting(tracks, clip, train)))
+    trial, at_rest = (Trial.of(each, clip, train, basis_values) for each in (tracks, resting(tracks, clip, train)))
     if len(trial.places) < FEWEST_CELLS_TO_TRY:
         return Tried({})
     cap = _cap(len(train), most).count

@@ -20,11 +20,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.fusion import Moved, unproject
+from worker.input.camera import unproject
 from worker.input.clip import DepthClip
 from worker.machine.opencv import cores, one_opencv_thread
 
 Floats = NDArray[np.float32]
+Moved = Callable[[int, NDArray[np.intp]], Floats]
+"""Displacements [M, 3] mm (world) of what the first training frame's pixels (flat, [M]) show, to a training frame."""
 
 FLOW_WIDTH = 320
 """Flow is computed at the clip's size over the least whole factor that brings its width to this or less, in px."""

@@ -5,19 +5,20 @@ Symbols: K training frames, k of them left out, n sampled cells of the tracks' g
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.fusion import unproject
+from worker.input.camera import unproject
 from worker.input.clip import DepthClip
-from worker.model.deformation import SharedBasis
 from worker.motion.tracks import Tracks, cell_means, fit_series
 
 Reals = NDArray[np.float64]
+BasisValues = Callable[[int, Sequence[float], Sequence[float]], Reals]
+"""(B, times trained on, times) -> [len(times), B] values of B bases that were placed for the times trained on."""
 
 CELLS = 1000
 """Tracks on which bases are tried."""
@@ -50,6 +51,7 @@ class Trial:
     colour           [K, n, 3]  change, in grey levels
     confidence       [K, n]
     left_out         [K]
+    basis_values                values of the bases that the motion would have
     """
 
     clip: DepthClip
@@ -61,9 +63,10 @@ class Trial:
     colour: Reals
     confidence: Reals
     left_out: NDArray[np.bool_]
+    basis_values: BasisValues
 
     @classmethod
-    def of(cls, tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> Trial:
+    def of(cls, tracks: Tracks, clip: DepthClip, train: Sequence[int], basis_values: BasisValues) -> Trial:
         """train are the clip's frames that the tracks are of."""
         frames, height, width = tracks.confidence.shape
         step, reference = tracks.step_px, train[0]
@@ -88,6 +91,7 @@ class Trial:
             colour=255 * of_some(tracks.colour, 3),
             confidence=of_some(tracks.confidence),
             left_out=left_out,
+            basis_values=basis_values,
         )
 
     def missed(self, bases: int) -> Missed:
@@ -118,8 +122,7 @@ class Trial:
         times = np.array([float(self.clip.t[index]) for index in self.train])
         kept = ~self.left_out
         fitted = max(min(2, bases), round(kept.mean() * bases))
-        shared = SharedBasis.initial(1, bases=fitted, times=times[kept].tolist())
-        basis = np.stack([shared.basis(float(t)).double().numpy() for t in times])
+        basis = self.basis_values(fitted, times[kept].tolist(), times.tolist())
         series = np.concatenate([self.displacement_mm, self.colour], axis=2)
         weights = fit_series(series[kept], self.confidence[kept], basis[kept])
         predicted = (basis[self.left_out] @ weights).transpose(1, 0, 2)

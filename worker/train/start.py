@@ -45,7 +45,9 @@ def settled(
     """The preset with what it leaves to the scene settled (decisions 014, 018), and why, in words for the report."""
     words = []
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
-    tried = try_bases(tracks, clip, train, preset.most_bases) if tracks is not None and left_open else Tried({})
+    tried = Tried({})
+    if tracks is not None and left_open:
+        tried = try_bases(tracks, clip, train, basis_values, preset.most_bases)
     fusion = fusion_for(preset, clip.intrinsics)
     if fusion.mode == "fill" and preset.points_per_image is not None:
         least = ", the least there is" if fusion.stride == MIN_STRIDE else ""
@@ -65,6 +67,16 @@ def settled(
         preset = dataclasses.replace(preset, bases=choice.count)
         words.append(f"Motion has {choice.count} {'basis' if choice.count == 1 else 'bases'}: {choice.reason}.")
     return preset, tuple(words)
+
+
+def basis_values(bases: int, trained_times: Sequence[float], times: Sequence[float]) -> NDArray[np.float64]:
+    """[T, B] values at the times of the bases that a shared motion trained on trained_times starts with."""
+    return values_at(SharedBasis.initial(1, bases=bases, times=trained_times), times)
+
+
+def values_at(motion: SharedBasis, times: Sequence[float]) -> NDArray[np.float64]:
+    """[T, B] values of the motion's bases at the times."""
+    return np.stack([motion.basis(t).double().numpy() for t in times])
 
 
 def start_model(
@@ -127,7 +139,7 @@ def _follow_tracks(
 ) -> Gaussians:
     """Fill motion's weights from optical-flow tracks; returns the Gaussians with each canonical mean and colour shifted
     so that they pass through their point and its colour at the time of the frame it was taken from."""
-    basis = np.stack([motion.basis(float(clip.t[i])).double().numpy() for i in range(clip.frame_count)])
+    basis = values_at(motion, [float(clip.t[i]) for i in range(clip.frame_count)])
     pixels = _reference_pixels(cloud, clip, train[0])
     width = clip.intrinsics.width
     weights, _ = fit_tracks(tracks, basis[list(train)], pixels, width, share_px=SHARE_PX, guessed=GUESSED)

@@ -13,15 +13,15 @@ from tests.worker.clips import HEIGHT, WIDTH, plane_clip
 from worker.fusion import (
     COMPLETED_CONFIDENCE,
     FusionSettings,
-    Moved,
     PointCloud,
     complete_depth,
     fuse,
     motion_mask,
-    unproject,
 )
 from worker.fusion.fill import MARGIN
+from worker.input.camera import unproject
 from worker.input.clip.types import DepthClip
+from worker.motion.tracks import Moved
 
 TRAIN = [0, 2, 3, 4, 5, 6, 7, 8, 10, 11]
 HELD_OUT = [1, 9]

@@ -26,7 +26,7 @@ from worker.motion.tracks import Tracks, track
 from worker.motion.trials import Missed
 from worker.phantom import Motion
 from worker.train.presets import PRESETS
-from worker.train.start import MIN_STRIDE, fusion_for, settled
+from worker.train.start import MIN_STRIDE, basis_values, fusion_for, settled
 
 FAST = PRESETS["fast"]
 FRAMES = 40
@@ -51,6 +51,10 @@ def motion_left(errors: dict[int, float]) -> Tried:
     return Tried({bases: Missed(motion=error, light=0.0) for bases, error in errors.items()})
 
 
+def tried_bases(tracks: Tracks, clip: DepthClip, train: list[int], most: int | None = None) -> Tried:
+    return try_bases(tracks, clip, train, basis_values, most)
+
+
 def faster(clip: DepthClip, every: int) -> DepthClip:
     """Every so many frames of the clip: the same tissue, moving so many times as fast."""
     per_frame = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera", "frame_times_s")
@@ -65,14 +69,14 @@ def test_a_still_clip_gets_the_fewest_bases() -> None:
 def test_a_clip_that_moves_gets_more(motion: Motion) -> None:
     assert bases_for(motion) > BASES[0]
     clip, train, tracks = followed(motion)
-    assert not try_bases(tracks, clip, train).resting
+    assert not tried_bases(tracks, clip, train).resting
 
 
 def test_displacements_that_the_pictures_do_not_confirm_ask_for_no_bases() -> None:
     clip, train, tracks = followed("still")
     drift_mm = np.random.default_rng(0).normal(0, 0.1, (len(train), 1, 1, 3)).cumsum(0).astype(np.float32)
     drifting = dataclasses.replace(tracks, displacement_mm=tracks.displacement_mm + drift_mm)
-    tried = try_bases(drifting, clip, train)
+    tried = tried_bases(drifting, clip, train)
     assert settled(FAST, drifting, clip, train)[0].bases == REST
     assert choose_bases(dataclasses.replace(tried, resting={}), 0.1, len(train)).count > REST
 
@@ -81,9 +85,9 @@ def test_tissue_that_is_never_seen_in_place_is_not_said_to_rest() -> None:
     clip, train, tracks = followed("breathing")
     tissue = np.zeros_like(clip.tissue)
     tissue[train[0]] = clip.tissue[train[0]]
-    tried = try_bases(tracks, dataclasses.replace(clip, tissue=tissue), train)
+    tried = tried_bases(tracks, dataclasses.replace(clip, tissue=tissue), train)
     assert not tried.resting
-    assert tried.tracked == try_bases(tracks, clip, train).tracked
+    assert tried.tracked == tried_bases(tracks, clip, train).tracked
 
 
 def test_light_that_changes_on_tissue_at_rest_gets_bases() -> None:
@@ -108,7 +112,7 @@ def test_held_out_frames_are_never_read() -> None:
     held_out = sorted(set(range(clip.frame_count)) - set(train))
     poisoned = dataclasses.replace(clip, rgb=clip.rgb.copy(), tissue=clip.tissue.copy(), depth_mm=clip.depth_mm.copy())
     poisoned.rgb[held_out], poisoned.tissue[held_out], poisoned.depth_mm[held_out] = 255, False, np.nan
-    assert try_bases(track(poisoned, train), poisoned, train) == try_bases(tracks, clip, train)
+    assert tried_bases(track(poisoned, train), poisoned, train) == tried_bases(tracks, clip, train)
     assert settled(FAST, tracks, poisoned, train) == settled(FAST, tracks, clip, train)
 
 
@@ -138,7 +142,7 @@ def test_light_that_no_number_follows_gets_no_more_bases() -> None:
     clip, train, _ = followed("still")
     brightness = 1 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (FRAMES, 1, 1, 1))
     flickering = dataclasses.replace(clip, rgb=np.clip(clip.rgb * brightness, 0, 255).astype(np.uint8))
-    tried = try_bases(track(flickering, train), flickering, train)
+    tried = tried_bases(track(flickering, train), flickering, train)
     floor = floor_error(flickering, train[0], MIN_STRIDE)
     assert min(each.light for each in tried.tracked.values()) > max(floor, tried.tracked[REST].light / 2)
     choice = choose_bases(tried, floor, len(train))
@@ -173,7 +177,7 @@ def test_the_most_is_called_by_what_limits_it(frames: int, most: int | None, tri
 def test_there_are_more_than_two_training_frames_for_each_basis(frames: int) -> None:
     clip = phantom_clip("pull", frames=frames)
     train = list(range(frames))
-    tried = try_bases(track(clip, train), clip, train)
+    tried = tried_bases(track(clip, train), clip, train)
     assert frames / max(tried.tracked) > 2
 
 
@@ -224,7 +228,7 @@ def test_a_preset_may_allow_fewer_bases_than_the_scene_would_get(most: int) -> N
     assert limited.bases <= most
     assert limited.bases == bases_for("breathing") or most < bases_for("breathing")
     assert words[-1].startswith(f"Motion has {limited.bases} bases: ")
-    assert max(try_bases(tracks, clip, train, most).tracked) <= most
+    assert max(tried_bases(tracks, clip, train, most).tracked) <= most
 
 
 @pytest.mark.parametrize("most", [1, 2, 17])
