@@ -1,6 +1,6 @@
 """`make chaos`: kill everything at every point of a clip's way, many times, and check what became of every clip.
 
-python -m tests.chaos --kills 310 --houses 6 --out docs/results/chaos.md
+python -m tests.chaos --kills 310 --deployments 6 --out docs/results/chaos.md
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from pathlib import Path
 from benchmarks.bm_train import commit, machine
 from contract.queue.promise import BEAT_PERIOD_S, LEASE_S
 from tests.chaos.campaign import CELLS, NO_MATTER, Outcome, run_kill
+from tests.chaos.deployment import Deployment, Target
 from tests.chaos.history import RERUN_WITHIN_S, ClipHistory, orphans
-from tests.chaos.house import House, Target
 from tests.chaos.points import Point
 from tests.chaos.scenarios import Finding, bad_wire, zombie
 
@@ -35,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the campaign, write the table; 1 if any law was broken."""
     parser = argparse.ArgumentParser(prog="python -m tests.chaos", description=__doc__)
     parser.add_argument("--kills", type=int, default=310)
-    parser.add_argument("--houses", type=int, default=6, help="installations killed side by side")
+    parser.add_argument("--deployments", type=int, default=6, help="installations killed side by side")
     parser.add_argument("--first-port", type=int, default=18_800)
     parser.add_argument("--seed", type=int, default=0, help="of the order of the kills")
     parser.add_argument("--out", type=Path, help="write the table here as well")
@@ -43,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
     plan = _plan(options.kills, options.seed)
     started_s = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="intrasplat-chaos-") as folder:
-        outcomes, left = _run_houses(plan, Path(folder), options.houses, options.first_port)
+        outcomes, left = _run_deployments(plan, Path(folder), options.deployments, options.first_port)
         seconds = time.monotonic() - started_s
         findings = _run_scenarios(Path(folder), options.first_port)
     table = _table(outcomes, left, seconds, options) + _scenario_lines(findings)
@@ -65,8 +65,8 @@ def _plan(kills: int, seed: int) -> list[tuple[Target, Point, bool]]:
     return plan
 
 
-def _run_houses(
-    plan: list[tuple[Target, Point, bool]], folder: Path, houses: int, first_port: int
+def _run_deployments(
+    plan: list[tuple[Target, Point, bool]], folder: Path, deployments: int, first_port: int
 ) -> tuple[list[Outcome], list[Path]]:
     outcomes: list[Outcome] = []
     left: list[Path] = []
@@ -74,23 +74,23 @@ def _run_houses(
     lock = threading.Lock()
 
     def live_in(number: int) -> None:
-        with House(folder / f"house-{number}", first_port + number) as house:
+        with Deployment(folder / f"deployment-{number}", first_port + number) as deployment:
             known: set[str] = set()
             while True:
                 with lock:
                     cell = next(remaining, None)
                 if cell is None:
                     break
-                outcome = _one(house, *cell)
+                outcome = _one(deployment, *cell)
                 if outcome.history.job_id is not None:
                     known.add(outcome.history.job_id)
                 with lock:
                     outcomes.append(outcome)
                     _report(outcome, len(outcomes), len(plan))
             with lock:
-                left.extend(orphans(house.store, known))
+                left.extend(orphans(deployment.store, known))
 
-    threads = [threading.Thread(target=live_in, args=(number,)) for number in range(houses)]
+    threads = [threading.Thread(target=live_in, args=(number,)) for number in range(deployments)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -112,12 +112,12 @@ def _scenario_lines(findings: list[Finding]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _one(house: House, target: Target, point: Point, cancels: bool) -> Outcome:
+def _one(deployment: Deployment, target: Target, point: Point, cancels: bool) -> Outcome:
     try:
-        return run_kill(house, target, point, cancels)
-    except Exception as error:  # a house that does not come back is the gravest finding of all
-        house.points.let_go()
-        house.wait_until_ready()
+        return run_kill(deployment, target, point, cancels)
+    except Exception as error:  # a deployment that does not come back is the gravest finding of all
+        deployment.points.let_go()
+        deployment.wait_until_ready()
         return Outcome(ClipHistory((target.value, point.value)), [f"{type(error).__name__}: {error}"])
 
 
@@ -138,10 +138,11 @@ def _table(outcomes: list[Outcome], left: list[Path], seconds: float, options: a
     lines = [
         "# kill -9, everywhere",
         "",
-        f"Command: `python -m tests.chaos --kills {options.kills} --houses {options.houses} --seed {options.seed}` "
+        f"Command: `python -m tests.chaos --kills {options.kills} --deployments {options.deployments} "
+        f"--seed {options.seed}` "
         f"(`make chaos`), commit {commit()}, {machine()}, Python {platform.python_version()}, "
-        f"{options.houses} installations side by side, {seconds / 60:.1f} min. The trainer is a stand-in that takes "
-        "half a second; service, queue, supervisor and store are the real ones.",
+        f"{options.deployments} installations side by side, {seconds / 60:.1f} min. "
+        "The trainer is a stand-in that takes half a second; service, queue, supervisor and store are the real ones.",
         "",
         f"- kills: {len(outcomes)}; clips that got 202: {len(accepted)}; cancels that were confirmed: {len(cancelled)}",
         f"- broken laws: {len(broken)}; folders that belong to no job: {len(left)}",

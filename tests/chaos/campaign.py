@@ -17,8 +17,8 @@ import httpx
 
 from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
+from tests.chaos.deployment import Deployment, Target
 from tests.chaos.history import ClipHistory, violations
-from tests.chaos.house import House, Target
 from tests.chaos.points import Point
 
 CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
@@ -92,63 +92,63 @@ class Caller:
             time.sleep(RETRY_PAUSE_S)
 
 
-def run_kill(house: House, target: Target, point: Point, cancels: bool) -> Outcome:
+def run_kill(deployment: Deployment, target: Target, point: Point, cancels: bool) -> Outcome:
     """Kill `target` while a clip is at `point`; with `cancels`, after asking to cancel it."""
-    house.points.reset()
+    deployment.points.reset()
     history = ClipHistory((target.value, point.value))
-    caller = Caller(house.url)
+    caller = Caller(deployment.url)
     half: socket.socket | None = None
     if point is Point.UPLOAD:
         half = caller.send_half()
         time.sleep(0.1)  # the half arrives
     else:
-        house.points.arm(point)
+        deployment.points.arm(point)
         caller.start()
-        house.points.wait_for(point, POINT_WITHIN_S)
+        deployment.points.wait_for(point, POINT_WITHIN_S)
     if cancels:
         caller.wait()
-        history.cancel_heard = _cancel(house, caller.job_id)
+        history.cancel_heard = _cancel(deployment, caller.job_id)
     history.killed_at_s = time.time()
-    house.kill(target)
-    house.points.let_go()
+    deployment.kill(target)
+    deployment.points.let_go()
     if half is not None:
         half.close()
         caller.start()
-    house.wait_until_ready()
+    deployment.wait_until_ready()
     history.restart_s = time.time() - history.killed_at_s if target in (Target.VALKEY, Target.ALL) else 0.0
     caller.wait()
     history.job_id = caller.job_id
-    watch(house, history)
-    return Outcome(history, violations(history, house.store))
+    watch(deployment, history)
+    return Outcome(history, violations(history, deployment.store))
 
 
-def _cancel(house: House, job_id: str | None) -> bool:
+def _cancel(deployment: Deployment, job_id: str | None) -> bool:
     if job_id is None:
         return False
     with suppress(httpx.HTTPError):
-        answer = httpx.delete(f"{house.url}/jobs/{job_id}", timeout=10)
+        answer = httpx.delete(f"{deployment.url}/jobs/{job_id}", timeout=10)
         return answer.status_code == 200 and (
             answer.json()["cancel_requested"] or answer.json()["state"] == "cancelled"
         )
     return False
 
 
-def watch(house: House, history: ClipHistory) -> None:
+def watch(deployment: Deployment, history: ClipHistory) -> None:
     """Until the job has ended, and a moment longer, so that a second ending would be seen."""
     if history.job_id is None:
         return
-    record = wait_until_ended(house, history.job_id, ENDED_WITHIN_S)
+    record = wait_until_ended(deployment, history.job_id, ENDED_WITHIN_S)
     time.sleep(SECOND_ENDING_S if record is not None and record.state is JobState.DONE else TIDIED_WITHIN_S)
-    history.events = house.queue.events(history.job_id)
+    history.events = deployment.queue.events(history.job_id)
 
 
-def wait_until_ended(house: House, job_id: str, timeout_s: float) -> JobRecord | None:
+def wait_until_ended(deployment: Deployment, job_id: str, timeout_s: float) -> JobRecord | None:
     """The record of the job that has ended, or after timeout_s as it was last seen; None if it never was."""
     deadline_s = time.monotonic() + timeout_s
     record: JobRecord | None = None
     while time.monotonic() < deadline_s:
         with suppress(UnavailableError):
-            record = house.queue.get(job_id)
+            record = deployment.queue.get(job_id)
             if record is not None and record.state in TERMINAL_STATES:
                 break
         time.sleep(0.05)

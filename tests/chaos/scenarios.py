@@ -12,8 +12,8 @@ from pathlib import Path
 from contract.queue.promise import LEASE_S
 from contract.wire.job import TERMINAL_STATES, JobState
 from tests.chaos.campaign import Caller, wait_until_ended, watch
+from tests.chaos.deployment import Deployment, children_of
 from tests.chaos.history import ClipHistory, orphans, violations
-from tests.chaos.house import House, children_of
 from tests.chaos.points import Point
 from tests.chaos.proxy import ChaosProxy, Fault
 
@@ -44,19 +44,19 @@ class Finding:
 
 def zombie(folder: Path, port: int, point: Point) -> Finding:
     """SIGSTOP the worker that holds a job at `point` past its lease, let the other finish, SIGCONT the first."""
-    with House(folder, port, workers=2) as house:
-        caller = Caller(house.url)
-        house.points.arm(point)
+    with Deployment(folder, port, workers=2) as deployment:
+        caller = Caller(deployment.url)
+        deployment.points.arm(point)
         caller.start()
-        held = house.points.wait_for(point, 40.0)
+        held = deployment.points.wait_for(point, 40.0)
         caller.wait()
         assert caller.job_id is not None
-        sleepers = _family_of(held, house)
+        sleepers = _family_of(held, deployment)
         for process_id in sleepers:
             os.kill(process_id, signal.SIGSTOP)
         stopped_s = time.time()
-        house.points.let_go()  # which the sleepers hear of only when they wake
-        record = wait_until_ended(house, caller.job_id, SETTLED_WITHIN_S)
+        deployment.points.let_go()  # which the sleepers hear of only when they wake
+        record = wait_until_ended(deployment, caller.job_id, SETTLED_WITHIN_S)
         if record is None or record.state not in TERMINAL_STATES:
             raise TimeoutError(f"job {caller.job_id} was not taken over within {SETTLED_WITHIN_S:g} s")
         taken_over_s = time.time() - stopped_s
@@ -66,8 +66,8 @@ def zombie(folder: Path, port: int, point: Point) -> Finding:
                 os.kill(process_id, signal.SIGCONT)
         time.sleep(3.0)  # the zombie tries to publish
         history = ClipHistory(("zombie", point.value), caller.job_id, killed_at_s=stopped_s)
-        watch(house, history)
-        broken = violations(history, house.store)
+        watch(deployment, history)
+        broken = violations(history, deployment.store)
         if history.events[-1].record.attempt != 2:
             broken.append(f"attempt {history.events[-1].record.attempt} won")
         seen = f"another worker was done {taken_over_s:.1f} s after the first was stopped"
@@ -76,14 +76,14 @@ def zombie(folder: Path, port: int, point: Point) -> Finding:
 
 def bad_wire(folder: Path, port: int, seed: int) -> Finding:
     """Two workers behind a wire that misbehaves while jobs come in."""
-    with House(folder, port, workers=0) as house, ChaosProxy(house.socket, seed) as proxy:
-        house.add_workers(2, redis_url=f"redis://127.0.0.1:{proxy.port}/0")
-        house.wait_until_ready()
+    with Deployment(folder, port, workers=0) as deployment, ChaosProxy(deployment.socket, seed) as proxy:
+        deployment.add_workers(2, redis_url=f"redis://127.0.0.1:{proxy.port}/0")
+        deployment.wait_until_ready()
         callers = []
         for fault, seconds in WIRE_FAULTS:
             proxy.set(fault)
             for _ in range(WIRE_JOBS // len(WIRE_FAULTS)):
-                callers.append(Caller(house.url))
+                callers.append(Caller(deployment.url))
                 callers[-1].start()
                 time.sleep(seconds * len(WIRE_FAULTS) / WIRE_JOBS)
             proxy.set(Fault.NONE)
@@ -92,23 +92,23 @@ def bad_wire(folder: Path, port: int, seed: int) -> Finding:
         for caller in callers:
             caller.wait()
             history = ClipHistory(("wire", ""), caller.job_id)
-            watch(house, history)
-            broken += violations(history, house.store)
+            watch(deployment, history)
+            broken += violations(history, deployment.store)
             attempts += history.events[-1].record.attempt if history.events else 0
-        records = house.queue.records(limit=None)
+        records = deployment.queue.records(limit=None)
         if len(records) != WIRE_JOBS:
             broken.append(f"{WIRE_JOBS} clips became {len(records)} jobs")
         if {record.state for record in records} != {JobState.DONE}:
             broken.append("not every job is done")
-        if orphans(house.store, {record.job_id for record in records}):
+        if orphans(deployment.store, {record.job_id for record in records}):
             broken.append("folders that belong to no job")
         faults = ", ".join(f"{fault.value} {seconds:g} s" for fault, seconds in WIRE_FAULTS)
         return Finding(f"wire: {faults}", f"{WIRE_JOBS} clips, {len(records)} jobs, {attempts} attempts", broken)
 
 
-def _family_of(process_id: int, house: House) -> list[int]:
+def _family_of(process_id: int, deployment: Deployment) -> list[int]:
     """The supervisor and child to which a process belongs."""
-    for kept in house.workers:
+    for kept in deployment.workers:
         supervisor = kept.process_id
         if supervisor is not None and process_id in (supervisor, *children_of(supervisor)):
             return [supervisor, *children_of(supervisor)]

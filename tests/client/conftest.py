@@ -9,28 +9,28 @@ import pytest
 
 from client import Client
 from contract.queue.promise import Claim
-from tests.client.town import CLIP, Town, town_at
+from tests.client.local_service import CLIP, LocalService, local_service
 
 
 @pytest.fixture(scope="package")
-def _town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
-    with town_at(tmp_path_factory.mktemp("data")) as town:
-        yield town
+def _service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalService]:
+    with local_service(tmp_path_factory.mktemp("data")) as service:
+        yield service
 
 
 @pytest.fixture
-def town(_town: Town) -> Town:
+def service(_service: LocalService) -> LocalService:
     """The service, with nothing to do and its worker awake."""
-    for record in _town.queue.records():
-        _town.queue.cancel(record.job_id)
-        _town.queue.confirm_cancel(Claim(record.job_id, record.attempt, record.owner or ""))
-    _town.announce()
-    return _town
+    for record in _service.queue.records():
+        _service.queue.cancel(record.job_id)
+        _service.queue.confirm_cancel(Claim(record.job_id, record.attempt, record.owner or ""))
+    _service.announce()
+    return _service
 
 
 @pytest.fixture
-def client(town: Town) -> Iterator[Client]:
-    with Client(town.url) as client:
+def client(service: LocalService) -> Iterator[Client]:
+    with Client(service.url) as client:
         yield client
 
 

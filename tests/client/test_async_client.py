@@ -11,18 +11,18 @@ import pytest
 from client import AsyncClient, JobCancelled, NotFound, RequestRefused, Unauthorized, submission
 from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobProgress, JobState
-from tests.client.town import Town, line_to
+from tests.client.local_service import LocalService, line_to
 
 
-def test_a_clip_becomes_a_scene_while_other_work_goes_on(town: Town, clip: Path) -> None:
+def test_a_clip_becomes_a_scene_while_other_work_goes_on(service: LocalService, clip: Path) -> None:
     async def use() -> None:
-        async with AsyncClient(town.url) as client:
+        async with AsyncClient(service.url) as client:
             assert await client.is_ready()
             job = await client.reconstruct(clip, iterations=30)
             waiting = asyncio.create_task(client.wait(job.id))
             assert (await client.job(job.id)).state is JobState.QUEUED
             assert job.id in {each.id for each in await client.jobs(JobState.QUEUED)}
-            await asyncio.to_thread(town.finish)
+            await asyncio.to_thread(service.finish)
             assert (await waiting).state is JobState.DONE
             assert (await client.report(job.id))["psnr_tissue_db"] == 36.2
             assert (await client.curve(job.id)).startswith("t_train_s")
@@ -40,17 +40,17 @@ def test_a_clip_becomes_a_scene_while_other_work_goes_on(town: Town, clip: Path)
     asyncio.run(use())
 
 
-def test_many_views_come_over_one_connection(town: Town, clip: Path) -> None:
+def test_many_views_come_over_one_connection(service: LocalService, clip: Path) -> None:
     async def use() -> None:
-        async with AsyncClient(town.url) as client:
+        async with AsyncClient(service.url) as client:
             job = await client.reconstruct(clip)
-            await asyncio.to_thread(town.finish)
+            await asyncio.to_thread(service.finish)
             async with client.stream(job.id) as viewer:
                 for t in (0.0, 1.0):
                     assert (await viewer.render(t, format="npy")).array()[0, 0] == t
                 with pytest.raises(RequestRefused, match="yaw"):
                     await viewer.render(pose="orbit:999,0,1")
-        async with AsyncClient(town.url, api_key="isp_wrong") as client:
+        async with AsyncClient(service.url, api_key="isp_wrong") as client:
             with pytest.raises(Unauthorized):
                 async with client.stream(job.id):
                     pass
@@ -58,27 +58,27 @@ def test_many_views_come_over_one_connection(town: Town, clip: Path) -> None:
     asyncio.run(use())
 
 
-def test_a_watch_that_is_cut_off_goes_on_and_misses_nothing(town: Town, clip: Path) -> None:
+def test_a_watch_that_is_cut_off_goes_on_and_misses_nothing(service: LocalService, clip: Path) -> None:
     async def use() -> list[float | None]:
         seen = []
         async with AsyncClient(line.url) as far:
             job = await far.reconstruct(clip)
-            claim = town.claim()
+            claim = service.claim()
             async for view in far.watch(job.id):
                 seen.append(view.fraction)
                 if view.state is JobState.RUNNING and view.fraction is None:
                     line.cut()
-                    town.queue.beat(claim, JobProgress(stage="train", fraction=0.5))
-                    town.finish(claim)
+                    service.queue.beat(claim, JobProgress(stage="train", fraction=0.5))
+                    service.finish(claim)
         return seen
 
-    with line_to(town) as line:
+    with line_to(service) as line:
         assert [fraction for fraction in asyncio.run(use()) if fraction] == [0.5, 0.5]
         assert line.connections >= 2
 
 
 def test_a_clip_in_pieces_goes_on_from_where_the_line_was_cut(
-    town: Town, clip: Path, monkeypatch: pytest.MonkeyPatch
+    service: LocalService, clip: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = clip.stat().st_size
     monkeypatch.setattr(submission, "PIECE_BYTES", size // 3)
@@ -94,16 +94,16 @@ def test_a_clip_in_pieces_goes_on_from_where_the_line_was_cut(
             line.cut()
         told.append(sent)
 
-    with line_to(town) as line:
+    with line_to(service) as line:
         job_id = asyncio.run(use())
         assert line.connections == 2
     assert told[-1] == size
-    assert (town.store.spool_folder(job_id) / "clip.mp4").read_bytes() == clip.read_bytes()
+    assert (service.store.spool_folder(job_id) / "clip.mp4").read_bytes() == clip.read_bytes()
 
 
-def test_errors_are_the_same(town: Town, clip: Path, tmp_path: Path) -> None:
+def test_errors_are_the_same(service: LocalService, clip: Path, tmp_path: Path) -> None:
     async def use() -> None:
-        async with AsyncClient(town.url) as client:
+        async with AsyncClient(service.url) as client:
             with pytest.raises(InputError, match="cannot be read"):
                 await client.reconstruct(tmp_path / "nothing.mp4")
             job = await client.reconstruct(clip, idempotency_key="async", seed=1)

@@ -18,64 +18,64 @@ from client.remote import in_commands, progress_of
 from contract.access.keys import KeyFile, KeyScope
 from contract.runtime.exits import ExitCode
 from contract.wire.job import JobError, JobState
-from tests.client.town import Town, town_at
+from tests.client.local_service import LocalService, local_service
 
 
-def run_in(town: Town, *arguments: str) -> int:
-    return main([*arguments, "--url", town.url])
+def run_in(service: LocalService, *arguments: str) -> int:
+    return main([*arguments, "--url", service.url])
 
 
-def submitted(town: Town, clip: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    assert run_in(town, "submit", str(clip), *arguments) == ExitCode.OK
+def submitted(service: LocalService, clip: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert run_in(service, "submit", str(clip), *arguments) == ExitCode.OK
     return capsys.readouterr().out.strip()
 
 
 def test_submit_watch_fetch_and_delete(
-    town: Town, client: Client, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    service: LocalService, client: Client, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked = ["--iterations", "30", "--priority", "high", "--retention-hours", "12"]
-    job_id = submitted(town, clip, capsys, *asked)
+    job_id = submitted(service, clip, capsys, *asked)
     options = client.job(job_id).options
     assert (options.iterations, options.priority, options.retention_hours) == (30, "high", 12.0)
-    town.finish()
-    assert run_in(town, "watch", job_id) == ExitCode.OK
+    service.finish()
+    assert run_in(service, "watch", job_id) == ExitCode.OK
     out = tmp_path / "results"
-    assert run_in(town, "fetch", job_id, "--out", str(out), "--t", "0.5") == ExitCode.OK
+    assert run_in(service, "fetch", job_id, "--out", str(out), "--t", "0.5") == ExitCode.OK
     assert {path.name for path in out.iterdir()} == {"report.json", "curve.csv", "view.png", "scene.ply"}
     capsys.readouterr()
-    assert run_in(town, "delete", job_id) == ExitCode.OK
+    assert run_in(service, "delete", job_id) == ExitCode.OK
     assert json.loads(capsys.readouterr().out)["job_id"] == job_id
 
 
 def test_jobs_lists_cancel_stops_and_retry_queues_again(
-    town: Town, client: Client, clip: Path, capsys: pytest.CaptureFixture[str]
+    service: LocalService, client: Client, clip: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    failed = submitted(town, clip, capsys)
-    town.fail(JobError(problem="it diverged."))
-    waiting = submitted(town, clip, capsys)
-    assert run_in(town, "jobs", "--limit", "2") == ExitCode.OK
+    failed = submitted(service, clip, capsys)
+    service.fail(JobError(problem="it diverged."))
+    waiting = submitted(service, clip, capsys)
+    assert run_in(service, "jobs", "--limit", "2") == ExitCode.OK
     assert capsys.readouterr().out.split() == [waiting, "queued", failed, "failed", "it", "diverged."]
-    assert run_in(town, "jobs", "--state", "failed", "--limit", "1") == ExitCode.OK
+    assert run_in(service, "jobs", "--state", "failed", "--limit", "1") == ExitCode.OK
     assert capsys.readouterr().out.startswith(failed)
-    assert run_in(town, "retry", failed) == ExitCode.OK
+    assert run_in(service, "retry", failed) == ExitCode.OK
     assert client.job(failed).state is JobState.QUEUED
-    assert run_in(town, "cancel", waiting) == ExitCode.OK
+    assert run_in(service, "cancel", waiting) == ExitCode.OK
     assert client.job(waiting).state is JobState.CANCELLED
 
 
 def test_the_same_idempotency_key_prints_the_same_job(
-    town: Town, clip: Path, capsys: pytest.CaptureFixture[str]
+    service: LocalService, clip: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     same = ["--idempotency-key", "monday 9:30"]
-    assert submitted(town, clip, capsys, *same) == submitted(town, clip, capsys, *same)
+    assert submitted(service, clip, capsys, *same) == submitted(service, clip, capsys, *same)
 
 
 def test_url_and_key_come_from_the_environment(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, key = KeyFile(tmp_path).create("ward", {KeyScope.VIEW})
-    with town_at(tmp_path, hosts=("ward.example",)) as town:
-        monkeypatch.setenv("INTRASPLAT_URL", town.url)
+    with local_service(tmp_path, hosts=("ward.example",)) as service:
+        monkeypatch.setenv("INTRASPLAT_URL", service.url)
         assert main(["jobs"]) == ExitCode.BAD_INPUT
         told = capsys.readouterr().err
         assert "--api-key" in told
@@ -95,20 +95,20 @@ def test_url_and_key_come_from_the_environment(
     ],
 )
 def test_exit_codes_tell_what_went_wrong(
-    town: Town, arguments: list[str], code: ExitCode, capsys: pytest.CaptureFixture[str]
+    service: LocalService, arguments: list[str], code: ExitCode, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    url = [] if "--url" in arguments else ["--url", town.url]
+    url = [] if "--url" in arguments else ["--url", service.url]
     assert main([*arguments, *url]) == code
     assert capsys.readouterr().err.startswith("intrasplat: ")
 
 
 @pytest.mark.parametrize("command", ["watch", "fetch", "cancel", "retry", "delete"])
 def test_a_job_that_is_not_there_leads_to_the_list_of_those_that_are(
-    town: Town, command: str, capsys: pytest.CaptureFixture[str]
+    service: LocalService, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = ["--out", "never"] if command == "fetch" else []
     for job in ("nosuch", "0" * 32, "../jobs"):
-        assert run_in(town, command, job, *out) == ExitCode.BAD_INPUT
+        assert run_in(service, command, job, *out) == ExitCode.BAD_INPUT
         told = capsys.readouterr().err
         assert "GET" not in told
         assert "`intrasplat jobs` lists what there is" in told or "--help" in told
@@ -116,14 +116,16 @@ def test_a_job_that_is_not_there_leads_to_the_list_of_those_that_are(
 
 
 def test_a_job_in_the_wrong_state_leads_to_the_command_that_helps(
-    town: Town, clip: Path, capsys: pytest.CaptureFixture[str]
+    service: LocalService, clip: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    job_id = submitted(town, clip, capsys)
+    job_id = submitted(service, clip, capsys)
     for command, remedy in (("fetch", f"intrasplat watch {job_id}"), ("delete", f"intrasplat cancel {job_id}")):
-        assert run_in(town, command, job_id, *(["--out", "never"] if command == "fetch" else [])) == ExitCode.BAD_INPUT
+        assert (
+            run_in(service, command, job_id, *(["--out", "never"] if command == "fetch" else [])) == ExitCode.BAD_INPUT
+        )
         assert remedy in capsys.readouterr().err
-    town.finish()
-    assert run_in(town, "cancel", job_id) == ExitCode.BAD_INPUT
+    service.finish()
+    assert run_in(service, "cancel", job_id) == ExitCode.BAD_INPUT
     assert f"intrasplat delete {job_id}" in capsys.readouterr().err
 
 

@@ -26,14 +26,16 @@ from client import (
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobError, JobProgress, JobState
-from tests.client.town import SNAPSHOT_ITERATION, Town, line_to, town_at
+from tests.client.local_service import SNAPSHOT_ITERATION, LocalService, line_to, local_service
 
 
-def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(town: Town, client: Client, clip: Path) -> None:
+def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(
+    service: LocalService, client: Client, clip: Path
+) -> None:
     job = client.reconstruct(clip, iterations=30)
     assert job.state is JobState.QUEUED
     assert job.options.iterations == 30
-    town.finish()
+    service.finish()
     assert client.wait(job.id).state is JobState.DONE
     assert client.report(job.id)["psnr_tissue_db"] == 36.2
     assert client.curve(job.id).startswith("t_train_s")
@@ -46,9 +48,11 @@ def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(town: Town,
     assert caught.value.status == 404
 
 
-def test_a_render_comes_as_a_file_as_an_array_or_as_what_is_known(town: Town, client: Client, clip: Path) -> None:
+def test_a_render_comes_as_a_file_as_an_array_or_as_what_is_known(
+    service: LocalService, client: Client, clip: Path
+) -> None:
     job = client.reconstruct(clip)
-    town.finish()
+    service.finish()
     image = client.render(t=0.5, scene=job.id, layer="depth", format="npy", width=64)
     np.testing.assert_array_equal(image.array(), np.full((4, 6), 0.5, np.float32))
     np.testing.assert_array_equal(client.render_array(t=0.25, scene=job.id), np.full((4, 6), 0.25, np.float32))
@@ -60,19 +64,19 @@ def test_a_render_comes_as_a_file_as_an_array_or_as_what_is_known(town: Town, cl
 
 
 def test_a_job_that_trains_shows_its_newest_snapshot_and_one_that_waits_is_a_conflict(
-    town: Town, client: Client, clip: Path
+    service: LocalService, client: Client, clip: Path
 ) -> None:
     job = client.reconstruct(clip)
     with pytest.raises(Conflict):
         client.render(scene=job.id)
-    town.claim()
+    service.claim()
     image = client.render(scene=job.id)
     assert (image.state, image.iteration) == ("running", SNAPSHOT_ITERATION)
 
 
-def test_many_views_come_over_one_connection(town: Town, client: Client, clip: Path) -> None:
+def test_many_views_come_over_one_connection(service: LocalService, client: Client, clip: Path) -> None:
     job = client.reconstruct(clip)
-    town.finish()
+    service.finish()
     with client.stream(job.id) as viewer:
         for t in (0.0, 0.5, 1.0):
             image = viewer.render(t, "orbit:5,0,1", layer="depth", format="npy")
@@ -86,7 +90,7 @@ def test_many_views_come_over_one_connection(town: Town, client: Client, clip: P
         viewer.render()
 
 
-def test_watching_shows_each_state_and_ends_with_the_last(town: Town, client: Client, clip: Path) -> None:
+def test_watching_shows_each_state_and_ends_with_the_last(service: LocalService, client: Client, clip: Path) -> None:
     job = client.reconstruct(clip)
     states = []
     for view in client.watch(job.id):
@@ -98,29 +102,29 @@ def test_watching_shows_each_state_and_ends_with_the_last(town: Town, client: Cl
         client.wait(job.id)
 
 
-def test_a_watch_that_is_cut_off_goes_on_and_misses_nothing(town: Town, client: Client, clip: Path) -> None:
+def test_a_watch_that_is_cut_off_goes_on_and_misses_nothing(service: LocalService, client: Client, clip: Path) -> None:
     job = client.reconstruct(clip)
     seen: list[float] = []
-    with line_to(town) as line, Client(line.url) as far:
-        claim = town.claim()
+    with line_to(service) as line, Client(line.url) as far:
+        claim = service.claim()
         for view in far.watch(job.id):
             seen.append(view.fraction or 0.0)
             if view.state is JobState.RUNNING and view.fraction is None:
                 line.cut()
                 for fraction in (0.25, 0.5):
-                    town.queue.beat(claim, JobProgress(stage="train", fraction=fraction))
-                town.finish(claim)
+                    service.queue.beat(claim, JobProgress(stage="train", fraction=fraction))
+                service.finish(claim)
         assert line.connections == 2
     assert [fraction for fraction in seen if fraction] == [0.25, 0.5, 0.5]
 
 
 def test_a_job_that_failed_by_its_input_differs_from_one_that_failed_otherwise(
-    town: Town, client: Client, clip: Path
+    service: LocalService, client: Client, clip: Path
 ) -> None:
     rejected = client.reconstruct(clip)
-    town.fail(JobError(problem="one eye only.", field="clip", remedy="Send both."))
+    service.fail(JobError(problem="one eye only.", field="clip", remedy="Send both."))
     broken = client.reconstruct(clip)
-    town.fail(JobError(problem="it diverged."))
+    service.fail(JobError(problem="it diverged."))
     with pytest.raises(JobRejected, match="Send both"):
         client.wait(rejected.id)
     with pytest.raises(JobFailed, match="diverged"):
@@ -132,7 +136,7 @@ def test_a_job_that_failed_by_its_input_differs_from_one_that_failed_otherwise(
 
 
 def test_a_large_clip_goes_in_pieces_and_on_from_where_the_line_was_cut(
-    town: Town, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    service: LocalService, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(submission, "PIECE_BYTES", 2**22)
     large = tmp_path / "Smith.mp4"
@@ -141,7 +145,7 @@ def test_a_large_clip_goes_in_pieces_and_on_from_where_the_line_was_cut(
         file.write(small + (size - len(small)).to_bytes(4, "big") + b"free")
         file.truncate(size)
     told: list[int] = []
-    with line_to(town) as line:
+    with line_to(service) as line:
 
         def on_upload(sent: int, total: int) -> None:
             assert total == size
@@ -154,21 +158,21 @@ def test_a_large_clip_goes_in_pieces_and_on_from_where_the_line_was_cut(
         assert line.connections == 2
     assert job.input_bytes == size
     assert told[-1] == size
-    assert (town.store.spool_folder(job.id) / "clip.mp4").read_bytes() == large.read_bytes()
+    assert (service.store.spool_folder(job.id) / "clip.mp4").read_bytes() == large.read_bytes()
 
 
 def test_two_eyes_calibration_and_masks_arrive_as_what_they_are(
-    town: Town, client: Client, clip: Path, tmp_path: Path
+    service: LocalService, client: Client, clip: Path, tmp_path: Path
 ) -> None:
     calibration = tmp_path / "calibration.json"
     calibration.write_text("{}")
     for in_pieces in (False, True):
         job = client.reconstruct(clip, clip, calibration=calibration, masks=clip, in_pieces=in_pieces)
-        spooled = {path.name for path in town.store.spool_folder(job.id).iterdir()}
+        spooled = {path.name for path in service.store.spool_folder(job.id).iterdir()}
         assert spooled >= {"left.mp4", "right.mp4", "calibration.json", "masks.mp4"}
 
 
-def test_the_same_key_is_the_same_job_and_another_is_another(town: Town, client: Client, clip: Path) -> None:
+def test_the_same_key_is_the_same_job_and_another_is_another(service: LocalService, client: Client, clip: Path) -> None:
     first, again, other = (client.reconstruct(clip, idempotency_key=key) for key in ("a", "a", None))
     assert first.id == again.id != other.id
     with pytest.raises(RequestRefused) as caught:
@@ -219,20 +223,20 @@ def test_a_key_opens_what_it_may_and_nothing_else(tmp_path: Path, clip: Path) ->
     keys = KeyFile(tmp_path)
     _, viewing = keys.create("ward", {KeyScope.VIEW})
     _, both = keys.create("ward")
-    with town_at(tmp_path, hosts=("ward.example",)) as town:
-        with Client(town.url) as nobody, pytest.raises(Unauthorized):
+    with local_service(tmp_path, hosts=("ward.example",)) as service:
+        with Client(service.url) as nobody, pytest.raises(Unauthorized):
             nobody.jobs()
-        with Client(town.url, api_key=f"{both}\n") as client:
+        with Client(service.url, api_key=f"{both}\n") as client:
             job = client.reconstruct(clip)
             with pytest.raises(Forbidden, match="purge"):
                 client.delete(job.id)
-        with Client(town.url, api_key=f"{viewing}\n") as client:
+        with Client(service.url, api_key=f"{viewing}\n") as client:
             assert client.job(job.id).id == job.id
             with pytest.raises(Forbidden, match="reconstruct"):
                 client.cancel(job.id)
             with client.stream(job.id) as viewer, pytest.raises(Conflict):
                 viewer.render()
-        with Client(town.url, api_key="isp_wrong") as client, pytest.raises(Unauthorized), client.stream(job.id):
+        with Client(service.url, api_key="isp_wrong") as client, pytest.raises(Unauthorized), client.stream(job.id):
             pass
 
 

@@ -12,8 +12,8 @@ from selenium.webdriver.common.keys import Keys
 
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobError, JobState
+from tests.client.local_service import CLIP
 from tests.client.page import FAR, Page, Site, browser, grey_of, site_at
-from tests.client.town import CLIP
 
 
 @pytest.fixture(scope="module")

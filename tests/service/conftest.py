@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.service.house import House, make_house
+from tests.service.under_test import ServiceUnderTest, running_service
 
 
 @pytest.fixture
-def house(tmp_path: Path) -> Iterator[House]:
-    yield from make_house(tmp_path)
+def service(tmp_path: Path) -> Iterator[ServiceUnderTest]:
+    yield from running_service(tmp_path)

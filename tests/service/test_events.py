@@ -17,7 +17,7 @@ from contract.store.store import new_job_id
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobError, JobFiles, JobProgress, JobRecord
 from service.events import NOTHING_SEEN, Feeds
-from tests.service.house import House, assert_problem
+from tests.service.under_test import ServiceUnderTest, assert_problem
 
 PATIENCE_S = 20.0
 
@@ -36,17 +36,17 @@ def states(events: list[dict[str, Any]]) -> list[str]:
     return [event["data"]["state"] for event in events]
 
 
-def ended_job(house: House) -> str:
-    job_id: str = house.upload().json()["id"]
-    _, claim = house.claimed()
-    house.queue.beat(claim, JobProgress(stage="train", fraction=0.5, psnr_db=31.0))
-    house.queue.fail(claim, JobError(problem="no depth."))
+def ended_job(service: ServiceUnderTest) -> str:
+    job_id: str = service.upload().json()["id"]
+    _, claim = service.claimed()
+    service.queue.beat(claim, JobProgress(stage="train", fraction=0.5, psnr_db=31.0))
+    service.queue.fail(claim, JobError(problem="no depth."))
     return job_id
 
 
-def test_a_stream_tells_all_that_happened_in_order_and_ends_with_the_job(house: House) -> None:
-    job_id = ended_job(house)
-    response = house.http.get(f"/jobs/{job_id}/events")
+def test_a_stream_tells_all_that_happened_in_order_and_ends_with_the_job(service: ServiceUnderTest) -> None:
+    job_id = ended_job(service)
+    response = service.http.get(f"/jobs/{job_id}/events")
     assert response.headers["content-type"].startswith("text/event-stream")
     assert response.headers["x-accel-buffering"] == "no"
     assert response.headers["cache-control"] == "no-store"
@@ -57,41 +57,41 @@ def test_a_stream_tells_all_that_happened_in_order_and_ends_with_the_job(house: 
     assert {event["event"] for event in events} == {"job"}
 
 
-def test_whoever_comes_back_hears_what_it_missed_and_nothing_twice(house: House) -> None:
-    job_id = ended_job(house)
-    events = told(house.http.get(f"/jobs/{job_id}/events"))
+def test_whoever_comes_back_hears_what_it_missed_and_nothing_twice(service: ServiceUnderTest) -> None:
+    job_id = ended_job(service)
+    events = told(service.http.get(f"/jobs/{job_id}/events"))
     for index, event in enumerate(events[:-1]):
-        rest = told(house.http.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": event["id"]}))
+        rest = told(service.http.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": event["id"]}))
         assert rest == events[index + 1 :]
-    known = house.http.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": events[-1]["id"]})
+    known = service.http.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": events[-1]["id"]})
     assert known.status_code == 204
 
 
-def test_a_last_event_that_never_was_is_no_fault(house: House) -> None:
-    job_id = ended_job(house)
+def test_a_last_event_that_never_was_is_no_fault(service: ServiceUnderTest) -> None:
+    job_id = ended_job(service)
     for number in ("nonsense", "-1", "9" * 40, "1-", "\u00b2"):
-        response = house.http.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": number.encode()})
+        response = service.http.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": number.encode()})
         assert len(told(response)) == 4
 
 
-def test_a_job_that_is_not_there_is_a_problem_and_no_stream(house: House) -> None:
-    assert_problem(house.http.get(f"/jobs/{'0' * 32}/events"), 404, "job_id")
+def test_a_job_that_is_not_there_is_a_problem_and_no_stream(service: ServiceUnderTest) -> None:
+    assert_problem(service.http.get(f"/jobs/{'0' * 32}/events"), 404, "job_id")
 
 
-def test_a_stream_goes_on_while_the_job_does(house: House) -> None:
-    job_id = house.upload().json()["id"]
+def test_a_stream_goes_on_while_the_job_does(service: ServiceUnderTest) -> None:
+    job_id = service.upload().json()["id"]
 
     def work() -> None:
         for _ in range(100):  # until somebody listens
-            if house.queue.figures().queued == 0:
+            if service.queue.figures().queued == 0:
                 break
             time.sleep(0.01)
-        house.queue.fail(claim, JobError(problem="no depth."))
+        service.queue.fail(claim, JobError(problem="no depth."))
 
-    _, claim = house.claimed()
+    _, claim = service.claimed()
     worker = threading.Timer(0.3, work)
     worker.start()
-    events = told(house.http.get(f"/jobs/{job_id}/events"))
+    events = told(service.http.get(f"/jobs/{job_id}/events"))
     worker.join()
     assert states(events)[-1] == "failed"
 

@@ -8,7 +8,7 @@ import pytest
 
 from client import Client, JobRejected, RequestRefused
 from client.demo import started_service
-from tests.service.house import House, assert_problem
+from tests.service.under_test import ServiceUnderTest, assert_problem
 from tests.worker.input.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile
 
 PLAIN = [name for name, hostile in CORPUS.items() if hostile.refused_at == "upload"]
@@ -17,16 +17,16 @@ DECODED = [name for name, hostile in CORPUS.items() if hostile.refused_at == "de
 
 @pytest.mark.parametrize("name", PLAIN)
 def test_what_cannot_be_a_clip_is_refused_when_it_arrives_and_leaves_nothing(
-    house: House, tmp_path: Path, name: str
+    service: ServiceUnderTest, tmp_path: Path, name: str
 ) -> None:
     hostile = CORPUS[name]
     path = hostile.write(tmp_path)
     parts = {"clip": (VIDEO.name, VIDEO.read_bytes())} | {hostile.part: (path.name, path.read_bytes())}
-    response = house.upload(parts=parts)
+    response = service.upload(parts=parts)
     assert response.status_code in (413, 422)
     assert assert_problem(response, response.status_code, hostile.part)["remedy"]
-    assert house.spooled() == []
-    assert house.queue.records() == []
+    assert service.spooled() == []
+    assert service.queue.records() == []
 
 
 def test_what_only_decoding_shows_fails_its_job_and_the_worker_takes_the_next(tmp_path: Path) -> None:

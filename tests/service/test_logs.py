@@ -14,8 +14,8 @@ import pytest
 
 from contract.runtime.logs import configure
 from contract.runtime.settings import Settings
-from tests.service.house import House, make_house
 from tests.service.test_tus import TUS, metadata
+from tests.service.under_test import ServiceUnderTest, running_service
 
 MARKER = "Smith-Jane-1961"
 
@@ -32,19 +32,19 @@ def _logging_as_it_was() -> Iterator[None]:
     logging.raiseExceptions = True
 
 
-def say_it_everywhere(house: House) -> None:
+def say_it_everywhere(service: ServiceUnderTest) -> None:
     """Requests that carry the marker wherever a caller can put one; most are refused."""
-    house.upload(parts={"clip": (f"{MARKER}.mp4", b"x")}, headers={"Idempotency-Key": MARKER})
-    house.upload(parts={"clip": (f"{MARKER}.exe", b"x")})
-    house.upload(parts={MARKER: ("a.mp4", b"x")})
-    house.upload(f'{{"holdout": "{MARKER}", "{MARKER}": 1}}')
-    house.http.post("/reconstruct", json={MARKER: MARKER, "clip": MARKER})
+    service.upload(parts={"clip": (f"{MARKER}.mp4", b"x")}, headers={"Idempotency-Key": MARKER})
+    service.upload(parts={"clip": (f"{MARKER}.exe", b"x")})
+    service.upload(parts={MARKER: ("a.mp4", b"x")})
+    service.upload(f'{{"holdout": "{MARKER}", "{MARKER}": 1}}')
+    service.http.post("/reconstruct", json={MARKER: MARKER, "clip": MARKER})
     for values in ({"part": "clip", "filename": f"{MARKER}.mp4"}, {"part": MARKER}):
         headers = {**TUS, "Upload-Length": "5", "Upload-Metadata": metadata(**values)}
-        house.http.post("/uploads", headers=headers)
+        service.http.post("/uploads", headers=headers)
     for path in (f"/{MARKER}", f"/jobs/{MARKER}", f"/jobs/{MARKER}/events", f"/uploads/{MARKER}", f"/scenes/{MARKER}"):
-        house.http.get(path, headers=TUS)
-    house.http.get("/render", params={"t": MARKER, "scene": MARKER, MARKER: MARKER})
+        service.http.get(path, headers=TUS)
+    service.http.get("/render", params={"t": MARKER, "scene": MARKER, MARKER: MARKER})
     for name in (
         "User-Agent",
         "X-Request-Id",
@@ -55,7 +55,7 @@ def say_it_everywhere(house: House) -> None:
         "Last-Event-ID",
         "Cookie",
     ):
-        house.http.get("/jobs", headers={name: MARKER})
+        service.http.get("/jobs", headers={name: MARKER})
 
 
 @pytest.mark.parametrize("log_format", ["text", "json"])
@@ -63,8 +63,8 @@ def test_nothing_a_caller_says_is_in_the_log(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], log_format: Literal["text", "json"]
 ) -> None:
     configure(Settings(data_dir=tmp_path, log_format=log_format), "service")
-    for house in make_house(tmp_path):
-        say_it_everywhere(house)
+    for service in running_service(tmp_path):
+        say_it_everywhere(service)
     log = capsys.readouterr().err
     assert "/jobs/{job_id}" in log
     assert MARKER not in log
@@ -75,9 +75,9 @@ def test_each_answer_is_a_line_with_the_id_that_the_caller_was_given(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     configure(Settings(data_dir=tmp_path, log_format="json"), "service")
-    for house in make_house(tmp_path):
-        answer = house.http.get(f"/jobs/{'0' * 32}")
-        house.http.get("/healthz")
+    for service in running_service(tmp_path):
+        answer = service.http.get(f"/jobs/{'0' * 32}")
+        service.http.get("/healthz")
     lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     (line,) = [line for line in lines if line["message"] == "answered"]
     assert line.pop("duration_ms") >= 0
@@ -102,9 +102,9 @@ def test_a_fault_is_logged_with_where_it_was_and_without_its_text(
     def broken(*_: object) -> None:
         raise RuntimeError(MARKER)
 
-    for house in make_house(tmp_path):
-        monkeypatch.setattr(house.queue, "ping", broken)
-        answer = house.http.get("/readyz")
+    for service in running_service(tmp_path):
+        monkeypatch.setattr(service.queue, "ping", broken)
+        answer = service.http.get("/readyz")
         assert (answer.status_code, answer.headers["content-type"]) == (500, "application/problem+json")
         assert MARKER not in answer.text
     lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]

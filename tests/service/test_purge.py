@@ -27,8 +27,8 @@ from service.audit import Audit
 from service.done import DoneJobs
 from service.purge import LOG_CLEARED_AFTER_S, NOTES, Purger
 from service.retention import HOUR_S, Retention, check_retention, kept_hours
-from tests.service.house import CLIP, House, assert_problem, make_house
 from tests.service.test_tus import uploaded
+from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, running_service
 
 KEPT_FILES = {AUDIT_FILE, RESERVE_FILE}
 """What tells of a job after its purge: that it was purged."""
@@ -47,161 +47,165 @@ def traces_of(data_dir: Path, job_id: str) -> list[Path]:
     return named + [path for path in holding if job_id.encode() in path.read_bytes()]
 
 
-def upload_in_pieces(house: House) -> str:
+def upload_in_pieces(service: ServiceUnderTest) -> str:
     """A job whose clip came as a resumable upload."""
-    job_id: str = house.http.post("/reconstruct", json={"clip": uploaded(house)}).json()["id"]
+    job_id: str = service.http.post("/reconstruct", json={"clip": uploaded(service)}).json()["id"]
     return job_id
 
 
-def failed_job(house: House, job_id: str) -> str:
-    record, claim = house.claimed()
+def failed_job(service: ServiceUnderTest, job_id: str) -> str:
+    record, claim = service.claimed()
     assert record.job_id == job_id
-    assert house.queue.fail(claim, JobError(problem="no depth."))
+    assert service.queue.fail(claim, JobError(problem="no depth."))
     return job_id
 
 
-def parts(house: House) -> tuple[Purger, Retention]:
-    settings = Settings(data_dir=house.store.data_dir, retention_hours=1.0)
-    purger = Purger(house.queue, house.store, Audit(AuditLog(house.store.data_dir)), DoneJobs(house.queue, house.store))
-    return purger, Retention(settings, house.queue, house.store, purger)
+def parts(service: ServiceUnderTest) -> tuple[Purger, Retention]:
+    settings = Settings(data_dir=service.store.data_dir, retention_hours=1.0)
+    purger = Purger(
+        service.queue, service.store, Audit(AuditLog(service.store.data_dir)), DoneJobs(service.queue, service.store)
+    )
+    return purger, Retention(settings, service.queue, service.store, purger)
 
 
-def test_a_purge_leaves_nothing_and_its_receipt_counts_what_there_was(house: House) -> None:
-    scene_id = house.finished_scene()
+def test_a_purge_leaves_nothing_and_its_receipt_counts_what_there_was(service: ServiceUnderTest) -> None:
+    scene_id = service.finished_scene()
     sizes = {
-        area: sum(path.stat().st_size for path in (house.store.data_dir / area).rglob("*") if path.is_file())
+        area: sum(path.stat().st_size for path in (service.store.data_dir / area).rglob("*") if path.is_file())
         for area in ("spool", "scenes")
     }
-    response = house.http.delete(f"/scenes/{scene_id}")
+    response = service.http.delete(f"/scenes/{scene_id}")
     assert response.status_code == 200
     receipt = response.json()
     assert (receipt["job_id"], receipt["record"], receipt["verified"]) == (scene_id, True, True)
     assert receipt["files"] == {"incoming": 0, "spool": 2, "work": 0, "scenes": 3, "uploads": 0}
     assert (receipt["bytes"]["spool"], receipt["bytes"]["scenes"]) == (sizes["spool"], sizes["scenes"])
     assert receipt["purged_at"].startswith("20")
-    assert traces_of(house.store.data_dir, scene_id) == []
-    assert not [path for path in files_of(house.store.data_dir) if CLIP in path.read_bytes()]
-    assert (house.queue.get(scene_id), house.queue.events(scene_id)) == (None, [])
+    assert traces_of(service.store.data_dir, scene_id) == []
+    assert not [path for path in files_of(service.store.data_dir) if CLIP in path.read_bytes()]
+    assert (service.queue.get(scene_id), service.queue.events(scene_id)) == (None, [])
     for path in (f"/scenes/{scene_id}", f"/jobs/{scene_id}", f"/render?scene={scene_id}"):
-        assert_problem(house.http.get(path), 404, "job_id" if "jobs" in path else "scene")
-    assert_problem(house.http.delete(f"/scenes/{scene_id}"), 404, "scene")
+        assert_problem(service.http.get(path), 404, "job_id" if "jobs" in path else "scene")
+    assert_problem(service.http.delete(f"/scenes/{scene_id}"), 404, "scene")
 
 
-def test_a_purge_takes_resumable_uploads_along(house: House) -> None:
-    job_id = failed_job(house, upload_in_pieces(house))
-    receipt = house.http.delete(f"/scenes/{job_id}").json()
+def test_a_purge_takes_resumable_uploads_along(service: ServiceUnderTest) -> None:
+    job_id = failed_job(service, upload_in_pieces(service))
+    receipt = service.http.delete(f"/scenes/{job_id}").json()
     assert receipt["files"]["uploads"] >= 1
-    assert traces_of(house.store.data_dir, job_id) == []
-    assert house.spooled() == []
+    assert traces_of(service.store.data_dir, job_id) == []
+    assert service.spooled() == []
 
 
-def test_an_upload_that_its_job_had_not_noted_yet_is_found_by_its_file(house: House) -> None:
-    job_id = house.upload().json()["id"]
-    failed_job(house, job_id)
-    upload = house.store.open_incoming("e" * 32)
+def test_an_upload_that_its_job_had_not_noted_yet_is_found_by_its_file(service: ServiceUnderTest) -> None:
+    job_id = service.upload().json()["id"]
+    failed_job(service, job_id)
+    upload = service.store.open_incoming("e" * 32)
     declaration = {"tenant": "local", "part": "clip", "suffix": ".mp4", "length_bytes": len(CLIP), "created_at_s": 1.0}
     (upload / "upload.json").write_text(json.dumps(declaration))
-    os.link(house.store.spool_folder(job_id) / "clip.mp4", upload / "clip.mp4")
-    assert house.http.delete(f"/scenes/{job_id}").json()["files"]["uploads"] == 2
-    assert traces_of(house.store.data_dir, job_id) == []
+    os.link(service.store.spool_folder(job_id) / "clip.mp4", upload / "clip.mp4")
+    assert service.http.delete(f"/scenes/{job_id}").json()["files"]["uploads"] == 2
+    assert traces_of(service.store.data_dir, job_id) == []
 
 
-def test_a_live_job_is_not_purged(house: House) -> None:
-    job_id = house.upload().json()["id"]
-    assert "Cancel it first" in assert_problem(house.http.delete(f"/scenes/{job_id}"), 409, "scene_id")["remedy"]
-    house.claimed()
-    assert_problem(house.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
-    assert house.spooled() != []
-    assert not (house.store.data_dir / NOTES).exists()
+def test_a_live_job_is_not_purged(service: ServiceUnderTest) -> None:
+    job_id = service.upload().json()["id"]
+    assert "Cancel it first" in assert_problem(service.http.delete(f"/scenes/{job_id}"), 409, "scene_id")["remedy"]
+    service.claimed()
+    assert_problem(service.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
+    assert service.spooled() != []
+    assert not (service.store.data_dir / NOTES).exists()
 
 
 @pytest.mark.parametrize("cut_at", ["store.purge", "queue.forget"])
 @pytest.mark.parametrize("finisher", ["again", "retention"])
 def test_a_purge_that_was_cut_off_is_finished(
-    house: House, monkeypatch: pytest.MonkeyPatch, cut_at: str, finisher: str
+    service: ServiceUnderTest, monkeypatch: pytest.MonkeyPatch, cut_at: str, finisher: str
 ) -> None:
-    scene_id = house.finished_scene()
+    scene_id = service.finished_scene()
     part, method = cut_at.split(".")
     with monkeypatch.context() as patch:
 
         def cut(*arguments: Any) -> None:
             raise UnavailableError("The power went.", "Wait.")
 
-        patch.setattr(getattr(house, part), method, cut)
-        assert_problem(house.http.delete(f"/scenes/{scene_id}"), 503)
+        patch.setattr(getattr(service, part), method, cut)
+        assert_problem(service.http.delete(f"/scenes/{scene_id}"), 503)
     if finisher == "again":
-        assert house.http.delete(f"/scenes/{scene_id}").json()["verified"] is True
+        assert service.http.delete(f"/scenes/{scene_id}").json()["verified"] is True
     else:
-        _, retention = parts(house)
+        _, retention = parts(service)
         retention.purge_due(time.time())
-        assert house.queue.get(scene_id) is not None  # so young a note may be of a purge that is under way
-        note = house.store.data_dir / NOTES / scene_id
+        assert service.queue.get(scene_id) is not None  # so young a note may be of a purge that is under way
+        note = service.store.data_dir / NOTES / scene_id
         os.utime(note, (1.0, 1.0))
         retention.purge_due(time.time())
         assert not note.exists()
-    assert house.queue.get(scene_id) is None
-    assert traces_of(house.store.data_dir, scene_id) == []
+    assert service.queue.get(scene_id) is None
+    assert traces_of(service.store.data_dir, scene_id) == []
 
 
 def test_a_job_that_is_retried_during_its_purge_is_not_reported_as_purged(
-    house: House, monkeypatch: pytest.MonkeyPatch
+    service: ServiceUnderTest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = failed_job(house, house.upload().json()["id"])
-    purge = house.store.purge
+    job_id = failed_job(service, service.upload().json()["id"])
+    purge = service.store.purge
 
     def purge_while_somebody_retries(purged_id: str) -> Any:
-        house.queue.retry(purged_id)
+        service.queue.retry(purged_id)
         return purge(purged_id)
 
-    monkeypatch.setattr(house.store, "purge", purge_while_somebody_retries)
-    assert_problem(house.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
-    assert (house.store.data_dir / NOTES / job_id).exists()
+    monkeypatch.setattr(service.store, "purge", purge_while_somebody_retries)
+    assert_problem(service.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
+    assert (service.store.data_dir / NOTES / job_id).exists()
 
 
-def test_several_services_may_purge_the_same_job_at_once(house: House) -> None:
+def test_several_services_may_purge_the_same_job_at_once(service: ServiceUnderTest) -> None:
     for _ in range(10):
-        job_id = failed_job(house, upload_in_pieces(house))
-        purgers = [parts(house)[0] for _ in range(4)]
+        job_id = failed_job(service, upload_in_pieces(service))
+        purgers = [parts(service)[0] for _ in range(4)]
         with ThreadPoolExecutor(len(purgers)) as pool:
             purges = [pool.submit(purger.purge, job_id, None) for purger in purgers]
         assert all(purge.result().verified for purge in purges)
-        assert traces_of(house.store.data_dir, job_id) == []
+        assert traces_of(service.store.data_dir, job_id) == []
 
 
-def test_retention_purges_in_time_and_nothing_before_and_nothing_live(house: House) -> None:
-    own = house.upload('{"retention_hours": 3}').json()["id"]
-    failed_job(house, own)
-    usual = failed_job(house, house.upload().json()["id"])
-    waiting = house.upload().json()["id"]
-    _, retention = parts(house)
+def test_retention_purges_in_time_and_nothing_before_and_nothing_live(service: ServiceUnderTest) -> None:
+    own = service.upload('{"retention_hours": 3}').json()["id"]
+    failed_job(service, own)
+    usual = failed_job(service, service.upload().json()["id"])
+    waiting = service.upload().json()["id"]
+    _, retention = parts(service)
     now_s = time.time()
     assert retention.purge_due(now_s + 0.9 * HOUR_S) == 0
     assert retention.purge_due(now_s + 1.1 * HOUR_S) == 1
-    assert [house.queue.get(job_id) is None for job_id in (own, usual, waiting)] == [False, True, False]
+    assert [service.queue.get(job_id) is None for job_id in (own, usual, waiting)] == [False, True, False]
     assert retention.purge_due(now_s + 3.1 * HOUR_S) == 1
-    assert [house.queue.get(job_id) is None for job_id in (own, usual, waiting)] == [True, True, False]
-    assert traces_of(house.store.data_dir, own) == []
-    lines = [json.loads(line) for line in (house.store.data_dir / AUDIT_FILE).read_text().splitlines()]
+    assert [service.queue.get(job_id) is None for job_id in (own, usual, waiting)] == [True, True, False]
+    assert traces_of(service.store.data_dir, own) == []
+    lines = [json.loads(line) for line in (service.store.data_dir / AUDIT_FILE).read_text().splitlines()]
     purged = [line for line in lines if line["action"] == AuditAction.PURGED and line["job_id"] == own]
     assert [line["outcome"] for line in purged] == ["begun (retention)", "done (retention)"]
     assert "tenant" not in purged[0]
 
 
-def test_one_job_that_cannot_be_purged_keeps_no_other(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
-    stuck = failed_job(house, house.upload().json()["id"])
-    other = failed_job(house, house.upload().json()["id"])
-    purge = house.store.purge
+def test_one_job_that_cannot_be_purged_keeps_no_other(
+    service: ServiceUnderTest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stuck = failed_job(service, service.upload().json()["id"])
+    other = failed_job(service, service.upload().json()["id"])
+    purge = service.store.purge
 
     def purge_but_one(job_id: str) -> Any:
         if job_id == stuck:
             raise UnavailableError("The disk fails.", "Mend it.")
         return purge(job_id)
 
-    monkeypatch.setattr(house.store, "purge", purge_but_one)
-    _, retention = parts(house)
+    monkeypatch.setattr(service.store, "purge", purge_but_one)
+    _, retention = parts(service)
     assert retention.purge_due(time.time() + 2 * HOUR_S) == 1
-    assert house.queue.get(other) is None
-    assert house.queue.get(stuck) is not None
+    assert service.queue.get(other) is None
+    assert service.queue.get(stuck) is not None
 
 
 @pytest.mark.parametrize(
@@ -227,9 +231,9 @@ def test_a_job_is_kept_as_long_as_it_asks_else_as_usual_and_never_longer_than_th
 def test_asking_to_be_kept_longer_than_the_maximum_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="7 hours"):
         check_retention(JobOptions(retention_hours=8.0), Settings(max_retention_hours=7.0))
-    for house in make_house(tmp_path, max_retention_hours=7.0):
-        assert_problem(house.upload('{"retention_hours": 8}'), 422, "options.retention_hours")
-        assert house.spooled() == []
+    for service in running_service(tmp_path, max_retention_hours=7.0):
+        assert_problem(service.upload('{"retention_hours": 8}'), 422, "options.retention_hours")
+        assert service.spooled() == []
 
 
 @pytest.fixture

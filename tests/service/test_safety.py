@@ -22,7 +22,7 @@ from contract.store.store import Store
 from contract.wire.job import JobError
 from service import deps
 from service.app import create_app
-from tests.service.house import CLIP, House, assert_problem, make_house
+from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, running_service
 
 OPEN_TO_ALL = {"/healthz", "/readyz", "/info", "/openapi.json", "OPTIONS /uploads"}
 """They tell of nobody's work. The page's own files are the only others."""
@@ -56,22 +56,22 @@ class Ward:
 
 
 @pytest.fixture
-def open_house(tmp_path: Path) -> Iterator[House]:
+def open_service(tmp_path: Path) -> Iterator[ServiceUnderTest]:
     """A service that listens to the network, and so asks for keys."""
-    yield from make_house(tmp_path, host=NETWORK)
+    yield from running_service(tmp_path, host=NETWORK)
 
 
-def ward(house: House, tenant: str, scopes: frozenset[KeyScope] = ALL_SCOPES) -> Ward:
-    return Ward(house.http, KeyFile(house.store.data_dir).create(tenant, scopes)[1])
+def ward(service: ServiceUnderTest, tenant: str, scopes: frozenset[KeyScope] = ALL_SCOPES) -> Ward:
+    return Ward(service.http, KeyFile(service.store.data_dir).create(tenant, scopes)[1])
 
 
-def audit(house: House) -> list[dict[str, Any]]:
-    path = house.store.data_dir / AUDIT_FILE
+def audit(service: ServiceUnderTest) -> list[dict[str, Any]]:
+    path = service.store.data_dir / AUDIT_FILE
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def acts(house: House) -> list[tuple[str, str, str | None]]:
-    return [(line["action"], line["outcome"], line.get("job_id")) for line in audit(house)]
+def acts(service: ServiceUnderTest) -> list[tuple[str, str, str | None]]:
+    return [(line["action"], line["outcome"], line.get("job_id")) for line in audit(service)]
 
 
 def routes_of(routes: list[BaseRoute]) -> Iterator[BaseRoute]:
@@ -84,10 +84,10 @@ def routes_of(routes: list[BaseRoute]) -> Iterator[BaseRoute]:
 
 
 def all_routes(data_dir: Path) -> list[BaseRoute]:
-    for house in make_house(data_dir):
-        app: FastAPI = create_app(Settings(data_dir=data_dir), house.queue, house.store, None)  # type: ignore[arg-type]
+    for service in running_service(data_dir):
+        app: FastAPI = create_app(Settings(data_dir=data_dir), service.queue, service.store, None)  # type: ignore[arg-type]
         return list(routes_of(app.routes))
-    raise AssertionError("no house")
+    raise AssertionError("no service")
 
 
 def requests_of(data_dir: Path, job_id: str) -> list[tuple[str, str]]:
@@ -122,26 +122,28 @@ def test_no_route_is_without_the_question_who_calls(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", [None, "isp_000000000000_00", "nonsense"])
 def test_without_a_known_key_every_route_answers_401_and_tells_nothing(
-    open_house: House, tmp_path: Path, key: str | None
+    open_service: ServiceUnderTest, tmp_path: Path, key: str | None
 ) -> None:
-    job_id = open_house.finished_scene(ward(open_house, "ward-3").headers)
+    job_id = open_service.finished_scene(ward(open_service, "ward-3").headers)
     headers = {} if key is None else {"X-API-Key": key}
     asked = requests_of(tmp_path / "other", job_id)
     assert len(asked) >= 14
     bodies = set()
     for method, path in asked:
         headers["Tus-Resumable"] = "1.0.0"
-        response = open_house.http.request(method, path, headers=headers)
+        response = open_service.http.request(method, path, headers=headers)
         assert response.status_code in (401, 429), f"{method} {path}: {response.status_code}"
         assert "www-authenticate" in response.headers or response.status_code == 429
         bodies.add(response.text)
     assert not [body for body in bodies if job_id in body]
-    assert [line["action"] for line in audit(open_house)].count("refused") == 1
+    assert [line["action"] for line in audit(open_service)].count("refused") == 1
 
 
-def test_another_tenants_job_is_answered_exactly_like_one_that_is_not_there(open_house: House, tmp_path: Path) -> None:
-    mine, theirs = ward(open_house, "ward-3"), ward(open_house, "ward-4")
-    job_id = open_house.finished_scene(mine.headers)
+def test_another_tenants_job_is_answered_exactly_like_one_that_is_not_there(
+    open_service: ServiceUnderTest, tmp_path: Path
+) -> None:
+    mine, theirs = ward(open_service, "ward-3"), ward(open_service, "ward-4")
+    job_id = open_service.finished_scene(mine.headers)
     missing = "f" * 32
     named = [
         (method, path)
@@ -157,12 +159,12 @@ def test_another_tenants_job_is_answered_exactly_like_one_that_is_not_there(open
         assert {*foreign.headers} == {*absent.headers}
     assert theirs.request("GET", "/jobs").json() == theirs.request("GET", "/scenes").json() == []
     assert mine.request("GET", f"/render?scene={job_id}").status_code == 200
-    refused = [line for line in audit(open_house) if line["action"] == "refused"]
+    refused = [line for line in audit(open_service) if line["action"] == "refused"]
     assert {(line["tenant"], line["job_id"], line["outcome"]) for line in refused} == {("ward-4", job_id, "404")}
 
 
-def test_another_tenants_upload_is_not_there_either(open_house: House) -> None:
-    mine, theirs = ward(open_house, "ward-3"), ward(open_house, "ward-4")
+def test_another_tenants_upload_is_not_there_either(open_service: ServiceUnderTest) -> None:
+    mine, theirs = ward(open_service, "ward-3"), ward(open_service, "ward-4")
     tus = {"Tus-Resumable": "1.0.0"}
     created = {**tus, "Upload-Length": str(len(CLIP)), "Upload-Metadata": "part Y2xpcA==,suffix Lm1wNA=="}
     path = mine.request("POST", "/uploads", headers=created).headers["location"]
@@ -180,9 +182,11 @@ def test_another_tenants_upload_is_not_there_either(open_house: House) -> None:
 
 
 @pytest.mark.parametrize("scope", list(KeyScope))
-def test_a_key_does_what_its_scope_says_and_nothing_else(open_house: House, tmp_path: Path, scope: KeyScope) -> None:
-    job_id = open_house.finished_scene(ward(open_house, "ward-3").headers)
-    limited = ward(open_house, "ward-3", frozenset({scope}))
+def test_a_key_does_what_its_scope_says_and_nothing_else(
+    open_service: ServiceUnderTest, tmp_path: Path, scope: KeyScope
+) -> None:
+    job_id = open_service.finished_scene(ward(open_service, "ward-3").headers)
+    limited = ward(open_service, "ward-3", frozenset({scope}))
     needed = {"/metrics": KeyScope.OPERATE, "DELETE /scenes": KeyScope.PURGE}
     for method, path in requests_of(tmp_path / "other", job_id):
         writes = (
@@ -198,43 +202,45 @@ def test_a_key_does_what_its_scope_says_and_nothing_else(open_house: House, tmp_
             assert response.status_code == 422 or method == "HEAD" or wanted.value in response.json()["detail"]
 
 
-def test_a_revoked_key_is_refused_with_the_next_request(open_house: House) -> None:
-    holder = ward(open_house, "ward-3")
+def test_a_revoked_key_is_refused_with_the_next_request(open_service: ServiceUnderTest) -> None:
+    holder = ward(open_service, "ward-3")
     assert holder.request("GET", "/jobs").status_code == 200
-    keys = KeyFile(open_house.store.data_dir)
+    keys = KeyFile(open_service.store.data_dir)
     keys.revoke(keys.list()[0].key_id)
     assert_problem(holder.request("GET", "/jobs"), 401, "Authorization")
 
 
-def test_a_damaged_file_of_keys_lets_nobody_in(open_house: House) -> None:
-    holder = ward(open_house, "ward-3")
+def test_a_damaged_file_of_keys_lets_nobody_in(open_service: ServiceUnderTest) -> None:
+    holder = ward(open_service, "ward-3")
     assert holder.request("GET", "/jobs").status_code == 200
-    (open_house.store.data_dir / KEYS_FILE).write_text("{")
+    (open_service.store.data_dir / KEYS_FILE).write_text("{")
     assert_problem(holder.request("GET", "/jobs"), 503)
-    assert_problem(open_house.http.get("/jobs"), 401, "Authorization")
+    assert_problem(open_service.http.get("/jobs"), 401, "Authorization")
 
 
-def test_on_loopback_no_key_is_needed_a_wrong_one_is_refused_and_a_right_one_counts(house: House) -> None:
-    local_id = house.finished_scene()
-    assert_problem(house.http.request("GET", "/jobs", headers={"X-API-Key": "isp_1_2"}), 401, "Authorization")
-    holder = ward(house, "ward-3")
+def test_on_loopback_no_key_is_needed_a_wrong_one_is_refused_and_a_right_one_counts(service: ServiceUnderTest) -> None:
+    local_id = service.finished_scene()
+    assert_problem(service.http.request("GET", "/jobs", headers={"X-API-Key": "isp_1_2"}), 401, "Authorization")
+    holder = ward(service, "ward-3")
     assert holder.request("GET", "/jobs").json() == []
     assert holder.request("GET", f"/scenes/{local_id}").status_code == 404
-    assert house.http.get(f"/scenes/{local_id}").status_code == 200
+    assert service.http.get(f"/scenes/{local_id}").status_code == 200
 
 
-def test_no_scene_is_shown_unasked_when_several_are_owned_and_none_of_others_ever(open_house: House) -> None:
-    mine, theirs = ward(open_house, "ward-3"), ward(open_house, "ward-4")
-    first = open_house.finished_scene(mine.headers)
+def test_no_scene_is_shown_unasked_when_several_are_owned_and_none_of_others_ever(
+    open_service: ServiceUnderTest,
+) -> None:
+    mine, theirs = ward(open_service, "ward-3"), ward(open_service, "ward-4")
+    first = open_service.finished_scene(mine.headers)
     assert_problem(theirs.request("GET", "/render"), 400, "scene")
     assert mine.request("GET", "/render").headers["x-intrasplat-scene"] == first
-    open_house.finished_scene(mine.headers)
+    open_service.finished_scene(mine.headers)
     assert_problem(mine.request("GET", "/render"), 400, "scene")
 
 
 def test_a_caller_that_asks_too_often_hears_when_to_come_back_and_others_are_served(tmp_path: Path) -> None:
-    for house in make_house(tmp_path, host=NETWORK, requests_per_s=3.0):
-        hasty, calm = ward(house, "ward-3"), ward(house, "ward-4")
+    for service in running_service(tmp_path, host=NETWORK, requests_per_s=3.0):
+        hasty, calm = ward(service, "ward-3"), ward(service, "ward-4")
         responses = [hasty.request("GET", "/jobs") for _ in range(8)]
         assert responses[0].status_code == 200
         assert_problem(responses[-1], 429)
@@ -243,20 +249,20 @@ def test_a_caller_that_asks_too_often_hears_when_to_come_back_and_others_are_ser
         assert calm.request("GET", "/jobs").status_code == 200
 
 
-def test_what_is_done_is_in_the_audit_and_a_view_once_a_minute(open_house: House) -> None:
-    holder = ward(open_house, "ward-3")
-    done = open_house.finished_scene(holder.headers)
+def test_what_is_done_is_in_the_audit_and_a_view_once_a_minute(open_service: ServiceUnderTest) -> None:
+    holder = ward(open_service, "ward-3")
+    done = open_service.finished_scene(holder.headers)
     for _ in range(5):
         assert holder.request("GET", f"/render?scene={done}").status_code == 200
     holder.request("GET", f"/scenes/{done}")
     holder.request("GET", f"/scenes/{done}/export")
     failed = holder.upload()
-    _, claim = open_house.claimed()
-    open_house.queue.fail(claim, JobError(problem="no depth."))
+    _, claim = open_service.claimed()
+    open_service.queue.fail(claim, JobError(problem="no depth."))
     holder.request("POST", f"/jobs/{failed}/retry")
     holder.request("DELETE", f"/jobs/{failed}")
     holder.request("DELETE", f"/scenes/{done}")
-    recorded = acts(open_house)
+    recorded = acts(open_service)
     views = recorded.count(("viewed", "ok", done))
     assert views in (1, 2)  # a minute may have ended in between
     assert [act for act in recorded if act[0] != "viewed"] == [
@@ -268,15 +274,15 @@ def test_what_is_done_is_in_the_audit_and_a_view_once_a_minute(open_house: House
         ("purged", "begun (request)", done),
         ("purged", "done (request)", done),
     ]
-    key_id = KeyFile(open_house.store.data_dir).list()[0].key_id
-    assert {(line["tenant"], line["key_id"]) for line in audit(open_house)} == {("ward-3", key_id)}
-    assert all(line["request_id"] for line in audit(open_house))
+    key_id = KeyFile(open_service.store.data_dir).list()[0].key_id
+    assert {(line["tenant"], line["key_id"]) for line in audit(open_service)} == {("ward-3", key_id)}
+    assert all(line["request_id"] for line in audit(open_service))
 
 
-def test_what_cannot_be_recorded_does_not_happen(house: House) -> None:
-    scene_id = house.finished_scene()
-    queued = house.upload().json()["id"]
-    path = house.store.data_dir / AUDIT_FILE
+def test_what_cannot_be_recorded_does_not_happen(service: ServiceUnderTest) -> None:
+    scene_id = service.finished_scene()
+    queued = service.upload().json()["id"]
+    path = service.store.data_dir / AUDIT_FILE
     path.rename(path.with_suffix(".away"))
     path.mkdir()
     for method, asked in (
@@ -286,30 +292,30 @@ def test_what_cannot_be_recorded_does_not_happen(house: House) -> None:
         ("DELETE", f"/scenes/{scene_id}"),
         ("DELETE", f"/jobs/{queued}"),
     ):
-        assert_problem(house.http.request(method, asked), 503)
-    before = house.spooled()
-    assert_problem(house.upload(), 503)
-    assert house.spooled() == before
-    assert house.painter.requests == []
+        assert_problem(service.http.request(method, asked), 503)
+    before = service.spooled()
+    assert_problem(service.upload(), 503)
+    assert service.spooled() == before
+    assert service.painter.requests == []
     path.rmdir()
-    assert house.http.get(f"/scenes/{scene_id}").status_code == 200
-    assert house.http.get(f"/jobs/{queued}").json()["state"] == "queued"
+    assert service.http.get(f"/scenes/{scene_id}").status_code == 200
+    assert service.http.get(f"/jobs/{queued}").json()["state"] == "queued"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_on_a_full_disk_without_a_reserve_nothing_is_shown_and_the_answer_says_why(house: House) -> None:
-    scene_id = house.finished_scene()
-    (house.store.data_dir / AUDIT_FILE).unlink()
-    (house.store.data_dir / RESERVE_FILE).unlink(missing_ok=True)
-    (house.store.data_dir / AUDIT_FILE).symlink_to("/dev/full")
-    assert_problem(house.http.get(f"/render?scene={scene_id}"), 507)
-    assert house.painter.requests == []
+def test_on_a_full_disk_without_a_reserve_nothing_is_shown_and_the_answer_says_why(service: ServiceUnderTest) -> None:
+    scene_id = service.finished_scene()
+    (service.store.data_dir / AUDIT_FILE).unlink()
+    (service.store.data_dir / RESERVE_FILE).unlink(missing_ok=True)
+    (service.store.data_dir / AUDIT_FILE).symlink_to("/dev/full")
+    assert_problem(service.http.get(f"/render?scene={scene_id}"), 507)
+    assert service.painter.requests == []
 
 
 def test_a_callers_words_appear_in_no_metric_audit_problem_event_log_or_file_name(
-    open_house: House, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    open_service: ServiceUnderTest, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    holder = ward(open_house, "ward-3")
+    holder = ward(open_service, "ward-3")
     caplog.set_level(0)
     job_id = holder.upload(f"{MARKER}.mp4")
     told = [holder.request("GET", f"/jobs/{job_id}").text]
@@ -317,24 +323,24 @@ def test_a_callers_words_appear_in_no_metric_audit_problem_event_log_or_file_nam
     assert refused.status_code == 422
     holder.request("GET", f"/{MARKER}", headers={"User-Agent": MARKER, "X-Request-Id": f"{MARKER} {MARKER}"})
     holder.request("POST", f"/jobs/{job_id}/{MARKER}")
-    record, claim = open_house.claimed()
-    open_house.queue.fail(claim, JobError(problem="no depth."))
+    record, claim = open_service.claimed()
+    open_service.queue.fail(claim, JobError(problem="no depth."))
     told.append(holder.request("GET", f"/jobs/{job_id}/events").text)
     told.append(holder.request("GET", "/metrics").text)
-    told += [event.record.model_dump_json() for event in open_house.queue.events(job_id)]
+    told += [event.record.model_dump_json() for event in open_service.queue.events(job_id)]
     told.append(record.model_dump_json())
-    told.append((open_house.store.data_dir / AUDIT_FILE).read_text())
-    told += [str(path) for path in open_house.store.data_dir.rglob("*")]
-    told += [path.read_text() for path in open_house.store.data_dir.rglob("*.json")]
+    told.append((open_service.store.data_dir / AUDIT_FILE).read_text())
+    told += [str(path) for path in open_service.store.data_dir.rglob("*")]
+    told += [path.read_text() for path in open_service.store.data_dir.rglob("*.json")]
     told += ["".join(capfd.readouterr())]
     assert "intrasplat_http_requests_total" in told[2]
     assert not [text for text in told if MARKER in text]
     assert not [line for line in caplog.records if line.name.startswith("intrasplat") and MARKER in line.getMessage()]
 
 
-def test_folders_and_files_are_their_owners_alone(open_house: House) -> None:
-    ward(open_house, "ward-3").upload()
-    data_dir = Store(open_house.store.data_dir).data_dir
+def test_folders_and_files_are_their_owners_alone(open_service: ServiceUnderTest) -> None:
+    ward(open_service, "ward-3").upload()
+    data_dir = Store(open_service.store.data_dir).data_dir
     assert data_dir.stat().st_mode & 0o077 == 0
     for name in (AUDIT_FILE, KEYS_FILE):
         assert (data_dir / name).stat().st_mode & 0o077 == 0

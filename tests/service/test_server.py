@@ -18,8 +18,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from service.server import MAX_CONNECTIONS, MAX_HEAD_BYTES, SPARE_FILES, room_for_connections
-from tests.service.house import CLIP
 from tests.service.live import LiveService, live_service
+from tests.service.under_test import CLIP
 
 PATIENCE_S = 20.0
 

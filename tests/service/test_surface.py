@@ -7,25 +7,25 @@ from pathlib import Path
 import pytest
 
 from contract.wire.errors import UnavailableError
-from tests.service.house import House, assert_problem, make_house
+from tests.service.under_test import ServiceUnderTest, assert_problem, running_service
 
 
 @pytest.mark.parametrize(("method", "path", "status"), [("GET", "/nothing", 404), ("PUT", "/jobs", 405)])
-def test_what_does_not_exist_is_a_problem_too(house: House, method: str, path: str, status: int) -> None:
-    assert_problem(house.http.request(method, path), status)
+def test_what_does_not_exist_is_a_problem_too(service: ServiceUnderTest, method: str, path: str, status: int) -> None:
+    assert_problem(service.http.request(method, path), status)
 
 
 @pytest.mark.parametrize(
     "headers",
     [{"host": "evil.example"}, {"host": "["}, {"origin": "https://evil.example"}, {"origin": "http://["}],
 )
-def test_foreign_pages_and_names_are_refused(house: House, headers: dict[str, str]) -> None:
-    assert house.http.post("/reconstruct", headers=headers).status_code == 403
-    assert house.http.get("/jobs", headers=headers).status_code == 403
+def test_foreign_pages_and_names_are_refused(service: ServiceUnderTest, headers: dict[str, str]) -> None:
+    assert service.http.post("/reconstruct", headers=headers).status_code == 403
+    assert service.http.get("/jobs", headers=headers).status_code == 403
 
 
-def test_the_page_itself_may_use_the_service_and_nothing_from_elsewhere_may_run(house: House) -> None:
-    response = house.http.get("/jobs", headers={"origin": "http://127.0.0.1:8765"})
+def test_the_page_itself_may_use_the_service_and_nothing_from_elsewhere_may_run(service: ServiceUnderTest) -> None:
+    response = service.http.get("/jobs", headers={"origin": "http://127.0.0.1:8765"})
     assert response.status_code == 200
     assert "default-src 'none'" in response.headers["content-security-policy"]
     assert response.headers["x-content-type-options"] == "nosniff"
@@ -40,8 +40,8 @@ OPERATIONS = {
 """What clients are generated from: renaming or removing one breaks them."""
 
 
-def test_the_api_describes_itself_with_stable_operation_ids(house: House) -> None:
-    document = house.http.get("/openapi.json").json()
+def test_the_api_describes_itself_with_stable_operation_ids(service: ServiceUnderTest) -> None:
+    document = service.http.get("/openapi.json").json()
     operations = [each for path in document["paths"].values() for each in path.values()]
     assert {each["operationId"] for each in operations} == OPERATIONS
     problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
@@ -51,8 +51,8 @@ def test_the_api_describes_itself_with_stable_operation_ids(house: House) -> Non
     assert "HTTPValidationError" not in document["components"]["schemas"]
 
 
-def test_the_service_tells_its_limits_in_numbers(house: House) -> None:
-    info = house.http.get("/info").json()
+def test_the_service_tells_its_limits_in_numbers(service: ServiceUnderTest) -> None:
+    info = service.http.get("/info").json()
     assert "Not a medical device" in info["notice"]
     limits = info["limits"]
     assert limits["max_frames"] == 1000
@@ -61,51 +61,55 @@ def test_the_service_tells_its_limits_in_numbers(house: House) -> None:
     assert all(isinstance(value, int | float) for value in numbers)
 
 
-def test_every_answer_has_an_id_and_a_safe_one_that_was_given_is_kept(house: House) -> None:
+def test_every_answer_has_an_id_and_a_safe_one_that_was_given_is_kept(service: ServiceUnderTest) -> None:
     given = "4bf92f35-77b3-4da6-a3ce-929d0e0e4736"
-    assert house.http.get("/jobs", headers={"X-Request-Id": given}).headers["x-request-id"] == given
+    assert service.http.get("/jobs", headers={"X-Request-Id": given}).headers["x-request-id"] == given
     for unsafe in ("Smith", "a b", "x" * 100, "<script>"):
-        made = house.http.get("/nothing", headers={"X-Request-Id": unsafe}).headers["x-request-id"]
+        made = service.http.get("/nothing", headers={"X-Request-Id": unsafe}).headers["x-request-id"]
         assert unsafe not in made
         assert len(made) == 32
-    assert house.http.get("/jobs", headers={"host": "evil.example"}).headers["x-request-id"]
+    assert service.http.get("/jobs", headers={"host": "evil.example"}).headers["x-request-id"]
 
 
-def test_an_unforeseen_error_is_a_problem_that_tells_nothing(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unforeseen_error_is_a_problem_that_tells_nothing(
+    service: ServiceUnderTest, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def broken(*_: object) -> None:
         raise RuntimeError("patient Smith")
 
-    monkeypatch.setattr(house.queue, "ping", broken)
-    response = house.http.get("/readyz")
+    monkeypatch.setattr(service.queue, "ping", broken)
+    response = service.http.get("/readyz")
     assert "X-Request-Id" in assert_problem(response, 500)["remedy"]
     assert "Smith" not in response.text
     assert response.headers["x-request-id"]
 
 
 @pytest.mark.parametrize("length", ["-1", "ten", "1e3", "9" * 30])
-def test_a_length_that_is_none_is_a_problem(house: House, length: str) -> None:
+def test_a_length_that_is_none_is_a_problem(service: ServiceUnderTest, length: str) -> None:
     headers = {"content-length": length, "content-type": "multipart/form-data; boundary=x"}
-    assert_problem(house.http.post("/reconstruct", content=b"", headers=headers), 400, "Content-Length")
+    assert_problem(service.http.post("/reconstruct", content=b"", headers=headers), 400, "Content-Length")
 
 
-def test_the_service_is_not_ready_without_queue_worker_or_room(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert house.http.get("/readyz").json()["ready"] is True
+def test_the_service_is_not_ready_without_queue_worker_or_room(
+    service: ServiceUnderTest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert service.http.get("/readyz").json()["ready"] is True
 
     def away() -> None:
         raise UnavailableError("The queue does not answer.", "Start it.")
 
-    house.queue.withdraw("worker-1")
-    assert_problem(house.http.get("/readyz"), 503, "worker")
-    monkeypatch.setattr(house.queue, "ping", away)
-    assert_problem(house.http.get("/readyz"), 503, "queue")
-    assert house.http.get("/healthz").json() == {"alive": True}
+    service.queue.withdraw("worker-1")
+    assert_problem(service.http.get("/readyz"), 503, "worker")
+    monkeypatch.setattr(service.queue, "ping", away)
+    assert_problem(service.http.get("/readyz"), 503, "queue")
+    assert service.http.get("/healthz").json() == {"alive": True}
 
 
 def test_the_dashboard_is_served_at_the_root(tmp_path: Path) -> None:
     folder = tmp_path / "page"
     folder.mkdir()
     (folder / "index.html").write_text("<!doctype html><title>intrasplat</title>")
-    for house in make_house(tmp_path / "data", dashboard_dir=folder):
-        assert "intrasplat" in house.http.get("/").text
-        assert house.http.get("/jobs").json() == []
-        assert_problem(house.http.get("/nothing.js"), 404)
+    for service in running_service(tmp_path / "data", dashboard_dir=folder):
+        assert "intrasplat" in service.http.get("/").text
+        assert service.http.get("/jobs").json() == []
+        assert_problem(service.http.get("/nothing.js"), 404)

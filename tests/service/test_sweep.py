@@ -14,7 +14,7 @@ from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.names import MANIFEST, SUBMISSION
 from service.sweep import Sweep
-from tests.service.house import House, assert_problem, make_house
+from tests.service.under_test import ServiceUnderTest, assert_problem, running_service
 
 PATIENCE_S = 10.0
 
@@ -50,12 +50,12 @@ def test_a_clip_accepted_while_the_queue_is_away_is_queued_once_it_is_back(
 ) -> None:
     monkeypatch.setattr("service.sweep.SWEEP_PERIOD_S", 0.05)
     queue = AbsentQueue()
-    for house in make_house(tmp_path, queue):
+    for service in running_service(tmp_path, queue):
         queue.is_away, queue.loses = True, loses
-        refused = house.upload()
+        refused = service.upload()
         problem = assert_problem(refused, 503, "queue")
         assert refused.headers["retry-after"]
-        assert house.store.submission(problem["job_id"]) is not None
+        assert service.store.submission(problem["job_id"]) is not None
         queue.is_away = False
         assert wait_for_job(queue, problem["job_id"]).state is JobState.QUEUED
         assert len(queue.records()) == 1
@@ -63,39 +63,39 @@ def test_a_clip_accepted_while_the_queue_is_away_is_queued_once_it_is_back(
 
 def test_a_repeat_under_the_same_key_finds_the_job_that_the_sweep_queued(tmp_path: Path) -> None:
     queue = AbsentQueue()
-    for house in make_house(tmp_path, queue):
+    for service in running_service(tmp_path, queue):
         queue.is_away = True
-        job_id = house.upload(headers={"Idempotency-Key": "k"}).json()["job_id"]
+        job_id = service.upload(headers={"Idempotency-Key": "k"}).json()["job_id"]
         queue.is_away = False
-        Sweep(queue, house.store).settle()
-        assert house.upload(headers={"Idempotency-Key": "k"}).json()["id"] == job_id
-        assert house.store.spooled_ids() == [job_id]
+        Sweep(queue, service.store).settle()
+        assert service.upload(headers={"Idempotency-Key": "k"}).json()["id"] == job_id
+        assert service.store.spooled_ids() == [job_id]
 
 
 def test_of_two_clips_under_one_key_the_sweep_keeps_one(tmp_path: Path) -> None:
     queue = AbsentQueue()
-    for house in make_house(tmp_path, queue):
+    for service in running_service(tmp_path, queue):
         queue.is_away = True
         for _ in range(2):
-            house.upload(headers={"Idempotency-Key": "k"})
-        assert len(house.store.spooled_ids()) == 2
+            service.upload(headers={"Idempotency-Key": "k"})
+        assert len(service.store.spooled_ids()) == 2
         queue.is_away = False
-        Sweep(queue, house.store).settle()
+        Sweep(queue, service.store).settle()
         (record,) = queue.records()
-        assert house.store.spooled_ids() == [record.job_id]
+        assert service.store.spooled_ids() == [record.job_id]
 
 
 def test_a_service_that_starts_queues_what_an_earlier_one_left(tmp_path: Path) -> None:
-    for house in make_house(tmp_path):
-        job_id = house.upload().json()["id"]
+    for service in running_service(tmp_path):
+        job_id = service.upload().json()["id"]
     emptied = MemoryQueue()
-    for _ in make_house(tmp_path, emptied):
+    for _ in running_service(tmp_path, emptied):
         assert wait_for_job(emptied, job_id).state is JobState.QUEUED
 
 
 def test_a_finished_scene_whose_record_was_lost_is_restored_and_not_run_again(tmp_path: Path) -> None:
-    for house in make_house(tmp_path):
-        scene = house.finished_scene()
+    for service in running_service(tmp_path):
+        scene = service.finished_scene()
     emptied, store = MemoryQueue(), Store(tmp_path)
     Sweep(emptied, store).settle()
     record = emptied.get(scene)
@@ -104,34 +104,34 @@ def test_a_finished_scene_whose_record_was_lost_is_restored_and_not_run_again(tm
     assert (store.scene_folder(scene, record.attempt) / MANIFEST).is_file()
 
 
-def test_the_sweep_may_run_as_often_as_it_likes(house: House) -> None:
-    job_id = house.upload().json()["id"]
-    before = house.queue.get(job_id)
+def test_the_sweep_may_run_as_often_as_it_likes(service: ServiceUnderTest) -> None:
+    job_id = service.upload().json()["id"]
+    before = service.queue.get(job_id)
     for _ in range(3):
-        Sweep(house.queue, house.store).settle()
-    assert house.queue.get(job_id) == before
+        Sweep(service.queue, service.store).settle()
+    assert service.queue.get(job_id) == before
 
 
-def test_the_clip_of_a_cancelled_job_goes_even_if_its_canceller_died(house: House) -> None:
-    job_id = house.upload().json()["id"]
-    house.queue.cancel(job_id)
-    Sweep(house.queue, house.store).settle()
-    assert house.store.spooled_ids() == []
+def test_the_clip_of_a_cancelled_job_goes_even_if_its_canceller_died(service: ServiceUnderTest) -> None:
+    job_id = service.upload().json()["id"]
+    service.queue.cancel(job_id)
+    Sweep(service.queue, service.store).settle()
+    assert service.store.spooled_ids() == []
 
 
 def test_a_submission_that_cannot_be_read_stops_no_other(tmp_path: Path) -> None:
-    for house in make_house(tmp_path):
-        ids = [house.upload().json()["id"] for _ in range(3)]
+    for service in running_service(tmp_path):
+        ids = [service.upload().json()["id"] for _ in range(3)]
     (Store(tmp_path).spool_folder(ids[1]) / SUBMISSION).write_text("{")
     queue = MemoryQueue()
     Sweep(queue, Store(tmp_path)).settle()
     assert {record.job_id for record in queue.records()} == {ids[0], ids[2]}
 
 
-def test_a_job_that_a_request_is_submitting_is_let_be(house: House) -> None:
-    job_id = house.upload().json()["id"]
+def test_a_job_that_a_request_is_submitting_is_let_be(service: ServiceUnderTest) -> None:
+    job_id = service.upload().json()["id"]
     emptied = MemoryQueue()
-    sweep = Sweep(emptied, house.store)
+    sweep = Sweep(emptied, service.store)
     with sweep.in_hand(job_id):
         sweep.settle()
         assert emptied.records() == []
@@ -151,17 +151,17 @@ class WithdrawingQueue(MemoryQueue):
         return super().submit(record, admission)
 
 
-def test_a_job_whose_clip_was_withdrawn_meanwhile_is_taken_back(house: House) -> None:
-    house.upload()
-    queue = WithdrawingQueue(house.store)
-    Sweep(queue, house.store).settle()
+def test_a_job_whose_clip_was_withdrawn_meanwhile_is_taken_back(service: ServiceUnderTest) -> None:
+    service.upload()
+    queue = WithdrawingQueue(service.store)
+    Sweep(queue, service.store).settle()
     assert queue.records() == []
 
 
-def files_left(house: House, job_id: str) -> list[object]:
+def files_left(service: ServiceUnderTest, job_id: str) -> list[object]:
     """The clip and the attempts at a scene; they go one after the other."""
-    submission = house.store.submission(job_id)
-    return ([] if submission is None else [submission]) + list(house.store.scene_attempts(job_id))
+    submission = service.store.submission(job_id)
+    return ([] if submission is None else [submission]) + list(service.store.scene_attempts(job_id))
 
 
 def test_the_files_of_a_cancelled_job_go_even_if_its_worker_died(
@@ -169,19 +169,19 @@ def test_the_files_of_a_cancelled_job_go_even_if_its_worker_died(
 ) -> None:
     monkeypatch.setattr("service.sweep.SWEEP_PERIOD_S", 0.05)
     queue = MemoryQueue(lease_s=0.0)
-    for house in make_house(tmp_path, queue):
-        job_id = house.upload().json()["id"]
+    for service in running_service(tmp_path, queue):
+        job_id = service.upload().json()["id"]
         record = queue.claim("worker-1.dead", 0.0)
         assert record is not None
-        (house.store.work_folder(job_id, record.attempt) / MANIFEST).write_text("{}")
-        house.store.publish_scene(job_id, record.attempt)
+        (service.store.work_folder(job_id, record.attempt) / MANIFEST).write_text("{}")
+        service.store.publish_scene(job_id, record.attempt)
         queue.cancel(job_id)
         assert queue.claim("worker-2", 0.0) is None  # which finds the lease run out
         ended = queue.get(job_id)
         assert ended is not None
         assert ended.state is JobState.CANCELLED
         deadline = time.monotonic() + PATIENCE_S
-        while (left := files_left(house, job_id)) and time.monotonic() < deadline:
+        while (left := files_left(service, job_id)) and time.monotonic() < deadline:
             time.sleep(0.02)
         assert not left
 
@@ -196,12 +196,12 @@ def test_a_job_that_cannot_be_queued_is_not_in_the_way_of_others(tmp_path: Path)
             return super().submit(record, admission)
 
     queue = PickyQueue()
-    for house in make_house(tmp_path, queue):
-        jobs = [house.upload().json()["id"] for _ in range(3)]
+    for service in running_service(tmp_path, queue):
+        jobs = [service.upload().json()["id"] for _ in range(3)]
         for job_id in jobs:
             queue.cancel(job_id)
             queue.forget(job_id)
         queue.refused = jobs[1]
-        Sweep(queue, house.store).settle()
+        Sweep(queue, service.store).settle()
         assert {record.job_id for record in queue.records()} == {jobs[0], jobs[2]}
-        assert house.store.submission(jobs[1]) is not None
+        assert service.store.submission(jobs[1]) is not None

@@ -18,31 +18,31 @@ from contract.wire.names import SUBMISSION
 from service.problems import Problem, install_handlers
 from service.upload import UploadLimits, receive_upload
 from tests.service.asgi import serving
-from tests.service.house import CLIP, EMPTY_ZIP, House, assert_problem, make_house
+from tests.service.under_test import CLIP, EMPTY_ZIP, ServiceUnderTest, assert_problem, running_service
 
 PATIENCE_S = 10.0
 
 
-def test_an_accepted_clip_is_on_disk_and_queued_before_the_answer(house: House) -> None:
-    response = house.upload('{"preset": "fast", "iterations": 30, "holdout": [1, 9]}')
+def test_an_accepted_clip_is_on_disk_and_queued_before_the_answer(service: ServiceUnderTest) -> None:
+    response = service.upload('{"preset": "fast", "iterations": 30, "holdout": [1, 9]}')
     assert response.status_code == 202
     job = response.json()
     assert response.headers["location"] == f"/jobs/{job['id']}"
     assert job["state"] == "queued"
-    record = house.queue.get(job["id"])
+    record = service.queue.get(job["id"])
     assert record is not None
     assert record.options.holdout == "1,9"
     assert record.input_sha256 == hashlib.sha256(CLIP).hexdigest()
-    folder = house.store.spool_folder(job["id"])
+    folder = service.store.spool_folder(job["id"])
     assert (folder / "clip.mp4").read_bytes() == CLIP
     assert JobRecord.model_validate_json((folder / SUBMISSION).read_text()) == record
-    assert list((house.store.data_dir / "incoming").iterdir()) == []
+    assert list((service.store.data_dir / "incoming").iterdir()) == []
 
 
-def test_two_eyes_calibration_and_masks_are_kept_under_our_names(house: House) -> None:
+def test_two_eyes_calibration_and_masks_are_kept_under_our_names(service: ServiceUnderTest) -> None:
     eyes = {"left": ("Smith_L.MOV", CLIP), "right": ("Smith_R.mov", CLIP)}
-    response = house.upload(parts={**eyes, "calibration": ("stereo.yaml", b"K: 1"), "masks": ("m.zip", EMPTY_ZIP)})
-    record = house.queue.get(response.json()["id"])
+    response = service.upload(parts={**eyes, "calibration": ("stereo.yaml", b"K: 1"), "masks": ("m.zip", EMPTY_ZIP)})
+    record = service.queue.get(response.json()["id"])
     assert record is not None
     assert record.files.model_dump() == {
         "clip": "left.mov",
@@ -50,7 +50,7 @@ def test_two_eyes_calibration_and_masks_are_kept_under_our_names(house: House) -
         "calibration": "calibration.yaml",
         "masks": "masks.zip",
     }
-    assert "Smith" not in "".join(path.read_text() for path in house.store.data_dir.rglob("*.json"))
+    assert "Smith" not in "".join(path.read_text() for path in service.store.data_dir.rglob("*.json"))
 
 
 @pytest.mark.parametrize(
@@ -68,11 +68,11 @@ def test_two_eyes_calibration_and_masks_are_kept_under_our_names(house: House) -
     ],
 )
 def test_an_upload_that_cannot_be_used_names_the_part_and_leaves_nothing(
-    house: House, parts: dict[str, tuple[str, bytes]], field: str
+    service: ServiceUnderTest, parts: dict[str, tuple[str, bytes]], field: str
 ) -> None:
-    assert assert_problem(house.upload(parts=parts), 422, field)["remedy"]
-    assert house.spooled() == []
-    assert house.queue.records() == []
+    assert assert_problem(service.upload(parts=parts), 422, field)["remedy"]
+    assert service.spooled() == []
+    assert service.queue.records() == []
 
 
 @pytest.mark.parametrize(
@@ -86,14 +86,14 @@ def test_an_upload_that_cannot_be_used_names_the_part_and_leaves_nothing(
         ("{", "options"),
     ],
 )
-def test_an_option_that_cannot_be_meant_is_named(house: House, options: str, field: str) -> None:
-    assert_problem(house.upload(options), 422, field)
-    assert house.spooled() == []
+def test_an_option_that_cannot_be_meant_is_named(service: ServiceUnderTest, options: str, field: str) -> None:
+    assert_problem(service.upload(options), 422, field)
+    assert service.spooled() == []
 
 
-def test_a_part_that_comes_twice_is_refused(house: House) -> None:
+def test_a_part_that_comes_twice_is_refused(service: ServiceUnderTest) -> None:
     twice = [("clip", ("a.mp4", b"x")), ("clip", ("b.mp4", b"y"))]
-    assert_problem(house.http.post("/reconstruct", files=twice), 422, "clip")
+    assert_problem(service.http.post("/reconstruct", files=twice), 422, "clip")
 
 
 @pytest.mark.parametrize(
@@ -110,11 +110,13 @@ def test_a_part_that_comes_twice_is_refused(house: House) -> None:
         ),
     ],
 )
-def test_a_body_that_is_no_complete_form_is_a_bad_request(house: House, content_type: str, body: bytes) -> None:
-    response = house.http.post("/reconstruct", content=body, headers={"content-type": content_type})
+def test_a_body_that_is_no_complete_form_is_a_bad_request(
+    service: ServiceUnderTest, content_type: str, body: bytes
+) -> None:
+    response = service.http.post("/reconstruct", content=body, headers={"content-type": content_type})
     assert response.status_code == 400
     assert response.json()["remedy"]
-    assert house.spooled() == []
+    assert service.spooled() == []
 
 
 def test_uploads_cut_off_by_the_end_of_an_earlier_service_are_removed_at_the_start_of_the_next(tmp_path: Path) -> None:
@@ -123,17 +125,17 @@ def test_uploads_cut_off_by_the_end_of_an_earlier_service_are_removed_at_the_sta
     long_ago_s = time.time() - ABANDONED_AFTER_S - 60
     for path in (folder / "clip.mp4", folder):
         os.utime(path, (long_ago_s, long_ago_s))
-    for house in make_house(tmp_path):
+    for service in running_service(tmp_path):
         deadline = time.monotonic() + PATIENCE_S
-        while house.spooled() and time.monotonic() < deadline:
+        while service.spooled() and time.monotonic() < deadline:
             time.sleep(0.02)
-        assert house.spooled() == []
+        assert service.spooled() == []
 
 
 def test_an_upload_over_the_limit_is_cut_off_while_it_is_counted(tmp_path: Path) -> None:
-    for house in make_house(tmp_path, max_upload_bytes=1000):
-        assert "INTRASPLAT_MAX_UPLOAD_BYTES" in assert_problem(house.upload(), 413, "clip")["remedy"]
-        assert house.spooled() == []
+    for service in running_service(tmp_path, max_upload_bytes=1000):
+        assert "INTRASPLAT_MAX_UPLOAD_BYTES" in assert_problem(service.upload(), 413, "clip")["remedy"]
+        assert service.spooled() == []
 
 
 def test_an_upload_leaves_the_room_on_disk_that_must_stay_free(tmp_path: Path) -> None:
@@ -161,9 +163,9 @@ def test_a_disk_that_fills_up_is_told_as_such() -> None:
 
 
 def test_nothing_is_accepted_on_a_full_disk(tmp_path: Path) -> None:
-    for house in make_house(tmp_path, min_free_bytes=2**62):
-        assert_problem(house.upload(), 507)
-        assert_problem(house.http.get("/readyz"), 503, "disk")
+    for service in running_service(tmp_path, min_free_bytes=2**62):
+        assert_problem(service.upload(), 507)
+        assert_problem(service.http.get("/readyz"), 503, "disk")
 
 
 def test_a_declared_length_that_is_too_large_is_refused_before_the_body_is_read(tmp_path: Path) -> None:
@@ -172,20 +174,20 @@ def test_a_declared_length_that_is_too_large_is_refused_before_the_body_is_read(
         yield b""
 
     headers = {"content-type": "multipart/form-data; boundary=x", "content-length": "1001"}
-    for house in make_house(tmp_path, max_upload_bytes=1000):
-        assert_problem(house.http.post("/reconstruct", content=never(), headers=headers), 413, "clip")
-        assert house.spooled() == []
+    for service in running_service(tmp_path, max_upload_bytes=1000):
+        assert_problem(service.http.post("/reconstruct", content=never(), headers=headers), 413, "clip")
+        assert service.spooled() == []
     headers["content-length"] = str(2**62)
-    for house in make_house(tmp_path, max_upload_bytes=2**63):
-        assert_problem(house.http.post("/reconstruct", content=never(), headers=headers), 507)
+    for service in running_service(tmp_path, max_upload_bytes=2**63):
+        assert_problem(service.http.post("/reconstruct", content=never(), headers=headers), 507)
 
 
 def test_only_so_many_uploads_are_received_at_once(tmp_path: Path) -> None:
-    for house in make_house(tmp_path, max_uploads=0):
-        refused = house.upload()
+    for service in running_service(tmp_path, max_uploads=0):
+        refused = service.upload()
         assert_problem(refused, 503, "uploads")
         assert refused.headers["retry-after"]
-        assert house.spooled() == []
+        assert service.spooled() == []
 
 
 async def stalled() -> AsyncIterator[bytes]:
@@ -205,7 +207,7 @@ def test_a_body_that_brings_hardly_anything_is_given_up(
     tmp_path: Path, body: Callable[[], AsyncIterator[bytes]]
 ) -> None:
     headers = {"content-type": "multipart/form-data; boundary=x"}
-    for house in make_house(tmp_path, upload_silence_s=0.1):
-        assert_problem(house.http.post("/reconstruct", content=body(), headers=headers), 408)
-        assert house.spooled() == []
-        assert house.upload().status_code == 202
+    for service in running_service(tmp_path, upload_silence_s=0.1):
+        assert_problem(service.http.post("/reconstruct", content=body(), headers=headers), 408)
+        assert service.spooled() == []
+        assert service.upload().status_code == 202

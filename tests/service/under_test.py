@@ -56,7 +56,7 @@ class Painter:
 
 
 @dataclass
-class House:
+class ServiceUnderTest:
     """A running service and what it stands on."""
 
     http: AsgiClient
@@ -101,7 +101,7 @@ class House:
         return [path for area in ("incoming", "spool") for path in (self.store.data_dir / area).iterdir()]
 
 
-def make_house(data_dir: Path, queue: MemoryQueue | None = None, **changes: Any) -> Iterator[House]:
+def running_service(data_dir: Path, queue: MemoryQueue | None = None, **changes: Any) -> Iterator[ServiceUnderTest]:
     queue, store, painter = queue or MemoryQueue(), Store(data_dir), Painter()
     settings = Settings(data_dir=data_dir, render_timeout_s=5.0, min_free_bytes=0).model_copy(update=changes)
     app = create_app(settings, queue, store, ZmqRenderer(queue, settings.render_timeout_s))
@@ -111,7 +111,7 @@ def make_house(data_dir: Path, queue: MemoryQueue | None = None, **changes: Any)
         serving(app, "http://127.0.0.1:8765") as http,
     ):
         queue.announce(WorkerAddress(name="worker-1", endpoint=endpoint, device="cpu"))
-        yield House(http, queue, store, painter)
+        yield ServiceUnderTest(http, queue, store, painter)
 
 
 def assert_problem(response: httpx.Response, status: int, field: str | None = None) -> dict[str, Any]:

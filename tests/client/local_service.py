@@ -42,7 +42,7 @@ def paint(request: RenderRequest | ExportRequest) -> View:
     return View(buffer.getvalue(), MEDIA_TYPES[request.format], request.t, ("seen from afar",), iteration)
 
 
-class Town:
+class LocalService:
     """The service, and the queue and store behind it."""
 
     def __init__(self, data_dir: Path, **changes: Any) -> None:
@@ -87,14 +87,14 @@ class Town:
 
 
 @contextmanager
-def town_at(data_dir: Path, **changes: Any) -> Iterator[Town]:
-    town = Town(data_dir, **changes)
+def local_service(data_dir: Path, **changes: Any) -> Iterator[LocalService]:
+    service = LocalService(data_dir, **changes)
     try:
-        with RequestServer(town.endpoint, paint):
-            town.announce()
-            yield town
+        with RequestServer(service.endpoint, paint):
+            service.announce()
+            yield service
     finally:
-        town.stop()
+        service.stop()
 
 
 class Line:
@@ -147,8 +147,8 @@ class Line:
 
 
 @contextmanager
-def line_to(town: Town) -> Iterator[Line]:
-    line = Line(town.port)
+def line_to(service: LocalService) -> Iterator[Line]:
+    line = Line(service.port)
     try:
         yield line
     finally:

@@ -69,7 +69,7 @@ class Kept:
             self._process.wait()
 
 
-class House:
+class Deployment:
     """One installation in its own folder and on its own port; a context manager."""
 
     def __init__(self, folder: Path, port: int, workers: int = 1) -> None:
@@ -87,7 +87,7 @@ class House:
         self._end = threading.Event()
         self._keeper = threading.Thread(target=self._keep, name="keeper", daemon=True)
 
-    def __enter__(self) -> House:
+    def __enter__(self) -> Deployment:
         self.server.start()
         self.queue = RedisQueue(self.server.url)
         self._keeper.start()
