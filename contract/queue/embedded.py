@@ -12,7 +12,6 @@ import importlib
 import os
 import shutil
 import socket
-import subprocess
 import tempfile
 import time
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ import redis
 
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.locks import FolderLock
-from contract.runtime.processes import end_process
+from contract.runtime.supervised import Supervised
 from contract.wire.errors import UnavailableError
 
 SOCKET_PATH_LIMIT = 107
@@ -90,7 +89,8 @@ class EmbeddedServer:
         self._folder = data_dir / "valkey"
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._socket = short_socket_path(self._folder, "queue.sock")
-        self._process: subprocess.Popen[bytes] | None = None
+        self._log = self._folder / "server.log"
+        self._server: Supervised | None = None
         self._adopted = False
         self._lock = FolderLock(self._folder / "lock")
 
@@ -102,7 +102,7 @@ class EmbeddedServer:
     @property
     def process_id(self) -> int | None:
         """Of the server, if this object started it."""
-        return self._process.pid if self._process else None
+        return self._server.process_id if self._server else None
 
     def start(self) -> None:
         """Start the server, or share the one that runs; return when it answers.
@@ -113,41 +113,50 @@ class EmbeddedServer:
         owner = self._lock.take()
         self._adopted = owner and self._listens()
         if owner and not self._adopted:
-            binary = self._binary()
-            with (self._folder / "server.log").open("ab") as log:
-                command = [str(binary.path), *self._arguments()]
-                self._process = subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
-                )
-        deadline = time.monotonic() + START_TIMEOUT_S
-        while not self._answers():
-            if self._process is not None and self._process.poll() is not None:
-                raise self._ended(self._process.returncode)
-            if time.monotonic() > deadline:
-                problem = f"The queue's server did not answer within {START_TIMEOUT_S:g} s."
-                raise UnavailableError(problem, f"See {self._folder / 'server.log'}.")
-            time.sleep(0.02)
+            self._server = Supervised(
+                "queue's server",
+                [str(self._binary().path), *self._arguments()],
+                log=self._log,
+                dies_with_parent=False,
+                grace_s=STOP_TIMEOUT_S,  # it writes its log to disk before it ends
+            )
+            self._server.watch()
+        self._wait_until_it_answers()
 
     def ensure_running(self) -> bool:
         """Start the server again if it has died; True if that was needed."""
-        if self._process is not None:
-            running = self._process.poll() is None
-        else:
-            running = not self._adopted or self._listens()
-        if running:
+        if self._server is not None:
+            if self._server.watch() is None:
+                return False
+            self._wait_until_it_answers()
+            return True
+        if not self._adopted or self._listens():
             return False
         self.start()
         return True
 
     def stop(self) -> None:
         """End the server this object started, or whose starter has died; one that was shared is left alone."""
-        if self._process is not None:
-            end_process(self._process, STOP_TIMEOUT_S)  # the server writes its log to disk before it leaves
-            self._process = None
+        if self._server is not None:
+            self._server.stop()
+            self._server = None
         elif self._adopted:
             redis.Redis.from_url(self.url, socket_timeout=STOP_TIMEOUT_S).shutdown()
             self._adopted = False
         self._lock.release()
+
+    def _wait_until_it_answers(self) -> None:
+        deadline_s = time.monotonic() + START_TIMEOUT_S
+        while not self._answers():
+            ended = self._server.watch() if self._server else None
+            if ended is not None:
+                raise self._ended(ended.status)
+            if time.monotonic() > deadline_s:
+                problem = f"The queue's server did not answer within {START_TIMEOUT_S:g} s."
+                raise UnavailableError(problem, f"See {self._log}.")
+            time.sleep(0.02)
+        if self._server is not None:
+            self._server.mark_healthy()
 
     def _listens(self) -> bool:
         """Whether a server is there, even if it still replays its log: a second one would write to the same log."""
@@ -207,5 +216,5 @@ class EmbeddedServer:
         return UnavailableError(problem, f"See {self._folder / 'server.log'}.")
 
     def _last_log_line(self) -> str:
-        lines = (self._folder / "server.log").read_text(errors="replace").strip().splitlines()
+        lines = self._log.read_text(errors="replace").strip().splitlines()
         return lines[-1][:200] if lines else "it wrote no log."
