@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept between runs.
+"""The decorator of every Numba kernel, and the folder where compiled kernels are kept between runs.
 
 Numba keys a kernel's cache by its own source file and does not see a change in a module it was compiled from (a
 constant, an inlined helper, the vector type), so a stale kernel could run with a new layout of its arrays. All kernels
@@ -14,10 +14,43 @@ import os
 import shutil
 import tempfile
 import warnings
-from functools import cache
+from collections.abc import Callable
+from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import numba
+from numba.core.caching import FunctionCache
+
+
+def kernel(function: Callable[..., Any] | None = None, *, inline: str = "never") -> Any:
+    """Declare a function as a kernel: compiled by Numba at its first call, kept on disk, and run without the GIL.
+
+    Declaring one touches no file. Numba's own `cache=True` would choose the folder while a module is imported.
+
+    Args:
+        inline: "always" copies the kernel into those that call it.
+    """
+    if function is None:
+        return lambda declared: kernel(declared, inline=inline)
+    dispatcher = numba.njit(nogil=True, inline=inline)(function)
+    dispatcher._cache = _LateCache(function)
+    return dispatcher
+
+
+class _LateCache:
+    """Numba's cache of one kernel, opened when that kernel is first compiled or loaded."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    @cached_property
+    def _opened(self) -> FunctionCache:
+        use_kernel_cache()
+        return FunctionCache(self._function)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._opened, name)
 
 
 def kernel_cache_directory() -> Path:
@@ -37,7 +70,7 @@ def kernel_cache_directory() -> Path:
 
 @cache
 def use_kernel_cache() -> None:
-    """Point Numba at that folder, once a process; must run before the first kernel is declared.
+    """Point Numba at that folder, once a process.
 
     Where nothing can be written there, a temporary folder takes its place until the process ends, with a warning.
     """

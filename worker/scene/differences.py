@@ -13,10 +13,9 @@ arithmetic.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from worker.machine.cache import use_kernel_cache
+from worker.machine.cache import kernel
 
 Table = NDArray[np.int32]
 Powers = NDArray[np.int64]
@@ -25,8 +24,6 @@ FINEST = 4
 """The largest power there may be."""
 LARGEST_STORED = 2**28
 """Of a number's magnitude, and of a difference's. The coder takes four times that."""
-
-use_kernel_cache()
 
 
 def told_order(count: int) -> NDArray[np.int64]:
@@ -66,7 +63,7 @@ def _runs(group: NDArray[np.int64]) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(group, prepend=-1, append=-1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _beside(count, i, power, g):  # type: ignore[no-untyped-def]
     """Of Gaussian i, in a group: the two it lies between, how far their numbers go up, and how far their sum down."""
     left, right = i - (i & -i), i + (i & -i)
@@ -75,14 +72,14 @@ def _beside(count, i, power, g):  # type: ignore[no-untyped-def]
     return left, right, FINEST - power[left, g], FINEST - power[right, g], FINEST + 1 - power[i, g]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mean(first, second, up, also_up, down):  # type: ignore[no-untyped-def]
     """Of two numbers, as a multiple of the unit of the one between them, rounded."""
     half = np.int64(1) << (down - 1)
     return ((np.int64(first) << up) + (np.int64(second) << also_up) + half) >> down
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _subtract(table, power, group, runs, told, stored, before, after, largest):  # type: ignore[no-untyped-def]
     """Into stored [N, K], and each column's sum of magnitudes before and after, and the largest one after."""
     for place, i in enumerate(told):
@@ -97,7 +94,7 @@ def _subtract(table, power, group, runs, told, stored, before, after, largest): 
                 largest[k] = max(largest[k], abs(difference))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _put_back(table, told, wanted, stored):  # type: ignore[no-untyped-def]
     for place, i in enumerate(told):
         for k in range(table.shape[1]):
@@ -105,7 +102,7 @@ def _put_back(table, told, wanted, stored):  # type: ignore[no-untyped-def]
                 stored[place, k] = table[i, k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add(table, power, group, runs, told, wanted):  # type: ignore[no-untyped-def]
     """Returns whether all numbers are within LARGEST_STORED."""
     most = np.int64(0)

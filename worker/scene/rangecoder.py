@@ -15,10 +15,9 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from worker.machine.cache import use_kernel_cache
+from worker.machine.cache import kernel
 
 Table = NDArray[np.int32]
 
@@ -46,8 +45,6 @@ _BUCKET_OF = np.searchsorted(THRESHOLDS, np.arange(MOST_ACTIVE + 1), side="right
 _TOP = np.uint64(1 << 24)
 _FULL = np.uint64(0xFFFFFFFF)
 _BYTE = np.uint64(8)
-
-use_kernel_cache()
 
 
 def encode(table: Table) -> list[bytes]:
@@ -91,7 +88,7 @@ def decode(codes: list[bytes], count: int, rows: int) -> Table:
     return table
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _encode(table, out):  # type: ignore[no-untyped-def]
     """Code a table into out; returns the bytes written."""
     count, rows = table.shape
@@ -124,7 +121,7 @@ def _encode(table, out):  # type: ignore[no-untyped-def]
     return state[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _decode(code, table):  # type: ignore[no-untyped-def]
     """Read a table from its code; returns the bytes that the coder of this table has written, or -1."""
     count, rows = table.shape
@@ -160,20 +157,20 @@ def _decode(code, table):  # type: ignore[no-untyped-def]
     return state[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _start(rows):  # type: ignore[no-untyped-def]
     """Probabilities [rows * BUCKETS * MODELS, 2], each row's average magnitude (of 256) and activity so far."""
     models = np.full((rows * BUCKETS * MODELS, 2), ONE // 2, np.uint16)  # they never reach ONE
     return models, np.full(rows, 256, np.int64), np.full(rows, AVERAGE, np.int64)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _set(k, here, nearby):  # type: ignore[no-untyped-def]
     """Where the models of this row and activity begin."""
     return (k * BUCKETS + _BUCKET_OF[(3 * here + nearby[k]) >> 2]) * MODELS
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _digit_model(digits, digit, magnitude):  # type: ignore[no-untyped-def]
     """Which model tells the digit below the leading one; 0: none. magnitude: right in the digits above this one."""
     if digit == digits - 2:
@@ -183,7 +180,7 @@ def _digit_model(digits, digit, magnitude):  # type: ignore[no-untyped-def]
     return 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _follow(magnitude, here, average, nearby, k):  # type: ignore[no-untyped-def]
     """After a number: its row's average and activity; returns the Gaussian's activity."""
     average[k] += ((magnitude << 8) - average[k]) >> 7
@@ -194,7 +191,7 @@ def _follow(magnitude, here, average, nearby, k):  # type: ignore[no-untyped-def
     return here + ((activity - here) >> 3)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _adapt(models, at, bit):  # type: ignore[no-untyped-def]
     quick, slow = np.int64(models[at, 0]), np.int64(models[at, 1])
     if bit:
@@ -204,25 +201,25 @@ def _adapt(models, at, bit):  # type: ignore[no-untyped-def]
     models[at, 0], models[at, 1] = quick, slow
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _bound(width, models, at):  # type: ignore[no-untyped-def]
     """Where a range is cut: a 0 takes what is below."""
     return (width >> np.uint64(16)) * np.uint64((np.int64(models[at, 0]) + np.int64(models[at, 1])) >> 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _tell(state, out, models, at, bit):  # type: ignore[no-untyped-def]
     state = _cut(state, out, _bound(state[1], models, at), bit)
     _adapt(models, at, bit)
     return state
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _tell_plain(state, out, bit):  # type: ignore[no-untyped-def]
     return _cut(state, out, state[1] >> np.uint64(1), bit)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cut(state, out, bound, bit):  # type: ignore[no-untyped-def]
     low, width, place = state
     if bit:
@@ -238,7 +235,7 @@ def _cut(state, out, bound, bit):  # type: ignore[no-untyped-def]
     return low, width, place
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _carry(out, place):  # type: ignore[no-untyped-def]
     """Add 1 to the number written so far; its first byte is 0 and takes what no other can."""
     place -= 1
@@ -248,7 +245,7 @@ def _carry(out, place):  # type: ignore[no-untyped-def]
     out[place] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _give(state, out):  # type: ignore[no-untyped-def]
     """Move low's top byte out."""
     low, width, place = state
@@ -256,19 +253,19 @@ def _give(state, out):  # type: ignore[no-untyped-def]
     return (low << _BYTE) & _FULL, width, place + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _ask(state, code, models, at):  # type: ignore[no-untyped-def]
     state, bit = _which(state, code, _bound(state[1], models, at))
     _adapt(models, at, bit)
     return state, bit
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _ask_plain(state, code):  # type: ignore[no-untyped-def]
     return _which(state, code, state[1] >> np.uint64(1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _which(state, code, bound):  # type: ignore[no-untyped-def]
     """The new state, and 1 where the code lies above the cut."""
     above, width, place = state
@@ -284,7 +281,7 @@ def _which(state, code, bound):  # type: ignore[no-untyped-def]
     return (above, width, place), bit
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _take(state, code):  # type: ignore[no-untyped-def]
     """The next byte; behind the end there are zeros."""
     above, width, place = state

@@ -59,11 +59,17 @@ def test_without_a_folder_to_keep_them_in_kernels_are_compiled_into_a_temporary_
     assert not Path(temporary).exists(), "the temporary folder is left behind"
 
 
+def test_declaring_kernels_touches_no_file(tmp_path: Path) -> None:
+    _, err = finish(start("-c", "import worker.raster.cpu, worker.scene.compact", cache=tmp_path / "kernels"))
+    assert not err
+    assert not list(tmp_path.iterdir())
+
+
 WHERE = """
 import numba, numpy
 from worker.raster.cpu import bins, Rasterizer
-print(numba.config.CACHE_DIR, Rasterizer(8, 8).statistics.sum())
 none, scratch = numpy.zeros((0, 12), numpy.float32), (numpy.zeros(0, numpy.int32), numpy.zeros(0, numpy.uint32))
 assert bins.depth_order(none, none[:, 0].copy(), *scratch, *scratch)[0] == 0
+print(numba.config.CACHE_DIR, Rasterizer(8, 8).statistics.sum())
 """
 """Compiles one small kernel, so that the folder is really used."""

@@ -4,13 +4,8 @@ vectors -> simd -> bins -> project -> blend -> rasterizer (buffers and calls) ->
 update, harmonics -> motion -> model (the fused training step) -> compilation.
 """
 
-from worker.machine.cache import use_kernel_cache
-
-use_kernel_cache()
-
-# The cache folder must be set before a kernel is declared.
-from worker.raster.cpu.autograd import rasterize  # noqa: E402
-from worker.raster.cpu.compilation import compile_kernels  # noqa: E402
-from worker.raster.cpu.rasterizer import Gradients, Rasterizer, padded  # noqa: E402
+from worker.raster.cpu.autograd import rasterize
+from worker.raster.cpu.compilation import compile_kernels
+from worker.raster.cpu.rasterizer import Gradients, Rasterizer, padded
 
 __all__ = ["Gradients", "Rasterizer", "compile_kernels", "padded", "rasterize"]

@@ -25,8 +25,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from worker.machine.cache import kernel
 from worker.raster.cpu.simd import ceil, floor, iota, maximum, minimum, splat, sqrt, store
 from worker.raster.cpu.vectors import LANES
 
@@ -49,7 +49,7 @@ _INFO_SHIFT = np.uint32(2 * ROW_BITS)
 _ROWS_MASK = np.uint32((1 << 2 * ROW_BITS) - 1)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _rows(extent, g, x, y, column, bounds):  # type: ignore[no-untyped-def]
     """Image rows [top, end) that the ellipse covers in LANES columns of tiles from this one on: bounds [2 * LANES].
 
@@ -68,7 +68,7 @@ def _rows(extent, g, x, y, column, bounds):  # type: ignore[no-untyped-def]
     store(bounds, LANES, floor(bottom + splat(y + _HALF + ROUNDING)))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _number_homes(homes, g, home, first, last, highest, lowest):  # type: ignore[no-untyped-def]
     """Homes of splat g for tiles in columns first to last and bands highest to lowest, from this one on; the next."""
     first_block, last_block = first // BLOCK_TILES, last // BLOCK_TILES
@@ -78,7 +78,7 @@ def _number_homes(homes, g, home, first, last, highest, lowest):  # type: ignore
     return home + homes[g, 1]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_slots(  # type: ignore[no-untyped-def]
     thread, threads, splats, radius2, extent, height, tiles_x, home_capacity,
     slot_start, slot_count, slot_info, homes, region_end,
@@ -121,7 +121,7 @@ def fill_slots(  # type: ignore[no-untyped-def]
     region_end[thread, 0], region_end[thread, 1] = slot, home
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def depth_order(splats, radius2, order, keys, other_order, other_keys):  # type: ignore[no-untyped-def]
     """Sort the visible splats, nearest first, ties by index; return how many there are and whether they are in order.
 
@@ -154,7 +154,7 @@ def depth_order(splats, radius2, order, keys, other_order, other_keys):  # type:
     return visible, is_first
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sort_into_tiles(  # type: ignore[no-untyped-def]
     order, visible, slot_start, slot_count, slot_info, region_end, tile_start, entries
 ):

@@ -21,8 +21,8 @@ Its rows [top, end) and the home of its splat are in ``spans``. The planes lie i
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from worker.machine.cache import kernel
 from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from worker.raster.cpu.bins import BLOCK_TILES, GRADIENT, ROW_BITS, TILE_ROWS
 from worker.raster.cpu.simd import (
@@ -66,7 +66,7 @@ _HALF = np.float32(0.5)
 _CHECK_EVERY = 32  # records between two looks at whether the whole tile is opaque
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def blend(  # type: ignore[no-untyped-def]
     thread, threads, next_block, mode, width, height, tiles_x, splats, tile_start, entries, homes,
     records, spans, trail, planes, sums, statistics, target, weight, inverse_depth, loss_settings, image,
@@ -109,7 +109,7 @@ def blend(  # type: ignore[no-untyped-def]
         block = claim(next_block)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather(  # type: ignore[no-untyped-def]
     first, end, row0, column0, band, block_x, splats, entries, homes, records, spans
 ):
@@ -147,7 +147,7 @@ def _gather(  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _clear(planes, column0, width, rows):  # type: ignore[no-untyped-def]
     """Nothing blended yet: T = 1 inside the image, 0 beside it."""
     zero = splat(_ZERO)
@@ -159,7 +159,7 @@ def _clear(planes, column0, width, rows):  # type: ignore[no-untyped-def]
             store(planes, p + k * PLANE, zero)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[no-untyped-def]
     """Blend the records into planes; return how many were visited before the tile was opaque."""
     zero, cut, cap, stop = splat(_ZERO), splat(_CUT), splat(_CAP), splat(_STOP)
@@ -199,7 +199,7 @@ def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-untyped-def]
     """Gradients of the first count records, back to front; planes hold B - g_A, then g_R g_G g_B g_Z.
 
@@ -252,7 +252,7 @@ def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-un
         moment, moment_y, moment_yy = zero, zero, zero
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _write(planes, image, origin, stride, size, rows):  # type: ignore[no-untyped-def]
     """R G B Z A and the value of the tile into the image."""
     one = splat(_ONE)
@@ -264,7 +264,7 @@ def _write(planes, image, origin, stride, size, rows):  # type: ignore[no-untype
         store(image, q + 5 * size, load(planes, p + 5 * PLANE))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _read_cotangents(planes, image, origin, stride, size, rows):  # type: ignore[no-untyped-def]
     """The image's cotangents into the planes' places for g; B starts at 0."""
     for row in range(rows):
@@ -274,7 +274,7 @@ def _read_cotangents(planes, image, origin, stride, size, rows):  # type: ignore
         store(planes, p, splat(_ZERO) - load(image, q + 4 * size))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _clip_unit(x):  # type: ignore[no-untyped-def]
     """x held within [-1, 1]: the derivative of the L1 loss with a quadratic zone of half-width 1."""
     one, minus = splat(_ONE), splat(-_ONE)
@@ -282,7 +282,7 @@ def _clip_unit(x):  # type: ignore[no-untyped-def]
     return where_less(one, x, one, x)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _depth_loss(planes, p, tissue, wanted, normalised, sharpness, depth_weight):  # type: ignore[no-untyped-def]
     """The depth's share of _loss at the LANES pixels from p: its L1, and its gradient into the planes Z and T."""
     zero, one = splat(_ZERO), splat(_ONE)
@@ -305,7 +305,7 @@ def _depth_loss(planes, p, tissue, wanted, normalised, sharpness, depth_weight):
     return usable * where_less(error, zero, zero - error, error)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _loss(  # type: ignore[no-untyped-def]
     planes, statistics, target, weight, inverse_depth, loss_settings, origin, stride, size, rows
 ):

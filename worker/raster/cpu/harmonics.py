@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from worker.machine.cache import kernel
 from worker.model.gaussians import SH_C0  # a kernel keeps its value: no other will ever be right
 
 _C1 = 0.4886025119029199
@@ -21,7 +21,7 @@ _C3 = (
 )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _terms(degree, x, y, z, value, slope):  # type: ignore[no-untyped-def]
     """Real harmonics at the unit direction (x, y, z) into value [K]; as polynomials, their slopes into [K, 3]."""
     value[0] = SH_C0
@@ -57,7 +57,7 @@ def _terms(degree, x, y, z, value, slope):  # type: ignore[no-untyped-def]
         slope[15, 0], slope[15, 1] = h * (3 * x * x - 3 * y * y), -6 * h * x * y
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def colour_from_sh(thread, threads, degree, centre, state, rest, colour):  # type: ignore[no-untyped-def]
     """colour = max(0, 0.5 + sum_k c_k Y_k(direction from the camera centre to the mean))."""
     terms = (degree + 1) * (degree + 1)
@@ -74,7 +74,7 @@ def colour_from_sh(thread, threads, degree, centre, state, rest, colour):  # typ
             colour[channel, g] = max(total, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def colour_from_sh_backward(  # type: ignore[no-untyped-def]
     thread, threads, degree, centre, state, rest, colour, v_colour, v_rest, v_state
 ):

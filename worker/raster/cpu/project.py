@@ -16,8 +16,8 @@ LARGEST_EXP, so no log-scale or logit, however far out, leaves the numbers.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from worker.machine.cache import kernel
 from worker.raster import EPS2D, LIMIT, MIN_ALPHA, NEAR
 from worker.raster.cpu.bins import EXTENT, GRADIENT
 from worker.raster.cpu.simd import (
@@ -49,24 +49,24 @@ LARGEST_EXP = 2.0**_MOST_POWER
 still fits into float32; an opacity of one in as many is never drawn."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _each(a, b):  # type: ignore[no-untyped-def]
     """Product entry by entry."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum(p, a, q, b):  # type: ignore[no-untyped-def]
     """p a + q b of numbers p, q and triples a, b."""
     return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _through(a, m):  # type: ignore[no-untyped-def]
     """a^T M, M as three rows."""
     return (
@@ -76,26 +76,26 @@ def _through(a, m):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _onto(m, a):  # type: ignore[no-untyped-def]
     """M a, M as three rows."""
     return _dot(m[0], a), _dot(m[1], a), _dot(m[2], a)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rows_of(state, first, i):  # type: ignore[no-untyped-def]
     """Three consecutive rows of the state at the Gaussians from i."""
     return widen(load(state[first], i)), widen(load(state[first + 1], i)), widen(load(state[first + 2], i))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _exp(x):  # type: ignore[no-untyped-def]
     """e^x, at most LARGEST_EXP; NaN of NaN."""
     power, most = x * LOG2E, widen(splat(np.float32(_MOST_POWER)))
     return widen(exp2(narrow(where_less(most, power, most, power))))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _quaternion(state, i):  # type: ignore[no-untyped-def]
     """Unit quaternions wxyz of the Gaussians from i and 1 / the lengths they were stored with."""
     q0 = widen(load(state[3], i))
@@ -104,7 +104,7 @@ def _quaternion(state, i):  # type: ignore[no-untyped-def]
     return (q0 * n, q1 * n, q2 * n, q3 * n), n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rotation(q):  # type: ignore[no-untyped-def]
     """Rotation matrix of a unit quaternion wxyz, as three rows."""
     w, x, y, z = q
@@ -115,7 +115,7 @@ def _rotation(q):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _quaternion_gradient(q, n, p):  # type: ignore[no-untyped-def]
     """dL/d(stored quaternion) from P = dL/dR, q of unit length: through R(q), then (I - q q^T) / |stored|."""
     w, x, y, z = q
@@ -127,7 +127,7 @@ def _quaternion_gradient(q, n, p):  # type: ignore[no-untyped-def]
     return n * (d0 - along * w), n * (d1 - along * x), n * (d2 - along * y), n * (d3 - along * z)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pose(camera):  # type: ignore[no-untyped-def]
     """W as three rows, and the translation."""
     return (
@@ -137,7 +137,7 @@ def _pose(camera):  # type: ignore[no-untyped-def]
     ), (camera[9], camera[13], camera[17])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _limits(camera):  # type: ignore[no-untyped-def]
     """Least and greatest x / z and y / z at which J is taken (Camera.ratio_limits)."""
     fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
@@ -149,13 +149,13 @@ def _limits(camera):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _held(ratio, low, high):  # type: ignore[no-untyped-def]
     """ratio within [low, high]."""
     return minimum(maximum(ratio, low), high)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _unless_culled(extent2, z, det, centre, reach, width, height):  # type: ignore[no-untyped-def]
     """extent2; -1 where there is no ellipse, or no pixel centre of the image within its reach."""
     zero = widen(splat(np.float32(0.0)))
@@ -169,7 +169,7 @@ def _unless_culled(extent2, z, det, centre, reach, width, height):  # type: igno
     return where_less(zero + (height - 0.5), centre[1] - reach[1], culled, visible)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _store_splats(splats, at, centre, covariance, inverse_det, log2_opacity, z):  # type: ignore[no-untyped-def]
     """All of LANES splats but their colour, from splats[at]."""
     cxx, cxy, cyy = covariance
@@ -185,7 +185,7 @@ def _store_splats(splats, at, centre, covariance, inverse_det, log2_opacity, z):
     store_strided(splats, at + 11, SPLAT, splat(np.float32(0.0)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _store_extents(extent, at, covariance, det, extent2, reach):  # type: ignore[no-untyped-def]
     """What bins.EXTENT lists; the conic's a, b, c are cyy, -cxy, cxx over det, and ac - b^2 is 1 / det."""
     cxx, cxy, cyy = covariance
@@ -198,7 +198,7 @@ def _store_extents(extent, at, covariance, det, extent2, reach):  # type: ignore
     store_strided(extent, at + 5, EXTENT, narrow(reach[1]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project(  # type: ignore[no-untyped-def]
     thread, threads, camera, state, opacity_logit, colour, splats, radius2, extent
 ):
@@ -239,7 +239,7 @@ def project(  # type: ignore[no-untyped-def]
         _store_extents(extent, i * EXTENT, (cxx, cxy, cyy), det, extent2, reach)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _more(total, a, visible):  # type: ignore[no-untyped-def]
     """total + a, triples of wides, in the lanes where visible >= 0."""
     zero = widen(splat(np.float32(0.0)))
@@ -251,7 +251,7 @@ def _more(total, a, visible):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_homes(first, homes, sums, totals):  # type: ignore[no-untyped-def]
     """The blend's gradients of LANES Gaussians, summed over their homes, into totals [LANES * GRADIENT]."""
     for lane in range(LANES):
@@ -264,7 +264,7 @@ def _add_homes(first, homes, sums, totals):  # type: ignore[no-untyped-def]
         store(totals, lane * GRADIENT, head)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project_backward(  # type: ignore[no-untyped-def]
     thread, threads, camera, state, opacity_logit, radius2, homes, sums,
     v_state, v_opacity_logit, v_colour, v_mean2d_norm, v_pose,

@@ -10,8 +10,8 @@ rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and eps scaled by the same square r
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from worker.machine.cache import kernel
 from worker.raster.cpu.simd import exp2, fma, load, splat, sqrt, store, where_less
 from worker.raster.cpu.vectors import LANES
 
@@ -26,7 +26,7 @@ QUARTIC_FLOOR = np.float32(1e-4)
 """Added to sigma^2 in the released form of the basis."""
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _adam(value, first, second, i, gradient, rate, eps, beta1, beta2):  # type: ignore[no-untyped-def]
     """One Adam step on LANES parameters at value[i]; first and second are the moments."""
     m = fma(splat(beta1), load(first, i), splat(_ONE - beta1) * gradient)
@@ -36,7 +36,7 @@ def _adam(value, first, second, i, gradient, rate, eps, beta1, beta2):  # type: 
     store(value, i, load(value, i) - rate * m / (sqrt(v) + eps))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def adam(thread, threads, value, gradient, first, second, rate, eps, beta1, beta2):  # type: ignore[no-untyped-def]
     """Adam on flat arrays whose length is a multiple of LANES."""
     vectors = value.shape[0] // LANES
@@ -44,7 +44,7 @@ def adam(thread, threads, value, gradient, first, second, rate, eps, beta1, beta
         _adam(value, first, second, k * LANES, load(gradient, k * LANES), splat(rate), splat(eps), beta1, beta2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def deform_shared(thread, threads, canonical, weight, basis, first, last, state):  # type: ignore[no-untyped-def]
     """state [ROWS, N] = canonical + sum over j in [first, last) of basis[j] weight[j]; weight [B, C, N], C <= ROWS."""
     vectors = canonical.shape[1] // LANES
@@ -58,7 +58,7 @@ def deform_shared(thread, threads, canonical, weight, basis, first, last, state)
             store(state[c], i, total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def update_shared(  # type: ignore[no-untyped-def]
     thread, threads, weight, first_moment, second_moment, v_state, basis, alive, rate, eps, beta1, beta2
 ):
@@ -80,7 +80,7 @@ def update_shared(  # type: ignore[no-untyped-def]
                 _adam(weight[j, c], first_moment[j, c], second_moment[j, c], i, gradient, step, floor, beta1, beta2)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _basis(t, centre, width, quartic):  # type: ignore[no-untyped-def]
     """Value of a basis at t, and its logarithmic derivatives to centre and width.
 
@@ -105,7 +105,7 @@ def _basis(t, centre, width, quartic):  # type: ignore[no-untyped-def]
     return value, along * inverse, along * along * inverse * free
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def deform_fdm(thread, threads, canonical, weight, centre, width, t, quartic, state):  # type: ignore[no-untyped-def]
     """state [ROWS, N] = canonical + FDM at t; weight, centre, width [10, B, N] (Deform3DGS, equations 3 and 4)."""
     vectors = canonical.shape[1] // LANES
@@ -126,7 +126,7 @@ def deform_fdm(thread, threads, canonical, weight, centre, width, t, quartic, st
                     store(state[c], i, fma(load(weight[c, j], i), value, load(state[c], i)))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _through_fdm(v_state, weight, centre, width, i, time, quartic):  # type: ignore[no-untyped-def]
     """dL/d weight, centre and width of LANES bases at [i], by one frame's dL/dstate."""
     value, by_centre, by_width = _basis(time, load(centre, i), load(width, i), quartic)
@@ -135,7 +135,7 @@ def _through_fdm(v_state, weight, centre, width, i, time, quartic):  # type: ign
     return to_weight, scaled * by_centre, scaled * by_width
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _adam_fdm(weight, centre, width, m, v, i, gradients, step, floor, beta1, beta2):  # type: ignore[no-untyped-def]
     """Adam on all three at [i]; m and v hold the moments of each."""
     to_weight, to_centre, to_width = gradients
@@ -144,7 +144,7 @@ def _adam_fdm(weight, centre, width, m, v, i, gradients, step, floor, beta1, bet
     _adam(width, m[2], v[2], i, to_width, step, floor, beta1, beta2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def update_fdm(  # type: ignore[no-untyped-def]
     thread, threads, weight, centre, width, first_moment, second_moment, v_state, times, quartic, rate, eps,
     beta1, beta2,
