@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ValidationError
@@ -17,7 +17,7 @@ from contract.store.store import is_job_id
 from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.names import CURVE, REPORT
-from contract.wire.rendering import ExportRequest
+from contract.wire.rendering import ExportName, ExportRequest
 from service.access import Caller
 from service.deps import AnyCaller, Deps, ListingLimit, Services, no_such_scene, owned_scene
 from service.problems import Problem
@@ -72,7 +72,7 @@ async def export_scene(
     services: Services,
     caller: AnyCaller,
     t: ModelTime = 0.0,
-    format: Annotated[Literal["ply"], Query(description="the property order common splat viewers read")] = "ply",
+    format: Annotated[ExportName, Query(description="the property order common splat viewers read")] = "ply",
 ) -> Response:
     """The scene's Gaussians at time t as a file."""
     caller.require(KeyScope.VIEW)

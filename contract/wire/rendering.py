@@ -8,7 +8,7 @@ The body is the encoded image or file; requests on one connection may be answere
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -39,6 +39,10 @@ MEDIA_TYPES = {
     ImageFormat.WEBP: "image/webp",
     ImageFormat.NPY: "application/x-npy",
 }
+
+
+ExportName: TypeAlias = Literal["ply"]
+"""What GET /scenes/{id}/export offers: the names of worker/scene/export, which the service must not import."""
 
 
 class IntrinsicsOverride(BaseModel):
@@ -79,7 +83,7 @@ class RenderRequest(BaseModel):
 
 
 class ExportRequest(BaseModel):
-    """The scene's Gaussians at time t as a file."""
+    """The scene's Gaussians at time t as a file of one of the formats of worker/scene/export."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -87,7 +91,7 @@ class ExportRequest(BaseModel):
     scene_id: str = Field(pattern=JOB_ID_PATTERN)
     attempt: int
     t: float = Field(ge=0, le=1e6)
-    format: Literal["ply"] = "ply"
+    format: str = Field(default="ply", max_length=32)
 
 
 class WorkerRequest(BaseModel):

@@ -26,20 +26,20 @@ from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, W
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
-from worker.daemon.serve import RequestServer, View
+from worker.daemon.serve import Reply, RequestServer
 
 CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
 SNAPSHOT_ITERATION = 7
 
 
-def paint(request: RenderRequest | ExportRequest) -> View:
+def paint(request: RenderRequest | ExportRequest) -> Reply:
     """A 4 x 6 depth map that holds t everywhere."""
     if isinstance(request, ExportRequest):
-        return View(b"ply\n", "application/octet-stream", request.t)
+        return Reply(b"ply\n", "application/octet-stream", request.t)
     buffer = io.BytesIO()
     np.save(buffer, np.full((4, 6), request.t, np.float32))
     iteration = SNAPSHOT_ITERATION if request.attempt is None else None
-    return View(buffer.getvalue(), MEDIA_TYPES[request.format], request.t, ("seen from afar",), iteration)
+    return Reply(buffer.getvalue(), MEDIA_TYPES[request.format], request.t, ("seen from afar",), iteration)
 
 
 class LocalService:

@@ -35,7 +35,7 @@ from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, W
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
-from worker.daemon.serve import RequestServer, View
+from worker.daemon.serve import Reply, RequestServer
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 WAIT_S = 15.0
@@ -62,15 +62,15 @@ class Painter:
     def __init__(self) -> None:
         self.pause_s = 0.0
 
-    def answer(self, request: RenderRequest | ExportRequest) -> View:
+    def answer(self, request: RenderRequest | ExportRequest) -> Reply:
         if isinstance(request, ExportRequest):
-            return View(b"ply\n", "application/octet-stream", request.t)
+            return Reply(b"ply\n", "application/octet-stream", request.t)
         time.sleep(self.pause_s)
         picture = np.full((48, 60, 3), grey_of(request.scene_id), np.uint8)
         is_far = isinstance(request.pose, OrbitPose) and abs(request.pose.yaw_deg) > FAR_DEG
         image = cv2.imencode(f".{request.format.value}", picture)[1].tobytes()
         iteration = SNAPSHOT_ITERATION if request.attempt is None else None
-        return View(image, MEDIA_TYPES[request.format], request.t, (FAR,) if is_far else (), iteration)
+        return Reply(image, MEDIA_TYPES[request.format], request.t, (FAR,) if is_far else (), iteration)
 
 
 class Site:

@@ -24,7 +24,7 @@ from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
-from worker.daemon.serve import RequestServer, View
+from worker.daemon.serve import Reply, RequestServer
 
 WORKER = "worker-1"
 
@@ -68,14 +68,14 @@ class LiveService:
         return self.finish(self.running_job(tenant))
 
 
-def nothing_to_see(request: RenderRequest | ExportRequest) -> View:
+def nothing_to_see(request: RenderRequest | ExportRequest) -> Reply:
     """The answer of a worker that has no scene."""
     raise SceneError("There is no such scene.")
 
 
 @contextmanager
 def live_service(
-    data_dir: Path, answer: Callable[[RenderRequest | ExportRequest], View] = nothing_to_see, **changes: Any
+    data_dir: Path, answer: Callable[[RenderRequest | ExportRequest], Reply] = nothing_to_see, **changes: Any
 ) -> Iterator[LiveService]:
     """Start a service whose worker answers so, hand it out, end it; `changes` are to its settings."""
     with contextlib.closing(socket.socket()) as probe:

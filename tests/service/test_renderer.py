@@ -21,7 +21,7 @@ from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.connection import Answer
 from service.renderer import ZmqRenderer
-from worker.daemon.serve import RequestServer, View
+from worker.daemon.serve import Reply, RequestServer
 
 SCENES = [f"{number:032x}" for number in range(40)]
 SECRET, ANOTHER = "a secret of at least 32 characters", "another secret of 32 characters!"
@@ -42,9 +42,9 @@ class Workers:
         return f"ipc://{short_socket_path(self._folder, f'{name}.sock')}"
 
     def start(self, name: str, *, job_id: str | None = None, scenes: tuple[str, ...] = ()) -> RequestServer:
-        def answer(request: RenderRequest | ExportRequest) -> View:
+        def answer(request: RenderRequest | ExportRequest) -> Reply:
             self.asked[name] += 1
-            return View(name.encode(), "image/png", request.t)
+            return Reply(name.encode(), "image/png", request.t)
 
         server = RequestServer(self.endpoint(name), answer)
         self._stack.enter_context(server)
@@ -147,10 +147,10 @@ def test_each_of_many_viewers_gets_its_own_answer(workers: Workers) -> None:
 def test_who_gives_up_is_not_rendered_for(workers: Workers) -> None:
     go_on, asked = Event(), list[float]()
 
-    def answer(request: RenderRequest | ExportRequest) -> View:
+    def answer(request: RenderRequest | ExportRequest) -> Reply:
         asked.append(request.t)
         assert go_on.wait(TIMEOUT_S)
-        return View(b"", "image/png", request.t)
+        return Reply(b"", "image/png", request.t)
 
     async def ask(renderer: ZmqRenderer) -> None:
         many = [asyncio.create_task(renderer.ask(scene(SCENES[0], t=number))) for number in range(50)]
@@ -242,8 +242,8 @@ def tcp_endpoint() -> str:
         return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
 
 
-def named(request: RenderRequest | ExportRequest) -> View:
-    return View(b"over tcp", "image/png", request.t)
+def named(request: RenderRequest | ExportRequest) -> Reply:
+    return Reply(b"over tcp", "image/png", request.t)
 
 
 def test_over_tcp_the_same_secret_opens_and_another_is_named_as_the_cause(workers: Workers, tcp_endpoint: str) -> None:

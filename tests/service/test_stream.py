@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
 from contract.wire.rendering import ExportRequest, RenderRequest
 from tests.service.live import LiveService, live_service
-from worker.daemon.serve import NotYetError, View
+from worker.daemon.serve import NotYetError, Reply
 
 TIMEOUT_S = 10.0
 LARGE = 4 * 2**20
@@ -33,7 +33,7 @@ class Painter:
         self.began = threading.Event()
         self.bytes = 100
 
-    def answer(self, request: RenderRequest | ExportRequest) -> View:
+    def answer(self, request: RenderRequest | ExportRequest) -> Reply:
         self.asked.append(request.t)
         self.began.set()
         assert self.go_on.wait(TIMEOUT_S)
@@ -42,7 +42,7 @@ class Painter:
         if request.t == 600:
             raise RuntimeError("patient Smith")
         iteration = 7 if request.attempt is None else None
-        return View(b"\xff" * self.bytes, "image/jpeg", request.t, ("look out",), iteration)
+        return Reply(b"\xff" * self.bytes, "image/jpeg", request.t, ("look out",), iteration)
 
 
 @pytest.fixture

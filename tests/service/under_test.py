@@ -21,7 +21,7 @@ from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from tests.service.asgi import AsgiClient, serving
-from worker.daemon.serve import RequestServer, View
+from worker.daemon.serve import Reply, RequestServer
 
 CLIP = (Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4").read_bytes()
 EMPTY_ZIP = b"PK\x05\x06" + bytes(18)
@@ -39,10 +39,10 @@ class Painter:
     def __init__(self) -> None:
         self.requests: list[RenderRequest | ExportRequest] = []
 
-    def answer(self, request: RenderRequest | ExportRequest) -> View:
+    def answer(self, request: RenderRequest | ExportRequest) -> Reply:
         self.requests.append(request)
         if isinstance(request, ExportRequest):
-            return View(b"ply\n", "application/octet-stream", request.t)
+            return Reply(b"ply\n", "application/octet-stream", request.t)
         if request.camera.width == 8:
             raise InputError("width", "8 is too narrow.", "Use more.")
         if request.camera.width == 9:
@@ -52,7 +52,7 @@ class Painter:
         warnings = ("t is after the last frame", "ansicht – geschätzt") if request.t > 1 else ()
         iteration = 7 if request.attempt is None else None
         media_type, shown_t = f"image/{request.format.value}", min(request.t, 1.0)
-        return View(request.format.value.encode(), media_type, shown_t, warnings, iteration)
+        return Reply(request.format.value.encode(), media_type, shown_t, warnings, iteration)
 
 
 @dataclass

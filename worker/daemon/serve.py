@@ -39,7 +39,7 @@ class NotYetError(IntrasplatError):
 
 
 @dataclass(frozen=True)
-class View:
+class Reply:
     """An answered request: encoded bytes, the time they show (clamped), what the caller should know.
 
     iteration is that of the snapshot that is shown, None where the scene is finished.
@@ -63,7 +63,7 @@ class RequestServer:
     def __init__(
         self,
         endpoint: str,
-        answer: Callable[[RenderRequest | ExportRequest], View],
+        answer: Callable[[RenderRequest | ExportRequest], Reply],
         *,
         between: Callable[[], None] | None = None,
         rest_s: Callable[[], float] = lambda: 0.0,

@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from contract.runtime.settings import GIB
 from contract.store.store import Store
-from contract.wire.errors import LimitError
+from contract.wire.errors import InputError, LimitError
 from contract.wire.pose import MatrixPose, OrbitPose, world_from_camera
 from contract.wire.rendering import MEDIA_TYPES, ExportRequest, IntrinsicsOverride, RenderRequest
 from worker.daemon.pace import Pace
-from worker.daemon.serve import NotYetError, View
+from worker.daemon.serve import NotYetError, Reply
 from worker.daemon.snapshot import Snapshots
 from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
 from worker.render.encode import encode_layer
 from worker.render.view import HARDLY_SEEN, ROUNDING, render_frame
 from worker.scene.checkpoint import Scene, load_scene
-from worker.scene.export import export_ply
+from worker.scene.export import EXPORTS
 from worker.train.targets import MEDIAN_DEPTH_UNITS
 
 COPIES = 3
@@ -57,17 +57,18 @@ class Views:
         self._scenes: OrderedDict[tuple[str, int], Scene] = OrderedDict()
         self.held: tuple[str, ...] = ()
 
-    def answer(self, request: RenderRequest | ExportRequest) -> View:
+    def answer(self, request: RenderRequest | ExportRequest) -> Reply:
         """The encoded image or file.
 
         Raises:
             SceneError: the scene is not there, or damaged.
             NotYetError: a running job is asked for, and there is no snapshot of it here.
             LimitError: the image would have more than request.max_pixels.
+            InputError: the export format does not exist.
         """
         if isinstance(request, ExportRequest):
             with self._pace.rendering():
-                return _export(self._stored(request.scene_id, request.attempt), request.t)
+                return _export(self._stored(request.scene_id, request.attempt), request)
         if request.attempt is not None:
             with self._pace.rendering():
                 return _render(self._stored(request.scene_id, request.attempt), request, self._device)
@@ -105,7 +106,7 @@ class Views:
         return COPIES * sum(scene.byte_count for scene in self._scenes.values())
 
 
-def _render(scene: Scene, request: RenderRequest, device: Device, iteration: int | None = None) -> View:
+def _render(scene: Scene, request: RenderRequest, device: Device, iteration: int | None = None) -> Reply:
     """One view; iteration is that of a snapshot, None of a finished scene."""
     intrinsics = camera_of(scene.intrinsics, request.camera, request.max_pixels)
     frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics, device)
@@ -115,15 +116,18 @@ def _render(scene: Scene, request: RenderRequest, device: Device, iteration: int
         # What the clip shows of each place is counted when training has ended: until then nothing is vouched for.
         goes_on = f"Training goes on: this is iteration {iteration}, and how far to trust it is not known yet."
         warnings = (goes_on, *(each for each in warnings if each != HARDLY_SEEN))
-    return View(body, MEDIA_TYPES[request.format], shown_time(scene, request.t), warnings, iteration)
+    return Reply(body, MEDIA_TYPES[request.format], shown_time(scene, request.t), warnings, iteration)
 
 
-def _export(scene: Scene, t: float) -> View:
-    """The Gaussians at time t as PLY."""
-    shown = shown_time(scene, t)
-    outside = f"t = {t:g} lies outside the clip; t = {shown:.4g} is exported."
-    warnings = (outside,) if t > shown + ROUNDING else ()
-    return View(export_ply(scene, shown), "application/octet-stream", shown, warnings)
+def _export(scene: Scene, request: ExportRequest) -> Reply:
+    """The Gaussians at time t in the requested format."""
+    export_format = EXPORTS.get(request.format)
+    if export_format is None:
+        raise InputError("format", f"{request.format} is not an export format.", f"Use one of: {', '.join(EXPORTS)}.")
+    shown = shown_time(scene, request.t)
+    outside = f"t = {request.t:g} lies outside the clip; t = {shown:.4g} is exported."
+    warnings = (outside,) if request.t > shown + ROUNDING else ()
+    return Reply(export_format.encode(scene, shown), export_format.media_type, shown, warnings)
 
 
 def shown_time(scene: Scene, t: float) -> float:

@@ -16,13 +16,13 @@ from contract.access.curve import CurveKeys, service_keys, worker_keys
 from contract.queue.embedded import short_socket_path
 from contract.wire.errors import InputError, SceneError, UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
-from worker.daemon.serve import LONGEST_REQUEST_BYTES, NotYetError, RequestServer, View
+from worker.daemon.serve import LONGEST_REQUEST_BYTES, NotYetError, Reply, RequestServer
 
 SCENE = "0" * 32
 SECRET = "a secret of at least 32 characters"
 
 
-def answer(request: RenderRequest | ExportRequest) -> View:
+def answer(request: RenderRequest | ExportRequest) -> Reply:
     if request.t == 1:
         raise InputError("t", "1 is odd.", "Use another.")
     if request.t == 2:
@@ -31,7 +31,7 @@ def answer(request: RenderRequest | ExportRequest) -> View:
         raise ZeroDivisionError("patient Smith")
     if request.t == 4:
         raise NotYetError("Nothing to show yet.")
-    return View(b"image", "image/png", request.t, ("a warning",), iteration=12)
+    return Reply(b"image", "image/png", request.t, ("a warning",), iteration=12)
 
 
 @contextmanager
@@ -162,7 +162,7 @@ def test_over_tcp_the_services_of_the_same_secret_are_answered(tcp_endpoint: str
 def test_over_tcp_nobody_else_is(tcp_endpoint: str, keys: CurveKeys | None, server: bytes) -> None:
     asked: list[RenderRequest | ExportRequest] = []
 
-    def note(request: RenderRequest | ExportRequest) -> View:
+    def note(request: RenderRequest | ExportRequest) -> Reply:
         asked.append(request)
         return answer(request)
 

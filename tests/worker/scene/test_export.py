@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
+from contract.wire.rendering import ExportName
 from tests.worker.scenes import KINDS, random_scene
-from worker.scene.export import export_ply
+from worker.scene.export import EXPORTS
+from worker.scene.export.ply import export_ply
+
+
+def test_the_service_offers_the_formats_that_are_registered() -> None:
+    assert get_args(ExportName) == tuple(EXPORTS)
 
 
 def parse(data: bytes) -> tuple[list[str], NDArray[np.float32]]:
