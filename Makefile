@@ -76,25 +76,25 @@ bench: setup ## every benchmarks/bm_*.py, one after the other
 		[ -e "$$each" ] || { echo "bench: benchmarks/ holds no bm_*.py" >&2; exit 1; }; \
 		echo "== $$each"; $(BIN)/python "$$each"; done
 
-gpu-check: ## with an NVIDIA GPU: are its kernels right, how fast are they; 8 minutes at most, docs/gpu.md
+gpu-check: ## with an NVIDIA GPU: are its kernels right, how fast are they; 7 minutes at most, docs/gpu.md
 	@# nothing is installed and no .venv is made; a PYTHON that is named is used whatever it has
 	@python="$(PYTHON)"; \
 	if [ "$(origin PYTHON)" = file ] && [ -x $(BIN)/python ] && ! "$$python" -c '$(HAS_CUDA)' 2>/dev/null; then \
 		python=$(BIN)/python; fi; \
 	if ! "$$python" -c '$(NEW_ENOUGH)' 2>/dev/null; then \
 		echo "gpu-check: '$$python' is no Python of 3.11 or newer; name one: make gpu-check PYTHON=/path/to/python3" >&2; exit 1; fi; \
-	"$$python" benchmarks/gpu_check.py $(ARGS)
+	"$$python" benchmarks/gpu/check.py $(ARGS)
 
 evaluate: setup ## every preset on every clip, and the charts; hours, and it goes on where it was (CLIPS="phantom:pull ...")
 	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out docs/results
 	@$(EVALUATE) $(CLIPS) --series fast --budget-s 15 --seeds 0 1 2 --out docs/results
 	@$(if $(filter d4d_%,$(CLIPS)),$(EVALUATE) d4d_stereo --series instant fast --holdout every8 --out docs/results)
 	@$(EVALUATE) $(CLIPS) --series rivals --out docs/results
-	@$(BIN)/python benchmarks/write_results.py
+	@$(BIN)/python -m benchmarks.pages
 
 capacity: setup ## a grid of fixed capacities beside the automatic choice; hours, and it goes on where it was
 	@$(EVALUATE) $(GRID_CLIPS) --series fast --grid --holdout every8 --iterations 600 --seeds 0 1 2 3 4 --out docs/results/capacity
-	@$(BIN)/python benchmarks/write_results.py
+	@$(BIN)/python -m benchmarks.pages
 
 chaos: setup ## kill every part of a running service at every point, and count what was lost; ARGS narrows it
 	@$(BIN)/python -m tests.chaos $(ARGS)

@@ -29,11 +29,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from bm_train import commit
 from numba import njit
 from numpy.typing import NDArray
 
-from worker.evaluate.rows import write_rows
+from worker.evaluate.rows import commit, write_rows
 from worker.model.deformation import Deformation, FlexibleDeformation, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.evaluation_page import CAPACITY, MARKS, sections, write_readme
+from benchmarks.pages.evaluation import CAPACITY, MARKS, sections, write_readme
 from tests.worker.evaluate.made_up import curve_rows, failed_row, run_row
 from worker.evaluate.rows import CURVE_FIELDS, CURVES, RUN_FIELDS, RUNS, write_rows
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.stability_page import stability_sections
+from benchmarks.pages.stability import stability_sections
 from contract.runtime.exits import ExitCode
 from contract.wire.errors import Cancelled, InputError, UnavailableError
 from worker.__main__ import main

@@ -18,10 +18,10 @@ from typing import Any
 
 import torch
 import triton
+from triton.backends.compiler import GPUTarget
 from triton.runtime.driver import driver
 from triton.runtime.jit import JITFunction
 
-from benchmarks.gpu_compile import NoDevice
 from tests.worker.raster.test_cuda_model import LOSS, RATES, frames, model
 from worker.raster.cuda.rasterizer import CudaRasterizer
 
@@ -30,6 +30,22 @@ TIMES = 3
 
 compiled: dict[str, dict[str, Any]] = {}
 launch = JITFunction.run
+
+
+class NoDevice:
+    """A driver of Triton that compiles for an H200 (sm_90) and needs no GPU."""
+
+    def get_current_target(self) -> GPUTarget:
+        return GPUTarget("cuda", 90, 32)
+
+    def get_current_device(self) -> int:
+        return 0
+
+    def get_current_stream(self, device: int) -> int:
+        return device
+
+    def get_active_torch_device(self) -> torch.device:
+        return torch.device("cpu")
 
 
 def compile_launch(kernel: JITFunction, *args: Any, grid: Any, warmup: bool, **named: Any) -> None:

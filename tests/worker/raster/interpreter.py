@@ -1,6 +1,6 @@
 """Triton's interpreter of kernels without the work that it repeats: two and a half times as fast, with the same result.
 
-It checks as much as before, overflow of integers included. gpu_check.py and the tests ask for it.
+It checks as much as before, overflow of integers included. benchmarks/gpu/ and the tests ask for it.
 """
 
 from __future__ import annotations

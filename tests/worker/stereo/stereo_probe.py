@@ -8,8 +8,7 @@ import torch
 from triton.runtime.driver import driver
 from triton.runtime.jit import JITFunction
 
-from benchmarks.gpu_compile import NoDevice
-from tests.worker.raster.cuda_probe import compile_launch, compiled
+from tests.worker.raster.cuda_probe import NoDevice, compile_launch, compiled
 from worker.stereo.cuda.matching import filled, path_sums, winners
 
 RANGES = ((1, 20), (-7, 48))

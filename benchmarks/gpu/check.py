@@ -1,17 +1,16 @@
-"""Everything that only a GPU can show, in one command that ends within eight minutes and needs no network.
+"""Check and time the GPU kernels: one command that ends within seven minutes and needs no network.
 
     make gpu-check [PYTHON=python3] [ARGS="--clip FOLDER --out docs/results"]
-    python benchmarks/gpu_check.py --interpret --out FOLDER     the same on tiny sizes, in Triton's interpreter
+    python benchmarks/gpu/check.py --interpret --out FOLDER     the same on tiny sizes, in Triton's interpreter
 
-In this order: whether the kernels are right (gpu_correct.py), what a step and a picture take and where the card's own
-peaks are (gpu_speed.py), how soon training is how good (gpu_train.py), tiles of other shapes (gpu_variants.py), and
-gsplat beside it where it is installed (gpu_rival.py). Each part is a process with a time to end at, and writes
-OUT/gpu-*.csv row by row. If a kernel is wrong, the rest is measured all the same, says so in every row, and the exit
-code is 1. Without a GPU there is nothing to check: exit code 5. make prints either, and itself ends with 2.
+Three parts run in this order: correct.py checks the kernels, speed.py times steps and pictures, train.py measures how
+soon training reaches a given quality. Each part is a process with a deadline and writes OUT/gpu-*.csv row by row. If a
+kernel is wrong, the other parts still run, every row of theirs says so, and the exit code is 1. Without a GPU there is
+nothing to check: exit code 5. make prints the code and ends with 2 itself.
 
---clip names a recording in the EndoNeRF layout (its depth is in it); without it, synthetic tissue is made on the spot.
-An option that cannot be used is refused before anything is done: exit code 2.
-This file needs the standard library alone, so that it can say what is missing.
+--clip names a recording in the EndoNeRF layout, which brings its depth; without it the check makes synthetic tissue.
+An option that cannot be used ends the check before it begins: exit code 2.
+This file imports only the standard library, so that it can say what is missing.
 """
 
 from __future__ import annotations
@@ -28,7 +27,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-RESULTS = HERE.parent / "docs" / "results"
+REPOSITORY = HERE.parent.parent
+RESULTS = REPOSITORY / "docs" / "results"
 UNAVAILABLE = 5
 """As contract/runtime/exits.py has it."""
 CLIP_HAS = ("images", "depth", "poses_bounds.npy")
@@ -50,7 +50,7 @@ class Part:
 
     @property
     def program(self) -> Path:
-        return self.folder / f"gpu_{self.name}.py"
+        return self.folder / f"{self.name}.py"
 
     def files(self, out: Path) -> list[Path]:
         """What it writes."""
@@ -58,8 +58,7 @@ class Part:
         return [out / f"gpu-{name}.csv" for name in names]
 
 
-PARTS = (Part("correct", 140), Part("speed", 115), Part("train", 120), Part("variants", 65), Part("rival", 20))
-"""460 s in all, of the 480 there are."""
+PARTS = (Part("correct", 140), Part("speed", 115), Part("train", 120))
 
 
 def main() -> int:
@@ -113,7 +112,7 @@ def clip_problem(path: Path) -> str:
 def what_is_missing() -> tuple[str, str]:
     """Why nothing can be checked here, and what to do about it; empty if everything is there."""
     command = [sys.executable, "-c", LOOK]
-    look = subprocess.run(command, cwd=HERE.parent, capture_output=True, text=True, check=False)
+    look = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     if look.returncode != 0:
         last = look.stderr.strip().splitlines()[-1:] or ["it ended without a word"]
         return (
@@ -127,7 +126,7 @@ def what_is_missing() -> tuple[str, str]:
 def environment(work: Path, interpret: bool) -> dict[str, str]:
     """Of the parts: this checkout's modules, and caches that begin empty and end with the check."""
     own = {
-        "PYTHONPATH": os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
+        "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
         "PYTHONUNBUFFERED": "1",
         "TRITON_CACHE_DIR": str(work / "triton"),
     }
@@ -139,9 +138,15 @@ def environment(work: Path, interpret: bool) -> dict[str, str]:
 
 
 def run_parts(parts: list[Part], options: list[str], variables: dict[str, str]) -> list[str]:
-    """Run the parts one after the other beside gpu_prepare.py; what failed, in words."""
+    """Run the parts one after the other beside prepare.py; what failed, in words."""
     failures, doubt, deadline = [], "", time.time()
-    prepare = [sys.executable, str(HERE / "gpu_prepare.py"), *options, "--deadline", str(deadline + 460)]
+    prepare = [
+        sys.executable,
+        str(HERE / "prepare.py"),
+        *options,
+        "--deadline",
+        str(deadline + sum(part.seconds for part in parts)),
+    ]
     with subprocess.Popen(prepare, env=variables, stdout=subprocess.DEVNULL) as prepared:
         try:
             for part in parts:

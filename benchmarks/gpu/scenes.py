@@ -1,4 +1,4 @@
-"""What gpu_correct.py feeds the kernels: frames of noise, motions that move, and buffers full of NaN."""
+"""What correct.py feeds the kernels: frames of noise, motions that move, and buffers full of NaN."""
 
 from __future__ import annotations
 

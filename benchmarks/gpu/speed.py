@@ -1,4 +1,4 @@
-"""Part of gpu_check.py: what a step and a picture take, of what, and how far that is from the card's own peaks.
+"""Part of check.py: how long a step and a picture take, and what they spend it on.
 
 The standard scene is that of bm_raster.py: 640x512, a Gaussian every 2.86 pixels each way (40,096), with 17 shared
 bases and moving colour, and with the paper's FDM of 17 bases. Durations are medians: of the device's own events, or,
@@ -8,32 +8,23 @@ steps whose launches were queued before the first of them began.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 import torch
-from bm_raster import BASES, GAUSSIAN_FMA, GRID_STEP_PX, HEIGHT, PAIR_FMA, RATES, WIDTH, grid_scene
-from gpu_counts import count
-from gpu_peaks import Peaks, measure_peaks
-from gpu_rows import KERNELS_READY, Part, Stamp, device_ms, synchronize, wall_ms
-from gpu_scenes import stereo_pairs
-from gpu_work import Sizes, bytes_by_kernel
 from torch.profiler import ProfilerActivity, profile
 
+from benchmarks.bm_raster import BASES, GRID_STEP_PX, HEIGHT, RATES, WIDTH, grid_scene
+from benchmarks.gpu.rows import Part, Stamp, device_ms, synchronize, wall_ms
+from benchmarks.gpu.scenes import stereo_pairs
 from worker.model.deformation import Deformation, FlexibleDeformation, SharedBasis
 from worker.model.loss import LossSettings
 from worker.raster.cpu import padded
-from worker.raster.cpu.model import FusedModel
-from worker.raster.cpu.motion import NEGLIGIBLE
-from worker.raster.cuda.bins import TILE_HEIGHT, TILE_WIDTH
-from worker.raster.cuda.blend import CHUNK
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
 from worker.raster.step import Target, TrainingFrame, camera_vector
 from worker.stereo.cuda import match_frames
@@ -51,9 +42,6 @@ TIME = 0.4
 def main() -> None:
     part = Part.begin("speed", FIELDS)
     speed = Speed(part)
-    peaks = measure_peaks(part)
-    for name, value in vars(peaks).items():
-        speed.add("peak: " + name.replace("_", " "), value, "us" if name == "launch_us" else "a second")
     speed.compilation()
     motions = ("shared",) if part.interpret else ("shared", "fdm")
     for frames in (1, 2) if part.interpret else (1, 4, 2):
@@ -64,12 +52,10 @@ def main() -> None:
         speed.pictures()
     if part.has(0 if part.interpret else 10, "stereo"):
         speed.stereo()
-    if part.has(0 if part.interpret else 10, "floors"):
-        speed.floors(peaks)
 
 
 class Speed:
-    """The measurements of a part; milliseconds and sizes of a step by (motion, frames) are kept for the floors."""
+    """The measurements of this part, on the standard scene."""
 
     def __init__(self, part: Part) -> None:
         self._part, self._device = part, part.device
@@ -78,7 +64,6 @@ class Speed:
         self.camera = camera_vector(camera)
         self._rounds = 1 if part.interpret else 11
         self._block = 2 if part.interpret else CHECK_EVERY
-        self.measured: dict[tuple[str, int], tuple[float, Sizes]] = {}
 
     def add(self, what: str, value: float, unit: str, *, scene: str = "", frames: int = 1, **more: str) -> None:
         """Keep and print a figure."""
@@ -148,8 +133,6 @@ class Speed:
 
         block()
         trained_ms = wall_ms(block, self._device, calls=1, rounds=self._rounds) / self._block
-        sizes = _sizes(model, self.motion(motion), self._width * self._height)
-        self.measured[motion, frames] = trained_ms, sizes
         self.add("step, as trained", trained_ms, "ms", clock="host", **place)
         self.add("step, as trained, a frame", trained_ms / frames, "ms", clock="host", **place)
         launches = model._training.launches
@@ -267,32 +250,12 @@ class Speed:
         ms = device_ms(lambda: match_frames(one, other, plan), self._device, calls=1, rounds=rounds)
         self.add("stereo pairs", 1e3 * count / ms, "a second", scene=f"{width}x{height}", frames=count, clock="device")
 
-    # Floors
-
-    def floors(self, peaks: Peaks) -> None:
-        """What the step's bytes and multiply-adds take at the card's peaks, and how near steps come to them."""
-        self._part.wait_for(KERNELS_READY)
-        cpu = FusedModel(self.gaussians, self.motion("shared"), self._width, self._height)
-        counts = count(cpu, self.camera, TIME, (TILE_WIDTH, TILE_HEIGHT), CHUNK)
-        for (motion, frames), (step_ms, sizes) in self.measured.items():
-            moved = sum(bytes_by_kernel(sizes, counts).values())
-            made = frames * (PAIR_FMA["step"] * counts.blended + GAUSSIAN_FMA["step"] * sizes.gaussians)
-            place: dict[str, Any] = {"scene": motion, "frames": frames}
-            self.add("floor: bytes", 1e3 * moved / peaks.copied_bytes, "ms", note=f"{moved / 1e6:.1f} MB", **place)
-            floor_ms = 1e3 * made / peaks.multiply_adds
-            self.add("floor: multiply-adds", floor_ms, "ms", note=f"{made / 1e6:.1f} million", **place)
-            self.add("reached: bytes", 1e3 * moved / step_ms, "a second", **place)
-            self.add("reached: multiply-adds", 1e3 * made / step_ms, "a second", **place)
-
 
 def _seconds_of_another_process() -> float:
     """What compile_again prints there; NaN if it fails."""
-    path = f"{Path(__file__).parent}{os.pathsep}{os.environ['PYTHONPATH']}"
-    command = [sys.executable, "-c", "import gpu_speed; gpu_speed.compile_again()", *sys.argv[1:]]
+    command = [sys.executable, "-c", "from benchmarks.gpu.speed import compile_again; compile_again()", *sys.argv[1:]]
     try:
-        found = subprocess.run(
-            command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True, timeout=60
-        )
+        found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
         return float(found.stdout.split()[-1])
     except (subprocess.SubprocessError, ValueError, IndexError) as error:
         print(f"  no seconds of a process that finds the cache full: {error}", flush=True)
@@ -315,16 +278,6 @@ def _nested(ms: dict[str, float]) -> dict[str, float]:
         "project backward": ms["_carry_back"],
         "update": ms["update"],
     }
-
-
-def _sizes(model: CudaModel, deformation: Deformation, pixels: int) -> Sizes:
-    raster, weight = model._training.rasterizer, deformation.parameters()["weight"]
-    is_fdm = isinstance(deformation, FlexibleDeformation)
-    alive = 0 if is_fdm else int((deformation.basis(TIME).abs() >= NEGLIGIBLE).sum())  # type: ignore[attr-defined]
-    return Sizes(
-        raster.gaussians, raster.frames, pixels, weight.shape[2], alive, weight.shape[1], is_fdm, raster.capacity,
-        raster._key.element_size(),
-    )  # fmt: skip
 
 
 if __name__ == "__main__":

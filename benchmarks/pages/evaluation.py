@@ -65,7 +65,7 @@ _INTRODUCTION = """
 
 `make evaluate` ([runs.csv](runs.csv), a row a run with its command, which looks for `d4d_endonerf` in the folder
 `INTRASPLAT_DATA` names; [curves.csv](curves.csv); [summary.csv](summary.csv), medians over seeds). `intrasplat evaluate
---redraw --out docs/results` draws all charts anew from the rows; PNG and SVG lie beside this page. {count}
+--redraw --out docs/results` draws all charts anew from the rows, as PNG and SVG. {count}
 """
 _TRUTH = """
 ### What copying cannot do

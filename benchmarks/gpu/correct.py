@@ -1,4 +1,4 @@
-"""Part of gpu_check.py: is what the device computes right? Fresh random inputs, poisoned buffers, every kernel.
+"""Part of check.py: is what the device computes right? Fresh random inputs, poisoned buffers, every kernel.
 
 The rasteriser is held against the reference in float64, of values and of gradients; whole training steps against the
 CPU's, of every form of motion. Pixels where a Gaussian comes so near a cut that rounding decides are left out, as the
@@ -16,12 +16,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from bm_raster import BASES, GRID_STEP_PX, HEIGHT, WIDTH, grid_scene
-from gpu_rows import KERNELS_READY, Part
-from gpu_scenes import LOSS, Noise, poison, stereo_pairs, stirred_motion
 from numpy.typing import NDArray
 from torch import Tensor
 
+from benchmarks.bm_raster import BASES, GRID_STEP_PX, HEIGHT, WIDTH, grid_scene
+from benchmarks.gpu.rows import KERNELS_READY, Part
+from benchmarks.gpu.scenes import LOSS, Noise, poison, stereo_pairs, stirred_motion
 from tests.worker.raster.interpreter import hasten
 from tests.worker.raster.scenes import Scene, pixels_near_a_cut, random_scene
 from worker.model.deformation import Deformation, SharedBasis

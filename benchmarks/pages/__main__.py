@@ -1,6 +1,6 @@
 """docs/results/index.md from the CSV files beside it, so that no figure there is typed by hand; README's chart, too.
 
-    python benchmarks/write_results.py
+    python -m benchmarks.pages
 
 Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
 stability`), {train,ablation,raster,service}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py);
@@ -13,19 +13,18 @@ import csv
 from pathlib import Path
 from statistics import median
 
-from evaluation_page import origin, sections, table, write_readme
-from gpu_page import gpu_sections
-from stability_page import stability_sections
-
+from benchmarks.pages.evaluation import origin, sections, table, write_readme
+from benchmarks.pages.gpu import gpu_sections
+from benchmarks.pages.stability import stability_sections
 from worker.evaluate.stability import STABILITY
 
-RESULTS = Path(__file__).parent.parent / "docs" / "results"
+RESULTS = Path(__file__).resolve().parent.parent.parent / "docs" / "results"
 Row = dict[str, str]
 
 _INTRODUCTION = """# Results
 
 Every figure here was printed by a command in this repository and stands in the CSV file named beside it; this page is
-written by `python benchmarks/write_results.py`. `d4d-a` is a real da Vinci recording (96 frames, 640x512, camera at
+written by `python -m benchmarks.pages`. `d4d-a` is a real da Vinci recording (96 frames, 640x512, camera at
 rest), `surgt_raw` another of 10 raw frames, neither part of the project; the rest is synthetic. `psnr_tissue` is the
 honest score, `psnr_paper` what papers print ([conventions](../conventions.md)). The machines are shared and noisy: rows
 of runs have their load. A section holds for the commits it names; later ones may train or splat differently.

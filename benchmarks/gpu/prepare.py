@@ -1,4 +1,4 @@
-"""What the parts of gpu_check.py need of the processor, made beside them: the CPU's kernels compiled, and the clip.
+"""What the parts of check.py need of the processor, made beside them: the CPU's kernels compiled, and the clip.
 
 Both take tens of seconds and none of the GPU. The clip is a recording in the EndoNeRF layout, or synthetic tissue.
 """
@@ -14,8 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from gpu_rows import CLIP, CLIP_READY, KERNELS_READY, Part
 
+from benchmarks.gpu.rows import CLIP, CLIP_READY, KERNELS_READY, Part
 from contract.wire.errors import InputError
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip, open_clip

@@ -1,4 +1,4 @@
-"""Part of gpu_check.py: how soon training on the device is how good, against `paper` to its end and the CPU's `fast`.
+"""Part of check.py: how soon training on the device is how good, against `paper` to its end and the CPU's `fast`.
 
 A run is what `reconstruct` makes of a clip with depth, without what follows training: points, tracks, a model, steps.
 Seconds are t_train_s as docs/conventions.md defines it, so they have what is done on the processor before the first
@@ -17,9 +17,9 @@ import sys
 import traceback
 
 import numpy as np
-from gpu_prepare import load_clip
-from gpu_rows import CLIP, CLIP_READY, KERNELS_READY, Part
 
+from benchmarks.gpu.prepare import load_clip
+from benchmarks.gpu.rows import CLIP, CLIP_READY, KERNELS_READY, Part
 from contract.wire.errors import Cancelled
 from worker.input.clip import DepthClip, split_frames
 from worker.machine.hooks import Hooks

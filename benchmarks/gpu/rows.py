@@ -1,4 +1,4 @@
-"""What every part of gpu_check.py shares: its place, its time, its rows, and a clock of the device.
+"""What every part of check.py shares: its place, its time, its rows, and a clock of the device.
 
 A part is a process of its own: what breaks one, be it the memory of the device, breaks no other. Rows are written as
 they are measured, each with what it was measured on.
@@ -24,7 +24,7 @@ from worker.evaluate.rows import commit, machine
 
 ORIGIN = ("believed", "machine", "gpu", "driver", "torch", "triton", "commit")
 CLIP, CLIP_READY, KERNELS_READY = "clip.npz", "clip.json", "kernels.json"
-"""In the folder of work: the clip, and that it and the CPU's kernels are there (gpu_prepare.py)."""
+"""In the folder of work: the clip, and that it and the CPU's kernels are there (prepare.py)."""
 
 
 @dataclass
@@ -51,7 +51,7 @@ class Part:
 
     @classmethod
     def begin(cls, name: str, fields: tuple[str, ...]) -> Part:
-        """The part that the command line describes (gpu_check.py writes it)."""
+        """The part that the command line describes (check.py writes it)."""
         parser = argparse.ArgumentParser()
         parser.add_argument("--out", type=Path, required=True)
         parser.add_argument("--work", type=Path, required=True)
@@ -107,7 +107,7 @@ class Part:
         self._begun = True
 
     def wait_for(self, name: str) -> dict[str, object]:
-        """What gpu_prepare.py says under this name, waited for; what it failed with is raised.
+        """What prepare.py says under this name, waited for; what it failed with is raised.
 
         Raises:
             RuntimeError: it failed, or is not done in time.
