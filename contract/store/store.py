@@ -32,7 +32,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from contract.runtime.settings import Settings
-from contract.store.durable import flush
+from contract.store.durable import flush, move_folder
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JOB_ID_PATTERN, JobRecord
 from contract.wire.names import MANIFEST, SUBMISSION
@@ -152,7 +152,7 @@ class Store:
         """
         folder = self.incoming_folder(record.job_id)
         (folder / SUBMISSION).write_text(record.model_dump_json(indent=1))
-        _publish(folder, self._folder("spool", record.job_id))
+        move_folder(folder, self._folder("spool", record.job_id))
 
     @disk_errors()
     def spooled_ids(self) -> list[str]:
@@ -218,7 +218,7 @@ class Store:
         work, scene = self._folder("work", job_id, attempt), self._folder("scenes", job_id, attempt)
         if work.is_dir():
             _remove_scene(scene)
-            _publish(work, scene)
+            move_folder(work, scene)
         return self.scene_folder(job_id, attempt)
 
     @disk_errors()
@@ -365,16 +365,3 @@ def _unless_gone(_: object, __: object, failure: tuple[type[BaseException], Base
     """For rmtree: somebody else removing the same is no failure."""
     if not isinstance(failure[1], FileNotFoundError):
         raise failure[1]
-
-
-def _publish(source: Path, target: Path) -> None:
-    """Rename a folder into place only after every byte of it is on disk."""
-    for path in source.rglob("*"):
-        flush(path)
-    flush(source)
-    source.rename(target)
-    try:
-        flush(target.parent)
-    except OSError:
-        target.rename(source)  # who is told that it failed must not find it done
-        raise

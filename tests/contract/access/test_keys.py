@@ -95,7 +95,7 @@ def test_a_key_that_cannot_be_meant_is_named(
 def test_a_write_that_was_cut_off_leaves_the_old_keys_and_does_not_block_new_ones(tmp_path: Path) -> None:
     keys = KeyFile(tmp_path)
     key, _ = keys.create("a")
-    (tmp_path / f"{KEYS_FILE}.new").write_bytes(b'{"keys": [')
+    (tmp_path / f".{KEYS_FILE}.new").write_bytes(b'{"keys": [')
     assert KeyFile(tmp_path).list() == (key,)
     keys.create("b")
     assert [each.tenant for each in KeyFile(tmp_path).list()] == ["a", "b"]
