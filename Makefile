@@ -1,8 +1,9 @@
 # `make help` lists what there is. Needs Python 3.11 or newer, make and pip; everything else goes into .venv.
 #
-#   TORCH_INDEX  package index for torch alone, e.g. https://download.pytorch.org/whl/cpu (small, no GPU);
-#                empty: pip's own index, which on Linux is usually a CUDA build of several GB;
-#                default: the one .venv was made with; another one than that installs torch anew
+#   TORCH_INDEX  package index for torch alone, e.g. https://download.pytorch.org/whl/cu128; empty: pip's own index,
+#                which on Linux is usually a CUDA build of several GB. Default: the one .venv was made with; for a
+#                new .venv on Linux without an NVIDIA GPU the index of CPU builds, if it answers within seconds;
+#                else pip's own. Another index than that of .venv installs torch anew
 #   PYTHON       the interpreter that makes .venv, and that gpu-check uses
 #                (default: the first of python3, python3.13, 3.12, 3.11 that is new enough;
 #                gpu-check takes .venv's where that one's torch is no CUDA build)
@@ -12,11 +13,24 @@ SHELL := /bin/bash
 
 VENV := .venv
 BIN := $(VENV)/bin
-# says that .venv is finished, and holds the TORCH_INDEX it was made with
+# says that .venv is finished, and holds the TORCH_INDEX it was made with; the other: that it has the tools of [dev], too
 STAMP := $(VENV)/.installed
+DEV_STAMP := $(VENV)/.installed-dev
 INSTALLED_INDEX := $(shell cat $(STAMP) 2>/dev/null)
-TORCH_INDEX ?= $(INSTALLED_INDEX)
-ifneq ($(TORCH_INDEX),$(INSTALLED_INDEX))
+CPU_INDEX := https://download.pytorch.org/whl/cpu
+NVIDIA = $(shell command -v nvidia-smi; ls -d /dev/nvidia* 2>/dev/null)
+# the index of CPU builds, if it answers; asked by Python, for a bare machine has no curl
+ANSWERING_CPU_INDEX = $(shell timeout 6 "$(PYTHON)" -c \
+	'import sys, urllib.request as web; web.urlopen(sys.argv[1] + "/torch/", timeout=5)' "$(CPU_INDEX)" 2>/dev/null && echo "$(CPU_INDEX)")
+NEEDS_CPU_INDEX = $(and $(filter Linux,$(shell uname -s)),$(if $(NVIDIA),,yes))
+ifeq ($(origin TORCH_INDEX),undefined)
+ifneq ($(wildcard $(STAMP)),)
+TORCH_INDEX := $(INSTALLED_INDEX)
+else
+# found out once, and only where a recipe asks
+TORCH_INDEX = $(eval TORCH_INDEX := $(if $(NEEDS_CPU_INDEX),$(ANSWERING_CPU_INDEX)))$(TORCH_INDEX)
+endif
+else ifneq ($(TORCH_INDEX),$(INSTALLED_INDEX))
 .PHONY: $(STAMP)
 # else pip would be content with the build that is there
 REINSTALL := --force-reinstall
@@ -42,7 +56,7 @@ evaluate capacity: export INTRASPLAT_DATA ?= ../shared/data
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
 
-setup: $(STAMP) ## make .venv and install everything into it (TORCH_INDEX=URL chooses the torch build)
+setup: $(STAMP) ## make .venv and install what running needs into it (TORCH_INDEX=URL chooses the torch build)
 	@$(BIN)/python -c 'import torch; print(f"torch {torch.__version__}:", f"CUDA {torch.version.cuda} build" if torch.version.cuda else "CPU build")'
 
 $(STAMP): pyproject.toml constraints.txt
@@ -56,16 +70,21 @@ $(STAMP): pyproject.toml constraints.txt
 		echo "setup: installing torch from $(or $(TORCH_INDEX),pip's own index)"; \
 		$(PIP) install -qq $(REINSTALL) --constraint $(TORCH_CONSTRAINTS) $(TORCH_INDEX:%=--index-url "%") torch; fi
 	@echo "setup: installing intrasplat and what it needs (download sizes are in README.md; minutes on a slow line)"
-	@$(PIP) install -qq --constraint constraints.txt --editable '.[dev]'
+	@$(PIP) install -qq --constraint constraints.txt --editable .
 	@echo "$(TORCH_INDEX)" >$@
+
+$(DEV_STAMP): $(STAMP)
+	@echo "setup: installing what the tests and checks need besides"
+	@$(PIP) install -qq --constraint constraints.txt --editable '.[dev]'
+	@touch $@
 
 demo: setup ## reconstruct a synthetic clip of tissue and render it without the instrument
 	@$(BIN)/python -m client.demo
 
-test: setup ## the whole test suite; ARGS="tests/test_layers.py -k law" narrows it
+test: setup $(DEV_STAMP) ## the whole test suite; ARGS="tests/test_layers.py -k law" narrows it
 	@$(BIN)/python -m pytest $(ARGS)
 
-check: setup ## style, types, the import rules and the containers' rules
+check: setup $(DEV_STAMP) ## style, types, the import rules and the containers' rules
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
@@ -96,10 +115,10 @@ capacity: setup ## a grid of fixed capacities beside the automatic choice; hours
 	@$(EVALUATE) $(GRID_CLIPS) --series fast --grid --holdout every8 --iterations 600 --seeds 0 1 2 3 4 --out docs/results/capacity
 	@$(BIN)/python -m benchmarks.pages
 
-chaos: setup ## kill every part of a running service at every point, and count what was lost; ARGS narrows it
+chaos: setup $(DEV_STAMP) ## kill every part of a running service at every point, and count what was lost; ARGS narrows it
 	@$(BIN)/python -m tests.chaos $(ARGS)
 
-sbom: setup ## build/sbom.json: every component of this environment, as CycloneDX
+sbom: setup $(DEV_STAMP) ## build/sbom.json: every component of this environment, as CycloneDX
 	@$(BIN)/python docker/sbom.py build/sbom.json
 
 clean: ## remove .venv, caches and build leftovers; scenes and the demo's pictures stay
