@@ -1,4 +1,4 @@
-"""Rendered views: how they are asked for, and what comes back over HTTP or over the stream."""
+"""Rendered views: their parameters, and their answers over HTTP or over the stream."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import httpx
 
-from client.errors import Refusal, ServiceFault, error_of_document
-from client.steps import Call, Steps, answered
-from contract.wire.errors import InputError, IntrasplatError
+from intrasplat_client.connection import Call
+from intrasplat_client.errors import InputError, IntrasplatError, Refusal, ServiceFault, error_of_document
+from intrasplat_client.session import Session, parsed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 NPY = "application/x-npy"
 LENGTH_BYTES = 4
-"""Of the length that opens a message of the stream."""
+"""Of the number that opens a message of the stream: its head's length."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,18 @@ class Image:
     render_ms: float | None = None
 
     def array(self) -> NDArray[Any]:
-        """The values of a view asked for with format="npy"; needs numpy."""
+        """The values of a view asked for with format="npy".
+
+        Raises:
+            InputError: it is of another format.
+            ImportError: numpy is not installed.
+        """
         if self.media_type != NPY:
             raise InputError("format", f"this render is {self.media_type}.", 'Ask for it with format="npy".')
-        import numpy as np  # here, so that a client without numpy can do everything else
+        try:
+            import numpy as np  # nothing else needs it
+        except ImportError as error:
+            raise ImportError("Arrays need numpy: pip install 'intrasplat-client[numpy]'.") from error
 
         values: NDArray[Any] = np.load(io.BytesIO(self.content), allow_pickle=False)
         return values
@@ -63,13 +71,13 @@ def view_query(
     return {name: value for name, value in values.items() if value is not None}
 
 
-def render(query: Mapping[str, Any], known: Image | None, patience_s: float) -> Steps[Image]:
-    """One view; `known` itself if it still is what would be sent."""
+async def render(session: Session, query: Mapping[str, Any], known: Image | None) -> Image:
+    """One view; `known` itself if it is still what the service would send."""
     headers = {"If-None-Match": known.etag} if known is not None and known.etag is not None else {}
-    response = yield from answered(Call("GET", "/render", query, headers, is_repeatable=True), patience_s)
+    response = await session.request(Call("GET", "/render", query, headers, is_repeatable=True))
     if response.status_code == httpx.codes.NOT_MODIFIED and known is not None:
         return known
-    return _image_of(response)
+    return parsed(response, _image_of, response)
 
 
 def _image_of(response: httpx.Response) -> Image:
@@ -97,7 +105,7 @@ def _duration_ms(server_timing: str, name: str) -> float | None:
 
 
 def image_of_message(message: bytes | str) -> tuple[object, Image | IntrasplatError]:
-    """The id that the request had, and the view or the refusal that the stream answers."""
+    """The request's id, and the view or the error that the stream answers with."""
     try:
         if isinstance(message, str):
             document = json.loads(message)

@@ -1,23 +1,21 @@
 """What can go wrong between a caller and a service.
 
-IntrasplatError (contract/wire/errors.py)
-├── InputError
+IntrasplatError
+├── InputError                  what the caller gave cannot be used: names the field and the remedy
 │   ├── RequestRefused          the service refused the request (4xx, 507)
 │   │   ├── Unauthorized        401: a key is needed, or this one is not known
 │   │   ├── Forbidden           403: the key lacks a scope, or the service does not answer to this name
 │   │   ├── NotFound            404: there is no such job or scene, or it is another tenant's
 │   │   └── Conflict            409: not in this state, such as a render of a job that waits
 │   └── JobRejected             the job failed because of what was sent
-├── UnavailableError
-│   └── ServiceUnavailable      503; tried again as often as the client's patience allowed, as are the next two
-│       ├── RateLimited         429: too much from this caller at once
-│       └── Unreachable         nobody answers (that is said at once), or the connection was lost
+├── ServiceUnavailable          503; raised after the client's patience, as are the next two
+│   ├── RateLimited             429: too much from this caller at once
+│   └── Unreachable             nobody answers (raised at once), or the connection was lost
 ├── JobFailed                   the job failed for another reason
-├── Cancelled
-│   └── JobCancelled            somebody cancelled the job
-└── ServiceFault                the service answered with a fault of its own (5xx), or with what is no answer of its
+├── JobCancelled                somebody cancelled the job
+└── ServiceFault                the service answered with a fault of its own (5xx), or another server answered
 
-Those that come from an answer carry field, remedy, status and request_id; the service's log has more under the last.
+Errors that come from an answer carry field, remedy, status and request_id; the service logs more under that id.
 """
 
 from __future__ import annotations
@@ -28,15 +26,14 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any
 
-from contract.wire.errors import Cancelled, InputError, IntrasplatError, UnavailableError
-from contract.wire.job import JobView
+from intrasplat_client.models import JobView
 
-UNAVAILABLE_REMEDY = "Start one with `intrasplat up`, or correct the address."
+UNREACHABLE_REMEDY = "Start one with `intrasplat up`, or correct the address."
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """An answer other than the one asked for, as the service's problem document and headers tell it."""
+    """An answer other than the one asked for, as the service's problem document and headers describe it."""
 
     status: int
     problem: str
@@ -46,6 +43,26 @@ class Refusal:
     retry_after_s: float | None = None
     job_id: str | None = None
     """The job that the clip became all the same."""
+
+
+class IntrasplatError(Exception):
+    """Base of all errors raised on purpose."""
+
+
+class InputError(IntrasplatError):
+    """What the caller gave cannot be used.
+
+    Attributes:
+        field: what is at fault, in the caller's words ("clip", "masks", "options.holdout").
+        problem: what is wrong with it.
+        remedy: what to do about it, one sentence.
+    """
+
+    def __init__(self, field: str, problem: str, remedy: str) -> None:
+        super().__init__(f"{field}: {problem} {remedy}")
+        self.field = field
+        self.problem = problem
+        self.remedy = remedy
 
 
 class RequestRefused(InputError):
@@ -58,7 +75,7 @@ class RequestRefused(InputError):
 
 
 class Unauthorized(RequestRefused):
-    """A key is needed, or the one that was sent is not known."""
+    """A key is needed, or the service does not know the one that was sent."""
 
 
 class Forbidden(RequestRefused):
@@ -70,19 +87,21 @@ class NotFound(RequestRefused):
 
 
 class Conflict(RequestRefused):
-    """What was asked for cannot be done as things stand."""
+    """The job or scene is not in a state for this."""
 
 
-class ServiceUnavailable(UnavailableError):
-    """The service cannot do it now, or cannot be reached (status None). field: what is missing, such as "queue"."""
+class ServiceUnavailable(IntrasplatError):
+    """The service cannot answer now (503). field: what is missing, such as "queue"."""
 
-    def __init__(self, refusal: Refusal | None, problem: str, remedy: str) -> None:
-        super().__init__(problem, remedy)
-        self.status = refusal.status if refusal else None
-        self.field = refusal.field if refusal else None
-        self.request_id = refusal.request_id if refusal else None
-        self.retry_after_s = refusal.retry_after_s if refusal else None
-        self.job_id = refusal.job_id if refusal else None
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(f"{refusal.problem} {refusal.remedy}")
+        self.problem = refusal.problem
+        self.remedy = refusal.remedy
+        self.status: int | None = refusal.status
+        self.field = refusal.field
+        self.request_id = refusal.request_id
+        self.retry_after_s = refusal.retry_after_s
+        self.job_id = refusal.job_id
 
 
 class RateLimited(ServiceUnavailable):
@@ -90,16 +109,18 @@ class RateLimited(ServiceUnavailable):
 
 
 class Unreachable(ServiceUnavailable):
-    """The connection failed. is_nobody_there: nothing was sent, because nobody took the call."""
+    """The connection failed, so status is None. is_nobody_there: it was never made, so nothing was sent."""
 
     def __init__(self, url: str, error: Exception, is_nobody_there: bool) -> None:
         what = "No service answers at" if is_nobody_there else "The connection was lost to the service at"
-        super().__init__(None, f"{what} {url} ({type(error).__name__}).", UNAVAILABLE_REMEDY)
+        problem = f"{what} {url} ({type(error).__name__})."
+        super().__init__(Refusal(HTTPStatus.SERVICE_UNAVAILABLE, problem, remedy=UNREACHABLE_REMEDY))
+        self.status = None
         self.is_nobody_there = is_nobody_there
 
 
 class ServiceFault(IntrasplatError):
-    """The service answered, but not with anything that was asked for."""
+    """The service failed, or another server answered."""
 
     def __init__(self, refusal: Refusal) -> None:
         super().__init__(" ".join(part for part in (refusal.problem, refusal.remedy) if part))
@@ -126,7 +147,7 @@ class JobFailed(IntrasplatError):
         self.job = job
 
 
-class JobCancelled(Cancelled):
+class JobCancelled(IntrasplatError):
     """The job was cancelled; `job` is its last view."""
 
     def __init__(self, job: JobView) -> None:
@@ -143,7 +164,7 @@ REFUSED: Mapping[int, type[RequestRefused]] = {
 
 
 def error_of_answer(status: int, headers: Mapping[str, str], content: bytes) -> IntrasplatError:
-    """The exception that an answer with an error's status means."""
+    """The exception for an answer with an error's status."""
     request_id = headers.get("x-request-id")
     try:
         document = json.loads(content)
@@ -156,7 +177,7 @@ def error_of_answer(status: int, headers: Mapping[str, str], content: bytes) -> 
 def error_of_document(
     document: Mapping[str, Any], request_id: str | None = None, retry_after_s: float | None = None
 ) -> IntrasplatError:
-    """The exception that a problem document means.
+    """The exception for a problem document (RFC 9457).
 
     Raises:
         KeyError, TypeError, ValueError: it is no problem document.
@@ -171,14 +192,14 @@ def error_of_document(
         job_id=document.get("job_id"),
     )
     if refusal.status == HTTPStatus.TOO_MANY_REQUESTS:
-        return RateLimited(refusal, refusal.problem, refusal.remedy)
+        return RateLimited(refusal)
     if refusal.status == HTTPStatus.SERVICE_UNAVAILABLE:
-        return ServiceUnavailable(refusal, refusal.problem, refusal.remedy)
+        return ServiceUnavailable(refusal)
     if refusal.status >= HTTPStatus.INTERNAL_SERVER_ERROR and refusal.status != HTTPStatus.INSUFFICIENT_STORAGE:
         return ServiceFault(refusal)
     return REFUSED.get(refusal.status, RequestRefused)(refusal)
 
 
 def _seconds(retry_after: str | None) -> float | None:
-    """Retry-After in seconds; a date, which it may be as well, is not understood."""
+    """Retry-After in seconds; None for its other form, a date."""
     return float(retry_after) if retry_after and retry_after.isascii() and retry_after.isdigit() else None

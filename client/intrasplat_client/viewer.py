@@ -8,77 +8,76 @@ from typing import TYPE_CHECKING, Any
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 
-from client.connection import ANSWER_TIMEOUT_S, CONNECT_TIMEOUT_S, authorization
-from client.errors import Unreachable, error_of_answer
-from client.views import Image, image_of_message, view_query
-from contract.wire.errors import IntrasplatError
+from intrasplat_client.connection import ANSWER_TIMEOUT_S, CONNECT_TIMEOUT_S, authorization
+from intrasplat_client.errors import IntrasplatError, Unreachable, error_of_answer
+from intrasplat_client.views import Image, image_of_message, view_query
 
 if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection as AsyncConnection
     from websockets.sync.client import ClientConnection as Connection
 
-LONGEST_MESSAGE_BYTES = 2**28
-"""64 million pixels of depth in mm, more than any service renders; the library's own limit, 1 MiB, is for chat."""
+MAX_MESSAGE_BYTES = 2**28
+"""64 million pixels of depth in mm, more than any service renders; the library's own limit is 1 MiB."""
 
 CONNECTION_ERRORS = (OSError, InvalidHandshake, InvalidURI, ConnectionClosed)
 """OSError includes TimeoutError."""
 
 
-class Talk:
-    """What is said on the connection; both viewers share it."""
+class StreamMessages:
+    """The requests and answers of one connection; both viewers share it."""
 
     def __init__(self, url: str, scene: str, api_key: str | None) -> None:
         self.http_url = url
         self.url = f"ws{url.removeprefix('http')}/stream"
         self.headers = authorization(api_key)
         self._scene = scene
-        self._asked = 0
+        self._last_id = 0
 
     def request(
         self, t: float, pose: str | None, layer: str, format: str, quality: int | None, camera: dict[str, float]
     ) -> str:
         """The message that asks for a view."""
-        self._asked += 1
-        return json.dumps({"id": self._asked, **view_query(t, self._scene, pose, layer, format, quality, camera)})
+        self._last_id += 1
+        return json.dumps({"id": self._last_id, **view_query(t, self._scene, pose, layer, format, quality, camera)})
 
     def answer(self, message: str | bytes) -> Image | None:
-        """The view that was asked for last; None if the message tells of an earlier one.
+        """The view that was asked for last; None for the answer to an earlier request.
 
         Raises:
-            RequestRefused and others: the service's refusal.
+            IntrasplatError: the service's refusal.
         """
         about, answer = image_of_message(message)
-        if about not in (self._asked, None):
+        if about not in (self._last_id, None):
             return None
         if isinstance(answer, IntrasplatError):
             raise answer
         return answer
 
     def error_of(self, error: Exception) -> IntrasplatError:
-        """What a failure of the connection means."""
+        """The exception for a failed connection."""
         if isinstance(error, InvalidStatus):
             response = error.response
             headers = {name.lower(): value for name, value in response.headers.raw_items()}
             return error_of_answer(response.status_code, headers, bytes(response.body or b""))
-        return Unreachable(self.http_url, error, is_nobody_there=not self._asked)
+        return Unreachable(self.http_url, error, is_nobody_there=not self._last_id)
 
 
 class Viewer:
     """Client.stream(): use it as a context. One thread at a time may use it."""
 
-    def __init__(self, talk: Talk) -> None:
+    def __init__(self, messages: StreamMessages) -> None:
         from websockets.sync.client import connect
 
-        self._talk = talk
+        self._messages = messages
         try:
             self._socket: Connection = connect(
-                talk.url,
-                additional_headers=talk.headers,
+                messages.url,
+                additional_headers=messages.headers,
                 open_timeout=CONNECT_TIMEOUT_S,
-                max_size=LONGEST_MESSAGE_BYTES,
+                max_size=MAX_MESSAGE_BYTES,
             )
         except CONNECTION_ERRORS as error:
-            raise talk.error_of(error) from error
+            raise messages.error_of(error) from error
 
     def render(
         self,
@@ -92,16 +91,16 @@ class Viewer:
     ) -> Image:
         """One view; arguments as Client.render has them."""
         try:
-            self._socket.send(self._talk.request(t, pose, layer, format, quality, camera))
+            self._socket.send(self._messages.request(t, pose, layer, format, quality, camera))
             while True:
-                image = self._talk.answer(self._socket.recv(ANSWER_TIMEOUT_S))
+                image = self._messages.answer(self._socket.recv(ANSWER_TIMEOUT_S))
                 if image is not None:
                     return image
         except CONNECTION_ERRORS as error:
-            raise self._talk.error_of(error) from error
+            raise self._messages.error_of(error) from error
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._socket.close()
 
     def __enter__(self) -> Viewer:
@@ -116,8 +115,8 @@ class Viewer:
 class AsyncViewer:
     """AsyncClient.stream(): an asynchronous context. One task at a time may use it; asyncio only."""
 
-    def __init__(self, talk: Talk) -> None:
-        self._talk = talk
+    def __init__(self, messages: StreamMessages) -> None:
+        self._messages = messages
         self._socket: AsyncConnection
 
     async def render(
@@ -134,28 +133,28 @@ class AsyncViewer:
         import asyncio
 
         try:
-            await self._socket.send(self._talk.request(t, pose, layer, format, quality, camera))
+            await self._socket.send(self._messages.request(t, pose, layer, format, quality, camera))
             async with asyncio.timeout(ANSWER_TIMEOUT_S):
                 while True:
-                    image = self._talk.answer(await self._socket.recv())
+                    image = self._messages.answer(await self._socket.recv())
                     if image is not None:
                         return image
         except CONNECTION_ERRORS as error:
-            raise self._talk.error_of(error) from error
+            raise self._messages.error_of(error) from error
 
     async def __aenter__(self) -> AsyncViewer:
         from websockets.asyncio.client import connect
 
-        talk = self._talk
+        messages = self._messages
         try:
             self._socket = await connect(
-                talk.url,
-                additional_headers=talk.headers,
+                messages.url,
+                additional_headers=messages.headers,
                 open_timeout=CONNECT_TIMEOUT_S,
-                max_size=LONGEST_MESSAGE_BYTES,
+                max_size=MAX_MESSAGE_BYTES,
             )
         except CONNECTION_ERRORS as error:
-            raise talk.error_of(error) from error
+            raise messages.error_of(error) from error
         return self
 
     async def __aexit__(self, *_: Any) -> None:

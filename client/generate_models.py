@@ -1,0 +1,180 @@
+"""Write intrasplat_client/models.py: the service's types, generated from contract/wire.
+
+python -m client.generate_models
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic.json_schema import models_json_schema
+
+from contract.wire.job import TERMINAL_STATES, JobOptions, JobView
+from contract.wire.report import Report
+
+MODELS = Path(__file__).resolve().parent / "intrasplat_client" / "models.py"
+READ = (JobView, Report)
+"""What the service answers with; types that these contain follow."""
+GIVEN_ALSO = {"holdout": "list[int]"}
+"""Forms that the service accepts besides the schema's."""
+EXCLUSIVE_OPTIONS = (("iterations", "budget_s"),)
+COLUMNS = 116
+
+HEAD = '''\
+"""The service's types. Generated from contract/wire by `python -m client.generate_models`; do not edit."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, with_config
+from typing_extensions import TypedDict
+
+
+class Model(BaseModel):
+    """Accepts and keeps fields that it does not know, so that this client can read the answers of a newer service."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+'''
+GIVEN = '''
+@with_config(ConfigDict(extra="forbid"))
+class GivenOptions(TypedDict, total=False):
+    """What a caller may choose about a reconstruction: the keyword arguments of Client.reconstruct."""
+'''
+SCALARS = {"string": "str", "integer": "int", "number": "float", "boolean": "bool", "null": "None"}
+BOUNDS = {
+    "minimum": "ge",
+    "maximum": "le",
+    "exclusiveMinimum": "gt",
+    "exclusiveMaximum": "lt",
+    "maxLength": "max_length",
+    "pattern": "pattern",
+}
+
+
+def main() -> int:
+    """Write the file."""
+    MODELS.write_text(generate(), encoding="utf-8")
+    return 0
+
+
+def generate() -> str:
+    """The whole file, formatted."""
+    _, document = models_json_schema([(each, "validation") for each in READ])
+    definitions: dict[str, Any] = document["$defs"]
+    ordered: dict[str, str] = {}
+    for each in READ:
+        _emit(each.__name__, definitions, ordered)
+    states = ", ".join(f"JobState.{state.name}" for state in sorted(TERMINAL_STATES))
+    constants = [
+        f'TERMINAL_STATES = frozenset({{{states}}})\n"""States that a job does not leave by itself."""\n',
+        f'EXCLUSIVE_OPTIONS = {EXCLUSIVE_OPTIONS!r}\n"""Of each group at most one may be given."""\n',
+    ]
+    text = "\n\n".join([HEAD, *ordered.values(), *constants, "".join(_given(definitions[JobOptions.__name__]))])
+    command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", MODELS.name, "--line-length", "120", "-"]
+    return subprocess.run(command, input=text, capture_output=True, text=True, check=True).stdout
+
+
+def _emit(name: str, definitions: Mapping[str, Any], done: dict[str, str]) -> None:
+    """Add the class `name` to `done`, after the classes that it contains."""
+    if name in done:
+        return
+    for other in _references(definitions[name]):
+        _emit(other, definitions, done)
+    schema = definitions[name]
+    done[name] = "".join(_enum(name, schema) if "enum" in schema else _model(name, schema))
+
+
+def _references(schema: object) -> Iterator[str]:
+    if isinstance(schema, dict):
+        if "$ref" in schema:
+            yield _name_of(schema)
+        for each in schema.values():
+            yield from _references(each)
+    elif isinstance(schema, list):
+        for each in schema:
+            yield from _references(each)
+
+
+def _enum(name: str, schema: Mapping[str, Any]) -> Iterator[str]:
+    yield f"class {name}(StrEnum):\n" + _docstring(schema["description"]) + "\n"
+    for value in schema["enum"]:
+        yield f"    {_member(value)} = {value!r}\n"
+
+
+def _model(name: str, schema: Mapping[str, Any]) -> Iterator[str]:
+    yield f"class {name}(Model):\n" + _docstring(schema["description"]) + "\n"
+    required = schema.get("required", ())
+    for field, kind in schema["properties"].items():
+        default = "" if field in required else f" = {_default(kind)}"
+        yield f"    {field}: {_read_type(kind)}{default}\n" + _docstring(kind.get("description"))
+
+
+def _given(schema: Mapping[str, Any]) -> Iterator[str]:
+    yield GIVEN + "\n"
+    for field, kind in schema["properties"].items():
+        also = f" | {GIVEN_ALSO[field]}" if field in GIVEN_ALSO else ""
+        yield f"    {field}: {_given_type(kind)}{also}\n" + _docstring(kind.get("description"))
+
+
+def _read_type(kind: Mapping[str, Any]) -> str:
+    """The type of a field that the service sends: no bounds and no fixed choices, because a later version adds some."""
+    if "$ref" in kind:
+        return _name_of(kind)
+    if "anyOf" in kind:
+        return " | ".join(_read_type(each) for each in kind["anyOf"])
+    if kind["type"] == "array":
+        return f"tuple[{_read_type(kind['items'])}, ...]"
+    if kind["type"] == "object":
+        return f"dict[str, {_read_type(kind['additionalProperties'])}]"
+    return SCALARS[kind["type"]]
+
+
+def _given_type(kind: Mapping[str, Any]) -> str:
+    """The type of a field that a caller gives, with choices and bounds."""
+    if "anyOf" in kind:
+        return " | ".join(_given_type(each) for each in kind["anyOf"])
+    if "enum" in kind:
+        return f"Literal[{', '.join(map(repr, kind['enum']))}]"
+    bounds = ", ".join(f"{BOUNDS[key]}={value!r}" for key, value in kind.items() if key in BOUNDS)
+    scalar = SCALARS[kind["type"]]
+    return f"Annotated[{scalar}, Field({bounds})]" if bounds else scalar
+
+
+def _default(kind: Mapping[str, Any]) -> str:
+    value = kind["default"]
+    if "$ref" in kind:
+        return f"{_name_of(kind)}.{_member(value)}"
+    if isinstance(value, list):
+        return repr(tuple(value))
+    return f"Field(default={value!r})" if isinstance(value, dict) else repr(value)
+
+
+def _docstring(text: str | None) -> str:
+    if text is None:
+        return ""
+    indent = " " * 4
+    paragraphs = [textwrap.wrap(" ".join(each.split()), COLUMNS - 8) for each in text.split("\n\n")]
+    lines = [line for each in paragraphs for line in (*each, "")][:-1]
+    closing = f"\n{indent}" if len(lines) > 1 else ""
+    body = "\n".join((indent + line).rstrip() for line in lines).strip()
+    return f'{indent}"""{body}{closing}"""\n'
+
+
+def _name_of(reference: Mapping[str, Any]) -> str:
+    name: str = reference["$ref"].rpartition("/")[2]
+    return name
+
+
+def _member(value: str) -> str:
+    return value.upper().replace("-", "_")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

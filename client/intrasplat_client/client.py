@@ -1,0 +1,181 @@
+"""Client: one blocking method a route, typed answers, errors as exceptions (errors.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import httpx
+from typing_extensions import Unpack
+
+from intrasplat_client.connection import DEFAULT_URL, BlockingConnection, http_settings, iterate, run
+from intrasplat_client.core import Core
+from intrasplat_client.models import GivenOptions, JobState, JobView, Report
+from intrasplat_client.session import DEFAULT_PATIENCE_S
+from intrasplat_client.submission import OnUpload
+from intrasplat_client.viewer import StreamMessages, Viewer
+from intrasplat_client.views import Image
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+class Client:
+    """A connection to one service: use it as a context, or call close().
+
+    api_key: from `intrasplat keys create`; needed unless the service runs on this machine for its user alone.
+    patience_s: how long, in all, a call waits while the service is busy (429, 503) or the connection is lost. Where
+    nobody answers at all, a call fails at once.
+    transport: instead of the network, for tests.
+    """
+
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        *,
+        api_key: str | None = None,
+        patience_s: float = DEFAULT_PATIENCE_S,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self.url = url.rstrip("/")
+        self._http = httpx.Client(transport=transport, **http_settings(self.url, api_key))
+        self._api_key = api_key
+        self._core = Core(BlockingConnection(self._http), self.url, patience_s)
+
+    def reconstruct(
+        self,
+        clip: Path,
+        right: Path | None = None,
+        *,
+        calibration: Path | None = None,
+        masks: Path | None = None,
+        idempotency_key: str | None = None,
+        in_pieces: bool | None = None,
+        on_upload: OnUpload | None = None,
+        **options: Unpack[GivenOptions],
+    ) -> JobView:
+        """Upload a clip and get its queued job; `right` is the right eye's file, if there are two.
+
+        A large clip is sent in pieces, and its upload resumes where a lost connection cut it off; `in_pieces` forces
+        or forbids that. on_upload(sent_bytes, total_bytes) is called while the clip is sent. The same idempotency_key
+        with the same clip and options always yields the same job, also later and from another process.
+        `options` say how to reconstruct: preset, budget_s or iterations, holdout and others (GivenOptions).
+
+        Raises:
+            InputError: a file cannot be read, or an option cannot be used; nothing was sent.
+        """
+        return run(
+            self._core.reconstruct(
+                clip,
+                right,
+                calibration=calibration,
+                masks=masks,
+                idempotency_key=idempotency_key,
+                in_pieces=in_pieces,
+                on_upload=on_upload,
+                **options,
+            )
+        )
+
+    def job(self, job_id: str) -> JobView:
+        """A job's state and progress."""
+        return run(self._core.job(job_id))
+
+    def jobs(self, state: JobState | None = None, limit: int | None = None) -> list[JobView]:
+        """The newest jobs, newest first; only those in `state`, if it is given."""
+        return run(self._core.jobs(state, limit))
+
+    def cancel(self, job_id: str) -> JobView:
+        """Cancel a job; a running one stops a moment later."""
+        return run(self._core.cancel(job_id))
+
+    def retry(self, job_id: str) -> JobView:
+        """Queue a failed job again."""
+        return run(self._core.retry(job_id))
+
+    def watch(self, job_id: str) -> Iterator[JobView]:
+        """The job whenever something happens to it, the last time in its terminal state."""
+        return iterate(self._core.watch(job_id))
+
+    def wait(self, job_id: str, on_progress: Callable[[JobView], object] | None = None) -> JobView:
+        """The job, once it is done; on_progress(job) is called whenever something happens to it.
+
+        Raises:
+            JobRejected, JobFailed, JobCancelled: it ended without a scene.
+        """
+        return run(self._core.wait(job_id, on_progress))
+
+    def render(
+        self,
+        t: float = 0.0,
+        *,
+        scene: str | None = None,
+        pose: str | None = None,
+        layer: str = "rgb",
+        format: str = "png",
+        quality: int | None = None,
+        known: Image | None = None,
+        **camera: float,
+    ) -> Image:
+        """One view of a finished scene, or of a job that trains; arguments as Core.render has them."""
+        return run(
+            self._core.render(
+                t, scene=scene, pose=pose, layer=layer, format=format, quality=quality, known=known, **camera
+            )
+        )
+
+    def render_array(
+        self, t: float = 0.0, *, scene: str | None = None, pose: str | None = None, layer: str = "rgb", **camera: float
+    ) -> NDArray[Any]:
+        """One view's exact values: uint8 [H, W, 3] of rgb, float32 [H, W] of depth (mm, 0 invalid) and confidence.
+
+        Raises:
+            ImportError: numpy is not installed.
+        """
+        return run(self._core.render_array(t, scene=scene, pose=pose, layer=layer, **camera))
+
+    def stream(self, scene: str) -> Viewer:
+        """A connection for many views: `with client.stream(scene) as viewer: viewer.render(t, pose)`."""
+        return Viewer(StreamMessages(self.url, scene, self._api_key))
+
+    def scenes(self, limit: int | None = None) -> list[dict[str, Any]]:
+        """Finished scenes, newest first."""
+        return run(self._core.scenes(limit))
+
+    def report(self, scene: str) -> Report:
+        """The scene's quality report."""
+        return run(self._core.report(scene))
+
+    def curve(self, scene: str) -> str:
+        """Held-out psnr_tissue over seconds of training, as CSV."""
+        return run(self._core.curve(scene))
+
+    def export(self, scene: str, t: float = 0.0, format: str = "ply") -> bytes:
+        """The scene's Gaussians at time t as a file."""
+        return run(self._core.export(scene, t, format))
+
+    def delete(self, scene: str) -> dict[str, Any]:
+        """Remove clip, scene and record of a job that has ended; the receipt lists what was removed."""
+        return run(self._core.delete(scene))
+
+    def info(self) -> dict[str, Any]:
+        """Version, limits and accepted formats of the service."""
+        return run(self._core.info())
+
+    def is_ready(self) -> bool:
+        """Whether the service would train a clip sent now; False too while nobody answers."""
+        return run(self._core.is_ready())
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._http.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,182 @@
+"""What both clients do, written once: a method here is one of AsyncClient, and Client runs it (connection.py)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import AsyncGenerator, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import httpx
+from typing_extensions import Unpack
+
+from intrasplat_client import events, submission, views
+from intrasplat_client.connection import Call, Connection
+from intrasplat_client.errors import Unreachable
+from intrasplat_client.models import GivenOptions, JobState, JobView, Report
+from intrasplat_client.session import Session, parsed
+from intrasplat_client.submission import OnUpload
+from intrasplat_client.views import Image, view_query
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+class Core:
+    """Every route of a service as a coroutine."""
+
+    def __init__(self, connection: Connection, url: str, patience_s: float) -> None:
+        self.url = url
+        self._session = Session(connection, url, patience_s)
+
+    async def reconstruct(
+        self,
+        clip: Path,
+        right: Path | None = None,
+        *,
+        calibration: Path | None = None,
+        masks: Path | None = None,
+        idempotency_key: str | None = None,
+        in_pieces: bool | None = None,
+        on_upload: OnUpload | None = None,
+        **options: Unpack[GivenOptions],
+    ) -> JobView:
+        """Upload a clip and get its queued job; `right` is the right eye's file, if there are two.
+
+        A large clip is sent in pieces, and its upload resumes where a lost connection cut it off; `in_pieces` forces
+        or forbids that. on_upload(sent_bytes, total_bytes) is called while the clip is sent. The same idempotency_key
+        with the same clip and options always yields the same job, also later and from another process.
+        `options` say how to reconstruct: preset, budget_s or iterations, holdout and others (GivenOptions).
+
+        Raises:
+            InputError: a file cannot be read, or an option cannot be used; nothing was sent.
+        """
+        others = {"calibration": calibration, "masks": masks}
+        prepared = submission.prepare(
+            clip, right, others, options, idempotency_key=idempotency_key, in_pieces=in_pieces, on_upload=on_upload
+        )
+        return await submission.submit(self._session, prepared)
+
+    async def job(self, job_id: str) -> JobView:
+        """A job's state and progress."""
+        return await self._job(Call("GET", _path("jobs", job_id), is_repeatable=True))
+
+    async def jobs(self, state: JobState | None = None, limit: int | None = None) -> list[JobView]:
+        """The newest jobs, newest first; only those in `state`, if it is given."""
+        response = await self._get("jobs", state=None if state is None else JobState(state).value, limit=limit)
+        return parsed(response, _jobs_of, response.content)
+
+    async def cancel(self, job_id: str) -> JobView:
+        """Cancel a job; a running one stops a moment later."""
+        return await self._job(Call("DELETE", _path("jobs", job_id), is_repeatable=True))
+
+    async def retry(self, job_id: str) -> JobView:
+        """Queue a failed job again."""
+        return await self._job(Call("POST", _path("jobs", job_id, "retry")))
+
+    def watch(self, job_id: str) -> AsyncGenerator[JobView, None]:
+        """The job whenever something happens to it, the last time in its terminal state."""
+        return events.watch(self._session, _path("jobs", job_id))
+
+    async def wait(self, job_id: str, on_progress: Callable[[JobView], object] | None = None) -> JobView:
+        """The job, once it is done; on_progress(job) is called whenever something happens to it.
+
+        Raises:
+            JobRejected, JobFailed, JobCancelled: it ended without a scene.
+        """
+        async for job in self.watch(job_id):
+            if on_progress is not None:
+                on_progress(job)
+        return events.finished(job)
+
+    async def render(
+        self,
+        t: float = 0.0,
+        *,
+        scene: str | None = None,
+        pose: str | None = None,
+        layer: str = "rgb",
+        format: str = "png",
+        quality: int | None = None,
+        known: Image | None = None,
+        **camera: float,
+    ) -> Image:
+        """One view of a finished scene, or of a job that trains.
+
+        t: time as a fraction of the clip, in [0, 1].
+        scene: the job's id; needed unless the service holds one scene only.
+        pose: orbit:YAW,PITCH,ZOOM in degrees, or world_from_camera as 12 or 16 numbers in mm, row-major.
+        layer: rgb, depth or confidence. format: png, jpeg, webp or npy. quality: of jpeg and webp, 1 to 100.
+        known: an earlier view; it is returned if it is still what the service would send.
+        camera: width, height, fx, fy, cx, cy in pixels.
+        """
+        query = view_query(t, scene, pose, layer, format, quality, camera)
+        return await views.render(self._session, query, known)
+
+    async def render_array(
+        self, t: float = 0.0, *, scene: str | None = None, pose: str | None = None, layer: str = "rgb", **camera: float
+    ) -> NDArray[Any]:
+        """One view's exact values: uint8 [H, W, 3] of rgb, float32 [H, W] of depth (mm, 0 invalid) and confidence.
+
+        Raises:
+            ImportError: numpy is not installed.
+        """
+        query = view_query(t, scene, pose, layer, "npy", None, camera)
+        return (await views.render(self._session, query, None)).array()
+
+    async def scenes(self, limit: int | None = None) -> list[dict[str, Any]]:
+        """Finished scenes, newest first."""
+        scenes: list[dict[str, Any]] = _json_of(await self._get("scenes", limit=limit))
+        return scenes
+
+    async def report(self, scene: str) -> Report:
+        """The scene's quality report."""
+        response = await self._get("scenes", scene)
+        return parsed(response, Report.model_validate_json, response.content)
+
+    async def curve(self, scene: str) -> str:
+        """Held-out psnr_tissue over seconds of training, as CSV."""
+        return (await self._get("scenes", scene, "curve")).content.decode()
+
+    async def export(self, scene: str, t: float = 0.0, format: str = "ply") -> bytes:
+        """The scene's Gaussians at time t as a file."""
+        return (await self._get("scenes", scene, "export", t=t, format=format)).content
+
+    async def delete(self, scene: str) -> dict[str, Any]:
+        """Remove clip, scene and record of a job that has ended; the receipt lists what was removed."""
+        # Not repeated when its answer is lost: the second answer would be that there is no such scene.
+        receipt: dict[str, Any] = _json_of(await self._session.request(Call("DELETE", _path("scenes", scene))))
+        return receipt
+
+    async def info(self) -> dict[str, Any]:
+        """Version, limits and accepted formats of the service."""
+        info: dict[str, Any] = _json_of(await self._get("info"))
+        return info
+
+    async def is_ready(self) -> bool:
+        """Whether the service would train a clip sent now; False too while nobody answers."""
+        try:
+            return (await self._session.send(Call("GET", "/readyz"))).status_code == httpx.codes.OK
+        except Unreachable:
+            return False
+
+    async def _get(self, *path: str, **query: Any) -> httpx.Response:
+        given = {name: value for name, value in query.items() if value is not None}
+        return await self._session.request(Call("GET", _path(*path), given, is_repeatable=True))
+
+    async def _job(self, call: Call) -> JobView:
+        response = await self._session.request(call)
+        return parsed(response, JobView.model_validate_json, response.content)
+
+
+def _json_of(response: httpx.Response) -> Any:
+    return parsed(response, json.loads, response.content)
+
+
+def _jobs_of(content: bytes) -> list[JobView]:
+    return [JobView.model_validate(job) for job in json.loads(content)]
+
+
+def _path(*parts: str) -> str:
+    return "".join(f"/{quote(part, safe='')}" for part in parts)

@@ -1,0 +1,188 @@
+"""The service's types. Generated from contract/wire by `python -m client.generate_models`; do not edit."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, with_config
+from typing_extensions import TypedDict
+
+
+class Model(BaseModel):
+    """Accepts and keeps fields that it does not know, so that this client can read the answers of a newer service."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+
+class JobState(StrEnum):
+    """Where a job stands."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+class JobError(Model):
+    """Why a job failed: one sentence, the field at fault if it was the input, and what to do about it."""
+
+    problem: str
+    field: str | None = None
+    remedy: str | None = None
+
+
+class JobOptions(Model):
+    """What the caller may choose about a reconstruction; the `options` field of POST /reconstruct."""
+
+    preset: str = "fast"
+    budget_s: float | None = None
+    """About how many seconds to train, often less; not with iterations."""
+    iterations: int | None = None
+    """Fixed schedule; not with budget_s."""
+    mask_polarity: str = "auto"
+    layout: str = "auto"
+    pose_convention: str = "opengl"
+    """Axes of poses_bounds.npy."""
+    holdout: str = "every8"
+    """Every8, blocks8, none, or frame numbers such as 1,9,17."""
+    seed: int = 0
+    priority: str = "standard"
+    """High: before, and in place of, standard jobs."""
+    retention_hours: float | None = None
+    """Clip, scene and record are purged so long after the job ended."""
+
+
+class JobView(Model):
+    """A job as the API shows it."""
+
+    id: str
+    state: JobState
+    stage: str | None = None
+    fraction: float | None = None
+    iteration: int | None = None
+    iterations: int | None = None
+    psnr_db: float | None = None
+    seconds_left: float | None = None
+    position: int | None = None
+    """Jobs that will be claimed before this one; while queued."""
+    eta_s: float | None = None
+    """Estimated seconds until it is done; None if unknown."""
+    error: JobError | None = None
+    cancel_requested: bool = False
+    attempt: int = 0
+    options: JobOptions
+    input_bytes: int
+    created_at_s: float
+    started_at_s: float | None = None
+    finished_at_s: float | None = None
+    links: dict[str, str]
+
+
+class FrameScore(Model):
+    """One held-out frame: the model's scores beside those of copying its neighbours. None: no tissue to judge."""
+
+    frame: int
+    psnr_tissue_db: float | None
+    psnr_paper_db: float | None
+    ssim: float | None
+    coverage: float | None
+    baseline_blend_db: float | None
+    baseline_flow_db: float | None
+
+
+class Report(Model):
+    """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why.
+
+    Scores are means over the held-out frames, which took no part in training (docs/conventions.md, "Scores").
+    psnr_tissue_db is the one to go by; psnr_paper_db is what papers print, and higher. When psnr_tissue_db does
+    not exceed the two baselines, copying the neighbouring frames would have served as well.
+    """
+
+    report_version: int = 1
+    notice: str = "Research use only. Not a medical device; it must not guide treatment."
+    versions: dict[str, str] = Field(default={})
+    """Of intrasplat and what it computes with."""
+    psnr_tissue_db: float | None
+    psnr_paper_db: float | None
+    ssim: float | None
+    baseline_blend_db: float | None
+    """Psnr_tissue_db of blending the nearest training frames."""
+    baseline_flow_db: float | None
+    """The same, each warped half-way by optical flow first."""
+    depth_agreement_mm: float | None
+    """Median |rendered - stereo depth| on held-out tissue."""
+    coverage: float | None
+    """Share of tissue pixels the model covers."""
+    train_psnr_tissue_db: float | None
+    """Psnr_tissue_db over some training frames, to compare."""
+    frames: tuple[FrameScore, ...] = ()
+    warnings: tuple[str, ...]
+    """What to distrust, in plain words; empty if nothing was found."""
+    assumptions: tuple[str, ...]
+    """What was taken for granted about the input."""
+    measurements: dict[str, float] = Field(default={})
+    """Of the input, such as its misalignment in px."""
+    preset: str
+    seed: int
+    device: str
+    iterations: int
+    frames_seen: int | None = None
+    """By training, each as often as it was in a step."""
+    seconds: dict[str, float]
+    """By stage; t_train_s and t_post_s as docs/conventions.md has them."""
+    gaussians: int
+    bases: int
+    """Of a channel's motion; 0 if the model has no such number."""
+    scene_bytes: int
+    units_per_mm: float
+    width: int
+    height: int
+    frame_count: int
+    train_count: int
+    held_out: tuple[int, ...]
+    repeated: tuple[int, ...]
+    """Frames in neither set, because they repeat a held-out one."""
+    frame_times_s: tuple[float, ...]
+
+
+TERMINAL_STATES = frozenset({JobState.CANCELLED, JobState.DONE, JobState.FAILED})
+"""States that a job does not leave by itself."""
+
+
+EXCLUSIVE_OPTIONS = (("iterations", "budget_s"),)
+"""Of each group at most one may be given."""
+
+
+@with_config(ConfigDict(extra="forbid"))
+class GivenOptions(TypedDict, total=False):
+    """What a caller may choose about a reconstruction: the keyword arguments of Client.reconstruct."""
+
+    preset: Literal[
+        "instant",
+        "fast",
+        "quality",
+        "small",
+        "paper",
+        "paper-released",
+        "paper-wide",
+        "pfs",
+        "hexplane",
+        "without_mapf",
+    ]
+    budget_s: Annotated[float, Field(gt=0, le=7200)] | None
+    """About how many seconds to train, often less; not with iterations."""
+    iterations: Annotated[int, Field(le=1000000, ge=1)] | None
+    """Fixed schedule; not with budget_s."""
+    mask_polarity: Literal["auto", "tool", "tissue"]
+    layout: Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]
+    pose_convention: Literal["opengl", "llff"]
+    """Axes of poses_bounds.npy."""
+    holdout: Annotated[str, Field(max_length=8000, pattern="^(every8|blocks8|none|\\d{1,6}(,\\d{1,6})*)$")]
+    """Every8, blocks8, none, or frame numbers such as 1,9,17."""
+    seed: Annotated[int, Field(lt=2147483648, ge=0)]
+    priority: Literal["standard", "high"]
+    """High: before, and in place of, standard jobs."""
+    retention_hours: Annotated[float, Field(gt=0, le=87600)] | None
+    """Clip, scene and record are purged so long after the job ended."""
