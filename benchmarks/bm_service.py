@@ -33,8 +33,8 @@ import httpx
 import numpy as np
 from bm_train import commit, machine
 
-from client.api import Client
 from client.demo import started_service
+from intrasplat_client import Client
 
 WIDTH, HEIGHT, FRAMES = 640, 512, 48
 SCENE_ITERATIONS = 300

@@ -30,11 +30,10 @@ from urllib.parse import urlsplit
 from bm_service import PhantomClip, make_clip
 from bm_train import commit, machine
 
-from client.api import Client
 from client.demo import started_service
-from client.errors import Conflict
 from contract.wire.errors import IntrasplatError
 from contract.wire.job import JobState
+from intrasplat_client import Client, Conflict
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 16
 ROUND_ITERATIONS = 100

@@ -14,15 +14,16 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
-from client.api import Client
+import intrasplat_client
+from client.connected import connected
 from client.pictures import Panel, draw_curve, draw_sheet, draw_strip
 from client.remote import progress_of
 from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
 from contract.runtime.progress_bar import ProgressBar
 from contract.wire.errors import IntrasplatError, UnavailableError
-from contract.wire.job import JobState, JobView
+from intrasplat_client import Client, JobState, JobView, Report
 
 FRAMES = 48
 WIDTH, HEIGHT = 480, 384
@@ -126,7 +127,7 @@ class Preview:
         self._began_s = self._began_s or time.monotonic()
         try:
             image = self._client.render(time_of(VIEWED_FRAME), scene=job.id)
-        except IntrasplatError:
+        except intrasplat_client.IntrasplatError:
             return
         if image.iteration:
             self._path.write_bytes(image.content)
@@ -185,9 +186,9 @@ def save_renders(client: Client, scene: str, out: Path) -> dict[Path, str]:
     return {folder: f"{len(asked)} rendered frames, one file each"}
 
 
-def save_sheet(client: Client, scene: str, clip: Path, report: dict[str, Any], out: Path) -> dict[Path, str]:
+def save_sheet(client: Client, scene: str, clip: Path, report: Report, out: Path) -> dict[Path, str]:
     """All on one sheet: what was recorded, the same moments without the instrument, other views, geometry."""
-    held_out = {each["frame"] for each in report["frames"]}
+    held_out = {each.frame for each in report.frames}
     captions = [
         f"t = {time_of(frame):.3g}" + (", not trained on" if frame in held_out else "") for frame in SHOWN_FRAMES
     ]
@@ -243,33 +244,33 @@ def strip_of(client: Client, scene: str, clip: Path) -> list[Panel]:
     ]
 
 
-def save_curve(curve_csv: str, report: dict[str, Any], out: Path) -> dict[Path, str]:
+def save_curve(curve_csv: str, report: Report, out: Path) -> dict[Path, str]:
     """The chart of speed against accuracy, and its numbers."""
     table, chart = out / "curve.csv", out / "curve.png"
     table.write_text(curve_csv)
-    title = f"{len(report['frames'])} of {FRAMES} frames held out, eight at a time; synthetic tissue, two eyes in"
+    title = f"{len(report.frames)} of {FRAMES} frames held out, eight at a time; synthetic tissue, two eyes in"
     draw_curve(curve_csv, baselines_of(report), title, chart)
     return {chart: "accuracy over seconds of training, beside plain copying", table: "the same as numbers"}
 
 
-def baselines_of(report: dict[str, Any]) -> dict[str, float]:
+def baselines_of(report: Report) -> dict[str, float]:
     """What copying neighbouring frames scores, by what the chart calls it."""
     stated = {
-        "copying: neighbours blended": report["baseline_blend_db"],
-        "copying: neighbours warped by optical flow": report["baseline_flow_db"],
+        "copying: neighbours blended": report.baseline_blend_db,
+        "copying: neighbours warped by optical flow": report.baseline_flow_db,
     }
     return {name: value_db for name, value_db in stated.items() if value_db is not None}
 
 
-def summary_of(report: dict[str, Any]) -> str:
+def summary_of(report: Report) -> str:
     """The figures that tell how good the scene is."""
     copies = ", ".join(
         f"{name.removeprefix('copying: ')} {value:.1f} dB" for name, value in baselines_of(report).items()
     )
     return (
-        f"{report['gaussians']:,} Gaussians after {report['seconds']['t_train_s']:.0f} s of training; "
-        f"psnr_tissue {report['psnr_tissue_db']:.1f} dB on {len(report['frames'])} frames it never saw "
-        f"(copying: {copies}); depth {report['depth_agreement_mm']:.2f} mm from stereo"
+        f"{report.gaussians:,} Gaussians after {report.seconds['t_train_s']:.0f} s of training; "
+        f"psnr_tissue {report.psnr_tissue_db:.1f} dB on {len(report.frames)} frames it never saw "
+        f"(copying: {copies}); depth {report.depth_agreement_mm:.2f} mm from stereo"
     )
 
 
@@ -288,7 +289,7 @@ def started_service(data_dir: Path, log: Path) -> Iterator[Client]:
             command, env=environment, start_new_session=True, stdout=messages, stderr=subprocess.STDOUT
         )
     try:
-        with Client(f"http://127.0.0.1:{port}") as client:
+        with connected(f"http://127.0.0.1:{port}") as client:
             deadline_s = time.monotonic() + READY_TIMEOUT_S
             while not client.is_ready():
                 if process.poll() is not None or time.monotonic() > deadline_s:

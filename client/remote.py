@@ -7,17 +7,19 @@ import json
 import os
 import re
 import sys
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import get_args
 
-from client.api import Client
-from client.connection import DEFAULT_URL
+from client.connected import connected
 from contract.runtime.arguments import Commands, add_command, finite, positive
 from contract.runtime.exits import ExitCode
 from contract.runtime.progress_bar import ProgressBar
 from contract.wire.errors import InputError
-from contract.wire.job import JobProgress, JobState, JobView, Priority
+from contract.wire.job import JobProgress, Priority
 from contract.wire.names import Layout, MaskPolarity, PoseConvention, PresetName
+from intrasplat_client import Client, JobState, JobView
+from intrasplat_client.connection import DEFAULT_URL
 
 URL_VARIABLE = "INTRASPLAT_URL"
 KEY_VARIABLE = "INTRASPLAT_API_KEY"
@@ -123,8 +125,8 @@ def _add_service(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _client(options: argparse.Namespace) -> Client:
-    return Client(options.url, api_key=options.api_key)
+def _client(options: argparse.Namespace) -> AbstractContextManager[Client]:
+    return connected(options.url, options.api_key)
 
 
 def _submit(options: argparse.Namespace) -> int:
@@ -178,7 +180,7 @@ def progress_of(job: JobView) -> JobProgress:
 def _fetch(options: argparse.Namespace) -> int:
     with _client(options) as client:
         files: dict[str, bytes] = {
-            "report.json": json.dumps(client.report(options.job), indent=1).encode(),
+            "report.json": client.report(options.job).model_dump_json(indent=1).encode(),
             "curve.csv": client.curve(options.job).encode(),
             "view.png": client.render(options.t, scene=options.job, pose=options.pose).content,
         }

@@ -1,122 +1,41 @@
 """`intrasplat up`: a queue, the service and its workers on this machine, watched until the caller ends them.
 
-If `up` itself is killed, service and workers are killed with it: what was accepted is on disk, and what was training
-goes on from its last checkpoint at the next start. The queue's server alone stays; the next `up` of the same data
-directory takes it over, and ends it when it ends itself.
+If `up` itself is killed, service and workers are killed with it. Accepted clips are on disk, and training resumes from
+its last checkpoint at the next start. Only the queue's server stays; the next `up` of the same data directory takes it
+over, and ends it when it ends itself.
 
-A child that ends is started again, but for one: what it needs is not there. That would end the next one, too, so it
-ends `up`, with the remedy. A queue or a bucket elsewhere that does not answer is waited for, as it may start later.
-Once a child has been sound, what it needed was there and may come back (room on the disk, a device): then it is started
-again like any other, and the rest keeps working meanwhile.
+A child that ends is started again (contract/runtime/supervised.py). If it lacks something that cannot come back by
+itself, and has never worked, the next child would end as well; so `up` ends with the child's remedy instead.
 """
 
 from __future__ import annotations
 
 import os
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from client.api import Client
 from contract.access.keys import check_keys
 from contract.queue.embedded import EmbeddedServer
-from contract.runtime.exits import LAST_WORDS_VARIABLE, ExitCode, take_last_words
 from contract.runtime.locks import FolderLock
-from contract.runtime.processes import die_with_parent, end_process, told_to_end
+from contract.runtime.processes import told_to_end
 from contract.runtime.settings import Settings
+from contract.runtime.supervised import Supervised
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
+from intrasplat_client import Client
 
 DASHBOARD = Path(__file__).resolve().parent / "dashboard"
 WATCH_PERIOD_S = 0.2
 READY_PERIOD_S = 1.0
-FIRST_PAUSE_S = 0.5
-LONGEST_PAUSE_S = 30.0
-STEADY_S = 60.0
-"""A process that lived this long was sound: its next crash is the first again."""
-
+HEALTHY_AFTER_S = 60.0
+"""A child that has lived this long works: if it ends, it is started again at once."""
 STOP_TIMEOUT_S = 15.0
 WORKER_NAME_VARIABLE = "INTRASPLAT_WORKER_NAME"
 EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
-"""Where this machine finds itself when the service answers at all of its addresses."""
-
-
-class WatchedProcess:
-    """A child that is started again when it ends by itself, after pauses that double.
-
-    In the folder it leaves what it lacks, if that is why it ends (contract/runtime/exits.py).
-    """
-
-    def __init__(self, name: str, command: list[str], environment: dict[str, str], folder: Path) -> None:
-        self._name = name
-        self._command = command
-        self._last_words = folder / f"{name}.last-words"
-        self._environment = {**environment, LAST_WORDS_VARIABLE: str(self._last_words)}
-        self._was_sound = False
-        self._process: subprocess.Popen[bytes] | None = None
-        self._pause_s = FIRST_PAUSE_S
-        self._started_s = 0.0
-        self._start_at_s = 0.0
-
-    @property
-    def process_id(self) -> int | None:
-        """Of the running child."""
-        return self._process.pid if self._process else None
-
-    def watch(self) -> None:
-        """Start the child if it is not there and its pause is over.
-
-        Raises:
-            UnavailableError: it ended because something that it needs is not there, and has never been sound.
-        """
-        now_s = time.monotonic()
-        if self._process is not None:
-            status = self._process.poll()
-            if status is None:
-                return
-            self._process = None
-            self._bury(status, now_s)
-        if now_s >= self._start_at_s:
-            self._last_words.unlink(missing_ok=True)  # a launcher that was killed may have left them
-            # A session of its own: Ctrl-C reaches the launcher alone, which ends the others in order.
-            self._process = subprocess.Popen(
-                self._command,
-                env=self._environment,
-                stdin=subprocess.DEVNULL,
-                start_new_session=True,
-                preexec_fn=die_with_parent if os.name == "posix" else None,
-            )
-            self._started_s = now_s
-
-    def _bury(self, status: int, now_s: float) -> None:
-        """Say that the child has ended, and when another starts; raises as watch."""
-        if now_s - self._started_s > STEADY_S:
-            self._was_sound, self._pause_s = True, FIRST_PAUSE_S
-        lack = take_last_words(self._last_words)
-        if status == ExitCode.UNAVAILABLE and not self._was_sound and not (lack and lack.may_return):
-            if lack is None:
-                problem = f"The {self._name} ended with status {status}: something that it needs is not there."
-                raise UnavailableError(problem, "Its messages are above; try `intrasplat doctor`.")
-            raise UnavailableError(f"The {self._name} cannot work here: {lack.problem}", lack.remedy)
-        self._start_at_s = now_s + self._pause_s
-        say(f"the {self._name} ended with status {status}; starting it again in {self._pause_s:g} s")
-        self._pause_s = min(LONGEST_PAUSE_S, 2 * self._pause_s)
-
-    def ask_to_end(self) -> None:
-        """Send SIGTERM, and do not wait."""
-        if self._process is not None:
-            self._process.terminate()
-
-    def stop(self) -> None:
-        """Ask the child to end, and insist after STOP_TIMEOUT_S."""
-        if self._process is None:
-            return
-        end_process(self._process, STOP_TIMEOUT_S)
-        self._last_words.unlink(missing_ok=True)
-        self._process = None
+"""The loopback address of a service that listens at every address."""
 
 
 class Installation:
@@ -131,12 +50,10 @@ class Installation:
         self.settings = settings.model_copy(
             update={"data_dir": data_dir, "redis_url": redis_url, "dashboard_dir": DASHBOARD}
         )
-        environment = {**os.environ, **self.settings.to_environment()}
-        folder = data_dir / "run"
-        self.service = WatchedProcess("service", [sys.executable, "-m", "service"], environment, folder)
+        self.service = self._child("service", [sys.executable, "-m", "service"], {})
         command = [sys.executable, "-m", "worker", "consume"]
         self.workers = [
-            WatchedProcess(name, command, {**environment, WORKER_NAME_VARIABLE: name}, folder)
+            self._child(name, command, {WORKER_NAME_VARIABLE: name})
             for name in worker_names(settings.worker_name, worker_count)
         ]
 
@@ -165,15 +82,31 @@ class Installation:
             self._queue.stop()
         self._lock.release()
 
+    def _child(self, name: str, command: list[str], variables: dict[str, str]) -> Supervised:
+        return Supervised(
+            name,
+            command,
+            {**os.environ, **self.settings.to_environment(), **variables},
+            last_words=self.settings.data_dir / "run" / f"{name}.last-words",
+            dies_with_parent=os.name == "posix",
+            grace_s=STOP_TIMEOUT_S,
+            healthy_after_s=HEALTHY_AFTER_S,
+        )
+
     def watch(self) -> None:
-        """Start again what has died; call it often. Raises UnavailableError for what cannot work here at all."""
+        """Start again what has ended; call it often. Raises UnavailableError if a child cannot work here."""
         if self._queue is not None and self._queue.ensure_running():
             say("the queue's server had died and was started again; nothing it had accepted is lost")
-        for process in (self.service, *self.workers):
-            process.watch()
+        for child in (self.service, *self.workers):
+            try:
+                ended = child.watch()
+            except UnavailableError as lack:
+                raise UnavailableError(f"The {child.name} cannot work here: {lack.problem}", lack.remedy) from lack
+            if ended is not None:
+                say(f"the {child.name} {ended.cause}; starting it again in {ended.pause_s:g} s")
 
     def wait_until_ready(self, is_ended: Callable[[], bool], timeout_s: float) -> bool:
-        """Watch until a clip would be trained; False if that takes too long or the caller ends. Raises as watch."""
+        """Watch until the service would train a clip; False after timeout_s or once is_ended(). Raises as watch."""
         deadline_s = time.monotonic() + timeout_s
         asked_s = 0.0
         with Client(self.url) as client:
@@ -187,16 +120,16 @@ class Installation:
         return False
 
 
-def end_together(processes: Sequence[WatchedProcess]) -> None:
-    """Ask all to end, then wait for each, so that the slowest alone is waited for."""
-    for process in processes:
-        process.ask_to_end()
-    for process in processes:
-        process.stop()
+def end_together(children: Sequence[Supervised]) -> None:
+    """Ask all to end before waiting for any."""
+    for child in children:
+        child.ask_to_end()
+    for child in children:
+        child.stop()
 
 
 def worker_names(first: str, number: int) -> list[str]:
-    """`first` alone; of several, worker-1, worker-2 and so on, or what stands in place of `worker`."""
+    """`first` alone; for several, its stem with a number: worker-1, worker-2 and so on."""
     stem = first.removesuffix("-1")
     return [first] if number == 1 else [f"{stem}-{each}" for each in range(1, number + 1)]
 

@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from client import Client, JobRejected
 from client.demo import started_service
-from contract.wire.job import JobState
+from intrasplat_client import Client, JobRejected, JobState
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 12
 LEAST_PSNR_DB = 20.0
@@ -59,13 +58,13 @@ def test_a_clip_sent_over_http_comes_back_as_renders_of_any_time_and_pose(tmp_pa
         job = client.reconstruct(clip / "stereo.webm", **files, iterations=30)
         assert client.wait(job.id).state is JobState.DONE
         report = client.report(job.id)
-        assert report["psnr_tissue_db"] > LEAST_PSNR_DB
-        assert report["iterations"] == 30
+        assert report.psnr_tissue_db > LEAST_PSNR_DB
+        assert report.iterations == 30
         assert len(client.curve(job.id).splitlines()) >= 2
         assert_renders(client, job.id)
         ply = client.export(job.id, t=0.5)
         assert ply.startswith(b"ply\nformat binary_little_endian 1.0")
-        assert f"element vertex {report['gaussians']}".encode() in io.BytesIO(ply).read(2000)
+        assert f"element vertex {report.gaussians}".encode() in io.BytesIO(ply).read(2000)
 
         broken = client.reconstruct(clip / "stereo.webm", iterations=30)  # stereo without its calibration
         with pytest.raises(JobRejected) as rejected:

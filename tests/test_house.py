@@ -76,7 +76,7 @@ def test_the_python_example_calls_only_what_the_client_offers() -> None:
     readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"^```python\n(.*?)^```", readme, re.DOTALL | re.MULTILINE)
     assert len(example.splitlines()) <= 20
-    offered = importlib.import_module("client").Client
+    offered = importlib.import_module("intrasplat_client").Client
     called = {
         node.attr
         for node in ast.walk(ast.parse(example))

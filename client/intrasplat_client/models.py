@@ -38,20 +38,20 @@ class JobOptions(Model):
 
     preset: str = "fast"
     budget_s: float | None = None
-    """About how many seconds to train, often less; not with iterations."""
+    """about how many seconds to train, often less; not with iterations"""
     iterations: int | None = None
-    """Fixed schedule; not with budget_s."""
+    """fixed schedule; not with budget_s"""
     mask_polarity: str = "auto"
     layout: str = "auto"
     pose_convention: str = "opengl"
-    """Axes of poses_bounds.npy."""
+    """axes of poses_bounds.npy"""
     holdout: str = "every8"
-    """Every8, blocks8, none, or frame numbers such as 1,9,17."""
+    """every8, blocks8, none, or frame numbers such as 1,9,17"""
     seed: int = 0
     priority: str = "standard"
-    """High: before, and in place of, standard jobs."""
+    """high: before, and in place of, standard jobs"""
     retention_hours: float | None = None
-    """Clip, scene and record are purged so long after the job ended."""
+    """clip, scene and record are purged so long after the job ended"""
 
 
 class JobView(Model):
@@ -66,9 +66,9 @@ class JobView(Model):
     psnr_db: float | None = None
     seconds_left: float | None = None
     position: int | None = None
-    """Jobs that will be claimed before this one; while queued."""
+    """jobs that will be claimed before this one; while queued"""
     eta_s: float | None = None
-    """Estimated seconds until it is done; None if unknown."""
+    """estimated seconds until it is done; None if unknown"""
     error: JobError | None = None
     cancel_requested: bool = False
     attempt: int = 0
@@ -103,38 +103,38 @@ class Report(Model):
     report_version: int = 1
     notice: str = "Research use only. Not a medical device; it must not guide treatment."
     versions: dict[str, str] = Field(default={})
-    """Of intrasplat and what it computes with."""
+    """of intrasplat and what it computes with"""
     psnr_tissue_db: float | None
     psnr_paper_db: float | None
     ssim: float | None
     baseline_blend_db: float | None
-    """Psnr_tissue_db of blending the nearest training frames."""
+    """psnr_tissue_db of blending the nearest training frames"""
     baseline_flow_db: float | None
-    """The same, each warped half-way by optical flow first."""
+    """the same, each warped half-way by optical flow first"""
     depth_agreement_mm: float | None
-    """Median |rendered - stereo depth| on held-out tissue."""
+    """median |rendered - stereo depth| on held-out tissue"""
     coverage: float | None
-    """Share of tissue pixels the model covers."""
+    """share of tissue pixels the model covers"""
     train_psnr_tissue_db: float | None
-    """Psnr_tissue_db over some training frames, to compare."""
+    """psnr_tissue_db over some training frames, to compare"""
     frames: tuple[FrameScore, ...] = ()
     warnings: tuple[str, ...]
-    """What to distrust, in plain words; empty if nothing was found."""
+    """what to distrust, in plain words; empty if nothing was found"""
     assumptions: tuple[str, ...]
-    """What was taken for granted about the input."""
+    """what was taken for granted about the input"""
     measurements: dict[str, float] = Field(default={})
-    """Of the input, such as its misalignment in px."""
+    """of the input, such as its misalignment in px"""
     preset: str
     seed: int
     device: str
     iterations: int
     frames_seen: int | None = None
-    """By training, each as often as it was in a step."""
+    """by training, each as often as it was in a step"""
     seconds: dict[str, float]
-    """By stage; t_train_s and t_post_s as docs/conventions.md has them."""
+    """by stage; t_train_s and t_post_s as docs/conventions.md has them"""
     gaussians: int
     bases: int
-    """Of a channel's motion; 0 if the model has no such number."""
+    """of a channel's motion; 0 if the model has no such number"""
     scene_bytes: int
     units_per_mm: float
     width: int
@@ -143,7 +143,7 @@ class Report(Model):
     train_count: int
     held_out: tuple[int, ...]
     repeated: tuple[int, ...]
-    """Frames in neither set, because they repeat a held-out one."""
+    """frames in neither set, because they repeat a held-out one"""
     frame_times_s: tuple[float, ...]
 
 
@@ -172,17 +172,17 @@ class GivenOptions(TypedDict, total=False):
         "without_mapf",
     ]
     budget_s: Annotated[float, Field(gt=0, le=7200)] | None
-    """About how many seconds to train, often less; not with iterations."""
+    """about how many seconds to train, often less; not with iterations"""
     iterations: Annotated[int, Field(le=1000000, ge=1)] | None
-    """Fixed schedule; not with budget_s."""
+    """fixed schedule; not with budget_s"""
     mask_polarity: Literal["auto", "tool", "tissue"]
     layout: Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]
     pose_convention: Literal["opengl", "llff"]
-    """Axes of poses_bounds.npy."""
-    holdout: Annotated[str, Field(max_length=8000, pattern="^(every8|blocks8|none|\\d{1,6}(,\\d{1,6})*)$")]
-    """Every8, blocks8, none, or frame numbers such as 1,9,17."""
+    """axes of poses_bounds.npy"""
+    holdout: Annotated[str, Field(max_length=8000, pattern="^(every8|blocks8|none|\\d{1,6}(,\\d{1,6})*)$")] | list[int]
+    """every8, blocks8, none, or frame numbers such as 1,9,17"""
     seed: Annotated[int, Field(lt=2147483648, ge=0)]
     priority: Literal["standard", "high"]
-    """High: before, and in place of, standard jobs."""
+    """high: before, and in place of, standard jobs"""
     retention_hours: Annotated[float, Field(gt=0, le=87600)] | None
-    """Clip, scene and record are purged so long after the job ended."""
+    """clip, scene and record are purged so long after the job ended"""

@@ -94,9 +94,7 @@ class Session:
         except httpx.TransportError as error:
             raise self._unreachable(error) from error
 
-    async def request(
-        self, call: Call, *, patience_s: float | None = None, is_there: bool = False
-    ) -> httpx.Response:
+    async def request(self, call: Call, *, patience_s: float | None = None, is_there: bool = False) -> httpx.Response:
         """Send a call, again while the service is busy (429, 503) or loses the connection; its successful answer.
 
         patience_s: another than the session's.

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from client import Client
 from contract.queue.promise import Claim
+from intrasplat_client import Client
 from tests.client.local_service import CLIP, LocalService, local_service
 
 

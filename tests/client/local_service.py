@@ -23,6 +23,7 @@ from contract.store.store import Store
 from contract.wire.job import JobError
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
+from contract.wire.report import Report
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
@@ -30,6 +31,34 @@ from worker.daemon.serve import Reply, RequestServer
 
 CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
 SNAPSHOT_ITERATION = 7
+REPORT_OF_A_SCENE = Report(
+    psnr_tissue_db=36.2,
+    psnr_paper_db=37.0,
+    ssim=0.95,
+    baseline_blend_db=30.0,
+    baseline_flow_db=None,
+    depth_agreement_mm=0.5,
+    coverage=0.99,
+    train_psnr_tissue_db=37.5,
+    warnings=(),
+    assumptions=(),
+    preset="fast",
+    seed=0,
+    device="cpu",
+    iterations=30,
+    seconds={"t_train_s": 1.0},
+    gaussians=1000,
+    bases=17,
+    scene_bytes=10_000,
+    units_per_mm=1.0,
+    width=6,
+    height=4,
+    frame_count=12,
+    train_count=10,
+    held_out=(1, 9),
+    repeated=(),
+    frame_times_s=tuple(each / 12 for each in range(12)),
+)
 
 
 def paint(request: RenderRequest | ExportRequest) -> Reply:
@@ -77,7 +106,7 @@ class LocalService:
         claim = claim or self.claim()
         folder = self.store.work_folder(claim.job_id, claim.attempt)
         (folder / MANIFEST).write_text("{}")
-        (folder / REPORT).write_text('{"psnr_tissue_db": 36.2, "warnings": []}')
+        (folder / REPORT).write_text(REPORT_OF_A_SCENE.model_dump_json())
         (folder / CURVE).write_text("t_train_s,psnr_tissue_db\n1,30\n")
         self.store.publish_scene(claim.job_id, claim.attempt)
         assert self.queue.finish(claim)

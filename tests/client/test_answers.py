@@ -8,10 +8,12 @@ from pathlib import Path
 import httpx
 import pytest
 
-from client import (
+from intrasplat_client import (
     Client,
     Conflict,
     Forbidden,
+    IntrasplatError,
+    JobState,
     NotFound,
     RateLimited,
     RequestRefused,
@@ -19,8 +21,6 @@ from client import (
     ServiceUnavailable,
     Unauthorized,
 )
-from contract.wire.errors import IntrasplatError, UnavailableError
-from contract.wire.job import JobState
 
 JOB_ID = "0" * 32
 JOB = {
@@ -171,5 +171,5 @@ def test_an_upload_outlives_a_restart_of_the_service_but_not_its_end(clip: Path)
         assert client.reconstruct(clip, in_pieces=True, seed=3).id == JOB_ID
     assert service.came == clip.read_bytes()
     service = Restarting(away=1000)
-    with Client(transport=httpx.MockTransport(service), patience_s=0.5) as client, pytest.raises(UnavailableError):
+    with Client(transport=httpx.MockTransport(service), patience_s=0.5) as client, pytest.raises(ServiceUnavailable):
         client.reconstruct(clip, in_pieces=True)

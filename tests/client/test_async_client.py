@@ -8,9 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client import AsyncClient, JobCancelled, NotFound, RequestRefused, Unauthorized, submission
-from contract.wire.errors import InputError, UnavailableError
-from contract.wire.job import JobProgress, JobState
+from contract.wire.job import JobProgress
+from intrasplat_client import (
+    AsyncClient,
+    InputError,
+    JobCancelled,
+    JobState,
+    NotFound,
+    RequestRefused,
+    ServiceUnavailable,
+    Unauthorized,
+    submission,
+)
 from tests.client.local_service import LocalService, line_to
 
 
@@ -24,7 +33,7 @@ def test_a_clip_becomes_a_scene_while_other_work_goes_on(service: LocalService, 
             assert job.id in {each.id for each in await client.jobs(JobState.QUEUED)}
             await asyncio.to_thread(service.finish)
             assert (await waiting).state is JobState.DONE
-            assert (await client.report(job.id))["psnr_tissue_db"] == 36.2
+            assert (await client.report(job.id)).psnr_tissue_db == 36.2
             assert (await client.curve(job.id)).startswith("t_train_s")
             assert await client.export(job.id) == b"ply\n"
             assert job.id in {scene["id"] for scene in await client.scenes()}
@@ -114,7 +123,7 @@ def test_errors_are_the_same(service: LocalService, clip: Path, tmp_path: Path) 
                 await client.wait(job.id)
         async with AsyncClient("http://127.0.0.1:9") as nobody:
             assert not await nobody.is_ready()
-            with pytest.raises(UnavailableError, match="intrasplat up"):
+            with pytest.raises(ServiceUnavailable, match="intrasplat up"):
                 await nobody.wait("a")
 
     asyncio.run(use())

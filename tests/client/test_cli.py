@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 import client as client_package
-from client import Client
 from client.cli import main
 from client.remote import in_commands, progress_of
 from contract.access.keys import KeyFile, KeyScope
 from contract.runtime.exits import ExitCode
-from contract.wire.job import JobError, JobState
+from contract.wire.job import JobError
+from intrasplat_client import Client, JobState
 from tests.client.local_service import LocalService, local_service
 
 
@@ -174,7 +174,8 @@ def test_local_commands_have_help_too(command: str) -> None:
 
 def run_here(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """The command line in a process of its own, started in `folder`, whose `worker` is taken if it has one."""
-    environment = os.environ | {"PYTHONPATH": str(Path(client_package.__file__).parents[1])}
+    own = Path(client_package.__file__).parent
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(own.parent), str(own)))}
     command = [sys.executable, "-m", "client.cli", *arguments]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=60)
 

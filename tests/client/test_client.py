@@ -10,22 +10,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client import (
+from contract.access.keys import KeyFile, KeyScope
+from contract.wire.job import JobError, JobProgress
+from intrasplat_client import (
     AsyncClient,
     Client,
     Conflict,
     Forbidden,
+    InputError,
     JobCancelled,
     JobFailed,
     JobRejected,
+    JobState,
     NotFound,
     RequestRefused,
+    ServiceUnavailable,
     Unauthorized,
     submission,
 )
-from contract.access.keys import KeyFile, KeyScope
-from contract.wire.errors import InputError, UnavailableError
-from contract.wire.job import JobError, JobProgress, JobState
 from tests.client.local_service import SNAPSHOT_ITERATION, LocalService, line_to, local_service
 
 
@@ -37,7 +39,7 @@ def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(
     assert job.options.iterations == 30
     service.finish()
     assert client.wait(job.id).state is JobState.DONE
-    assert client.report(job.id)["psnr_tissue_db"] == 36.2
+    assert client.report(job.id).psnr_tissue_db == 36.2
     assert client.curve(job.id).startswith("t_train_s")
     assert client.export(job.id) == b"ply\n"
     assert job.id in {scene["id"] for scene in client.scenes()}
@@ -244,7 +246,7 @@ def test_no_service_is_unavailable_at_once_and_not_ready() -> None:
     with Client("http://127.0.0.1:9") as client:
         assert not client.is_ready()
         for ask in (client.jobs, lambda: client.wait("a"), lambda: client.stream("a")):
-            with pytest.raises(UnavailableError, match="intrasplat up"):
+            with pytest.raises(ServiceUnavailable, match="intrasplat up"):
                 ask()
 
 

@@ -1,63 +1,25 @@
-"""`up`'s parts: children come back after a crash and end with it, and one data directory has one launcher."""
+"""`up`'s parts: it starts its children again, says what they lack, and is alone in its data directory."""
 
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import subprocess
 import sys
-import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from client import up
-from client.up import Installation, WatchedProcess, check_port, worker_names
+from client.up import Installation, check_port, worker_names
 from contract.runtime.exits import ExitCode
 from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
+from contract.runtime.supervised import Supervised
 from contract.wire.errors import UnavailableError
 
-WAIT_S = 10.0
-
-
-def child_that_runs(program: str, folder: Path) -> WatchedProcess:
-    return WatchedProcess("worker", [sys.executable, "-c", program], dict(os.environ), folder)
-
-
-def watch_until_ended(child: WatchedProcess) -> None:
-    """Start the child, wait for its end, and look at it again."""
-    child.watch()
-    assert child.process_id is not None
-    os.waitid(os.P_PID, child.process_id, os.WEXITED | os.WNOWAIT)
-    child.watch()
-
-
-def test_a_killed_child_is_started_again_and_a_stopped_one_is_not(tmp_path: Path) -> None:
-    child = child_that_runs("import time; time.sleep(60)", tmp_path)
-    child.watch()
-    first = child.process_id
-    assert first is not None
-    os.kill(first, signal.SIGKILL)
-    deadline_s = time.monotonic() + WAIT_S
-    while child.process_id in (first, None):
-        assert time.monotonic() < deadline_s
-        child.watch()
-        time.sleep(0.02)
-    child.stop()
-    assert child.process_id is None
-
-
-@pytest.mark.parametrize("status", [code for code in ExitCode if code != ExitCode.UNAVAILABLE] + [1])
-def test_a_child_that_crashes_at_once_is_not_started_in_a_hurry(status: int, tmp_path: Path) -> None:
-    child = child_that_runs(f"raise SystemExit({int(status)})", tmp_path)
-    watch_until_ended(child)
-    child.watch()
-    assert child.process_id is None
-    child.stop()
-
-
+SLEEP = "import time; time.sleep(60)"
 LACKS = """
 from contract.wire.errors import UnavailableError
 from contract.runtime.exits import end_by
@@ -65,41 +27,53 @@ raise SystemExit(end_by(UnavailableError("There is no such device.", "Set INTRAS
 """
 
 
-def test_a_child_that_lacks_something_is_not_started_again_and_says_what_it_lacks(tmp_path: Path) -> None:
-    child = child_that_runs(LACKS, tmp_path)
-    with pytest.raises(UnavailableError, match=r"worker cannot work here: There is no such device\. Set INTRASPLAT"):
-        watch_until_ended(child)
-    assert child.process_id is None
-    assert list(tmp_path.iterdir()) == []
+def child_that_runs(program: str, folder: Path) -> Supervised:
+    return Supervised("worker", [sys.executable, "-c", program], last_words=folder / "worker.last-words")
 
 
-def test_a_child_whose_queue_does_not_answer_yet_is_started_again(
+@contextmanager
+def started(folder: Path, worker: str) -> Iterator[Installation]:
+    """An installation with a queue elsewhere, a service that sleeps, and one worker that runs a program."""
+    installation = Installation(Settings(data_dir=folder, redis_url="redis://127.0.0.1:1"))
+    installation.service = child_that_runs(SLEEP, folder)
+    installation.workers = [child_that_runs(worker, folder)]
+    with installation:
+        yield installation
+
+
+def watch_the_worker_end(installation: Installation) -> None:
+    process_id = installation.workers[0].process_id
+    assert process_id is not None
+    os.waitid(os.P_PID, process_id, os.WEXITED | os.WNOWAIT)
+    installation.watch()
+
+
+def test_a_worker_that_ends_is_started_again_and_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with started(tmp_path, "raise SystemExit(7)") as installation:
+        watch_the_worker_end(installation)
+        assert installation.service.process_id is not None
+    assert "the worker ended with status 7; starting it again in 0.5 s" in capsys.readouterr().err
+
+
+def test_a_worker_that_lacks_something_raises_what_it_lacks(tmp_path: Path) -> None:
+    with (
+        started(tmp_path, LACKS) as installation,
+        pytest.raises(UnavailableError, match=r"worker cannot work here: There is no such device\. Set INTRASPLAT"),
+    ):
+        watch_the_worker_end(installation)
+    assert installation.workers[0].process_id is None
+    assert not list(tmp_path.glob("*.last-words"))
+
+
+def test_a_worker_whose_queue_does_not_answer_yet_is_started_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     away = LACKS.replace('"Set INTRASPLAT_DEVICE."', '"Start it.", may_return=True')
-    child = child_that_runs(away, tmp_path)
-    watch_until_ended(child)
+    with started(tmp_path, away) as installation:
+        watch_the_worker_end(installation)
     assert "starting it again" in capsys.readouterr().err
-    child.stop()
-
-
-def test_words_that_an_earlier_child_left_are_not_taken_for_those_of_the_next(tmp_path: Path) -> None:
-    (tmp_path / "worker.last-words").write_text('{"problem": "There was no queue.", "remedy": "Start one."}')
-    with pytest.raises(UnavailableError, match=r"ended with status 5.*messages are above"):
-        watch_until_ended(child_that_runs("raise SystemExit(5)", tmp_path))
-
-
-def test_a_child_that_was_sound_once_is_started_again_whatever_it_lacks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(up, "STEADY_S", -1.0)
-    monkeypatch.setattr(up, "FIRST_PAUSE_S", 0.0)
-    child = child_that_runs(LACKS, tmp_path)
-    watch_until_ended(child)
-    monkeypatch.setattr(up, "STEADY_S", 60.0)
-    watch_until_ended(child)
-    assert capsys.readouterr().err.count("starting it again") == 2
-    child.stop()
 
 
 def test_a_worker_that_lacks_something_ends_the_launcher_with_its_remedy_and_leaves_nothing_behind(
@@ -133,8 +107,8 @@ def test_a_second_launcher_of_a_data_directory_is_refused(tmp_path: Path) -> Non
 
 def test_a_launcher_that_cannot_start_everything_leaves_nothing_behind(tmp_path: Path) -> None:
     installation = Installation(Settings(data_dir=tmp_path))
-    installation.service = child_that_runs("import time; time.sleep(60)", tmp_path)
-    installation.workers = [WatchedProcess("worker", [str(tmp_path / "no-such-program")], {}, tmp_path)]
+    installation.service = child_that_runs(SLEEP, tmp_path)
+    installation.workers = [Supervised("worker", [str(tmp_path / "no-such-program")])]
     with pytest.raises(FileNotFoundError), installation:
         pass
     assert installation.service.process_id is None
@@ -147,39 +121,6 @@ def test_a_port_that_is_taken_is_said_before_anything_starts() -> None:
         listener.listen()
         with pytest.raises(UnavailableError, match="--port"):
             check_port("127.0.0.1", listener.getsockname()[1])
-
-
-def test_children_end_with_a_launcher_that_was_killed(tmp_path: Path) -> None:
-    program = (
-        "import os, sys, time\n"
-        "from pathlib import Path\n"
-        "from client.up import WatchedProcess\n"
-        "command = [sys.executable, '-c', 'import time; time.sleep(60)']\n"
-        "child = WatchedProcess('worker', command, dict(os.environ), Path(sys.argv[1]))\n"
-        "child.watch()\n"
-        "print(child.process_id, flush=True)\n"
-        "time.sleep(60)\n"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True
-    ) as launcher:
-        assert launcher.stdout is not None
-        child_id = int(launcher.stdout.readline())
-        assert is_running(child_id)
-        launcher.kill()
-    deadline_s = time.monotonic() + WAIT_S
-    while is_running(child_id):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
-
-
-def is_running(process_id: int) -> bool:
-    """Whether the process is there and has not ended; one that ended may wait for somebody to ask for its status."""
-    try:
-        state = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0]
-    except FileNotFoundError:
-        return False
-    return state != "Z"
 
 
 def test_every_worker_has_a_name_of_its_own(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from client import Client, JobRejected, RequestRefused
 from client.demo import started_service
+from intrasplat_client import Client, JobRejected, RequestRefused
 from tests.service.under_test import ServiceUnderTest, assert_problem
 from tests.worker.input.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile
 
