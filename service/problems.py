@@ -12,7 +12,7 @@ from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocketState
 
 from contract.queue.promise import QueueFullError
-from contract.store.store import NO_ROOM, StoreFullError
+from contract.store.disk_errors import NO_ROOM, StoreFullError
 from contract.wire.errors import InputError, LimitError, SceneError, UnavailableError
 
 MEDIA_TYPE = "application/problem+json"

@@ -11,7 +11,7 @@ from contract.queue import redis_queue as queue_redis
 from contract.queue.promise import LEASE_S, MAX_ATTEMPTS
 from contract.queue.redis_queue import PREFIX
 from contract.runtime.settings import ENVIRONMENT_PREFIX, Settings, default_data_dir
-from contract.store.bucket import LOOKED_FOR_S
+from contract.store.s3 import SEEN_FOR_S
 from contract.wire.job import Priority
 from tests.test_house import REPOSITORY
 from worker.daemon.supervisor import TIDY_PERIOD_S
@@ -65,7 +65,7 @@ def test_the_access_list_is_that_of_the_containers() -> None:
 def test_the_figures_are_those_of_the_code() -> None:
     assert f"after {LEASE_S:g} s of silence" in PAGE
     assert f"up to {MAX_ATTEMPTS} times" in PAGE
-    assert f"nowhere after {LOOKED_FOR_S:g} s" in " ".join(PAGE.split())
+    assert f"nowhere after {SEEN_FOR_S:g} s" in " ".join(PAGE.split())
     assert f"within {TIDY_PERIOD_S / 60:g} minutes" in PAGE
 
 

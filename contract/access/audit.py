@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from contract.store.store import StoreFullError, disk_errors
+from contract.store.disk_errors import StoreFullError, disk_errors
 
 AUDIT_FILE = "audit.jsonl"
 RESERVE_FILE = "audit.reserve"

@@ -1,4 +1,5 @@
-"""Clips and scenes in, the same bytes out: on the local disk or in an S3 bucket.
+"""Clips and scenes in, the same bytes out, on one machine or on many.
 
-store.py is the store; bucket.py keeps it in S3; durable.py makes a file or folder appear whole or not at all.
+`open_store(settings)` gives the `Store`. It keeps what was accepted and finished on a `Shelf` (shelf.py): the disk
+(local.py) or an S3 bucket (s3.py). `replace_file` and `move_folder` (durable.py) are the only durable writes.
 """

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
 
 from contract.store.store import Store, new_job_id
 from contract.wire.job import JobFiles, JobRecord
+from contract.wire.names import MANIFEST
+
+BUCKET_URL = "s3://clips/of/all"
 
 
 def received(store: Store) -> JobRecord:
@@ -22,6 +30,23 @@ def accepted(store: Store) -> JobRecord:
     record = received(store)
     store.accept(record)
     return record
+
+
+def published(store: Store, job_id: str, attempt: int, content: bytes = b"tensors") -> Path:
+    """The folder of a scene with that content."""
+    folder = store.work_folder(job_id, attempt)
+    (folder / "scene.safetensors").write_bytes(content)
+    digest = hashlib.sha256(content).hexdigest()
+    (folder / MANIFEST).write_text(json.dumps({"files": {"scene.safetensors": {"sha256": digest}}}))
+    return store.publish_scene(job_id, attempt)
+
+
+def lead_to(environment: pytest.MonkeyPatch, server: str) -> None:
+    """Make a store in a bucket use that server."""
+    environment.setenv("AWS_ENDPOINT_URL", server)
+    environment.setenv("AWS_ACCESS_KEY_ID", "key")
+    environment.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+    environment.setenv("AWS_DEFAULT_REGION", "us-east-1")
 
 
 @contextmanager

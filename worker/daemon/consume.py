@@ -18,7 +18,6 @@ from contract.queue.promise import Claim, Order, Queue
 from contract.store.store import Store
 from contract.wire.errors import IntrasplatError, UnavailableError
 from contract.wire.job import JobProgress, JobRecord, JobState
-from contract.wire.names import RESUME
 from worker.daemon.child import DeviceChild, Ended, Keeper
 from worker.daemon.faults import describe
 from worker.daemon.heartbeat import Heartbeat
@@ -134,7 +133,7 @@ class _Job:
         job_id, attempt = self._claim.job_id, self._claim.attempt
         self._heart.report(JobProgress(stage=FETCHING, fraction=0.0))
         spool = self._with_patience(lambda: self._store.fetch_clip(job_id))
-        out = self._with_patience(lambda: self._store.work_folder(job_id, attempt, keep=RESUME))
+        out = self._with_patience(lambda: self._store.work_folder(job_id, attempt))
         if child.ended is not None:
             return Died(child.ended.cause, excused=True)
         child.send(Run(record=record, spool=spool, out=out))
@@ -195,7 +194,7 @@ class _Job:
         if isinstance(result, Died):
             self._log.warning("the device process %s", result.cause)
         if isinstance(result, Stopped) and result.checkpointed:
-            self._store.hand_over(self._claim.job_id, self._claim.attempt, RESUME)
+            self._store.hand_over(self._claim.job_id, self._claim.attempt)
         accepted = self._insist(lambda: self._queue.release(self._claim, died=died))
         return accepted, "handed back, its worker's death held against it" if died else "handed back"
 

@@ -1,4 +1,4 @@
-"""Folders appear whole or not at all, and leave nothing behind."""
+"""What the store promises, on a disk and in a bucket: folders appear whole or not at all, and leave nothing behind."""
 
 from __future__ import annotations
 
@@ -12,13 +12,9 @@ import pytest
 from contract.store.store import ABANDONED_AFTER_S, Store, is_job_id, new_job_id
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
-from contract.wire.names import MANIFEST, SUBMISSION
-from tests.contract.stores import accepted
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "data")
+from contract.wire.names import MANIFEST, RESUME, SUBMISSION
+from tests.contract.store.conftest import MakeStore
+from tests.contract.stores import accepted, published
 
 
 def publish(store: Store, job_id: str, attempt: int, content: str = "{}") -> Path:
@@ -32,7 +28,8 @@ def everything_of(store: Store, job_id: str) -> list[Path]:
 
 def test_an_accepted_upload_lies_in_the_spool_with_its_record(store: Store) -> None:
     record = accepted(store)
-    folder = store.spool_folder(record.job_id)
+    folder = store.fetch_clip(record.job_id)
+    assert folder == store.spool_folder(record.job_id)
     assert (folder / "clip.mp4").read_bytes() == b"frames"
     assert JobRecord.model_validate_json((folder / SUBMISSION).read_text()) == record
     assert list((store.data_dir / "incoming").iterdir()) == []
@@ -50,15 +47,6 @@ def test_the_accepted_clips_can_be_listed_and_read_again(store: Store) -> None:
     assert (store.fetch_clip(store.spooled_ids()[0]) / "clip.mp4").read_bytes() == b"frames"
 
 
-def test_a_damaged_submission_hides_no_other(store: Store) -> None:
-    damaged, sound = accepted(store).job_id, accepted(store).job_id
-    (store.spool_folder(damaged) / SUBMISSION).write_text('{"job_id": ')
-    assert store.spooled_ids() == sorted([damaged, sound])
-    assert store.submission(damaged) is None
-    assert store.submission(sound) is not None
-    assert store.submission(new_job_id()) is None
-
-
 def test_a_clip_that_is_not_there_cannot_be_fetched(store: Store) -> None:
     with pytest.raises(UnavailableError, match="is not there"):
         store.fetch_clip(new_job_id())
@@ -74,6 +62,19 @@ def test_a_scene_is_there_only_once_it_is_published(store: Store) -> None:
     assert store.scene_attempts(job_id) == [1]
     assert store.has_scene(job_id, 1)
     assert store.scene_folder(job_id, 1).is_dir()
+
+
+def test_a_scene_published_on_one_machine_is_shown_on_another(machine: MakeStore) -> None:
+    worker, other = machine("worker"), machine("other")
+    job_id = accepted(worker).job_id
+    published(worker, job_id, 2)
+    assert other.scene_attempts(job_id) == [2]
+    assert other.published_attempt(job_id) == 2
+    assert other.has_scene(job_id, 2)
+    assert not other.has_scene(job_id, 1)
+    assert (other.scene_folder(job_id, 2) / "scene.safetensors").read_bytes() == b"tensors"
+    with pytest.raises(SceneError, match="no scene"):
+        other.scene_folder(job_id, 1)
 
 
 def test_publishing_may_be_repeated(store: Store) -> None:
@@ -108,10 +109,10 @@ def test_an_attempt_starts_from_an_empty_folder(store: Store) -> None:
 
 def test_an_attempt_takes_over_the_one_file_to_go_on_from_and_removes_earlier_folders(store: Store) -> None:
     job_id = new_job_id()
-    for name in ("kept", "half-written"):
-        (store.work_folder(job_id, 9, keep="kept") / name).write_text(name)
-    folder = store.work_folder(job_id, 10, keep="kept")
-    assert [path.name for path in folder.iterdir()] == ["kept"]
+    for name in (RESUME, "half-written"):
+        (store.work_folder(job_id, 9) / name).write_text(name)
+    folder = store.work_folder(job_id, 10)
+    assert [path.name for path in folder.iterdir()] == [RESUME]
     assert [path.name for path in (store.data_dir / "work").iterdir()] == [folder.name]
 
 
@@ -121,16 +122,39 @@ def test_what_an_attempt_goes_on_from_is_the_latest_that_any_earlier_one_left(st
         folder = store.data_dir / "work" / f"{job_id}.{attempt}"
         folder.mkdir()
         if left:
-            (folder / "kept").write_text(f"of attempt {attempt}")
-    assert (store.work_folder(job_id, 4, keep="kept") / "kept").read_text() == "of attempt 2"
-    assert (store.work_folder(job_id, 4, keep="kept") / "kept").read_text() == "of attempt 2"
+            (folder / RESUME).write_text(f"of attempt {attempt}")
+    assert (store.work_folder(job_id, 4) / RESUME).read_text() == "of attempt 2"
+    assert (store.work_folder(job_id, 4) / RESUME).read_text() == "of attempt 2"
+
+
+def test_an_attempt_goes_on_from_what_one_on_another_machine_handed_over(machine: MakeStore) -> None:
+    job_id = new_job_id()
+    for name, attempt in (("first", 1), ("second", 2), ("first", 3)):
+        store = machine(name)
+        folder = store.work_folder(job_id, attempt)
+        before = (folder / RESUME).read_text() if (folder / RESUME).exists() else ""
+        assert before == "".join(f"{n} " for n in range(1, attempt))
+        (folder / RESUME).write_text(f"{before}{attempt} ")
+        store.hand_over(job_id, attempt)
+    published(store, job_id, 3)
+    store.remove_other_attempts(job_id, 3)
+    assert not (machine("third").work_folder(job_id, 4) / RESUME).exists()
+
+
+def test_what_lies_here_from_a_later_attempt_is_preferred_to_what_was_handed_over(store: Store) -> None:
+    job_id = new_job_id()
+    for attempt in (1, 2):
+        (store.work_folder(job_id, attempt) / RESUME).write_text(f"of attempt {attempt}")
+        if attempt == 1:
+            store.hand_over(job_id, attempt)
+    assert (store.work_folder(job_id, 3) / RESUME).read_text() == "of attempt 2"
 
 
 def test_an_attempt_that_starts_late_leaves_a_later_one_alone(store: Store) -> None:
     job_id = new_job_id()
-    (store.work_folder(job_id, 2, keep="kept") / "kept").write_text("of attempt 2")
-    assert list(store.work_folder(job_id, 1, keep="kept").iterdir()) == []
-    assert (store.data_dir / "work" / f"{job_id}.2" / "kept").is_file()
+    (store.work_folder(job_id, 2) / RESUME).write_text("of attempt 2")
+    assert list(store.work_folder(job_id, 1).iterdir()) == []
+    assert (store.data_dir / "work" / f"{job_id}.2" / RESUME).is_file()
 
 
 def test_after_a_scene_is_reported_nothing_else_is_left_of_its_attempts(store: Store) -> None:
@@ -141,13 +165,6 @@ def test_after_a_scene_is_reported_nothing_else_is_left_of_its_attempts(store: S
     store.remove_other_attempts(job_id, 2)
     assert [path.name for path in everything_of(store, job_id)] == [f"{job_id}.2"]
     assert store.scene_attempts(job_id) == [2]
-
-
-def test_scenes_of_the_version_before_count_as_the_first_attempts(store: Store) -> None:
-    job_id = new_job_id()
-    (store.data_dir / "scenes" / job_id).mkdir()
-    (store.data_dir / "scenes" / job_id / MANIFEST).write_text("{}")
-    assert Store(store.data_dir).scene_attempts(job_id) == [1]
 
 
 def test_scratch_is_emptied_when_its_worker_starts_again_and_is_no_attempt(store: Store) -> None:
@@ -180,29 +197,18 @@ def test_what_a_worker_unpacked_and_never_came_back_for_is_removed_after_a_day(s
     assert [path.name for path in scratch.iterdir()] == ["in use"]
 
 
-def test_a_purge_leaves_no_file_of_a_job_and_says_what_it_took(store: Store) -> None:
-    job_id, other = accepted(store).job_id, accepted(store).job_id
-    publish(store, job_id, 1)
-    (store.work_folder(job_id, 2) / "resume").write_bytes(b"12345")
-    store.open_incoming(job_id)
-    removed = store.purge(job_id)
-    assert everything_of(store, job_id) == []
-    assert removed.files == {"incoming": 0, "spool": 2, "work": 1, "scenes": 1}
-    assert removed.bytes["work"] == 5
-    assert removed.bytes["scenes"] == len("{}")
-    assert store.spooled_ids() == [other]
-    assert sum(store.purge(job_id).files.values()) == 0
-
-
-def test_a_purge_that_was_cut_off_shows_nothing_and_is_completed(store: Store) -> None:
-    job_id = accepted(store).job_id
-    publish(store, job_id, 1)
-    (store.spool_folder(job_id) / SUBMISSION).unlink()
-    (store.scene_folder(job_id, 1) / MANIFEST).unlink()
-    assert store.spooled_ids() == []
-    assert store.scene_attempts(job_id) == []
-    store.tidy()
-    assert everything_of(store, job_id) == []
+def test_a_purge_on_one_machine_leaves_nothing_of_a_job_and_nothing_of_it_is_found(machine: MakeStore) -> None:
+    service, worker = machine("service"), machine("worker")
+    job_id, other = accepted(service).job_id, accepted(service).job_id
+    published(worker, job_id, 1)
+    (worker.work_folder(job_id, 2) / RESUME).write_bytes(b"12345")
+    worker.hand_over(job_id, 2)
+    service.open_incoming(job_id)
+    assert sum(service.purge(job_id).files.values()) == 5
+    assert everything_of(service, job_id) == []
+    assert service.spooled_ids() == [other]
+    assert service.scene_attempts(job_id) == []
+    assert sum(service.purge(job_id).files.values()) == 0
 
 
 @pytest.mark.parametrize("text", ["..", "../x", "", "A" * 32, "a" * 31, "a" * 32 + "\n", "a" * 32 + "/x"])

@@ -1,84 +1,46 @@
-"""The store in a bucket, against a real HTTP server that speaks S3: what one machine stores, every other finds."""
+"""A store in a bucket: what one machine stores, every other finds, and a purge holds everywhere."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import shutil
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from contract.runtime.settings import Settings
-from contract.store.bucket import BucketStore
 from contract.store.store import ABANDONED_AFTER_S, Store, new_job_id, open_store
 from contract.wire.errors import SceneError, UnavailableError
-from contract.wire.names import MANIFEST, SUBMISSION
-from tests.contract.stores import accepted, received
+from contract.wire.names import MANIFEST, RESUME, SUBMISSION
+from tests.contract.stores import BUCKET_URL, accepted, lead_to, published, received
 
 pytest.importorskip("s3fs")
 moto_server: Any = pytest.importorskip("moto.server")
 boto3: Any = pytest.importorskip("boto3")
 
-URL = "s3://clips/of/all"
 PREFIX = "of/all/"
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    """The address of an S3 server."""
-    server = moto_server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    yield f"http://{host}:{port}"
-    server.stop()
-
-
-@pytest.fixture
-def bucket(server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The empty bucket that URL names, as boto3 sees it; the environment leads our store to it."""
-    lead_to(monkeypatch, server)
-    bucket = boto3.resource("s3").Bucket("clips")
-    bucket.create()
-    yield bucket
-    bucket.object_versions.delete()
-    bucket.delete()
-
-
-def lead_to(environment: pytest.MonkeyPatch, server: str) -> None:
-    environment.setenv("AWS_ENDPOINT_URL", server)
-    environment.setenv("AWS_ACCESS_KEY_ID", "key")
-    environment.setenv("AWS_SECRET_ACCESS_KEY", "secret")
-    environment.setenv("AWS_DEFAULT_REGION", "us-east-1")
-
-
-def machine(tmp_path: Path, name: str) -> BucketStore:
-    return BucketStore(tmp_path / name, URL)
+def on(tmp_path: Path, name: str) -> Store:
+    """The store as that machine sees it."""
+    return Store(tmp_path / name, BUCKET_URL)
 
 
 def keys(bucket: Any) -> list[str]:
     return sorted(each.key.removeprefix(PREFIX) for each in bucket.objects.all())
 
 
-def published(store: Store, job_id: str, attempt: int, content: bytes = b"tensors") -> Path:
-    folder = store.work_folder(job_id, attempt)
-    (folder / "scene.safetensors").write_bytes(content)
-    digest = hashlib.sha256(content).hexdigest()
-    (folder / MANIFEST).write_text(json.dumps({"files": {"scene.safetensors": {"sha256": digest}}}))
-    return store.publish_scene(job_id, attempt)
-
-
 def test_the_settings_choose_the_store(tmp_path: Path, bucket: Any) -> None:
-    assert type(open_store(Settings(data_dir=tmp_path))) is Store
-    assert type(open_store(Settings(data_dir=tmp_path, store_url=URL))) is BucketStore
+    accepted(open_store(Settings(data_dir=tmp_path)))
+    assert keys(bucket) == []
+    job_id = accepted(open_store(Settings(data_dir=tmp_path, store_url=BUCKET_URL))).job_id
+    assert keys(bucket) == [f"spool/{job_id}/clip.mp4", f"spool/{job_id}/{SUBMISSION}"]
 
 
 def test_a_clip_accepted_on_one_machine_can_be_fetched_on_another(tmp_path: Path, bucket: Any) -> None:
-    service, worker = machine(tmp_path, "service"), machine(tmp_path, "worker")
+    service, worker = on(tmp_path, "service"), on(tmp_path, "worker")
     record = accepted(service)
     shutil.rmtree(service.data_dir)
     assert worker.spooled_ids() == [record.job_id]
@@ -90,7 +52,7 @@ def test_a_clip_accepted_on_one_machine_can_be_fetched_on_another(tmp_path: Path
 
 
 def test_a_clip_without_its_submission_is_not_accepted_and_goes_in_the_end(tmp_path: Path, bucket: Any) -> None:
-    store, job_id = machine(tmp_path, "service"), new_job_id()
+    store, job_id = on(tmp_path, "service"), new_job_id()
     bucket.put_object(Key=f"{PREFIX}spool/{job_id}/clip.mp4", Body=b"half of an acceptance")
     assert store.spooled_ids() == []
     assert store.submission(job_id) is None
@@ -100,21 +62,8 @@ def test_a_clip_without_its_submission_is_not_accepted_and_goes_in_the_end(tmp_p
     assert keys(bucket) == [f"spool/{job_id}/clip.mp4"]  # its acceptance may still be going on
 
 
-def test_a_scene_published_on_one_machine_is_shown_on_another(tmp_path: Path, bucket: Any) -> None:
-    worker, other = machine(tmp_path, "worker"), machine(tmp_path, "other")
-    job_id = accepted(worker).job_id
-    published(worker, job_id, 2)
-    assert other.scene_attempts(job_id) == [2]
-    assert other.published_attempt(job_id) == 2
-    assert other.has_scene(job_id, 2)
-    assert not other.has_scene(job_id, 1)
-    assert (other.scene_folder(job_id, 2) / "scene.safetensors").read_bytes() == b"tensors"
-    with pytest.raises(SceneError, match="no scene"):
-        other.scene_folder(job_id, 1)
-
-
 def test_a_scene_that_was_altered_in_the_bucket_is_not_shown(tmp_path: Path, bucket: Any) -> None:
-    worker, other = machine(tmp_path, "worker"), machine(tmp_path, "other")
+    worker, other = on(tmp_path, "worker"), on(tmp_path, "other")
     job_id = new_job_id()
     published(worker, job_id, 1)
     bucket.put_object(Key=f"{PREFIX}scenes/{job_id}.1/scene.safetensors", Body=b"tenzors")
@@ -124,7 +73,7 @@ def test_a_scene_that_was_altered_in_the_bucket_is_not_shown(tmp_path: Path, buc
 
 
 def test_an_object_whose_name_leads_out_of_its_folder_is_refused(tmp_path: Path, bucket: Any) -> None:
-    worker, job_id = machine(tmp_path, "worker"), new_job_id()
+    worker, job_id = on(tmp_path, "worker"), new_job_id()
     for name in ("../../../outside", MANIFEST):
         bucket.put_object(Key=f"{PREFIX}scenes/{job_id}.1/{name}", Body=b"{}")
     with pytest.raises(SceneError, match="none of ours"):
@@ -132,31 +81,8 @@ def test_an_object_whose_name_leads_out_of_its_folder_is_refused(tmp_path: Path,
     assert not list(tmp_path.rglob("outside"))
 
 
-def test_an_attempt_goes_on_from_what_one_on_another_machine_handed_over(tmp_path: Path, bucket: Any) -> None:
-    first, second = machine(tmp_path, "first"), machine(tmp_path, "second")
-    job_id = new_job_id()
-    for store, attempt in ((first, 1), (second, 2), (first, 3)):
-        folder = store.work_folder(job_id, attempt, keep="resume")
-        before = (folder / "resume").read_text() if (folder / "resume").exists() else ""
-        assert before == "".join(f"{n} " for n in range(1, attempt))
-        (folder / "resume").write_text(f"{before}{attempt} ")
-        store.hand_over(job_id, attempt, "resume")
-    published(first, job_id, 3)
-    first.remove_other_attempts(job_id, 3)
-    assert [key for key in keys(bucket) if key.startswith("resume/")] == []
-
-
-def test_what_lies_here_from_a_later_attempt_is_preferred_to_what_was_handed_over(tmp_path: Path, bucket: Any) -> None:
-    store, job_id = machine(tmp_path, "worker"), new_job_id()
-    for attempt in (1, 2):
-        (store.work_folder(job_id, attempt, keep="resume") / "resume").write_text(f"of attempt {attempt}")
-        if attempt == 1:
-            store.hand_over(job_id, attempt, "resume")
-    assert (store.work_folder(job_id, 3, keep="resume") / "resume").read_text() == "of attempt 2"
-
-
 def test_the_scene_of_a_refused_attempt_goes_from_the_bucket_and_the_other_stays(tmp_path: Path, bucket: Any) -> None:
-    zombie, worker = machine(tmp_path, "zombie"), machine(tmp_path, "worker")
+    zombie, worker = on(tmp_path, "zombie"), on(tmp_path, "worker")
     job_id = new_job_id()
     for store, attempt in ((zombie, 1), (worker, 10)):
         published(store, job_id, attempt)
@@ -173,20 +99,20 @@ def test_a_purge_leaves_nothing_in_the_bucket_nor_on_any_machine_that_shows_it(
 ) -> None:
     if versioned:
         bucket.Versioning().enable()
-    service, worker = machine(tmp_path, "service"), machine(tmp_path, "worker")
+    service, worker = on(tmp_path, "service"), on(tmp_path, "worker")
     job_id, other = accepted(service).job_id, accepted(service).job_id
     worker.fetch_clip(job_id)
     for content in (b"first", b"again"):
         scene = published(worker, job_id, 1, content)
-    (worker.work_folder(job_id, 2) / "resume").write_bytes(b"state")
-    worker.hand_over(job_id, 2, "resume")
+    (worker.work_folder(job_id, 2) / RESUME).write_bytes(b"state")
+    worker.hand_over(job_id, 2)
     assert service.has_scene(job_id, 1)
     removed = service.purge(job_id)
     assert not service.has_scene(job_id, 1)
     assert removed.files["bucket"] == 5
     assert [each.key for each in bucket.object_versions.all() if job_id in each.key] == []
     assert service.spooled_ids() == [other]
-    monkeypatch.setattr("contract.store.bucket.LOOKED_FOR_S", 0.0)
+    monkeypatch.setattr("contract.store.s3.SEEN_FOR_S", 0.0)
     with pytest.raises(SceneError):
         worker.scene_folder(job_id, 1)
     assert not scene.exists()
@@ -196,7 +122,7 @@ def test_a_purge_leaves_nothing_in_the_bucket_nor_on_any_machine_that_shows_it(
 
 
 def test_copies_that_nobody_has_used_for_a_day_are_dropped_and_come_back(tmp_path: Path, bucket: Any) -> None:
-    store, job_id = machine(tmp_path, "worker"), new_job_id()
+    store, job_id = on(tmp_path, "worker"), new_job_id()
     scene = published(store, job_id, 1)
     store.tidy()
     assert scene.is_dir()
@@ -209,7 +135,7 @@ def test_copies_that_nobody_has_used_for_a_day_are_dropped_and_come_back(tmp_pat
 
 def test_a_bucket_that_is_not_there_is_noticed_at_once(tmp_path: Path, bucket: Any) -> None:
     with pytest.raises(UnavailableError, match="bucket"):
-        BucketStore(tmp_path, "s3://no-such-bucket")
+        Store(tmp_path, "s3://no-such-bucket")
 
 
 def test_while_the_bucket_is_away_nothing_is_accepted_nor_taken_for_missing(tmp_path: Path) -> None:
@@ -218,9 +144,9 @@ def test_while_the_bucket_is_away_nothing_is_accepted_nor_taken_for_missing(tmp_
     host, port = server.get_host_and_port()
     with pytest.MonkeyPatch.context() as environment:
         lead_to(environment, f"http://{host}:{port}")
-        environment.setattr("contract.store.bucket.RETRIES", {"mode": "standard", "total_max_attempts": 1})
+        environment.setattr("contract.store.s3.RETRIES", {"mode": "standard", "total_max_attempts": 1})
         boto3.resource("s3").Bucket("elsewhere").create()
-        store = BucketStore(tmp_path, "s3://elsewhere")
+        store = Store(tmp_path, "s3://elsewhere")
         job_id = accepted(store).job_id
         published(store, job_id, 1)
         record = received(store)
@@ -239,8 +165,8 @@ def test_while_the_bucket_is_away_nothing_is_accepted_nor_taken_for_missing(tmp_
 def test_a_listing_of_more_than_one_page_is_complete(
     tmp_path: Path, bucket: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("contract.store.bucket.LISTING_PAGE", 2)
-    store = machine(tmp_path, "service")
+    monkeypatch.setattr("contract.store.s3.LISTING_PAGE", 2)
+    store = on(tmp_path, "service")
     records = [accepted(store) for _ in range(4)]
     assert store.spooled_ids() == sorted(record.job_id for record in records)
     for record in records:

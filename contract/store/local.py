@@ -1,0 +1,112 @@
+"""A shelf on the disk of this machine: an entry is the folder data_dir/<area>/<name>."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from pathlib import Path
+
+from contract.store.disk_errors import disk_errors
+from contract.store.durable import flush, move_folder
+from contract.store.shelf import MARKERS, Area, Entry, Removed, checked, entry_of, is_job_id
+
+
+class LocalShelf:
+    """A Shelf in one data directory, whose folders this makes if need be."""
+
+    @disk_errors()
+    def __init__(self, data_dir: Path) -> None:
+        self.data_dir = data_dir
+        self.data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for area in Area:
+            (self.data_dir / area).mkdir(mode=0o700, exist_ok=True)
+        self._number_old_scenes()
+
+    def path(self, entry: Entry) -> Path:
+        """Where the entry's folder lies, or would lie."""
+        return self.data_dir / entry.area / entry.name
+
+    @disk_errors()
+    def put(self, folder: Path, entry: Entry) -> None:
+        target = self.path(entry)
+        if folder != target:
+            _remove_folder(target, entry.marker)
+            move_folder(folder, target)
+
+    def get(self, entry: Entry) -> Path | None:
+        return self.path(entry) if self.holds(entry) else None
+
+    @disk_errors()
+    def holds(self, entry: Entry) -> bool:
+        return (self.path(entry) / entry.marker).is_file()
+
+    @disk_errors()
+    def read_marker(self, entry: Entry) -> bytes | None:
+        with contextlib.suppress(FileNotFoundError):
+            return (self.path(entry) / entry.marker).read_bytes()
+        return None
+
+    def entries(self, area: Area, job_id: str | None = None) -> list[Entry]:
+        return [entry for entry in self.folders(area, job_id) if self.holds(entry)]
+
+    @disk_errors()
+    def folders(self, area: Area, job_id: str | None = None) -> list[Entry]:
+        """As entries(), with folders that lack their marker."""
+        # Not by glob: Python keeps each pattern it has seen, and every job would be another.
+        start = checked(job_id) if job_id is not None else ""
+        names = [each.name for each in os.scandir(self.data_dir / area) if each.name.startswith(start)]
+        found = [entry for entry in (entry_of(area, name) for name in names) if entry is not None]
+        return sorted(found, key=lambda entry: (entry.job_id, entry.attempt or 0))
+
+    @disk_errors()
+    def remove(self, area: Area, job_id: str, attempt: int | None = None) -> Removed:
+        found = [self.path(entry) for entry in self.folders(area, job_id) if attempt in (None, entry.attempt)]
+        files = sizes = 0
+        for folder in found:
+            with contextlib.suppress(FileNotFoundError):  # its worker has just renamed it, or another purge removes it
+                for path in (path for path in folder.rglob("*") if path.is_file()):
+                    sizes += path.stat().st_size
+                    files += 1
+        for folder in found:
+            _remove_folder(folder, MARKERS[area])
+        if found:
+            flush(self.data_dir / area)
+        return Removed({str(area): files}, {str(area): sizes})
+
+    def drop_copy(self, entry: Entry) -> None:
+        """Nothing: what lies here is the entry itself."""
+
+    @disk_errors()
+    def tidy(self) -> None:
+        for area in (Area.SPOOL, Area.SCENES):
+            for folder in (self.data_dir / area).iterdir():
+                if not (folder / MARKERS[area]).is_file():  # of a removal that was cut off
+                    remove_tree(folder)
+
+    def _number_old_scenes(self) -> None:
+        """Version 0.1 kept one scene a job, in a folder without a number: it counts as made by the first attempt."""
+        for folder in list((self.data_dir / Area.SCENES).iterdir()):
+            if is_job_id(folder.name):
+                with contextlib.suppress(FileNotFoundError):  # another process does the same
+                    folder.rename(folder.with_name(f"{folder.name}.1"))
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a file or a folder with all that is in it, as far as it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, onerror=_unless_gone)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _remove_folder(folder: Path, marker: str) -> None:
+    """Remove a folder, its marker first, so that nobody takes the rest for an entry."""
+    (folder / marker).unlink(missing_ok=True)
+    remove_tree(folder)
+
+
+def _unless_gone(_: object, __: object, failure: tuple[type[BaseException], BaseException, object]) -> None:
+    """For rmtree: somebody else removing the same is no failure."""
+    if not isinstance(failure[1], FileNotFoundError):
+        raise failure[1]

@@ -1,0 +1,142 @@
+"""The seam between the store and where it keeps things: `Shelf`, on the disk (local.py) or in a bucket (s3.py)."""
+
+from __future__ import annotations
+
+import re
+import uuid
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Protocol
+
+from contract.wire.job import JOB_ID_PATTERN
+from contract.wire.names import MANIFEST, RESUME, SUBMISSION
+
+ABANDONED_AFTER_S = 24 * 3600.0
+"""What has not changed for this long belongs to a process that has ended."""
+
+
+class Area(StrEnum):
+    """What kind of entry it is; each kind has a folder of this name."""
+
+    INCOMING = "incoming"
+    SPOOL = "spool"
+    WORK = "work"
+    SCENES = "scenes"
+
+
+MARKERS = {Area.INCOMING: SUBMISSION, Area.SPOOL: SUBMISSION, Area.WORK: RESUME, Area.SCENES: MANIFEST}
+"""The file without which an entry does not count: it is removed first and, in a bucket, written last."""
+
+
+def new_job_id() -> str:
+    """A random id, safe as a file name and unguessable."""
+    return uuid.uuid4().hex
+
+
+def is_job_id(text: str) -> bool:
+    """Whether `text` may be a part of a path in the store."""
+    return re.fullmatch(JOB_ID_PATTERN, text) is not None
+
+
+def checked(job_id: str) -> str:
+    """The id itself.
+
+    Raises:
+        ValueError: it is not one of ours, so it must not become a part of a path.
+    """
+    if not is_job_id(job_id):
+        raise ValueError(f"not a job id: {job_id!r}")
+    return job_id
+
+
+@dataclass(frozen=True)
+class Entry:
+    """The name of a folder in the store; ValueError if job_id is none. attempt: of entries in WORK and SCENES only."""
+
+    area: Area
+    job_id: str
+    attempt: int | None = None
+
+    def __post_init__(self) -> None:
+        checked(self.job_id)
+
+    @property
+    def name(self) -> str:
+        """Of the folder in its area."""
+        return self.job_id if self.attempt is None else f"{self.job_id}.{self.attempt:d}"
+
+    @property
+    def marker(self) -> str:
+        """The file without which the entry does not count."""
+        return MARKERS[self.area]
+
+
+def entry_of(area: Area, name: str) -> Entry | None:
+    """The entry whose folder has that name; None if the name is not one of ours."""
+    job_id, dot, attempt = name.partition(".")
+    numbered = area in (Area.WORK, Area.SCENES)
+    if not is_job_id(job_id) or bool(dot) is not numbered or (numbered and not re.fullmatch(r"[0-9]{1,9}", attempt)):
+        return None
+    return Entry(area, job_id, int(attempt) if numbered else None)
+
+
+@dataclass(frozen=True)
+class Removed:
+    """How many files and bytes a removal took away, by the place they were in."""
+
+    files: dict[str, int]
+    bytes: dict[str, int]
+
+    def __add__(self, other: Removed) -> Removed:
+        return Removed(_sum(self.files, other.files), _sum(self.bytes, other.bytes))
+
+
+def _sum(first: dict[str, int], second: dict[str, int]) -> dict[str, int]:
+    return {name: first.get(name, 0) + second.get(name, 0) for name in first | second}
+
+
+class Shelf(Protocol):
+    """Keeps entries for every process of an installation; an entry is there with all of its files or not at all.
+
+    All methods raise UnavailableError when the disk or the bucket cannot do what is asked.
+    """
+
+    def put(self, folder: Path, entry: Entry) -> None:
+        """Keep a folder of this machine as the entry, in place of an earlier one; the folder moves to path(entry).
+
+        After an error the entry is not there, and the folder is where it was.
+        """
+        ...
+
+    def get(self, entry: Entry) -> Path | None:
+        """The entry's folder on this machine, fetched if need be; None if there is no such entry.
+
+        Raises:
+            SceneError: what was fetched is not what was put.
+        """
+        ...
+
+    def holds(self, entry: Entry) -> bool:
+        """Whether the entry is there."""
+        ...
+
+    def read_marker(self, entry: Entry) -> bytes | None:
+        """The content of the entry's marker; None if there is no such entry."""
+        ...
+
+    def entries(self, area: Area, job_id: str | None = None) -> list[Entry]:
+        """The entries of an area, of one job or of all, in the order of their names and attempts."""
+        ...
+
+    def remove(self, area: Area, job_id: str, attempt: int | None = None) -> Removed:
+        """Remove a job's entries in an area, also incomplete ones; only that of `attempt` if it is given."""
+        ...
+
+    def drop_copy(self, entry: Entry) -> None:
+        """Say that this machine needs the entry no more; the entry itself stays."""
+        ...
+
+    def tidy(self) -> None:
+        """Remove what interrupted processes have left, and copies that nobody uses."""
+        ...
