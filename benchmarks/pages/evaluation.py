@@ -136,15 +136,15 @@ def write_readme(readme: Path, folder: Path) -> None:
     picture = f"![Seconds of training against held-out decibels, for every preset]({place})"
     clip = clip_alone(groups_of(results.runs))
     caption = (
-        f"*Held-out frames of `{clip}`, medians of the seeds that were run; a disc's area is the scene's size on "
-        "disk, the line joins what nothing is both sooner and better than; dashed and dotted is copying the "
-        "neighbouring frames; hollow is published, on other hardware and data. `psnr_tissue` and the splits every8 and "
-        "blocks8 are defined in [docs/conventions.md](docs/conventions.md).*"
+        f"*Held-out frames of `{clip}`, medians over seeds. Discs show the scene's size on disk; the line joins the "
+        "best trade-offs; dashed and dotted lines are copies of the neighbouring frames; hollow marks are published, on "
+        "other hardware and data. [docs/conventions.md](docs/conventions.md) defines every8, blocks8 and psnr_tissue.*"
     )
+    usual = [each for each in found if each.our_limit == _usual_limit(found, each.holdout)]
     page = f"[All charts and figures]({folder.relative_to(readme.parent)}/index.md)"
     before, rest = text.split(MARKS[0])
     after = rest.split(MARKS[1])[1]
-    body = "\n\n".join((MARKS[0], picture, caption, f"{_claim(found)} {page}.", MARKS[1]))
+    body = "\n\n".join((MARKS[0], picture, caption, f"{_claim(usual)} {page}.", MARKS[1]))
     readme.write_text(f"{before}{body}{after}")
 
 
@@ -158,16 +158,21 @@ _METHOD = (
 )
 
 
+def _usual_limit(found: Sequence[Sooner], holdout: str) -> str:
+    """The limit that most clips were given with this holdout."""
+    return mode(each.our_limit for each in found if each.holdout == holdout)
+
+
 def _claim(found: Sequence[Sooner]) -> str:
-    """The headline in one sentence for each way of holding out, of the length that most clips were given."""
+    """The headline for each way of holding out, for runs of the limit that most clips were given."""
     sentences = []
     for holdout in dict.fromkeys(each.holdout for each in found):
-        usual = mode(each.our_limit for each in found if each.holdout == holdout)
+        usual = _usual_limit(found, holdout)
         here = [each for each in found if (each.holdout, each.our_limit) == (holdout, usual)]
         reached = [each for each in here if each.our_s]
         ours, theirs = here[0].ours, here[0].theirs
         said = (
-            f"With {holdout}, `{ours}` first reaches the score that `{theirs}` ends with on {len(reached)} of "
+            f"With {holdout}, `{ours}` reaches the score that `{theirs}` ends with on {len(reached)} of "
             f"{len(here)} clips"
         )
         if reached:
@@ -175,8 +180,8 @@ def _claim(found: Sequence[Sooner]) -> str:
             first = _span(each.times_from_their_first or math.nan for each in reached)
             iterations = _span(each.times_in_iterations or math.nan for each in reached)
             said += (
-                f": {seconds} times sooner than `{theirs}` ends, {first} times sooner than `{theirs}` itself first has "
-                f"that score, in {iterations} times fewer iterations"
+                f": {seconds} times sooner than `{theirs}` ends, {first} times sooner than `{theirs}` first reaches it, "
+                f"and in {iterations} times fewer iterations"
             )
         others = [
             f"`{each.clip}` {each.times_in_seconds:.1f} times sooner when given {each.our_limit} instead of {usual}"
