@@ -137,8 +137,9 @@ def write_readme(readme: Path, folder: Path) -> None:
     clip = clip_alone(groups_of(results.runs))
     caption = (
         f"*Held-out frames of `{clip}`, medians over seeds. Discs show the scene's size on disk; the line joins the "
-        "best trade-offs; dashed and dotted lines are copies of the neighbouring frames; hollow marks are published, on "
-        "other hardware and data. [docs/conventions.md](docs/conventions.md) defines every8, blocks8 and psnr_tissue.*"
+        "best trade-offs; dashed and dotted lines are copies of the neighbouring frames; hollow marks are published, "
+        "on other hardware and data. [docs/conventions.md](docs/conventions.md) defines every8, blocks8 and "
+        "psnr_tissue.*"
     )
     usual = [each for each in found if each.our_limit == _usual_limit(found, each.holdout)]
     page = f"[All charts and figures]({folder.relative_to(readme.parent)}/index.md)"
@@ -180,8 +181,8 @@ def _claim(found: Sequence[Sooner]) -> str:
             first = _span(each.times_from_their_first or math.nan for each in reached)
             iterations = _span(each.times_in_iterations or math.nan for each in reached)
             said += (
-                f": {seconds} times sooner than `{theirs}` ends, {first} times sooner than `{theirs}` first reaches it, "
-                f"and in {iterations} times fewer iterations"
+                f": {seconds} times sooner than `{theirs}` ends, {first} times sooner than `{theirs}` first reaches "
+                f"it, and in {iterations} times fewer iterations"
             )
         others = [
             f"`{each.clip}` {each.times_in_seconds:.1f} times sooner when given {each.our_limit} instead of {usual}"
