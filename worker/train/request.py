@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from contract.wire.errors import InputError
-from contract.wire.names import Layout, MaskPolarity, PoseConvention
+from contract.wire.names import MaskPolarity, PoseConvention
 from worker.input.clip import ClipLimits, DepthClip
 from worker.train.presets import Preset
 
@@ -24,7 +24,7 @@ class ReconstructionRequest:
 
     clip: Path | DepthClip
     right: Path | None = None
-    layout: Layout = "auto"
+    layout: str = "auto"
     calibration: Path | None = None
     masks: Path | None = None
     mask_polarity: MaskPolarity = "auto"

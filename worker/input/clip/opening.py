@@ -10,21 +10,17 @@ from typing import get_args
 
 from contract.intake.limits import MOST_CALIBRATION_BYTES, ClipLimits
 from contract.wire.errors import InputError
-from contract.wire.names import Layout, MaskPolarity, PoseConvention
-from worker.input.clip.endonerf import is_endonerf, read_endonerf
+from contract.wire.names import MaskPolarity, PoseConvention
 from worker.input.clip.files import FileTree, check_exists, open_tree, scratch_folder
-from worker.input.clip.masks import NO_MASKS, BrightClass, MaskFrames, open_masks
-from worker.input.clip.stereo_source import (
-    STEREOMIS,
-    STEREOMIS_CALIBRATION,
-    is_stereomis,
-    open_tree_clip,
-    open_two_files,
-    open_video_clip,
-    own_masks,
-    with_masks,
-)
+from worker.input.clip.images import open_images
+from worker.input.clip.layouts import ClipFiles, detect_layout, layout_named
+from worker.input.clip.layouts.layout import outside_masks
+from worker.input.clip.layouts.stereomis import CALIBRATION_FILE
+from worker.input.clip.masks import NO_MASKS, MaskFrames, mask_names, open_masks
+from worker.input.clip.packing import FrameSequence
+from worker.input.clip.stereo import two_sequence_clip, with_masks
 from worker.input.clip.types import DepthClip, StereoClip
+from worker.input.clip.video import open_video, open_video_in
 
 _CALIBRATION_SUFFIXES = frozenset({".json", ".yaml", ".yml", ".xml", ".ini"})
 
@@ -33,7 +29,7 @@ def open_clip(
     path: Path | str,
     right: Path | str | None = None,
     *,
-    layout: Layout = "auto",
+    layout: str = "auto",
     masks: Path | str | None = None,
     mask_polarity: MaskPolarity = "auto",
     pose_convention: PoseConvention = "opengl",
@@ -42,15 +38,14 @@ def open_clip(
     """Opens and validates a clip; every assumption made on the way is in the clip's `assumptions`.
 
     path             a stereo video, a folder or a zip; or the left eye's video or frames when `right` is given
-    layout           "endonerf" (gives a DepthClip, decoded at once), "stereomis", "sbs" and "tb" (both eyes in one
-                     picture), "frames" (left and right images); "auto" tells them by names, shape and content
+    layout           one of clip/layouts/ by its name; "auto" tells it by names, shape and content
     masks            zip or folder of PNG, or a video; without it the clip's own masks/ folder is used, if there is one
     mask_polarity    what white means; "auto" asks layout and look (masks.tissue_from_masks)
     pose_convention  axes in poses_bounds.npy: "opengl" as EndoNeRF writes them, "llff" for files made by LLFF
 
     Raises InputError, naming field and remedy, for everything that is wrong, and LimitError when it is too large.
     """
-    _check_choice("options.layout", layout, get_args(Layout))
+    named = layout_named(layout) if layout != "auto" else None
     _check_choice("options.mask_polarity", mask_polarity, get_args(MaskPolarity))
     _check_choice("options.pose_convention", pose_convention, get_args(PoseConvention))
     limits = limits or ClipLimits()
@@ -58,14 +53,19 @@ def open_clip(
     check_exists(path, "clip")
     given = open_masks(Path(masks), limits) if masks is not None else None
     if right is not None:
-        return _finish(_open_two(path, Path(right), layout, limits), given, mask_polarity, None)
+        clip = _open_two(path, Path(right), layout, limits)
+        return with_masks(clip, given, mask_polarity, None) if given is not None else _without_masks(clip)
     tree = open_tree(path, "clip", limits)
-    if layout == "endonerf" or (layout == "auto" and tree is not None and is_endonerf(tree)):
-        return read_endonerf(_needs_tree(tree, path), given, mask_polarity, pose_convention)
-    clip = open_video_clip(path, layout, limits) if tree is None else open_tree_clip(tree, layout)
-    if given is None and tree is not None:
-        given = own_masks(tree)
-    return _finish(clip, given, mask_polarity, _mask_rule(tree, layout))
+    files = ClipFiles(path, tree, limits, named is None, given, mask_polarity, pose_convention)
+    chosen = named or detect_layout(files)
+    opened = chosen.open(files)
+    if isinstance(opened, DepthClip):
+        return opened
+    found = given or (_own_masks(tree) if tree is not None else None)
+    if found is None:
+        return _without_masks(opened)
+    by_layout = (chosen.title or chosen.name, chosen.white) if chosen.white is not None else None
+    return with_masks(opened, found, mask_polarity, by_layout)
 
 
 def find_calibration(path: Path | str, scratch: Path | None = None, limits: ClipLimits | None = None) -> Path | None:
@@ -83,7 +83,7 @@ def find_calibration(path: Path | str, scratch: Path | None = None, limits: Clip
     candidates = [name for name in tree.names if PurePosixPath(name).suffix.lower() in _CALIBRATION_SUFFIXES]
     stems = {name: PurePosixPath(name).stem.lower() for name in candidates}
     ranks = (
-        [name for name in candidates if PurePosixPath(name).name.lower() == STEREOMIS_CALIBRATION.lower()],
+        [name for name in candidates if PurePosixPath(name).name.lower() == CALIBRATION_FILE.lower()],
         [name for name in candidates if stems[name] == "calibration"],
         [name for name in candidates if "calib" in stems[name]],
     )
@@ -93,37 +93,31 @@ def find_calibration(path: Path | str, scratch: Path | None = None, limits: Clip
     return _as_path(tree, found[0], scratch) if found else None
 
 
-def _open_two(left: Path, right: Path, layout: Layout, limits: ClipLimits) -> StereoClip:
+def _open_two(left: Path, right: Path, layout: str, limits: ClipLimits) -> StereoClip:
+    """Left and right eye as two videos, two folders or zips of frames, or two images."""
     if layout != "auto":
         raise InputError("options.layout", f'layout "{layout}" does not go with a second file.', "Leave it out.")
     check_exists(right, "right")
-    return open_two_files(left, right, limits)
+    eyes = _open_eye(left, "clip", limits), _open_eye(right, "right", limits)
+    return two_sequence_clip(*eyes, "layout: two files, left eye first", limits)
 
 
-def _finish(
-    clip: StereoClip,
-    given: MaskFrames | None,
-    told: MaskPolarity,
-    by_layout: tuple[str, BrightClass] | None,
-) -> StereoClip:
-    if given is None:
-        return replace(clip, assumptions=(*clip.assumptions, NO_MASKS))
-    return with_masks(clip, given, told, by_layout)
-
-
-def _mask_rule(tree: FileTree | None, layout: Layout) -> tuple[str, BrightClass] | None:
-    """What the layout says white means in masks, if it says anything."""
-    if layout == "stereomis" or (layout == "auto" and tree is not None and is_stereomis(tree)):
-        return STEREOMIS, "tissue"
-    return None
-
-
-def _needs_tree(tree: FileTree | None, path: Path) -> FileTree:
+def _open_eye(path: Path, field: str, limits: ClipLimits) -> FrameSequence:
+    tree = open_tree(path, field, limits)
     if tree is None:
-        raise InputError(
-            "options.layout", f'layout "endonerf" needs a folder or zip, {path.name} is neither.', "Leave it out."
-        )
-    return tree
+        return open_video(path, field, limits)
+    videos = outside_masks(tree.videos())
+    return open_video_in(tree, videos[0]) if len(videos) == 1 else open_images(tree, outside_masks(tree.images()))
+
+
+def _own_masks(tree: FileTree) -> MaskFrames | None:
+    """The masks that lie in the clip's own folder, if any."""
+    names = mask_names(tree)
+    return MaskFrames(open_images(tree, names)) if names else None
+
+
+def _without_masks(clip: StereoClip) -> StereoClip:
+    return replace(clip, assumptions=(*clip.assumptions, NO_MASKS))
 
 
 def _as_path(tree: FileTree, name: str, scratch: Path | None) -> Path:

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
-from contract.wire.names import Layout, MaskPolarity, PoseConvention
+from contract.wire.names import MaskPolarity, PoseConvention
 from worker.input.calibration import check_calibration
 from worker.input.calibration.types import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
 from worker.input.camera import Intrinsics
 from worker.input.clip import ClipLimits, DepthClip, StereoClip
 from worker.input.clip.files import DEEPEST_FOLDER
+from worker.input.clip.layouts import registered_files
 from worker.input.clip.types import RgbFrame
 from worker.input.decode.contained import MALFORMED, REMEDY, private_folder, run_contained
 from worker.input.decode.guard import LIMITED_MEMORY, PROTECTIONS, Allowance
@@ -55,7 +56,7 @@ def decode_clip(
     clip: Path,
     right: Path | None = None,
     *,
-    layout: Layout = "auto",
+    layout: str = "auto",
     calibration: Path | None = None,
     masks: Path | None = None,
     mask_polarity: MaskPolarity = "auto",
@@ -76,14 +77,14 @@ def decode_clip(
         UnavailableError: the disk is full.
     """
     limits, hooks = limits or ClipLimits(), hooks or Hooks()
-    files = {"path": clip, "right": right, "masks": masks}
-    given = {name: None if path is None else str(path.absolute()) for name, path in files.items()}
-    chosen = {"layout": layout, "mask_polarity": mask_polarity, "pose_convention": pose_convention}
-    own = None if calibration is None else str(calibration.absolute())
+    given = {"path": clip, "right": right, "masks": masks, "calibration": calibration}
+    paths = {name: str(path.absolute()) for name, path in given.items() if path is not None}
+    layouts = [str(file) for file in registered_files()]
     request = {
-        "clip": given | chosen,
-        "calibration": own,
-        "readable": [each for path in (*given.values(), own) if path is not None for each in _reached(path)],
+        "paths": paths,
+        "options": {"layout": layout, "mask_polarity": mask_polarity, "pose_convention": pose_convention},
+        "layouts": layouts,
+        "readable": [each for path in (*paths.values(), *layouts) for each in _reached(path)],
         "limits": limits.numbers(),
     }
     allowance = Allowance(LIBRARIES_BYTES + limits.decoded_bytes, limits.decoded_bytes, CPU_S)

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from contract.wire.errors import InputError
 from worker.input.calibration import load_calibration
 from worker.input.clip import ClipLimits, DepthClip, StereoClip, find_calibration, open_clip
-from worker.input.decode.child import Reports
+from worker.input.clip.layouts import register_layout
 from worker.input.decode.handover import DEPTH, STEREO, write_arrays
+from worker.input.decode.reports import Reports
 
 _OPENING_SHARE = 0.5  # of the stage; a video is walked once to count its frames, and once to hand them over
 
@@ -32,7 +33,11 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
         reports.picture()
 
     limits = ClipLimits(**request["limits"], on_picture=picture)
-    clip = open_clip(limits=limits, **request["clip"])
+    for file in request["layouts"]:
+        register_layout(Path(file))
+    paths = dict(request["paths"])
+    given_calibration = paths.pop("calibration", None)
+    clip = open_clip(limits=limits, **paths, **request["options"])
     height, width = clip.rgb.shape[1:3] if isinstance(clip, DepthClip) else (clip.height, clip.width)
     told = {
         "size": [clip.frame_count, height, width],
@@ -43,7 +48,8 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
         write_arrays(folder, _depth_arrays(clip, reports))
         return told | {"kind": DEPTH, "intrinsics": clip.intrinsics.numbers()}
     reports.reading("calibration")
-    calibration = _calibration(request, clip, folder, limits)
+    path = given_calibration or find_calibration(paths["path"], folder, limits)
+    calibration = _calibration(path, clip)
     reports.reading("clip")
     write_arrays(folder, _stereo_arrays(clip, reports))
     masked = clip.tissue is not None
@@ -78,9 +84,7 @@ def _stereo_arrays(clip: StereoClip, reports: Reports) -> Iterator[tuple[str, ND
         raise InputError("clip", f"it ended after {found} of {clip.frame_count} frames.", "Give the whole recording.")
 
 
-def _calibration(request: dict[str, Any], clip: StereoClip, folder: Path, limits: ClipLimits) -> dict[str, Any]:
-    """The given calibration, or the one that lies in the clip's folder or zip."""
-    path = request["calibration"] or find_calibration(request["clip"]["path"], folder, limits)
+def _calibration(path: Path | str | None, clip: StereoClip) -> dict[str, Any]:
     if path is None:
         problem = f"a stereo clip of {clip.width} x {clip.height} px an eye came without one."
         remedy = "Give a calibration: our JSON (docs/conventions.md), OpenCV YAML or XML, or StereoMIS ini."

@@ -1,4 +1,4 @@
-"""The EndoNeRF layout: images/ depth/ masks/ poses_bounds.npy, decoded at once.
+"""Layout "endonerf": images/ depth/ masks/ poses_bounds.npy, decoded at once.
 
 Symbols: T frames, H W pixels.
 """
@@ -19,34 +19,36 @@ from contract.wire.names import MaskPolarity, PoseConvention
 from worker.input.camera import Intrinsics
 from worker.input.clip.files import FileTree
 from worker.input.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
+from worker.input.clip.layouts.layout import ClipFiles, InputLayout
 from worker.input.clip.masks import NO_MASKS, MaskFrames, TissueMasks, tissue_from_masks
 from worker.input.clip.naming import check_aligned
 from worker.input.clip.poses import POSES_FILE, Poses, parse_poses
 from worker.input.clip.types import DepthClip
 from worker.input.clip.video import FALLBACK_RATE_HZ
 
-LAYOUT = "EndoNeRF"
+TITLE = "EndoNeRF"
 CONFIDENT = 255  # depth_confidence of every valid depth: the layout carries none of its own
 _USUAL_DEPTH_MM = (5.0, 500.0)  # working distances of endoscopes with ample room; other units fall outside
 _LEAST_DEPTH_SHARE = 0.5  # of tissue pixels with depth, below which the user should know
 _MOST_THREADS = 4  # decoding PNG releases the interpreter; more threads than this wait for the disk
 
 
-def is_endonerf(tree: FileTree) -> bool:
-    """Whether a tree means to be in this layout; what is missing is then an error."""
-    has_poses = any(name.endswith(POSES_FILE) for name in tree.names)
-    return has_poses or bool(tree.images("images") and tree.images("depth"))
+def _recognises(files: ClipFiles) -> bool:
+    """Whether files mean to be in this layout; what is missing is then an error."""
+    tree = files.tree
+    if tree is None:
+        return False
+    return any(name.endswith(POSES_FILE) for name in tree.names) or bool(tree.images("images") and tree.images("depth"))
 
 
-def read_endonerf(
-    tree: FileTree, given: MaskFrames | None, mask_polarity: MaskPolarity, convention: PoseConvention
-) -> DepthClip:
+def _open(files: ClipFiles) -> DepthClip:
     """Decodes the whole clip. The masks given, if any, replace the folder's own.
 
     Depth images hold millimetres in 8 or 16 bit, 0 = invalid. Intrinsics are f, cx = W / 2, cy = H / 2:
     all the layout knows.
     Raises InputError for everything that does not fit together and LimitError when it is too large.
     """
+    tree, convention = files.tree_for("endonerf"), files.pose_convention
     _check_files(tree)
     images = open_images(tree, tree.images("images"))
     tree.limits.check_clip(tree.field, tree.label, images.frame_count, images.width, images.height, eyes=1)
@@ -55,7 +57,7 @@ def read_endonerf(
         tree.read(POSES_FILE, header_bytes + frame_bytes * images.frame_count), images.frame_count, convention
     )
     _check_size(images, poses)
-    masks = _masks(tree, images, given, mask_polarity)
+    masks = _masks(tree, images, files.masks, files.mask_polarity)
     rgb = _decode_all(images, np.uint8, (3,), lambda name: as_rgb(images.decode(name), tree.field, name))
     depth_mm = _read_depth(tree, images)
     if not ((depth_mm > 0) & masks.tissue).any():
@@ -86,7 +88,7 @@ def read_endonerf(
 def _assumptions(masks: TissueMasks, poses: Poses, convention: PoseConvention) -> tuple[str, ...]:
     moves = not np.allclose(poses.world_from_camera, np.eye(4), atol=1e-6)
     return (
-        f"layout: {LAYOUT}",
+        f"layout: {TITLE}",
         masks.assumption,
         f"poses: {convention} camera-to-world, " + ("moving camera" if moves else "fixed camera"),
         "intrinsics: principal point at the image centre",
@@ -136,7 +138,7 @@ def _masks(tree: FileTree, images: ImageSequence, given: MaskFrames | None, told
             return TissueMasks(np.ones(shape, dtype=np.bool_), NO_MASKS)
         check_aligned("masks", images.names, names)
         given = MaskFrames(open_images(tree, names))
-    return tissue_from_masks(given, shape, told, by_layout=(LAYOUT, "tool"))
+    return tissue_from_masks(given, shape, told, by_layout=(TITLE, "tool"))
 
 
 def _decode_all(
@@ -166,3 +168,6 @@ def _depth_warnings(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) ->
     if share < _LEAST_DEPTH_SHARE:
         warnings.append(f"depth: only {100 * share:.0f} % of the tissue pixels have one")
     return tuple(warnings)
+
+
+ENDONERF = InputLayout("endonerf", _recognises, _open, title=TITLE)

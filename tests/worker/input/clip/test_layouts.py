@@ -1,0 +1,77 @@
+"""The registry of input layouts: what callers may choose, and a layout from outside from its files to a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from contract.wire.errors import InputError
+from contract.wire.names import Layout
+from tests.worker.clips import plane_clip
+from tests.worker.input.clip import toy_layout
+from worker.input.clip import DepthClip, layouts, open_clip
+from worker.input.clip.layouts import LAYOUTS, register_layout, registered_files
+from worker.input.decode import decode_clip
+from worker.machine.hooks import Hooks
+from worker.pipeline import reconstruct
+from worker.scene.checkpoint import load_scene
+from worker.train.request import ReconstructionRequest
+
+TOY = Path(toy_layout.__file__)
+
+
+@pytest.fixture
+def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder in the toy layout, which is registered."""
+    monkeypatch.setattr(layouts, "_outside", {})
+    register_layout(TOY)
+    clip = plane_clip()
+    folder = tmp_path / "toy"
+    folder.mkdir()
+    np.savez(folder / toy_layout.FILE, rgb=clip.rgb, depth_mm=clip.depth_mm, focal_px=clip.intrinsics.fx)
+    return folder
+
+
+def test_callers_may_choose_every_layout_there_is() -> None:
+    assert get_args(Layout) == ("auto", *(each.name for each in LAYOUTS))
+
+
+def test_a_layout_from_outside_is_found_by_its_files_and_by_its_name(toy: Path) -> None:
+    for layout in ("auto", "toy"):
+        clip = open_clip(toy, layout=layout)
+        assert isinstance(clip, DepthClip)
+        np.testing.assert_array_equal(clip.rgb, plane_clip().rgb)
+
+
+def test_the_decoding_process_knows_layouts_from_outside(toy: Path) -> None:
+    clip = decode_clip(toy, layout="toy")
+    assert isinstance(clip, DepthClip)
+    np.testing.assert_array_equal(clip.depth_mm, plane_clip().depth_mm)
+
+
+def test_a_clip_in_a_layout_from_outside_becomes_a_scene(toy: Path, tmp_path: Path) -> None:
+    request = ReconstructionRequest(clip=toy, preset="fast", iterations=3, layout="toy")
+    report = reconstruct(request, tmp_path / "scene", Hooks())
+    assert load_scene(tmp_path / "scene").intrinsics == plane_clip().intrinsics
+    assert report.iterations == 3
+
+
+def test_a_layout_must_have_a_name_of_its_own(toy: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="'toy' already"):
+        register_layout(TOY)
+    assert registered_files() == [TOY]
+
+
+def test_a_file_without_a_layout_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty.py").write_text("")
+    with pytest.raises(ValueError, match="defines no InputLayout"):
+        register_layout(tmp_path / "empty.py")
+
+
+def test_an_unknown_layout_is_refused_and_the_known_ones_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'diagonal' is not known") as caught:
+        open_clip(tmp_path, layout="diagonal")
+    assert caught.value.remedy == "Choose one of auto, endonerf, stereomis, sbs, tb, frames."
