@@ -51,7 +51,7 @@ def test_every_variable_that_is_named_exists() -> None:
 def test_keda_watches_the_queues_own_streams() -> None:
     watched = [trigger["metadata"] for trigger in yaml.safe_load(block("yaml"))["spec"]["triggers"]]
     assert {each["stream"] for each in watched} == {f"{PREFIX}jobs:{name}" for name in get_args(Priority)}
-    scripts = (REPOSITORY / "contract" / "queue" / "scripts.py").read_text(encoding="utf-8")
+    scripts = (REPOSITORY / "contract" / "queue" / "scripts" / "common.lua").read_text(encoding="utf-8")
     assert all(f"'{each['consumerGroup']}'" in scripts for each in watched)
 
 

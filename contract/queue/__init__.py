@@ -1,5 +1,6 @@
 """Jobs in, claims out: the queue that every service and worker shares.
 
-promise.py states what a queue guarantees; memory.py and redis_queue.py keep it; scripts.py holds each atomic change:
-CLAIM and BEAT are the lease; embedded.py starts a private Valkey.
+`Queue` (promise.py) states what submit, claim, beat, finish, fail, release and cancel guarantee. RedisQueue and
+MemoryQueue keep it. scripts/ holds each atomic change on Redis; claim.lua and beat.lua are the lease. `EmbeddedServer`
+starts a private Valkey.
 """

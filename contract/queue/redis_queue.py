@@ -1,4 +1,4 @@
-"""The queue on Redis 7+ or Valkey Streams. This file and contract/queue/scripts.py are all that touches keys.
+"""The queue on Redis 7+ or Valkey Streams. This file and contract/queue/scripts/ are all that touches keys.
 
 Keys (the braces put all of them in one cluster slot, so that a script may touch several):
     {intrasplat}:jobs:high|standard     stream; an entry has one field, `job` = job id. Group `workers`; an entry stays
@@ -33,8 +33,9 @@ These expire:
 A user who may do this and nothing else:
     ACL SETUSER intrasplat on >PASSWORD ~{intrasplat}:* resetchannels +@all -@dangerous +bgrewriteaof
 
-Every change of state is one script, and every script gives the same answer when it is run twice, so the client may
-repeat a command whose reply was lost. Claiming, too, is one script; what blocks is a plain XREAD, which takes nothing.
+Every change of state is one script (contract/queue/scripts/), and every script gives the same answer when it runs
+twice, so the client may repeat a command whose answer was lost. Claiming is a script, too; it never blocks. A plain
+XREAD waits for new entries and takes none.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ import json
 import logging
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -51,7 +52,7 @@ import redis
 from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
-from contract.queue import scripts
+from contract.queue.lua import load_script
 from contract.queue.promise import (
     DURATIONS_KEPT,
     EVENTS_KEPT,
@@ -86,10 +87,10 @@ QUEUED = PREFIX + "queued"
 WORKERS = PREFIX + "workers"
 
 BLOCK_S = 2.0
-"""Longest single blocking read: a cut connection is noticed within this and the socket's timeout."""
+"""How long one read may block. The client notices a cut connection within this and the socket's timeout."""
 
 LEASE_CHECK_S = 0.5
-"""Longest one while jobs run: a lease that runs out makes no sound."""
+"""The same while jobs run: a lease that runs out writes nothing that would end the read."""
 
 SOCKET_TIMEOUT_S = 4.0
 CONNECT_TIMEOUT_S = 2.0
@@ -106,7 +107,9 @@ REFUSALS = (
     "NOPERM",
     "READONLY",
 )
-"""First words of errors by which a server says that it, or its disk, cannot or may not serve now."""
+"""First words of the errors with which a server says that it cannot, or may not, serve now."""
+
+SCRIPTS = ("submit", "restore", "claim", "beat", "settle", "release", "cancel", "retry", "forget", "announce")
 
 UNREADABLE = JobError(problem="The queue's record of this job cannot be read.", remedy="Submit the clip again.")
 
@@ -122,37 +125,29 @@ class RedisQueue:
     def __init__(self, url: str, *, lease_s: float = LEASE_S, preempt_after_s: float = PREEMPT_AFTER_S) -> None:
         self._client: Any = _connect(url)
         self._rules = _rules(lease_s, preempt_after_s)
-        self._submit = self._script(scripts.SUBMIT, when_full=False)
-        self._restore = self._script(scripts.RESTORE, when_full=False)
-        self._retry = self._script(scripts.RETRY, when_full=False)
-        self._claim = self._script(scripts.CLAIM, when_full=True)
-        self._beat = self._script(scripts.BEAT, when_full=True)
-        self._end = self._script(scripts.SETTLE, when_full=True)
-        self._release = self._script(scripts.RELEASE, when_full=True)
-        self._cancel = self._script(scripts.CANCEL, when_full=True)
-        self._forget = self._script(scripts.FORGET, when_full=True)
-        self._announce = self._script(scripts.ANNOUNCE, when_full=True)
+        self._scripts = {name: self._client.register_script(load_script(name)) for name in SCRIPTS}
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
-        most = (admission.queued, admission.queued_per_tenant) if admission else ("", "")
-        answer = self._submit(*introduced(record), IDEMPOTENCY_S * 1000, *most)
+        limits = (admission.queued, admission.queued_per_tenant) if admission else ("", "")
+        answer = self._run("submit", *introduced(record), IDEMPOTENCY_S * 1000, *limits)
         if answer[0] == "full" and admission is not None:
             check_admission(admission, *answer[1:])
-        standing = record_of(answer[1], table_of(answer[2]))
-        if standing is None:
-            raise UnavailableError(f"The queue's record of job {answer[1]} cannot be read.", "Submit under a new key.")
-        return standing
+        known = record_of(answer[1], table_of(answer[2]))
+        if known is None:
+            problem = f"The queue's record of job {answer[1]} cannot be read."
+            raise UnavailableError(problem, "Submit again under a new idempotency key.")
+        return known
 
     def restore(self, record: JobRecord) -> bool:
         if record.state not in TERMINAL_STATES:
             raise ValueError(f"Job {record.job_id} is {record.state}; only ended jobs are restored.")
         remaining_s = record.created_at_s + IDEMPOTENCY_S - time.time()
-        return bool(self._restore(*introduced(record), round(remaining_s * 1000), uuid.uuid4().hex))
+        return bool(self._run("restore", *introduced(record), round(remaining_s * 1000), uuid.uuid4().hex))
 
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
         deadline = time.monotonic() + timeout_s
         while True:
-            found, *answer = self._claim(owner)
+            found, *answer = self._run("claim", owner)
             if found:
                 record = self._usable(owner, *answer)
                 if record is not None:
@@ -168,7 +163,7 @@ class RedisQueue:
 
     def beat(self, claim: Claim, progress: JobProgress | None = None) -> Order:
         document = progress.model_dump_json() if progress else ""
-        return Order(self._beat(claim.job_id, claim.owner, claim.attempt, document))
+        return Order(self._run("beat", claim.job_id, claim.owner, claim.attempt, document))
 
     def finish(self, claim: Claim) -> bool:
         return self._settle(claim, JobState.DONE)
@@ -180,14 +175,14 @@ class RedisQueue:
         return self._settle(claim, JobState.CANCELLED)
 
     def release(self, claim: Claim, *, died: bool = False) -> bool:
-        return bool(self._release(claim.job_id, claim.owner, claim.attempt, "1" if died else ""))
+        return bool(self._run("release", claim.job_id, claim.owner, claim.attempt, "1" if died else ""))
 
     def cancel(self, job_id: str) -> JobRecord | None:
-        return record_of(job_id, table_of(self._cancel(job_id)))
+        return record_of(job_id, table_of(self._run("cancel", job_id)))
 
     def retry(self, job_id: str) -> JobRecord | None:
         record = self.get(job_id)
-        return record and record_of(job_id, table_of(self._retry(job_id, record.attempt)))
+        return record and record_of(job_id, table_of(self._run("retry", job_id, record.attempt)))
 
     def get(self, job_id: str) -> JobRecord | None:
         return self._get_all([job_id]).get(job_id)
@@ -233,7 +228,7 @@ class RedisQueue:
         record = self.get(job_id)
         terminal = json.dumps(dict.fromkeys(sorted(TERMINAL_STATES), True))
         idempotency_key = (record and record.idempotency_key) or ""
-        return bool(self._forget(job_id, terminal, idempotency_key, uuid.uuid4().hex))
+        return bool(self._run("forget", job_id, terminal, idempotency_key, uuid.uuid4().hex))
 
     def rewrite_log(self) -> bool:
         try:
@@ -244,7 +239,7 @@ class RedisQueue:
         return True
 
     def announce(self, address: WorkerAddress) -> None:
-        self._announce(address.name, address.model_dump_json(), round(WORKER_TTL_S * 1000))
+        self._run("announce", address.name, address.model_dump_json(), round(WORKER_TTL_S * 1000))
 
     def withdraw(self, name: str) -> None:
         with _reachable():
@@ -276,17 +271,13 @@ class RedisQueue:
     def close(self) -> None:
         self._client.close()
 
-    def _script(self, body: str, *, when_full: bool) -> Callable[..., Any]:
-        run: Any = self._client.register_script(scripts.script_text(body, when_full=when_full))
-
-        def call(*arguments: Any) -> Any:
-            with _reachable():
-                return run(keys=[PREFIX], args=[self._rules, *arguments])
-
-        return call
+    def _run(self, script: str, *arguments: object) -> Any:
+        """The answer of contract/queue/scripts/<script>.lua."""
+        with _reachable():
+            return self._scripts[script](keys=[PREFIX], args=[self._rules, *arguments])
 
     def _settle(self, claim: Claim, target: JobState, error: str = "") -> bool:
-        return bool(self._end(claim.job_id, claim.owner, claim.attempt, target.value, error))
+        return bool(self._run("settle", claim.job_id, claim.owner, claim.attempt, target.value, error))
 
     def _usable(self, owner: str, job_id: str, answer: Sequence[str]) -> JobRecord | None:
         """The claimed record; if it cannot be read the job fails, so that it is in nobody's way."""
