@@ -26,8 +26,8 @@ from contract.runtime.settings import Settings
 from contract.store.store import new_job_id
 from contract.wire.job import JobFiles, JobProgress, JobRecord, JobState
 from contract.wire.rendering import WorkerAddress
-from tests.test_house import project, requirement_name
 from tests.test_layers import imports_of
+from tests.test_repository import project, requirement_name
 
 DOCKER = Path(__file__).resolve().parent.parent / "docker"
 REPOSITORY = DOCKER.parent

@@ -13,7 +13,7 @@ from contract.queue.redis_queue import PREFIX
 from contract.runtime.settings import ENVIRONMENT_PREFIX, Settings, default_data_dir
 from contract.store.s3 import SEEN_FOR_S
 from contract.wire.job import Priority
-from tests.test_house import REPOSITORY
+from tests.test_repository import REPOSITORY
 from worker.daemon.supervisor import TIDY_PERIOD_S
 
 PAGE = (REPOSITORY / "docs" / "operations.md").read_text(encoding="utf-8")

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.test_house import REPOSITORY, project, requirement_name
+from tests.test_repository import REPOSITORY, project, requirement_name
 
 
 def without_parsing_addresses(folder: Path) -> dict[str, str]:

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 import client
-from tests.test_house import REPOSITORY, project, requirement_name
 from tests.test_layers import imports_of
+from tests.test_repository import REPOSITORY, project, requirement_name
 
 FOLDER = Path(client.__file__).parent
 BUILD = "import sys; from setuptools import build_meta; print(build_meta.build_wheel(sys.argv[1]))"

@@ -1,4 +1,4 @@
-"""The front door keeps its word: links lead somewhere, commands exist, versions agree, files stay readable."""
+"""The repository is consistent: links resolve, commands exist, versions agree, no file is too long."""
 
 from __future__ import annotations
 
@@ -30,9 +30,18 @@ def project() -> dict[str, Any]:
     return table
 
 
-def relative_links(page: Path) -> list[str]:
-    targets = LINK.findall(page.read_text(encoding="utf-8"))
-    return [unquote(each.split("#")[0]) for each in targets if not re.match(r"[a-z]+:|#", each)]
+def links(page: Path) -> list[tuple[Path, str]]:
+    """The files, with the #anchor or "", that a page's links within the repository lead to."""
+    targets = [each for each in LINK.findall(page.read_text(encoding="utf-8")) if not re.match(r"[a-z]+:", each)]
+    parts = [unquote(each).partition("#") for each in targets]
+    return [(page.parent / path if path else page, anchor) for path, _, anchor in parts]
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as code hosts make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", LINK.sub(lambda link: link[0][1 : link[0].index("](")], text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
 def requirement_name(requirement: str) -> str:
@@ -40,8 +49,10 @@ def requirement_name(requirement: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
-def test_links_between_pages_and_files_lead_somewhere(page: Path) -> None:
-    assert [each for each in relative_links(page) if not (page.parent / each).exists()] == []
+def test_links_between_pages_and_files_resolve(page: Path) -> None:
+    assert [str(path) for path, _ in links(page) if not path.exists()] == []
+    to_headings = [(path, anchor) for path, anchor in links(page) if anchor and path.suffix == ".md"]
+    assert [f"{path}#{anchor}" for path, anchor in to_headings if anchor not in anchors(path)] == []
 
 
 def names_in_the_tree() -> list[str]:
