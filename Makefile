@@ -81,8 +81,11 @@ $(DEV_STAMP): $(STAMP)
 demo: setup ## reconstruct a synthetic clip of tissue and render it without the instrument
 	@$(BIN)/python -m client.demo
 
+# the whole suite runs a file on each core, up to four at a time
+WHOLE_SUITE := -n auto --maxprocesses 4 --dist loadfile
+
 test: setup $(DEV_STAMP) ## the whole test suite; ARGS="tests/test_layers.py -k law" narrows it
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(BIN)/python -m pytest $(or $(ARGS),$(WHOLE_SUITE))
 
 check: setup $(DEV_STAMP) ## style, types, the import rules and the containers' rules
 	@$(BIN)/ruff check .
