@@ -32,7 +32,7 @@ from worker.machine.hooks import Hooks
 from worker.phantom import PhantomSettings, make_phantom
 from worker.pipeline import snapshot_of
 from worker.raster.cpu import compile_kernels
-from worker.scene.checkpoint import Scene
+from worker.scene.scene import Scene
 from worker.train.loop import Stopwatch, train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS

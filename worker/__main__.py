@@ -185,7 +185,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     from worker.daemon.orders import job_progress
     from worker.machine.hooks import Hooks
     from worker.pipeline import reconstruct
-    from worker.scene.checkpoint import RESUME_FILE
+    from worker.scene.resume_file import RESUME_FILE
     from worker.train.request import ReconstructionRequest
 
     out: Path = options.out

@@ -28,8 +28,10 @@ from worker.render.view import model_of
 from worker.report.baselines import copy_baselines
 from worker.report.quality import Training, build_report, measure
 from worker.report.visibility import drop_strays, seen_share
-from worker.scene.checkpoint import RESUME_FILE, Scene, save_scene
+from worker.scene.checkpoint import save_scene
 from worker.scene.compact import compile_coder
+from worker.scene.resume_file import RESUME_FILE
+from worker.scene.scene import Scene
 from worker.stereo import estimate_depth
 from worker.train.looking import View, held_out_psnr, sample_frames, view_function
 from worker.train.loop import Run, Stopwatch, train, write_curve

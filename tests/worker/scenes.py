@@ -9,7 +9,7 @@ from worker.input.camera import Intrinsics
 from worker.model.deformation import Deformation, FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
 from worker.model.deformation.fdm import Form
 from worker.model.gaussians import Gaussians
-from worker.scene.checkpoint import Scene
+from worker.scene.scene import Scene
 
 KINDS = ("fdm-gaussian", "fdm-quartic", "shared", "pfs", "hexplane")
 FRAMES = 6

@@ -18,7 +18,7 @@ import torch
 from contract.runtime.exits import ExitCode
 from contract.wire.names import PresetName
 from worker.__main__ import main
-from worker.scene.checkpoint import RESUME_FILE, load_resume
+from worker.scene.resume_file import RESUME_FILE, load_resume
 from worker.train.presets import PRESETS
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 10

@@ -27,7 +27,8 @@ from worker.pipeline import reconstruct, scene_of
 from worker.raster.step import camera_vector
 from worker.render.shrink import TOLERANCE_DB, model_of, shrink
 from worker.render.view import render_frame
-from worker.scene.checkpoint import RESUME_FILE, load_resume, load_scene
+from worker.scene.checkpoint import load_scene
+from worker.scene.resume_file import RESUME_FILE, load_resume
 from worker.train.presets import PRESETS
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units

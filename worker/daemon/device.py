@@ -39,8 +39,8 @@ from worker.machine.hooks import Hooks, Progress
 from worker.pipeline import reconstruct
 from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lost
 from worker.raster.cpu import compile_kernels
-from worker.scene.checkpoint import RESUME_FILE
 from worker.scene.compact import compile_coder
+from worker.scene.resume_file import RESUME_FILE
 from worker.train.request import ReconstructionRequest
 
 REPORT_PERIOD_S = 0.1

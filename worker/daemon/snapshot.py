@@ -11,7 +11,7 @@ import threading
 import time
 from dataclasses import dataclass
 
-from worker.scene.checkpoint import Scene
+from worker.scene.scene import Scene
 
 PERIOD_S = 1.0
 """Least time between two copies of one job's model."""

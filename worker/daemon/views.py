@@ -23,8 +23,9 @@ from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
 from worker.render.encode import encode_layer
 from worker.render.view import HARDLY_SEEN, ROUNDING, render_frame
-from worker.scene.checkpoint import Scene, load_scene
+from worker.scene.checkpoint import load_scene
 from worker.scene.export import EXPORTS
+from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS
 
 COPIES = 3

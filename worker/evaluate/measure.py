@@ -33,7 +33,8 @@ from worker.pipeline import reconstruct
 from worker.raster.backend import Device, choose_device
 from worker.raster.step import camera_vector
 from worker.render.view import model_of
-from worker.scene.checkpoint import Scene, load_scene
+from worker.scene.checkpoint import load_scene
+from worker.scene.scene import Scene
 from worker.train.looking import View
 from worker.train.presets import PRESETS
 from worker.train.request import ReconstructionRequest

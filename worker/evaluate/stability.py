@@ -45,7 +45,8 @@ from worker.phantom import PhantomSettings
 from worker.pipeline import reconstruct
 from worker.raster.step import camera_vector
 from worker.render.view import model_of
-from worker.scene.checkpoint import Scene, load_scene
+from worker.scene.checkpoint import load_scene
+from worker.scene.scene import Scene
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units, solid_depth_mm
 

@@ -37,7 +37,7 @@ from worker.model.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors
 from worker.phantom import Phantom
 from worker.raster.step import camera_vector
 from worker.render.view import model_of
-from worker.scene.checkpoint import Scene
+from worker.scene.scene import Scene
 from worker.train.looking import View, sample_frames
 from worker.train.targets import camera_in_units, solid_depth_mm
 

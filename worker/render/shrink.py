@@ -19,8 +19,9 @@ from worker.model.deformation import SharedBasis
 from worker.raster.backend import CPU, Device
 from worker.raster.model import Model
 from worker.render.view import model_of
-from worker.scene.checkpoint import Scene
-from worker.scene.compact import STATE, Compact, prepare, round_to
+from worker.scene.compact import STATE, Compact
+from worker.scene.quantize import prepare, round_to
+from worker.scene.scene import Scene
 from worker.train.targets import TrainingFrames
 
 TOLERANCE_DB = 0.1

@@ -18,7 +18,7 @@ from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device, make_model
 from worker.raster.model import Model
 from worker.raster.step import camera_vector
-from worker.scene.checkpoint import Scene
+from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
 
 POSE_FALL_OFF = 0.25

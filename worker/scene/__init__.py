@@ -1,4 +1,6 @@
-"""A trained model in, files out, and back: manifest and scene.safetensors, their compact form, exports.
+"""Keep a trained scene on disk, exact or compact, and give it to other programs.
 
-Verbs: checkpoint.save_scene, checkpoint.load_scene, export.
+In: a Scene (scene.py). Out: scene.safetensors and manifest.json, and the Scene again; the state of a stopped run.
+Verbs: checkpoint.save_scene, load_scene; resume_file.save_resume, load_resume; quantize.prepare, round_to;
+compact.unpack; EXPORTS of export/.
 """

@@ -23,7 +23,7 @@ from worker.model.optimize import rates_at
 from worker.raster.backend import CPU, Device
 from worker.raster.model import Model
 from worker.raster.step import StepSums
-from worker.scene.checkpoint import Scene
+from worker.scene.scene import Scene
 from worker.train.average import RunningMean
 from worker.train.densify import Densifier
 from worker.train.presets import Preset

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from contract.wire.errors import InputError, SceneError
-from worker.scene.checkpoint import RESUME_FILE, load_resume, save_resume
+from worker.scene.resume_file import RESUME_FILE, load_resume, save_resume
 from worker.train.loop import CurvePoint, Run
 from worker.train.schedule import Schedule
 

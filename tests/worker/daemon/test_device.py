@@ -25,7 +25,8 @@ from worker.daemon.device import request_of, run_or_start_anew
 from worker.daemon.faults import describe
 from worker.daemon.orders import Advanced, Failed, Finished, Run, Stop, Stopped
 from worker.machine.hooks import Hooks
-from worker.scene.checkpoint import RESUME_FILE, load_resume, load_scene
+from worker.scene.checkpoint import load_scene
+from worker.scene.resume_file import RESUME_FILE, load_resume
 from worker.train.request import ReconstructionRequest
 
 SPOOL = Path("spool")

@@ -15,8 +15,9 @@ from tests.worker.daemon.test_serve import ask, connected
 from tests.worker.scenes import random_scene
 from worker.daemon.serve import RequestServer
 from worker.daemon.views import Views
-from worker.scene.checkpoint import Scene, save_scene
+from worker.scene.checkpoint import save_scene
 from worker.scene.export import EXPORTS, ExportFormat
+from worker.scene.scene import Scene
 
 GAUSSIANS = 11
 

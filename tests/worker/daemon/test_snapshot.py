@@ -21,7 +21,8 @@ from worker.machine.hooks import Hooks, Progress
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf
 from worker.pipeline import reconstruct, snapshot_of
 from worker.render.view import render_frame
-from worker.scene.checkpoint import SCENE_FILE, Scene
+from worker.scene.checkpoint import SCENE_FILE
+from worker.scene.scene import Scene
 from worker.train.loop import Run, Stopwatch, train
 from worker.train.request import ReconstructionRequest
 

@@ -27,7 +27,8 @@ from worker.daemon.supervisor import run_supervisor
 from worker.machine.hooks import Hooks
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf
 from worker.pipeline import reconstruct
-from worker.scene.checkpoint import load_resume, load_scene
+from worker.scene.checkpoint import load_scene
+from worker.scene.resume_file import load_resume
 from worker.train.request import ReconstructionRequest
 
 LEASE_S = 6.0

@@ -21,7 +21,8 @@ from worker.daemon.views import COPIES, Views, camera_of, pose_of, shown_time
 from worker.input.camera import Intrinsics
 from worker.model.deformation import FlexibleDeformation
 from worker.model.gaussians import Gaussians
-from worker.scene.checkpoint import Scene, save_scene
+from worker.scene.checkpoint import save_scene
+from worker.scene.scene import Scene
 
 CLIP = Intrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
 FRAMES = 10

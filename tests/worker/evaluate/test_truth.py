@@ -16,7 +16,7 @@ from worker.model.deformation import SharedBasis
 from worker.model.gaussians import initial_gaussians
 from worker.model.metrics import BEST_PSNR_DB
 from worker.phantom import Phantom, PhantomSettings, make_phantom
-from worker.scene.checkpoint import Scene
+from worker.scene.scene import Scene
 from worker.train.looking import View
 from worker.train.targets import MEDIAN_DEPTH_UNITS
 

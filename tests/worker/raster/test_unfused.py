@@ -34,7 +34,7 @@ from worker.raster import reference
 from worker.raster.cpu.model import FusedModel
 from worker.raster.step import StepSums, TrainingFrame, camera_vector
 from worker.raster.unfused import UnfusedModel
-from worker.scene.checkpoint import load_resume, save_resume
+from worker.scene.resume_file import load_resume, save_resume
 
 LOSSES = pytest.mark.parametrize("loss", [PAPER, NORMALISED], ids=["paper", "normalised"])
 

@@ -19,7 +19,8 @@ from worker.model.metrics import psnr_tissue
 from worker.phantom import orbit_pose
 from worker.pipeline import scene_of
 from worker.render.view import FAR_POSE, endoscope_pose, render_frame
-from worker.scene.checkpoint import Scene, load_scene, save_scene
+from worker.scene.checkpoint import load_scene, save_scene
+from worker.scene.scene import Scene
 from worker.train.loop import Run
 from worker.train.presets import PRESETS
 

@@ -16,16 +16,8 @@ from safetensors.torch import load, save
 
 from contract.wire.errors import SceneError
 from tests.worker.scenes import KINDS, random_scene
-from worker.scene.checkpoint import (
-    MANIFEST_FILE,
-    RESUME_FILE,
-    RESUME_VERSION,
-    SCENE_FILE,
-    load_resume,
-    load_scene,
-    save_resume,
-    save_scene,
-)
+from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
+from worker.scene.resume_file import RESUME_FILE, RESUME_VERSION, load_resume, save_resume
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -113,6 +105,7 @@ def test_a_missing_file_is_named(tmp_path: Path, missing: str) -> None:
     ("change", "message"),
     [
         ({"version": 99}, "version 99"),
+        ({"version": 1}, "has format version 1; this program reads version 2. Reconstruct the clip again"),
         ({"format": "other"}, "not the manifest of a scene"),
         ({"deformation": "wavelets"}, "wavelets"),
         ({"deformation": "fdm-gaussian"}, "must share one shape"),
@@ -243,7 +236,7 @@ def test_a_training_state_comes_back_with_every_type(tmp_path: Path) -> None:
 
 def test_a_training_state_of_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as earlier:
-        earlier.setattr("worker.scene.checkpoint.RESUME_VERSION", RESUME_VERSION - 1)
+        earlier.setattr("worker.scene.resume_file.RESUME_VERSION", RESUME_VERSION - 1)
         save_resume(tmp_path, {"moment": torch.ones(4)}, {"iteration": 12})
     with pytest.raises(SceneError, match=rf"another version \({RESUME_VERSION - 1}; .* {RESUME_VERSION}\)"):
         load_resume(tmp_path)

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.conftest import REPOSITORY
-from worker.scene.rangecoder import DEAREST_BITS, LARGEST, ONE, PARTS, _adapt, _bound, decode, encode
+from worker.scene.rangecoder import MAX_BIT_COST, MAX_MAGNITUDE, ONE, PARTS, _bound, _update_probability, decode, encode
 
 GOLDEN_TABLE = [[0, 3, -1, 700, 0], [1, 2, 0, -650, 0], [0, -4, 0, 723, 0], [-1, 5, 0, 0, 1], [0, 3, 0, -9, 0]]
 GOLDEN_CODES = ("00666dc79cf1a99a00", "009fff8000", "00ffc5ad66a162abb6f63b3c1a00", "00137444e2")
@@ -32,11 +32,11 @@ def test_every_table_comes_back(count: int, rows: int, spread: float) -> None:
 
 
 def test_the_largest_numbers_come_back_and_larger_ones_are_refused() -> None:
-    table = np.array([[LARGEST, -LARGEST, 0, 1, -1]] * 40, np.int32)
+    table = np.array([[MAX_MAGNITUDE, -MAX_MAGNITUDE, 0, 1, -1]] * 40, np.int32)
     table[::3] = 0
     np.testing.assert_array_equal(decode(encode(table), *table.shape), table)
-    with pytest.raises(ValueError, match=str(LARGEST + 1)):
-        encode(np.array([[LARGEST + 1]], np.int32))
+    with pytest.raises(ValueError, match=str(MAX_MAGNITUDE + 1)):
+        encode(np.array([[MAX_MAGNITUDE + 1]], np.int32))
 
 
 def test_the_code_is_nearly_as_short_as_the_numbers_distribution_allows() -> None:
@@ -92,21 +92,21 @@ def test_files_of_today_are_read_tomorrow() -> None:
 
 @pytest.mark.parametrize("bit", [0, 1])
 @pytest.mark.parametrize("width", [1 << 24, (1 << 24) + 65535, (1 << 32) - 1])
-def test_no_bit_ever_costs_more_than_the_dearest(bit: int, width: int) -> None:
+def test_no_bit_costs_more_than_the_limit(bit: int, width: int) -> None:
     models = np.full((1, 2), ONE // 2, np.uint16)
     for _ in range(3000):
-        _adapt(models, 0, 1 - bit)
+        _update_probability(models, 0, 1 - bit)
     below = int(_bound(np.uint64(width), models, 0))
     left = width - below if bit else below
-    assert np.log2(width / left) < DEAREST_BITS
+    assert np.log2(width / left) < MAX_BIT_COST
 
 
-def test_numbers_that_are_never_as_expected_find_room() -> None:
-    """Long rests teach that there are only zeros; then each number comes at its dearest."""
+def test_the_buffer_holds_numbers_that_are_never_as_expected() -> None:
+    """Long rests teach that there are only zeros; then each number costs the most it can."""
     table = np.zeros((3000, 4), np.int32)
-    table[2999] = [LARGEST, -LARGEST, 5, 2]
+    table[2999] = [MAX_MAGNITUDE, -MAX_MAGNITUDE, 5, 2]
     np.testing.assert_array_equal(decode(encode(table), *table.shape), table)
-    lone = np.full((1, 400), LARGEST, np.int32)
+    lone = np.full((1, 400), MAX_MAGNITUDE, np.int32)
     np.testing.assert_array_equal(decode(encode(lone), *lone.shape), lone)
 
 

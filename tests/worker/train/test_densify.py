@@ -32,7 +32,7 @@ from worker.raster.cpu.model import FusedModel
 from worker.raster.model import Model
 from worker.raster.step import camera_vector
 from worker.raster.unfused import UnfusedModel
-from worker.scene.checkpoint import load_resume, save_resume
+from worker.scene.resume_file import load_resume, save_resume
 from worker.train.densify import Densifier, DensifyResult, DensifySettings
 
 NOTHING = DensifySettings(gradient_threshold=1e9)

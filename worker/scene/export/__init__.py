@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from worker.scene.checkpoint import Scene
 from worker.scene.export.ply import export_ply
+from worker.scene.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import math
 import numpy as np
 import torch
 
-from worker.scene.checkpoint import Scene
+from worker.scene.scene import Scene
 
 
 def export_ply(scene: Scene, t: float) -> bytes:
