@@ -178,7 +178,9 @@ def check_size(rows: int, columns: int) -> None:
         ValueError: it is.
     """
     if rows < 1 or rows * columns > MAX_NUMBERS:
-        raise ValueError(f"{rows} Gaussians of {columns} numbers: the compact form holds 1 to {MAX_NUMBERS} numbers")
+        raise ValueError(
+            f"{rows} Gaussians of {columns} numbers: a table has 1 Gaussian at least, and at most {MAX_NUMBERS} numbers"
+        )
 
 
 def _check_numbers(table: NDArray[np.int32], step: Floats) -> None:
