@@ -15,7 +15,7 @@ import zmq.asyncio
 from pydantic import ValidationError
 from zmq.utils.monitor import parse_monitor_message
 
-from contract.access.curve import service_keys, worker_keys
+from contract.access.render_keys import service_keys, worker_keys
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
 

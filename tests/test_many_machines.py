@@ -16,7 +16,6 @@ import httpx
 import pytest
 
 from contract.queue.embedded import EmbeddedServer
-from contract.runtime.processes import end_process
 from contract.runtime.settings import Settings
 
 pytest.importorskip("s3fs")
@@ -32,6 +31,16 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def end_process(process: subprocess.Popen[bytes], timeout_s: float) -> None:
+    """Ask the process to end, kill it after timeout_s, and wait for it."""
+    process.terminate()
+    try:
+        process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def eventually(happens: Callable[[], bool]) -> None:

@@ -28,7 +28,7 @@ from contract.wire.job import TENANT_PATTERN
 KEYS_FILE = "keys.json"
 KEY_PREFIX = "isp"
 SECRET_BYTES = 32
-LABEL_LENGTH = 60
+MAX_LABEL_CHARACTERS = 60
 LOCK_TIMEOUT_S = 5.0
 """Another process changes the keys for milliseconds only."""
 
@@ -59,7 +59,7 @@ class ApiKey(BaseModel):
     scopes: frozenset[KeyScope] = Field(min_length=1)
     secret_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     created_at_s: float
-    label: str | None = Field(default=None, max_length=LABEL_LENGTH)
+    label: str | None = Field(default=None, max_length=MAX_LABEL_CHARACTERS)
 
 
 class _Stored(BaseModel):

@@ -29,8 +29,8 @@ FIELDS = (
 )
 """What `extra` may carry into a line."""
 
-LONGEST_FIELD = 200
-FRAMES_SHOWN = 30
+MAX_FIELD_CHARACTERS = 200
+MAX_FRAMES = 30
 
 _request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 
@@ -111,7 +111,7 @@ def message_of(record: logging.LogRecord) -> str:
     if record.name == "py.warnings":
         return "a warning of Python's"
     lines = str(record.msg).strip().splitlines()
-    return f"{record.name}: {lines[0][:LONGEST_FIELD] if lines else ''}"
+    return f"{record.name}: {lines[0][:MAX_FIELD_CHARACTERS] if lines else ''}"
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, object]:
@@ -132,7 +132,7 @@ def frames_of(record: logging.LogRecord) -> list[str]:
     frames = _places(error.__traceback__)
     if error.__cause__ is not None:
         frames += [f"because of {type(error.__cause__).__name__}", *_places(error.__cause__.__traceback__)]
-    return frames[-FRAMES_SHOWN:]
+    return frames[-MAX_FRAMES:]
 
 
 def _places(traceback: TracebackType | None) -> list[str]:
@@ -160,4 +160,4 @@ def _time_of(record: logging.LogRecord) -> str:
 
 
 def _short(value: object) -> str:
-    return "".join(each if each.isprintable() and each != " " else "?" for each in str(value)[:LONGEST_FIELD])
+    return "".join(each if each.isprintable() and each != " " else "?" for each in str(value)[:MAX_FIELD_CHARACTERS])

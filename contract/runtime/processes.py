@@ -1,4 +1,4 @@
-"""How processes end: by signals, at another's request, or together with their parent."""
+"""How this process ends: by a signal, or together with its parent."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import ctypes
 import os
 import queue
 import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -25,8 +24,8 @@ def told_to_end() -> threading.Event:
         signals.get()
         end.set()
 
-    # A handler interrupts the main thread anywhere, also where that holds the lock that end.set() takes: it would wait
-    # for itself. Only a SimpleQueue may be written to all the same.
+    # A handler interrupts the main thread anywhere, also while that holds the lock that end.set() needs, and would wait
+    # for itself. SimpleQueue.put() is safe there.
     threading.Thread(target=wait, name="signals", daemon=True).start()
     for number in _ENDING:
         signal.signal(number, lambda *_: signals.put(None))
@@ -42,16 +41,6 @@ def heeding_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def end_process(process: subprocess.Popen[bytes], timeout_s: float) -> None:
-    """Ask the process to end, insist after timeout_s, and wait for it."""
-    process.terminate()
-    try:
-        process.wait(timeout_s)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 def die_with_parent() -> None:

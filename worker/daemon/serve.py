@@ -19,7 +19,7 @@ import zmq
 from pydantic import ValidationError
 from zmq.auth.thread import ThreadAuthenticator
 
-from contract.access.curve import service_keys, worker_keys
+from contract.access.render_keys import service_keys, worker_keys
 from contract.wire.errors import InputError, IntrasplatError, SceneError, UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, ReplyError, WorkerReply, WorkerRequest
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from contract.access.curve import CurveKeys, service_keys, worker_keys
+from contract.access.render_keys import RenderKeys, service_keys, worker_keys
 from contract.queue.embedded import short_socket_path
 from contract.wire.errors import InputError, SceneError, UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
@@ -35,7 +35,7 @@ def answer(request: RenderRequest | ExportRequest) -> Reply:
 
 
 @contextmanager
-def connected(endpoint: str, keys: CurveKeys | None = None, server: bytes = b"") -> Iterator[zmq.Socket[bytes]]:
+def connected(endpoint: str, keys: RenderKeys | None = None, server: bytes = b"") -> Iterator[zmq.Socket[bytes]]:
     """A DEALER to the endpoint, with CURVE if there are keys."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     socket = context.socket(zmq.DEALER)
@@ -159,7 +159,7 @@ def test_over_tcp_the_services_of_the_same_secret_are_answered(tcp_endpoint: str
         (service_keys(SECRET), worker_keys("another secret of 32 characters.").public),
     ],
 )
-def test_over_tcp_nobody_else_is(tcp_endpoint: str, keys: CurveKeys | None, server: bytes) -> None:
+def test_over_tcp_nobody_else_is(tcp_endpoint: str, keys: RenderKeys | None, server: bytes) -> None:
     asked: list[RenderRequest | ExportRequest] = []
 
     def note(request: RenderRequest | ExportRequest) -> Reply:
