@@ -18,7 +18,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from client.keys import add_keys
-from client.remote import add_remote, in_commands
+from client.remote import add_remote
 from contract.runtime.arguments import Commands, add_command, count
 from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
 from contract.runtime.settings import Settings, default_data_dir
@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return command(options)
     except IntrasplatError as error:
-        print(f"intrasplat: {in_commands(str(error))}", file=sys.stderr)
+        print(f"intrasplat: {error}", file=sys.stderr)
         return exit_code_of(error)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED

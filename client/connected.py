@@ -1,18 +1,37 @@
-"""A client for the commands: its errors become those of contract/wire/errors.py, which have exit codes."""
+"""A client for the commands: its errors become those of contract/wire/errors.py, and its remedies name commands.
+
+The service's remedies name routes. Which command helps instead follows from the error's type and from the command that
+was refused, never from the words of the service.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from http import HTTPStatus
+from types import MappingProxyType
+from typing import TypeAlias
 
 import intrasplat_client
 from contract.wire.errors import Cancelled, InputError, IntrasplatError, UnavailableError
 from intrasplat_client import Client
 
+KEY_VARIABLE = "INTRASPLAT_API_KEY"
+
+Remedies: TypeAlias = Mapping[type[intrasplat_client.IntrasplatError], str]
+
+REMEDIES: Remedies = MappingProxyType(
+    {
+        intrasplat_client.Unauthorized: f"Give one as --api-key or {KEY_VARIABLE}.",
+        intrasplat_client.NotFound: "`intrasplat jobs` lists what there is.",
+    }
+)
+"""Of every command; a command may have its own."""
+
 
 @contextmanager
-def connected(url: str, api_key: str | None = None) -> Iterator[Client]:
-    """A client of the service at `url`.
+def connected(url: str, api_key: str | None = None, remedies: Remedies | None = None) -> Iterator[Client]:
+    """A client of the service at `url`. remedies: what to say instead of the service's remedy, by the error's type.
 
     Raises:
         InputError, UnavailableError, Cancelled, IntrasplatError: in place of the client's errors.
@@ -21,14 +40,20 @@ def connected(url: str, api_key: str | None = None) -> Iterator[Client]:
         with Client(url, api_key=api_key) as client:
             yield client
     except intrasplat_client.IntrasplatError as error:
-        raise command_error(error) from error
+        raise command_error(error, {**REMEDIES, **(remedies or {})}) from error
 
 
-def command_error(error: intrasplat_client.IntrasplatError) -> IntrasplatError:
+def command_error(error: intrasplat_client.IntrasplatError, remedies: Remedies = REMEDIES) -> IntrasplatError:
     """The error of the command line that means the same."""
     match error:
+        case intrasplat_client.RequestRefused(status=HTTPStatus.INSUFFICIENT_STORAGE):
+            return InputError(
+                error.field, error.problem, "Delete scenes (`intrasplat delete JOB`) or give it more room."
+            )
         case intrasplat_client.InputError():
-            return InputError(error.field, error.problem, error.remedy)
+            return InputError(error.field, error.problem, remedies.get(type(error), error.remedy))
+        case intrasplat_client.ServiceUnavailable(job_id=str(job_id)):
+            return UnavailableError(error.problem, f"Send nothing again; `intrasplat watch {job_id}` shows it later.")
         case intrasplat_client.ServiceUnavailable():
             return UnavailableError(error.problem, error.remedy)
         case intrasplat_client.JobCancelled():

@@ -5,48 +5,27 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import sys
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import get_args
 
-from client.connected import connected
-from contract.runtime.arguments import Commands, add_command, finite, positive
+from client.connected import KEY_VARIABLE, Remedies, connected
+from contract.runtime.arguments import Commands, add_command, count, finite, positive
 from contract.runtime.exits import ExitCode
 from contract.runtime.progress_bar import ProgressBar
 from contract.wire.errors import InputError
 from contract.wire.job import JobProgress, Priority
 from contract.wire.names import Layout, MaskPolarity, PoseConvention, PresetName
-from intrasplat_client import Client, JobState, JobView
+from intrasplat_client import Client, Conflict, JobState, JobView
 from intrasplat_client.connection import DEFAULT_URL
 
 URL_VARIABLE = "INTRASPLAT_URL"
-KEY_VARIABLE = "INTRASPLAT_API_KEY"
 
 OPTIONS = (
     *("mask_polarity", "layout", "pose_convention", "holdout", "preset", "budget_s", "iterations", "seed"),
     *("priority", "retention_hours"),
 )
-
-COMMANDS_OF_ROUTES = (
-    (r"GET /(?:jobs|scenes) lists", "`intrasplat jobs` lists"),
-    (r"GET /jobs/(\w+)", r"`intrasplat watch \1`"),
-    (r"DELETE /jobs/(\w+)", r"`intrasplat cancel \1`"),
-    (r"DELETE /scenes/(\w+)", r"`intrasplat delete \1`"),
-    (r"DELETE /scenes/\{id\}", "`intrasplat delete JOB`"),
-    (r"POST /jobs/(\w+)/retry", r"`intrasplat retry \1`"),
-    (r"POST /reconstruct", "`intrasplat submit`"),
-    (r"Send `Authorization: Bearer KEY`", f"Give it as --api-key or {KEY_VARIABLE}"),
-    (r"The API is described at /openapi\.json\.", "See --help."),
-)
-
-
-def in_commands(text: str) -> str:
-    """What the service says, with commands where it names routes."""
-    for route, command in COMMANDS_OF_ROUTES:
-        text = re.sub(route, command, text)
-    return text
 
 
 def add_remote(commands: Commands) -> None:
@@ -56,7 +35,7 @@ def add_remote(commands: Commands) -> None:
     _add_fetch(commands)
     jobs = add_command(commands, "jobs", "list the newest jobs, newest first", _jobs)
     jobs.add_argument("--state", choices=[state.value for state in JobState], help="of one state only")
-    jobs.add_argument("--limit", type=int, metavar="N", help="at most so many (default: 200)")
+    jobs.add_argument("--limit", type=count, metavar="N", help="at most so many (default: 200)")
     cancel = add_command(commands, "cancel", "stop a job and remove its clip", _cancel)
     retry = add_command(commands, "retry", "queue a failed job again", _retry)
     delete = add_command(commands, "delete", "remove clip, scene and record of a job that has ended", _delete)
@@ -125,8 +104,10 @@ def _add_service(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _client(options: argparse.Namespace) -> AbstractContextManager[Client]:
-    return connected(options.url, options.api_key)
+def _client(options: argparse.Namespace, if_conflict: str | None = None) -> AbstractContextManager[Client]:
+    """A client of the chosen service; if_conflict: what to say where the job is not in a state for the command."""
+    remedies: Remedies = {} if if_conflict is None else {Conflict: if_conflict}
+    return connected(options.url, options.api_key, remedies)
 
 
 def _submit(options: argparse.Namespace) -> int:
@@ -178,7 +159,7 @@ def progress_of(job: JobView) -> JobProgress:
 
 
 def _fetch(options: argparse.Namespace) -> int:
-    with _client(options) as client:
+    with _client(options, f"See `intrasplat watch {options.job}`.") as client:
         files: dict[str, bytes] = {
             "report.json": client.report(options.job).model_dump_json(indent=1).encode(),
             "curve.csv": client.curve(options.job).encode(),
@@ -214,19 +195,20 @@ def _detail_of(job: JobView) -> str:
 
 
 def _cancel(options: argparse.Namespace) -> int:
-    with _client(options) as client:
+    with _client(options, f"`intrasplat delete {options.job}` removes what is left of it.") as client:
         job = client.cancel(options.job)
     print("cancelled" if job.state is JobState.CANCELLED else "it stops as soon as its worker hears of it")
     return ExitCode.OK
 
 
 def _retry(options: argparse.Namespace) -> int:
-    with _client(options) as client:
+    remedy = f"See `intrasplat watch {options.job}`; if its clip is gone, send it again with `intrasplat submit`."
+    with _client(options, remedy) as client:
         print(client.retry(options.job).state.value)
     return ExitCode.OK
 
 
 def _delete(options: argparse.Namespace) -> int:
-    with _client(options) as client:
+    with _client(options, f"Cancel it first: `intrasplat cancel {options.job}`.") as client:
         print(json.dumps(client.delete(options.job), indent=1))
     return ExitCode.OK

@@ -13,11 +13,15 @@ import pytest
 
 import client as client_package
 from client.cli import main
-from client.remote import in_commands, progress_of
+from client.connected import command_error
+from client.remote import progress_of
 from contract.access.keys import KeyFile, KeyScope
-from contract.runtime.exits import ExitCode
+from contract.runtime.exits import ExitCode, exit_code_of
+from contract.wire.errors import IntrasplatError
 from contract.wire.job import JobError
+from contract.wire.names import SUBMISSION
 from intrasplat_client import Client, JobState
+from intrasplat_client.errors import error_of_document
 from tests.client.local_service import LocalService, local_service
 
 
@@ -129,10 +133,36 @@ def test_a_job_in_the_wrong_state_leads_to_the_command_that_helps(
     assert f"intrasplat delete {job_id}" in capsys.readouterr().err
 
 
-def test_routes_are_told_as_commands_and_other_words_stay() -> None:
-    assert in_commands("Send it again: POST /reconstruct.") == "Send it again: `intrasplat submit`."
-    assert in_commands("See GET /jobs/abc.") == "See `intrasplat watch abc`."
-    assert in_commands("Send both eyes.") == "Send both eyes."
+def test_a_job_whose_clip_is_gone_leads_to_submit(
+    service: LocalService, clip: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    job_id = submitted(service, clip, capsys)
+    service.fail(JobError(problem="it diverged."))
+    (service.store.spool_folder(job_id) / SUBMISSION).unlink()
+    assert run_in(service, "retry", job_id) == ExitCode.BAD_INPUT
+    assert "`intrasplat submit`" in capsys.readouterr().err
+
+
+def refusal(status: int, **extensions: str) -> IntrasplatError:
+    document = {"status": status, "detail": "It rains.", "field": "sky", "remedy": "GET /umbrella.", **extensions}
+    return command_error(error_of_document(document))
+
+
+def test_remedies_name_commands_where_one_helps_and_are_the_services_elsewhere() -> None:
+    assert "`intrasplat watch abc`" in str(refusal(503, job_id="abc"))
+    assert "`intrasplat delete JOB`" in str(refusal(507))
+    assert "--api-key" in str(refusal(401))
+    assert "`intrasplat jobs`" in str(refusal(404))
+    for status in (403, 409, 422, 429, 500, 503):
+        assert str(refusal(status)).endswith("It rains. GET /umbrella.")
+
+
+@pytest.mark.parametrize(
+    ("status", "code"),
+    [(404, ExitCode.BAD_INPUT), (422, ExitCode.BAD_INPUT), (503, ExitCode.UNAVAILABLE), (500, ExitCode.FAILED)],
+)
+def test_an_answer_decides_the_exit_code(status: int, code: ExitCode) -> None:
+    assert exit_code_of(refusal(status)) == code
 
 
 @pytest.mark.parametrize(
