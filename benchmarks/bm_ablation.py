@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from bm_train import append, commit, machine
 
+from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, open_clip, split_frames
 from worker.machine.hooks import Hooks
 from worker.model.metrics import psnr_tissue
@@ -27,7 +28,6 @@ from worker.train.looking import held_out_psnr, sample_frames, view_function
 from worker.train.loop import Stopwatch, train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS, Preset
-from worker.train.request import ReconstructionRequest
 
 FIELDS = (
     "change", "clip", "holdout", "iterations", "seed", "start_db", "psnr_tissue_db", "train_db", "gaussians", "bases",
@@ -101,9 +101,9 @@ def measure(
 ) -> dict[str, object]:
     """Train and score one cell; its row."""
     split = split_frames(clip, holdout)
-    request = ReconstructionRequest(Path(clip_name), iterations=iterations, seed=seed)
+    options = ReconstructionOptions(iterations=iterations, seed=seed)
     clock = Stopwatch()
-    run, scale = prepare(clip, split, CHANGES[change], request, clock)
+    run, scale = prepare(clip, split, CHANGES[change], options, clock)
     view_of = view_function(run, scale)
     start = held_out_psnr(clip, split, view_of)
     train(run, clock, lambda: held_out_psnr(clip, split, view_of), Hooks())

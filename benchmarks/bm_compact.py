@@ -16,6 +16,7 @@ from pathlib import Path
 
 from bm_train import append
 
+from contract.wire.options import ReconstructionOptions
 from worker.evaluate.rows import commit, machine
 from worker.input.clip import DepthClip, open_clip, split_frames
 from worker.machine.hooks import Hooks
@@ -26,7 +27,6 @@ from worker.train.looking import held_out_psnr, view_function
 from worker.train.loop import Stopwatch, train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
-from worker.train.request import ReconstructionRequest
 
 FIELDS = (
     "clip", "iterations", "gaussians", "bases", "held_out_db", "tolerance_db", "step", "train_loss_db",
@@ -55,7 +55,7 @@ def rows_of(path: Path, iterations: int, tolerances_db: list[float]) -> list[dic
     if not isinstance(clip, DepthClip):
         raise SystemExit(f"{path} has no depth; give a folder in the EndoNeRF layout.")
     split = split_frames(clip)
-    run, scale = prepare(clip, split, PRESETS["fast"], ReconstructionRequest(path, iterations=iterations), Stopwatch())
+    run, scale = prepare(clip, split, PRESETS["fast"], ReconstructionOptions(iterations=iterations), Stopwatch())
     train(run, Stopwatch(), lambda: float("nan"), Hooks())
     scene = scene_of(run, clip, split, scale, 0)
     exact_db = held_out_psnr(clip, split, view_function(run, scale))

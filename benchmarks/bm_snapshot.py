@@ -22,6 +22,7 @@ from pathlib import Path
 from statistics import median
 
 from contract.store.store import Store
+from contract.wire.options import ReconstructionOptions
 from contract.wire.rendering import ImageFormat, RenderRequest
 from worker.daemon.pace import Pace
 from worker.daemon.serve import NotYetError
@@ -36,7 +37,6 @@ from worker.scene.scene import Scene
 from worker.train.loop import Stopwatch, train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
-from worker.train.request import ReconstructionRequest
 
 CLIP = PhantomSettings(width=640, height=512, frames=24)
 JOB = "0" * 32
@@ -94,8 +94,8 @@ def line_of(name: str, runs: list[Figures]) -> str:
 def trained(clip: DepthClip, iterations: int, pace: Pace | None) -> Figures:
     """One training run, with a viewer if there is a pace for one."""
     split = split_frames(clip)
-    request = ReconstructionRequest(clip=Path("unused"), iterations=iterations)
-    run, scale = prepare(clip, split, PRESETS["fast"], request, Stopwatch())
+    options = ReconstructionOptions(iterations=iterations)
+    run, scale = prepare(clip, split, PRESETS["fast"], options, Stopwatch())
     snapshots, figures, end = Snapshots(), Figures(gaussians=run.model.count), threading.Event()
     snapshots.begin(JOB)
 

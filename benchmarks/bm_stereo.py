@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.wire.options import ClipOptions
 from worker.evaluate.rows import commit
 from worker.input.calibration import RectifiedClip, load_calibration, rectify
 from worker.input.clip import DepthClip, StereoClip, open_clip
@@ -80,7 +81,7 @@ def _print_truth(matched: Callable[[RectifiedClip], DepthClip]) -> None:
 
 
 def _rectified(video: Path, calibration: Path, masks: Path | None) -> RectifiedClip:
-    clip = open_clip(video, layout="sbs", masks=masks, mask_polarity="tool" if masks else "auto")
+    clip = open_clip(video, masks=masks, options=ClipOptions(layout="sbs", mask_polarity="tool" if masks else "auto"))
     assert isinstance(clip, StereoClip)
     return rectify(clip, load_calibration(calibration, eye_width=clip.width, eye_height=clip.height))
 

@@ -14,7 +14,8 @@ from typing import Any
 
 from pydantic.json_schema import models_json_schema
 
-from contract.wire.job import TERMINAL_STATES, JobOptions, JobView
+from contract.wire.job import TERMINAL_STATES, JobView
+from contract.wire.options import JobOptions
 from contract.wire.report import Report
 
 MODELS = Path(__file__).resolve().parent / "intrasplat_client" / "models.py"
@@ -22,7 +23,7 @@ READ = (JobView, Report)
 """What the service answers with; types that these contain follow."""
 GIVEN_ALSO = {"holdout": "list[int]"}
 """Forms that the service accepts besides the schema's."""
-EXCLUSIVE_OPTIONS = (("iterations", "budget_s"),)
+EXCLUSIVE_OPTIONS = (JobOptions.exclusive,)
 COLUMNS = 116
 
 HEAD = '''\

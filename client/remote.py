@@ -8,24 +8,18 @@ import os
 import sys
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import get_args
 
 from client.connected import KEY_VARIABLE, Remedies, connected
-from contract.runtime.arguments import Commands, add_command, count, finite, positive
+from contract.runtime.arguments import Commands, add_command, add_options, count, finite, given_options
 from contract.runtime.exits import ExitCode
 from contract.runtime.progress_bar import ProgressBar
 from contract.wire.errors import InputError
-from contract.wire.job import JobProgress, Priority
-from contract.wire.names import Layout, MaskPolarity, PoseConvention, PresetName
+from contract.wire.job import JobProgress
+from contract.wire.options import JobOptions
 from intrasplat_client import Client, Conflict, JobState, JobView
 from intrasplat_client.connection import DEFAULT_URL
 
 URL_VARIABLE = "INTRASPLAT_URL"
-
-OPTIONS = (
-    *("mask_polarity", "layout", "pose_convention", "holdout", "preset", "budget_s", "iterations", "seed"),
-    *("priority", "retention_hours"),
-)
 
 
 def add_remote(commands: Commands) -> None:
@@ -53,25 +47,7 @@ def _add_submit(commands: Commands) -> None:
     )
     parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini")
     parser.add_argument("--masks", type=Path, metavar="F", help="zip of PNGs or a video that shows the instruments")
-    parser.add_argument("--mask-polarity", choices=get_args(MaskPolarity), help="what is bright in the masks")
-    parser.add_argument("--layout", choices=get_args(Layout), help="how the eyes are laid out")
-    parser.add_argument("--pose-convention", choices=get_args(PoseConvention), help="axes of poses_bounds.npy")
-    parser.add_argument(
-        "--holdout", metavar="every8|blocks8|none|LIST", help="frames kept from training, to measure on"
-    )
-    parser.add_argument(
-        "--preset",
-        choices=get_args(PresetName),
-        help="ours: instant, fast (default), quality, small; paper: as published",
-    )
-    limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--budget-s", type=positive, metavar="S", help="about how many seconds to train, often less")
-    limit.add_argument("--iterations", type=int, metavar="N", help="steps of training")
-    parser.add_argument("--seed", type=int, metavar="N", help="of the random numbers (default: 0)")
-    parser.add_argument("--priority", choices=get_args(Priority), help="high: before, and in place of, standard jobs")
-    parser.add_argument(
-        "--retention-hours", type=positive, metavar="H", help="purge clip and scene so many hours after the job's end"
-    )
+    add_options(parser, JobOptions)
     parser.add_argument("--idempotency-key", metavar="TEXT", help="the same key with the same clip is the same job")
     parser.add_argument("--watch", action="store_true", help="wait for the scene, with a progress bar")
     _add_service(parser)
@@ -111,7 +87,7 @@ def _client(options: argparse.Namespace, if_conflict: str | None = None) -> Abst
 
 
 def _submit(options: argparse.Namespace) -> int:
-    chosen = {name: getattr(options, name) for name in OPTIONS if getattr(options, name) is not None}
+    chosen = given_options(options, JobOptions).model_dump(exclude_unset=True)
     with _client(options) as client:
         with ProgressBar(sys.stderr) as bar:
             job = client.reconstruct(

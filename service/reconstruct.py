@@ -23,7 +23,8 @@ from contract.intake.sniff import check_file
 from contract.queue.promise import Admission, QueueFullError
 from contract.store.store import new_job_id
 from contract.wire.errors import InputError, LimitError, UnavailableError
-from contract.wire.job import JOB_ID_PATTERN, JobOptions, JobRecord, JobView, Standing, parse_options
+from contract.wire.job import JOB_ID_PATTERN, JobRecord, JobView, Standing
+from contract.wire.options import JobOptions, parse_options
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
 from service.intake import declared_length
@@ -156,7 +157,7 @@ async def _read_submission(request: Request, services: Deps) -> Submission:
 
 def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key: str | None) -> JobRecord:
     """Finished uploads become a job; once they have, asking again yields that job."""
-    options = parse_options(submission.options)
+    options = parse_options(JobOptions, submission.options)
     given = submission.uploads()
     partials = {part: _finished(services, caller, part, upload_id) for part, upload_id in given.items()}
     job_ids = {partial.declaration.job_id for partial in partials.values()}
@@ -242,7 +243,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         job_id=job_id,
         tenant=caller.tenant,
         files=received.files(),
-        options=parse_options(received.options),
+        options=parse_options(JobOptions, received.options),
         input_bytes=received.total_bytes,
         input_sha256=received.sha256(),
         idempotency_key=key,

@@ -12,7 +12,7 @@ from contract.queue.promise import LEASE_S, MAX_ATTEMPTS
 from contract.queue.redis_queue import PREFIX
 from contract.runtime.settings import ENVIRONMENT_PREFIX, Settings, default_data_dir
 from contract.store.s3 import SEEN_FOR_S
-from contract.wire.job import Priority
+from contract.wire.options import Priority
 from tests.test_repository import REPOSITORY
 from worker.daemon.supervisor import TIDY_PERIOD_S
 

@@ -8,7 +8,6 @@ without torch.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import signal
 import sys
@@ -20,14 +19,15 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from contract.runtime.arguments import Commands, add_command, finite, positive
+from contract.runtime.arguments import Commands, add_command, add_options, finite, given_options
 from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, end_by
 from contract.runtime.logs import configure
 from contract.runtime.processes import told_to_end
 from contract.runtime.progress_bar import ProgressBar
 from contract.runtime.settings import Settings
 from contract.wire.errors import Cancelled, InputError, IntrasplatError, UnavailableError
-from contract.wire.names import MANIFEST, REPORT, DeviceName, Layout, MaskPolarity, PoseConvention, PresetName
+from contract.wire.names import MANIFEST, REPORT, DeviceName
+from contract.wire.options import ReconstructionOptions
 from contract.wire.rendering import ImageFormat, IntrinsicsOverride, Layer
 
 SUFFIX_FORMATS = {
@@ -79,39 +79,10 @@ def _add_reconstruct(commands: Commands) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="SCENE", help="folder for the scene: new, empty, or of a stopped run"
     )
-    parser.add_argument(
-        "--layout", choices=get_args(Layout), default="auto", help="how the eyes are laid out (default: guess)"
-    )
     parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini; for stereo")
     parser.add_argument("--masks", type=Path, metavar="F", help="zip or folder of PNGs, or a video: the instruments")
-    parser.add_argument(
-        "--mask-polarity", choices=get_args(MaskPolarity), default="auto", help="what is bright in the masks"
-    )
-    parser.add_argument(
-        "--pose-convention", choices=get_args(PoseConvention), default="opengl", help="axes of poses_bounds.npy"
-    )
-    parser.add_argument(
-        "--holdout",
-        default="every8",
-        metavar="every8|blocks8|none|LIST",
-        help="frames kept from training to measure quality on (default: every8); LIST such as 1,9,17",
-    )
-    parser.add_argument(
-        "--preset",
-        choices=get_args(PresetName),
-        default="fast",
-        help="ours: instant, fast (default), quality, small; paper: as published",
-    )
-    limit = parser.add_mutually_exclusive_group()
-    limit.add_argument(
-        "--budget-s",
-        type=positive,
-        metavar="S",
-        help="about how many seconds to train, often less (default: the preset's)",
-    )
-    limit.add_argument("--iterations", type=int, metavar="N", help="steps of training; the same N gives the same bits")
+    add_options(parser, ReconstructionOptions)
     _add_device(parser, "auto")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
 
 
 def _add_render(commands: Commands) -> None:
@@ -192,8 +163,14 @@ def _reconstruct(options: argparse.Namespace) -> int:
     if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= {RESUME_FILE}):
         problem = f"{out} is there already and is neither an empty folder nor that of a stopped run."
         raise InputError("--out", problem, "Name a new folder.")
-    fields = [field.name for field in dataclasses.fields(ReconstructionRequest)]
-    chosen = {name: getattr(options, name) for name in fields if hasattr(options, name)}
+    request = ReconstructionRequest(
+        clip=options.clip,
+        right=options.right,
+        calibration=options.calibration,
+        masks=options.masks,
+        options=given_options(options, ReconstructionOptions),
+        device=options.device,
+    )
     interrupted = threading.Event()
     is_new = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
@@ -201,7 +178,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     try:
         with ProgressBar(sys.stderr) as bar:
             hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
-            reconstruct(ReconstructionRequest(**chosen), out, hooks)
+            reconstruct(request, out, hooks)
     except Cancelled as error:
         again = " The same command goes on from there." if (out / RESUME_FILE).exists() else ""
         raise Cancelled(f"{error}{again}") from error

@@ -36,8 +36,8 @@ from worker.stereo import estimate_depth
 from worker.train.looking import View, held_out_psnr, sample_frames, view_function
 from worker.train.loop import Run, Stopwatch, train, write_curve
 from worker.train.prepare import Seconds, fixed_iterations, prepare, report_stage, timed
-from worker.train.presets import Preset, preset_named
-from worker.train.request import ReconstructionRequest, check_options
+from worker.train.presets import preset_named
+from worker.train.request import ReconstructionRequest
 from worker.train.resume import resume, save_run
 
 VERSIONED = ("intrasplat", "torch", "numba")
@@ -56,20 +56,19 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
         Cancelled: hooks.should_stop said so.
     """
     accepted_at_s = request.accepted_at_s or time.time()
-    named = request.preset
-    preset = named if isinstance(named, Preset) else preset_named(named, request.budget_s)
-    check_options(request)
+    options = request.options
+    preset = request.own_preset or preset_named(options.preset, options.budget_s)
     device = device_for(preset.deformation, request.device)
     out_dir.mkdir(parents=True, exist_ok=True)
     seconds: Seconds = {}
 
     clip = depth_clip_of(request, hooks, seconds, device)
-    split = split_frames(clip, request.holdout)
+    split = split_frames(clip, options.holdout)
     seconds["compile_s"] = seconds.get("compile_s", 0.0) + compile_coder()
     if device == CPU:
         seconds["compile_s"] += compile_kernels(partial(report_stage, hooks, "compile"))
     clock = Stopwatch()
-    run, scale = prepare(clip, split, preset, request, clock, hooks, seconds, device)
+    run, scale = prepare(clip, split, preset, options, clock, hooks, seconds, device)
     resumed_s = resume(out_dir, run)
     clock = Stopwatch(resumed_s) if resumed_s is not None else clock
     try:
@@ -97,11 +96,9 @@ def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: Seconds
         lambda: decode_clip(
             path,
             request.right,
-            layout=request.layout,
             calibration=request.calibration,
             masks=request.masks,
-            mask_polarity=request.mask_polarity,
-            pose_convention=request.pose_convention,
+            options=request.options,
             limits=request.limits,
             hooks=hooks,
         ),
@@ -110,7 +107,7 @@ def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: Seconds
         return decoded
     rectified = rectify(decoded.clip, decoded.calibration)
     frame_count = decoded.clip.frame_count
-    held_out = set(held_out_frames(frame_count, request.holdout))
+    held_out = set(held_out_frames(frame_count, request.options.holdout))
     measured = [i for i in range(frame_count) if i not in held_out]
     if device != CPU:  # before it matches anything
         report_stage(hooks, "compile", 0.0)
@@ -239,7 +236,7 @@ def training_of(
 def training_warnings(run: Run, request: ReconstructionRequest) -> tuple[str, ...]:
     """What the run itself has to say."""
     said = []
-    if fixed_iterations(request, run.preset) is None and run.schedule.planned == run.schedule.epoch:
+    if fixed_iterations(request.options, run.preset) is None and run.schedule.planned == run.schedule.epoch:
         said.append("The time given allowed less than one step a training frame; one a frame was made all the same.")
     if run.device != choose_device(request.device):
         said.append(f"The motion of preset {run.preset.name} trains on the CPU only, so the GPU was left idle.")

@@ -34,20 +34,24 @@ class JobError(Model):
 
 
 class JobOptions(Model):
-    """What the caller may choose about a reconstruction; the `options` field of POST /reconstruct."""
+    """How a service reconstructs a clip; the `options` field of POST /reconstruct."""
 
-    preset: str = "fast"
-    budget_s: float | None = None
-    """about how many seconds to train, often less; not with iterations"""
-    iterations: int | None = None
-    """fixed schedule; not with budget_s"""
-    mask_polarity: str = "auto"
     layout: str = "auto"
+    """how the clip's eyes, depths and masks are laid out"""
+    mask_polarity: str = "auto"
+    """what is bright in the masks"""
     pose_convention: str = "opengl"
     """axes of poses_bounds.npy"""
     holdout: str = "every8"
-    """every8, blocks8, none, or frame numbers such as 1,9,17"""
+    """frames to measure quality on, never to train on: every8, blocks8, none, or frame numbers such as 1,9,17"""
+    preset: str = "fast"
+    """instant, fast, quality and small are ours; paper is the method as published"""
+    iterations: int | None = None
+    """exactly how many steps to train; not with budget_s"""
+    budget_s: float | None = None
+    """about how many seconds to train, often less; not with iterations"""
     seed: int = 0
+    """of all random numbers"""
     priority: str = "standard"
     """high: before, and in place of, standard jobs"""
     retention_hours: float | None = None
@@ -159,6 +163,14 @@ EXCLUSIVE_OPTIONS = (("iterations", "budget_s"),)
 class GivenOptions(TypedDict, total=False):
     """What a caller may choose about a reconstruction: the keyword arguments of Client.reconstruct."""
 
+    layout: Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]
+    """how the clip's eyes, depths and masks are laid out"""
+    mask_polarity: Literal["auto", "tool", "tissue"]
+    """what is bright in the masks"""
+    pose_convention: Literal["opengl", "llff"]
+    """axes of poses_bounds.npy"""
+    holdout: Annotated[str, Field(max_length=8000, pattern="^(every8|blocks8|none|\\d{1,6}(,\\d{1,6})*)$")] | list[int]
+    """frames to measure quality on, never to train on: every8, blocks8, none, or frame numbers such as 1,9,17"""
     preset: Literal[
         "instant",
         "fast",
@@ -171,17 +183,13 @@ class GivenOptions(TypedDict, total=False):
         "hexplane",
         "without_mapf",
     ]
+    """instant, fast, quality and small are ours; paper is the method as published"""
+    iterations: Annotated[int, Field(le=1000000, ge=1)] | None
+    """exactly how many steps to train; not with budget_s"""
     budget_s: Annotated[float, Field(gt=0, le=7200)] | None
     """about how many seconds to train, often less; not with iterations"""
-    iterations: Annotated[int, Field(le=1000000, ge=1)] | None
-    """fixed schedule; not with budget_s"""
-    mask_polarity: Literal["auto", "tool", "tissue"]
-    layout: Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]
-    pose_convention: Literal["opengl", "llff"]
-    """axes of poses_bounds.npy"""
-    holdout: Annotated[str, Field(max_length=8000, pattern="^(every8|blocks8|none|\\d{1,6}(,\\d{1,6})*)$")] | list[int]
-    """every8, blocks8, none, or frame numbers such as 1,9,17"""
     seed: Annotated[int, Field(lt=2147483648, ge=0)]
+    """of all random numbers"""
     priority: Literal["standard", "high"]
     """high: before, and in place of, standard jobs"""
     retention_hours: Annotated[float, Field(gt=0, le=87600)] | None

@@ -1,13 +1,15 @@
-"""What the command lines of client and worker share: how a command is added, and which numbers can be meant."""
+"""What the command lines of client and worker share: commands, options made from a model's fields, numbers."""
 
 from __future__ import annotations
 
 import argparse
 import math
 from collections.abc import Callable
-from typing import TypeAlias
+from types import NoneType
+from typing import Any, Literal, TypeAlias, get_args, get_origin
 
 from contract.runtime.exits import EXIT_CODES_HELP
+from contract.wire.options import ClipOptions, Options, parse_options
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """What ArgumentParser.add_subparsers returns."""
@@ -21,6 +23,44 @@ def add_command(
     parser.epilog = EXIT_CODES_HELP
     parser.set_defaults(command=command)
     return parser
+
+
+def add_options(parser: argparse.ArgumentParser, model: type[ClipOptions], *names: str, **overrides: Any) -> None:
+    """Add one command-line option for each named field of `model` (default: all): flag, type, choices and help.
+
+    The namespace holds None for an option that was not given. `overrides` go to every add_argument, such as nargs="+".
+    """
+    chosen = names or tuple(model.model_fields)
+    exclusive = parser.add_mutually_exclusive_group() if {*chosen} & {*model.exclusive} else parser
+    for name in chosen:
+        field = model.model_fields[name]
+        kinds = [kind for kind in get_args(field.annotation) or (field.annotation,) if kind is not NoneType]
+        settings: dict[str, Any] = {"default": None, "help": field.description}
+        if get_origin(field.annotation) is Literal:
+            settings["choices"] = kinds
+        else:
+            is_positive = any(getattr(bound, "gt", None) == 0 for bound in field.metadata)
+            settings["type"] = (positive if is_positive else finite) if kinds == [float] else kinds[0]
+            settings["metavar"] = name.rsplit("_", 1)[-1].upper()
+        if field.default is not None:
+            settings["help"] = f"{field.description} (default: {field.default})"
+        target = exclusive if name in model.exclusive else parser
+        target.add_argument(flag_of(name), **(settings | overrides))
+
+
+def given_options(namespace: argparse.Namespace, model: type[Options]) -> Options:
+    """The options of add_options that the user gave, as a model; the others have its defaults.
+
+    Raises:
+        InputError: names the option at fault.
+    """
+    values = {name: getattr(namespace, name) for name in model.model_fields}
+    return parse_options(model, {name: value for name, value in values.items() if value is not None})
+
+
+def flag_of(name: str) -> str:
+    """budget_s is --budget-s."""
+    return f"--{name.replace('_', '-')}"
 
 
 def finite(text: str) -> float:

@@ -5,22 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
-from contract.wire.errors import InputError
-from contract.wire.names import Layout, MaskPolarity, PoseConvention, PresetName
+from contract.wire.options import JobOptions
 
 JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
 """Job ids are made by the service, never by a caller, so they are safe as file names and key parts."""
-
-Priority = Literal["standard", "high"]
-"""high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
-
-MOST_HOLDOUT_CHARACTERS = 8000
-"""A thousand frame numbers of up to six digits, and what stands between them. A record must be small enough to go
-through a pipe to a process that does not read just now."""
 
 LOCAL_TENANT = "local"
 """Whose jobs they are where no key is asked for."""
@@ -58,60 +49,6 @@ TERMINAL_STATES = frozenset({JobState.DONE, JobState.FAILED, JobState.CANCELLED}
 def sources_of(target: JobState) -> frozenset[JobState]:
     """The states from which `target` may be reached."""
     return frozenset(state for state, following in TRANSITIONS.items() if target in following)
-
-
-class JobOptions(BaseModel):
-    """What the caller may choose about a reconstruction; the `options` field of POST /reconstruct."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    preset: PresetName = "fast"
-    budget_s: float | None = Field(
-        default=None, gt=0, le=7200, description="about how many seconds to train, often less; not with iterations"
-    )
-    iterations: int | None = Field(default=None, ge=1, le=1_000_000, description="fixed schedule; not with budget_s")
-    mask_polarity: MaskPolarity = "auto"
-    layout: Layout = "auto"
-    pose_convention: PoseConvention = Field(default="opengl", description="axes of poses_bounds.npy")
-    holdout: str = Field(
-        default="every8",
-        max_length=MOST_HOLDOUT_CHARACTERS,
-        pattern=r"^(every8|blocks8|none|\d{1,6}(,\d{1,6})*)$",
-        description="every8, blocks8, none, or frame numbers such as 1,9,17",
-    )
-    seed: int = Field(default=0, ge=0, lt=2**31)
-    priority: Priority = Field(default="standard", description="high: before, and in place of, standard jobs")
-    retention_hours: float | None = Field(
-        default=None, gt=0, le=87_600, description="clip, scene and record are purged so long after the job ended"
-    )
-
-    @field_validator("holdout", mode="before")
-    @classmethod
-    def _frames_as_text(cls, value: object) -> object:
-        """A JSON list of frame numbers means the same as their comma-separated text."""
-        return ",".join(str(frame) for frame in value) if isinstance(value, list) else value
-
-    @model_validator(mode="after")
-    def _one_limit(self) -> JobOptions:
-        if self.budget_s is not None and self.iterations is not None:
-            raise ValueError("budget_s and iterations exclude each other; give one of them")
-        return self
-
-
-def parse_options(given: str | Mapping[str, object]) -> JobOptions:
-    """Options from JSON text or from values by name.
-
-    Raises:
-        InputError: names the option at fault, as options.NAME.
-    """
-    try:
-        return JobOptions.model_validate_json(given) if isinstance(given, str) else JobOptions.model_validate(given)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(["options", *(str(part) for part in first["loc"])])
-        problem = f"{first['msg']} (given: {str(first['input'])[:80]!r})."
-        known = ", ".join(JobOptions.model_fields)
-        raise InputError(field, problem, f"The options are {known}; /openapi.json describes them.") from error
 
 
 class JobFiles(BaseModel):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from client.generate_models import MODELS, generate
-from contract.wire.job import TERMINAL_STATES, JobOptions
+from contract.wire.job import TERMINAL_STATES
+from contract.wire.options import JobOptions
 from intrasplat_client import InputError, JobState, JobView, models
 from intrasplat_client.submission import checked_options
 

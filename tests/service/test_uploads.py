@@ -79,7 +79,7 @@ def test_an_upload_that_cannot_be_used_names_the_part_and_leaves_nothing(
     ("options", "field"),
     [
         ('{"budget_s": 0}', "options.budget_s"),
-        ('{"budget_s": 1, "iterations": 1}', "options"),
+        ('{"budget_s": 1, "iterations": 1}', "options.budget_s"),
         ('{"layout": "diagonal"}', "options.layout"),
         ('{"colour": 1}', "options.colour"),
         ("[1]", "options"),

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.wire.options import ClipOptions, parse_options
 from worker.input.camera import Intrinsics
-from worker.input.clip.types import DepthClip
+from worker.input.clip import ClipLimits, DepthClip, StereoClip, open_clip
 
 HEIGHT, WIDTH = 48, 64
 
@@ -48,3 +51,11 @@ def _plane_depth_mm(intrinsics: Intrinsics, world_from_camera: NDArray[np.float6
     above = 60 + 0.2 * shift[0] + 0.1 * shift[1] - shift[2]
     depth = above / (1 - 0.2 * x[None, :] - 0.1 * y[:, None])
     return np.asarray(depth, dtype=np.float32)
+
+
+def open_with(
+    path: Path | str, right: Path | None = None, *, masks: Path | None = None, limits: ClipLimits | None = None,
+    **options: object,
+) -> StereoClip | DepthClip:  # fmt: skip
+    """open_clip, its options by their names."""
+    return open_clip(path, right, masks=masks, options=parse_options(ClipOptions, options), limits=limits)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from contract.queue.promise import Queue
 from contract.store.store import Store, new_job_id
-from contract.wire.job import TERMINAL_STATES, JobFiles, JobOptions, JobRecord, JobState
+from contract.wire.job import TERMINAL_STATES, JobFiles, JobRecord, JobState
+from contract.wire.options import JobOptions
 
 WAIT_S = 40.0
 STANDIN = Path(__file__).with_name("standin.py")

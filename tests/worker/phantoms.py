@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
+from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, FrameSplit, split_frames
 from worker.machine.hooks import Hooks
 from worker.phantom import Motion, PhantomSettings, make_phantom
@@ -15,7 +15,6 @@ from worker.train.looking import View, view_function
 from worker.train.loop import Run, Stopwatch, train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS, Preset
-from worker.train.request import ReconstructionRequest
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 12
 
@@ -58,8 +57,8 @@ def prepared_on(
 ) -> Run:
     """The same on a given split."""
     chosen = PRESETS[preset] if isinstance(preset, str) else preset
-    request = ReconstructionRequest(clip=Path("unused"), iterations=iterations, seed=seed)
-    return prepare(clip, split, chosen, request, Stopwatch())[0]
+    options = ReconstructionOptions(iterations=iterations, seed=seed)
+    return prepare(clip, split, chosen, options, Stopwatch())[0]
 
 
 def trained(run: Run, hooks: Hooks | None = None) -> Run:

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
+from contract.wire.options import ReconstructionOptions, parse_options
 from contract.wire.report import Report
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared_on, trained, view
 from worker.input.clip import DepthClip, open_clip, split_frames
@@ -29,7 +30,7 @@ from worker.render.shrink import TOLERANCE_DB, model_of, shrink
 from worker.render.view import render_frame
 from worker.scene.checkpoint import load_scene
 from worker.scene.resume_file import RESUME_FILE, load_resume
-from worker.train.presets import PRESETS
+from worker.train.presets import PRESETS, Preset
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units
 
@@ -89,8 +90,14 @@ def stereo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(clip: Path, out: Path, hooks: Hooks | None = None, **options: Any) -> Report:
+    """Reconstruct with options and fields of the request by their names; `preset` may be a preset of one's own."""
     options = {"iterations": ITERATIONS, **options}
-    return reconstruct(ReconstructionRequest(clip, **options), out, hooks or Hooks())
+    if isinstance(options.get("preset"), Preset):
+        options["own_preset"] = options.pop("preset")
+    fields = {field.name for field in dataclasses.fields(ReconstructionRequest)}
+    of_request = {name: options.pop(name) for name in fields & options.keys()}
+    asked = parse_options(ReconstructionOptions, options)
+    return reconstruct(ReconstructionRequest(clip, asked, **of_request), out, hooks or Hooks())
 
 
 def files(folder: Path) -> set[str]:

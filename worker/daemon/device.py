@@ -151,21 +151,14 @@ class _Reporter:
 
 def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits | None = None) -> ReconstructionRequest:
     """The reconstruction that a job asks for, with its files where the store keeps them."""
-    files, options = record.files, record.options
+    files = record.files
     return ReconstructionRequest(
         clip=spool / files.clip,
         right=spool / files.right if files.right else None,
-        layout=options.layout,
         calibration=spool / files.calibration if files.calibration else None,
         masks=spool / files.masks if files.masks else None,
-        mask_polarity=options.mask_polarity,
-        pose_convention=options.pose_convention,
-        holdout=options.holdout,
-        preset=options.preset,
-        budget_s=options.budget_s,
-        iterations=options.iterations,
+        options=record.options,
         device=device,
-        seed=options.seed,
         accepted_at_s=record.created_at_s,
         limits=limits,
     )

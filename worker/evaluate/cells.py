@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from contract.wire.errors import InputError
-from worker.input.clip.split import check_holdout
+from contract.wire.options import ReconstructionOptions, parse_options
 from worker.train.presets import PRESETS, Preset, preset_named
-from worker.train.request import check_seed
 
 OURS = tuple(name for name in ("instant", "fast", "quality", "small") if name in PRESETS)
 RIVALS = ("paper", "paper-released", "without_mapf", "pfs", "hexplane")
@@ -68,10 +67,6 @@ def plan(
     Raises:
         InputError: a series is not known, or no reconstruction takes a holdout or a seed.
     """
-    for holdout in holdouts:
-        check_holdout(holdout)
-    for seed in seeds:
-        check_seed(seed)
     presets = dict(_read(name) for each in series for name in SHORTHANDS.get(each, (each,)))
     cells = []
     for clip in clips:
@@ -85,7 +80,20 @@ def plan(
                         timed = [preset.budget_s] if preset.budget_s and not fixed else []
                     cells += [Cell(clip, name, holdout, seed, budget_s=each) for each in timed]
                     cells += [Cell(clip, name, holdout, seed, iterations=each) for each in fixed]
+    for cell in cells:
+        options_of(cell)
     return cells
+
+
+def options_of(cell: Cell) -> ReconstructionOptions:
+    """The options of the cell's reconstruction. The preset is named only if the series changes none of its values.
+
+    Raises:
+        InputError: no reconstruction takes one of them.
+    """
+    preset = {"preset": cell.series} if cell.series in PRESETS else {}
+    length = {"budget_s": cell.budget_s, "iterations": cell.iterations}
+    return parse_options(ReconstructionOptions, {"holdout": cell.holdout, "seed": cell.seed, **length, **preset})
 
 
 def preset_of(series: str) -> Preset:

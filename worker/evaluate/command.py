@@ -6,15 +6,16 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
-from contract.runtime.arguments import count, positive
+from contract.runtime.arguments import add_options, given_options
 from contract.runtime.exits import ExitCode
 from contract.runtime.processes import heeding_signals
 from contract.runtime.progress_bar import ProgressBar
 from contract.wire.errors import InputError
 from contract.wire.job import JobProgress
-from contract.wire.names import DeviceName, Layout, MaskPolarity, PoseConvention
+from contract.wire.names import DeviceName
+from contract.wire.options import ClipOptions, ReconstructionOptions
 from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
 from worker.evaluate.measure import Bench
@@ -25,6 +26,8 @@ from worker.machine.hooks import Hooks, Progress
 from worker.raster.backend import choose_device
 
 SUMMARY = "summary.csv"
+FILES = ("calibration", "masks")
+"""Beside a clip that is a path."""
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,16 +49,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--holdout", nargs="+", default=list(DEFAULT_HOLDOUTS), help="(default: %(default)s)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N", help="(default: 0)")
-    limit = parser.add_mutually_exclusive_group()
-    limit.add_argument(
-        "--budget-s",
-        nargs="+",
-        type=positive,
-        default=[],
-        metavar="S",
-        help="about how many seconds to train, often less",
-    )
-    limit.add_argument("--iterations", nargs="+", type=count, default=[], metavar="N", help="instead of the preset's")
+    add_options(parser, ReconstructionOptions, "budget_s", "iterations", nargs="+", default=[])
     parser.add_argument(
         "--grid", action="store_true", help="of each series, the grid of fixed capacities beside its own choice"
     )
@@ -67,11 +61,9 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--again", action="store_true", help="measure anew what failed, which has its rows otherwise")
     parser.add_argument("--redraw", action="store_true", help="measure nothing; sum up and draw the rows in DIR")
-    for name in ("calibration", "masks"):
+    for name in FILES:
         parser.add_argument(f"--{name}", type=Path, metavar="F", help="of the clips that are paths")
-    parser.add_argument("--layout", choices=get_args(Layout), default="auto")
-    parser.add_argument("--mask-polarity", choices=get_args(MaskPolarity), default="auto")
-    parser.add_argument("--pose-convention", choices=get_args(PoseConvention), default="opengl")
+    add_options(parser, ClipOptions)
 
 
 def run_cli(options: argparse.Namespace) -> int:
@@ -160,9 +152,9 @@ def in_words(found: Sooner) -> str:
 
 def _asked(options: argparse.Namespace) -> tuple[Bench, list[Cell]]:
     """Where the clips come from, and every cell of the grid."""
-    names = ("calibration", "masks", "layout", "mask_polarity", "pose_convention")
-    of_paths: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    sources = [source_of(argument, of_paths) for argument in options.clips]
+    files = {name: getattr(options, name) for name in FILES if getattr(options, name) is not None}
+    reading = given_options(options, ClipOptions)
+    sources = [source_of(argument, files, reading) for argument in options.clips]
     series = options.series
     if options.grid:
         series = [variant for name in series for variant in capacity_grid(name)]

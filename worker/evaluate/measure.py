@@ -20,9 +20,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.runtime.arguments import flag_of
 from contract.wire.names import CURVE, REPORT, DeviceName
 from contract.wire.report import Report
-from worker.evaluate.cells import Cell, preset_of
+from worker.evaluate.cells import Cell, options_of, preset_of
 from worker.evaluate.rows import KEY, NO_RESULT, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
 from worker.evaluate.truth import ShownScene, Truth
@@ -92,12 +93,9 @@ class Bench:
         opened = self._open[place]
         request = ReconstructionRequest(
             clip=opened.clip,
-            holdout=cell.holdout,
-            preset=cell.series if cell.series in PRESETS else preset_of(cell.series),
-            budget_s=cell.budget_s,
-            iterations=cell.iterations,
+            options=options_of(cell),
+            own_preset=None if cell.series in PRESETS else preset_of(cell.series),
             device=self.device,
-            seed=cell.seed,
             accepted_at_s=time.time() - sum(opened.seconds.values()),
         )
         on_the_way = _OnTheWay(opened.clip)
@@ -172,10 +170,10 @@ class _OnTheWay:
 def command_of(cell: Cell, source: Source, device: DeviceName = "auto") -> str:
     """The command line that measures this cell, as a shell reads it."""
     limit = {"--iterations": cell.iterations} if cell.iterations else {"--budget-s": f"{cell.budget_s:g}"}
-    is_path = source.argument == str(source.options.get("clip"))
-    given = {
-        f"--{name.replace('_', '-')}": value for name, value in source.options.items() if is_path and name != "clip"
-    }
+    given: dict[str, object] = {}
+    if source.argument == str(source.clip):
+        given = {flag_of(name): path for name, path in source.files.items()}
+        given |= {flag_of(name): value for name, value in source.options.model_dump(exclude_unset=True).items()}
     own = {"--series": cell.series, "--holdout": cell.holdout, "--seeds": cell.seed, **limit, "--out": "DIR"}
     own |= {} if device == "auto" else {"--device": device}
     options = [str(part) for option in {**given, **own}.items() for part in option]

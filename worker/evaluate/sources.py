@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from contract.wire.errors import InputError
+from contract.wire.options import ClipOptions, ReconstructionOptions
 from worker.input.clip import DepthClip
 from worker.machine.hooks import Hooks
 from worker.phantom import MOTIONS, Phantom, PhantomSettings, make_phantom
@@ -38,13 +39,17 @@ class Source:
     """A clip that can be opened. argument is what the command line says, name what rows say.
 
     phantom  how to draw it; None for a recording
-    options  of the ReconstructionRequest: path, calibration, masks and so on
+    clip     the recording's file or folder
+    files    beside it: calibration, masks
+    options  how the files are to be read
     """
 
     name: str
     argument: str
     phantom: PhantomSettings | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
+    clip: Path = Path()
+    files: Mapping[str, Path] = field(default_factory=dict)
+    options: ClipOptions = field(default_factory=ClipOptions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +61,8 @@ class OpenClip:
     seconds: Mapping[str, float]
 
 
-def source_of(argument: str, options: Mapping[str, Any] | None = None) -> Source:
-    """The source that an argument names; options (calibration, masks, layout, ...) are for paths.
+def source_of(argument: str, files: Mapping[str, Path] | None = None, options: ClipOptions | None = None) -> Source:
+    """The source that an argument names; files (calibration, masks) and options are of a clip that is a path.
 
     Raises:
         InputError: there is no such motion or file, or a recording is asked for and INTRASPLAT_DATA is not set.
@@ -70,7 +75,8 @@ def source_of(argument: str, options: Mapping[str, Any] | None = None) -> Source
     if not Path(argument).exists():
         remedy = f"Give a path, phantom:MOTION ({', '.join(MOTIONS)}), or one of {', '.join(RECORDINGS)}."
         raise InputError("CLIP", f"there is no {argument!r}.", remedy)
-    return Source(Path(argument).stem, argument, None, {"clip": Path(argument), **(options or {})})
+    path = Path(argument)
+    return Source(path.stem, argument, None, path, files or {}, options or ClipOptions())
 
 
 def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU) -> OpenClip:
@@ -83,7 +89,11 @@ def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU
         phantom = make_phantom(source.phantom)
         return OpenClip(phantom.depth_clip(), phantom, {})
     seconds: dict[str, float] = {}
-    clip = depth_clip_of(ReconstructionRequest(holdout=holdout, **source.options), hooks, seconds, device)
+    options, files = ReconstructionOptions(holdout=holdout, **source.options.model_dump()), source.files
+    request = ReconstructionRequest(
+        source.clip, options, calibration=files.get("calibration"), masks=files.get("masks")
+    )
+    clip = depth_clip_of(request, hooks, seconds, device)
     return OpenClip(clip, None, seconds)
 
 
@@ -96,7 +106,7 @@ def _recording(argument: str) -> Source:
     path = Path(folder) / file
     if not path.exists():
         raise InputError("CLIP", f"{argument} is not under {folder}.", remedy)
-    return Source(name, argument, None, {"clip": path, **{key: path.parent / each for key, each in beside.items()}})
+    return Source(name, argument, None, path, {key: path.parent / each for key, each in beside.items()})
 
 
 def _phantom_settings(argument: str) -> PhantomSettings:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
 from worker.evaluate.cells import preset_of
 from worker.evaluate.conditions import (
@@ -240,7 +241,8 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Hooks) 
             else ReconstructionRequest(given.clip)
         )
         preset = preset_of(cell.series)
-        request = dataclasses.replace(asked, preset=preset, iterations=grid.iterations, seed=cell.seed)
+        options = ReconstructionOptions(iterations=grid.iterations, seed=cell.seed)
+        request = dataclasses.replace(asked, own_preset=preset, options=options)
         report = reconstruct(request, Path(folder, "scene"), hooks)
         scene = load_scene(Path(folder, "scene"))
     psnr_db, depth_error_mm = _judged(given, scene, moments_of(given, report.held_out, report.frame_count))

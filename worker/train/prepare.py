@@ -8,6 +8,7 @@ from functools import partial
 from typing import TypeVar
 
 from contract.wire.errors import Cancelled
+from contract.wire.options import ReconstructionOptions
 from worker.fusion import fuse
 from worker.input.clip import DepthClip, FrameSplit
 from worker.machine.hooks import Hooks, Progress
@@ -17,7 +18,6 @@ from worker.raster.model import Model
 from worker.train.densify import Densifier
 from worker.train.loop import Run, Stopwatch, iterations_within, steps_an_epoch, warm_up
 from worker.train.presets import Preset
-from worker.train.request import ReconstructionRequest
 from worker.train.schedule import Schedule, left_out
 from worker.train.start import fusion_for, settled, start_model
 from worker.train.targets import TrainingFrames, units_per_mm
@@ -49,7 +49,7 @@ def prepare(
     clip: DepthClip,
     split: FrameSplit,
     preset: Preset,
-    request: ReconstructionRequest,
+    options: ReconstructionOptions,
     clock: Stopwatch,
     hooks: Hooks | None = None,
     seconds: Seconds | None = None,
@@ -70,10 +70,10 @@ def prepare(
     preset, chosen = timed(seconds, "capacity_s", lambda: settled(preset, tracks, clip, split.train))
     fusion = fusion_for(preset, clip.intrinsics)
     moved = moved_along(tracks, split.train, clip.intrinsics.width) if tracks is not None else None
-    cloud = timed(seconds, "fusion_s", lambda: fuse(clip, split.train, fusion, seed=request.seed, moved=moved))
+    cloud = timed(seconds, "fusion_s", lambda: fuse(clip, split.train, fusion, seed=options.seed, moved=moved))
     report_stage(hooks, "start", 0.0)
     model = timed(
-        seconds, "start_s", lambda: start_model(cloud, tracks, clip, split.train, preset, scale, request.seed, device)
+        seconds, "start_s", lambda: start_model(cloud, tracks, clip, split.train, preset, scale, options.seed, device)
     )
     frames = timed(seconds, "targets_s", lambda: TrainingFrames(clip, split.train, scale))
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
@@ -81,27 +81,27 @@ def prepare(
         seconds["compile_s"] += clock.pause(
             lambda: warm_up(model, frames, preset, partial(report_stage, hooks, "compile"))
         )
-    schedule, asked = schedule_of(model, frames, preset, request, clock, hooks)
-    run = Run(model, frames, preset, schedule, request.seed, asked, densifier=densifier, device=device, chosen=chosen)
+    schedule, asked = schedule_of(model, frames, preset, options, clock, hooks)
+    run = Run(model, frames, preset, schedule, options.seed, asked, densifier=densifier, device=device, chosen=chosen)
     return run, scale
 
 
-def fixed_iterations(request: ReconstructionRequest, preset: Preset) -> int | None:
+def fixed_iterations(options: ReconstructionOptions, preset: Preset) -> int | None:
     """The iterations that were asked for, or else are the preset's own; None where seconds say how long a run is."""
-    return request.iterations or (None if request.budget_s else preset.iterations)
+    return options.iterations or (None if options.budget_s else preset.iterations)
 
 
 def schedule_of(
-    model: Model, frames: TrainingFrames, preset: Preset, request: ReconstructionRequest, clock: Stopwatch, hooks: Hooks
+    model: Model, frames: TrainingFrames, preset: Preset, options: ReconstructionOptions, clock: Stopwatch, hooks: Hooks
 ) -> tuple[Schedule, str]:
     """How many iterations are made and how rates fall in them; and, in words, the length that was asked for."""
     epoch = steps_an_epoch(frames, preset)
-    fixed = fixed_iterations(request, preset)
+    fixed = fixed_iterations(options, preset)
     if fixed is not None:
         return Schedule(fixed, preset.cycles, epoch=epoch), f"{fixed} iterations"
-    budget_s = request.budget_s or preset.budget_s
+    budget_s = options.budget_s or preset.budget_s
     assert budget_s is not None
     report_stage(hooks, "calibrate", 0.0)
-    planned = iterations_within(model, frames, preset, request.seed, budget_s, clock.elapsed_s)
+    planned = iterations_within(model, frames, preset, options.seed, budget_s, clock.elapsed_s)
     worth_db = preset.worth_db if left_out(frames.indices) else None
     return Schedule(planned, preset.cycles, worth_db, epoch), f"{budget_s} s"

@@ -15,7 +15,8 @@ from contract.queue.promise import (
     Queue,
 )
 from contract.store.store import new_job_id
-from contract.wire.job import JobOptions, JobState
+from contract.wire.job import JobState
+from contract.wire.options import JobOptions
 from contract.wire.rendering import WorkerAddress
 from tests.contract.queues import ERROR, TRAINING, claimed, job, known, state_of
 

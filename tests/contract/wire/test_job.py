@@ -17,13 +17,13 @@ from contract.wire.job import (
     TERMINAL_STATES,
     TRANSITIONS,
     JobFiles,
-    JobOptions,
     JobProgress,
     JobRecord,
     JobState,
     JobView,
     sources_of,
 )
+from contract.wire.options import JobOptions
 
 PROGRESS = JobProgress(stage="train", fraction=0.25, iteration=50, iterations=200, psnr_db=31.237, seconds_left=42.4)
 

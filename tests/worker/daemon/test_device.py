@@ -17,8 +17,9 @@ from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
 from contract.store.store import new_job_id
 from contract.wire.errors import InputError, TrainingDiverged, UnavailableError
-from contract.wire.job import JobFiles, JobOptions, JobRecord
+from contract.wire.job import JobFiles, JobRecord
 from contract.wire.names import REPORT
+from contract.wire.options import JobOptions, ReconstructionOptions
 from worker.__main__ import main
 from worker.daemon.child import DeviceChild
 from worker.daemon.device import request_of, run_or_start_anew
@@ -51,7 +52,7 @@ def test_every_option_of_a_job_is_one_of_the_request(chosen: dict[str, object]) 
     asked = request(JobFiles(clip="clip.mp4"), chosen)
     for name, value in JobOptions.model_validate(chosen):
         if name not in ("priority", "retention_hours"):  # they are the queue's and the service's business
-            assert getattr(asked, name) == value, name
+            assert getattr(asked.options, name) == value, name
     assert asked.device == "cpu"
 
 
@@ -165,7 +166,7 @@ def is_alive(process_id: int) -> bool:
 
 
 def test_a_state_of_another_version_is_left_behind_and_training_starts_anew(tmp_path: Path, clip: Path) -> None:
-    request_here = ReconstructionRequest(clip=clip, iterations=3)
+    request_here = ReconstructionRequest(clip, ReconstructionOptions(iterations=3))
     (tmp_path / RESUME_FILE).write_bytes(b"of another version")
     run_or_start_anew(request_here, tmp_path, Hooks())
     assert (tmp_path / REPORT).exists()
@@ -193,8 +194,9 @@ def test_every_error_is_told_with_a_remedy_and_without_what_nobody_wrote_for_the
 
 def test_other_trouble_with_the_input_is_not_tried_twice(tmp_path: Path) -> None:
     (tmp_path / RESUME_FILE).write_bytes(b"kept")
+    asked = ReconstructionRequest(tmp_path / "no.zip", ReconstructionOptions(iterations=3))
     with pytest.raises(InputError, match="clip"):
-        run_or_start_anew(ReconstructionRequest(clip=tmp_path / "no.zip", iterations=3), tmp_path, Hooks())
+        run_or_start_anew(asked, tmp_path, Hooks())
     assert (tmp_path / RESUME_FILE).read_bytes() == b"kept"
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from contract.wire.job import JobProgress
+from contract.wire.options import ReconstructionOptions
 from worker.daemon.liveness import LONGEST_LOOK_S, OTHER_LIMIT_S, STAGE_LIMITS_S, Watch
 from worker.daemon.orders import job_progress
 from worker.machine.hooks import Hooks, Progress
@@ -85,7 +86,7 @@ def test_a_reconstruction_from_stereo_advances_with_every_frame_and_knows_no_sta
     frames = 10
     write_stereo_video(make_phantom(PhantomSettings(width=192, height=160, frames=frames)), tmp_path / "clip")
     told: list[Progress] = []
-    request = ReconstructionRequest(clip=tmp_path / "clip", iterations=5)
+    request = ReconstructionRequest(tmp_path / "clip", ReconstructionOptions(iterations=5))
     reconstruct(request, tmp_path / "out", Hooks(on_progress=told.append))
     places = {stage: {each.fraction for each in told if each.stage == stage} for stage in STAGE_LIMITS_S}
     assert {each.stage for each in told} <= set(STAGE_LIMITS_S)

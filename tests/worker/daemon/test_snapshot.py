@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from contract.store.store import Store
+from contract.wire.options import ReconstructionOptions
 from contract.wire.rendering import ImageFormat, RenderRequest
 from tests.worker.phantoms import bits, phantom_clip, prepared, view
 from tests.worker.scenes import random_scene
@@ -82,7 +83,7 @@ def test_a_watched_run_comes_to_the_bits_of_an_unwatched_one(preset: str, tmp_pa
 
 def test_a_reconstruction_can_be_watched_from_its_clip_to_its_scene(tmp_path: Path) -> None:
     write_endonerf(make_phantom(PhantomSettings(width=96, height=80, frames=10, period_frames=12)), tmp_path / "clip")
-    request = ReconstructionRequest(tmp_path / "clip", iterations=ITERATIONS)
+    request = ReconstructionRequest(tmp_path / "clip", ReconstructionOptions(iterations=ITERATIONS))
     snapshots, stages = Snapshots(period_s=ALWAYS), set[str]()
     snapshots.begin(JOB)
 

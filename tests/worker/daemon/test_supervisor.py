@@ -22,6 +22,7 @@ from contract.runtime.settings import Settings
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobState
+from contract.wire.options import ReconstructionOptions
 from tests.worker.jobs import STANDIN, WAIT_S, Jobs, eventually
 from worker.daemon.supervisor import run_supervisor
 from worker.machine.hooks import Hooks
@@ -114,7 +115,7 @@ def test_a_real_worker_told_to_end_keeps_what_was_trained_and_the_next_comes_to_
 ) -> None:
     write_endonerf(make_phantom(PhantomSettings(width=96, height=80, frames=8)), tmp_path / "clip")
     clip = Path(shutil.make_archive(str(tmp_path / "clip"), "zip", tmp_path / "clip"))
-    reconstruct(ReconstructionRequest(clip, iterations=500), tmp_path / "whole", Hooks())
+    reconstruct(ReconstructionRequest(clip, ReconstructionOptions(iterations=500)), tmp_path / "whole", Hooks())
     real = [sys.executable, "-m", "worker", "consume"]
     job_id = bench.submit(clip, iterations=500)
     with bench.worker(command=real) as worker:

@@ -82,7 +82,7 @@ def test_a_recording_is_looked_for_where_the_environment_says(tmp_path: Path, mo
     with pytest.raises(InputError, match=f"d4d_endonerf is not under {tmp_path}"):
         source_of("d4d_endonerf")
     (tmp_path / "d4d_endonerf").mkdir()
-    assert source_of("d4d_endonerf").options == {"clip": tmp_path / "d4d_endonerf"}
+    assert source_of("d4d_endonerf").clip == tmp_path / "d4d_endonerf"
 
 
 def test_a_curve_ends_where_its_run_does(measured: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from contract.wire.options import ClipOptions
 from worker.input.camera import Intrinsics
 from worker.input.clip import open_clip
 from worker.input.clip.types import DepthClip, StereoClip
@@ -321,7 +322,7 @@ def short() -> Phantom:
 def test_stereo_video_reads_back_close_with_its_calibration_and_masks(tmp_path: Path) -> None:
     scene = short()
     write_stereo_video(scene, tmp_path)
-    clip = open_clip(tmp_path / "stereo.webm", masks=tmp_path / "masks.zip", mask_polarity="tool")
+    clip = open_clip(tmp_path / "stereo.webm", masks=tmp_path / "masks.zip", options=ClipOptions(mask_polarity="tool"))
     assert isinstance(clip, StereoClip)
     assert (clip.frame_count, clip.height, clip.width) == (3, 80, 96)
     assert clip.tissue is not None

@@ -17,6 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from contract.wire.errors import Cancelled, InputError
+from contract.wire.options import ClipOptions
 from worker.input.calibration import RectifiedClip, load_calibration, rectify
 from worker.input.calibration.types import StereoCalibration, parse_calibration
 from worker.input.camera import Intrinsics
@@ -359,7 +360,7 @@ def first_frames(clip: StereoClip, calibration: Path) -> RectifiedClip:
 def test_a_real_recording_agrees_with_another_groups_stereo_depth() -> None:
     folder = DATA / "d4d_stereo"
     masks = folder / "tool_masks.zip"
-    clip = open_clip(folder / "stereo_sbs.mp4", layout="sbs", masks=masks, mask_polarity="tool")
+    clip = open_clip(folder / "stereo_sbs.mp4", masks=masks, options=ClipOptions(layout="sbs", mask_polarity="tool"))
     assert isinstance(clip, StereoClip)
     depth = estimate_depth(first_frames(clip, folder / "calibration.json"))
     differences: list[NDArray[np.float32]] = []
@@ -376,7 +377,7 @@ def test_a_real_recording_agrees_with_another_groups_stereo_depth() -> None:
 
 @needs_data
 def test_a_raw_recording_lands_on_equal_rows() -> None:
-    clip = open_clip(DATA / "surgt_raw/video.mp4", layout="sbs")
+    clip = open_clip(DATA / "surgt_raw/video.mp4", options=ClipOptions(layout="sbs"))
     assert isinstance(clip, StereoClip)
     depth = estimate_depth(first_frames(clip, DATA / "surgt_raw/calibration.yaml"))
     assert depth.measurements["vertical_residual_px"] < 0.5

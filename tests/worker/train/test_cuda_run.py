@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
+from contract.wire.options import ReconstructionOptions
 from tests.helpers import assert_close
 from tests.worker.clips import plane_clip
 from worker.input.clip import DepthClip, FrameSplit, split_frames
@@ -23,7 +24,6 @@ from worker.render.view import render_frame
 from worker.train.loop import Run, Stopwatch, step
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
-from worker.train.request import ReconstructionRequest
 from worker.train.resume import load_run, save_run
 
 WIDTH, HEIGHT, FRAMES, ITERATIONS = 24, 16, 2, 3
@@ -59,9 +59,9 @@ def split(clip: DepthClip) -> FrameSplit:
 
 
 def prepared(clip: DepthClip, split: FrameSplit, device: Device) -> Run:
-    request = ReconstructionRequest(clip=Path("unused"), iterations=ITERATIONS)
+    options = ReconstructionOptions(iterations=ITERATIONS)
     seconds: dict[str, float] = {}
-    run, _ = prepare(clip, split, SMALL, request, Stopwatch(), seconds=seconds, device=device)
+    run, _ = prepare(clip, split, SMALL, options, Stopwatch(), seconds=seconds, device=device)
     assert ("compile_s" in seconds) == (device != CPU)
     return run
 

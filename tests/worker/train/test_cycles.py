@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from contract.wire.errors import Cancelled
+from contract.wire.options import ReconstructionOptions
 from tests.worker.phantoms import bits, phantom_clip, prepared_on, trained
 from worker.input.clip import DepthClip, FrameSplit, split_frames
 from worker.machine.hooks import Hooks
@@ -20,7 +21,6 @@ from worker.raster.model import Model
 from worker.train.loop import Run, Stopwatch, frames_at, train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
-from worker.train.request import ReconstructionRequest
 from worker.train.resume import load_run, save_run
 from worker.train.schedule import AVERAGED, Schedule, left_out
 from worker.train.targets import TrainingFrames
@@ -226,8 +226,8 @@ def test_the_schedule_that_a_scene_names_makes_the_same_steps_again(
 
 
 def prepared_for(clip: DepthClip, split: FrameSplit, **length: float) -> Run:
-    request = ReconstructionRequest(clip=Path("unused"), **length)  # type: ignore[arg-type]
-    return prepare(clip, split, PRESETS["fast"], request, Stopwatch())[0]
+    options = ReconstructionOptions(**length)  # type: ignore[arg-type]
+    return prepare(clip, split, PRESETS["fast"], options, Stopwatch())[0]
 
 
 def test_only_a_run_that_is_given_time_may_end_before_it(clip: DepthClip, split: FrameSplit) -> None:

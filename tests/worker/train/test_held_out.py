@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, held_out_frames
 from worker.machine.hooks import Hooks
 from worker.phantom import PhantomSettings, make_phantom, write_stereomis
@@ -32,7 +33,7 @@ def poison(folder: Path, frames: list[int]) -> None:
 @pytest.mark.parametrize("holdout", ["every8", "0,5,6,11"])
 def test_held_out_frames_of_a_stereo_clip_change_no_bit_of_the_others(holdout: str, tmp_path: Path) -> None:
     write_stereomis(make_phantom(PhantomSettings(width=96, height=80, frames=FRAMES, period_frames=12)), tmp_path)
-    request = ReconstructionRequest(clip=tmp_path, holdout=holdout)
+    request = ReconstructionRequest(tmp_path, ReconstructionOptions(holdout=holdout))
 
     def depth_clip() -> DepthClip:
         return depth_clip_of(request, Hooks(), {})

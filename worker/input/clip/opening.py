@@ -6,11 +6,10 @@ import atexit
 import shutil
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import get_args
 
 from contract.intake.limits import MOST_CALIBRATION_BYTES, ClipLimits
 from contract.wire.errors import InputError
-from contract.wire.names import MaskPolarity, PoseConvention
+from contract.wire.options import ClipOptions
 from worker.input.clip.files import FileTree, check_exists, open_tree, scratch_folder
 from worker.input.clip.images import open_images
 from worker.input.clip.layouts import ClipFiles, detect_layout, layout_named
@@ -29,26 +28,22 @@ def open_clip(
     path: Path | str,
     right: Path | str | None = None,
     *,
-    layout: str = "auto",
     masks: Path | str | None = None,
-    mask_polarity: MaskPolarity = "auto",
-    pose_convention: PoseConvention = "opengl",
+    options: ClipOptions | None = None,
     limits: ClipLimits | None = None,
 ) -> StereoClip | DepthClip:
     """Opens and validates a clip; every assumption made on the way is in the clip's `assumptions`.
 
-    path             a stereo video, a folder or a zip; or the left eye's video or frames when `right` is given
-    layout           one of clip/layouts/ by its name; "auto" tells it by names, shape and content
-    masks            zip or folder of PNG, or a video; without it the clip's own masks/ folder is used, if there is one
-    mask_polarity    what white means; "auto" asks layout and look (masks.tissue_from_masks)
-    pose_convention  axes in poses_bounds.npy: "opengl" as EndoNeRF writes them, "llff" for files made by LLFF
+    path     a stereo video, a folder or a zip; or the left eye's video or frames when `right` is given
+    masks    zip or folder of PNG, or a video; without it the clip's own masks/ folder is used, if there is one
+    options  layout: one of clip/layouts/ by its name; "auto" tells it by names, shape and content.
+             mask_polarity: "auto" asks layout and look (masks.tissue_from_masks)
 
     Raises InputError, naming field and remedy, for everything that is wrong, and LimitError when it is too large.
     """
+    options, limits = options or ClipOptions(), limits or ClipLimits()
+    layout, mask_polarity = options.layout, options.mask_polarity
     named = layout_named(layout) if layout != "auto" else None
-    _check_choice("options.mask_polarity", mask_polarity, get_args(MaskPolarity))
-    _check_choice("options.pose_convention", pose_convention, get_args(PoseConvention))
-    limits = limits or ClipLimits()
     path = Path(path)
     check_exists(path, "clip")
     given = open_masks(Path(masks), limits) if masks is not None else None
@@ -56,7 +51,7 @@ def open_clip(
         clip = _open_two(path, Path(right), layout, limits)
         return with_masks(clip, given, mask_polarity, None) if given is not None else _without_masks(clip)
     tree = open_tree(path, "clip", limits)
-    files = ClipFiles(path, tree, limits, named is None, given, mask_polarity, pose_convention)
+    files = ClipFiles(path, tree, limits, named is None, given, mask_polarity, options.pose_convention)
     chosen = named or detect_layout(files)
     opened = chosen.open(files)
     if isinstance(opened, DepthClip):
@@ -129,8 +124,3 @@ def _as_path(tree: FileTree, name: str, scratch: Path | None) -> Path:
     target = scratch / f"calibration{PurePosixPath(name).suffix.lower()}"
     tree.copy_to(name, target, MOST_CALIBRATION_BYTES)
     return target
-
-
-def _check_choice(field: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise InputError(field, f"{value!r} is not known.", f"Choose one of {', '.join(allowed)}.")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
-from contract.wire.names import MaskPolarity, PoseConvention
+from contract.wire.options import ClipOptions
 from worker.input.calibration import check_calibration
 from worker.input.calibration.types import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
 from worker.input.camera import Intrinsics
@@ -56,11 +56,9 @@ def decode_clip(
     clip: Path,
     right: Path | None = None,
     *,
-    layout: str = "auto",
     calibration: Path | None = None,
     masks: Path | None = None,
-    mask_polarity: MaskPolarity = "auto",
-    pose_convention: PoseConvention = "opengl",
+    options: ClipOptions | None = None,
     limits: ClipLimits | None = None,
     hooks: Hooks | None = None,
 ) -> StereoRecording | DepthClip:
@@ -82,7 +80,7 @@ def decode_clip(
     layouts = [str(file) for file in registered_files()]
     request = {
         "paths": paths,
-        "options": {"layout": layout, "mask_polarity": mask_polarity, "pose_convention": pose_convention},
+        "options": (options or ClipOptions()).model_dump(include=set(ClipOptions.model_fields)),
         "layouts": layouts,
         "readable": [each for path in (*paths.values(), *layouts) for each in _reached(path)],
         "limits": limits.numbers(),

@@ -12,6 +12,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from contract.wire.options import ClipOptions
 from worker.input.calibration import load_calibration
 from worker.input.clip import ClipLimits, DepthClip, StereoClip, find_calibration, open_clip
 from worker.input.clip.layouts import register_layout
@@ -37,7 +38,8 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
         register_layout(Path(file))
     paths = dict(request["paths"])
     given_calibration = paths.pop("calibration", None)
-    clip = open_clip(limits=limits, **paths, **request["options"])
+    options = ClipOptions.model_construct(**request["options"])  # checked by the parent; layouts from outside are new
+    clip = open_clip(**paths, options=options, limits=limits)
     height, width = clip.rgb.shape[1:3] if isinstance(clip, DepthClip) else (clip.height, clip.width)
     told = {
         "size": [clip.frame_count, height, width],

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from contract.intake.limits import HELD_BYTES_PER_PIXEL
 from contract.wire.errors import InputError, LimitError
+from tests.worker.clips import open_with
 from worker.input.clip import ClipLimits, DepthClip, open_clip
 
 
 def depth_clip(path: Path, **options) -> DepthClip:
-    clip = open_clip(path, **options)
+    clip = open_with(path, **options)
     assert isinstance(clip, DepthClip)
     return clip
 
@@ -260,7 +261,7 @@ def test_a_clip_over_the_limits_is_refused_before_it_is_decoded(studio) -> None:
 
 def test_unknown_choices_are_refused(studio) -> None:
     folder = studio.endonerf()
-    with pytest.raises(InputError, match="Choose one of opengl, llff"):
-        open_clip(folder, pose_convention="opencv")
-    with pytest.raises(InputError, match="Choose one of auto, tool, tissue"):
-        open_clip(folder, mask_polarity="white")
+    with pytest.raises(InputError, match="'opengl' or 'llff'"):
+        open_with(folder, pose_convention="opencv")
+    with pytest.raises(InputError, match="'auto', 'tool' or 'tissue'"):
+        open_with(folder, mask_polarity="white")

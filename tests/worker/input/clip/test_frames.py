@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from contract.wire.errors import InputError, LimitError
+from tests.worker.clips import open_with
 from worker.input.clip import ClipLimits, StereoClip, find_calibration, open_clip
 
 LIVE = Path(__file__).parents[3] / "data/stereo_sbs_live.webm"  # declares no length
@@ -228,7 +229,7 @@ def test_what_is_said_of_a_clip_repeats_no_name_of_its_files(studio, pattern: st
     folder = write_pairs(studio, ("clip/" + pattern.format(eye="left"), "clip/" + pattern.format(eye="right")))
     (folder / calibration).write_text("[StereoLeft]")
     studio.masks("clip/masks/smith", studio.tool(3))
-    clip = open_clip(studio.zip(folder, prefix="smith/"), mask_polarity="tool")
+    clip = open_with(studio.zip(folder, prefix="smith/"), mask_polarity="tool")
     assert clip.assumptions
     assert not any("smith" in said for said in clip.assumptions + clip.warnings)
 

@@ -10,6 +10,7 @@ import pytest
 
 from contract.wire.errors import InputError
 from contract.wire.names import Layout
+from contract.wire.options import ClipOptions, Options, ReconstructionOptions
 from tests.worker.clips import plane_clip
 from tests.worker.input.clip import toy_layout
 from worker.input.clip import DepthClip, layouts, open_clip
@@ -21,6 +22,11 @@ from worker.scene.checkpoint import load_scene
 from worker.train.request import ReconstructionRequest
 
 TOY = Path(toy_layout.__file__)
+
+
+def in_layout(options: Options, name: str) -> Options:
+    """Options with a layout that the contract does not name."""
+    return options.model_copy(update={"layout": name})
 
 
 @pytest.fixture
@@ -41,19 +47,19 @@ def test_callers_may_choose_every_layout_there_is() -> None:
 
 def test_a_layout_from_outside_is_found_by_its_files_and_by_its_name(toy: Path) -> None:
     for layout in ("auto", "toy"):
-        clip = open_clip(toy, layout=layout)
+        clip = open_clip(toy, options=in_layout(ClipOptions(), layout))
         assert isinstance(clip, DepthClip)
         np.testing.assert_array_equal(clip.rgb, plane_clip().rgb)
 
 
 def test_the_decoding_process_knows_layouts_from_outside(toy: Path) -> None:
-    clip = decode_clip(toy, layout="toy")
+    clip = decode_clip(toy, options=in_layout(ClipOptions(), "toy"))
     assert isinstance(clip, DepthClip)
     np.testing.assert_array_equal(clip.depth_mm, plane_clip().depth_mm)
 
 
 def test_a_clip_in_a_layout_from_outside_becomes_a_scene(toy: Path, tmp_path: Path) -> None:
-    request = ReconstructionRequest(clip=toy, preset="fast", iterations=3, layout="toy")
+    request = ReconstructionRequest(toy, in_layout(ReconstructionOptions(iterations=3), "toy"))
     report = reconstruct(request, tmp_path / "scene", Hooks())
     assert load_scene(tmp_path / "scene").intrinsics == plane_clip().intrinsics
     assert report.iterations == 3
@@ -73,5 +79,5 @@ def test_a_file_without_a_layout_is_refused(tmp_path: Path) -> None:
 
 def test_an_unknown_layout_is_refused_and_the_known_ones_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'diagonal' is not known") as caught:
-        open_clip(tmp_path, layout="diagonal")
+        open_clip(tmp_path, options=in_layout(ClipOptions(), "diagonal"))
     assert caught.value.remedy == "Choose one of auto, endonerf, stereomis, sbs, tb, frames."

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from tests.worker.clips import open_with
 from worker.input.clip import StereoClip, open_clip
 
 
@@ -22,7 +23,7 @@ def frames(studio) -> Path:
 
 
 def tissue_of(path: Path, **options) -> NDArray[np.bool_]:
-    clip = open_clip(path, **options)
+    clip = open_with(path, **options)
     assert isinstance(clip, StereoClip)
     assert clip.tissue is not None
     return clip.tissue
@@ -59,7 +60,7 @@ def test_the_class_on_the_border_with_the_smaller_area_is_the_tool(studio, frame
 
 
 def test_what_was_told_wins_over_the_look(studio, frames: Path) -> None:
-    clip = open_clip(frames, masks=studio.masks("masks", studio.tool()), mask_polarity="tissue")
+    clip = open_with(frames, masks=studio.masks("masks", studio.tool()), mask_polarity="tissue")
     np.testing.assert_array_equal(clip.tissue, studio.tool())
     assert "masks: white is tissue (as told)" in clip.assumptions
 
@@ -89,7 +90,7 @@ def test_masks_that_contradict_their_layout_ask_for_the_polarity(studio) -> None
 
 
 def tissue_of_depth(folder: Path, polarity: str) -> NDArray[np.bool_]:
-    return open_clip(folder, mask_polarity=polarity).tissue
+    return open_with(folder, mask_polarity=polarity).tissue
 
 
 @pytest.mark.parametrize("white", [False, True])
@@ -102,12 +103,12 @@ def test_masks_that_mark_nothing_are_refused(studio, frames: Path, white: bool) 
 
 def test_told_masks_may_mark_no_tool_but_not_everything(studio, frames: Path) -> None:
     masks = studio.masks("masks", np.zeros((6, 80, 96), dtype=np.bool_))
-    clip = open_clip(frames, masks=masks, mask_polarity="tool")
+    clip = open_with(frames, masks=masks, mask_polarity="tool")
     assert clip.tissue is not None
     assert clip.tissue.all()
     assert "the masks mark no instrument in any frame" in clip.warnings
     with pytest.raises(InputError, match="every pixel of every mask is tool"):
-        open_clip(frames, masks=masks, mask_polarity="tissue")
+        open_with(frames, masks=masks, mask_polarity="tissue")
 
 
 def test_a_frame_that_is_all_tool_is_warned_about(studio, frames: Path) -> None:

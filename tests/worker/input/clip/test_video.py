@@ -11,6 +11,7 @@ import pytest
 
 from contract.intake.limits import HELD_BYTES_PER_PIXEL
 from contract.wire.errors import InputError, LimitError
+from tests.worker.clips import open_with
 from worker.input.clip import ClipLimits, StereoClip, open_clip
 
 DATA = Path(__file__).parents[3] / "data"
@@ -22,7 +23,7 @@ LOSSY_LEVELS = 8.0  # mean error of strongly compressed 8-bit frames
 
 
 def stereo(path, *args, **options) -> StereoClip:
-    clip = open_clip(path, *args, **options)
+    clip = open_with(path, *args, **options)
     assert isinstance(clip, StereoClip)
     return clip
 
@@ -276,11 +277,11 @@ def test_a_clip_that_just_fits_is_accepted(studio) -> None:
 def test_layouts_that_do_not_fit_a_video_are_refused() -> None:
     for layout in ("endonerf", "stereomis", "frames"):
         with pytest.raises(InputError, match="folder or zip"):
-            open_clip(SBS_H264, layout=layout)
-    with pytest.raises(InputError, match="'mono' is not known"):
-        open_clip(SBS_H264, layout="mono")
+            open_with(SBS_H264, layout=layout)
+    with pytest.raises(InputError, match="given: 'mono'"):
+        open_with(SBS_H264, layout="mono")
     with pytest.raises(InputError, match="does not go with a second file"):
-        open_clip(SBS_H264, SBS_H264, layout="sbs")
+        open_with(SBS_H264, SBS_H264, layout="sbs")
 
 
 @pytest.mark.skipif(not REAL_DATA.is_dir(), reason="needs INTRASPLAT_DATA")

@@ -1,0 +1,102 @@
+"""The one definition of what a caller may choose about a reconstruction: names, choices, bounds, meaning.
+
+Derived from it: the fields of POST /reconstruct, the options of `intrasplat reconstruct`, `submit` and `evaluate`
+(contract/runtime/arguments.py), what the decoding process and the training are told, and the form of the page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic_core.core_schema import ValidationInfo
+
+from contract.wire.errors import InputError
+from contract.wire.names import Layout, MaskPolarity, PoseConvention, PresetName
+
+Priority = Literal["standard", "high"]
+"""high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
+
+MAX_HOLDOUT_CHARACTERS = 8000
+"""A thousand frame numbers of up to six digits with commas: a job's record must fit into a pipe's buffer."""
+
+FIELD_PREFIX = "options"
+"""InputError.field of an option is `options.NAME`."""
+
+
+class ClipOptions(BaseModel):
+    """How to read a clip's files."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    exclusive: ClassVar[tuple[str, ...]] = ()
+    """Options of which at most one may be given."""
+
+    layout: Layout = Field(default="auto", description="how the clip's eyes, depths and masks are laid out")
+    mask_polarity: MaskPolarity = Field(default="auto", description="what is bright in the masks")
+    pose_convention: PoseConvention = Field(default="opengl", description="axes of poses_bounds.npy")
+
+
+class ReconstructionOptions(ClipOptions):
+    """How to reconstruct a clip. Without budget_s and iterations the preset says how long to train."""
+
+    exclusive: ClassVar[tuple[str, ...]] = ("iterations", "budget_s")
+
+    holdout: str = Field(
+        default="every8",
+        max_length=MAX_HOLDOUT_CHARACTERS,
+        pattern=r"^(every8|blocks8|none|\d{1,6}(,\d{1,6})*)$",
+        description="frames to measure quality on, never to train on: "
+        "every8, blocks8, none, or frame numbers such as 1,9,17",
+    )
+    preset: PresetName = Field(
+        default="fast", description="instant, fast, quality and small are ours; paper is the method as published"
+    )
+    iterations: int | None = Field(
+        default=None, ge=1, le=1_000_000, description="exactly how many steps to train; not with budget_s"
+    )
+    budget_s: float | None = Field(
+        default=None, gt=0, le=7200, description="about how many seconds to train, often less; not with iterations"
+    )
+    seed: int = Field(default=0, ge=0, lt=2**31, description="of all random numbers")
+
+    @field_validator("holdout", mode="before")
+    @classmethod
+    def _frames_as_text(cls, value: object) -> object:
+        """A JSON list of frame numbers means the same as their comma-separated text."""
+        return ",".join(str(frame) for frame in value) if isinstance(value, list) else value
+
+    @field_validator("budget_s")
+    @classmethod
+    def _one_length(cls, budget_s: float | None, given: ValidationInfo) -> float | None:
+        if budget_s is not None and given.data.get("iterations") is not None:
+            raise ValueError("budget_s and iterations exclude each other; give one of them")
+        return budget_s
+
+
+class JobOptions(ReconstructionOptions):
+    """How a service reconstructs a clip; the `options` field of POST /reconstruct."""
+
+    priority: Priority = Field(default="standard", description="high: before, and in place of, standard jobs")
+    retention_hours: float | None = Field(
+        default=None, gt=0, le=87_600, description="clip, scene and record are purged so long after the job ended"
+    )
+
+
+Options = TypeVar("Options", bound=ClipOptions)
+
+
+def parse_options(model: type[Options], given: str | Mapping[str, object]) -> Options:
+    """Options from JSON text or from values by name.
+
+    Raises:
+        InputError: names the option at fault, as options.NAME.
+    """
+    try:
+        return model.model_validate_json(given) if isinstance(given, str) else model.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join([FIELD_PREFIX, *(str(part) for part in first["loc"])])
+        problem = f"{first['msg']} (given: {str(first['input'])[:80]!r})."
+        known = ", ".join(model.model_fields)
+        raise InputError(field, problem, f"The options are {known}; /openapi.json describes them.") from error
