@@ -33,13 +33,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from worker.evaluate.rows import commit, write_rows
-from worker.model.deformation import Deformation, FlexibleDeformation, SharedBasis
+from worker.model.deformation import Deformation, GaussianFdm, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
 from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera
 from worker.raster.cpu import Rasterizer, compile_kernels
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion
 from worker.raster.cpu.project import LOG2E
 from worker.raster.cpu.simd import fma, lane_sum, load, splat
@@ -103,7 +103,7 @@ def _standard(repeats: int, peak: Row) -> list[Row]:
     rows = []
     for label, deformation in (
         ("shared, 17 bases, 13 channels", SharedBasis.initial(count, bases=BASES, colour=True)),
-        ("fdm, 17 bases", FlexibleDeformation.initial(count, bases=BASES)),
+        ("fdm, 17 bases", GaussianFdm.initial(count, bases=BASES)),
     ):
         rows += measure(f"standard: {label}", gaussians, deformation, camera, repeats, peak)
     return rows
@@ -164,7 +164,7 @@ def measure(
     parts: bool = True,
 ) -> list[Row]:
     """Median ms of a render and of a step, printed with their parts, as rows."""
-    model = FusedModel(gaussians, deformation, camera.width, camera.height)
+    model = CpuModel(gaussians, deformation, camera.width, camera.height)
     view, pixels = camera_vector(camera), camera.width * camera.height
     frame = TrainingFrame(view, TIME, _target(model.rasterizer), pixels, pixels)
     works: dict[str, Callable[[], object]] = {
@@ -190,7 +190,7 @@ def measure(
     return rows
 
 
-def _floor_ms(work: str, model: FusedModel, blended: float, peak: Row) -> float:
+def _floor_ms(work: str, model: CpuModel, blended: float, peak: Row) -> float:
     """Multiply-adds and bytes of a work over the machine's peaks, one after the other."""
     pixels = model.rasterizer.width * model.rasterizer.height
     moved = model.canonical.nbytes + model.opacity_logit.nbytes
@@ -204,7 +204,7 @@ def _floor_ms(work: str, model: FusedModel, blended: float, peak: Row) -> float:
     return 1e3 * float(multiply_adds / (1e9 * peak["gfma_per_s"]) + moved_bytes / (1e9 * peak["gb_per_s"]))
 
 
-def _timed(model: FusedModel, call: Callable[[], object], repeats: int) -> tuple[float, float, dict[str, float]]:
+def _timed(model: CpuModel, call: Callable[[], object], repeats: int) -> tuple[float, float, dict[str, float]]:
     """Median and least ms of call, median ms of its parts, by wrapping the model's own methods while it runs."""
     spent: dict[str, float] = {}
 
@@ -248,7 +248,7 @@ def _target(rasterizer: Rasterizer) -> Target:
     return Target(rgb, np.full(pixels, 255, np.uint8), np.full(pixels, 1 / DEPTH, np.float32))
 
 
-def blended_per_pixel(model: FusedModel, view: NDArray[np.float64]) -> float:
+def blended_per_pixel(model: CpuModel, view: NDArray[np.float64]) -> float:
     """Mean number of Gaussians that a pixel takes before it is full, by the contract's rules."""
     model.project(view, TIME, model.sh_degree)
     raster = model.rasterizer

@@ -28,7 +28,7 @@ from worker.model.deformation import Deformation, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.optimize import StepRates
 from worker.raster import reference
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.raster.cuda import rasterize
 from worker.raster.cuda.model import CudaModel
 from worker.raster.cuda.rasterizer import CudaRasterizer
@@ -213,7 +213,7 @@ class Checks:
             worst[kind] = _relative(got - gaussians.mean, wanted - exact.mean)
         return worst
 
-    def _train(self, model: CudaModel | FusedModel, steps: int, sh_degree: int = 0, first: int = 1) -> None:
+    def _train(self, model: CudaModel | CpuModel, steps: int, sh_degree: int = 0, first: int = 1) -> None:
         frames = self._frames(4)
         for iteration in range(first, first + steps):
             if isinstance(model, CudaModel) and 1 < iteration < 4:  # while the launches are captured, and replayed
@@ -226,7 +226,7 @@ class Checks:
     def steps(self, kind: str, sh_degree: int = 0) -> Differences:
         """How far a few steps, the last on two frames, take every parameter, beside how far they take the CPU's."""
         size = self.sizes
-        cpu = FusedModel(*self._parts(kind, sh_degree), size.model_width, size.model_height)
+        cpu = CpuModel(*self._parts(kind, sh_degree), size.model_width, size.model_height)
         cuda = self._model(kind, sh_degree)
         before = {name: each.clone() for name, each in cpu.parameters().items()}
         for model in (cpu, cuda):
@@ -245,7 +245,7 @@ class Checks:
         view, shared = camera_vector(camera), SharedBasis.initial(len(gaussians), bases=BASES, colour=True)
         noise = Noise(random_scene(1, width=width, height=height), self._random())
         seen = [noise.frame(t, view) for t in (0.2, 0.25, 0.3)]
-        cpu = FusedModel(gaussians, shared, width, height)
+        cpu = CpuModel(gaussians, shared, width, height)
         cuda = CudaModel(gaussians, shared, width, height, self._device)
         before = {name: each.clone() for name, each in cpu.parameters().items()}
         for model in (cpu, cuda):
@@ -295,7 +295,7 @@ class Checks:
         """Pictures of a model that was trained here, on the CPU and here, alone and several at once."""
         size, model = self.sizes, self._model("shared")
         self._train(model, size.steps)
-        cpu = FusedModel(*model.export(), size.model_width, size.model_height)
+        cpu = CpuModel(*model.export(), size.model_width, size.model_height)
         camera = camera_vector(random_scene(1, width=size.model_width, height=size.model_height).camera)
         times = [0.25, 0.7]
         at_once = model.render_times(camera, times).cpu().numpy().copy()

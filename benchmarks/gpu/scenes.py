@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.worker.raster.scenes import Scene, pixels_near_a_cut
-from worker.model.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.model.deformation import Deformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
 from worker.model.loss import LossSettings, training_loss
 from worker.raster import reference
 from worker.raster.cpu import padded
@@ -96,8 +96,9 @@ def stirred_motion(kind: str, count: int, random: torch.Generator) -> Deformatio
         return tensor + 0.05 * torch.randn(tensor.shape, generator=random)
 
     if kind.startswith("fdm"):
-        fdm = FlexibleDeformation.initial(count, bases=3, width=0.3, form=kind.removeprefix("fdm-"))  # type: ignore[arg-type]
-        return FlexibleDeformation(*(stirred(each) for each in fdm.parameters().values()), form=fdm.form)
+        form = QuarticFdm if kind == QuarticFdm.kind else GaussianFdm
+        fdm = form.initial(count, bases=3, width=0.3)
+        return form(*(stirred(each) for each in fdm.parameters().values()))
     if kind == "pfs":
         polynomial = PolynomialFourier.initial(count, weights=6)
         return dataclasses.replace(polynomial, weight=stirred(polynomial.weight))

@@ -22,7 +22,7 @@ from torch.profiler import ProfilerActivity, profile
 from benchmarks.bm_raster import BASES, GRID_STEP_PX, HEIGHT, RATES, WIDTH, grid_scene
 from benchmarks.gpu.rows import Part, Stamp, device_ms, synchronize, wall_ms
 from benchmarks.gpu.scenes import stereo_pairs
-from worker.model.deformation import Deformation, FlexibleDeformation, SharedBasis
+from worker.model.deformation import Deformation, GaussianFdm, SharedBasis
 from worker.model.loss import LossSettings
 from worker.raster.cpu import padded
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
@@ -77,7 +77,7 @@ class Speed:
     def motion(self, name: str) -> Deformation:
         number = len(self.gaussians)
         if name == "fdm":
-            return FlexibleDeformation.initial(number, bases=BASES)
+            return GaussianFdm.initial(number, bases=BASES)
         return SharedBasis.initial(number, bases=BASES, colour=True)
 
     def frame(self, t: float) -> TrainingFrame:

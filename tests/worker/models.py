@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worker.model.deformation import FlexibleDeformation, HexPlane, SharedBasis
+from worker.model.deformation import GaussianFdm, HexPlane, SharedBasis
 from worker.model.gaussians import Gaussians, initial_gaussians
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
 from worker.raster import Camera
 from worker.raster.cpu import padded
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.raster.model import Model
 from worker.raster.step import StepSums, Target, TrainingFrame, camera_vector
 
@@ -108,7 +108,7 @@ def training_frames(count: int = 3, *, seed: int = 1) -> list[Picture]:
 def frame_of(gaussians: Gaussians, t: float) -> Picture:
     """The frame that shows exactly these Gaussians at time t, with their depth where they are solid."""
     still = SharedBasis.initial(len(gaussians), bases=1)
-    red, green, blue, summed, alpha = FusedModel(gaussians, still, WIDTH, HEIGHT).render(camera_vector(endoscope()), t)
+    red, green, blue, summed, alpha = CpuModel(gaussians, still, WIDTH, HEIGHT).render(camera_vector(endoscope()), t)
     rgb = np.clip(np.stack([red, green, blue], axis=-1) * 255, 0, 255).round().astype(np.uint8)
     solid = alpha > 0.5
     depth = np.where(solid, summed / np.where(solid, alpha, 1), 0).astype(np.float32)
@@ -134,9 +134,9 @@ def moving_shared(gaussians: Gaussians) -> SharedBasis:
     return dataclasses.replace(start, weight=weight)
 
 
-def moving_fdm(gaussians: Gaussians) -> FlexibleDeformation:
+def moving_fdm(gaussians: Gaussians) -> GaussianFdm:
     """Wide bases of every Gaussian's own."""
-    start = FlexibleDeformation.initial(len(gaussians), bases=4, width=0.3)
+    start = GaussianFdm.initial(len(gaussians), bases=4, width=0.3)
     weight = 0.1 * torch.randn(start.weight.shape, generator=torch.Generator().manual_seed(5))
     return dataclasses.replace(start, weight=weight)
 

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from worker.input.camera import Intrinsics
-from worker.model.deformation import Deformation, FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
-from worker.model.deformation.fdm import Form
+from worker.model.deformation import Deformation, GaussianFdm, HexPlane, PolynomialFourier, QuarticFdm, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.scene.scene import Scene
 
@@ -51,9 +50,9 @@ def _deformation(kind: str, gaussians: Gaussians, random: torch.Generator) -> De
     count = len(gaussians)
     weight = 0.1 * torch.randn(count, 10, 5, generator=random)
     if kind.startswith("fdm-"):
-        form: Form = "quartic" if kind == "fdm-quartic" else "gaussian"
-        start = FlexibleDeformation.initial(count, bases=5, width=0.1, form=form)
-        return FlexibleDeformation(weight, start.centre, start.width, form)
+        form = QuarticFdm if kind == QuarticFdm.kind else GaussianFdm
+        start = form.initial(count, bases=5, width=0.1)
+        return form(weight, start.centre, start.width)
     if kind == "shared":
         start_shared = SharedBasis.initial(count, bases=5)
         return SharedBasis(weight, start_shared.centre, start_shared.width)

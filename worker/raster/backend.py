@@ -11,14 +11,10 @@ import torch
 from contract.wire.errors import InputError, UnavailableError
 from contract.wire.names import DeviceName
 from worker.machine.gpu import Gpu, find_gpu
-from worker.model.deformation import Deformation, HexPlane
+from worker.model.deformation import Deformation, motion_named
 from worker.model.gaussians import Gaussians
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.raster.model import Model
-from worker.raster.unfused import UnfusedModel
-
-CPU_ALONE = frozenset({"hexplane"})
-"""Kinds of motion without kernels of their own: torch moves the Gaussians, on the processor."""
 
 CPU_BY_OPTION, CPU_BY_VARIABLE = "--device cpu", "INTRASPLAT_DEVICE=cpu"
 """How the CPU is chosen for one reconstruction, and for a worker."""
@@ -95,14 +91,14 @@ def gpu_is_lost() -> bool:
 
 
 def device_for(deformation: str, asked: str, gpu: Gpu | None = None) -> Device:
-    """choose_device for training a motion of this kind: auto trains one without kernels for a GPU on the CPU.
+    """choose_device for training a motion of this name: auto trains one without kernels on the CPU.
 
     Raises:
         InputError: cuda is asked for, and the motion trains on the CPU only; or there is no device of that name.
         UnavailableError: as choose_device.
     """
     device = choose_device(asked, gpu)
-    if device.kind == "cpu" or deformation not in CPU_ALONE:
+    if device.kind == "cpu" or motion_named(deformation).has_kernels:
         return device
     if asked == "cuda":
         problem = f"cuda was asked for, but motion {deformation!r} trains on the CPU only."
@@ -113,15 +109,13 @@ def device_for(deformation: str, asked: str, gpu: Gpu | None = None) -> Device:
 def make_model(gaussians: Gaussians, deformation: Deformation, width: int, height: int, device: Device = CPU) -> Model:
     """The Gaussians (on the host) and their motion in the form that the device trains and renders.
 
-    A motion without kernels of its own lies on the CPU, whatever the device. Triton is imported for a GPU alone.
+    A motion without kernels lies on the CPU, whatever the device. Triton is imported for a GPU alone.
 
     Raises:
         UnavailableError: as examine.
     """
-    if isinstance(deformation, HexPlane):
-        return UnfusedModel(gaussians, deformation, width, height)
-    if device.kind == "cpu":
-        return FusedModel(gaussians, deformation, width, height)
+    if device.kind == "cpu" or not deformation.has_kernels:
+        return CpuModel(gaussians, deformation, width, height)
     from worker.raster.cuda.model import CudaModel
 
     examine(device)

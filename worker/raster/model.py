@@ -1,8 +1,9 @@
 """What training needs of a model, whatever computes its steps: Gaussians, their deformation and Adam's moments.
 
 Symbols: N Gaussians; H W pixels, as many as the camera says; F frames a step.
-Implementations: worker/raster/cpu/model.py, worker/raster/cuda/model.py, and worker/raster/unfused.py for deformations
-without kernels of their own. worker/raster/backend.py makes the one for a device.
+Implementations: CpuModel (worker/raster/cpu/model.py) and CudaModel (worker/raster/cuda/model.py). Each holds a Motion,
+which evaluates and trains the deformation: by kernels, or on the CPU by torch (worker/raster/cpu/unfused.py).
+worker/raster/backend.py makes the one for a device.
 
 A device may lag behind: step() returns before its step is made. Every other method waits for the steps before it, so
 none ever sees a model between two steps. What has to be known of steps that nobody waited for, whether their loss is a

@@ -12,6 +12,7 @@ from contract.wire.options import ReconstructionOptions
 from worker.fusion import fuse
 from worker.input.clip import DepthClip, FrameSplit
 from worker.machine.hooks import Hooks, Progress
+from worker.model.deformation import SharedBasis
 from worker.motion.tracks import moved_along, track
 from worker.raster.backend import CPU, Device, examine
 from worker.raster.model import Model
@@ -62,7 +63,7 @@ def prepare(
         report_stage(hooks, "compile", 0.0)
         seconds["compile_s"] = seconds.get("compile_s", 0.0) + clock.pause(lambda: examine(device))
     tracks = None
-    if preset.tracks and preset.deformation == "shared" and len(split.train) > 1:
+    if preset.tracks and preset.deformation == SharedBasis.kind and len(split.train) > 1:
         tracks = timed(
             seconds, "motion_s", lambda: track(clip, split.train, lambda share: report_stage(hooks, "motion", share))
         )

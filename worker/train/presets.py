@@ -13,6 +13,7 @@ from typing import Literal
 
 from contract.wire.errors import InputError
 from worker.fusion import FusionSettings
+from worker.model.deformation import GaussianFdm, HexPlane, PolynomialFourier, QuarticFdm, SharedBasis, motion_named
 from worker.model.gaussians import MAX_SH_DEGREE
 from worker.model.loss import LossSettings
 from worker.model.optimize import Rate, Rates
@@ -27,7 +28,7 @@ class Preset:
     points_per_image "fill" fusion takes the grid stride that comes nearest to this many points a frame; None: as far
                      apart as the scene's detail allows
     points_by_budget whether a run with budget_s takes as many points as pay within it instead
-    deformation      "shared", "fdm", "fdm-quartic", "pfs", "hexplane"
+    deformation      name of a motion in the registry (worker/model/deformation)
     bases            B of the deformation; None: as many as the scene's motion needs ("shared" alone)
     most_bases       of those the scene may choose; None: as many as there are to choose from
     tracks           whether optical-flow tracks start the motion ("shared" only)
@@ -50,7 +51,7 @@ class Preset:
     fusion: FusionSettings
     points_per_image: int | None
     points_by_budget: bool
-    deformation: Literal["shared", "fdm", "fdm-quartic", "pfs", "hexplane"]
+    deformation: str
     bases: int | None
     most_bases: int | None
     tracks: bool
@@ -74,7 +75,7 @@ class Preset:
             raise ValueError("cycles end in an average of models, which are not of one size with densification")
         if self.worth_db is not None and not self.cycles:
             raise ValueError("worth_db compares the ends of cycles, so it needs cycles")
-        least_bases = 0 if self.deformation == "hexplane" else 1
+        least_bases = motion_named(self.deformation).min_bases
         ranges: tuple[tuple[str, float, float], ...] = (
             ("bases", least_bases, math.inf),
             ("most_bases", least_bases, math.inf),
@@ -121,7 +122,7 @@ _PAPER = Preset(
     fusion=FusionSettings(mode="paper"),
     points_per_image=None,
     points_by_budget=False,
-    deformation="fdm",
+    deformation=GaussianFdm.kind,
     bases=17,
     most_bases=None,
     tracks=False,
@@ -167,7 +168,7 @@ _FAST = Preset(
     fusion=FusionSettings(mode="fill"),
     points_per_image=MANY_POINTS,
     points_by_budget=True,
-    deformation="shared",
+    deformation=SharedBasis.kind,
     bases=None,
     most_bases=None,
     tracks=True,
@@ -204,10 +205,10 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
                 budget_s=30.0,
             ),
             _PAPER,
-            replace(_PAPER, name="paper-released", deformation="fdm-quartic"),
+            replace(_PAPER, name="paper-released", deformation=QuarticFdm.kind),
             replace(_PAPER, name="paper-wide", start_width=0.6 / 16),
-            replace(_PAPER, name="pfs", deformation="pfs", start_width=None),
-            replace(_PAPER, name="hexplane", deformation="hexplane", bases=0, start_width=None),
+            replace(_PAPER, name="pfs", deformation=PolynomialFourier.kind, start_width=None),
+            replace(_PAPER, name="hexplane", deformation=HexPlane.kind, bases=0, start_width=None),
             replace(_PAPER, name="without_mapf", fusion=FusionSettings(mode="reference_only")),
         )
     }

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from worker.fusion import FusionSettings, PointCloud
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip
-from worker.model.deformation import Deformation, FlexibleDeformation, HexPlane, PolynomialFourier, SharedBasis
-from worker.model.deformation.base import CHANNELS, MEAN
+from worker.model.deformation import CHANNELS, MEAN, AtRest, SharedBasis, motion_named
 from worker.model.gaussians import SH_C0, Gaussians, initial_gaussians
 from worker.motion.capacity import MOST_POINTS, Tried, choose_bases, choose_stride, floor_error, try_bases
 from worker.motion.tracks import GUESSED, Tracks, fit_tracks
@@ -102,30 +101,11 @@ def start_model(
         mean=torch.from_numpy(cloud.points_mm * np.float32(scale)),
         log_scale=gaussians.log_scale + math.log(preset.spread),
     )
-    motion = _at_rest(gaussians, preset, [float(clip.t[i]) for i in train], seed)
+    start = AtRest(preset.bases, preset.start_width, [float(clip.t[i]) for i in train], seed)
+    motion = motion_named(preset.deformation).at_rest(gaussians, start)
     if tracks is not None and isinstance(motion, SharedBasis):
         gaussians = _follow_tracks(gaussians, motion, cloud, tracks, clip, train, scale)
     return make_model(gaussians, motion, clip.intrinsics.width, clip.intrinsics.height, device)
-
-
-def _at_rest(gaussians: Gaussians, preset: Preset, times: Sequence[float], seed: int) -> Deformation:
-    """The preset's motion of these Gaussians before anything is known of it; times are those of the training frames."""
-    count = len(gaussians)
-    assert preset.bases is not None
-    if preset.deformation == "hexplane":
-        bounds = torch.stack([gaussians.mean.amin(0), gaussians.mean.amax(0)])
-        return HexPlane.initial(bounds, seed=seed)
-    if preset.deformation == "pfs":
-        return PolynomialFourier.initial(count, weights=preset.bases)
-    if preset.deformation == "shared":
-        return SharedBasis.initial(count, bases=min(len(times), preset.bases), colour=True, times=times)
-    assert preset.start_width is not None
-    return FlexibleDeformation.initial(
-        count,
-        bases=preset.bases,
-        width=preset.start_width,
-        form="gaussian" if preset.deformation == "fdm" else "quartic",
-    )
 
 
 def _follow_tracks(

@@ -19,7 +19,7 @@ from worker.daemon.serve import NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import COPIES, Views, camera_of, pose_of, shown_time
 from worker.input.camera import Intrinsics
-from worker.model.deformation import FlexibleDeformation
+from worker.model.deformation import GaussianFdm
 from worker.model.gaussians import Gaussians
 from worker.scene.checkpoint import save_scene
 from worker.scene.scene import Scene
@@ -44,7 +44,7 @@ def scene() -> Scene:
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     return Scene(
         gaussians=gaussians,
-        deformation=FlexibleDeformation.initial(len(gaussians)),
+        deformation=GaussianFdm.initial(len(gaussians)),
         intrinsics=CLIP,
         world_from_camera=poses,
         frame_times_s=np.arange(FRAMES) / 25,

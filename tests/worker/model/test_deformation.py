@@ -15,17 +15,18 @@ from worker.model.deformation import (
     CHANNELS,
     Deformation,
     FlexibleDeformation,
+    GaussianFdm,
     HexPlane,
     PolynomialFourier,
+    QuarticFdm,
     SharedBasis,
     restore,
 )
-from worker.model.deformation.fdm import Form
 from worker.model.gaussians import Gaussians
 
 COUNT = 6
 TIMES = [0.0, 0.13, 0.5, 0.97]
-FORMS: list[Form] = ["gaussian", "quartic"]
+FORMS: list[type[FlexibleDeformation]] = [GaussianFdm, QuarticFdm]
 
 
 def canonical() -> Gaussians:
@@ -45,8 +46,8 @@ def stir(tensor: Tensor, amount: float, seed: int) -> Tensor:
 def moving(kind: str) -> Deformation:
     """A model of each kind whose every parameter is away from its start, float64."""
     start: dict[str, Deformation] = {
-        "fdm-gaussian": FlexibleDeformation.initial(COUNT, bases=5, width=0.1, form="gaussian"),
-        "fdm-quartic": FlexibleDeformation.initial(COUNT, bases=5, width=0.1, form="quartic"),
+        "fdm-gaussian": GaussianFdm.initial(COUNT, bases=5, width=0.1),
+        "fdm-quartic": QuarticFdm.initial(COUNT, bases=5, width=0.1),
         "shared": SharedBasis.initial(COUNT, bases=5),
         "shared with colour": SharedBasis.initial(COUNT, bases=5, colour=True),
         "pfs": PolynomialFourier.initial(COUNT, weights=8),
@@ -61,8 +62,8 @@ def moving(kind: str) -> Deformation:
 
 KINDS = ["fdm-gaussian", "fdm-quartic", "shared", "shared with colour", "pfs", "hexplane"]
 STARTS: list[Deformation] = [
-    FlexibleDeformation.initial(COUNT),
-    FlexibleDeformation.initial(COUNT, form="quartic"),
+    GaussianFdm.initial(COUNT),
+    QuarticFdm.initial(COUNT),
     SharedBasis.initial(COUNT),
     SharedBasis.initial(COUNT, colour=True),
     PolynomialFourier.initial(COUNT),
@@ -94,13 +95,13 @@ def test_every_model_starts_without_motion(model: Deformation, t: float) -> None
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("t", TIMES)
-def test_fdm_is_the_sum_its_equation_says(form: Form, t: float) -> None:
-    model = moving(f"fdm-{form}")
+def test_fdm_is_the_sum_its_equation_says(form: type[FlexibleDeformation], t: float) -> None:
+    model = moving(form.kind)
     assert isinstance(model, FlexibleDeformation)
     expected = np.zeros((COUNT, CHANNELS))
     for n, c, j in np.ndindex(COUNT, CHANNELS, 5):
         w, theta, sigma = (float(each[n, c, j]) for each in (model.weight, model.centre, model.width))
-        if form == "gaussian":
+        if form is GaussianFdm:
             expected[n, c] += w * math.exp(-((t - theta) ** 2) / (2 * sigma**2))
         else:
             expected[n, c] += w * math.exp(-(((t - theta) ** 2 / (sigma**2 + 1e-4)) ** 2))
@@ -109,7 +110,7 @@ def test_fdm_is_the_sum_its_equation_says(form: Form, t: float) -> None:
 
 def test_fdm_holds_a_width_at_its_floor() -> None:
     t = 0.501
-    narrow = FlexibleDeformation(
+    narrow = GaussianFdm(
         weight=torch.ones(1, CHANNELS, 1), centre=torch.full((1, CHANNELS, 1), 0.5), width=torch.zeros(1, CHANNELS, 1)
     )
     assert_close(narrow.basis(t), np.full((1, CHANNELS, 1), math.exp(-0.5)), relative=1e-4)
@@ -120,15 +121,15 @@ def test_fdm_holds_a_width_at_its_floor() -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_the_sign_of_a_width_changes_nothing(form: Form) -> None:
-    model = moving(f"fdm-{form}")
+def test_the_sign_of_a_width_changes_nothing(form: type[FlexibleDeformation]) -> None:
+    model = moving(form.kind)
     assert isinstance(model, FlexibleDeformation)
     mirrored = dataclasses.replace(model, width=-model.width)
     assert bool((mirrored.basis(0.3) == model.basis(0.3)).all())
 
 
 def test_fdm_starts_as_the_paper_says() -> None:
-    model = FlexibleDeformation.initial(2)
+    model = GaussianFdm.initial(2)
     assert model.weight.shape == (2, CHANNELS, 17)
     assert_close(model.centre[1, 4], np.linspace(0, 1, 17))
     assert_close(model.width, np.full((2, CHANNELS, 17), 0.01))
@@ -136,14 +137,14 @@ def test_fdm_starts_as_the_paper_says() -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_beyond_six_widths_of_every_centre_is_the_canonical_state(form: Form) -> None:
+def test_beyond_six_widths_of_every_centre_is_the_canonical_state(form: type[FlexibleDeformation]) -> None:
     random = torch.Generator().manual_seed(3)
     shape = (COUNT, CHANNELS, 4)
     centre = 0.3 * torch.rand(shape, generator=random, dtype=torch.float64)
     width = 0.01 + 0.09 * torch.rand(shape, generator=random, dtype=torch.float64)
     weight = torch.randn(shape, generator=random, dtype=torch.float64)
-    model = FlexibleDeformation(weight, centre, width, form)
-    t = float((centre + 6 * torch.sqrt(width**2 + (1e-4 if form == "quartic" else 0))).max())
+    model = form(weight, centre, width)
+    t = float((centre + 6 * torch.sqrt(width**2 + (1e-4 if form is QuarticFdm else 0))).max())
     bound = float(weight.abs().sum(-1).max()) * math.exp(-18)  # exp(-6^2 / 2); the quartic form's exp(-6^4) is below
     assert_close(deformed_channels(model, canonical(), t), np.zeros((COUNT, CHANNELS)), absolute=bound)
 
@@ -326,10 +327,10 @@ def test_tensors_that_make_no_model_are_refused(kind: str, tensors: dict[str, Te
 def test_shapes_that_do_not_belong_together_are_refused() -> None:
     weight = torch.zeros(2, CHANNELS, 3)
     with pytest.raises(ValueError, match="share one shape"):
-        FlexibleDeformation(weight, weight[:1], weight)
+        GaussianFdm(weight, weight[:1], weight)
     with pytest.raises(ValueError, match="must be positive"):
         SharedBasis(weight, torch.zeros(3), torch.tensor([0.1, 0.0, 0.1]))
     with pytest.raises(ValueError, match="centre and width"):
         SharedBasis(weight, torch.zeros(2), torch.ones(2))
     with pytest.raises(ValueError, match="6 Gaussians need"):
-        FlexibleDeformation.initial(2).deform(canonical(), 0.0)
+        GaussianFdm.initial(2).deform(canonical(), 0.0)

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numba.core.dispatcher import Dispatcher
 
-from worker.model.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.model.deformation import Deformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
 from worker.raster import Camera
 from worker.raster.cpu import compile_kernels, rasterize
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.raster.step import Target, TrainingFrame, camera_vector
 
 COUNT, WIDTH, HEIGHT = 50, 37, 35
@@ -52,11 +52,11 @@ def use_everything() -> None:
         (SharedBasis.initial(COUNT, bases=3), 0),
         (SharedBasis.initial(COUNT, bases=3, colour=True), 0),
         (PolynomialFourier.initial(COUNT), 3),
-        (FlexibleDeformation.initial(COUNT), 3),
-        (FlexibleDeformation.initial(COUNT, form="quartic"), 2),
+        (GaussianFdm.initial(COUNT), 3),
+        (QuarticFdm.initial(COUNT), 2),
     ]
     for motion, degree in motions:
-        model = FusedModel(gaussians(degree), motion, WIDTH, HEIGHT)
+        model = CpuModel(gaussians(degree), motion, WIDTH, HEIGHT)
         pixels = HEIGHT * model.rasterizer.stride
         rgb, weight = np.full(3 * pixels, 100, np.uint8), np.full(pixels, 255, np.uint8)
         target = Target(rgb, weight, np.ones(pixels, np.float32))

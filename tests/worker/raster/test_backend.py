@@ -21,8 +21,7 @@ from worker.raster.backend import (
     gpu_is_lost,
     make_model,
 )
-from worker.raster.cpu.model import FusedModel
-from worker.raster.unfused import UnfusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.train.presets import PRESETS
 
 H200 = Gpu(build="13.0", name="NVIDIA H200", triton="3.6.0")
@@ -98,9 +97,9 @@ def test_reports_name_the_gpu() -> None:
 def test_the_model_of_a_motion_is_that_of_the_device() -> None:
     gaussians = wall()
     for moving in (moving_shared, moving_fdm):
-        assert type(make_model(gaussians, moving(gaussians), WIDTH, HEIGHT)) is FusedModel
+        assert type(make_model(gaussians, moving(gaussians), WIDTH, HEIGHT)) is CpuModel
     for device in (CPU, Device("cuda", "NVIDIA H200", "cuda")):
-        assert type(make_model(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT, device)) is UnfusedModel
+        assert type(make_model(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT, device)) is CpuModel
 
 
 def test_a_process_that_has_used_no_gpu_has_lost_none() -> None:

@@ -17,13 +17,20 @@ from torch import Tensor
 
 from tests.helpers import assert_close
 from tests.worker.raster.scenes import Scene, opaque_wall, pixels_near_a_cut, random_scene
-from worker.model.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis, restore
+from worker.model.deformation import (
+    FlexibleDeformation,
+    GaussianFdm,
+    PolynomialFourier,
+    QuarticFdm,
+    SharedBasis,
+    restore,
+)
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings, training_loss
 from worker.model.optimize import StepRates
 from worker.raster import Camera
 from worker.raster.cpu import Rasterizer, padded
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion, motion_of
 from worker.raster.step import Target, TrainingFrame, camera_vector
 
@@ -223,12 +230,13 @@ def moving_gaussians(kind: str, sh_degree: int) -> tuple[Gaussians, Fused, Camer
         linear: Fused = SharedBasis.initial(90, bases=4, colour=kind == "shared with colour")
         linear = PolynomialFourier.initial(90, weights=6) if kind == "pfs" else linear
         return gaussians, dataclasses.replace(linear, weight=_stirred(linear.weight, 0.05, random)), scene.camera
-    fdm = FlexibleDeformation.initial(90, bases=5, width=0.2, form="quartic" if kind == "fdm-quartic" else "gaussian")
+    form = QuarticFdm if kind == QuarticFdm.kind else GaussianFdm
+    fdm = form.initial(90, bases=5, width=0.2)
     moved = {name: _stirred(each, 0.05, random) for name, each in fdm.parameters().items()}
     # Alive at t = 0.4 and narrower than the floor: no gradient to the width in the paper's form.
     moved["width"][0, 0, 2], moved["centre"][0, 0, 2] = 1e-4, 0.4005
     moved["width"][1, 0, 2] *= -1
-    return gaussians, FlexibleDeformation(**moved, form=fdm.form), scene.camera
+    return gaussians, form(**moved), scene.camera
 
 
 def _stirred(tensor: Tensor, amount: float, random: torch.Generator) -> Tensor:
@@ -259,7 +267,7 @@ def test_a_fused_step_has_the_gradients_of_the_stages_one_by_one(kind: str, sh_d
     gradients = torch.autograd.grad(frame.loss(scene, NORMALISED), everything)
     wanted = dict(zip([*leaves, *motion], gradients, strict=True))
 
-    model = FusedModel(gaussians, deformation, camera.width, camera.height)
+    model = CpuModel(gaussians, deformation, camera.width, camera.height)
     model.step([frame.seen_from(camera, t, model.rasterizer)], NORMALISED, RATES, 1, sh_degree)
     stored = {name: 10 * np.asarray(each) for name, each in model.arrays().items()}
 
@@ -291,7 +299,7 @@ def test_a_fused_render_is_the_reference_of_the_deformed_gaussians(kind: str) ->
     scene = _scene_of(deformation.deform(gaussians, 0.4), camera)
     kept = ~pixels_near_a_cut(scene)
     wanted = scene.to(torch.float64).render()
-    red, green, blue, depth, alpha = FusedModel(gaussians, deformation, camera.width, camera.height).render(
+    red, green, blue, depth, alpha = CpuModel(gaussians, deformation, camera.width, camera.height).render(
         camera_vector(camera), 0.4
     )
     assert_close(np.stack([red, green, blue], axis=-1), wanted.rgb, where=kept, name="rgb")
@@ -302,7 +310,7 @@ def test_a_fused_render_is_the_reference_of_the_deformed_gaussians(kind: str) ->
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_model_exports_what_it_was_made_of(kind: str) -> None:
     gaussians, deformation, camera = moving_gaussians(kind, 2)
-    exported, motion = FusedModel(gaussians, deformation, camera.width, camera.height).export()
+    exported, motion = CpuModel(gaussians, deformation, camera.width, camera.height).export()
     assert motion.kind == deformation.kind
     given = gaussians.tensors() | deformation.parameters() | deformation.constants()
     for name, each in (exported.tensors() | motion.parameters() | motion.constants()).items():
@@ -313,7 +321,7 @@ def test_a_model_exports_what_it_was_made_of(kind: str) -> None:
 def test_motion_takes_the_steps_of_torchs_adam(kind: str) -> None:
     gaussians, deformation, _ = moving_gaussians(kind, 0)
     count, columns = 90, padded(90)
-    motion = motion_of(deformation, columns)
+    motion = motion_of(deformation, count, columns)
     leaves = {name: each.double().requires_grad_() for name, each in deformation.parameters().items()}
     constants = {name: each.double() for name, each in deformation.constants().items()}
     canonical = Gaussians(**{name: each.double() for name, each in gaussians.tensors().items()})
@@ -352,7 +360,7 @@ def test_bases_that_are_negligible_are_left_out_of_deformation_and_training() ->
 
 
 def test_beyond_six_widths_the_kernels_of_fdm_give_the_canonical_state() -> None:
-    fdm = FlexibleDeformation.initial(16, bases=3, width=0.01)
+    fdm = GaussianFdm.initial(16, bases=3, width=0.01)
     fdm = dataclasses.replace(fdm, weight=torch.ones_like(fdm.weight))
     canonical = np.random.default_rng(0).normal(size=(13, 16)).astype(np.float32)
     state = np.full((13, 16), np.nan, np.float32)
@@ -364,7 +372,7 @@ def test_beyond_six_widths_the_kernels_of_fdm_give_the_canonical_state() -> None
 def test_a_model_that_took_some_of_its_gaussians_trains_on_as_they_did(kind: str) -> None:
     gaussians, deformation, camera = moving_gaussians(kind, 1)
     frame = random_frame(camera, np.zeros((camera.height, camera.width), bool))
-    models = [FusedModel(gaussians, deformation, camera.width, camera.height) for _ in range(2)]
+    models = [CpuModel(gaussians, deformation, camera.width, camera.height) for _ in range(2)]
     order = np.random.default_rng(3).permutation(90)
     for iteration in (1, 2, 3):
         for model in models:
@@ -380,7 +388,7 @@ def test_a_model_that_took_some_of_its_gaussians_trains_on_as_they_did(kind: str
 def test_gaussians_taken_afresh_start_with_no_moments() -> None:
     gaussians, deformation, camera = moving_gaussians("shared with colour", 0)
     frame = random_frame(camera, np.zeros((camera.height, camera.width), bool))
-    model = FusedModel(gaussians, deformation, camera.width, camera.height)
+    model = CpuModel(gaussians, deformation, camera.width, camera.height)
     model.step([frame.seen_from(camera, 0.4, model.rasterizer)], NORMALISED, RATES, 1)
     model.take(np.array([5, 5, 7]), np.array([False, True, True]))
     moments = [each for name, each in model.arrays().items() if name.startswith("moments.") or name[7:] == "first"]

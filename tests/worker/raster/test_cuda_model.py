@@ -19,11 +19,11 @@ from tests.helpers import assert_close
 from tests.worker import models
 from tests.worker.raster import replays
 from tests.worker.raster.scenes import random_scene
-from worker.model.deformation import FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.model.deformation import FlexibleDeformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings
 from worker.raster.cpu import padded
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.raster.cuda.bins import MOST_FRAMES
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
 from worker.raster.step import Target, TrainingFrame, camera_vector
@@ -58,9 +58,10 @@ def deformation(kind: str) -> Fused:
         return tensor + 0.05 * torch.randn(tensor.shape, generator=random)
 
     if kind.startswith("fdm"):
-        fdm = FlexibleDeformation.initial(COUNT, bases=2, width=0.3)
+        form = QuarticFdm if kind == QuarticFdm.kind else GaussianFdm
+        fdm = form.initial(COUNT, bases=2, width=0.3)
         weight, centre, width = (stirred(each) for each in fdm.parameters().values())
-        return FlexibleDeformation(weight, centre, width, form="quartic" if kind == "fdm-quartic" else "gaussian")
+        return form(weight, centre, width)
     linear: Fused = SharedBasis.initial(COUNT, bases=4, colour=kind == "shared with colour")
     linear = PolynomialFourier.initial(COUNT, weights=4) if kind == "pfs" else linear
     return dataclasses.replace(linear, weight=stirred(linear.weight))
@@ -88,7 +89,7 @@ def frames(count: int = 3, width: int = WIDTH) -> list[TrainingFrame]:
     return made
 
 
-AnyModel = CudaModel | FusedModel
+AnyModel = CudaModel | CpuModel
 
 
 def model(device: str, kind: str = "shared with colour", sh_degree: int = 0) -> CudaModel:
@@ -115,11 +116,11 @@ def assert_same_bits(got: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
     [("shared", 1), ("shared with colour", 0), ("pfs", 0), ("fdm-gaussian", 0), ("fdm-quartic", 0)],
 )
 def test_steps_change_a_model_as_they_do_on_the_cpu(kind: str, sh_degree: int, device: str) -> None:
-    cpu = FusedModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT)
+    cpu = CpuModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT)
     cuda = model(device, kind, sh_degree)
     for trained in (cpu, cuda):
         train(trained, frames(2), sh_degree)
-    before = FusedModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT).parameters()
+    before = CpuModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT).parameters()
     wanted = cpu.arrays()
     got = stored(cuda)
     assert got.keys() == wanted.keys()
@@ -134,7 +135,7 @@ def test_steps_change_a_model_as_they_do_on_the_cpu(kind: str, sh_degree: int, d
 def test_what_was_trained_on_the_device_renders_on_the_cpu_within_an_8_bit_step(device: str) -> None:
     cuda = model(device)
     train(cuda, frames(1))
-    cpu = FusedModel(*cuda.export(), WIDTH, HEIGHT)
+    cpu = CpuModel(*cuda.export(), WIDTH, HEIGHT)
     values = np.linspace(0, 1, COUNT, dtype=np.float32)
     image = cuda.render(CAMERA, 0.6, values)
     wanted = cpu.render(CAMERA, 0.6, values)
@@ -151,13 +152,13 @@ def test_several_times_are_rendered_at_once_and_other_sizes_too(device: str) -> 
         assert_close(image, cuda.render(CAMERA, t), relative=1e-6, name=f"at {t}")
     other = CAMERA.copy()
     other[:6] *= 0.5
-    wanted = FusedModel(gaussians(1), deformation("shared with colour"), 10, 8).render(other, 0.2)
+    wanted = CpuModel(gaussians(1), deformation("shared with colour"), 10, 8).render(other, 0.2)
     assert_close(cuda.render(other, 0.2), wanted, relative=1e-3, name="half the size")
 
 
 def test_the_gradient_of_an_image_is_the_cpus(device: str) -> None:
     cotangents = np.random.default_rng(3).normal(size=(5, HEIGHT, WIDTH)).astype(np.float32)
-    cpu = FusedModel(gaussians(1), deformation("shared"), WIDTH, HEIGHT)
+    cpu = CpuModel(gaussians(1), deformation("shared"), WIDTH, HEIGHT)
     wanted = cpu.image_gradient(CAMERA, 0.4, cotangents)
     got = model(device, "shared", 1).image_gradient(CAMERA, 0.4, cotangents)
     for row in range(14):
@@ -202,7 +203,7 @@ def test_a_model_with_too_little_room_ends_as_one_with_ample_room(three_steps: d
 
 
 def test_steps_are_answered_for_once_and_together(device: str) -> None:
-    cpu = FusedModel(gaussians(), deformation("shared"), WIDTH, HEIGHT)
+    cpu = CpuModel(gaussians(), deformation("shared"), WIDTH, HEIGHT)
     seen = frames(2)
     answers = [cpu.step([frame], LOSS, RATES, k + 1) for k, frame in enumerate(seen)]
     cuda = model(device, "shared")
@@ -227,7 +228,7 @@ def test_what_was_learnt_while_waiting_for_something_else_comes_with_the_next_st
 
 @pytest.mark.parametrize(("kind", "sh_degree"), [("shared with colour", 0), ("fdm-gaussian", 1)])
 def test_steps_on_several_frames_change_a_model_as_they_do_on_the_cpu(kind: str, sh_degree: int, device: str) -> None:
-    cpu = FusedModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT)
+    cpu = CpuModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT)
     cuda, seen = model(device, kind, sh_degree), frames()
     squared_errors = []
     for trained in (cpu, cuda):
@@ -249,7 +250,7 @@ def test_more_frames_than_can_be_drawn_at_once_are_refused_and_no_preset_asks_fo
 
 def test_what_is_replayed_ends_as_what_is_launched(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     graph = replays.emulate(monkeypatch) if device == "cpu" else None
-    cpu, cuda = FusedModel(gaussians(), deformation("shared with colour"), WIDTH, HEIGHT), model(device)
+    cpu, cuda = CpuModel(gaussians(), deformation("shared with colour"), WIDTH, HEIGHT), model(device)
     cuda._store.row(frames(1)[0])  # else the first step makes room, and the second is the first with these addresses
     columns = np.r_[np.arange(COUNT)[::-1], 5, 7, 7]
     for trained in (cpu, cuda):
@@ -266,7 +267,7 @@ def test_what_is_replayed_ends_as_what_is_launched(device: str, monkeypatch: pyt
 
 def test_gaussians_taken_train_on_as_on_the_cpu(device: str) -> None:
     kind = "fdm-gaussian"
-    models = (FusedModel(gaussians(), deformation(kind), WIDTH, HEIGHT), model(device, kind))
+    models = (CpuModel(gaussians(), deformation(kind), WIDTH, HEIGHT), model(device, kind))
     columns = np.r_[np.arange(COUNT)[::-1], 5, 7, 7]
     for trained in models:
         train(trained, frames(2)[:1])

@@ -17,7 +17,7 @@ pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA 
 
 from tests.helpers import assert_close
 from tests.worker.raster.test_cpu import KINDS, RATES, Fused, moving_gaussians
-from worker.model.deformation import FlexibleDeformation, SharedBasis, restore
+from worker.model.deformation import GaussianFdm, SharedBasis, restore
 from worker.model.gaussians import SH_C0, Gaussians
 from worker.model.optimize import StepRates
 from worker.raster.cpu.motion import NEGLIGIBLE
@@ -134,7 +134,7 @@ def test_the_state_at_several_times_is_that_of_the_deformation(kind: str, device
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_frame_moves_and_trains_as_on_the_cpu(kind: str, device: str) -> None:
     made, random = bench(kind, device, (0.4,)), np.random.default_rng(5)
-    cpu = cpu_motion_of(made.deformation, padded(COUNT))
+    cpu = cpu_motion_of(made.deformation, COUNT, padded(COUNT))
     canonical = made.trained.values[:ROWS].cpu().numpy().copy()
     for iteration, t in enumerate((0.4, 0.52, 0.31), start=1):
         made.times = (t,)
@@ -236,7 +236,7 @@ def test_every_row_has_its_own_rate(kind: str, device: str) -> None:
 
 def test_beyond_six_widths_fdm_gives_the_canonical_state(device: str) -> None:
     made = bench("fdm-gaussian", device)
-    fdm = FlexibleDeformation.initial(COUNT, bases=3, width=0.01)
+    fdm = GaussianFdm.initial(COUNT, bases=3, width=0.01)
     fdm = dataclasses.replace(fdm, weight=torch.ones_like(fdm.weight))
     made.motion, made.times = motion_of(fdm, padded(COUNT), torch.device(device)), (0.25, 0.75)  # 25 widths away
     made.deform()

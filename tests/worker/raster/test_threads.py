@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
 from tests.worker.raster.test_cpu import NORMALISED, RATES, moving_gaussians, random_frame
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.raster.cpu.threads import THREADS_VARIABLE, run, thread_count
 from worker.raster.step import camera_vector
 
@@ -46,7 +46,7 @@ def train(kind: str, steps: int) -> list[NDArray[np.float32]]:
     """Everything a model holds after some steps."""
     gaussians, deformation, camera = moving_gaussians(kind, 0)
     frame = random_frame(camera, np.zeros((camera.height, camera.width), bool))
-    model = FusedModel(gaussians, deformation, camera.width, camera.height)
+    model = CpuModel(gaussians, deformation, camera.width, camera.height)
     seen = frame.seen_from(camera, 0.4, model.rasterizer)
     for iteration in range(1, steps + 1):
         model.step([seen], NORMALISED, RATES, iteration)
@@ -55,7 +55,7 @@ def train(kind: str, steps: int) -> list[NDArray[np.float32]]:
 
 def render(kind: str, frames: int) -> list[NDArray[np.float32]]:
     gaussians, deformation, camera = moving_gaussians(kind, 0)
-    model = FusedModel(gaussians, deformation, camera.width, camera.height)
+    model = CpuModel(gaussians, deformation, camera.width, camera.height)
     return [model.render(camera_vector(camera), t).copy() for t in np.linspace(0, 1, frames)]
 
 

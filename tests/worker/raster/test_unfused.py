@@ -31,9 +31,10 @@ from worker.model.deformation import Deformation, HexPlane
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings, training_loss
 from worker.raster import reference
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
+from worker.raster.cpu.motion import FdmMotion, LinearMotion, motion_of
+from worker.raster.cpu.unfused import AutogradMotion
 from worker.raster.step import StepSums, TrainingFrame, camera_vector
-from worker.raster.unfused import UnfusedModel
 from worker.scene.resume_file import load_resume, save_resume
 
 LOSSES = pytest.mark.parametrize("loss", [PAPER, NORMALISED], ids=["paper", "normalised"])
@@ -43,7 +44,9 @@ LOSSES = pytest.mark.parametrize("loss", [PAPER, NORMALISED], ids=["paper", "nor
 @pytest.mark.parametrize("moving", [moving_shared, moving_fdm])
 def test_it_takes_the_steps_of_the_fused_model(moving: Callable[[Gaussians], Deformation], loss: LossSettings) -> None:
     gaussians = wall(sh_degree=1)
-    models = [kind(gaussians, moving(gaussians), WIDTH, HEIGHT) for kind in (FusedModel, UnfusedModel)]
+    models = [
+        CpuModel(gaussians, moving(gaussians), WIDTH, HEIGHT, make_motion=each) for each in (motion_of, AutogradMotion)
+    ]
     fused_sums, sums = (take_steps(model, training_frames(), loss=loss, sh_degree=1) for model in models)
     for name in ("colour_l1", "depth_l1", "squared_error", "holes"):
         assert_close([getattr(each, name) for each in sums], [getattr(each, name) for each in fused_sums], name=name)
@@ -79,7 +82,7 @@ def test_the_first_moments_of_hexplane_are_the_gradients_of_the_loss(loss: LossS
     names = [*leaves, *parameters]
     wanted = dict(zip(names, torch.autograd.grad(total, [*leaves.values(), *parameters.values()]), strict=True))
 
-    model = UnfusedModel(gaussians, field, WIDTH, HEIGHT)
+    model = CpuModel(gaussians, field, WIDTH, HEIGHT)
     take_steps(model, [frame], loss=loss)
     count, arrays = model.count, model.arrays()
     canonical = 10 * arrays["moments.canonical"][0, :, :count].T
@@ -97,12 +100,11 @@ def test_a_step_on_several_frames_has_the_gradients_of_all_added(moving: Callabl
     gaussians, camera = wall(stride=6, sh_degree=1), camera_vector(endoscope())
     frames = [each.seen_from(camera) for each in training_frames(2)]
 
-    def after(seen: list[TrainingFrame]) -> tuple[FusedModel, StepSums]:
-        kind = UnfusedModel if moving is moving_hexplane else FusedModel
-        model = kind(gaussians, moving(gaussians), WIDTH, HEIGHT)
+    def after(seen: list[TrainingFrame]) -> tuple[CpuModel, StepSums]:
+        model = CpuModel(gaussians, moving(gaussians), WIDTH, HEIGHT)
         return model, model.step(seen, PAPER, RATES, 1, 1)
 
-    def gradients(model: FusedModel) -> dict[str, Tensor]:
+    def gradients(model: CpuModel) -> dict[str, Tensor]:
         """Adam's first moments after one step: a tenth of them."""
         arrays = model.arrays()
         found = {name: each[0] for name, each in arrays.items() if "moments." in name}
@@ -124,8 +126,8 @@ def test_a_render_is_the_fused_models_of_the_moved_gaussians() -> None:
     camera = camera_vector(endoscope())
     moved = field.deform(gaussians, 0.6)
     still = dataclasses.replace(moving_shared(gaussians), weight=torch.zeros(len(gaussians), 10, 3))
-    wanted = FusedModel(moved, still, WIDTH, HEIGHT).render(camera, 0.6)
-    assert_close(UnfusedModel(gaussians, field, WIDTH, HEIGHT).render(camera, 0.6), wanted)
+    wanted = CpuModel(moved, still, WIDTH, HEIGHT).render(camera, 0.6)
+    assert_close(CpuModel(gaussians, field, WIDTH, HEIGHT).render(camera, 0.6), wanted)
     assert float((moved.mean - gaussians.mean).abs().max()) > 0.05  # the field does move them
 
 
@@ -136,7 +138,7 @@ def test_hexplane_learns_a_motion_from_images_alone() -> None:
     ]
     frames = [frame_of(each, t) for each, t in zip(pushed, (0.2, 0.7), strict=True)]
     field = HexPlane.initial(torch.stack([gaussians.mean.amin(0), gaussians.mean.amax(0)]), space_cells=(8,))
-    model = UnfusedModel(gaussians, field, WIDTH, HEIGHT)
+    model = CpuModel(gaussians, field, WIDTH, HEIGHT)
     only_motion = dataclasses.replace(RATES, mean=0.0, quaternion=0.0, log_scale=0.0, opacity=0.0, colour=0.0)
     depths = dataclasses.replace(PAPER, depth_weight=100.0)
     errors = []
@@ -151,7 +153,7 @@ def test_it_leaves_the_deformation_it_was_given_alone_and_exports_copies() -> No
     gaussians = wall()
     field = moving_hexplane(gaussians)
     before = {name: each.clone() for name, each in field.parameters().items()}
-    model = UnfusedModel(gaussians, field, WIDTH, HEIGHT)
+    model = CpuModel(gaussians, field, WIDTH, HEIGHT)
     _, exported = model.export()
     take_steps(model, training_frames(1))
     for each in (field, exported):
@@ -163,7 +165,7 @@ def test_it_leaves_the_deformation_it_was_given_alone_and_exports_copies() -> No
 @pytest.mark.parametrize("moving", [moving_hexplane, moving_fdm])
 def test_taking_rows_keeps_their_motion_and_moments(moving: Callable[[Gaussians], Deformation]) -> None:
     gaussians = wall()
-    model = UnfusedModel(gaussians, moving(gaussians), WIDTH, HEIGHT)
+    model = CpuModel(gaussians, moving(gaussians), WIDTH, HEIGHT)
     take_steps(model, training_frames(2))
     columns = np.array([7, 3, 3, 11, 200])
     fresh = np.array([False, False, True, False, False])
@@ -186,13 +188,13 @@ def test_taking_rows_keeps_their_motion_and_moments(moving: Callable[[Gaussians]
 def test_a_resumed_model_takes_the_steps_of_an_uninterrupted_one(tmp_path: Path) -> None:
     gaussians = wall()
     frames = training_frames(4)
-    whole = UnfusedModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT)
+    whole = CpuModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT)
     take_steps(whole, frames[:2])
     save_resume(tmp_path, {name: each.contiguous() for name, each in whole.arrays().items()}, {})
     take_steps(whole, frames[2:], first=3)
 
     tensors, _ = load_resume(tmp_path)
-    resumed = UnfusedModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT)
+    resumed = CpuModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT)
     resumed.load_arrays(tensors)
     take_steps(resumed, frames[2:], first=3)
     for name, each in resumed.arrays().items():
@@ -201,13 +203,20 @@ def test_a_resumed_model_takes_the_steps_of_an_uninterrupted_one(tmp_path: Path)
 
 def test_a_rate_of_zero_leaves_motion_as_it_is() -> None:
     gaussians = wall()
-    model = UnfusedModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT)
+    model = CpuModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT)
     take_steps(model, training_frames(1), rates=dataclasses.replace(RATES, motion_mean=0.0))
     wanted = moving_hexplane(gaussians).parameters()
     assert all(torch.equal(each, wanted[name]) for name, each in model.export()[1].parameters().items())
 
 
-def test_the_fused_model_refuses_motion_without_kernels() -> None:
+@pytest.mark.parametrize(
+    ("moving", "trained_by"),
+    [(moving_shared, LinearMotion), (moving_fdm, FdmMotion), (moving_hexplane, AutogradMotion)],
+)
+def test_only_a_motion_without_kernels_is_left_to_torch(
+    moving: Callable[[Gaussians], Deformation], trained_by: type
+) -> None:
     gaussians = wall()
-    with pytest.raises(ValueError, match="hexplane"):
-        FusedModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT)
+    deformation = moving(gaussians)
+    assert deformation.has_kernels is (trained_by is not AutogradMotion)
+    assert type(CpuModel(gaussians, deformation, WIDTH, HEIGHT).motion) is trained_by

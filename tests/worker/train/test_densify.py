@@ -28,10 +28,10 @@ from tests.worker.models import (
 from worker.model.deformation import LOG_SCALE, MEAN, FlexibleDeformation, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
+from worker.raster.cpu.unfused import AutogradMotion
 from worker.raster.model import Model
 from worker.raster.step import camera_vector
-from worker.raster.unfused import UnfusedModel
 from worker.scene.resume_file import load_resume, save_resume
 from worker.train.densify import Densifier, DensifyResult, DensifySettings
 
@@ -39,11 +39,11 @@ NOTHING = DensifySettings(gradient_threshold=1e9)
 EVERYTHING = DensifySettings(gradient_threshold=1e-30)
 
 
-def fused(gaussians: Gaussians) -> FusedModel:
-    return FusedModel(gaussians, moving_shared(gaussians), WIDTH, HEIGHT)
+def fused(gaussians: Gaussians) -> CpuModel:
+    return CpuModel(gaussians, moving_shared(gaussians), WIDTH, HEIGHT)
 
 
-def trained(gaussians: Gaussians, settings: DensifySettings, frames: int = 3) -> tuple[FusedModel, Densifier]:
+def trained(gaussians: Gaussians, settings: DensifySettings, frames: int = 3) -> tuple[CpuModel, Densifier]:
     """A model after a few observed steps."""
     model = fused(gaussians)
     densifier = Densifier(settings, model.count)
@@ -107,7 +107,7 @@ def test_gradients_are_in_device_coordinates() -> None:
     frame = training_frames(1)[0]
 
     def colour_l1(shift: tuple[float, float]) -> tuple[float, float]:
-        model = FusedModel(gaussian, still, WIDTH, HEIGHT)
+        model = CpuModel(gaussian, still, WIDTH, HEIGHT)
         camera = camera_vector(endoscope())
         camera[2:4] += shift
         seen, colours = frame.seen_from(camera), LossSettings(depth_weight=0.0)
@@ -252,9 +252,9 @@ def test_a_model_whose_motion_has_no_kernels_is_densified_likewise() -> None:
     gaussians = with_opacity(wall(), [3], 0.001)
     counts = []
     for model in (
-        UnfusedModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT),
-        UnfusedModel(gaussians, moving_fdm(gaussians), WIDTH, HEIGHT),
-        FusedModel(gaussians, moving_fdm(gaussians), WIDTH, HEIGHT),
+        CpuModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT),
+        CpuModel(gaussians, moving_fdm(gaussians), WIDTH, HEIGHT, make_motion=AutogradMotion),
+        CpuModel(gaussians, moving_fdm(gaussians), WIDTH, HEIGHT),
     ):
         densifier = Densifier(EVERYTHING, model.count)
         take_steps(model, training_frames(1))
@@ -272,13 +272,13 @@ def test_training_goes_on_as_in_a_model_made_of_the_edited_gaussians(
     moving: Callable[[Gaussians], SharedBasis | FlexibleDeformation],
 ) -> None:
     gaussians = wall(sh_degree=1)
-    model = FusedModel(gaussians, moving(gaussians), WIDTH, HEIGHT)
+    model = CpuModel(gaussians, moving(gaussians), WIDTH, HEIGHT)
     densifier = Densifier(EVERYTHING, model.count)
     frames = training_frames(2)
     take_steps(model, frames[:1], sh_degree=1)
     densifier.observe(model)
     densify(model, densifier)
-    made = FusedModel(*model.export(), WIDTH, HEIGHT)
+    made = CpuModel(*model.export(), WIDTH, HEIGHT)
     made.load_arrays(model.arrays())
     for each in (model, made):
         take_steps(each, frames[1:], first=601, sh_degree=1)
@@ -290,7 +290,7 @@ def test_a_run_resumed_after_densification_takes_the_same_steps(tmp_path: Path) 
     settings = DensifySettings(from_iteration=2, every=2, gradient_threshold=5e-4)
     frames = training_frames(6)
 
-    def go_on(model: FusedModel, densifier: Densifier, first: int, last: int) -> None:
+    def go_on(model: CpuModel, densifier: Densifier, first: int, last: int) -> None:
         for iteration in range(first, last + 1):
             take_steps(model, [frames[iteration - 1]], first=iteration)
             densifier.observe(model)

@@ -15,7 +15,7 @@ from tests.worker.phantoms import bits, phantom_clip, prepared, trained
 from worker.machine.hooks import Hooks
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.raster.step import StepSums, TrainingFrame
 from worker.train.loop import CALIBRATION_STEPS, LATER_STEPS, Run, Stopwatch, iterations_within, train, warm_up
 from worker.train.presets import PRESETS
@@ -24,7 +24,7 @@ from worker.train.schedule import Schedule
 LAG = 5
 
 
-class LaggingModel(FusedModel):
+class LaggingModel(CpuModel):
     """Answers as a device does that is asked at every LAG-th step."""
 
     answers_every = LAG

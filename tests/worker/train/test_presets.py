@@ -93,7 +93,7 @@ def test_little_time_is_not_spent_on_many_gaussians() -> None:
 
 def test_the_paper_is_trained_as_published() -> None:
     paper = PRESETS["paper"]
-    assert (paper.deformation, paper.bases, paper.start_width) == ("fdm", 17, 0.01)
+    assert (paper.deformation, paper.bases, paper.start_width) == ("fdm-gaussian", 17, 0.01)
     assert (paper.iterations, paper.order, paper.sh_degree) == (3000, "random", 3)
     assert paper.fusion.mode == "paper"
     assert paper.densify is not None

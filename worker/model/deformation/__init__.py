@@ -6,16 +6,25 @@
 | shared                     | 10 B               | one fixed set for all                                     |
 | pfs                        | 10 B               | polynomials and harmonics                                 |
 | hexplane                   | 0                  | six shared feature planes at two resolutions and a network |
+
+MOTIONS is the registry. A new motion is a file here and a line there (docs/extending.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from torch import Tensor
 
-from worker.model.deformation.base import CHANNELS, LOG_SCALE, MEAN, QUATERNION, Deformation, add_offsets
-from worker.model.deformation.fdm import FlexibleDeformation
+from worker.model.deformation.base import (
+    CHANNELS,
+    LOG_SCALE,
+    MEAN,
+    QUATERNION,
+    AtRest,
+    Deformation,
+    LinearDeformation,
+    add_offsets,
+)
+from worker.model.deformation.fdm import FlexibleDeformation, GaussianFdm, QuarticFdm
 from worker.model.deformation.hexplane import HexPlane
 from worker.model.deformation.polynomial import PolynomialFourier
 from worker.model.deformation.shared import SharedBasis
@@ -24,34 +33,51 @@ __all__ = [
     "CHANNELS",
     "LOG_SCALE",
     "MEAN",
+    "MOTIONS",
     "QUATERNION",
+    "AtRest",
     "Deformation",
     "FlexibleDeformation",
+    "GaussianFdm",
     "HexPlane",
+    "LinearDeformation",
     "PolynomialFourier",
+    "QuarticFdm",
     "SharedBasis",
     "add_offsets",
+    "motion_named",
     "restore",
 ]
 
-_FROM_TENSORS: dict[str, Callable[[dict[str, Tensor]], Deformation]] = {
-    "fdm-gaussian": lambda named: FlexibleDeformation(**named, form="gaussian"),
-    "fdm-quartic": lambda named: FlexibleDeformation(**named, form="quartic"),
-    "shared": lambda named: SharedBasis(**named),
-    "pfs": lambda named: PolynomialFourier(**named),
-    "hexplane": HexPlane.from_tensors,
+MOTIONS: dict[str, type[Deformation]] = {
+    GaussianFdm.kind: GaussianFdm,
+    QuarticFdm.kind: QuarticFdm,
+    SharedBasis.kind: SharedBasis,
+    PolynomialFourier.kind: PolynomialFourier,
+    HexPlane.kind: HexPlane,
 }
+"""Every motion by its name in presets and in stored scenes."""
+
+
+def motion_named(kind: str) -> type[Deformation]:
+    """The motion of this name.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if kind not in MOTIONS:
+        raise ValueError(f"deformation kind {kind!r} is not one of {', '.join(MOTIONS)}")
+    return MOTIONS[kind]
 
 
 def restore(kind: str, tensors: dict[str, Tensor]) -> Deformation:
-    """The model whose kind, parameters() and constants() were stored.
+    """The motion whose kind, parameters() and constants() were stored.
 
     Raises:
         ValueError: a kind that is not known, or tensors that do not make one of it.
     """
-    if kind not in _FROM_TENSORS:
-        raise ValueError(f"deformation kind {kind!r} is not one of {', '.join(_FROM_TENSORS)}")
+    motion = motion_named(kind)
     try:
-        return _FROM_TENSORS[kind](tensors)
+        return motion.from_tensors(tensors)
     except (KeyError, TypeError) as error:
         raise ValueError(f"tensors {sorted(tensors)} do not make a {kind} deformation") from error

@@ -1,15 +1,19 @@
-"""What all deformation models share: the channels they move and the promises they keep.
+"""What all motions share: the channels they move and the promises they keep.
 
 Symbols: N Gaussians, B bases or weights a channel, C = 10 channels, t model time in [0, 1).
 Channels: mean 0:3, quaternion 3:7, log-scale 7:10. Opacity never deforms; colour does
-where a model has channels 10:13 for it (shared.py).
+where a motion has channels 10:13 for it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Self
 
+import torch
 from torch import Tensor
 
 from worker.model.gaussians import Gaussians
@@ -20,43 +24,118 @@ QUATERNION = slice(3, 7)
 LOG_SCALE = slice(7, 10)
 
 
-class Deformation(Protocol):
-    """A motion model: what it adds to the canonical Gaussians at time t.
+@dataclass(frozen=True)
+class AtRest:
+    """What a preset and a clip say about a motion before it is trained.
 
-    Attributes:
-        kind: its name in a checkpoint (deformation.restore).
-        bases: B, of every channel; 0 where there is no such number.
-        floats_per_gaussian: trained numbers each Gaussian adds.
-        shared_floats: numbers, trained or fixed, that all Gaussians share.
+    bases  B; None where the motion has no such number
+    width  of a basis, model time; None: the motion chooses
+    times  model times of the training frames
+    seed   of random numbers
     """
 
-    @property
-    def kind(self) -> str: ...
+    bases: int | None
+    width: float | None
+    times: Sequence[float]
+    seed: int
+
+
+class Deformation(ABC):
+    """A motion: what it adds to the canonical Gaussians at time t.
+
+    A subclass is a frozen dataclass whose fields are its tensors, or defines from_tensors.
+
+    Attributes:
+        kind: its name in the registry, in presets and in stored scenes.
+        has_kernels: whether the CPU's and the GPU's kernels train it (worker/raster/); else torch does, on the CPU.
+        min_bases: the fewest bases it can have.
+    """
+
+    kind: ClassVar[str]
+    has_kernels: ClassVar[bool] = False
+    min_bases: ClassVar[int] = 1
+
+    @classmethod
+    @abstractmethod
+    def at_rest(cls, gaussians: Gaussians, start: AtRest) -> Self:
+        """The motion of these Gaussians before training: none."""
+
+    @classmethod
+    def from_tensors(cls, tensors: dict[str, Tensor]) -> Self:
+        """The motion with these parameters() and constants()."""
+        return cls(**tensors)
 
     @property
-    def bases(self) -> int: ...
+    def bases(self) -> int:
+        """B of every channel; 0 where there is no such number."""
+        return 0
 
     @property
-    def floats_per_gaussian(self) -> int: ...
+    @abstractmethod
+    def floats_per_gaussian(self) -> int:
+        """Trained numbers that each Gaussian adds."""
 
     @property
-    def shared_floats(self) -> int: ...
+    def shared_floats(self) -> int:
+        """Numbers, trained or fixed, that all Gaussians share."""
+        return 0
 
+    @abstractmethod
     def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
         """The Gaussians at time t: pure, differentiable in every parameter and in the canonical state."""
-        ...
 
+    @abstractmethod
     def parameters(self) -> dict[str, Tensor]:
         """The tensors to train, by name."""
-        ...
 
     def constants(self) -> dict[str, Tensor]:
         """The tensors that stay as they are, by name; with parameters() they are the whole state."""
-        ...
+        return {}
 
-    def select(self, rows: Tensor) -> Deformation:
-        """The model of the Gaussians rows ([M] indices, repeats allowed, or [N] bool); shared tensors stay shared."""
-        ...
+    @abstractmethod
+    def select(self, rows: Tensor) -> Self:
+        """The motion of the Gaussians rows ([M] indices, repeats allowed, or [N] bool); shared tensors stay shared."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearDeformation(Deformation):
+    """psi(t) = weight basis(t): each Gaussian and channel weighs bases that all of them share.
+
+    A subclass gives basis(t), and has kernels by that.
+
+    weight [N, C, B]  trained, in the channel's unit; C = 10, or 13 where channels 10:13 add to the colour's harmonic 0
+    """
+
+    weight: Tensor
+
+    has_kernels: ClassVar[bool] = True
+
+    @abstractmethod
+    def basis(self, t: float) -> Tensor:
+        """[B] values at t."""
+
+    @property
+    def bases(self) -> int:
+        return int(self.weight.shape[2])
+
+    @property
+    def floats_per_gaussian(self) -> int:
+        return int(self.weight.shape[1]) * self.bases
+
+    def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
+        """The Gaussians at time t."""
+        offsets = self.weight @ self.basis(t)
+        moved = add_offsets(gaussians, offsets[:, :CHANNELS])
+        if offsets.shape[1] == CHANNELS:
+            return moved
+        constant = moved.sh[:, :1] + offsets[:, None, CHANNELS:]
+        return dataclasses.replace(moved, sh=torch.cat([constant, moved.sh[:, 1:]], 1))
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {"weight": self.weight}
+
+    def select(self, rows: Tensor) -> Self:
+        return dataclasses.replace(self, weight=self.weight[rows])
 
 
 def add_offsets(gaussians: Gaussians, offsets: Tensor) -> Gaussians:

@@ -5,16 +5,15 @@ Symbols: N Gaussians, C = 10 channels, B bases.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from worker.model.deformation.base import CHANNELS, add_offsets
+from worker.model.deformation.base import CHANNELS, AtRest, Deformation, add_offsets
 from worker.model.gaussians import Gaussians
-
-Form = Literal["gaussian", "quartic"]
 
 PAPER_BASES = 17
 PAPER_WIDTH = 0.01
@@ -26,45 +25,42 @@ QUARTIC_FLOOR = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class FlexibleDeformation:
-    """Every Gaussian and channel has B bases of its own in time, all of their numbers trained.
+class FlexibleDeformation(Deformation):
+    """psi(t) = sum_j w_j b_j(t): every Gaussian and channel has B bases of its own, all of their numbers trained.
 
     weight [N, 10, B]  w, in the channel's unit
     centre [N, 10, B]  theta, model time
     width  [N, 10, B]  sigma, model time, of either sign
-    form               "gaussian", the paper's:  psi(t) = sum_j w_j exp(-(t - theta_j)^2 / (2 sigma_j^2))
-                       with |sigma_j| held at 1e-3 where it is smaller (no gradient to sigma there);
-                       "quartic", the released code's: psi(t) = sum_j w_j exp(-((t - theta_j)^2 / (sigma_j^2 + 1e-4))^2)
     """
 
     weight: Tensor
     centre: Tensor
     width: Tensor
-    form: Form = "gaussian"
+
+    has_kernels: ClassVar[bool] = True
+    quartic: ClassVar[bool]
+    """Which of the two forms of b_j it is, for the kernels."""
 
     def __post_init__(self) -> None:
-        if self.form not in ("gaussian", "quartic"):
-            raise ValueError(f"form must be 'gaussian' or 'quartic', not {self.form!r}")
         shapes = {tuple(each.shape) for each in self.parameters().values()}
         if len(shapes) != 1 or self.weight.ndim != 3 or self.weight.shape[1] != CHANNELS:
             raise ValueError(f"weight, centre and width must share one shape [N, {CHANNELS}, B], not {sorted(shapes)}")
 
     @classmethod
-    def initial(
-        cls, count: int, *, bases: int = PAPER_BASES, width: float = PAPER_WIDTH, form: Form = "gaussian"
-    ) -> FlexibleDeformation:
+    def initial(cls, count: int, *, bases: int = PAPER_BASES, width: float = PAPER_WIDTH) -> Self:
         """No motion yet: weights 0, centres spread evenly over [0, 1], one width for all."""
         shape = (count, CHANNELS, bases)
         return cls(
             weight=torch.zeros(shape),
             centre=torch.linspace(0, 1, bases).expand(shape).clone(),
             width=torch.full(shape, width),
-            form=form,
         )
 
-    @property
-    def kind(self) -> str:
-        return f"fdm-{self.form}"
+    @classmethod
+    def at_rest(cls, gaussians: Gaussians, start: AtRest) -> Self:
+        """Initial with the bases and the width of the preset, else those of the paper."""
+        bases = PAPER_BASES if start.bases is None else start.bases
+        return cls.initial(len(gaussians), bases=bases, width=PAPER_WIDTH if start.width is None else start.width)
 
     @property
     def bases(self) -> int:
@@ -74,17 +70,9 @@ class FlexibleDeformation:
     def floats_per_gaussian(self) -> int:
         return 3 * CHANNELS * self.bases
 
-    @property
-    def shared_floats(self) -> int:
-        return 0
-
+    @abstractmethod
     def basis(self, t: float) -> Tensor:
-        """Value of every basis at t: [N, 10, B] in [0, 1]."""
-        squared = (t - self.centre) ** 2
-        if self.form == "quartic":
-            return torch.exp(-((squared / (self.width**2 + QUARTIC_FLOOR)) ** 2))
-        variance = torch.clamp(self.width**2, min=MIN_WIDTH**2)
-        return torch.exp(-squared / (2 * variance))
+        """Value of every b_j at t: [N, 10, B] in [0, 1]."""
 
     def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
         """The Gaussians at time t."""
@@ -93,8 +81,29 @@ class FlexibleDeformation:
     def parameters(self) -> dict[str, Tensor]:
         return {"weight": self.weight, "centre": self.centre, "width": self.width}
 
-    def constants(self) -> dict[str, Tensor]:
-        return {}
+    def select(self, rows: Tensor) -> Self:
+        return type(self)(self.weight[rows], self.centre[rows], self.width[rows])
 
-    def select(self, rows: Tensor) -> FlexibleDeformation:
-        return FlexibleDeformation(self.weight[rows], self.centre[rows], self.width[rows], self.form)
+
+class GaussianFdm(FlexibleDeformation):
+    """The paper's form: b_j(t) = exp(-(t - theta_j)^2 / (2 sigma_j^2)).
+
+    |sigma_j| is held at 1e-3 where it is smaller, and gets no gradient there.
+    """
+
+    kind = "fdm-gaussian"
+    quartic = False
+
+    def basis(self, t: float) -> Tensor:
+        variance = torch.clamp(self.width**2, min=MIN_WIDTH**2)
+        return torch.exp(-((t - self.centre) ** 2) / (2 * variance))
+
+
+class QuarticFdm(FlexibleDeformation):
+    """The released code's form: b_j(t) = exp(-((t - theta_j)^2 / (sigma_j^2 + 1e-4))^2)."""
+
+    kind = "fdm-quartic"
+    quartic = True
+
+    def basis(self, t: float) -> Tensor:
+        return torch.exp(-(((t - self.centre) ** 2 / (self.width**2 + QUARTIC_FLOOR)) ** 2))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, linear, relu
 
-from worker.model.deformation.base import CHANNELS, add_offsets
+from worker.model.deformation.base import CHANNELS, AtRest, Deformation, add_offsets
 from worker.model.gaussians import Gaussians
 
 AXES = "xyzt"
@@ -25,7 +25,7 @@ HIDDEN = 64
 
 
 @dataclass(frozen=True, eq=False)
-class HexPlane:
+class HexPlane(Deformation):
     """offsets(x, t) = MLP(concatenation over resolutions and pairs of plane_ab(x) * plane_cd(x, t)).
 
     planes  [R] dicts of "xy" .. "zt" -> [F, cells of the second axis, cells of the first axis]
@@ -36,6 +36,14 @@ class HexPlane:
     planes: tuple[dict[str, Tensor], ...]
     layers: tuple[tuple[Tensor, Tensor], ...]
     bounds: Tensor
+
+    kind = "hexplane"
+    min_bases = 0
+
+    @classmethod
+    def at_rest(cls, gaussians: Gaussians, start: AtRest) -> HexPlane:
+        """Initial in the box of the canonical means."""
+        return cls.initial(torch.stack([gaussians.mean.amin(0), gaussians.mean.amax(0)]), seed=start.seed)
 
     @classmethod
     def initial(
@@ -78,14 +86,6 @@ class HexPlane:
             layers=tuple((tensors[f"layer.{i}.weight"], tensors[f"layer.{i}.bias"]) for i in range(depth)),
             bounds=tensors["bounds"],
         )
-
-    @property
-    def kind(self) -> str:
-        return "hexplane"
-
-    @property
-    def bases(self) -> int:
-        return 0
 
     @property
     def floats_per_gaussian(self) -> int:

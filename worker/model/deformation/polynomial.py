@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from worker.model.deformation.base import CHANNELS, add_offsets
+from worker.model.deformation.base import CHANNELS, AtRest, LinearDeformation
 from worker.model.gaussians import Gaussians
 
 DEFAULT_WEIGHTS = 17
@@ -19,7 +19,7 @@ DEFAULT_WEIGHTS = 17
 
 
 @dataclass(frozen=True, eq=False)
-class PolynomialFourier:
+class PolynomialFourier(LinearDeformation):
     """psi(t) = sum_p a_p T_p(2t - 1) + sum_h b_h cos(2 pi h t) + c_h sin(2 pi h t), p = 1..P, h = 1..H.
 
     weight [N, 10, B]  [a | b | c], trained, in the channel's unit; H = (B - 1) // 3, P = B - 2H
@@ -28,7 +28,7 @@ class PolynomialFourier:
     treats every weight alike, and the powers of t in [0, 1] are nearly parallel.
     """
 
-    weight: Tensor
+    kind = "pfs"
 
     def __post_init__(self) -> None:
         if self.weight.ndim != 3 or self.weight.shape[1] != CHANNELS or self.weight.shape[2] < 1:
@@ -39,21 +39,10 @@ class PolynomialFourier:
         """No motion yet: all weights 0."""
         return cls(torch.zeros(count, CHANNELS, weights))
 
-    @property
-    def kind(self) -> str:
-        return "pfs"
-
-    @property
-    def bases(self) -> int:
-        return int(self.weight.shape[2])
-
-    @property
-    def floats_per_gaussian(self) -> int:
-        return CHANNELS * self.bases
-
-    @property
-    def shared_floats(self) -> int:
-        return 0
+    @classmethod
+    def at_rest(cls, gaussians: Gaussians, start: AtRest) -> PolynomialFourier:
+        """Initial with as many weights as the preset has bases."""
+        return cls.initial(len(gaussians), weights=DEFAULT_WEIGHTS if start.bases is None else start.bases)
 
     def basis(self, t: float) -> Tensor:
         """Value of every function at t: [B] in [-1, 1]."""
@@ -65,16 +54,3 @@ class PolynomialFourier:
         angles = [2 * math.pi * h * t for h in range(1, harmonics + 1)]
         values = chebyshev[1:] + [math.cos(angle) for angle in angles] + [math.sin(angle) for angle in angles]
         return self.weight.new_tensor(values)
-
-    def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
-        """The Gaussians at time t."""
-        return add_offsets(gaussians, self.weight @ self.basis(t))
-
-    def parameters(self) -> dict[str, Tensor]:
-        return {"weight": self.weight}
-
-    def constants(self) -> dict[str, Tensor]:
-        return {}
-
-    def select(self, rows: Tensor) -> PolynomialFourier:
-        return PolynomialFourier(self.weight[rows])

@@ -5,7 +5,6 @@ Symbols: N Gaussians, C = 10 channels, or 13 with the constant harmonic of the c
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from worker.model.deformation.base import CHANNELS, add_offsets
+from worker.model.deformation.base import CHANNELS, AtRest, LinearDeformation
 from worker.model.gaussians import Gaussians
 
 CHANNELS_WITH_COLOUR = CHANNELS + 3
@@ -25,7 +24,7 @@ MIN_WIDTH = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class SharedBasis:
+class SharedBasis(LinearDeformation):
     """psi(t) = sum_j w_j phi_j(t), phi_j = b_j / sum_k b_k, b_j(t) = exp(-(t - theta_j)^2 / (2 sigma_j^2)).
 
     theta and sigma are common to all and fixed.
@@ -38,9 +37,10 @@ class SharedBasis:
     width  [B]        sigma > 0, model time
     """
 
-    weight: Tensor
     centre: Tensor
     width: Tensor
+
+    kind = "shared"
 
     def __post_init__(self) -> None:
         bases, channels = self.centre.shape[0], (CHANNELS, CHANNELS_WITH_COLOUR)
@@ -78,17 +78,11 @@ class SharedBasis:
             width=torch.from_numpy(np.maximum(width, MIN_WIDTH)).float(),
         )
 
-    @property
-    def kind(self) -> str:
-        return "shared"
-
-    @property
-    def bases(self) -> int:
-        return int(self.weight.shape[2])
-
-    @property
-    def floats_per_gaussian(self) -> int:
-        return int(self.weight.shape[1]) * self.bases
+    @classmethod
+    def at_rest(cls, gaussians: Gaussians, start: AtRest) -> SharedBasis:
+        """Initial with moving colour, and with no more bases than training frames."""
+        bases = DEFAULT_BASES if start.bases is None else start.bases
+        return cls.initial(len(gaussians), bases=min(len(start.times), bases), colour=True, times=start.times)
 
     @property
     def shared_floats(self) -> int:
@@ -98,20 +92,5 @@ class SharedBasis:
         """phi at t: [B] in [0, 1], summing to 1."""
         return torch.softmax(-((t - self.centre) ** 2) / (2 * self.width**2), 0)
 
-    def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
-        """The Gaussians at time t."""
-        offsets = self.weight @ self.basis(t)
-        moved = add_offsets(gaussians, offsets[:, :CHANNELS])
-        if offsets.shape[1] == CHANNELS:
-            return moved
-        constant = moved.sh[:, :1] + offsets[:, None, CHANNELS:]
-        return dataclasses.replace(moved, sh=torch.cat([constant, moved.sh[:, 1:]], 1))
-
-    def parameters(self) -> dict[str, Tensor]:
-        return {"weight": self.weight}
-
     def constants(self) -> dict[str, Tensor]:
         return {"centre": self.centre, "width": self.width}
-
-    def select(self, rows: Tensor) -> SharedBasis:
-        return SharedBasis(self.weight[rows], self.centre, self.width)

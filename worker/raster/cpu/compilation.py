@@ -8,12 +8,12 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from worker.model.deformation import Deformation, FlexibleDeformation, SharedBasis
+from worker.model.deformation import Deformation, GaussianFdm, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
 from worker.raster import Camera
-from worker.raster.cpu.model import FusedModel
+from worker.raster.cpu.model import CpuModel
 from worker.raster.cpu.rasterizer import padded
 from worker.raster.step import Target, TrainingFrame, camera_vector
 
@@ -34,9 +34,9 @@ def compile_kernels(on_progress: Callable[[float], None] = lambda share: None) -
     camera = camera_vector(Camera(20.0, 20.0, 8.0, 8.0, _WIDTH, _HEIGHT, np.eye(4)))
     motions: list[tuple[Deformation, int]] = [
         (SharedBasis.initial(_COUNT, bases=2, colour=True), 0),
-        (FlexibleDeformation.initial(_COUNT, bases=2), 3),
+        (GaussianFdm.initial(_COUNT, bases=2), 3),
     ]
-    models = [FusedModel(_gaussians(degree), motion, _WIDTH, _HEIGHT) for motion, degree in motions]
+    models = [CpuModel(_gaussians(degree), motion, _WIDTH, _HEIGHT) for motion, degree in motions]
     parts: list[Callable[[], object]] = [
         lambda: models[0].project(camera, 0.5, 0),
         lambda: models[0].render(camera, 0.5),
@@ -62,7 +62,7 @@ def _gaussians(sh_degree: int) -> Gaussians:
     )
 
 
-def _step(model: FusedModel, camera: np.ndarray, sh_degree: int) -> None:
+def _step(model: CpuModel, camera: np.ndarray, sh_degree: int) -> None:
     pixels = _HEIGHT * padded(_WIDTH)
     weight, inverse_depth = np.full(pixels, 255, np.uint8), np.full(pixels, 1 / 60, np.float32)
     target = Target(np.zeros(3 * pixels, np.uint8), weight, inverse_depth)

@@ -6,7 +6,7 @@ N Gaussians (padded to whole vectors), rows of N floats, F frames a step; canoni
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple
 
 import numpy as np
@@ -30,12 +30,20 @@ SIZES_KEPT = 3
 """Image sizes, of those used last, whose buffers are kept."""
 
 
-class FusedModel:
+class CpuModel:
     """Canonical Gaussians, their deformation and Adam's moments, trained on the CPU. See worker/raster/model.py."""
 
     answers_every = 1
 
-    def __init__(self, gaussians: Gaussians, deformation: Deformation, width: int, height: int):
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        deformation: Deformation,
+        width: int,
+        height: int,
+        *,
+        make_motion: Callable[[Deformation, int, int], Motion] = motion_of,
+    ) -> None:
         self.count = len(gaussians)
         columns = padded(self.count)
         canonical = torch.cat([gaussians.mean, gaussians.quaternion, gaussians.log_scale], 1).numpy()
@@ -48,14 +56,11 @@ class FusedModel:
         self.sh_rest = np.zeros((gaussians.sh.shape[1] - 1, 3, columns), np.float32)
         self.sh_rest[:, :, : self.count] = gaussians.sh[:, 1:].permute(1, 2, 0).numpy()
         self.sh_degree = gaussians.sh_degree  # of those stored; a schedule may use fewer
-        self.motion = self._motion_of(deformation, columns)
+        self.motion = make_motion(deformation, self.count, columns)
         self._rasterizers: OrderedDict[tuple[int, int], Rasterizer] = OrderedDict()
         self.rasterizer = self._rasterizer(width, height)
         self._moments = {name: np.zeros((2, *a.shape), np.float32) for name, a in self._parameters().items()}
         self._allocate()
-
-    def _motion_of(self, deformation: Deformation, columns: int) -> Motion:
-        return motion_of(deformation, columns)
 
     def _parameters(self) -> dict[str, Floats]:
         return {"canonical": self.canonical, "opacity_logit": self.opacity_logit, "sh_rest": self.sh_rest}
@@ -89,10 +94,10 @@ class FusedModel:
         """[N] whether any of the last step's frames could see each Gaussian."""
         return torch.from_numpy(self._seen[: self.count].copy())
 
-    def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
-        """The Gaussians at time t on this camera's image."""
+    def project(self, camera: NDArray[np.float64], t: float, sh_degree: int, *, trains: bool = False) -> None:
+        """The Gaussians at time t on this camera's image. Where trains, a step of Adam follows."""
         self.rasterizer = self._rasterizer(int(camera[4]), int(camera[5]))
-        self.motion.deform(self.canonical, t, self.state)
+        self.motion.deform(self.canonical, t, self.state, trains=trains)
         if sh_degree == 0:
             np.multiply(self.state[10:13], np.float32(SH_C0), out=self.colour)
             self.colour += np.float32(0.5)
@@ -140,7 +145,7 @@ class FusedModel:
     def _backward(self, place: int, frame: TrainingFrame, loss: LossSettings, sh_degree: int) -> NDArray[np.float64]:
         """The gradients of a frame's loss, to its place among those of the step; the loss's sums (StepSums)."""
         gradients = self._gradients[place]
-        self.project(frame.camera, frame.t, sh_degree)
+        self.project(frame.camera, frame.t, sh_degree, trains=True)
         self.rasterizer.loss_backward(frame.target, frame.loss_settings(loss), gradients)
         if sh_degree == 0:
             np.multiply(gradients.colour, np.float32(SH_C0), out=gradients.state[10:13])

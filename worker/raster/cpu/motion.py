@@ -1,4 +1,4 @@
-"""The deformation of the fused step: shared bases or FDM, with Adam's moments beside the weights.
+"""The deformation in a training step, with Adam's moments beside its weights: linear, FDM, or any (unfused.py).
 
 N Gaussians (padded), F frames a step, B bases, C channels (10, or 13 where colour moves too), rows of N floats.
 """
@@ -13,25 +13,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from worker.model.deformation import Deformation, FlexibleDeformation, PolynomialFourier, SharedBasis
+from worker.model.deformation import Deformation, FlexibleDeformation, LinearDeformation
 from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu import update
 from worker.raster.cpu.rasterizer import Floats
 from worker.raster.cpu.threads import run
+from worker.raster.cpu.unfused import AutogradMotion
 
 NEGLIGIBLE = 1e-3
 """A shared basis below this at t is neither evaluated nor trained in that step."""
 
 
-LinearDeformation = SharedBasis | PolynomialFourier
-"""Deformations that are a matrix of weights times bases common to all Gaussians."""
-
-
 class Motion(Protocol):
-    """A deformation the fused step can evaluate and train."""
+    """A deformation that a step can evaluate and train."""
 
-    def deform(self, canonical: Floats, t: float, state: Floats) -> None:
-        """state [13, N] = canonical + psi(t)."""
+    def deform(self, canonical: Floats, t: float, state: Floats, *, trains: bool = False) -> None:
+        """state [13, N] = canonical + psi(t). Where trains, update follows."""
 
     def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
         """One Adam step of the weights that reach any of F times, those deformed to last, given dL/dstate at each.
@@ -82,7 +79,7 @@ class LinearMotion:
         alive = np.flatnonzero(np.abs(values) >= NEGLIGIBLE)
         return (values, int(alive[0]), int(alive[-1]) + 1) if alive.size else (values, 0, 0)
 
-    def deform(self, canonical: Floats, t: float, state: Floats) -> None:
+    def deform(self, canonical: Floats, t: float, state: Floats, *, trains: bool = False) -> None:
         values, first, last = self._alive(t)
         run(update.deform_shared, canonical, self.weight, values, first, last, state)
 
@@ -123,7 +120,7 @@ class FdmMotion:
     """The paper's FDM: weight, centre and width of every basis learnable a Gaussian and channel; dense Adam."""
 
     def __init__(self, deformation: FlexibleDeformation, columns: int) -> None:
-        self.form = deformation.form
+        self._form = type(deformation)
         self.weight, self.centre, self.width = (
             _columns_last(tensor, columns, fill)
             for tensor, fill in ((deformation.weight, 0.0), (deformation.centre, 0.5), (deformation.width, 1.0))
@@ -131,15 +128,16 @@ class FdmMotion:
         self.first = np.zeros((3, *self.weight.shape), np.float32)
         self.second = np.zeros(self.first.shape, np.float32)
 
-    def deform(self, canonical: Floats, t: float, state: Floats) -> None:
-        quartic = self.form == "quartic"
-        run(update.deform_fdm, canonical, self.weight, self.centre, self.width, np.float32(t), quartic, state)
+    def deform(self, canonical: Floats, t: float, state: Floats, *, trains: bool = False) -> None:
+        run(
+            update.deform_fdm, canonical, self.weight, self.centre, self.width, np.float32(t), self._form.quartic, state
+        )  # fmt: skip
 
     def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
         adam = adam_step(rates.motion_mean, rates, iteration)
         run(
             update.update_fdm, self.weight, self.centre, self.width, self.first, self.second, v_state,
-            np.array(times, np.float32), self.form == "quartic", *map(np.float32, dataclasses.astuple(adam)),
+            np.array(times, np.float32), self._form.quartic, *map(np.float32, dataclasses.astuple(adam)),
         )  # fmt: skip
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
@@ -158,7 +156,7 @@ class FdmMotion:
             torch.from_numpy(np.ascontiguousarray(a[..., :count].transpose(2, 0, 1)))
             for a in (self.weight, self.centre, self.width)
         )
-        return FlexibleDeformation(weight, centre, width, form=self.form)
+        return self._form(weight, centre, width)
 
 
 def _views(motion: LinearMotion | FdmMotion, names: Sequence[str], count: int) -> dict[str, Tensor]:
@@ -173,10 +171,10 @@ def _columns_last(tensor: torch.Tensor, columns: int, fill: float) -> Floats:
     return rows
 
 
-def motion_of(deformation: Deformation, columns: int) -> LinearMotion | FdmMotion:
-    """The trainable form of a deformation, padded to columns Gaussians; ValueError if it has none."""
+def motion_of(deformation: Deformation, count: int, columns: int) -> Motion:
+    """The trainable form of the deformation of count Gaussians, padded to columns."""
     if isinstance(deformation, FlexibleDeformation):
         return FdmMotion(deformation, columns)
     if isinstance(deformation, LinearDeformation):
         return LinearMotion(deformation, columns)
-    raise ValueError(f"deformation {deformation.kind!r} has no kernels of its own: worker/raster/unfused.py trains it")
+    return AutogradMotion(deformation, count, columns)

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from worker.model.deformation import Deformation, FlexibleDeformation
+from worker.model.deformation import Deformation, FlexibleDeformation, LinearDeformation
 from worker.model.optimize import StepRates, adam_step
-from worker.raster.cpu.motion import NEGLIGIBLE, LinearDeformation
+from worker.raster.cpu.motion import NEGLIGIBLE
 from worker.raster.cuda import motion_kernels as kernels
 from worker.raster.cuda.control import ADAM, Field
 from worker.raster.cuda.update import COLUMNS, ROWS
@@ -217,7 +217,7 @@ class FdmMotion:
     """The paper's FDM: weight, centre and width of every basis learnable a Gaussian and channel; dense Adam."""
 
     def __init__(self, deformation: FlexibleDeformation, columns: int, device: torch.device) -> None:
-        self._form = deformation.form
+        self._form = type(deformation)
         self.weight, self.centre, self.width = (
             _columns_last(tensor, columns, fill, device)
             for tensor, fill in ((deformation.weight, 0.0), (deformation.centre, 0.5), (deformation.width, 1.0))
@@ -237,7 +237,7 @@ class FdmMotion:
         frames, _, columns = state.shape
         kernels.deform_fdm[_grid(columns, frames)](
             values, self.weight, self.centre, self.width, control["time"], state, colour, columns,
-            self.weight.shape[1], QUARTIC=self._form == "quartic",
+            self.weight.shape[1], QUARTIC=self._form.quartic,
         )  # fmt: skip
 
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
@@ -246,7 +246,7 @@ class FdmMotion:
             *tensors[:2], self.weight, self.centre, self.width, *self._moments.both, *tensors[2:],
             *(control[name] for name in ADAM), control["time"], control["motion_size"],
             trained.columns, self.weight.shape[1], trained.tiles,
-            QUARTIC=self._form == "quartic", FRAMES=trained.frames,
+            QUARTIC=self._form.quartic, FRAMES=trained.frames,
         )  # fmt: skip
 
     def take(self, columns: Tensor, fresh: Tensor) -> None:
@@ -264,7 +264,7 @@ class FdmMotion:
         weight, centre, width = (
             _host_copy(each[..., :count].permute(2, 0, 1)) for each in (self.weight, self.centre, self.width)
         )
-        return FlexibleDeformation(weight, centre, width, form=self._form)
+        return self._form(weight, centre, width)
 
 
 def _host_copy(tensor: Tensor) -> Tensor:
@@ -284,4 +284,4 @@ def motion_of(deformation: Deformation, columns: int, device: torch.device) -> L
         return FdmMotion(deformation, columns, device)
     if isinstance(deformation, LinearDeformation):
         return LinearMotion(deformation, columns, device)
-    raise ValueError(f"deformation {deformation.kind!r} has no kernels of its own: worker/raster/unfused.py trains it")
+    raise ValueError(f"deformation {deformation.kind!r} has no kernels: it trains on the CPU")

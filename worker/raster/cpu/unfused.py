@@ -1,10 +1,10 @@
-"""Training with a deformation that has no kernels of its own (`hexplane`): torch moves the Gaussians, autograd answers.
+"""The motion of a deformation without kernels of its own (`hexplane`): torch moves the Gaussians and differentiates.
 
-The blend, its loss and the canonical parameters' Adam are those of the fused step, so that two deformations compared
-with each other differ in nothing else. Only the time a step takes is not comparable: tables of speed must say so.
+The rest of a step is that of every motion, so two deformations compared with each other differ in nothing else. Only
+the time of a step is not comparable: tables of speed must say so.
 
 Symbols: N Gaussians (padded to whole vectors), rows of N floats, F frames a step; canonical and state [13, N] as in
-raster/cpu/update.py.
+update.py.
 """
 
 from __future__ import annotations
@@ -13,41 +13,16 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from contract.wire.errors import TrainingDiverged
-from worker.model.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation, restore
+from worker.model.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation
 from worker.model.gaussians import Gaussians
 from worker.model.optimize import AdamStep, StepRates, adam_step
-from worker.raster.cpu.model import FusedModel
-from worker.raster.cpu.motion import Motion
 from worker.raster.cpu.rasterizer import Floats
 
 COLOUR = slice(10, 13)
 """Rows of the constant harmonic."""
-
-
-class UnfusedModel(FusedModel):
-    """A model of any deformation, with the surface of FusedModel."""
-
-    def _motion_of(self, deformation: Deformation, columns: int) -> Motion:
-        return AutogradMotion(deformation, self.count, columns)
-
-    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
-        """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
-        with torch.no_grad():  # no step follows: keep no graph
-            return super().render(camera, t, values)
-
-    def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
-        """Gradient of sum(cotangents * render(camera, t)) to the Gaussians as they are at t, [14, N]."""
-        with torch.no_grad():
-            return super().image_gradient(camera, t, cotangents)
-
-    def deformed_mean(self, t: float) -> Floats:
-        """Centres at time t, [3, N] in units, as a copy."""
-        with torch.no_grad():
-            return super().deformed_mean(t)
 
 
 class AutogradMotion:
@@ -67,19 +42,20 @@ class AutogradMotion:
         self._parameters = {name: each.detach().clone() for name, each in deformation.parameters().items()}
         for each in self._parameters.values():
             each.requires_grad_()
-        self._deformation = restore(deformation.kind, self._parameters | deformation.constants())
+        self._deformation = deformation.from_tensors(self._parameters | deformation.constants())
 
-    def deform(self, canonical: Floats, t: float, state: Floats) -> None:
-        """state = canonical + offsets at t; keeps the graph for update unless gradients are switched off.
+    def deform(self, canonical: Floats, t: float, state: Floats, *, trains: bool = False) -> None:
+        """state = canonical + offsets at t; where trains, keeps the graph for update.
 
         Raises:
             TrainingDiverged: a mean is not finite. Torch would look it up outside the planes' memory and crash.
         """
         if not np.isfinite(canonical[MEAN]).all():
             raise TrainingDiverged("A Gaussian's place is no longer a number.")
-        rows = torch.from_numpy(canonical.T.copy()).requires_grad_()
-        moved = _deformed(self._deformation, rows, t)
-        if torch.is_grad_enabled():
+        rows = torch.from_numpy(canonical.T.copy()).requires_grad_(trains)
+        with torch.set_grad_enabled(trains):
+            moved = _deformed(self._deformation, rows, t)
+        if trains:
             self._graphs.append((rows, moved))
         state[:] = moved.detach().T.numpy()
 
@@ -104,14 +80,13 @@ class AutogradMotion:
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         """Keep these columns, in this order; moments start at 0 where fresh. Shared parameters keep theirs."""
-        rows = torch.from_numpy(columns)
-        self._adopt(self._deformation.select(rows))
-        if self._deformation.floats_per_gaussian == 0:
-            return
-        for name, moments in self._moments.items():
-            taken = moments[:, rows]
-            taken[:, torch.from_numpy(fresh)] = 0.0
-            self._moments[name] = taken
+        rows, before = torch.from_numpy(columns), self._parameters
+        taken = self._deformation.select(rows)
+        for name, parameter in taken.parameters().items():
+            if parameter is not before[name]:
+                self._moments[name] = self._moments[name][:, rows]
+                self._moments[name][:, torch.from_numpy(fresh)] = 0.0
+        self._adopt(taken)
 
     def parameters(self, count: int) -> dict[str, Tensor]:
         """What is trained, by name; views. The Gaussians that only fill the last vector are among them, if any are."""
@@ -124,7 +99,7 @@ class AutogradMotion:
     def export(self, count: int) -> Deformation:
         """The first count Gaussians' deformation as torch tensors (copies)."""
         copies = {name: each.detach().clone() for name, each in self._parameters.items()}
-        deformation = restore(self._deformation.kind, copies | self._deformation.constants())
+        deformation = self._deformation.from_tensors(copies | self._deformation.constants())
         return deformation.select(torch.arange(count))
 
 
