@@ -15,7 +15,7 @@ from fastapi import Depends, Query
 from starlette.requests import HTTPConnection
 
 from contract.access.audit import AuditLog
-from contract.queue.promise import LISTING_LIMIT, Queue
+from contract.queue.promise import MAX_LISTED, Queue
 from contract.runtime.settings import Settings
 from contract.store.store import Store, is_job_id
 from contract.wire.job import JobRecord
@@ -98,7 +98,7 @@ EarlyCaller = Annotated[Caller | None, Depends(_caller_if_known)]
 services.access.caller_of_key(text, address) then says whose it is."""
 
 
-ListingLimit = Annotated[int, Query(ge=1, le=LISTING_LIMIT, description="at most so many")]
+ListingLimit = Annotated[int, Query(ge=1, le=MAX_LISTED, description="at most so many")]
 
 
 def owned_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:

@@ -1,7 +1,7 @@
 """What happens to a job, as it happens: server-sent events from the queue's own record of changes.
 
 One poller a watched job asks the queue, whatever number of callers listen; each of them goes through the same list of
-the last EVENTS_KEPT changes at its own pace, so a slow one costs no memory and holds nobody up.
+the last MAX_EVENTS changes at its own pace, so a slow one costs no memory and holds nobody up.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from fastapi.sse import format_sse_event
 from starlette.concurrency import run_in_threadpool
 
-from contract.queue.promise import EVENTS_KEPT, Queue, event_order
+from contract.queue.promise import MAX_EVENTS, Queue, event_order
 from contract.wire.errors import UnavailableError
-from contract.wire.job import TERMINAL_STATES, JobRecord, JobState, JobView, Standing
+from contract.wire.job import TERMINAL_STATES, Forecast, JobRecord, JobState, JobView
 
 POLL_PERIOD_S = 0.4
 LOOK_PERIOD_S = 2.0
@@ -52,16 +52,16 @@ class Feed:
         self.count = 0
         self.is_over = False
         self.changed = asyncio.Event()
-        self._entries: deque[Entry] = deque(maxlen=EVENTS_KEPT)
+        self._entries: deque[Entry] = deque(maxlen=MAX_EVENTS)
 
     @property
     def newest(self) -> Entry | None:
         """The last entry."""
         return self._entries[-1] if self._entries else None
 
-    def add(self, record: JobRecord, number: str | None = None, standing: Standing | None = None) -> None:
+    def add(self, record: JobRecord, number: str | None = None, forecast: Forecast | None = None) -> None:
         """Tell the listeners how the job is now."""
-        self._entries.append(Entry(number, record.state, JobView.of(record, standing).model_dump_json()))
+        self._entries.append(Entry(number, record.state, JobView.of(record, forecast).model_dump_json()))
         self.count += 1
         self.wake()
 
@@ -144,20 +144,20 @@ class Feeds:
                 del self._feeds[job_id]
 
     async def _poll(self, feed: Feed) -> None:
-        after, looked_at_s, standing = "0", 0.0, None
+        after, looked_at_s, forecast = "0", 0.0, None
         while not (feed.is_over or self._is_ending):
             with contextlib.suppress(UnavailableError):  # the listeners hear of the job when the queue is back
                 for event in await run_in_threadpool(self._queue.events, feed.job_id, after):
                     feed.add(event.record, event.number)
-                    after, standing = event.number, None
+                    after, forecast = event.number, None
                 if time.monotonic() >= looked_at_s + LOOK_PERIOD_S:
-                    standing = await self._look(feed, standing)
+                    forecast = await self._look(feed, forecast)
                     looked_at_s = time.monotonic()
             await asyncio.sleep(POLL_PERIOD_S)
         feed.end()
 
-    async def _look(self, feed: Feed, told: Standing | None) -> Standing | None:
-        """Tell of another position in the queue, and of a job without events; the standing that was told last."""
+    async def _look(self, feed: Feed, told: Forecast | None) -> Forecast | None:
+        """Tell of another position in the queue, and of a job without events; the forecast that was told last."""
         record = await run_in_threadpool(self._queue.get, feed.job_id)
         if record is None:
             feed.end()
@@ -166,7 +166,7 @@ class Feeds:
             if feed.newest is None:  # put back after the queue had lost it
                 feed.add(record)
             return None
-        standing = await run_in_threadpool(self._queue.standing, feed.job_id)
-        if told is None or standing.position != told.position:
-            feed.add(record, standing=standing)
-        return standing
+        forecast = await run_in_threadpool(self._queue.forecast, feed.job_id)
+        if told is None or forecast.position != told.position:
+            feed.add(record, forecast=forecast)
+        return forecast

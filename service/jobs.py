@@ -10,7 +10,7 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.queue.promise import LISTING_LIMIT, event_order
+from contract.queue.promise import MAX_LISTED, event_order
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState, JobView
 from service.deps import AnyCaller, Deps, ListingLimit, Services, owned_job
 from service.events import NOTHING_SEEN
@@ -29,7 +29,7 @@ STREAM_RESPONSES: dict[int | str, dict[str, object]] = {
 
 @router.get("", operation_id="list_jobs")
 def list_jobs(
-    services: Services, caller: AnyCaller, state: JobState | None = None, limit: ListingLimit = LISTING_LIMIT
+    services: Services, caller: AnyCaller, state: JobState | None = None, limit: ListingLimit = MAX_LISTED
 ) -> list[JobView]:
     """The newest jobs, newest first; of one state if it is given. Positions in the queue are told of each by itself."""
     caller.require(KeyScope.VIEW)
@@ -103,4 +103,4 @@ def _view(services: Deps, record: JobRecord, response: Response) -> JobView:
     if record.state in TERMINAL_STATES:
         return JobView.of(record)
     response.headers["Retry-After"] = str(RETRY_AFTER_S)
-    return JobView.of(record, services.queue.standing(record.job_id))
+    return JobView.of(record, services.queue.forecast(record.job_id))

@@ -23,7 +23,7 @@ from contract.intake.sniff import check_file
 from contract.queue.promise import Admission, QueueFullError
 from contract.store.store import new_job_id
 from contract.wire.errors import InputError, LimitError, UnavailableError
-from contract.wire.job import JOB_ID_PATTERN, JobRecord, JobView, Standing
+from contract.wire.job import JOB_ID_PATTERN, Forecast, JobRecord, JobView
 from contract.wire.options import JobOptions, parse_options
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
@@ -104,13 +104,13 @@ async def reconstruct(
         record = await _receive_form(request, services, caller, key)
     response.headers["Location"] = f"/jobs/{record.job_id}"
     response.headers["Retry-After"] = str(RETRY_AFTER_S)
-    return JobView.of(record, await run_in_threadpool(standing_of, services, record))
+    return JobView.of(record, await run_in_threadpool(forecast_of, services, record))
 
 
-def standing_of(services: Deps, record: JobRecord) -> Standing | None:
+def forecast_of(services: Deps, record: JobRecord) -> Forecast | None:
     """Where a job stands; None where that is unknown just now."""
     try:
-        return services.queue.standing(record.job_id)
+        return services.queue.forecast(record.job_id)
     except UnavailableError:
         return None
 

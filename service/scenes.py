@@ -12,7 +12,7 @@ from starlette.responses import FileResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.queue.promise import LISTING_LIMIT
+from contract.queue.promise import MAX_LISTED
 from contract.store.store import is_job_id
 from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
@@ -37,7 +37,7 @@ class SceneSummary(BaseModel):
 
 
 @router.get("", operation_id="list_scenes")
-def list_scenes(services: Services, caller: AnyCaller, limit: ListingLimit = LISTING_LIMIT) -> list[SceneSummary]:
+def list_scenes(services: Services, caller: AnyCaller, limit: ListingLimit = MAX_LISTED) -> list[SceneSummary]:
     """The newest finished scenes, newest first."""
     caller.require(KeyScope.VIEW)
     records = services.queue.records(caller.tenant, None)

@@ -205,7 +205,7 @@ def test_the_access_list_lets_the_queue_do_all_it_does(secret_url: str) -> None:
     jobs = [JobRecord(job_id=new_job_id(), files=JobFiles(clip="clip.mp4"), created_at_s=time.time()) for _ in "abc"]
     for job in jobs:
         assert queue.submit(job).job_id == job.job_id
-    queue.standing(jobs[1].job_id)
+    queue.forecast(jobs[1].job_id)
     for end in (queue.finish, queue.release):
         record = queue.claim("worker-1", 1.0)
         assert record is not None

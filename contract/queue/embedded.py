@@ -24,7 +24,7 @@ from contract.runtime.locks import FolderLock
 from contract.runtime.supervised import Supervised
 from contract.wire.errors import UnavailableError
 
-SOCKET_PATH_LIMIT = 107
+MAX_SOCKET_PATH_BYTES = 107
 """Bytes a unix socket's path may have on Linux (sun_path, less the final zero)."""
 
 START_TIMEOUT_S = 20.0
@@ -71,7 +71,7 @@ def short_socket_path(folder: Path, name: str) -> Path:
         UnavailableError: the short folder exists and belongs to somebody else.
     """
     path = folder / name
-    if len(os.fsencode(path)) <= SOCKET_PATH_LIMIT:
+    if len(os.fsencode(path)) <= MAX_SOCKET_PATH_BYTES:
         return path
     digest = hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]
     short = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / f"intrasplat-{os.getuid()}-{digest}"

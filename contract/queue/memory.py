@@ -7,12 +7,12 @@ import time
 from collections import Counter, deque
 
 from contract.queue.promise import (
-    DURATIONS_KEPT,
-    EVENTS_KEPT,
     IDEMPOTENCY_S,
     LEASE_S,
-    LISTING_LIMIT,
     MAX_ATTEMPTS,
+    MAX_DURATIONS,
+    MAX_EVENTS,
+    MAX_LISTED,
     PREEMPT_AFTER_S,
     WORKER_TTL_S,
     YIELD_S,
@@ -27,7 +27,7 @@ from contract.queue.promise import (
     event_order,
     worker_died,
 )
-from contract.wire.job import TERMINAL_STATES, TRANSITIONS, JobError, JobProgress, JobRecord, JobState, Standing
+from contract.wire.job import TERMINAL_STATES, TRANSITIONS, Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.rendering import WorkerAddress
 
 LEASE_CHECK_S = 0.05
@@ -53,7 +53,7 @@ class MemoryQueue:
         self._events: dict[str, deque[Event]] = {}
         self._event_count = 0
         self._ended: Counter[JobState] = Counter()
-        self._durations_s: deque[float] = deque(maxlen=DURATIONS_KEPT)
+        self._durations_s: deque[float] = deque(maxlen=MAX_DURATIONS)
         self._workers: dict[str, tuple[WorkerAddress, float]] = {}
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
@@ -148,11 +148,11 @@ class MemoryQueue:
         with self._changed:
             return self._records.get(job_id)
 
-    def standing(self, job_id: str) -> Standing:
+    def forecast(self, job_id: str) -> Forecast:
         with self._changed:
             record = self._records.get(job_id)
             if record is None or record.state in TERMINAL_STATES:
-                return Standing(position=None, eta_s=None)
+                return Forecast(position=None, eta_s=None)
             now_s = time.time()
             started = {running.job_id: running.started_at_s or now_s for running in self._in(JobState.RUNNING)}
             ran_s = {running_id: now_s - started_at_s for running_id, started_at_s in started.items()}
@@ -160,9 +160,9 @@ class MemoryQueue:
             position = waiting.index(job_id) if job_id in waiting else None
             own_s = ran_s.get(job_id, 0.0)
             eta_s = estimate_end_s(list(self._durations_s), position, own_s, list(ran_s.values()), len(self.workers()))
-            return Standing(position=position, eta_s=correct_end_s(record, eta_s))
+            return Forecast(position=position, eta_s=correct_end_s(record, eta_s))
 
-    def records(self, tenant: str | None = None, limit: int | None = LISTING_LIMIT) -> list[JobRecord]:
+    def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
         with self._changed:
             chosen = [record for record in self._records.values() if tenant in (None, record.tenant)]
         chosen.sort(key=lambda record: (record.created_at_s, record.job_id), reverse=True)
@@ -326,7 +326,7 @@ class MemoryQueue:
         """Every change of a record ends here: it is an event, and wakes those who wait for a job."""
         self._records[record.job_id] = record
         self._event_count += 1
-        kept = self._events.setdefault(record.job_id, deque(maxlen=EVENTS_KEPT))
+        kept = self._events.setdefault(record.job_id, deque(maxlen=MAX_EVENTS))
         kept.append(Event(f"{self._event_count}-0", record))
         self._changed.notify_all()
         return record

@@ -3,9 +3,9 @@
 Two implementations obey this file and pass the same tests: contract/queue/redis_queue.py, which deployments use, and
 contract/queue/memory.py, for tests and for a worker inside one process.
 
-A claim is a lease by liveness: it stands as long as its worker beats. After LEASE_S without a beat the job is
-anybody's again, as a new attempt; every report carries the attempt, so what a worker says that was thought dead
-changes nothing (the attempt is the fence).
+A claim is a lease: it holds as long as its worker beats. After LEASE_S without a beat any worker may claim the job, as
+a new attempt. Every report carries the attempt's number and changes nothing if a later attempt has begun: the number
+is the fencing token.
 """
 
 from __future__ import annotations
@@ -17,45 +17,45 @@ from statistics import median
 from typing import Protocol
 
 from contract.wire.errors import UnavailableError
-from contract.wire.job import JobError, JobProgress, JobRecord, JobState, Standing
+from contract.wire.job import Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.rendering import WorkerAddress
 
 MAX_ATTEMPTS = 3
-"""A job whose worker died this often is taken for the cause of it and fails."""
+"""A job whose worker has died this often fails: the job is taken for the cause."""
 
 BEAT_PERIOD_S = 2.0
 LEASE_S = 8.0
 """Three beats may be late or lost."""
 
 PREEMPT_AFTER_S = 1.0
-"""A high-priority job that nobody has claimed for so long takes the place of a standard one."""
+"""A worker with a standard job makes way for a high-priority one that has waited this long."""
 
 YIELD_S = 20.0
-"""How long the worker that was told to make way may take before another is told too."""
+"""If the worker that was told to make way has not done so after this long, another is told."""
 
 WORKER_TTL_S = 10.0
-"""A worker that has not announced itself for this long is not live."""
+"""How long an announcement of a worker lasts."""
 
 ANNOUNCE_PERIOD_S = 2.0
 
 IDEMPOTENCY_S = 24 * 3600
-"""How long a submission may be repeated under its idempotency key."""
+"""How long an idempotency key stands for the job that was submitted under it."""
 
-DURATIONS_KEPT = 20
-"""Done jobs from whose durations the next ones' are estimated."""
+MAX_DURATIONS = 20
+"""The forecast uses the durations of this many last jobs."""
 
-LISTING_LIMIT = 200
-"""GET /jobs shows the newest this many."""
+MAX_LISTED = 200
+"""How many jobs one listing may hold."""
 
-EVENTS_KEPT = 200
-"""Of each job, for callers that come back and ask for what they missed."""
+MAX_EVENTS = 200
+"""Kept of each job, for callers that reconnect and ask for what they missed."""
 
 EVENT_NUMBER = re.compile(r"(\d{1,19})(?:-(\d{1,19}))?", re.ASCII)
 """Milliseconds, and a count within them."""
 
 
 class Order(StrEnum):
-    """What a beat is answered with."""
+    """The answer to a beat."""
 
     GO_ON = "go-on"
     CANCEL = "cancel"
@@ -63,12 +63,12 @@ class Order(StrEnum):
     YIELD = "yield"
     """Stop, keep the state, release: a high-priority job waits and nobody is free."""
     LOST = "lost"
-    """The claim no longer stands: stop, and touch nothing but this attempt's own folder."""
+    """The claim no longer holds: stop, and touch nothing but this attempt's own folder."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A worker's hold on one attempt of a job; all its reports carry it, and a stale one changes nothing."""
+    """One attempt of a job and the worker that makes it; every report carries it, and a stale one changes nothing."""
 
     job_id: str
     attempt: int
@@ -85,7 +85,7 @@ class Admission:
 
 @dataclass(frozen=True)
 class Event:
-    """A change of a job: its number, which only grows, and the record as the change left it."""
+    """A change of a job: a number that only grows, and the record after the change."""
 
     number: str
     record: JobRecord
@@ -102,7 +102,7 @@ class QueueFigures:
 
 
 class QueueFullError(UnavailableError):
-    """Too many jobs wait; `tenant` says whether the caller's own share is used up (HTTP 429, else 503)."""
+    """Too many jobs wait. tenant: the caller's own share is used up (HTTP 429), not the whole queue (503)."""
 
     def __init__(self, problem: str, remedy: str, *, tenant: bool) -> None:
         super().__init__(problem, remedy)
@@ -110,16 +110,16 @@ class QueueFullError(UnavailableError):
 
 
 class Queue(Protocol):
-    """Every method is atomic and may be repeated when its answer was lost; those that change a job say what came of it.
+    """Every method is atomic, and may be repeated when its answer was lost.
 
     All raise UnavailableError when the queue cannot be reached or its memory is full.
     """
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
-        """Enqueue a job; the record that stands in the queue afterwards.
+        """Enqueue a job. Returns the record that the queue holds for it.
 
-        That is another one if the tenant submitted a job under the same idempotency key within IDEMPOTENCY_S, and the
-        job itself, unchanged, if its id is there already.
+        That is another job's if the tenant has submitted one under the same idempotency key within IDEMPOTENCY_S. It is
+        the unchanged record of the same job if the queue knows its id.
 
         Raises:
             QueueFullError: admission leaves no room; nothing was changed.
@@ -131,76 +131,76 @@ class Queue(Protocol):
         ...
 
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
-        """The next job, now running and owned; None after timeout_s.
+        """The next job, now running and owned by `owner`; None after timeout_s.
 
-        High priority before standard, so that a job that made way waits for the one it made way for; within each,
-        jobs that were released or whose lease has run out before new ones. An owner holds one job at a time: while it
-        holds one (because the answer to its claim was lost), it is given that one again, as the same attempt. A job
-        whose workers died MAX_ATTEMPTS times fails instead; one with cancel_requested ends as cancelled instead.
+        The order is: high priority before standard; within each, jobs that were released or whose lease has run out
+        before new ones. An owner holds one job at a time. If it holds one already (because the answer to its claim was
+        lost), it gets the same attempt again. A job whose workers have died MAX_ATTEMPTS times fails instead. One with
+        cancel_requested ends as cancelled instead.
         """
         ...
 
     def beat(self, claim: Claim, progress: JobProgress | None = None) -> Order:
-        """Renew the lease, record progress if there is any, and hear what to do."""
+        """Renew the lease and record progress; the answer says what the worker is to do."""
         ...
 
     def finish(self, claim: Claim) -> bool:
-        """running -> done; False if the claim no longer stands or a cancel was asked for."""
+        """running -> done; False if the claim no longer holds or a cancel was requested."""
         ...
 
     def fail(self, claim: Claim, error: JobError) -> bool:
-        """running -> failed, a dead letter; False if the claim no longer stands or a cancel was asked for."""
+        """running -> failed, a dead letter; False if the claim no longer holds or a cancel was requested."""
         ...
 
     def confirm_cancel(self, claim: Claim) -> bool:
-        """running -> cancelled, by the worker that has stopped; False if nobody asked for it."""
+        """running -> cancelled, by the worker that has stopped; False if no cancel was requested."""
         ...
 
     def release(self, claim: Claim, *, died: bool = False) -> bool:
-        """running -> queued, first in line; False if the claim no longer stands or a cancel was asked for.
+        """running -> queued, first in line; False if the claim no longer holds or a cancel was requested.
 
-        died: the attempt is held against the job, and after MAX_ATTEMPTS of them it is failed, a dead letter.
+        died: the attempt counts as a death. After MAX_ATTEMPTS deaths the job fails, a dead letter.
         """
         ...
 
     def cancel(self, job_id: str) -> JobRecord | None:
-        """queued -> cancelled at once; running: ask its worker. The record afterwards; None if there is none."""
+        """queued -> cancelled at once; running: ask its worker. Returns the record, None if there is none."""
         ...
 
     def retry(self, job_id: str) -> JobRecord | None:
-        """failed -> queued, earlier deaths forgiven. The record afterwards; None if there is none."""
+        """failed -> queued, with no deaths counted. Returns the record, None if there is none."""
         ...
 
     def get(self, job_id: str) -> JobRecord | None:
         """The job's record."""
         ...
 
-    def standing(self, job_id: str) -> Standing:
-        """Position in the queue and when the job may be done, from the duration of the last ones."""
+    def forecast(self, job_id: str) -> Forecast:
+        """Position in the queue and when the job may be done, estimated from the last jobs' durations."""
         ...
 
-    def records(self, tenant: str | None = None, limit: int | None = LISTING_LIMIT) -> list[JobRecord]:
+    def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
         """The newest jobs of a tenant, or of all, newest first."""
         ...
 
     def events(self, job_id: str, after: str = "0") -> list[Event]:
-        """What has happened to the job after the event of that number, oldest first; at once, without waiting."""
+        """The job's events after the one of that number, oldest first; does not wait for new ones."""
         ...
 
     def forget(self, job_id: str) -> bool:
-        """Remove record, events and idempotency key of a job in a terminal state; False if missing or still live."""
+        """Remove record, events and idempotency key of an ended job; False if it is missing or live."""
         ...
 
     def rewrite_log(self) -> bool:
-        """Drop from the server's log on disk what it still holds of forgotten jobs; False if it cannot just now."""
+        """Remove forgotten jobs from the server's log on disk, too; False if the server cannot do so now."""
         ...
 
     def announce(self, address: WorkerAddress) -> None:
-        """Say that a worker is live, for WORKER_TTL_S."""
+        """Add a worker to workers() for WORKER_TTL_S."""
         ...
 
     def withdraw(self, name: str) -> None:
-        """Say that a worker has stopped."""
+        """Remove a worker from workers()."""
         ...
 
     def workers(self) -> list[WorkerAddress]:
@@ -208,7 +208,7 @@ class Queue(Protocol):
         ...
 
     def figures(self) -> QueueFigures:
-        """How much waits, runs and has ended."""
+        """How many jobs wait, run and have ended."""
         ...
 
     def ping(self) -> None:
@@ -216,38 +216,40 @@ class Queue(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of connections."""
+        """Close all connections."""
         ...
 
 
 def worker_died() -> JobError:
-    """The error of a job that took MAX_ATTEMPTS workers down with it."""
+    """The error of a job whose workers have died MAX_ATTEMPTS times."""
     problem = f"The worker died {MAX_ATTEMPTS} times while it ran this job."
     return JobError(problem=problem, remedy="Try a shorter or smaller clip, and look at the worker's log.")
 
 
 def check_admission(admission: Admission, queued: int, queued_of_tenant: int) -> None:
-    """Refuse one job more when so many wait.
+    """Refuse another job if too many wait.
 
     Raises:
         QueueFullError: the tenant's share or the whole queue is used up.
     """
     if queued_of_tenant >= admission.queued_per_tenant:
-        problem = f"{queued_of_tenant} jobs of yours wait already; {admission.queued_per_tenant} may."
-        raise QueueFullError(problem, "Submit again when one of them has been started.", tenant=True)
+        problem = f"{queued_of_tenant} of your jobs wait; the limit is {admission.queued_per_tenant}."
+        raise QueueFullError(problem, "Submit again when one of them has started.", tenant=True)
     if queued >= admission.queued:
         raise QueueFullError(
-            f"{queued} jobs wait already; {admission.queued} may.", "Submit again later.", tenant=False
+            f"{queued} jobs wait; the limit is {admission.queued}.", "Submit again later.", tenant=False
         )
 
 
 def estimate_end_s(
     durations_s: list[float], position: int | None, own_s: float, running_s: list[float], workers: int
 ) -> float | None:
-    """Seconds until a job is done, if it and all before it take as long as the median of the last ones; None: unknown.
+    """Seconds until a job is done if every job takes the median of the last durations; None: unknown.
 
-    position: how many jobs wait before it, None while it runs itself, since own_s; running_s: how long each running
-    job has run; workers: how many are live and share the work.
+    Args:
+        position: how many jobs wait before it; None: it runs, and has run for own_s.
+        running_s: how long each running job has run.
+        workers: how many are live and share the work.
     """
     if not durations_s:
         return None
@@ -261,7 +263,7 @@ def estimate_end_s(
 
 
 def correct_end_s(record: JobRecord, estimated_s: float | None) -> float | None:
-    """The estimate from other jobs, put right by what this one says: what is left of it, or the budget it was given."""
+    """The estimate from other jobs, replaced by what this job reports, or raised to the budget that it was given."""
     progress = record.progress
     if progress is not None and progress.seconds_left is not None:
         return progress.seconds_left
@@ -271,6 +273,6 @@ def correct_end_s(record: JobRecord, estimated_s: float | None) -> float | None:
 
 
 def event_order(number: str) -> tuple[int, int]:
-    """What event numbers are compared by; a number that no event can have comes before all."""
+    """The key by which event numbers are compared; text that is no event number comes first."""
     parts = EVENT_NUMBER.fullmatch(number)
     return (int(parts[1]), int(parts[2] or 0)) if parts else (0, 0)

@@ -54,12 +54,12 @@ from redis.retry import Retry
 
 from contract.queue.lua import load_script
 from contract.queue.promise import (
-    DURATIONS_KEPT,
-    EVENTS_KEPT,
     IDEMPOTENCY_S,
     LEASE_S,
-    LISTING_LIMIT,
     MAX_ATTEMPTS,
+    MAX_DURATIONS,
+    MAX_EVENTS,
+    MAX_LISTED,
     PREEMPT_AFTER_S,
     WORKER_TTL_S,
     YIELD_S,
@@ -76,7 +76,7 @@ from contract.queue.promise import (
 )
 from contract.queue.redis_hash import EVENT_FIELDS, introduced, record_of, table_of
 from contract.wire.errors import UnavailableError
-from contract.wire.job import TERMINAL_STATES, JobError, JobProgress, JobRecord, JobState, Standing, sources_of
+from contract.wire.job import TERMINAL_STATES, Forecast, JobError, JobProgress, JobRecord, JobState, sources_of
 from contract.wire.rendering import WorkerAddress
 
 PREFIX = "{intrasplat}:"
@@ -187,10 +187,10 @@ class RedisQueue:
     def get(self, job_id: str) -> JobRecord | None:
         return self._get_all([job_id]).get(job_id)
 
-    def standing(self, job_id: str) -> Standing:
+    def forecast(self, job_id: str) -> Forecast:
         record = self.get(job_id)
         if record is None or record.state in TERMINAL_STATES:
-            return Standing(position=None, eta_s=None)
+            return Forecast(position=None, eta_s=None)
         with _reachable(), self._client.pipeline(transaction=True) as batch:
             batch.zrank(f"{PREFIX}waiting:{record.options.priority}", job_id)
             batch.zcard(f"{PREFIX}waiting:high")
@@ -205,9 +205,9 @@ class RedisQueue:
         durations_s = [float(duration) for duration in durations]
         workers = len(self.workers())
         eta_s = estimate_end_s(durations_s, position, ran_s.get(job_id, 0.0), list(ran_s.values()), workers)
-        return Standing(position=position, eta_s=correct_end_s(record, eta_s))
+        return Forecast(position=position, eta_s=correct_end_s(record, eta_s))
 
-    def records(self, tenant: str | None = None, limit: int | None = LISTING_LIMIT) -> list[JobRecord]:
+    def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
         index = INDEX if tenant is None else f"{PREFIX}tenant:{tenant}:index"
         if limit == 0:
             return []
@@ -350,9 +350,9 @@ def _rules(lease_s: float, preempt_after_s: float) -> str:
         "max_attempts": MAX_ATTEMPTS,
         "worker_died": worker_died().model_dump_json(),
         "unreadable": UNREADABLE.model_dump_json(),
-        "events_kept": EVENTS_KEPT,
+        "max_events": MAX_EVENTS,
         "event_fields": EVENT_FIELDS,
-        "durations_kept": DURATIONS_KEPT,
+        "max_durations": MAX_DURATIONS,
     }
     return json.dumps(rules)
 

@@ -115,8 +115,8 @@ class JobRecord(BaseModel):
     error: JobError | None = None
 
 
-class Standing(BaseModel):
-    """Where a queued or running job stands: how many will be claimed before it, and when it may be done."""
+class Forecast(BaseModel):
+    """How many jobs will be claimed before a queued one, and in how many seconds a live one may be done."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -148,7 +148,7 @@ class JobView(BaseModel):
     links: dict[str, str]
 
     @classmethod
-    def of(cls, record: JobRecord, standing: Standing | None = None) -> JobView:
+    def of(cls, record: JobRecord, forecast: Forecast | None = None) -> JobView:
         """The view of one record; `links` names what may be asked for next."""
         links = {"self": f"/jobs/{record.job_id}", "events": f"/jobs/{record.job_id}/events"}
         if record.state is JobState.FAILED:
@@ -162,5 +162,5 @@ class JobView(BaseModel):
             include={"state", "error", "cancel_requested", "attempt", "options", "input_bytes"}
             | {"created_at_s", "started_at_s", "finished_at_s"}
         )
-        progress |= {"position": standing.position, "eta_s": standing.eta_s} if standing else {}
+        progress |= {"position": forecast.position, "eta_s": forecast.eta_s} if forecast else {}
         return cls(id=record.job_id, links=links, **shared, **progress)

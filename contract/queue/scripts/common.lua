@@ -47,7 +47,7 @@ local function write(job, changes)
   for _, name in ipairs(RULES.event_fields) do
     if job[name] then event[#event + 1] = name; event[#event + 1] = job[name] end
   end
-  redis.call('XADD', P .. 'events:' .. job.id, 'MAXLEN', RULES.events_kept, '*', unpack(event))
+  redis.call('XADD', P .. 'events:' .. job.id, 'MAXLEN', RULES.max_events, '*', unpack(event))
 end
 
 local function drop(priority, entry)

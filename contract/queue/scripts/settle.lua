@@ -11,6 +11,6 @@ if job.state ~= 'running' or (target == 'cancelled') ~= (job.cancel ~= nil) then
 if not change(job, target, {error = ARGV[6] ~= '' and ARGV[6]}) then return 0 end
 if target == 'done' then
   redis.call('LPUSH', P .. 'durations', tonumber(job.finished) - tonumber(job.started))
-  redis.call('LTRIM', P .. 'durations', 0, RULES.durations_kept - 1)
+  redis.call('LTRIM', P .. 'durations', 0, RULES.max_durations - 1)
 end
 return 1

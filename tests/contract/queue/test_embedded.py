@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import redis
 
-from contract.queue.embedded import SOCKET_PATH_LIMIT, EmbeddedServer, find_server, short_socket_path
+from contract.queue.embedded import MAX_SOCKET_PATH_BYTES, EmbeddedServer, find_server, short_socket_path
 from contract.wire.errors import UnavailableError
 
 
@@ -112,7 +112,7 @@ def test_a_data_directory_too_deep_for_a_socket_still_gets_one(tmp_path: Path) -
     server = EmbeddedServer(deep)
     server.start()
     path = Path(server.url.removeprefix("unix://"))
-    assert len(os.fsencode(path)) <= SOCKET_PATH_LIMIT
+    assert len(os.fsencode(path)) <= MAX_SOCKET_PATH_BYTES
     assert path == short_socket_path(deep / "valkey", "queue.sock")
     server.stop()
     path.parent.rmdir()

@@ -8,8 +8,8 @@ import time
 import pytest
 
 from contract.queue.promise import (
-    EVENTS_KEPT,
     MAX_ATTEMPTS,
+    MAX_EVENTS,
     Claim,
     Order,
     Queue,
@@ -268,26 +268,26 @@ def test_after_a_number_that_no_event_has_all_is_told(queue: Queue, number: str)
 def test_the_last_events_of_a_job_are_kept(queue: Queue) -> None:
     submitted = queue.submit(job())
     _, claim = claimed(queue)
-    for iteration in range(EVENTS_KEPT + 5):
+    for iteration in range(MAX_EVENTS + 5):
         queue.beat(claim, TRAINING.model_copy(update={"iteration": iteration}))
     events = queue.events(submitted.job_id)
-    assert len(events) == EVENTS_KEPT
+    assert len(events) == MAX_EVENTS
     assert events[-1].record.progress is not None
-    assert events[-1].record.progress.iteration == EVENTS_KEPT + 4
+    assert events[-1].record.progress.iteration == MAX_EVENTS + 4
 
 
 def test_a_job_stands_behind_those_that_will_be_claimed_before_it(queue: Queue) -> None:
     first, second = queue.submit(job()), queue.submit(job())
     urgent = queue.submit(job(priority="high"))
-    positions = {record.job_id: queue.standing(record.job_id).position for record in (first, second, urgent)}
+    positions = {record.job_id: queue.forecast(record.job_id).position for record in (first, second, urgent)}
     assert positions == {urgent.job_id: 0, first.job_id: 1, second.job_id: 2}
     record, claim = claimed(queue)
-    assert queue.standing(record.job_id).position is None
-    assert queue.standing(second.job_id).position == 1
+    assert queue.forecast(record.job_id).position is None
+    assert queue.forecast(second.job_id).position == 1
     queue.finish(claim)
     for unknown in (record.job_id, new_job_id()):
-        standing = queue.standing(unknown)
-        assert (standing.position, standing.eta_s) == (None, None)
+        forecast = queue.forecast(unknown)
+        assert (forecast.position, forecast.eta_s) == (None, None)
 
 
 def test_the_end_of_a_job_is_estimated_from_those_that_were_done(queue: Queue) -> None:
@@ -295,8 +295,8 @@ def test_the_end_of_a_job_is_estimated_from_those_that_were_done(queue: Queue) -
     waiting = queue.submit(job())
     record, claim = claimed(queue)
     queue.announce(WorkerAddress(name="worker-1", endpoint="ipc:///run/worker-1.sock", device="cpu"))
-    assert queue.standing(record.job_id).eta_s is None
-    assert queue.standing(waiting.job_id).eta_s is None
+    assert queue.forecast(record.job_id).eta_s is None
+    assert queue.forecast(waiting.job_id).eta_s is None
     time.sleep(0.05)
     queue.finish(claim)
     done = known(queue, record.job_id)
@@ -304,14 +304,14 @@ def test_the_end_of_a_job_is_estimated_from_those_that_were_done(queue: Queue) -
     assert done.started_at_s is not None
     last = queue.submit(job())
     usual_s = done.finished_at_s - done.started_at_s
-    assert queue.standing(waiting.job_id).eta_s == pytest.approx(usual_s, abs=1e-4)
-    assert queue.standing(last.job_id).eta_s == pytest.approx(2 * usual_s, abs=1e-4)
+    assert queue.forecast(waiting.job_id).eta_s == pytest.approx(usual_s, abs=1e-4)
+    assert queue.forecast(last.job_id).eta_s == pytest.approx(2 * usual_s, abs=1e-4)
     budget_s = 60.0
     generous = queue.submit(job().model_copy(update={"options": JobOptions(budget_s=budget_s, priority="high")}))
-    assert queue.standing(generous.job_id).eta_s == budget_s
+    assert queue.forecast(generous.job_id).eta_s == budget_s
     _, claim = claimed(queue)
     queue.beat(claim, TRAINING)
-    assert queue.standing(generous.job_id).eta_s == TRAINING.seconds_left
+    assert queue.forecast(generous.job_id).eta_s == TRAINING.seconds_left
 
 
 def test_the_figures_count_what_waits_runs_and_has_ended(queue: Queue) -> None:

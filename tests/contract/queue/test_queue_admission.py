@@ -55,10 +55,10 @@ def test_a_tenant_may_have_only_its_share_of_jobs_waiting(queue: Queue) -> None:
 
 def test_all_tenants_together_may_have_only_so_many_jobs_waiting(queue: Queue) -> None:
     admission = Admission(queued=2, queued_per_tenant=2)
-    standing = queue.submit(job(tenant="ward-1", idempotency_key="a" * 64), admission)
+    first = queue.submit(job(tenant="ward-1", idempotency_key="a" * 64), admission)
     queue.submit(job(tenant="ward-2", priority="high"), admission)
     with pytest.raises(QueueFullError) as raised:
         queue.submit(job(tenant="ward-3"), admission)
     assert not raised.value.tenant
-    assert queue.submit(job(tenant="ward-1", idempotency_key="a" * 64), admission) == standing
+    assert queue.submit(job(tenant="ward-1", idempotency_key="a" * 64), admission) == first
     assert len(queue.records()) == 2

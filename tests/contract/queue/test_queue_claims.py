@@ -106,7 +106,7 @@ def test_a_released_job_is_first_of_its_priority_for_anybody_as_a_new_attempt(qu
     assert queue.release(stale)
     waiting = known(queue, first.job_id)
     assert (waiting.state, waiting.progress, waiting.released) == (JobState.QUEUED, None, 1)
-    assert queue.standing(first.job_id).position == 0
+    assert queue.forecast(first.job_id).position == 0
     assert not queue.finish(stale)
     second, current = claimed(queue, "worker-2")
     assert (second.job_id, second.attempt) == (first.job_id, 2)

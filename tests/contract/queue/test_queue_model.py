@@ -122,7 +122,7 @@ class BothQueues(RuleBasedStateMachine):
     def look(self, pick: int) -> None:
         job_id = self.some_job(pick)
         self.both("get", job_id)
-        positions = {queue.standing(job_id).position for queue in (self.memory, self.server)}
+        positions = {queue.forecast(job_id).position for queue in (self.memory, self.server)}
         assert len(positions) == 1
 
     @invariant()

@@ -276,7 +276,7 @@ def full_course(queue: Queue) -> None:
     assert queue.finish(claimed(queue)[1])
     assert queue.fail(claimed(queue)[1], ERROR)
     assert queue.retry(record.job_id) is not None
-    assert queue.standing(record.job_id).position == 0
+    assert queue.forecast(record.job_id).position == 0
     assert queue.cancel(record.job_id) is not None
     assert queue.restore(job().model_copy(update={"state": JobState.DONE, "finished_at_s": 1.0}))
     assert len(queue.events(record.job_id)) == 8
