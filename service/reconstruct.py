@@ -18,7 +18,7 @@ from starlette.requests import ClientDisconnect
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.intake.limits import MOST_MEMORY_BYTES, ClipLimits
+from contract.intake.limits import MAX_MEMORY_BYTES, ClipLimits
 from contract.intake.sniff import check_file
 from contract.queue.promise import Admission, QueueFullError
 from contract.store.store import new_job_id
@@ -259,7 +259,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
 
 def _look_at(services: Deps, job_id: str, received: Received) -> None:
     """Refuse what cannot be a clip. How much memory it may take is for the worker to say, which may be elsewhere."""
-    limits = replace(ClipLimits.of(services.settings), decoded_bytes=MOST_MEMORY_BYTES)
+    limits = replace(ClipLimits.of(services.settings), decoded_bytes=MAX_MEMORY_BYTES)
     for part, name in received.names.items():
         check_file(services.store.incoming_folder(job_id) / name, part, limits)
 

@@ -14,7 +14,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
-from contract.intake.limits import MOST_CALIBRATION_BYTES
+from contract.intake.limits import MAX_CALIBRATION_BYTES
 from contract.wire.errors import InputError, LimitError
 from contract.wire.job import JobFiles
 from service.problems import Problem, no_room
@@ -33,7 +33,7 @@ PARTS = tuple(SUFFIXES)
 
 OPTIONS = "options"
 MAX_OPTIONS_BYTES = 64 * 1024
-MOST_BYTES = {OPTIONS: MAX_OPTIONS_BYTES, "calibration": MOST_CALIBRATION_BYTES}
+MOST_BYTES = {OPTIONS: MAX_OPTIONS_BYTES, "calibration": MAX_CALIBRATION_BYTES}
 """Of the parts that are small by their nature."""
 LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
 MAX_HEADER_BYTES = 8 * 1024

@@ -15,7 +15,7 @@ from contract.wire.errors import LimitError
 if TYPE_CHECKING:
     from contract.runtime.settings import Settings
 
-SMALLEST_SIDE_PX = 16  # below this neither stereo matching nor a tile of the rasteriser has anything to work on
+MIN_SIDE_PX = 16  # below this neither stereo matching nor a tile of the rasteriser has anything to work on
 
 HELD_BYTES_PER_PIXEL = 18
 """Memory that a pixel of one eye takes in every frame while a clip is reconstructed.
@@ -24,14 +24,14 @@ HELD_BYTES_PER_PIXEL = 18
 weight 1, inverse depth 4), and 1 for their padding; before these exist, masks and the grey right eye take less.
 """
 
-MOST_MEMORY_BYTES = 8 * 1024**3  # a clip may take, however much there is: more frames than this train for too long
+MAX_MEMORY_BYTES = 8 * 1024**3  # a clip may take, however much there is: more frames than this train for too long
 MEMORY_SHARE = 2  # a clip may take one part in this many of the machine's memory; the model and its gradients need room
 
 EYES = 2  # of a stereo clip; the largest picture accepted holds both
 
-MOST_POSES_BYTES = 1 << 16, 1024  # of poses_bounds.npy: its header, and a frame's 17 numbers with ample room
-MOST_CALIBRATION_BYTES = 1_000_000  # a calibration has a few kB; anything larger is another file
-MOST_IMAGE_BYTES = 1 << 20, 8  # of a PNG or JPEG: its metadata, and a pixel of 16-bit RGBA stored uncompressed
+MAX_POSES_BYTES = 1 << 16, 1024  # of poses_bounds.npy: its header, and a frame's 17 numbers with ample room
+MAX_CALIBRATION_BYTES = 1_000_000  # a calibration has a few kB; anything larger is another file
+MAX_IMAGE_BYTES = 1 << 20, 8  # of a PNG or JPEG: its metadata, and a pixel of 16-bit RGBA stored uncompressed
 
 
 def memory_for_clip_bytes() -> int:
@@ -39,8 +39,8 @@ def memory_for_clip_bytes() -> int:
     try:
         memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):  # not every system tells
-        return MOST_MEMORY_BYTES
-    return min(MOST_MEMORY_BYTES, memory_bytes // MEMORY_SHARE) if memory_bytes > 0 else MOST_MEMORY_BYTES
+        return MAX_MEMORY_BYTES
+    return min(MAX_MEMORY_BYTES, memory_bytes // MEMORY_SHARE) if memory_bytes > 0 else MAX_MEMORY_BYTES
 
 
 def _ignore() -> None:
@@ -83,11 +83,11 @@ class ClipLimits:
 
     def check_frame(self, field: str, label: str, width: int, height: int) -> None:
         """LimitError unless a picture of width x height pixels is acceptable."""
-        if width < SMALLEST_SIDE_PX or height < SMALLEST_SIDE_PX:
+        if width < MIN_SIDE_PX or height < MIN_SIDE_PX:
             raise LimitError(
                 field,
                 f"{label} is {width}x{height} pixels.",
-                f"Give frames of at least {SMALLEST_SIDE_PX} pixels on each side.",
+                f"Give frames of at least {MIN_SIDE_PX} pixels on each side.",
             )
         if width * height > self.pixels_per_frame:
             raise LimitError(

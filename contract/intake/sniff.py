@@ -8,7 +8,7 @@ from __future__ import annotations
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from contract.intake.limits import MOST_CALIBRATION_BYTES, ClipLimits
+from contract.intake.limits import MAX_CALIBRATION_BYTES, ClipLimits
 from contract.intake.video_header import EBML, check_video, is_video
 from contract.intake.zips import UNREADABLE, open_zip
 from contract.wire.errors import InputError, LimitError
@@ -60,8 +60,8 @@ def check_calibration_text(text: str, field: str, label: str) -> None:
 
 def _text_of(path: Path, part: str) -> str:
     size = path.stat().st_size
-    if size > MOST_CALIBRATION_BYTES:
-        problem = f"{path.name} has {size} bytes; the limit is {MOST_CALIBRATION_BYTES}."
+    if size > MAX_CALIBRATION_BYTES:
+        problem = f"{path.name} has {size} bytes; the limit is {MAX_CALIBRATION_BYTES}."
         raise LimitError(part, problem, _PLAIN_TEXT_REMEDY)
     try:
         text = path.read_text(encoding="utf-8-sig")

@@ -39,8 +39,8 @@ REMEDY = "Give H.264, HEVC or VP9 video in mp4, mov, mkv or webm."
 
 EBML = b"\x1aE\xdf\xa3"  # first bytes of Matroska and WebM
 _FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
-_MOST_HEADER_BYTES = 32 << 20  # of moov, or of what stands before Matroska's first pictures; 1000 frames take some kB
-_MOST_PARTS = 10_000  # boxes or elements looked at
+_MAX_HEADER_BYTES = 32 << 20  # of moov, or of what stands before Matroska's first pictures; 1000 frames take some kB
+_MAX_PARTS = 10_000  # boxes or elements looked at
 _ACCEPTED = frozenset(name for names in CODECS.values() for name in names)
 
 _SEGMENT, _INFO, _TRACKS, _CLUSTER = 0x18538067, 0x1549A966, 0x1654AE6B, 0x1F43B675
@@ -117,7 +117,7 @@ def video_tracks(file: BinaryIO) -> list[VideoTrack]:
 
 def _iso_tracks(file: BinaryIO, file_bytes: int) -> list[VideoTrack]:
     start = 0
-    for _ in range(_MOST_PARTS):
+    for _ in range(_MAX_PARTS):
         if start + 8 > file_bytes:
             break
         file.seek(start)
@@ -126,7 +126,7 @@ def _iso_tracks(file: BinaryIO, file_bytes: int) -> list[VideoTrack]:
         if head[4:8] == b"moov":
             if start + size > file_bytes:
                 raise ValueError("its header (moov) ends after the file does")
-            if size > _MOST_HEADER_BYTES:
+            if size > _MAX_HEADER_BYTES:
                 raise ValueError(f"its header (moov) has {size} bytes")
             file.seek(start + header_bytes)
             return _moov_tracks(file.read(size - header_bytes))
@@ -134,7 +134,7 @@ def _iso_tracks(file: BinaryIO, file_bytes: int) -> list[VideoTrack]:
     raise ValueError("it has no header (moov)")
 
 
-def _box_size(head: bytes, most_bytes: int) -> tuple[int, int]:
+def _box_size(head: bytes, max_bytes: int) -> tuple[int, int]:
     """(bytes of the box's own header, bytes of the whole box)."""
     (size,) = struct.unpack_from(">I", head)
     if size == 1:
@@ -143,7 +143,7 @@ def _box_size(head: bytes, most_bytes: int) -> tuple[int, int]:
             raise ValueError(f"a box of {size} bytes")
         return 16, size
     if size == 0:  # up to the end
-        return 8, most_bytes
+        return 8, max_bytes
     if size < 8:
         raise ValueError(f"a box of {size} bytes")
     return 8, size
@@ -152,7 +152,7 @@ def _box_size(head: bytes, most_bytes: int) -> tuple[int, int]:
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """(name, content) of the boxes side by side in data."""
     start = 0
-    for _ in range(_MOST_PARTS):
+    for _ in range(_MAX_PARTS):
         if start + 8 > len(data):
             return
         header_bytes, size = _box_size(data[start : start + 16].ljust(16, b"\0"), len(data) - start)
@@ -160,7 +160,7 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
             raise ValueError("a box ends after the one it stands in")
         yield data[start + 4 : start + 8], data[start + header_bytes : start + size]
         start += size
-    raise ValueError(f"it has more than {_MOST_PARTS} boxes in one")
+    raise ValueError(f"it has more than {_MAX_PARTS} boxes in one")
 
 
 def _inside(data: bytes, *path: bytes) -> bytes | None:
@@ -212,7 +212,7 @@ def _duration_s(trak: bytes) -> float:
 
 def _matroska_tracks(file: BinaryIO, file_bytes: int) -> list[VideoTrack]:
     """Up to the first pictures: a file whose tracks come later is one for the decoder to judge."""
-    data = file.read(min(file_bytes, _MOST_HEADER_BYTES))
+    data = file.read(min(file_bytes, _MAX_HEADER_BYTES))
     tracks: list[VideoTrack] = []
     duration_s = 0.0
     for segment, content in _elements(data):
@@ -250,7 +250,7 @@ def _track(entry: bytes) -> Iterator[VideoTrack]:
 def _elements(data: bytes) -> Iterator[tuple[int, bytes]]:
     """(id, content) of the elements side by side in data; the last may be cut off, or of unknown size."""
     start = 0
-    for _ in range(_MOST_PARTS):
+    for _ in range(_MAX_PARTS):
         if start >= len(data):
             return
         id_bytes = _length_of_number(data[start], 4)
@@ -264,7 +264,7 @@ def _elements(data: bytes) -> Iterator[tuple[int, bytes]]:
         end = len(data) if size == mask else content_at + size
         yield int.from_bytes(data[start:size_at], "big"), data[content_at:end]
         start = end
-    raise ValueError(f"it has more than {_MOST_PARTS} elements in one")
+    raise ValueError(f"it has more than {_MAX_PARTS} elements in one")
 
 
 def _length_of_number(first: int, most: int) -> int:

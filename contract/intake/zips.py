@@ -18,9 +18,9 @@ from contract.intake.limits import ClipLimits
 from contract.wire.errors import InputError, LimitError
 
 ARCHIVE_SUFFIXES = frozenset({".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar", ".jar"})
-MOST_MEMBERS = 20_000  # images, depth, masks and right frames of 1000 frames are 4000
-MOST_DIRECTORY_BYTES = 16 << 20  # ample for as many: a record of 46 bytes and a path each
-MOST_RATIO = 200  # inflated to compressed; pictures hardly shrink, text some ten times, zeros a thousand times
+MAX_MEMBERS = 20_000  # images, depth, masks and right frames of 1000 frames are 4000
+MAX_DIRECTORY_BYTES = 16 << 20  # ample for as many: a record of 46 bytes and a path each
+MAX_RATIO = 200  # inflated to compressed; pictures hardly shrink, text some ten times, zeros a thousand times
 SMALL_BYTES = 1 << 20  # a member that inflates to no more than this may shrink as it likes
 
 UNREADABLE = (OSError, EOFError, NotImplementedError, RuntimeError, ValueError, zipfile.BadZipFile, zlib.error)
@@ -29,7 +29,7 @@ UNREADABLE = (OSError, EOFError, NotImplementedError, RuntimeError, ValueError, 
 _END = struct.Struct("<4s4H2LH")  # end of central directory (APPNOTE 4.3.16)
 _END_64 = struct.Struct("<4sQ2H2L4Q")  # (4.3.14)
 _LOCATOR_64 = struct.Struct("<4sLQL")  # (4.3.15)
-_LONGEST_COMMENT = 1 << 16
+_MAX_COMMENT_BYTES = 1 << 16
 _LOCAL_HEADER_BYTES = 30
 _AGAIN = "Zip the files again."
 
@@ -72,8 +72,8 @@ def _checked(
 
 def check_member_count(count: int, field: str, label: str) -> None:
     """LimitError for more members, or files of a folder, than any clip has."""
-    if count > MOST_MEMBERS:
-        problem = f"{label} holds {count} files or more; the limit is {MOST_MEMBERS}."
+    if count > MAX_MEMBERS:
+        problem = f"{label} holds {count} files or more; the limit is {MAX_MEMBERS}."
         raise LimitError(field, problem, "Keep the clip's own.")
 
 
@@ -82,14 +82,14 @@ def _check_directory(path: Path, field: str, label: str) -> None:
     with path.open("rb") as file:
         size, count = _directory_size(file, path.stat().st_size)
     check_member_count(count, field, label)
-    if size > MOST_DIRECTORY_BYTES:
-        problem = f"the directory of {label} has {size} bytes; the limit is {MOST_DIRECTORY_BYTES}."
+    if size > MAX_DIRECTORY_BYTES:
+        problem = f"the directory of {label} has {size} bytes; the limit is {MAX_DIRECTORY_BYTES}."
         raise LimitError(field, problem, "Keep the clip's own files, with short names.")
 
 
 def _directory_size(file: BinaryIO, file_bytes: int) -> tuple[int, int]:
     """(bytes, members) of the central directory, found where zipfile finds it."""
-    tail_bytes = min(file_bytes, _END.size + _LONGEST_COMMENT)
+    tail_bytes = min(file_bytes, _END.size + _MAX_COMMENT_BYTES)
     file.seek(file_bytes - tail_bytes)
     tail = file.read(tail_bytes)
     at = len(tail) - _END.size
@@ -137,9 +137,9 @@ def _check_inflated(entries: list[zipfile.ZipInfo], field: str, label: str, limi
         problem = f"{label} inflates to {total} bytes; the limit is {limits.decoded_bytes}."
         raise LimitError(field, problem, "Give a shorter clip.")
     for entry in entries:
-        if entry.file_size > SMALL_BYTES and entry.file_size > MOST_RATIO * entry.compress_size:
+        if entry.file_size > SMALL_BYTES and entry.file_size > MAX_RATIO * entry.compress_size:
             problem = f"{entry.filename!r} in {label} inflates from {entry.compress_size} to {entry.file_size} bytes."
-            raise LimitError(field, problem, f"Zip pictures and text only, which shrink less than {MOST_RATIO} times.")
+            raise LimitError(field, problem, f"Zip pictures and text only, which shrink less than {MAX_RATIO} times.")
 
 
 def _check_overlap(entries: list[zipfile.ZipInfo], path: Path, field: str, label: str) -> None:

@@ -1,4 +1,4 @@
-"""Motion-aware point fusion (MAPF): the coloured point cloud in which training starts.
+"""Depth clip and the motion of its tissue in; the coloured points with which training starts out. Verb: fuse.
 
 Symbols: T frames, H W pixels (row i, column j), N points, k stride in pixels. Lengths in mm, points in the world frame.
 Source of modes "paper" and "reference_only": Yang et al., Deform3DGS (MICCAI 2024), section "Motion-Aware Point Fusion"

@@ -35,7 +35,7 @@ EDGE_PX = 5
 """Masks and stereo are unsure this near to an instrument: hidden regions are filled from farther away if possible."""
 MARGIN = 1 / 16
 """Share of the image's sides by which tissue is looked for beyond the first frame: some comes into view later."""
-MOST_VIEWS = 32
+MAX_VIEWS = 32
 """Later frames, evenly spread, in which hidden cells are looked for along the tracks."""
 HIDDEN, COMPLETED, MEASURED, CLEAR = range(4)
 """How well a frame shows a place, rising: not, with completed depth, with depth, with confidence and well inside."""
@@ -86,7 +86,7 @@ def _along_tracks(clip: DepthClip, first: int, later: Sequence[int], stride: int
     """
     cells = _hidden_cells(clip, first, stride)
     unseen = cells.in_view.copy()
-    for index, chosen, pixels in _best_views(clip, spread(later, MOST_VIEWS), cells, moved):
+    for index, chosen, pixels in _best_views(clip, spread(later, MAX_VIEWS), cells, moved):
         points = points_at(clip, index, pixels)
         yield dataclasses.replace(points, reference_mm=cells.world_mm[chosen])
         unseen[chosen] = False

@@ -1,4 +1,5 @@
-"""Files in, a clip out: frames, tissue masks, camera and, where the layout has it, depth.
+"""Files in; a clip out: frames, tissue masks, camera, and depth if the files have it.
 
-Verbs: decode.decode_clip reads untrusted files in a process without network; calibration.rectify aligns the two eyes.
+clip.open_clip reads files and clip.split_frames holds frames out. calibration.load_calibration and
+calibration.rectify handle the cameras. decode.decode_clip reads clip and calibration in a confined process.
 """

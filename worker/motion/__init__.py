@@ -1,4 +1,4 @@
-"""Frames with depth in, tracks out: the motion of the tissue before training, and how many bases it needs.
+"""Depth clip in; tracks of its tissue out, and how many bases and points the scene needs.
 
-Verbs: tracks.track, tracks.fit_tracks, capacity.
+Verbs: tracks.track, tracks.fit_tracks, capacity.try_bases, capacity.choose_bases, capacity.choose_stride.
 """

@@ -1,7 +1,7 @@
 """How large a model the scene needs: how many bases its motion has, and how far apart its Gaussians start.
 
-Both are decided before training, from training frames alone, by the squared error of the picture each is expected to
-leave, in squared grey levels (of 255) a channel of a tissue pixel.
+Both choices minimise the squared error of the picture that each is expected to leave, in squared grey levels (of 255) a
+channel of a tissue pixel. They are made before training, from training frames alone (docs/decisions/014, 018).
 
 Symbols: B bases.
 """
@@ -17,30 +17,30 @@ import numpy as np
 
 from worker.input.clip import DepthClip
 from worker.motion.tracks import Tracks, resting
-from worker.motion.trials import BasisValues, Missed, Trial
+from worker.motion.trials import BasisValues, FitError, Trial
 
 BASES = (3, 5, 9, 13, 17, 25, 33)
 """Numbers of bases to choose from, besides REST."""
 REST = 1
-"""One basis is a constant: a scene that neither moves nor changes its light needs no more."""
+"""One basis is a constant: the scene neither moves nor changes its light."""
 FRAMES_A_BASIS = 3
-"""Training frames a basis stands for where nothing could be followed."""
-FOLLOWED = 0.5
-"""Share of the fewest bases' error in motion that has to go with more bases, or no number follows it."""
-MORE_FRAMES_THAN = 2
-"""Each basis has more training frames than this: where it has fewer, they gain what held-out frames lose."""
-WORTH_DB = 0.25
-"""More bases have to lower the expected error of the picture by more than this."""
-COARSEST = 4
-"""Points are at most so many times as far apart as in the finest grid: what is flat at first may be lit later."""
-MOST_POINTS = 80_000
-"""An image, where the scene decides: the finest grid that was measured."""
+"""Training frames a basis where too few tracks can be trusted to try numbers of bases."""
+MIN_FRAMES_A_BASIS = 2
+"""Each basis has more training frames than this. With fewer, training frames gain what held-out frames lose."""
+MAX_MOTION_LEFT = 0.5
+"""No number of bases follows the motion if the best leaves more than this share of what the smallest number leaves."""
+MIN_GAIN_DB = 0.25
+"""More bases, or more points, have to lower the expected error of the picture by more than this."""
+MAX_COARSENING = 4
+"""Points are at most this many times as far apart as in the finest grid: light may reveal detail later."""
+MAX_POINTS = 80_000
+"""Points an image in the finest grid that was measured."""
 TRAINED_SHARE = 0.1
-"""Gaussians that are trained leave about a tenth of the squared error of a grid of colours as fine as they start:
-they place and shape themselves. Measured on a still clip at 2 to 4 pixels, where 0.04 to 0.14 were left."""
-FEWEST_CELLS_TO_TRY = 30
-FEWEST_FRAMES_TO_TRY = 8
-"""Below either, leaving frames out says nothing."""
+"""Trained Gaussians leave about this share of the squared error of a grid of colours as fine as they start. Measured on
+a still clip at 2 to 4 pixels, where 0.04 to 0.14 were left."""
+MIN_TRIAL_CELLS = 30
+MIN_TRIAL_FRAMES = 8
+"""With fewer cells or frames, the error in validation frames says nothing."""
 
 
 @dataclass(frozen=True)
@@ -52,18 +52,18 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Tried:
-    """What each number of bases would leave in frames it was not fitted to; empty where too little could be followed.
+class Trials:
+    """Error of each number of bases in validation frames; empty where too few tracks can be trusted.
 
     tracked  of the tracks
-    resting  of tracks at rest, where they say as much of the pictures as the tracks do; else empty
+    resting  of tracks at rest, if the pictures fit these as well as the tracks; else empty
     """
 
-    tracked: Mapping[int, Missed]
-    resting: Mapping[int, Missed] = field(default_factory=dict)
+    tracked: Mapping[int, FitError]
+    resting: Mapping[int, FitError] = field(default_factory=dict)
 
     @property
-    def believed(self) -> Mapping[int, Missed]:
+    def decisive(self) -> Mapping[int, FitError]:
         return self.resting or self.tracked
 
 
@@ -71,86 +71,96 @@ class Tried:
 
 
 def try_bases(
-    tracks: Tracks, clip: DepthClip, train: Sequence[int], basis_values: BasisValues, most: int | None = None
-) -> Tried:
-    """What each number of bases that the training frames bear, up to most, would leave in frames it was not fitted to.
+    tracks: Tracks, clip: DepthClip, train: Sequence[int], basis_values: BasisValues, max_bases: int | None = None
+) -> Trials:
+    """The error of each number of bases up to max_bases, in validation frames.
 
-    Every fourth training frame is left out, the tracks of the others are fitted by three quarters of B bases, and the
-    fit is compared with the tracks in those left out. Frames bear as many bases as leave each more than
-    MORE_FRAMES_THAN of them. Tracks are noise where the pictures left out come no more than WORTH_DB nearer along them,
-    fitted by the most bases, than they come at rest.
+    Every fourth training frame is a validation frame. The tracks in the others are fitted by three quarters of B bases;
+    the error is the fit's difference from the tracks in the validation frames. There are more than MIN_FRAMES_A_BASIS
+    training frames for each basis.
+
+    Tracks are noise if moving along them brings the pictures of the validation frames no more than MIN_GAIN_DB nearer
+    than rest does, with the largest number of bases. The result then has `resting`.
     """
-    if len(train) < FEWEST_FRAMES_TO_TRY:
-        return Tried({})
+    if len(train) < MIN_TRIAL_FRAMES:
+        return Trials({})
     trial, at_rest = (Trial.of(each, clip, train, basis_values) for each in (tracks, resting(tracks, clip, train)))
-    if len(trial.places) < FEWEST_CELLS_TO_TRY:
-        return Tried({})
-    cap = _cap(len(train), most).count
-    numbers = sorted({REST, min(cap, BASES[0]), *(each for each in BASES if each <= cap)})
-    tracked = {bases: trial.missed(bases) for bases in numbers}
-    if len(at_rest.places) < FEWEST_CELLS_TO_TRY:  # tissue that is hardly ever seen alone in place says nothing of rest
-        return Tried(tracked)
-    if at_rest.picture_error(numbers[-1]) > trial.picture_error(numbers[-1]) * 10 ** (WORTH_DB / 10):
-        return Tried(tracked)
-    return Tried(tracked, {bases: at_rest.missed(bases) for bases in numbers})
+    if len(trial.places) < MIN_TRIAL_CELLS:
+        return Trials({})
+    limit = _bases_limit(len(train), max_bases).count
+    numbers = sorted({REST, min(limit, BASES[0]), *(each for each in BASES if each <= limit)})
+    tracked = {bases: trial.error(bases) for bases in numbers}
+    if len(at_rest.places) < MIN_TRIAL_CELLS:  # instruments hide the tissue's places: rest cannot be judged
+        return Trials(tracked)
+    if at_rest.picture_error(numbers[-1]) > trial.picture_error(numbers[-1]) * 10 ** (MIN_GAIN_DB / 10):
+        return Trials(tracked)
+    return Trials(tracked, {bases: at_rest.error(bases) for bases in numbers})
 
 
-def choose_bases(tried: Tried, floor: float, frames: int, most: int | None = None) -> Choice:
-    """The fewest bases whose expected error, on top of the floor that the Gaussians leave, is within WORTH_DB of the
-    least; frames is the number of training frames.
+def choose_bases(trials: Trials, floor: float, frames: int, max_bases: int | None = None) -> Choice:
+    """The smallest number of bases whose expected error is within MIN_GAIN_DB of the least.
 
-    The most, where several numbers were tried and none follows the motion: even the best leaves more of it than the
-    Gaussians do, and more than FOLLOWED of what the fewest bases leave. Light that nothing follows, such as a lamp
-    that flickers, asks for no more bases. Where nothing was tried one for every FRAMES_A_BASIS frames, at most `most`.
+    The expected error is that in validation frames plus the floor, which the Gaussians leave whatever moves. `frames`
+    is the number of training frames.
+
+    The largest number tried, if none follows the motion: even the best leaves more of the motion than the floor and
+    more than MAX_MOTION_LEFT of what the smallest number leaves. Changes of light do not count here, because more bases
+    do not help against a lamp that flickers. Without trials, one basis for every FRAMES_A_BASIS frames.
     """
-    errors = tried.tracked
+    errors = trials.tracked
     if not errors:
-        bases = min(frames, most or BASES[-1], max(BASES[0], -(-frames // FRAMES_A_BASIS)))
+        bases = min(frames, max_bases or BASES[-1], max(BASES[0], -(-frames // FRAMES_A_BASIS)))
         reason = f"one for {frames / bases:.2g} training frames, for too little could be followed to tell more"
         return Choice(bases, reason)
-    fewest, cap = min(errors), _cap(frames, most)
+    smallest, limit = min(errors), _bases_limit(frames, max_bases)
     if len(errors) == 1:
-        return Choice(fewest, cap.reason)
-    if min(each.motion for each in errors.values()) > max(floor, FOLLOWED * errors[fewest].motion):
-        return Choice(max(errors), f"{cap.reason}, for none that was tried follows the motion in frames left out")
-    total = {bases: each.total for bases, each in tried.believed.items()}
+        return Choice(smallest, limit.reason)
+    if min(each.motion for each in errors.values()) > max(floor, MAX_MOTION_LEFT * errors[smallest].motion):
+        return Choice(max(errors), f"{limit.reason}, for none that was tried follows the motion in validation frames")
+    total = {bases: each.total for bases, each in trials.decisive.items()}
     best = min(total, key=lambda each: total[each])
-    allowed = (total[best] + floor) * 10 ** (WORTH_DB / 10)
+    allowed = (total[best] + floor) * 10 ** (MIN_GAIN_DB / 10)
     bases = min(each for each, error in total.items() if error + floor <= allowed)
-    left = ", ".join(f"{each} leave {math.sqrt(total[each] + floor):.2f}" for each in sorted({fewest, bases, best}))
-    seen = "no motion shows in the pictures; " if tried.resting else ""
-    reason = f"{seen}the fewest within {WORTH_DB} dB of the best; in frames left out {left} of 255 grey levels"
+    left = ", ".join(f"{each} leave {math.sqrt(total[each] + floor):.2f}" for each in sorted({smallest, bases, best}))
+    seen = "no motion shows in the pictures; " if trials.resting else ""
+    reason = f"{seen}the fewest within {MIN_GAIN_DB} dB of the best; in validation frames {left} of 255 grey levels"
     return Choice(bases, reason)
 
 
-def _cap(frames: int, most: int | None) -> Choice:
-    """The most bases that may be tried, and what says so."""
+def _bases_limit(frames: int, max_bases: int | None) -> Choice:
+    """The largest number of bases that may be tried, and what limits it."""
     limits = [
         Choice(BASES[-1], "the most there are to choose from"),
-        Choice(most or BASES[-1], "the most that the preset allows"),
-        Choice((frames - 1) // MORE_FRAMES_THAN, f"the most that {frames} training frames bear"),
+        Choice(max_bases or BASES[-1], "the most that the preset allows"),
+        Choice((frames - 1) // MIN_FRAMES_A_BASIS, f"the most that {frames} training frames bear"),
     ]
     return min(limits, key=lambda each: each.count)
 
 
-def choose_stride(clip: DepthClip, index: int, finest: int, least_error: float) -> Choice:
-    """Pixels between points: the most, up to COARSEST times the finest, whose expected error is within WORTH_DB of the
-    finest's; least_error is what the motion leaves whatever the points, squared grey levels."""
-    errors = {stride: floor_error(clip, index, stride) for stride in range(finest, COARSEST * finest + 1)}
-    allowed = (errors[finest] + least_error) * 10 ** (WORTH_DB / 10)
-    stride = max(each for each, error in errors.items() if error + least_error <= allowed)
+# points -------------------------------------------------------------------------------------------------------------
+
+
+def choose_stride(clip: DepthClip, index: int, finest: int, motion_error: float) -> Choice:
+    """Pixels between points: the largest stride whose expected error is within MIN_GAIN_DB of the finest's.
+
+    It is at most MAX_COARSENING times the finest. motion_error is what the motion leaves whatever the points, in
+    squared grey levels.
+    """
+    errors = {stride: floor_error(clip, index, stride) for stride in range(finest, MAX_COARSENING * finest + 1)}
+    allowed = (errors[finest] + motion_error) * 10 ** (MIN_GAIN_DB / 10)
+    stride = max(each for each, error in errors.items() if error + motion_error <= allowed)
     left = ", ".join(
-        f"{each} would leave {math.sqrt(errors[each] + least_error):.1f}"
+        f"{each} would leave {math.sqrt(errors[each] + motion_error):.1f}"
         for each in (stride, stride + 1)
         if each in errors
     )
-    return Choice(stride, f"the most within {WORTH_DB} dB of {finest}; of 255 grey levels {left}")
+    return Choice(stride, f"the most within {MIN_GAIN_DB} dB of {finest}; of 255 grey levels {left}")
 
 
 def floor_error(clip: DepthClip, index: int, stride: int) -> float:
-    """What Gaussians that start stride px apart leave of the frame's tissue, whatever moves: squared grey levels.
+    """The error, in squared grey levels, that Gaussians which start stride px apart leave in one frame's tissue.
 
-    TRAINED_SHARE of the error of a grid of mean colours with linear interpolation between them.
+    It is TRAINED_SHARE of the error of a grid of mean colours with linear interpolation between them.
     """
     height, width = clip.tissue.shape[1:]
     few = (max(1, round(width / stride)), max(1, round(height / stride)))

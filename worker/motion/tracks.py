@@ -1,8 +1,9 @@
 """Motion known before training: optical flow from the first training frame, lifted to 3D by stereo depth.
 
-Dense flow (DIS) from the reference to every training frame, checked forward against backward, gives each reference
-pixel a track; its displacements and changes of colour are averages of what is trusted about it, the wider the less
-there is (docs/decisions/024), and are fitted by a deformation's bases. Held-out frames are never read.
+Dense flow (DIS) from the reference to every training frame gives each reference pixel a track. Forward and backward
+flow check each other. A track's displacements and changes of colour are averages of its trusted neighbours, over a
+wider area where few are trusted (docs/decisions/024). fit_tracks fits the bases of a motion to them. Held-out frames
+are never read.
 
 Symbols: K training frames, h w pixels of the coarse grid on which flow is computed, N points, B bases.
 """
@@ -29,37 +30,36 @@ Moved = Callable[[int, NDArray[np.intp]], Floats]
 """Displacements [M, 3] mm (world) of what the first training frame's pixels (flat, [M]) show, to a training frame."""
 
 FLOW_WIDTH = 320
-"""Flow is computed at the clip's size over the least whole factor that brings its width to this or less, in px."""
-LEAST_SIDE_PX = 16
-"""The coarse grid keeps at least this many cells along the shorter side where the clip has them: DIS needs them."""
+"""Maximum width in px at which flow is computed: the clip is reduced by the smallest whole factor that fits."""
+MIN_GRID_SIDE = 16
+"""Minimum cells along the coarse grid's shorter side, which DIS needs; a smaller clip is not reduced."""
 ROUND_TRIP_PX = 1.0
-"""Forward and backward flow disagreeing by this much, in px of the coarse grid, halve a track's confidence or worse."""
+"""A difference of this much between forward and backward flow, in px of the coarse grid, halves the confidence."""
 SMOOTH_PX = 4.0
-"""Standard deviation, in px of the coarse grid, over which trusted displacements are averaged: depth is noisy."""
+"""Standard deviation of the Gaussian mean of displacements, in px of the coarse grid: depth is noisy."""
 COLOUR_SMOOTH_PX = 2.0
-"""The same for changes of colour: light falls in smaller patches than tissue moves."""
+"""The same for changes of colour: light varies over smaller patches than motion does."""
 STEADINESS = 0.02
-"""Weight of a difference between neighbouring bases against one fully trusted frame; it carries motion across gaps."""
+"""Weight of the differences between neighbouring bases; a fully trusted frame has 1. It carries motion across gaps."""
 SURROUNDINGS = 0.1
-"""Weight of the mean of wider surroundings, against 1 of full trust, in an average over the two above."""
+"""Weight of the wider surroundings' mean in an average; full trust has 1."""
 GUESSED = 0.02
-"""Confidence at which what the surroundings do counts where the motion starts: as much as steadiness."""
+"""Minimum confidence of a track when a motion starts from it: the surroundings' displacement is better than none."""
 RIDGE = 1e-3
-"""Weight of the basis weights themselves, only to keep the system solvable."""
+"""Weight of the squared basis weights: it keeps the system solvable."""
 CHAINS = 2
-"""Parts of the clip that are followed side by side, on any machine: which flow starts which must not depend on the
-number of cores."""
+"""Parts of the clip that are tracked in parallel. It does not depend on the number of cores, because each flow starts
+from the one before."""
 POINTS_AT_ONCE = 4096
-"""Points fitted together: bounds the memory of their normal equations."""
+"""Points that are fitted together; it limits the memory of their normal equations."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
     """Displacement of reference pixels to every training frame, and how their colour changed on the way.
 
-    displacement_mm [K, h, w, 3]  camera frame of the reference (world), mm; averaged over what is trusted
-                                  near by, or farther away where nothing is; 0 in a frame of which nothing is
-    colour          [K, h, w, 3]  colour there less colour here, RGB in [0, 1]; likewise
+    displacement_mm [K, h, w, 3]  world axes, mm; mean of the trusted neighbours; 0 in a frame without any
+    colour          [K, h, w, 3]  colour there minus colour in the reference, RGB in [0, 1]; mean likewise
     confidence      [K, h, w]     in [0, 1]; 0 where the track is lost, hidden or without depth
     step_px                       clip pixels between neighbouring cells of the grid
     """
@@ -70,7 +70,7 @@ class Tracks:
     step_px: int
 
     def cells(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Row and column in the coarse grid of the clip's pixels, the nearest of the grid where that ends sooner."""
+        """Row and column in the coarse grid of the clip's pixels; beyond the grid's end, its last cells."""
         last_row, last_column = self.confidence.shape[1] - 1, self.confidence.shape[2] - 1
         return np.minimum(rows // self.step_px, last_row), np.minimum(columns // self.step_px, last_column)
 
@@ -82,12 +82,12 @@ def track(
     *,
     threads: int | None = None,
 ) -> Tracks:
-    """Follow the first training frame's tissue through the others; the tracks do not depend on `threads` (None: cores).
+    """Tracks of the first training frame's tissue through the others. They do not depend on `threads` (None: cores).
 
-    on_progress is called with the share of frames done, which grows, from threads of this function's own, one at a
-    time; what it raises ends the work and is raised here.
+    on_progress gets the share of frames done. Threads of this function call it, one at a time. What it raises ends the
+    tracking and is raised here.
     """
-    step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // LEAST_SIDE_PX))
+    step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // MIN_GRID_SIDE))
     grid = _Grid(clip, step)
     reference = _Coarse(clip, train[0], grid)
     displacement, colour = np.zeros((2, len(train), *reference.grey.shape, 3), np.float32)
@@ -120,7 +120,7 @@ def track(
 
 
 class _Helpers:
-    """Threads that take work off others' hands while they are free: lifting a flow takes longer than finding it."""
+    """Free threads that lift flows to 3D for the threads that compute them: lifting takes longer."""
 
     def __init__(self, count: int) -> None:
         self._free = Semaphore(max(count, 0))
@@ -128,7 +128,7 @@ class _Helpers:
         self._jobs: deque[Future[None]] = deque()
 
     def run(self, work: Callable[..., None], *arguments: Any) -> None:
-        """Have work(*arguments) done, by the caller where all helpers are busy; raises what earlier work raised."""
+        """Run work(*arguments) in a helper, or here if all are busy. Raises what earlier work raised."""
         if not self._free.acquire(blocking=False):
             work(*arguments)
             return
@@ -148,15 +148,17 @@ class _Helpers:
 
 
 def cell_means(image: NDArray[Any], step: int) -> NDArray[Any]:
-    """[h, w, ...] means of the cells of step by step pixels, from the upper left; pixels beyond the last are left out,
-    so that cell (i, j) is of the pixels from (step i, step j) whatever the image's size."""
+    """[h, w, ...] means of the cells of step by step pixels. Cell (i, j) starts at pixel (step i, step j).
+
+    Pixels beyond the last whole cell are ignored.
+    """
     h, w = image.shape[0] // step, image.shape[1] // step
     means: NDArray[Any] = cv2.resize(image[: h * step, : w * step], (w, h), interpolation=cv2.INTER_AREA)
     return means
 
 
 class _Grid:
-    """The coarse grid: which pixels it samples and where they look. h w cells, step pixels apart."""
+    """The coarse grid: the pixels that it samples and their rays. h w cells, step pixels apart."""
 
     def __init__(self, clip: DepthClip, step: int) -> None:
         height, width = clip.tissue.shape[1:]
@@ -165,15 +167,15 @@ class _Grid:
         pixels = (rows * width + columns).ravel()
         rays = unproject(pixels, np.ones(pixels.size, np.float32), clip.intrinsics, np.eye(4))
         self.rays = rays.reshape(*rows.shape, 3).astype(np.float32)
-        """[h, w, 3] points at depth 1 in the camera's frame."""
+        """[h, w, 3] points at depth 1, camera axes."""
 
     def sample(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The cells' middle pixels of an image: [h, w]; a view."""
+        """[h, w] the cells' middle pixels of an image; a view."""
         return values[self.step // 2 :: self.step, self.step // 2 :: self.step][: self.size[1], : self.size[0]]
 
 
 class _Coarse:
-    """A frame on the coarse grid: colour, grey, camera points (world, mm), and how far to trust depth and mask."""
+    """A frame on the coarse grid: colour, grey, points (world, mm), and the confidence of depth and mask."""
 
     def __init__(self, clip: DepthClip, index: int, grid: _Grid) -> None:
         self.grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), grid.step)
@@ -188,7 +190,7 @@ class _Coarse:
 
 
 def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats) -> tuple[Floats, Floats, Floats]:
-    """Displacement (mm), change of colour and confidence of every reference cell, given the flows there and back."""
+    """Displacement (mm), change of colour and confidence of every reference cell, from the flows there and back."""
     rows, columns = np.mgrid[0 : forward.shape[0], 0 : forward.shape[1]].astype(np.float32)
     x, y = columns + forward[..., 0], rows + forward[..., 1]
 
@@ -207,14 +209,16 @@ def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats
 
 
 def _averaged(values: Floats, confidence: Floats, over_px: float) -> Floats:
-    """Normalised convolution: a Gaussian mean [h, w, 3] in which only trusted neighbours count, completed from wider
-    and wider surroundings as far as there are none."""
+    """Normalised convolution: Gaussian mean [h, w, 3] weighted by confidence.
+
+    Where no neighbour is trusted, wider surroundings fill in.
+    """
     weight = np.asarray(cv2.GaussianBlur(confidence, (0, 0), over_px), np.float32)
     return _completed(cv2.GaussianBlur(values * confidence[..., None], (0, 0), over_px), weight)
 
 
 def _completed(total: Floats, weight: Floats) -> Floats:
-    """total [h, w, 3] by weight [h, w], with the same of a grid half as fine as one more observation (pull-push)."""
+    """total [h, w, 3] / weight [h, w]; the result on a grid half as fine counts as one more observation (pull-push)."""
     height, width = weight.shape
     if min(height, width) < 2:
         return np.broadcast_to(total.sum((0, 1)) / max(float(weight.sum()), 1e-9), total.shape).astype(np.float32)
@@ -225,7 +229,7 @@ def _completed(total: Floats, weight: Floats) -> Floats:
 
 
 def moved_along(tracks: Tracks, train: Sequence[int], width: int) -> Moved:
-    """The tracks as fusion asks for them; train are the clip's frames that they are of, width the clip's in px."""
+    """The tracks as a function for fusion. train lists the clip's frames that they cover; width is the clip's in px."""
     place_of = {index: place for place, index in enumerate(train)}
 
     def moved(index: int, pixels: NDArray[np.intp]) -> Floats:
@@ -236,8 +240,10 @@ def moved_along(tracks: Tracks, train: Sequence[int], width: int) -> Moved:
 
 
 def resting(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> Tracks:
-    """What the tracks would be if nothing had moved: no displacement, colour as it changed in place, as trusted where
-    tissue alone is seen there."""
+    """The tracks if nothing had moved: no displacement, and the change of colour in place.
+
+    The confidence is the tracks' where a cell shows only tissue, else 0.
+    """
     step, colour, confidence = tracks.step_px, np.empty_like(tracks.colour), np.empty_like(tracks.confidence)
     start = cell_means(clip.rgb[train[0]], step).astype(np.float32)
     for place, index in enumerate(train):
@@ -257,7 +263,7 @@ def fit_tracks(
     share_px: int = 1,
     guessed: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Weights of the bases for points of the reference frame, by weighted least squares over the training frames.
+    """Weights of the bases for points of the reference frame: weighted least squares over the training frames.
 
     Minimises sum_k max(c_k, g_k) |basis_k . w - d_k|^2 + STEADINESS sum_j |w_{j+1} - w_j|^2 + RIDGE |w|^2 for each
     point.
@@ -266,13 +272,12 @@ def fit_tracks(
         basis: [K, B] value of every basis at every training time.
         pixels: [N] flat pixel indices (row * width + column) of the points in the reference frame.
         width: of the clip, px.
-        share_px: points in the same square of this many pixels get the same weights, those of its first pixel.
-        guessed: g_k, the least that counts of a frame as trusted as the most trusted one, for what the surroundings do
-            is better than nothing; of others as much less as they are trusted less.
+        share_px: points in the same square of this many pixels share the weights of its first pixel.
+        guessed: minimum confidence g_k in the frame of the highest mean confidence; in the other frames g_k is smaller
+            in proportion to their mean confidence. A displacement guessed from the surroundings is better than none.
 
     Returns:
-        weights [N, B, 6], of the displacement in mm and of the colour; support [N], the mean confidence of the
-        point's track.
+        weights [N, B, 6]: 3 of the displacement in mm, 3 of the colour; and support [N]: mean confidence of each track.
     """
     rows, columns = (place // share_px * share_px for place in np.divmod(pixels, width))
     shared, member = np.unique(rows * width + columns, return_inverse=True)

@@ -1,6 +1,6 @@
-"""Tracks of training frames that are left out, as bases fitted to the other training frames predict them.
+"""Cross-validation of the number of bases: bases fitted to some training frames predict the tracks in the others.
 
-Symbols: K training frames, k of them left out, n sampled cells of the tracks' grid, B bases.
+Symbols: K training frames, k of them validation frames, n sampled cells of the tracks' grid, B bases.
 """
 
 from __future__ import annotations
@@ -22,16 +22,19 @@ BasisValues = Callable[[int, Sequence[float], Sequence[float]], Reals]
 
 CELLS = 1000
 """Tracks on which bases are tried."""
-TRIED_ON_EVERY, FIRST_TRIED_ON = 4, 2
-"""Bases are tried on every fourth training frame, from the third on, and fitted to the others."""
-TRUSTED = 0.3
-"""Mean confidence a track needs to be tried on."""
+VALIDATE_EVERY, FIRST_VALIDATED = 4, 2
+"""Every fourth training frame, from the third on, is a validation frame; bases are fitted to the others."""
+MIN_TRACK_CONFIDENCE = 0.3
+"""Mean confidence that a track needs to take part."""
 
 
 @dataclass(frozen=True)
-class Missed:
-    """What a number of bases would leave in frames it was not fitted to, squared grey levels: of motion, by which the
-    picture changes where the track starts, and of light, the change of colour along the track."""
+class FitError:
+    """Mean squared error of a number of bases in validation frames, in squared grey levels a channel.
+
+    motion  error of the displacement, times the picture's slope where the track starts
+    light   error of the change of colour along the track
+    """
 
     motion: float
     light: float
@@ -43,14 +46,14 @@ class Missed:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Trusted tracks, evenly over those there are, and which training frames are left out.
+    """A sample of the trusted tracks, evenly spread over them, and which training frames are validation frames.
 
     places           [n]        pixels of the first training frame, flat
     world_mm         [n, 3]     where they start
     displacement_mm  [K, n, 3]
     colour           [K, n, 3]  change, in grey levels
     confidence       [K, n]
-    left_out         [K]
+    validation       [K]        True for validation frames
     basis_values                values of the bases that the motion would have
     """
 
@@ -62,7 +65,7 @@ class Trial:
     displacement_mm: Reals
     colour: Reals
     confidence: Reals
-    left_out: NDArray[np.bool_]
+    validation: NDArray[np.bool_]
     basis_values: BasisValues
 
     @classmethod
@@ -73,14 +76,14 @@ class Trial:
         rows, columns = np.divmod(np.arange(height * width), width)
         places = (rows * step + step // 2) * clip.intrinsics.width + columns * step + step // 2
         depth_mm = clip.depth_mm[reference].reshape(-1)[places]
-        trusted = np.flatnonzero((tracks.confidence.mean(0).reshape(-1) > TRUSTED) & (depth_mm > 0))
+        trusted = np.flatnonzero((tracks.confidence.mean(0).reshape(-1) > MIN_TRACK_CONFIDENCE) & (depth_mm > 0))
         some = trusted[np.linspace(0, len(trusted) - 1, min(CELLS, len(trusted))).round().astype(np.intp)]
 
         def of_some(values: NDArray[np.floating], *channels: int) -> Reals:
             return values.reshape(frames, -1, *channels)[:, some].astype(np.float64)
 
-        left_out = np.zeros(frames, np.bool_)
-        left_out[FIRST_TRIED_ON::TRIED_ON_EVERY] = True
+        validation = np.zeros(frames, np.bool_)
+        validation[FIRST_VALIDATED::VALIDATE_EVERY] = True
         return cls(
             clip=clip,
             train=train,
@@ -90,25 +93,28 @@ class Trial:
             displacement_mm=of_some(tracks.displacement_mm, 3),
             colour=255 * of_some(tracks.colour, 3),
             confidence=of_some(tracks.confidence),
-            left_out=left_out,
+            validation=validation,
             basis_values=basis_values,
         )
 
-    def missed(self, bases: int) -> Missed:
-        """Mean squared error a channel of what so many bases predict."""
+    def error(self, bases: int) -> FitError:
+        """The error of so many bases in the validation frames."""
         displacement_mm, colour = self._predicted(bases)
-        off_mm = self.displacement_mm[self.left_out] - displacement_mm
+        off_mm = self.displacement_mm[self.validation] - displacement_mm
         motion = (self._grey_per_mm() @ off_mm[..., None])[..., 0]
-        light = self.colour[self.left_out] - colour
-        return Missed(self._mean_square(motion), self._mean_square(light))
+        light = self.colour[self.validation] - colour
+        return FitError(self._mean_square(motion), self._mean_square(light))
 
     def picture_error(self, bases: int) -> float:
-        """Mean squared difference a channel, in grey levels, of the pixels of the frames left out, where so many bases
-        place the tracks, from those where the tracks start with the predicted change of colour."""
+        """Mean squared difference a channel, in grey levels, between pictures and prediction in the validation frames.
+
+        The picture is read where so many bases place the tracks. The prediction is the colour where the tracks start
+        plus the predicted change.
+        """
         displacement_mm, colour = self._predicted(bases)
         k, start = self.clip.intrinsics, self.clip.rgb[self.train[0]].reshape(-1, 3)[self.places]
         expected, shown = start + colour, np.empty_like(colour)
-        for place, frame in enumerate(np.asarray(self.train)[self.left_out]):
+        for place, frame in enumerate(np.asarray(self.train)[self.validation]):
             pose = self.clip.world_from_camera[frame]
             x, y, z = ((self.world_mm + displacement_mm[place] - pose[:3, 3]) @ pose[:3, :3]).T
             column, row = (k.fx * x / z + k.cx - 0.5)[:, None], (k.fy * y / z + k.cy - 0.5)[:, None]
@@ -117,20 +123,22 @@ class Trial:
         return self._mean_square(shown - expected)
 
     def _predicted(self, bases: int) -> tuple[Reals, Reals]:
-        """Displacement (mm) and change of colour (grey levels) [k, n, 3] in the frames left out, of the tracks fitted
-        to the others as motion.py fits: by as large a share of the bases as of the frames."""
+        """Displacement (mm) and change of colour (grey levels) [k, n, 3] of the tracks in the validation frames.
+
+        The bases are fitted to the other frames as fit_tracks does; their number shrinks with that of the frames.
+        """
         times = np.array([float(self.clip.t[index]) for index in self.train])
-        kept = ~self.left_out
+        kept = ~self.validation
         fitted = max(min(2, bases), round(kept.mean() * bases))
         basis = self.basis_values(fitted, times[kept].tolist(), times.tolist())
         series = np.concatenate([self.displacement_mm, self.colour], axis=2)
         weights = fit_series(series[kept], self.confidence[kept], basis[kept])
-        predicted = (basis[self.left_out] @ weights).transpose(1, 0, 2)
+        predicted = (basis[self.validation] @ weights).transpose(1, 0, 2)
         return predicted[..., :3], predicted[..., 3:]
 
     def _mean_square(self, off: Reals) -> float:
-        """[k, n, 3] of the frames left out: a track counts as far as it is trusted."""
-        weight = self.confidence[self.left_out]
+        """Of [k, n, 3] in the validation frames; a track counts by its confidence."""
+        weight = self.confidence[self.validation]
         return float((np.square(off).mean(-1) * weight).sum() / max(weight.sum(), 1e-9))
 
     def _grey_per_mm(self) -> Reals:

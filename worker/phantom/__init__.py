@@ -1,4 +1,7 @@
-"""Synthetic tissue under a stereo endoscope, with everything a real clip cannot tell: depth, motion, what is hidden."""
+"""Settings in; a stereo clip of synthetic tissue and its true depth and motion out.
+
+Verbs: make_phantom, write_endonerf, write_stereomis, write_stereo_video.
+"""
 
 from worker.phantom.camera import orbit_pose
 from worker.phantom.command import add_cli_arguments, run_cli

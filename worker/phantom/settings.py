@@ -13,10 +13,10 @@ Motion = Literal["still", "breathing", "pull", "cut"]
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
 
 FOCAL_PER_WIDTH = 0.89  # a da Vinci endoscope's field of view, about 59 degrees across
-SMALLEST_WIDTH, SMALLEST_HEIGHT = 64, 48  # px; below this vessels and instrument are a pixel wide
-LARGEST_SIDE = 4096  # px; the tissue's texture is about twice as wide and must stay within OpenCV's 32767
-LARGEST_ASPECT = 4  # beyond this a pinhole sees nothing like an endoscope's view
-MOST_FRAMES = 100_000
+MIN_WIDTH_PX, MIN_HEIGHT_PX = 64, 48  # px; below this vessels and instrument are a pixel wide
+MAX_SIDE_PX = 4096  # px; the tissue's texture is about twice as wide and must stay within OpenCV's 32767
+MAX_ASPECT = 4  # beyond this a pinhole sees nothing like an endoscope's view
+MAX_FRAMES = 100_000
 
 
 @dataclass(frozen=True)
@@ -49,17 +49,17 @@ class PhantomSettings:
     frame_rate_hz: float = 25.0
 
     def __post_init__(self) -> None:
-        _require_range("width", self.width, SMALLEST_WIDTH, LARGEST_SIDE)
-        _require_range("height", self.height, SMALLEST_HEIGHT, LARGEST_SIDE)
-        _require_range("frames", self.frames, 1, MOST_FRAMES)
+        _require_range("width", self.width, MIN_WIDTH_PX, MAX_SIDE_PX)
+        _require_range("height", self.height, MIN_HEIGHT_PX, MAX_SIDE_PX)
+        _require_range("frames", self.frames, 1, MAX_FRAMES)
         _require_range("seed", self.seed, 0, 2**63 - 1)
         _require_range("baseline_mm", self.baseline_mm, 0.1, 50)
         _require_range("period_frames", self.period_frames, 2, 1e6)
         _require_range("frame_rate_hz", self.frame_rate_hz, 0.1, 1000)
-        if max(self.width, self.height) > LARGEST_ASPECT * min(self.width, self.height):
+        if max(self.width, self.height) > MAX_ASPECT * min(self.width, self.height):
             raise InputError(
                 "options.height",
-                f"{self.width}x{self.height} is more than {LARGEST_ASPECT} times as long as wide.",
+                f"{self.width}x{self.height} is more than {MAX_ASPECT} times as long as wide.",
                 "Give a less extreme shape.",
             )
         if self.motion not in MOTIONS:

@@ -20,7 +20,7 @@ from worker.phantom.settings import PhantomSettings
 MEAN_DEPTH_MM = 80.0
 DEPTH_RANGE_MM = (58.0, 104.0)  # of the sheet at rest
 SHEET_PER_VIEW = 1.75  # the sheet is this much larger than what is seen at mean depth: room for motion and other views
-SMALLEST_HALF_MM = 30.0  # of the sheet, so that a cut fits into the flattest picture
+MIN_HALF_MM = 30.0  # of the sheet, so that a cut fits into the flattest picture
 TILT_MM_PER_MM = (0.06, -0.2)  # (right, down): the near edge is below, as the endoscope looks along the cavity
 LOOPS_MM = ((34.0, 11.0, 0.12), (13.0, 1.9, 0.15))  # (wavelength, height, crease) of folds and of lobes on them
 RELIEF_MM = (4.5, 0.16)  # (wavelength, height)
@@ -122,7 +122,7 @@ def make_surface(settings: PhantomSettings, rng: np.random.Generator) -> Surface
     intrinsics = settings.intrinsics
     pixel_mm = MEAN_DEPTH_MM / intrinsics.fx
     half_u, half_v = (
-        max(SHEET_PER_VIEW * pixel_mm * side / 2, SMALLEST_HALF_MM) for side in (settings.width, settings.height)
+        max(SHEET_PER_VIEW * pixel_mm * side / 2, MIN_HALF_MM) for side in (settings.width, settings.height)
     )
     rest_z_mm = _rest_depth((2 * half_v, 2 * half_u), rng)
     motion = make_motion(settings.motion, settings.period_frames)

@@ -23,7 +23,7 @@ MM2_PER_ARTERY, MM2_PER_VEIN = 420.0, 1100.0  # area of sheet for one trunk
 ARTERY_MM, VEIN_MM = (0.22, 0.62), (0.6, 1.3)  # width of trunks
 ARTERY_BLUR_MM, VEIN_BLUR_MM = 0.05, 0.35  # veins lie deeper
 SUBPIXEL_BITS = 4  # of OpenCV's line coordinates
-MOST_PIECES = 40_000  # guards against a forest; usual sheets need a tenth
+MAX_PIECES = 40_000  # guards against a forest; usual sheets need a tenth
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def _draw(
 
 def _grow(rng: np.random.Generator, sprouts: list[_Sprout]) -> Iterator[tuple[float, NDArray[np.float64]]]:
     """Pieces (width mm, points [PIECE_STEPS + 1, 2] mm) of the vessels that grow from sprouts."""
-    for _ in range(MOST_PIECES):
+    for _ in range(MAX_PIECES):
         if not sprouts:
             return
         sprout = sprouts.pop()

@@ -1,4 +1,4 @@
-"""Stage 3: metric depth and its confidence from rectified stereo."""
+"""Rectified stereo clip in; depth in mm and its confidence for every frame out. Verb: estimate_depth."""
 
 from worker.stereo.depth import estimate_depth
 

@@ -25,13 +25,13 @@ FEATURES = 1500
 RATIO = 0.8  # Lowe's ratio test
 MAX_SEARCHED_SHIFT_PX = 48.0  # matches farther apart in y are wrong
 MIN_MATCHES = 20
-WORTH_CORRECTING_PX = 0.2  # resampling for less blurs more than it mends
+MIN_CORRECTION_PX = 0.2  # resampling for less blurs more than it mends
 MAX_CORRECTION_PX = 8.0  # beyond it the calibration belongs to other frames
-WORST_EQUAL_ROWS_PX = 1.0  # by which the rows of frames that are rectified already may differ
+MAX_EQUAL_ROWS_PX = 1.0  # by which the rows of frames that are rectified already may differ
 SWAPPED_SHARE = 0.8
 COARSE_WIDTH = 176  # px; wide enough for tissue, and a search of every disparity costs milliseconds
-NEAREST_MM = 12.0  # an endoscope that close sees nothing sharp
-WIDEST_DISPARITY = 0.6  # of the width: less overlap than that gives no depth worth having
+MIN_DEPTH_MM = 12.0  # an endoscope that close sees nothing sharp
+MAX_DISPARITY_SHARE = 0.6  # of the width: less overlap than that gives no depth worth having
 TEXTURED = 8.0  # mean |gradient| in grey levels from which a match is more than chance
 RANGE_PERCENTILES = (0.5, 99.5)
 RANGE_MARGIN_PX, RANGE_MARGIN = 3.0, 0.1  # the sampled frames do not show every disparity of the clip
@@ -48,7 +48,7 @@ class RowShift:
     @property
     def correction_px(self) -> float:
         """How far the right eye's rows are moved; 0 where it is not worth it or not known."""
-        worth_it = self.matches >= MIN_MATCHES and abs(self.shift_px) >= WORTH_CORRECTING_PX
+        worth_it = self.matches >= MIN_MATCHES and abs(self.shift_px) >= MIN_CORRECTION_PX
         return self.shift_px if worth_it else 0.0
 
 
@@ -138,7 +138,7 @@ def choose_range(
     height, width = pairs[0][0].shape
     scale = min(1.0, COARSE_WIDTH / width)
     size = (round(width * scale), round(height * scale))
-    widest = min(focal_baseline_px_mm / NEAREST_MM, WIDEST_DISPARITY * width)
+    widest = min(focal_baseline_px_mm / MIN_DEPTH_MM, MAX_DISPARITY_SHARE * width)
     low = int(np.floor(infinity_px * scale))
     count = 16 * max(1, int(np.ceil(widest * scale / 16)))
     lefts = np.stack([_resized(left, size) for left, _ in pairs])
@@ -167,7 +167,7 @@ def _densest(values: NDArray[np.float64]) -> float:
 
 def _check_recorded(shift_px: float, equal_rows_px: float) -> None:
     """Refuse frames whose rows matched before rectification and no longer do: they had been rectified already."""
-    if abs(equal_rows_px) <= 2 * WORST_EQUAL_ROWS_PX or abs(shift_px - equal_rows_px) > WORST_EQUAL_ROWS_PX:
+    if abs(equal_rows_px) <= 2 * MAX_EQUAL_ROWS_PX or abs(shift_px - equal_rows_px) > MAX_EQUAL_ROWS_PX:
         return
     raise InputError(
         "calibration",

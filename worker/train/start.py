@@ -15,7 +15,7 @@ from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip
 from worker.model.deformation import CHANNELS, MEAN, AtRest, SharedBasis, motion_named
 from worker.model.gaussians import SH_C0, Gaussians, initial_gaussians
-from worker.motion.capacity import MOST_POINTS, Tried, choose_bases, choose_stride, floor_error, try_bases
+from worker.motion.capacity import MAX_POINTS, Trials, choose_bases, choose_stride, floor_error, try_bases
 from worker.motion.tracks import GUESSED, Tracks, fit_tracks
 from worker.raster.backend import CPU, Device, make_model
 from worker.raster.model import Model
@@ -44,25 +44,25 @@ def settled(
     """The preset with what it leaves to the scene settled (decisions 014, 018), and why, in words for the report."""
     words = []
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
-    tried = Tried({})
+    trials = Trials({})
     if tracks is not None and left_open:
-        tried = try_bases(tracks, clip, train, basis_values, preset.most_bases)
+        trials = try_bases(tracks, clip, train, basis_values, preset.most_bases)
     fusion = fusion_for(preset, clip.intrinsics)
     if fusion.mode == "fill" and preset.points_per_image is not None:
         least = ", the least there is" if fusion.stride == MIN_STRIDE else ""
         wanted = preset.points_per_image
         words.append(f"Gaussians start {fusion.stride} pixels apart{least}: {wanted} an image were asked for.")
     elif fusion.mode == "fill":
-        finest = _stride_for(MOST_POINTS, clip.intrinsics)
+        finest = _stride_for(MAX_POINTS, clip.intrinsics)
         choice = choose_stride(
-            clip, train[0], finest, min((each.total for each in tried.believed.values()), default=0.0)
+            clip, train[0], finest, min((each.total for each in trials.decisive.values()), default=0.0)
         )
         fusion = dataclasses.replace(fusion, stride=choice.count)
         preset = dataclasses.replace(preset, fusion=fusion)
         words.append(f"Gaussians start {choice.count} pixels apart: {choice.reason}.")
     if preset.bases is None:
         floor = floor_error(clip, train[0], fusion.stride)
-        choice = choose_bases(tried, floor, len(train), preset.most_bases)
+        choice = choose_bases(trials, floor, len(train), preset.most_bases)
         preset = dataclasses.replace(preset, bases=choice.count)
         words.append(f"Motion has {choice.count} {'basis' if choice.count == 1 else 'bases'}: {choice.reason}.")
     return preset, tuple(words)

@@ -205,19 +205,19 @@ def test_a_decoder_that_computes_without_end_is_ended(tmp_path: Path) -> None:
 
 def test_a_decoder_that_hangs_is_ended(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"made no progress for 0\.5 s"):
-        run_stand_in(tmp_path, "import time; time.sleep(60)", patience=Patience(silence_s=0.5))
+        run_stand_in(tmp_path, "import time; time.sleep(60)", patience=Patience(max_silence_s=0.5))
 
 
 def test_a_decoder_that_never_ends_its_line_is_ended(tmp_path: Path) -> None:
     work = "import time\nwhile True: reports._stream.write(b' '); reports._stream.flush(); time.sleep(0.02)"
     with pytest.raises(InputError, match=r"made no progress for 0\.5 s"):
-        run_stand_in(tmp_path, work, patience=Patience(silence_s=0.5))
+        run_stand_in(tmp_path, work, patience=Patience(max_silence_s=0.5))
 
 
 def test_a_decoder_that_only_pretends_to_advance_is_ended_too(tmp_path: Path) -> None:
     work = "import time\nwhile True: reports.picture(); time.sleep(0.02)"
     with pytest.raises(InputError, match="took more than 1 s"):
-        run_stand_in(tmp_path, work, patience=Patience(longest_s=1.0))
+        run_stand_in(tmp_path, work, patience=Patience(max_total_s=1.0))
 
 
 def test_a_crash_over_the_calibration_names_the_calibration(tmp_path: Path) -> None:
@@ -288,7 +288,7 @@ def test_a_decoder_of_roots_is_not_root(tmp_path: Path) -> None:
 
 def test_a_decoder_that_stays_after_its_answer_is_ended(tmp_path: Path) -> None:
     work = "import os, time\nreports.end({'result': {'pid': os.getpid()}})\ntime.sleep(60)"
-    pid = run_stand_in(tmp_path, work, patience=Patience(parting_s=0.3))["pid"]
+    pid = run_stand_in(tmp_path, work, patience=Patience(max_exit_s=0.3))["pid"]
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
 

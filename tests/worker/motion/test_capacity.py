@@ -13,17 +13,17 @@ from tests.worker.phantoms import phantom_clip, prepared_on
 from worker.input.clip import DepthClip, split_frames
 from worker.motion.capacity import (
     BASES,
-    COARSEST,
-    FEWEST_FRAMES_TO_TRY,
+    MAX_COARSENING,
+    MIN_GAIN_DB,
+    MIN_TRIAL_FRAMES,
     REST,
-    WORTH_DB,
-    Tried,
+    Trials,
     choose_bases,
     floor_error,
     try_bases,
 )
 from worker.motion.tracks import Tracks, track
-from worker.motion.trials import Missed
+from worker.motion.trials import FitError
 from worker.phantom import Motion
 from worker.train.presets import PRESETS
 from worker.train.start import MIN_STRIDE, basis_values, fusion_for, settled
@@ -46,12 +46,12 @@ def bases_for(motion: Motion) -> int:
     return bases
 
 
-def motion_left(errors: dict[int, float]) -> Tried:
+def motion_left(errors: dict[int, float]) -> Trials:
     """The same errors, all of motion."""
-    return Tried({bases: Missed(motion=error, light=0.0) for bases, error in errors.items()})
+    return Trials({bases: FitError(motion=error, light=0.0) for bases, error in errors.items()})
 
 
-def tried_bases(tracks: Tracks, clip: DepthClip, train: list[int], most: int | None = None) -> Tried:
+def tried_bases(tracks: Tracks, clip: DepthClip, train: list[int], most: int | None = None) -> Trials:
     return try_bases(tracks, clip, train, basis_values, most)
 
 
@@ -119,7 +119,7 @@ def test_held_out_frames_are_never_read() -> None:
 def test_the_choice_is_the_fewest_within_the_tolerance_of_the_best() -> None:
     errors = {3: 100.0, 5: 30.0, 9: 20.4, 17: 20.0, 33: 21.0}
     assert choose_bases(motion_left(errors), 0.0, 60).count == 9
-    errors[9] = 20.0 * 10 ** (WORTH_DB / 10) + 0.1
+    errors[9] = 20.0 * 10 ** (MIN_GAIN_DB / 10) + 0.1
     assert choose_bases(motion_left(errors), 0.0, 60).count == 17
 
 
@@ -194,7 +194,7 @@ def test_a_flat_picture_gets_points_farther_apart() -> None:
     flat = dataclasses.replace(clip, rgb=np.full_like(clip.rgb, 130))
     detailed, smooth = (settled(open_grid, tracks, each, train)[0].fusion.stride for each in (clip, flat))
     assert detailed == MIN_STRIDE
-    assert smooth == COARSEST * MIN_STRIDE
+    assert smooth == MAX_COARSENING * MIN_STRIDE
 
 
 @pytest.mark.parametrize("points", [100, 500, 2000])
@@ -205,7 +205,7 @@ def test_a_fixed_number_of_points_is_kept_to(points: int) -> None:
     assert fusion_for(fixed, clip.intrinsics).stride == max(MIN_STRIDE, round(math.sqrt(96 * 80 / points)))
 
 
-@pytest.mark.parametrize("frames", [1, 2, FEWEST_FRAMES_TO_TRY - 1])
+@pytest.mark.parametrize("frames", [1, 2, MIN_TRIAL_FRAMES - 1])
 def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: int) -> None:
     clip = phantom_clip(frames=frames)
     train = list(range(frames))
@@ -217,7 +217,7 @@ def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: 
 
 @pytest.mark.parametrize(("frames", "bases"), [(1, 1), (2, 2), (12, 4), (1000, 33)])
 def test_where_nothing_could_be_followed_bases_come_by_the_frames_up_to_the_most(frames: int, bases: int) -> None:
-    assert choose_bases(Tried({}), 10.0, frames).count == bases
+    assert choose_bases(Trials({}), 10.0, frames).count == bases
 
 
 @pytest.mark.parametrize("most", [2, 5, 12, 1000])
@@ -233,7 +233,7 @@ def test_a_preset_may_allow_fewer_bases_than_the_scene_would_get(most: int) -> N
 
 @pytest.mark.parametrize("most", [1, 2, 17])
 def test_where_nothing_could_be_followed_a_preset_gets_no_more_bases_than_it_allows(most: int) -> None:
-    assert choose_bases(Tried({}), 10.0, 1000, most).count == most
+    assert choose_bases(Trials({}), 10.0, 1000, most).count == most
 
 
 @pytest.mark.parametrize("bases", [3, 9, 33])

@@ -1,4 +1,4 @@
-"""Stage 2: calibration files of every kind, and the lazy rectification of a stereo clip by them."""
+"""A calibration file and a stereo clip in; the rectified clip out, frame by frame. Verbs: load_calibration, rectify."""
 
 from worker.input.calibration.check import check_calibration
 from worker.input.calibration.files import load_calibration

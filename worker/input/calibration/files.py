@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from contract.intake.limits import MOST_CALIBRATION_BYTES
+from contract.intake.limits import MAX_CALIBRATION_BYTES
 from contract.intake.sniff import check_calibration_text
 from contract.wire.errors import InputError
 from worker.input.calibration.check import FIELD, check_calibration
@@ -75,7 +75,7 @@ def load_calibration(path: Path | str, *, eye_width: int, eye_height: int) -> St
 
 def _read_text(path: Path) -> str:
     try:
-        if path.stat().st_size > MOST_CALIBRATION_BYTES:
+        if path.stat().st_size > MAX_CALIBRATION_BYTES:
             raise InputError(FIELD, f"{path.name} has {path.stat().st_size} bytes.", FORMATS_REMEDY)
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:

@@ -1,4 +1,4 @@
-"""Decode and validate what the user gave: a stereo clip, or frames whose depth is already known."""
+"""Files in; a StereoClip, or a DepthClip if depth came along, out. Verbs: open_clip, find_calibration, split_frames."""
 
 from contract.intake.limits import ClipLimits
 from worker.input.clip.opening import find_calibration, open_clip

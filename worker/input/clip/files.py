@@ -22,7 +22,7 @@ from contract.wire.errors import InputError, LimitError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm"})
-DEEPEST_FOLDER = 6  # levels below the given folder; also what ends a loop of linked folders
+MAX_FOLDER_DEPTH = 6  # levels below the given folder; also what ends a loop of linked folders
 _CHUNK_BYTES = 1 << 20
 _LAYOUT_FOLDERS = frozenset({"images", "depth", "masks", "mask", "left", "right"})  # never stripped as mere wrapping
 
@@ -55,33 +55,33 @@ class FileTree(ABC):
         """Where the file lies on disk; None inside an archive."""
         return None
 
-    def read(self, name: str, most_bytes: int) -> bytes:
-        """Content of a file. InputError when it is unreadable, LimitError when it is larger than most_bytes."""
-        return b"".join(self._chunks(name, most_bytes))
+    def read(self, name: str, max_bytes: int) -> bytes:
+        """Content of a file. InputError when it is unreadable, LimitError when it is larger than max_bytes."""
+        return b"".join(self._chunks(name, max_bytes))
 
     def head(self, name: str, size: int) -> bytes:
         """The first `size` bytes of a file, or all of a smaller one. InputError when it is unreadable."""
         return next(self._chunks(name, size, size), b"")
 
-    def copy_to(self, name: str, target: Path, most_bytes: int | None = None) -> None:
+    def copy_to(self, name: str, target: Path, max_bytes: int | None = None) -> None:
         """Writes a file under a name of ours, for readers that need a path. target must not exist.
 
-        Raises what `read` does; most_bytes is the limit for everything in an archive unless given.
+        Raises what `read` does; max_bytes is the limit for everything in an archive unless given.
         """
         descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
         with open(descriptor, "wb") as stream:
-            for chunk in self._chunks(name, self.limits.decoded_bytes if most_bytes is None else most_bytes):
+            for chunk in self._chunks(name, self.limits.decoded_bytes if max_bytes is None else max_bytes):
                 stream.write(chunk)
 
-    def _chunks(self, name: str, most_bytes: int, size: int = _CHUNK_BYTES) -> Iterator[bytes]:
+    def _chunks(self, name: str, max_bytes: int, size: int = _CHUNK_BYTES) -> Iterator[bytes]:
         """Content piece by piece, counted while it is inflated: what an archive declares may be a lie."""
         total = 0
         try:
             with self.open(name) as stream:
                 while chunk := stream.read(size):
                     total += len(chunk)
-                    if total > most_bytes:
-                        problem = f"{name} is larger than {most_bytes} bytes."
+                    if total > max_bytes:
+                        problem = f"{name} is larger than {max_bytes} bytes."
                         raise LimitError(
                             self.field, problem, "Write the file again, without what does not belong in it."
                         )
@@ -156,7 +156,7 @@ def _open_folder(root: Path, field: str, limits: ClipLimits) -> FileTree:
     paths: dict[str, Path] = {}
     for folder, subfolders, files in os.walk(root, followlinks=True):
         relative = Path(folder).relative_to(root)
-        if len(relative.parts) >= DEEPEST_FOLDER:
+        if len(relative.parts) >= MAX_FOLDER_DEPTH:
             subfolders.clear()
         for file in files:
             paths[(relative / file).as_posix()] = Path(folder) / file

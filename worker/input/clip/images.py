@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.intake.limits import MOST_IMAGE_BYTES
+from contract.intake.limits import MAX_IMAGE_BYTES
 from contract.intake.sniff import JPEG_MAGIC, PNG_MAGIC, png_size
 from contract.wire.errors import InputError
 from worker.input.clip.files import FileTree
@@ -51,7 +51,7 @@ class ImageSequence:
 
     def decode(self, name: str) -> NDArray[Any]:
         """The pixels as stored, size checked: [H, W] or [H, W, channels], uint8 or uint16, colours in BGR order."""
-        metadata_bytes, pixel_bytes = MOST_IMAGE_BYTES
+        metadata_bytes, pixel_bytes = MAX_IMAGE_BYTES
         data = self.tree.read(name, metadata_bytes + pixel_bytes * self.width * self.height)
         image = decode_image(data, self.tree.field, name)
         if image.shape[:2] != (self.height, self.width):

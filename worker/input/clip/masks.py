@@ -23,7 +23,7 @@ from worker.input.clip.video import VideoFile, open_video, open_video_in
 
 BrightClass = Literal["tool", "tissue"]  # what a white pixel means
 
-MOST_TOOL_SHARE = 0.4  # of the area: a class larger than this is not taken for the instrument unasked
+MAX_TOOL_SHARE = 0.4  # of the area: a class larger than this is not taken for the instrument unasked
 NO_MASKS = "masks: none given, every pixel is tissue"  # the assumption recorded then
 _FIELD = "masks"
 _POLARITY_REMEDY = 'Say mask_polarity "tool" if white marks instruments, "tissue" if white marks tissue.'
@@ -140,16 +140,16 @@ def _bright_class(
         raise InputError(
             _FIELD, f"cannot tell whether white or black marks the instrument ({share}).", _POLARITY_REMEDY
         )
-    return look, f"the instrument enters from the border and covers less than {100 * MOST_TOOL_SHARE:.0f} %; {share}"
+    return look, f"the instrument enters from the border and covers less than {100 * MAX_TOOL_SHARE:.0f} %; {share}"
 
 
 def _bright_class_by_look(white: NDArray[np.bool_]) -> BrightClass | None:
     """The class that reaches the border in most of the frames it appears in, with little enough area to be the tool."""
     border = np.concatenate([white[:, 0], white[:, -1], white[:, :, 0], white[:, :, -1]], axis=1)
-    if white.mean() < MOST_TOOL_SHARE:
+    if white.mean() < MAX_TOOL_SHARE:
         touches = 2 * border.any(axis=1).sum() > white.any(axis=(1, 2)).sum()
         return "tool" if touches else None
-    if 1.0 - white.mean() < MOST_TOOL_SHARE:
+    if 1.0 - white.mean() < MAX_TOOL_SHARE:
         touches = 2 * (~border).any(axis=1).sum() > (~white.all(axis=(1, 2))).sum()
         return "tissue" if touches else None
     return None

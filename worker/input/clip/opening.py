@@ -7,7 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from contract.intake.limits import MOST_CALIBRATION_BYTES, ClipLimits
+from contract.intake.limits import MAX_CALIBRATION_BYTES, ClipLimits
 from contract.wire.errors import InputError
 from contract.wire.options import ClipOptions
 from worker.input.clip.files import FileTree, check_exists, open_tree, scratch_folder
@@ -122,5 +122,5 @@ def _as_path(tree: FileTree, name: str, scratch: Path | None) -> Path:
         scratch = scratch_folder()
         atexit.register(shutil.rmtree, scratch, ignore_errors=True)
     target = scratch / f"calibration{PurePosixPath(name).suffix.lower()}"
-    tree.copy_to(name, target, MOST_CALIBRATION_BYTES)
+    tree.copy_to(name, target, MAX_CALIBRATION_BYTES)
     return target

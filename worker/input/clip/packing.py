@@ -23,7 +23,7 @@ PACKING_WORDS: dict[Packing, str] = {"sbs": "side by side, left eye left", "tb":
 
 _EYE_ASPECTS = (0.8, 2.4)  # width / height an endoscope's eye plausibly has, 5:4 and 16:9 well inside
 _CLEAR_MARGIN = 0.15  # of correlation, by which content alone decides
-_LEAST_LIKENESS = 0.35  # two eyes on the same tissue correlate above this, different parts of one picture below
+_MIN_LIKENESS = 0.35  # two eyes on the same tissue correlate above this, different parts of one picture below
 _LIKENESS_WIDTH_PX = 160  # halves are compared at this width: disparities become few pixels, and it costs a millisecond
 _FLAT_STD = 1.0  # grey levels of detail below which a frame says nothing
 _FRAMES_ASKED = 30  # clips may open black
@@ -124,7 +124,7 @@ def detect_packing(sequence: FrameSequence) -> Packing:
         raise _undecided(sequence, "the frames show too little detail")
     by_content: Packing = "sbs" if likeness["sbs"] >= likeness["tb"] else "tb"
     figures = f"likeness of the halves: side by side {likeness['sbs']:.2f}, top-bottom {likeness['tb']:.2f}"
-    if likeness[by_content] < _LEAST_LIKENESS:
+    if likeness[by_content] < _MIN_LIKENESS:
         raise InputError(
             "clip",
             f"{sequence.label} does not look like two eyes in one picture ({figures}).",

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import InputError
 from worker.input.clip.types import DepthClip
 
-FEWEST_FRAMES = 9  # shorter clips cannot spare a frame
+MIN_FRAMES = 9  # shorter clips cannot spare a frame
 REPEAT_LEVELS = 0.2  # mean |difference| in 8-bit levels below which two frames are the same picture
 RULES = ("every8", "blocks8", "none")
 _FIELD = "options.holdout"
@@ -47,8 +47,8 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     held_out = held_out_frames(count, holdout)
     if holdout == "none":
         return FrameSplit(list(range(count)), [], [])
-    if count < FEWEST_FRAMES:
-        return _nothing_held_out(count, f"the clip has {count} frames, fewer than {FEWEST_FRAMES}")
+    if count < MIN_FRAMES:
+        return _nothing_held_out(count, f"the clip has {count} frames, fewer than {MIN_FRAMES}")
     if not held_out:
         return _nothing_held_out(count, f"{holdout} finds no frame to hold out in {count}")
     train = sorted(set(range(count)) - set(held_out))
@@ -66,7 +66,7 @@ def held_out_frames(frame_count: int, holdout: str) -> list[int]:
     So stages before the split can leave them alone. InputError as in split_frames.
     """
     wanted = _held_out_by_rule(holdout, frame_count)
-    return sorted(wanted) if frame_count >= FEWEST_FRAMES else []
+    return sorted(wanted) if frame_count >= MIN_FRAMES else []
 
 
 def check_holdout(holdout: str) -> None:

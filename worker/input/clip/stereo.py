@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from contract.intake.limits import SMALLEST_SIDE_PX, ClipLimits
+from contract.intake.limits import MIN_SIDE_PX, ClipLimits
 from contract.wire.errors import InputError
 from contract.wire.names import MaskPolarity
 from worker.input.clip.files import FileTree
@@ -88,8 +88,8 @@ def with_masks(
 def _stereo_clip(pairs: PackedPairs | TwoSequences, assumptions: tuple[str, ...], limits: ClipLimits) -> StereoClip:
     first = pairs.sequence if isinstance(pairs, PackedPairs) else pairs.left
     height, width = pairs.eye_size if isinstance(pairs, PackedPairs) else (first.height, first.width)
-    if min(height, width) < SMALLEST_SIDE_PX:
-        raise InputError("clip", f"one eye is {width}x{height} pixels.", f"Give at least {SMALLEST_SIDE_PX} a side.")
+    if min(height, width) < MIN_SIDE_PX:
+        raise InputError("clip", f"one eye is {width}x{height} pixels.", f"Give at least {MIN_SIDE_PX} a side.")
     limits.check_clip("clip", first.label, first.frame_count, width, height, eyes=1)
     frame_times_s = first.frame_times_s
     if frame_times_s is None:

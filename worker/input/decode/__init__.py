@@ -1,4 +1,4 @@
-"""Stage 3: a clip and its calibration are read by a process that has nothing else, and handed over as plain arrays."""
+"""Files from outside in; a clip and its calibration out, read by a confined process. Verb: decode_clip."""
 
 from worker.input.decode.decoding import StereoRecording, decode_clip
 

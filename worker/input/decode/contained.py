@@ -22,11 +22,11 @@ from typing import Any
 from contract.wire.errors import Cancelled, InputError, LimitError, UnavailableError
 from worker.input.decode.guard import Allowance
 
-SILENCE_S = 10.0  # without another picture; the largest frame there may be takes well under a second
-LONGEST_S = 1800.0  # of everything: a clip of the most and the largest frames takes minutes
-MOST_ANSWER_BYTES = 4 << 20  # a line of the answer; it grows with warnings, not with frames
+MAX_SILENCE_S = 10.0  # without another picture; the largest frame there may be takes well under a second
+MAX_TOTAL_S = 1800.0  # of everything: a clip of the most and the largest frames takes minutes
+MAX_ANSWER_BYTES = 4 << 20  # a line of the answer; it grows with warnings, not with frames
 POLL_S = 0.1  # how soon a stop is noticed
-PARTING_S = 5.0  # to end after the answer; what lives on could change the arrays that the worker maps
+MAX_EXIT_S = 5.0  # to end after the answer; what lives on could change the arrays that the worker maps
 
 PROGRAM = ("-m", "worker.input.decode.child")
 NONSENSE = "the decoder talks nonsense"
@@ -44,9 +44,9 @@ OnReport = Callable[[float], None]
 class Patience:
     """How long the process may take: seconds without another picture, of everything, and from its answer to its end."""
 
-    silence_s: float = SILENCE_S
-    longest_s: float = LONGEST_S
-    parting_s: float = PARTING_S
+    max_silence_s: float = MAX_SILENCE_S
+    max_total_s: float = MAX_TOTAL_S
+    max_exit_s: float = MAX_EXIT_S
 
 
 @contextmanager
@@ -96,7 +96,7 @@ def run_contained(
     except BrokenPipeError:
         answer = None
     finally:
-        _end(process, patience.parting_s if watch.answered else 0.0)
+        _end(process, patience.max_exit_s if watch.answered else 0.0)
         if process.stdout is not None:
             process.stdout.close()
     try:
@@ -105,10 +105,10 @@ def run_contained(
         raise _undecodable(watch.field, NONSENSE) from None
 
 
-def _end(process: subprocess.Popen[bytes], parting_s: float) -> None:
+def _end(process: subprocess.Popen[bytes], max_exit_s: float) -> None:
     """Wait until the process has ended; it is killed if that takes longer."""
     try:
-        process.wait(parting_s)
+        process.wait(max_exit_s)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
@@ -132,7 +132,7 @@ class _Watch:
 
     def answer(self) -> dict[str, Any] | None:
         """The last line; None when the process ended without one."""
-        end_s = time.monotonic() + self._patience.longest_s
+        end_s = time.monotonic() + self._patience.max_total_s
         self._advanced_s = time.monotonic()
         for line in self._lines():
             if line is None:
@@ -159,10 +159,10 @@ class _Watch:
         if self._should_stop():
             raise Cancelled("Stopped during stage 'decode'.")
         now_s = time.monotonic()
-        if now_s - self._advanced_s > self._patience.silence_s:
-            raise _undecodable(self.field, f"the decoder made no progress for {self._patience.silence_s:g} s")
+        if now_s - self._advanced_s > self._patience.max_silence_s:
+            raise _undecodable(self.field, f"the decoder made no progress for {self._patience.max_silence_s:g} s")
         if now_s > end_s:
-            raise _undecodable(self.field, f"the decoder took more than {self._patience.longest_s:g} s")
+            raise _undecodable(self.field, f"the decoder took more than {self._patience.max_total_s:g} s")
 
     def _lines(self) -> Iterator[bytes | None]:
         """Whole lines as they come, and None whenever POLL_S passed, or a part came, without any."""
@@ -182,7 +182,7 @@ class _Watch:
             yield from lines
             if not lines:
                 yield None
-            if len(rest) > MOST_ANSWER_BYTES:
+            if len(rest) > MAX_ANSWER_BYTES:
                 raise _undecodable(self.field, NONSENSE)
 
 

@@ -20,7 +20,7 @@ from worker.input.calibration import check_calibration
 from worker.input.calibration.types import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
 from worker.input.camera import Intrinsics
 from worker.input.clip import ClipLimits, DepthClip, StereoClip
-from worker.input.clip.files import DEEPEST_FOLDER
+from worker.input.clip.files import MAX_FOLDER_DEPTH
 from worker.input.clip.layouts import registered_files
 from worker.input.clip.types import RgbFrame
 from worker.input.decode.contained import MALFORMED, REMEDY, private_folder, run_contained
@@ -30,7 +30,7 @@ from worker.machine.hooks import Hooks, Progress
 
 STAGE = "decode"
 LIBRARIES_BYTES = 2 * 2**30  # address space of Python, NumPy and OpenCV with a decoder's threads
-CPU_S = 1800  # of all cores together: what LONGEST_S allows one of them
+CPU_S = 1800  # of all cores together: what MAX_TOTAL_S allows one of them
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _reached(path: str) -> list[str]:
     """A file or folder, and what links in the folder lead to; only who has this machine can give one with links."""
     found = [path]
     for folder, subfolders, files in os.walk(path, followlinks=True):
-        if len(Path(folder).relative_to(path).parts) >= DEEPEST_FOLDER:
+        if len(Path(folder).relative_to(path).parts) >= MAX_FOLDER_DEPTH:
             subfolders.clear()
         entries = (os.path.join(folder, name) for name in (*subfolders, *files))
         found += [os.path.realpath(entry) for entry in entries if os.path.islink(entry)]

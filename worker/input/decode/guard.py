@@ -18,7 +18,7 @@ from contract.runtime.processes import die_with_parent
 from worker.input.decode.landlock import confine_files
 from worker.input.decode.seccomp import forbid_network_and_programs
 
-MOST_OPEN_FILES = 128  # a zip, a video, the results, and what Python loads
+MAX_OPEN_FILES = 128  # a zip, a video, the results, and what Python loads
 
 _PR_SET_NO_NEW_PRIVS = 38
 _CLONE_NEWUSER = 0x10000000
@@ -56,7 +56,7 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
     _limit(resource.RLIMIT_CORE, 0)  # a dump would hold the clip
     _limit(resource.RLIMIT_FSIZE, allowance.file_bytes)
     _limit(resource.RLIMIT_CPU, allowance.cpu_s, allowance.cpu_s + 1)  # SIGXCPU tells why; SIGKILL follows
-    _limit(resource.RLIMIT_NOFILE, MOST_OPEN_FILES)
+    _limit(resource.RLIMIT_NOFILE, MAX_OPEN_FILES)
     granted = [LIMITED_MEMORY] if _limit_memory(allowance.memory_bytes) else []
     apart = _leave_network()
     confined = confine_files(_libraries() + list(readable), writable)
@@ -79,10 +79,10 @@ def _limit(kind: int, soft: int, hard: int | None = None) -> None:
     resource.setrlimit(kind, (min(soft, hard), hard))
 
 
-def _limit_memory(most_bytes: int) -> bool:
+def _limit_memory(max_bytes: int) -> bool:
     """Whether memory is limited; macOS knows the limit and may refuse to set it."""
     try:
-        _limit(resource.RLIMIT_AS, most_bytes)
+        _limit(resource.RLIMIT_AS, max_bytes)
     except (ValueError, OSError):
         return False
     return True

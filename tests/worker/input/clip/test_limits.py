@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from contract.intake.limits import HELD_BYTES_PER_PIXEL, MOST_MEMORY_BYTES, memory_for_clip_bytes
+from contract.intake.limits import HELD_BYTES_PER_PIXEL, MAX_MEMORY_BYTES, memory_for_clip_bytes
 from contract.runtime.settings import Settings
 from contract.wire.errors import LimitError
 from tests.worker.clips import HEIGHT, WIDTH, plane_clip
@@ -39,7 +39,7 @@ def test_a_clip_may_take_half_of_the_memory_and_at_most_eight_gib(
 
 def test_where_the_system_does_not_tell_its_memory_eight_gib_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sysconf")
-    assert memory_for_clip_bytes() == MOST_MEMORY_BYTES
+    assert memory_for_clip_bytes() == MAX_MEMORY_BYTES
 
 
 def test_a_clip_that_does_not_fit_is_told_how_many_of_its_frames_do() -> None:

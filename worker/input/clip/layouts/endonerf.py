@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.intake.limits import MOST_POSES_BYTES
+from contract.intake.limits import MAX_POSES_BYTES
 from contract.wire.errors import InputError
 from contract.wire.names import MaskPolarity, PoseConvention
 from worker.input.camera import Intrinsics
@@ -29,8 +29,8 @@ from worker.input.clip.video import FALLBACK_RATE_HZ
 TITLE = "EndoNeRF"
 CONFIDENT = 255  # depth_confidence of every valid depth: the layout carries none of its own
 _USUAL_DEPTH_MM = (5.0, 500.0)  # working distances of endoscopes with ample room; other units fall outside
-_LEAST_DEPTH_SHARE = 0.5  # of tissue pixels with depth, below which the user should know
-_MOST_THREADS = 4  # decoding PNG releases the interpreter; more threads than this wait for the disk
+_MIN_DEPTH_SHARE = 0.5  # of tissue pixels with depth, below which the user should know
+_MAX_THREADS = 4  # decoding PNG releases the interpreter; more threads than this wait for the disk
 
 
 def _recognises(files: ClipFiles) -> bool:
@@ -52,7 +52,7 @@ def _open(files: ClipFiles) -> DepthClip:
     _check_files(tree)
     images = open_images(tree, tree.images("images"))
     tree.limits.check_clip(tree.field, tree.label, images.frame_count, images.width, images.height, eyes=1)
-    header_bytes, frame_bytes = MOST_POSES_BYTES
+    header_bytes, frame_bytes = MAX_POSES_BYTES
     poses = parse_poses(
         tree.read(POSES_FILE, header_bytes + frame_bytes * images.frame_count), images.frame_count, convention
     )
@@ -150,7 +150,7 @@ def _decode_all(
     def fill(index: int) -> None:
         result[index] = decode(images.names[index])
 
-    with ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1)) as threads:
+    with ThreadPoolExecutor(min(_MAX_THREADS, os.cpu_count() or 1)) as threads:
         for _ in threads.map(fill, range(images.frame_count)):
             pass
     return result
@@ -165,7 +165,7 @@ def _depth_warnings(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) ->
     if valid.any() and not low <= (median := float(np.median(depth_mm[valid]))) <= high:
         warnings.append(f"depth: its median is {median:.1f} mm, unusual for an endoscope; is it in millimetres?")
     share = np.count_nonzero(valid) / max(1, int(np.count_nonzero(tissue)))
-    if share < _LEAST_DEPTH_SHARE:
+    if share < _MIN_DEPTH_SHARE:
         warnings.append(f"depth: only {100 * share:.0f} % of the tissue pixels have one")
     return tuple(warnings)
 
