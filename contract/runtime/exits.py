@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import sys
@@ -47,12 +46,22 @@ LAST_WORDS_VARIABLE = "INTRASPLAT_LAST_WORDS"
 def end_by(error: IntrasplatError) -> ExitCode:
     """Say on stderr why this process ends, leave what is not there to whoever started it, and return the exit code."""
     print(f"intrasplat: {error}", file=sys.stderr)
-    path = os.environ.get(LAST_WORDS_VARIABLE)
-    if path and isinstance(error, UnavailableError):
-        with contextlib.suppress(OSError):  # room on the disk may be what is not there; stderr has it all the same
-            words = {"problem": error.problem, "remedy": error.remedy, "may_return": error.may_return}
-            Path(path).write_text(json.dumps(words))
+    if isinstance(error, UnavailableError):
+        leave_last_words(error)
     return exit_code_of(error)
+
+
+def leave_last_words(error: UnavailableError) -> bool:
+    """Leave what is not there to whoever started this process; False: nobody asked, or the file cannot be written."""
+    path = os.environ.get(LAST_WORDS_VARIABLE)
+    if not path:
+        return False
+    try:
+        words = {"problem": error.problem, "remedy": error.remedy, "may_return": error.may_return}
+        Path(path).write_text(json.dumps(words))
+    except OSError:  # room on the disk may be what is not there
+        return False
+    return True
 
 
 def take_last_words(path: Path) -> UnavailableError | None:

@@ -92,8 +92,9 @@ def main() -> None:
     if "dies" in sys.argv:
         sys.exit(7)
     if "unable" in sys.argv:
-        tell("unable", problem="There is no such device.", remedy="Set INTRASPLAT_DEVICE.")
-        sys.exit(1)
+        lack = {"problem": "There is no such device.", "remedy": "Set INTRASPLAT_DEVICE."}
+        Path(os.environ["INTRASPLAT_LAST_WORDS"]).write_text(json.dumps(lack))
+        sys.exit(5)
     tell("ready", endpoint="ipc:///nowhere", device="cpu")
     tell("holding", scenes=["a" * 32])
     stop = threading.Event()

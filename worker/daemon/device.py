@@ -13,7 +13,7 @@ from pathlib import Path
 
 from contract.intake.limits import ClipLimits
 from contract.queue.embedded import short_socket_path
-from contract.runtime.exits import exit_code_of
+from contract.runtime.exits import ExitCode, leave_last_words
 from contract.runtime.processes import die_with_parent
 from contract.runtime.settings import Settings
 from contract.store.store import Store, open_store
@@ -28,7 +28,6 @@ from worker.daemon.orders import (
     Holding,
     Ready,
     Stopped,
-    Unable,
     job_progress,
 )
 from worker.daemon.pace import Pace
@@ -55,11 +54,11 @@ logger = logging.getLogger("intrasplat.worker")
 def run_device(settings: Settings) -> None:
     """Obey the orders on stdin; never returns, for the end of the orders ends the process.
 
-    What keeps it from starting (a device or data directory that cannot be used, an endpoint that is none) is reported
-    to the supervisor, which tells the user.
+    What keeps it from starting (a device, data directory or endpoint that cannot be used) is left to the supervisor
+    as last words (contract/runtime/exits.py), and the supervisor tells the user.
 
     Raises:
-        SystemExit: with that error's code.
+        SystemExit: something that it needs is not there.
     """
     die_with_parent()
     channel = Channel.instead_of_stdout()
@@ -67,8 +66,9 @@ def run_device(settings: Settings) -> None:
     try:
         _serve(settings, channel, orders)
     except (UnavailableError, InputError) as error:
-        channel.send(Unable(problem=error.problem, remedy=error.remedy))
-        raise SystemExit(exit_code_of(error)) from error
+        if not leave_last_words(UnavailableError(error.problem, error.remedy)):
+            logger.error("%s", error)
+        raise SystemExit(ExitCode.UNAVAILABLE) from error
 
 
 def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:

@@ -1,7 +1,7 @@
 """What the supervisor and its device child say to each other: one JSON document a line.
 
     supervisor -> child   on the child's stdin    Run, Stop; its end means: end at once
-    child -> supervisor   on the child's stdout   Ready or Unable once; Holding at any time;
+    child -> supervisor   on the child's stdout   Ready once; Holding at any time;
                                                   of a job any number of Advanced, then Finished, Stopped or Failed
 
 A job begins with Run and ends with one of its three reports, or with the child's death; only then may another begin.
@@ -46,14 +46,6 @@ class Ready(_Message):
     device: str
 
 
-class Unable(_Message):
-    """The child cannot work as it is set up, and starting it again will not help."""
-
-    kind: Literal["unable"] = "unable"
-    problem: str
-    remedy: str
-
-
 class Holding(_Message):
     """Scenes that are in the child's memory."""
 
@@ -91,7 +83,7 @@ class Failed(_Message):
 
 
 DeviceOrder: TypeAlias = Run | Stop
-DeviceReport: TypeAlias = Ready | Unable | Holding | Advanced | Finished | Stopped | Failed
+DeviceReport: TypeAlias = Ready | Holding | Advanced | Finished | Stopped | Failed
 
 _ORDERS: TypeAdapter[DeviceOrder] = TypeAdapter(Annotated[DeviceOrder, Field(discriminator="kind")])
 _REPORTS: TypeAdapter[DeviceReport] = TypeAdapter(Annotated[DeviceReport, Field(discriminator="kind")])

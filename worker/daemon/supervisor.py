@@ -54,7 +54,8 @@ def run_supervisor(settings: Settings, end: threading.Event, child_command: Sequ
         problem = f"A worker named {name} already works on {store.data_dir}."
         raise UnavailableError(problem, "End it, or set another INTRASPLAT_WORKER_NAME.")
     queue = RedisQueue(settings.redis_url)
-    keeper = Keeper(child_command or DEVICE_COMMAND, {**os.environ, **settings.to_environment()})
+    environment = {**os.environ, **settings.to_environment()}
+    keeper = Keeper(child_command or DEVICE_COMMAND, environment, store.run_dir / f"{name}.device.last-words")
     # New at each start: what an earlier process of this name still holds is given up by its silence alone.
     consumer = Consumer(queue, store, keeper, f"{name}.{secrets.token_hex(4)}", end)
     try:

@@ -14,13 +14,14 @@ import pytest
 
 from contract.queue.memory import MemoryQueue
 from contract.queue.promise import MAX_ATTEMPTS, Claim, Order
+from contract.runtime import supervised
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobError, JobProgress, JobRecord, JobState
 from contract.wire.names import MANIFEST, RESUME
 from contract.wire.rendering import WorkerAddress
 from tests.worker.jobs import STANDIN, Jobs, eventually
-from worker.daemon import child, consume, liveness
+from worker.daemon import consume, liveness
 from worker.daemon.child import Keeper
 from worker.daemon.consume import Consumer
 from worker.daemon.supervisor import address_of, announced
@@ -32,7 +33,8 @@ class Bench(Jobs):
     def __init__(self, data_dir: Path, queue: MemoryQueue | None = None, *arguments: str) -> None:
         super().__init__(queue or MemoryQueue(), Store(data_dir))
         self.end = threading.Event()
-        self.keeper = Keeper([sys.executable, str(STANDIN), *arguments])
+        command = [sys.executable, str(STANDIN), *arguments]
+        self.keeper = Keeper(command, last_words=self.store.run_dir / "worker-1.last-words")
         self.consumer = Consumer(self.queue, self.store, self.keeper, "worker-1.a", self.end)
         self.thread: threading.Thread | None = None
 
@@ -55,7 +57,7 @@ class Bench(Jobs):
         eventually(lambda: self.keeper.live is not None)
         live = self.keeper.live
         assert live is not None
-        return live.process_id
+        return live.process.pid
 
     def went_on_from(self, record: JobRecord) -> str:
         folder = self.store.scene_folder(record.job_id, record.attempt)
@@ -354,7 +356,7 @@ def test_a_clip_that_is_gone_fails_its_job(bench: Bench, monkeypatch: pytest.Mon
 def test_a_child_that_dies_at_its_start_is_not_started_in_a_hurry(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(child, "FIRST_PAUSE_S", 0.05)
+    monkeypatch.setattr(supervised, "FIRST_PAUSE_S", 0.05)
     bench = Bench(tmp_path, None, "dies")
     bench.start()
     eventually(lambda: "starts in 0.2 s" in caplog.text)

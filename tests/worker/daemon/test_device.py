@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +22,7 @@ from contract.wire.job import JobFiles, JobRecord
 from contract.wire.names import REPORT
 from contract.wire.options import JobOptions, ReconstructionOptions
 from worker.__main__ import main
-from worker.daemon.child import DeviceChild
+from worker.daemon.child import DeviceChild, Keeper
 from worker.daemon.device import request_of, run_or_start_anew
 from worker.daemon.faults import describe
 from worker.daemon.orders import Advanced, Failed, Finished, Run, Stop, Stopped
@@ -78,10 +79,11 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def device(tmp_path: Path) -> Iterator[DeviceChild]:
     """`python -m worker device`, ready."""
     settings = Settings(data_dir=tmp_path / "data")
-    child = DeviceChild([sys.executable, "-m", "worker", "device"], {**os.environ, **settings.to_environment()})
-    wait_until(lambda: child.ready is not None)
+    keeper = Keeper([sys.executable, "-m", "worker", "device"], {**os.environ, **settings.to_environment()})
+    child = keeper.child(threading.Event())
+    assert child is not None
     yield child
-    child.end()
+    keeper.stop()
 
 
 def wait_until(holds: Callable[[], bool], timeout_s: float = 60.0) -> None:
@@ -140,12 +142,12 @@ def tensor_bits(folder: Path) -> dict[str, bytes]:
 def test_a_job_that_trains_dies_with_the_process_that_ordered_it(tmp_path: Path, clip: Path) -> None:
     spool, out = clip.parent, tmp_path / "out"
     program = (
-        "import os, sys; from pathlib import Path;"
-        "from worker.daemon.child import DeviceChild; from worker.daemon.orders import *;"
-        "child = DeviceChild([sys.executable, '-m', 'worker', 'device'], os.environ);"
+        "import sys; from threading import Event;"
+        "from worker.daemon.child import Keeper; from worker.daemon.orders import *;"
+        "child = Keeper([sys.executable, '-m', 'worker', 'device']).child(Event());"
         "child.send(read_order(sys.argv[1].encode())); report = None\n"
         "while report is None or report.progress.stage != 'train': report = child.next_report(60)\n"
-        "print(child.process_id, flush=True); child.next_report(60)"
+        "print(child.process.pid, flush=True); child.next_report(60)"
     )
     settings = Settings(data_dir=tmp_path / "data").to_environment()
     ordered = order(spool / clip.name, out, iterations=1_000_000).model_dump_json()
