@@ -22,8 +22,7 @@ from contract.queue.promise import (
     Order,
     QueueFigures,
     check_admission,
-    correct_end_s,
-    estimate_end_s,
+    estimate_forecast,
     event_order,
     worker_died,
 )
@@ -31,7 +30,7 @@ from contract.wire.job import TERMINAL_STATES, TRANSITIONS, Forecast, JobError, 
 from contract.wire.rendering import WorkerAddress
 
 LEASE_CHECK_S = 0.05
-"""How often a claim that waits looks for leases that have run out."""
+"""How often a waiting claim looks for leases that have run out."""
 
 
 class MemoryQueue:
@@ -43,12 +42,12 @@ class MemoryQueue:
         self._changed = threading.Condition(threading.RLock())
         self._records: dict[str, JobRecord] = {}
         self._places: dict[str, int] = {}
-        """Of each job by when it was submitted or retried: the order in which jobs of one priority are claimed."""
+        """Of each job, in the order of submissions and retries: jobs of one priority are claimed in this order."""
         self._next_place = 0
         self._queued_at_s: dict[str, float] = {}
         self._lease_ends_s: dict[str, float] = {}
         self._asked_to_yield: dict[str, tuple[str, float]] = {}
-        """High-priority job: the owner that was told to make way for it, and until when nobody else is told."""
+        """By high-priority job: the owner that was told to make way for it, and until when nobody else is told."""
         self._idempotent: dict[tuple[str, str], tuple[str, float]] = {}
         self._events: dict[str, deque[Event]] = {}
         self._event_count = 0
@@ -116,7 +115,7 @@ class MemoryQueue:
             record = self._records.get(claim.job_id)
             if record is None or not _of(record, claim):
                 return False
-            if record.state is not JobState.RUNNING:  # its answer was lost, and it is asked again
+            if record.state is not JobState.RUNNING:  # this is a repetition, because the answer was lost
                 return record.state is JobState.QUEUED or (died and record.error == worker_died())
             if record.cancel_requested:
                 return False
@@ -154,13 +153,10 @@ class MemoryQueue:
             if record is None or record.state in TERMINAL_STATES:
                 return Forecast(position=None, eta_s=None)
             now_s = time.time()
-            started = {running.job_id: running.started_at_s or now_s for running in self._in(JobState.RUNNING)}
-            ran_s = {running_id: now_s - started_at_s for running_id, started_at_s in started.items()}
+            ran_s = {each.job_id: now_s - (each.started_at_s or now_s) for each in self._in(JobState.RUNNING)}
             waiting = [other.job_id for other in self._waiting()]
             position = waiting.index(job_id) if job_id in waiting else None
-            own_s = ran_s.get(job_id, 0.0)
-            eta_s = estimate_end_s(list(self._durations_s), position, own_s, list(ran_s.values()), len(self.workers()))
-            return Forecast(position=position, eta_s=correct_end_s(record, eta_s))
+            return estimate_forecast(record, position, list(self._durations_s), ran_s, len(self.workers()))
 
     def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
         with self._changed:
@@ -240,7 +236,7 @@ class MemoryQueue:
         return None
 
     def _count_death(self, record: JobRecord) -> None:
-        """The worker that ran the job is dead: queue the job again, or give it up."""
+        """The worker that ran the job is dead: queue the job again, or fail it after too many deaths."""
         if record.cancel_requested:
             self._change(record, JobState.CANCELLED)
         elif record.attempt - record.released >= MAX_ATTEMPTS:
@@ -249,12 +245,12 @@ class MemoryQueue:
             self._change(record, JobState.QUEUED, progress=None)
 
     def _settle(self, claim: Claim, target: JobState, **update: object) -> bool:
-        """A cancel that was asked for is confirmed, and nothing else; nothing else is confirmed as one."""
+        """End the job. If a cancel was requested, only CANCELLED is accepted; otherwise anything but CANCELLED."""
         with self._changed:
             record = self._records.get(claim.job_id)
             if record is None or not _of(record, claim):
                 return False
-            if record.state is not JobState.RUNNING:  # its answer was lost, and it is asked again
+            if record.state is not JobState.RUNNING:  # this is a repetition, because the answer was lost
                 return record.state is target
             if record.cancel_requested is not (target is JobState.CANCELLED):
                 return False
@@ -270,7 +266,7 @@ class MemoryQueue:
         self._lease_ends_s[record.job_id] = time.monotonic() + self._lease_s
 
     def _must_yield(self, record: JobRecord) -> bool:
-        """Whether a high-priority job waits for which nobody else was told to make way."""
+        """Whether a high-priority job has waited long enough, and no other worker was told to make way for it."""
         if record.options.priority == "high":
             return False
         for waiting in self._waiting():
@@ -297,14 +293,14 @@ class MemoryQueue:
             self._idempotent.setdefault((record.tenant, record.idempotency_key), held)
 
     def _enqueue(self, record: JobRecord) -> JobRecord:
-        """Write a queued record that takes the last place of its priority."""
+        """Write a queued record in the last place of its priority."""
         self._places[record.job_id] = self._next_place
         self._next_place += 1
         self._queued_at_s[record.job_id] = time.time()
         return self._write(record)
 
     def _moved(self, record: JobRecord, target: JobState, **update: object) -> JobRecord:
-        """The record in another state, by the one table of how it may change."""
+        """The record in another state, which TRANSITIONS must allow."""
         if target not in TRANSITIONS[record.state]:
             raise AssertionError(f"{record.state} -> {target} is not in TRANSITIONS")
         return record.model_copy(update={"state": target, **update})
@@ -323,7 +319,7 @@ class MemoryQueue:
         return self._write(self._moved(record, target, **update))
 
     def _write(self, record: JobRecord) -> JobRecord:
-        """Every change of a record ends here: it is an event, and wakes those who wait for a job."""
+        """Store a changed record, add its event, and wake the claims that wait for a job."""
         self._records[record.job_id] = record
         self._event_count += 1
         kept = self._events.setdefault(record.job_id, deque(maxlen=MAX_EVENTS))

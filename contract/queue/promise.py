@@ -241,16 +241,33 @@ def check_admission(admission: Admission, queued: int, queued_of_tenant: int) ->
         )
 
 
-def estimate_end_s(
-    durations_s: list[float], position: int | None, own_s: float, running_s: list[float], workers: int
-) -> float | None:
-    """Seconds until a job is done if every job takes the median of the last durations; None: unknown.
+def estimate_forecast(
+    record: JobRecord, position: int | None, durations_s: list[float], ran_s: dict[str, float], workers: int
+) -> Forecast:
+    """Where a queued or running job is in the queue, and when it may be done.
+
+    The job's own progress decides if it tells how long is left. Otherwise every job is taken to last the median of the
+    last durations; a job that has not begun and has a budget lasts that at least.
 
     Args:
-        position: how many jobs wait before it; None: it runs, and has run for own_s.
-        running_s: how long each running job has run.
+        position: how many jobs wait before it; None: it runs.
+        durations_s: how long the last done jobs ran.
+        ran_s: how long each running job has run so far, by its id.
         workers: how many are live and share the work.
     """
+    progress = record.progress
+    if progress is not None and progress.seconds_left is not None:
+        return Forecast(position=position, eta_s=progress.seconds_left)
+    eta_s = _estimate_s(position, durations_s, ran_s.get(record.job_id, 0.0), list(ran_s.values()), workers)
+    if eta_s is not None and progress is None and record.options.budget_s is not None:
+        eta_s = max(eta_s, record.options.budget_s)
+    return Forecast(position=position, eta_s=eta_s)
+
+
+def _estimate_s(
+    position: int | None, durations_s: list[float], own_s: float, running_s: list[float], workers: int
+) -> float | None:
+    """Seconds until the job is done if every job lasts the median of the last; None: unknown."""
     if not durations_s:
         return None
     usual_s = median(durations_s)
@@ -260,16 +277,6 @@ def estimate_end_s(
         return None
     left_s = sum(max(0.0, usual_s - ran_s) for ran_s in running_s)
     return (left_s + position * usual_s) / workers + usual_s
-
-
-def correct_end_s(record: JobRecord, estimated_s: float | None) -> float | None:
-    """The estimate from other jobs, replaced by what this job reports, or raised to the budget that it was given."""
-    progress = record.progress
-    if progress is not None and progress.seconds_left is not None:
-        return progress.seconds_left
-    if estimated_s is not None and progress is None and record.options.budget_s is not None:
-        return max(estimated_s, record.options.budget_s)
-    return estimated_s
 
 
 def event_order(number: str) -> tuple[int, int]:

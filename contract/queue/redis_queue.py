@@ -44,39 +44,31 @@ import json
 import logging
 import time
 import uuid
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import redis
-from redis.backoff import ExponentialBackoff
-from redis.retry import Retry
 
-from contract.queue.lua import load_script
+from contract.queue.lua import UNREADABLE, Scripts
 from contract.queue.promise import (
     IDEMPOTENCY_S,
     LEASE_S,
-    MAX_ATTEMPTS,
-    MAX_DURATIONS,
-    MAX_EVENTS,
     MAX_LISTED,
     PREEMPT_AFTER_S,
     WORKER_TTL_S,
-    YIELD_S,
     Admission,
     Claim,
     Event,
     Order,
     QueueFigures,
     check_admission,
-    correct_end_s,
-    estimate_end_s,
+    estimate_forecast,
     event_order,
-    worker_died,
 )
-from contract.queue.redis_hash import EVENT_FIELDS, introduced, record_of, table_of
+from contract.queue.redis_client import connect, reachable
+from contract.queue.redis_hash import introduced, record_of, table_of
 from contract.wire.errors import UnavailableError
-from contract.wire.job import TERMINAL_STATES, Forecast, JobError, JobProgress, JobRecord, JobState, sources_of
+from contract.wire.job import TERMINAL_STATES, Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.rendering import WorkerAddress
 
 PREFIX = "{intrasplat}:"
@@ -92,27 +84,6 @@ BLOCK_S = 2.0
 LEASE_CHECK_S = 0.5
 """The same while jobs run: a lease that runs out writes nothing that would end the read."""
 
-SOCKET_TIMEOUT_S = 4.0
-CONNECT_TIMEOUT_S = 2.0
-RETRIES = 2
-
-REFUSALS = (
-    "MISCONF",
-    "NOREPLICAS",
-    "MASTERDOWN",
-    "CLUSTERDOWN",
-    "TRYAGAIN",
-    "BUSY",
-    "UNKILLABLE",
-    "NOPERM",
-    "READONLY",
-)
-"""First words of the errors with which a server says that it cannot, or may not, serve now."""
-
-SCRIPTS = ("submit", "restore", "claim", "beat", "settle", "release", "cancel", "retry", "forget", "announce")
-
-UNREADABLE = JobError(problem="The queue's record of this job cannot be read.", remedy="Submit the clip again.")
-
 logger = logging.getLogger("intrasplat.queue")
 
 
@@ -123,13 +94,12 @@ class RedisQueue:
     """
 
     def __init__(self, url: str, *, lease_s: float = LEASE_S, preempt_after_s: float = PREEMPT_AFTER_S) -> None:
-        self._client: Any = _connect(url)
-        self._rules = _rules(lease_s, preempt_after_s)
-        self._scripts = {name: self._client.register_script(load_script(name)) for name in SCRIPTS}
+        self._client: Any = connect(url)
+        self._scripts = Scripts(self._client, PREFIX, lease_s, preempt_after_s)
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
         limits = (admission.queued, admission.queued_per_tenant) if admission else ("", "")
-        answer = self._run("submit", *introduced(record), IDEMPOTENCY_S * 1000, *limits)
+        answer = self._scripts.run("submit", *introduced(record), IDEMPOTENCY_S * 1000, *limits)
         if answer[0] == "full" and admission is not None:
             check_admission(admission, *answer[1:])
         known = record_of(answer[1], table_of(answer[2]))
@@ -142,12 +112,12 @@ class RedisQueue:
         if record.state not in TERMINAL_STATES:
             raise ValueError(f"Job {record.job_id} is {record.state}; only ended jobs are restored.")
         remaining_s = record.created_at_s + IDEMPOTENCY_S - time.time()
-        return bool(self._run("restore", *introduced(record), round(remaining_s * 1000), uuid.uuid4().hex))
+        return bool(self._scripts.run("restore", *introduced(record), round(remaining_s * 1000), uuid.uuid4().hex))
 
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
         deadline = time.monotonic() + timeout_s
         while True:
-            found, *answer = self._run("claim", owner)
+            found, *answer = self._scripts.run("claim", owner)
             if found:
                 record = self._usable(owner, *answer)
                 if record is not None:
@@ -158,12 +128,12 @@ class RedisQueue:
                 return None
             last_high, last_standard, pending = answer
             block_s = min(left_s, LEASE_CHECK_S if pending else BLOCK_S)
-            with _reachable():
+            with reachable():
                 self._client.xread({HIGH: last_high, STANDARD: last_standard}, 1, max(1, round(block_s * 1000)))
 
     def beat(self, claim: Claim, progress: JobProgress | None = None) -> Order:
         document = progress.model_dump_json() if progress else ""
-        return Order(self._run("beat", claim.job_id, claim.owner, claim.attempt, document))
+        return Order(self._scripts.run("beat", claim.job_id, claim.owner, claim.attempt, document))
 
     def finish(self, claim: Claim) -> bool:
         return self._settle(claim, JobState.DONE)
@@ -175,14 +145,14 @@ class RedisQueue:
         return self._settle(claim, JobState.CANCELLED)
 
     def release(self, claim: Claim, *, died: bool = False) -> bool:
-        return bool(self._run("release", claim.job_id, claim.owner, claim.attempt, "1" if died else ""))
+        return bool(self._scripts.run("release", claim.job_id, claim.owner, claim.attempt, "1" if died else ""))
 
     def cancel(self, job_id: str) -> JobRecord | None:
-        return record_of(job_id, table_of(self._run("cancel", job_id)))
+        return record_of(job_id, table_of(self._scripts.run("cancel", job_id)))
 
     def retry(self, job_id: str) -> JobRecord | None:
         record = self.get(job_id)
-        return record and record_of(job_id, table_of(self._run("retry", job_id, record.attempt)))
+        return record and record_of(job_id, table_of(self._scripts.run("retry", job_id, record.attempt)))
 
     def get(self, job_id: str) -> JobRecord | None:
         return self._get_all([job_id]).get(job_id)
@@ -191,7 +161,7 @@ class RedisQueue:
         record = self.get(job_id)
         if record is None or record.state in TERMINAL_STATES:
             return Forecast(position=None, eta_s=None)
-        with _reachable(), self._client.pipeline(transaction=True) as batch:
+        with reachable(), self._client.pipeline(transaction=True) as batch:
             batch.zrank(f"{PREFIX}waiting:{record.options.priority}", job_id)
             batch.zcard(f"{PREFIX}waiting:high")
             batch.hvals(HELD)
@@ -203,21 +173,19 @@ class RedisQueue:
         running = self._get_all(held)
         ran_s = {other: clock_s - (of.started_at_s or clock_s) for other, of in running.items()}
         durations_s = [float(duration) for duration in durations]
-        workers = len(self.workers())
-        eta_s = estimate_end_s(durations_s, position, ran_s.get(job_id, 0.0), list(ran_s.values()), workers)
-        return Forecast(position=position, eta_s=correct_end_s(record, eta_s))
+        return estimate_forecast(record, position, durations_s, ran_s, len(self.workers()))
 
     def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
         index = INDEX if tenant is None else f"{PREFIX}tenant:{tenant}:index"
         if limit == 0:
             return []
-        with _reachable():
+        with reachable():
             job_ids = self._client.zrevrange(index, 0, -1 if limit is None else limit - 1)
         return list(self._get_all(job_ids).values())
 
     def events(self, job_id: str, after: str = "0") -> list[Event]:
         milliseconds, count = event_order(after)
-        with _reachable(), self._client.pipeline(transaction=True) as batch:
+        with reachable(), self._client.pipeline(transaction=True) as batch:
             batch.hget(_job_key(job_id), "document")
             batch.xrange(f"{PREFIX}events:{job_id}", min=f"({milliseconds}-{count}")
             document, entries = batch.execute()
@@ -228,32 +196,32 @@ class RedisQueue:
         record = self.get(job_id)
         terminal = json.dumps(dict.fromkeys(sorted(TERMINAL_STATES), True))
         idempotency_key = (record and record.idempotency_key) or ""
-        return bool(self._run("forget", job_id, terminal, idempotency_key, uuid.uuid4().hex))
+        return bool(self._scripts.run("forget", job_id, terminal, idempotency_key, uuid.uuid4().hex))
 
     def rewrite_log(self) -> bool:
         try:
-            with _reachable():
+            with reachable():
                 self._client.bgrewriteaof()
         except (UnavailableError, redis.ResponseError):  # one is under way, or this user may not
             return False
         return True
 
     def announce(self, address: WorkerAddress) -> None:
-        self._run("announce", address.name, address.model_dump_json(), round(WORKER_TTL_S * 1000))
+        self._scripts.run("announce", address.name, address.model_dump_json(), round(WORKER_TTL_S * 1000))
 
     def withdraw(self, name: str) -> None:
-        with _reachable():
+        with reachable():
             self._client.delete(_worker_key(name))
 
     def workers(self) -> list[WorkerAddress]:
-        with _reachable():
+        with reachable():
             names = sorted(self._client.smembers(WORKERS))
             documents = self._client.mget([_worker_key(name) for name in names]) if names else []
         found = [_address(name, document) for name, document in zip(names, documents, strict=True) if document]
         return [address for address in found if address is not None]
 
     def figures(self) -> QueueFigures:
-        with _reachable(), self._client.pipeline(transaction=True) as batch:
+        with reachable(), self._client.pipeline(transaction=True) as batch:
             batch.zcard(QUEUED)
             batch.zrange(QUEUED, 0, 0, withscores=True)
             batch.hlen(HELD)
@@ -265,19 +233,14 @@ class RedisQueue:
         return QueueFigures(queued, running, max(0.0, seconds + microseconds / 1e6 - since_s), counts)
 
     def ping(self) -> None:
-        with _reachable():
+        with reachable():
             self._client.ping()
 
     def close(self) -> None:
         self._client.close()
 
-    def _run(self, script: str, *arguments: object) -> Any:
-        """The answer of contract/queue/scripts/<script>.lua."""
-        with _reachable():
-            return self._scripts[script](keys=[PREFIX], args=[self._rules, *arguments])
-
     def _settle(self, claim: Claim, target: JobState, error: str = "") -> bool:
-        return bool(self._run("settle", claim.job_id, claim.owner, claim.attempt, target.value, error))
+        return bool(self._scripts.run("settle", claim.job_id, claim.owner, claim.attempt, target.value, error))
 
     def _usable(self, owner: str, job_id: str, answer: Sequence[str]) -> JobRecord | None:
         """The claimed record; if it cannot be read the job fails, so that it is in nobody's way."""
@@ -291,7 +254,7 @@ class RedisQueue:
 
     def _get_all(self, job_ids: list[str]) -> dict[str, JobRecord]:
         """The records that there are and that can be read, in the order of their ids here."""
-        with _reachable():
+        with reachable():
             batch = self._client.pipeline(transaction=False)
             for job_id in job_ids:
                 batch.hgetall(_job_key(job_id))
@@ -303,58 +266,6 @@ class RedisQueue:
                     answers[i] = {"document": "something that is no hash"}
         found = {job_id: record_of(job_id, answer) for job_id, answer in zip(job_ids, answers, strict=True)}
         return {job_id: record for job_id, record in found.items() if record is not None}
-
-
-def _connect(url: str) -> Any:
-    """A client with every default that has changed between releases of redis-py stated."""
-    return redis.Redis.from_url(
-        url,
-        decode_responses=True,
-        protocol=2,
-        retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), RETRIES),
-        socket_timeout=SOCKET_TIMEOUT_S,
-        socket_connect_timeout=CONNECT_TIMEOUT_S,
-    )
-
-
-@contextmanager
-def _reachable() -> Iterator[None]:
-    """Turn trouble with the connection or the server into the error that names the remedy."""
-    try:
-        yield
-    except redis.exceptions.AuthenticationError as error:
-        raise UnavailableError("The queue refuses this user or password.", "Correct REDIS_URL.") from error
-    except (redis.ConnectionError, redis.TimeoutError) as error:
-        problem = f"The queue does not answer ({type(error).__name__})."
-        remedy = "Start it with `intrasplat up`, or correct REDIS_URL."
-        raise UnavailableError(problem, remedy, may_return=True) from error
-    except redis.exceptions.OutOfMemoryError as error:
-        raise UnavailableError("The queue's memory is full.", "Raise its maxmemory or delete old jobs.") from error
-    except redis.ResponseError as error:
-        word = "READONLY" if isinstance(error, redis.exceptions.ReadOnlyError) else str(error).partition(" ")[0]
-        if isinstance(error, redis.exceptions.NoPermissionError):
-            word = "NOPERM"
-        if word not in REFUSALS:
-            raise
-        remedy = "Look at the log of its server: REDIS_URL must name one that is no replica and whose disk has room."
-        raise UnavailableError(f"The queue's server refuses ({word}).", remedy) from error
-
-
-def _rules(lease_s: float, preempt_after_s: float) -> str:
-    """The contract's numbers and its table of transitions, as the scripts read them."""
-    rules = {
-        "sources": {state: dict.fromkeys(sorted(sources_of(state)), True) for state in JobState},
-        "lease_ms": round(lease_s * 1000),
-        "preempt_ms": round(preempt_after_s * 1000),
-        "yield_ms": round(YIELD_S * 1000),
-        "max_attempts": MAX_ATTEMPTS,
-        "worker_died": worker_died().model_dump_json(),
-        "unreadable": UNREADABLE.model_dump_json(),
-        "max_events": MAX_EVENTS,
-        "event_fields": EVENT_FIELDS,
-        "max_durations": MAX_DURATIONS,
-    }
-    return json.dumps(rules)
 
 
 def _address(name: str, document: str) -> WorkerAddress | None:
