@@ -1,8 +1,8 @@
 """The `intrasplat` command.
 
-reconstruct, render, phantom, evaluate, stability and doctor work on this machine, in a process of the worker's
-(`python -m worker ...`); up starts a service and keys opens it to others; submit, watch, fetch, jobs, cancel, retry and
-delete talk to one.
+reconstruct, render, phantom, evaluate, stability and doctor run the worker's program on this machine
+(`python -m worker ...`). up starts a service, keys manages its API keys. submit, watch, fetch, jobs, cancel, retry and
+delete talk to a service.
 """
 
 from __future__ import annotations
@@ -58,19 +58,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return exit_code_of(error)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
-    except BrokenPipeError:  # whoever read this has read enough
+    except BrokenPipeError:  # the reader, such as head, has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.OK
 
 
 def _run_local(arguments: list[str]) -> int:
-    """Become the worker's program, with the command line unchanged: signals and exit status are its own."""
+    """Replace this process by the worker's program, so that signals and exit status are the worker's."""
     command = [sys.executable, "-m", "worker", *arguments]
     if os.name == "posix":
         os.execv(sys.executable, command)
-    process = subprocess.Popen(command)  # elsewhere whoever called does not wait for what a process has become
+    process = subprocess.Popen(command)  # without exec on Windows, where the caller would not wait
     while True:
-        with contextlib.suppress(KeyboardInterrupt):  # it reaches both, and the worker decides
+        with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C reaches both processes; the worker decides
             return process.wait()
 
 
@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, summary in LOCAL_COMMANDS.items():
-        commands.add_parser(name, help=summary, add_help=False)  # its own options are parsed by the worker
+        commands.add_parser(name, help=summary, add_help=False)  # the worker parses its options
     _add_up(commands)
     add_remote(commands)
     add_keys(commands)
@@ -111,7 +111,7 @@ def _add_up(commands: Commands) -> None:
 
 
 def _up(options: argparse.Namespace) -> int:
-    from client.up import run  # it brings the queue's client along, which no other command needs
+    from client.up import run  # imports the queue's client, which no other command needs
 
     names = ("port", "host", "data_dir", "log_format")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}

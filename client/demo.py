@@ -1,4 +1,4 @@
-"""`make demo`: a synthetic clip goes through the real service, and pictures of what came back go into ./demo/."""
+"""`make demo`: send a synthetic clip through the real service, and draw what comes back into ./demo/."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ FRAMES = 48
 WIDTH, HEIGHT = 480, 384
 SEED = 3
 TRAINING = "train"
-"""The stage as a job's view names it."""
+"""Name of the stage in JobView.stage."""
 BUDGET_S = 45.0
-"""With these the demo takes two minutes on two quiet cores, and less than four on slow ones."""
+"""With this size and budget the demo takes two minutes on two quiet cores, and less than four on slow ones."""
 
 HOLDOUT = "blocks8"
-"""Eight frames hidden at a time, as behind an instrument: the stretch that copying neighbours cannot fill."""
+"""Eight held-out frames in a row, as behind an instrument: copying neighbours cannot fill such a stretch."""
 READY_TIMEOUT_S = 180.0
 READY_PERIOD_S = 1.0
 STOP_TIMEOUT_S = 40.0
 LOG_LINES_SHOWN = 20
 
 SHOWN_FRAMES = (0, 12, 30, 42)
-"""Of these 12 is held out; in 30 the instrument covers most."""
+"""Frame 12 is held out; in frame 30 the instrument covers most."""
 VIEWED_FRAME = 30
 VIEWS = {"from the right": "orbit:12,0,1", "from the left": "orbit:-12,0,1", "from above": "orbit:0,12,1"}
 NEAR = "orbit:0,0,1.6"
 DEPTH_SHARE = (2, 98)
-"""Percentiles of the depth that the colours span."""
+"""Percentiles of depth at the two ends of the colour scale."""
 
 
 def main() -> int:
-    """Run the demo; its exit codes are the command line's."""
+    """Run the demo and return an exit code of the command line."""
     options = _parser().parse_args()
     signal.signal(signal.SIGTERM, _interrupt)  # so that the service ends with the demo
     started_s = time.monotonic()
@@ -78,12 +78,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _interrupt(*_: object) -> NoReturn:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not keep the service from being ended in order
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not stop the clean-up of the service
     raise KeyboardInterrupt
 
 
 def run(folder: Path, out: Path, picture: Path | None = None) -> dict[Path, str]:
-    """Everything the demo does; `folder` is for what may be thrown away afterwards.
+    """Run every step of the demo; `folder` is for temporary files.
 
     Returns:
         the files written, each with what it shows.
@@ -98,7 +98,7 @@ def run(folder: Path, out: Path, picture: Path | None = None) -> dict[Path, str]
             for now in client.watch(job.id):
                 bar.show(progress_of(now))
                 preview.look(now)
-        client.wait(job.id)  # says why, if there is no scene
+        client.wait(job.id)  # raises the reason if there is no scene
         report = client.report(job.id)
         say(f"asking for views: GET {client.url}/render?t=...&pose=...")
         written = preview.written() | save_renders(client, job.id, out)
@@ -112,7 +112,7 @@ def run(folder: Path, out: Path, picture: Path | None = None) -> dict[Path, str]
 
 
 class Preview:
-    """The first picture of a scene that training has changed, and still does, if there is one."""
+    """The first render of the job while it trains."""
 
     def __init__(self, url: str, path: Path) -> None:
         self._client = Client(url, patience_s=0.0)
@@ -121,7 +121,7 @@ class Preview:
         self._seconds: float | None = None
 
     def look(self, job: JobView) -> None:
-        """Ask for it, now that the job is there; one that does not come is asked for next time."""
+        """Ask for the render if the job trains and there is none yet; ignore a refusal."""
         if job.state is not JobState.RUNNING or job.stage != TRAINING or self._seconds is not None:
             return
         self._began_s = self._began_s or time.monotonic()
@@ -134,7 +134,7 @@ class Preview:
             self._seconds = time.monotonic() - self._began_s
 
     def written(self) -> dict[Path, str]:
-        """The file, and what it shows."""
+        """The file and what it shows; empty if no render came."""
         self._client.close()
         if self._seconds is None:
             return {}
@@ -142,7 +142,7 @@ class Preview:
 
 
 def make_clip(clip: Path) -> Path:
-    """A folder in StereoMIS layout: synthetic tissue that breathes, and an instrument in front of it."""
+    """A folder in StereoMIS layout: synthetic breathing tissue with an instrument in front."""
     say(f"making a stereo clip of synthetic tissue: {FRAMES} frames of {WIDTH} x {HEIGHT}, an instrument in front")
     size = ("--frames", str(FRAMES), "--width", str(WIDTH), "--height", str(HEIGHT), "--seed", str(SEED))
     command = [sys.executable, "-m", "worker", "phantom", *size, "--format", "stereomis", "--out", str(clip)]
@@ -152,7 +152,7 @@ def make_clip(clip: Path) -> Path:
 
 
 def zipped(clip: Path) -> Path:
-    """The folder as one file that can be sent; PNGs are compressed already."""
+    """The folder as one zip file, stored, because PNGs are compressed already."""
     archive = clip.with_suffix(".zip")
     with zipfile.ZipFile(archive, "w") as file:
         for path in sorted(clip.rglob("*")):
@@ -161,17 +161,17 @@ def zipped(clip: Path) -> Path:
 
 
 def recorded(clip: Path, frame: int) -> bytes:
-    """The left eye's PNG."""
+    """The PNG of one frame of the left eye."""
     return (clip / f"{frame:06d}l.png").read_bytes()
 
 
 def time_of(frame: int) -> float:
-    """Model time of a frame, as docs/conventions.md has it."""
+    """Model time of a frame (docs/conventions.md)."""
     return frame / FRAMES
 
 
 def save_renders(client: Client, scene: str, out: Path) -> dict[Path, str]:
-    """Each shown time from the endoscope, and each view at one time, as PNG files of their own."""
+    """Write one PNG per shown frame from the endoscope's pose, and one per other view at VIEWED_FRAME."""
     folder = out / "renders"
     folder.mkdir(exist_ok=True)
     asked: list[tuple[str, float, str | None]] = [
@@ -187,7 +187,7 @@ def save_renders(client: Client, scene: str, out: Path) -> dict[Path, str]:
 
 
 def save_sheet(client: Client, scene: str, clip: Path, report: Report, out: Path) -> dict[Path, str]:
-    """All on one sheet: what was recorded, the same moments without the instrument, other views, geometry."""
+    """Draw a sheet with four rows: recorded frames, the same rendered, other views, geometry."""
     held_out = {each.frame for each in report.frames}
     captions = [
         f"t = {time_of(frame):.3g}" + (", not trained on" if frame in held_out else "") for frame in SHOWN_FRAMES
@@ -213,7 +213,7 @@ def save_sheet(client: Client, scene: str, clip: Path, report: Report, out: Path
 
 
 def geometry_of(client: Client, scene: str, t: float) -> list[Panel]:
-    """Depth in mm and confidence, from the endoscope and from the first of the other views."""
+    """Depth in mm and confidence, from the endoscope's pose and from the first of VIEWS."""
     name, pose = next(iter(VIEWS.items()))
     panels = [depth_panel(client, scene, t, None, "depth"), depth_panel(client, scene, t, pose, f"depth {name}")]
     for where, caption in ((None, "confidence"), (pose, f"confidence {name}")):
@@ -223,8 +223,8 @@ def geometry_of(client: Client, scene: str, t: float) -> list[Panel]:
 
 
 def depth_panel(client: Client, scene: str, t: float, pose: str | None, caption: str) -> Panel:
-    """Depth in mm; where nothing solid is, no colour."""
-    import numpy as np  # the client needs it for arrays only
+    """Depth in mm; no colour where depth is invalid."""
+    import numpy as np  # only here, to keep the command line light
 
     depth_mm = client.render(t, scene=scene, pose=pose, layer="depth", format="npy").array()
     valid = np.where(depth_mm > 0, depth_mm, np.nan)
@@ -234,7 +234,7 @@ def depth_panel(client: Client, scene: str, t: float, pose: str | None, caption:
 
 
 def strip_of(client: Client, scene: str, clip: Path) -> list[Panel]:
-    """The README's picture: one moment recorded, without the instrument, from another side, and its depth."""
+    """Panels of the README's picture: one moment recorded, rendered, from another side, and its depth."""
     t, (name, pose) = time_of(VIEWED_FRAME), next(iter(VIEWS.items()))
     return [
         Panel("recorded, left eye", recorded(clip, VIEWED_FRAME)),
@@ -245,7 +245,7 @@ def strip_of(client: Client, scene: str, clip: Path) -> list[Panel]:
 
 
 def save_curve(curve_csv: str, report: Report, out: Path) -> dict[Path, str]:
-    """The chart of speed against accuracy, and its numbers."""
+    """Draw accuracy over seconds of training, and write its numbers."""
     table, chart = out / "curve.csv", out / "curve.png"
     table.write_text(curve_csv)
     title = f"{len(report.frames)} of {FRAMES} frames held out, eight at a time; synthetic tissue, two eyes in"
@@ -254,7 +254,7 @@ def save_curve(curve_csv: str, report: Report, out: Path) -> dict[Path, str]:
 
 
 def baselines_of(report: Report) -> dict[str, float]:
-    """What copying neighbouring frames scores, by what the chart calls it."""
+    """Scores of the copy baselines in dB, by their labels in the chart."""
     stated = {
         "copying: neighbours blended": report.baseline_blend_db,
         "copying: neighbours warped by optical flow": report.baseline_flow_db,
@@ -263,7 +263,7 @@ def baselines_of(report: Report) -> dict[str, float]:
 
 
 def summary_of(report: Report) -> str:
-    """The figures that tell how good the scene is."""
+    """One line with the scene's quality."""
     copies = ", ".join(
         f"{name.removeprefix('copying: ')} {value:.1f} dB" for name, value in baselines_of(report).items()
     )
@@ -276,7 +276,7 @@ def summary_of(report: Report) -> str:
 
 @contextmanager
 def started_service(data_dir: Path, log: Path) -> Iterator[Client]:
-    """`intrasplat up` on a free port until the context ends; its messages go into log.
+    """A client of an `intrasplat up` that runs on a free port until the context ends and writes to `log`.
 
     Raises:
         UnavailableError: it does not become ready.
@@ -307,7 +307,7 @@ def started_service(data_dir: Path, log: Path) -> Iterator[Client]:
 
 
 def free_port() -> int:
-    """A port of the loopback interface that nobody listens on now."""
+    """A free port of the loopback interface."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -315,7 +315,7 @@ def free_port() -> int:
 
 
 def say(text: str) -> None:
-    """A line for whoever watches."""
+    """Print a line of progress."""
     print(f"demo: {text}", file=sys.stderr, flush=True)
 
 

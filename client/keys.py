@@ -1,7 +1,7 @@
 """`intrasplat keys`: make, list and revoke the API keys of an installation, in its data directory.
 
-The commands work on the file that the services read (contract/access/keys.py), so whoever may use them is whoever may
-read the clips anyway; run them as the user that runs the service.
+The commands edit the file that the services read (contract/access/keys.py). Run them as the user that runs the service:
+that user can read the clips anyway.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from contract.wire.errors import InputError
 
 
 def add_keys(commands: Commands) -> None:
-    """Add the command with its own three."""
+    """Add `keys` with create, list and revoke."""
     parser = commands.add_parser("keys", help="make, list and revoke API keys", description="API keys of a service.")
     own: Commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     create = add_command(own, "create", "make a key and print it, this once", _create)
@@ -44,7 +44,7 @@ def _create(options: argparse.Namespace) -> int:
     try:
         _record(options, AuditAction.KEY_CREATED, key)
     except BaseException:
-        keys.revoke(key.key_id)  # nobody has seen it
+        keys.revoke(key.key_id)  # it was never shown
         raise
     print(text)
     print(f"{_line(key)}\nKeep the key; it is not shown again.", file=sys.stderr)

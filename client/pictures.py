@@ -18,10 +18,10 @@ SHEET_DPI = 130
 CURVE_DPI = 110
 STRIP_DPI = 115
 STRIP_COLOURS = 256
-"""Wet tissue shows no bands with this many, and the file stays below 400 kB."""
+"""Enough for wet tissue without bands; the file stays below 400 kB."""
 CURVE_COLOUR = "#00707a"
 BASELINE_COLOURS = ("#b35900", "#6b4e9b")
-"""Told apart in print and by the colour-blind; the lines are dashed differently as well."""
+"""Distinct in print and for the colour-blind; the lines also differ in dashes."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Panel:
 
 
 def draw_sheet(title: str, rows: Sequence[tuple[str, Sequence[Panel]]], path: Path) -> None:
-    """Rows of panels, each row with its name at the left."""
+    """Draw rows of panels, each row with its name at the left."""
     columns = max(len(panels) for _, panels in rows)
     size = (PANEL_INCHES[0] * columns + 0.4, (PANEL_INCHES[1] + 0.25) * len(rows) + 0.4)
     figure, axes = _figure(columns, len(rows), size)
@@ -52,7 +52,7 @@ def draw_sheet(title: str, rows: Sequence[tuple[str, Sequence[Panel]]], path: Pa
 
 
 def draw_strip(panels: Sequence[Panel], path: Path) -> None:
-    """One row of panels as a PNG with a palette, small enough for a page."""
+    """Draw one row of panels as a PNG with a palette, which keeps the file small."""
     from PIL import Image
 
     figure, axes = _figure(len(panels), 1, (PANEL_INCHES[0] * len(panels), PANEL_INCHES[1] + 0.2))
@@ -65,7 +65,7 @@ def draw_strip(panels: Sequence[Panel], path: Path) -> None:
 
 
 def draw_curve(curve_csv: str, baselines_db: dict[str, float], title: str, path: Path) -> None:
-    """Speed against accuracy: held-out psnr_tissue over seconds of training, the copy baselines dashed."""
+    """Draw held-out psnr_tissue over seconds of training, with the copy baselines as dashed lines."""
     rows = list(csv.DictReader(io.StringIO(curve_csv)))
     seconds = [float(row["t_train_s"]) for row in rows]
     decibels = [float(row["psnr_tissue_db"]) for row in rows]
@@ -103,7 +103,7 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
 
 
 def _figure(columns: int, rows: int, size_inches: tuple[float, float]) -> tuple[Any, list[Any]]:
-    """A figure that needs no display, and its axes in reading order."""
+    """A figure without a display, and its axes in reading order."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

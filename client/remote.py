@@ -23,7 +23,7 @@ URL_VARIABLE = "INTRASPLAT_URL"
 
 
 def add_remote(commands: Commands) -> None:
-    """Add them all."""
+    """Add the parsers of all these commands."""
     _add_submit(commands)
     watch = add_command(commands, "watch", "wait for a job, with a progress bar", _watch)
     _add_fetch(commands)
@@ -81,7 +81,7 @@ def _add_service(parser: argparse.ArgumentParser) -> None:
 
 
 def _client(options: argparse.Namespace, if_conflict: str | None = None) -> AbstractContextManager[Client]:
-    """A client of the chosen service; if_conflict: what to say where the job is not in a state for the command."""
+    """A client of the chosen service; if_conflict: the remedy where the job's state does not allow the command."""
     remedies: Remedies = {} if if_conflict is None else {Conflict: if_conflict}
     return connected(options.url, options.api_key, remedies)
 
@@ -121,7 +121,7 @@ def _show_until_done(client: Client, job_id: str) -> int:
 
 
 def progress_of(job: JobView) -> JobProgress:
-    """What the bar shows of a job; before its first report that is its state."""
+    """What the progress bar shows: the stage, or the state of a job that has not reported a stage."""
     if job.stage is None or job.state is JobState.QUEUED:
         return JobProgress(stage=job.state.value, fraction=0.0, seconds_left=job.eta_s)
     return JobProgress(

@@ -135,7 +135,7 @@ def worker_names(first: str, number: int) -> list[str]:
 
 
 def say(text: str) -> None:
-    """A line for whoever watches the launcher."""
+    """Print a message of the launcher."""
     print(f"intrasplat: {text}", file=sys.stderr, flush=True)
 
 
