@@ -21,6 +21,8 @@ from contract.wire.report import Report
 MODELS = Path(__file__).resolve().parent / "intrasplat_client" / "models.py"
 READ = (JobView, Report)
 """What the service answers with; types that these contain follow."""
+CLOSED = ("JobState",)
+"""Enumerations whose every member a reader must know. Of others, a member that a later version adds is read as text."""
 GIVEN_ALSO = {"holdout": "list[int]"}
 """Forms that the service accepts besides the schema's."""
 EXCLUSIVE_OPTIONS = (JobOptions.exclusive,)
@@ -89,7 +91,7 @@ def _emit(name: str, definitions: Mapping[str, Any], done: dict[str, str]) -> No
     for other in _references(definitions[name]):
         _emit(other, definitions, done)
     schema = definitions[name]
-    done[name] = "".join(_enum(name, schema) if "enum" in schema else _model(name, schema))
+    done[name] = "".join(_enum(name, schema) if "enum" in schema else _model(name, schema, definitions))
 
 
 def _references(schema: object) -> Iterator[str]:
@@ -109,12 +111,12 @@ def _enum(name: str, schema: Mapping[str, Any]) -> Iterator[str]:
         yield f"    {_member(value)} = {value!r}\n"
 
 
-def _model(name: str, schema: Mapping[str, Any]) -> Iterator[str]:
+def _model(name: str, schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> Iterator[str]:
     yield f"class {name}(Model):\n" + _docstring(schema["description"]) + "\n"
     required = schema.get("required", ())
     for field, kind in schema["properties"].items():
         default = "" if field in required else f" = {_default(kind)}"
-        yield f"    {field}: {_read_type(kind)}{default}\n" + _docstring(kind.get("description"))
+        yield f"    {field}: {_read_type(kind, definitions)}{default}\n" + _docstring(kind.get("description"))
 
 
 def _given(schema: Mapping[str, Any]) -> Iterator[str]:
@@ -124,16 +126,18 @@ def _given(schema: Mapping[str, Any]) -> Iterator[str]:
         yield f"    {field}: {_given_type(kind)}{also}\n" + _docstring(kind.get("description"))
 
 
-def _read_type(kind: Mapping[str, Any]) -> str:
+def _read_type(kind: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
     """The type of a field that the service sends: no bounds and no fixed choices, because a later version adds some."""
     if "$ref" in kind:
-        return _name_of(kind)
+        name = _name_of(kind)
+        is_open = "enum" in definitions[name] and name not in CLOSED
+        return f'Annotated[{name} | str, Field(union_mode="left_to_right")]' if is_open else name
     if "anyOf" in kind:
-        return " | ".join(_read_type(each) for each in kind["anyOf"])
+        return " | ".join(_read_type(each, definitions) for each in kind["anyOf"])
     if kind["type"] == "array":
-        return f"tuple[{_read_type(kind['items'])}, ...]"
+        return f"tuple[{_read_type(kind['items'], definitions)}, ...]"
     if kind["type"] == "object":
-        return f"dict[str, {_read_type(kind['additionalProperties'])}]"
+        return f"dict[str, {_read_type(kind['additionalProperties'], definitions)}]"
     return SCALARS[kind["type"]]
 
 
