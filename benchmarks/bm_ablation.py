@@ -20,14 +20,15 @@ from bm_train import append, commit, machine
 
 from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, open_clip, split_frames
-from worker.machine.hooks import Hooks
 from worker.model.metrics import psnr_tissue
 from worker.model.optimize import Rate
 from worker.phantom import PhantomSettings, make_phantom
-from worker.train.looking import held_out_psnr, sample_frames, view_function
-from worker.train.loop import Stopwatch, train
+from worker.train.hooks import TrainingHooks
+from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS, Preset
+from worker.train.scoring import frame_renderer, held_out_psnr, sample_frames
+from worker.train.setup import Setup
 
 FIELDS = (
     "change", "clip", "holdout", "iterations", "seed", "start_db", "psnr_tissue_db", "train_db", "gaussians", "bases",
@@ -53,7 +54,7 @@ CHANGES: dict[str, Preset] = {
     ),
     "Adam's moments as published": _rates(beta1=_PAPER.rates.beta1, beta2=_PAPER.rates.beta2),
     "plain L1 of colour": dataclasses.replace(_FAST, loss=dataclasses.replace(_FAST.loss, colour_zone=0.0)),
-    "rates fall once, nothing averaged": dataclasses.replace(_FAST, cycles=False, worth_db=None),
+    "rates fall once, nothing averaged": dataclasses.replace(_FAST, warm_restarts=False, min_gain_db=None),
     "opacity 0.8, spread 0.6": dataclasses.replace(_FAST, opacity=0.8, spread=0.6),
     "9 bases": dataclasses.replace(_FAST, bases=9),
     "20 k points": dataclasses.replace(_FAST, points_per_image=20_000),
@@ -102,12 +103,11 @@ def measure(
     """Train and score one cell; its row."""
     split = split_frames(clip, holdout)
     options = ReconstructionOptions(iterations=iterations, seed=seed)
-    clock = Stopwatch()
-    run, scale = prepare(clip, split, CHANGES[change], options, clock)
-    view_of = view_function(run, scale)
-    start = held_out_psnr(clip, split, view_of)
-    train(run, clock, lambda: held_out_psnr(clip, split, view_of), Hooks())
-    trained = [psnr_tissue(view_of(i).rgb, clip.rgb[i], clip.tissue[i]) for i in sample_frames(split.train)]
+    run = prepare(Setup(clip, split, CHANGES[change], options))
+    render = frame_renderer(run)
+    start = held_out_psnr(run, render)
+    train(run, run.setup.clock, lambda: held_out_psnr(run, render), TrainingHooks())
+    trained = [psnr_tissue(render(i).rgb, clip.rgb[i], clip.tissue[i]) for i in sample_frames(split.train)]
     _, deformation = run.model.export()
     row: dict[str, object] = {
         "change": change, "clip": clip_name, "holdout": holdout, "iterations": iterations, "seed": seed,

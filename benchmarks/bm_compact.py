@@ -19,14 +19,17 @@ from bm_train import append
 from contract.wire.options import ReconstructionOptions
 from worker.evaluate.rows import commit, machine
 from worker.input.clip import DepthClip, open_clip, split_frames
-from worker.machine.hooks import Hooks
+from worker.machine.timing import Stopwatch
 from worker.pipeline import scene_of
-from worker.render.shrink import model_of, shrink
 from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
-from worker.train.looking import held_out_psnr, view_function
-from worker.train.loop import Stopwatch, train
+from worker.scene.model import model_of
+from worker.train.hooks import TrainingHooks
+from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
+from worker.train.rate_distortion import quantize_scene
+from worker.train.scoring import frame_renderer, held_out_psnr
+from worker.train.setup import Setup
 
 FIELDS = (
     "clip", "iterations", "gaussians", "bases", "held_out_db", "tolerance_db", "step", "train_loss_db",
@@ -55,29 +58,30 @@ def rows_of(path: Path, iterations: int, tolerances_db: list[float]) -> list[dic
     if not isinstance(clip, DepthClip):
         raise SystemExit(f"{path} has no depth; give a folder in the EndoNeRF layout.")
     split = split_frames(clip)
-    run, scale = prepare(clip, split, PRESETS["fast"], ReconstructionOptions(iterations=iterations), Stopwatch())
-    train(run, Stopwatch(), lambda: float("nan"), Hooks())
-    scene = scene_of(run, clip, split, scale, 0)
-    exact_db = held_out_psnr(clip, split, view_function(run, scale))
+    run = prepare(Setup(clip, split, PRESETS["fast"], ReconstructionOptions(iterations=iterations)))
+    train(run, Stopwatch(), lambda: float("nan"), TrainingHooks())
+    scene = scene_of(run)
+    exact_db = held_out_psnr(run, frame_renderer(run))
     rows: list[dict[str, object]] = []
     for tolerance_db in tolerances_db:
         start = time.perf_counter()
-        shrunk = shrink(scene, clip, run.frames, tolerance_db)
+        quantized = quantize_scene(scene, clip, run.frames, tolerance_db)
         shrink_s = time.perf_counter() - start
-        if shrunk is None:
+        if quantized is None:
             continue
         with tempfile.TemporaryDirectory() as folder:
-            save_scene(Path(folder), shrunk.scene)
+            save_scene(Path(folder), quantized.scene)
             start = time.perf_counter()
             loaded = load_scene(Path(folder))
             load_s = time.perf_counter() - start
             scene_bytes, manifest_bytes = ((Path(folder) / name).stat().st_size for name in (SCENE_FILE, MANIFEST_FILE))
-        stored_db = held_out_psnr(clip, split, view_function(run, scale, model_of(loaded)))
+        stored_db = held_out_psnr(run, frame_renderer(run, model_of(loaded)))
         rows.append(
             {
                 "clip": path.name, "iterations": iterations, "gaussians": len(loaded.gaussians),
-                "bases": len(shrunk.scene.deformation.constants()["centre"]), "held_out_db": f"{exact_db:.2f}",
-                "tolerance_db": tolerance_db, "step": f"{shrunk.step:.3g}", "train_loss_db": f"{shrunk.loss_db:.3f}",
+                "bases": len(quantized.scene.deformation.constants()["centre"]), "held_out_db": f"{exact_db:.2f}",
+                "tolerance_db": tolerance_db, "step": f"{quantized.step:.3g}",
+                "train_loss_db": f"{quantized.loss_db:.3f}",
                 "held_out_loss_db": f"{exact_db - stored_db:.3f}", "float_mb": f"{scene.byte_count / 1e6:.2f}",
                 "scene_mb": f"{scene_bytes / 1e6:.3f}", "manifest_mb": f"{manifest_bytes / 1e6:.3f}",
                 "shrink_s": f"{shrink_s:.2f}", "load_s": f"{load_s:.2f}", "machine": machine(), "commit": commit(),

@@ -29,14 +29,16 @@ from worker.daemon.serve import NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.input.clip import DepthClip, split_frames
-from worker.machine.hooks import Hooks
+from worker.machine.timing import Stopwatch
 from worker.phantom import PhantomSettings, make_phantom
 from worker.pipeline import snapshot_of
 from worker.raster.cpu import compile_kernels
 from worker.scene.scene import Scene
-from worker.train.loop import Stopwatch, train
+from worker.train.hooks import TrainingHooks
+from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
+from worker.train.setup import Setup
 
 CLIP = PhantomSettings(width=640, height=512, frames=24)
 JOB = "0" * 32
@@ -95,17 +97,17 @@ def trained(clip: DepthClip, iterations: int, pace: Pace | None) -> Figures:
     """One training run, with a viewer if there is a pace for one."""
     split = split_frames(clip)
     options = ReconstructionOptions(iterations=iterations)
-    run, scale = prepare(clip, split, PRESETS["fast"], options, Stopwatch())
+    run = prepare(Setup(clip, split, PRESETS["fast"], options))
     snapshots, figures, end = Snapshots(), Figures(gaussians=run.model.count), threading.Event()
     snapshots.begin(JOB)
 
     def copy() -> Scene:
         start = time.perf_counter()
-        scene = snapshot_of(run, clip, split, scale, 0)
+        scene = snapshot_of(run)
         figures.copy_ms.append((time.perf_counter() - start) * 1e3)
         return scene
 
-    hooks = Hooks(wants_snapshot=snapshots.wanted, on_snapshot=snapshots.offer)
+    hooks = TrainingHooks(wants_snapshot=snapshots.wanted, on_snapshot=snapshots.offer)
     with ExitStack() as beside:
         start = time.perf_counter()
         if pace is not None:

@@ -154,9 +154,9 @@ def _frames(text: str) -> list[int]:
 
 def _reconstruct(options: argparse.Namespace) -> int:
     from worker.daemon.orders import job_progress
-    from worker.machine.hooks import Hooks
     from worker.pipeline import reconstruct
     from worker.scene.resume_file import RESUME_FILE
+    from worker.train.hooks import TrainingHooks
     from worker.train.request import ReconstructionRequest
 
     out: Path = options.out
@@ -177,7 +177,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     before = {number: signal.signal(number, _once(interrupted)) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with ProgressBar(sys.stderr) as bar:
-            hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
+            hooks = TrainingHooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
             reconstruct(request, out, hooks)
     except Cancelled as error:
         again = " The same command goes on from there." if (out / RESUME_FILE).exists() else ""

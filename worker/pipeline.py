@@ -6,7 +6,6 @@ import dataclasses
 import json
 import platform
 import time
-from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
@@ -18,36 +17,40 @@ from contract.wire.errors import Cancelled
 from contract.wire.names import CURVE, REPORT
 from contract.wire.report import Report
 from worker.input.calibration import rectify
-from worker.input.clip import DepthClip, FrameSplit, held_out_frames, split_frames
+from worker.input.clip import DepthClip, held_out_frames, split_frames
 from worker.input.decode import decode_clip
 from worker.machine.hooks import Hooks, Progress
+from worker.machine.timing import Timings
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
-from worker.render.shrink import Shrunk, shrink
-from worker.render.view import model_of
 from worker.report.baselines import copy_baselines
 from worker.report.quality import Training, build_report, measure
 from worker.report.visibility import drop_strays, seen_share
 from worker.scene.checkpoint import save_scene
 from worker.scene.compact import compile_coder
+from worker.scene.model import model_of
 from worker.scene.resume_file import RESUME_FILE
 from worker.scene.scene import Scene
 from worker.stereo import estimate_depth
-from worker.train.looking import View, held_out_psnr, sample_frames, view_function
-from worker.train.loop import Run, Stopwatch, train, write_curve
-from worker.train.prepare import Seconds, fixed_iterations, prepare, report_stage, timed
+from worker.train.hooks import RenderedFrame, TrainingHooks
+from worker.train.loop import train
+from worker.train.prepare import prepare
 from worker.train.presets import preset_named
+from worker.train.rate_distortion import QuantizedScene, quantize_scene
 from worker.train.request import ReconstructionRequest
 from worker.train.resume import resume, save_run
+from worker.train.run import Run, write_curve
+from worker.train.scoring import FrameRenderer, frame_renderer, held_out_psnr, sample_frames
+from worker.train.setup import Setup
 
 VERSIONED = ("intrasplat", "torch", "numba")
 """What decides a scene's numbers; the report names their versions."""
 
 
-def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> Report:
+def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Report:
     """Clip in; manifest.json, scene.safetensors, report.json and curve.csv out, in out_dir.
 
-    A stopped run leaves its state in out_dir; the same request on the same folder goes on from there.
+    A stopped run leaves its state in out_dir; the same request on the same folder resumes it.
 
     Raises:
         InputError: the clip, its calibration, masks or an option cannot be used.
@@ -55,54 +58,52 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: Hooks) -> 
         TrainingDiverged: training left the finite numbers; nothing is written.
         Cancelled: hooks.should_stop said so.
     """
-    accepted_at_s = request.accepted_at_s or time.time()
+    setup = begin(request, out_dir, hooks)
+    run = prepare(setup)
+    if (resumed_s := resume(out_dir, run)) is not None:
+        setup.clock.restart(resumed_s)
+    try:
+        optimise(run)
+        scene, quantized = finish(run)
+        report = assess(run, scene, quantized)
+    except Cancelled:
+        save_run(out_dir, run, setup.timings.seconds.get("t_train_s", setup.clock.elapsed_s))
+        raise
+    publish(out_dir, run, scene, report)
+    return report
+
+
+def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Setup:
+    """The clip with depth, its split, its preset, the device and compiled kernels; then the clock starts."""
+    accepted_at_s, timings = request.accepted_at_s or time.time(), Timings()
     options = request.options
     preset = request.own_preset or preset_named(options.preset, options.budget_s)
     device = device_for(preset.deformation, request.device)
     out_dir.mkdir(parents=True, exist_ok=True)
-    seconds: Seconds = {}
-
-    clip = depth_clip_of(request, hooks, seconds, device)
+    clip = open_with_depth(request, hooks, timings, device)
     split = split_frames(clip, options.holdout)
-    seconds["compile_s"] = seconds.get("compile_s", 0.0) + compile_coder()
+    timings.add("compile_s", compile_coder())
     if device == CPU:
-        seconds["compile_s"] += compile_kernels(partial(report_stage, hooks, "compile"))
-    clock = Stopwatch()
-    run, scale = prepare(clip, split, preset, options, clock, hooks, seconds, device)
-    resumed_s = resume(out_dir, run)
-    clock = Stopwatch(resumed_s) if resumed_s is not None else clock
-    try:
-        optimise(run, clip, split, clock, hooks, seconds)
-        scene, shrunk = finish(run, clip, split, hooks, seconds)
-        view_of = reporting(run, view_function(run, scale, model_of(scene, device) if shrunk else None), split, hooks)
-        report = report_of(run, clip, split, scene, shrunk, request, seconds, view_of, accepted_at_s)
-    except Cancelled:
-        save_run(out_dir, run, seconds.get("t_train_s", clock.elapsed_s))
-        raise
-    hooks.on_progress(Progress("score", 1.0, run.iteration, run.iterations, report.psnr_tissue_db))
-    publish(out_dir, scene, report, run)
-    return report
+        timings.add("compile_s", compile_kernels(partial(hooks.report_stage, "compile")))
+    idle = device != choose_device(request.device)
+    return Setup(clip, split, preset, options, device, hooks, timings, accepted_at_s=accepted_at_s, gpu_is_idle=idle)
 
 
-def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: Seconds, device: Device = CPU) -> DepthClip:
+def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
     """Decode, and for stereo input rectify and match: the left frames with depth."""
     if isinstance(request.clip, DepthClip):
         return request.clip
-    path = request.clip
-    report_stage(hooks, "decode", 0.0)
-    decoded = timed(
-        seconds,
-        "decode_s",
-        lambda: decode_clip(
-            path,
+    hooks.report_stage("decode", 0.0)
+    with timings.measure("decode_s"):
+        decoded = decode_clip(
+            request.clip,
             request.right,
             calibration=request.calibration,
             masks=request.masks,
             options=request.options,
             limits=request.limits,
             hooks=hooks,
-        ),
-    )
+        )
     if isinstance(decoded, DepthClip):
         return decoded
     rectified = rectify(decoded.clip, decoded.calibration)
@@ -110,71 +111,52 @@ def depth_clip_of(request: ReconstructionRequest, hooks: Hooks, seconds: Seconds
     held_out = set(held_out_frames(frame_count, request.options.holdout))
     measured = [i for i in range(frame_count) if i not in held_out]
     if device != CPU:  # before it matches anything
-        report_stage(hooks, "compile", 0.0)
-        seconds["compile_s"] = seconds.get("compile_s", 0.0) + examine(device)
-    matched = partial(estimate_depth, rectified, hooks, measured_frames=measured, device=device.kind)
-    return timed(seconds, "stereo_s", matched)
+        hooks.report_stage("compile", 0.0)
+        timings.add("compile_s", examine(device))
+    with timings.measure("stereo_s"):
+        return estimate_depth(rectified, hooks, measured_frames=measured, device=device.kind)
 
 
-def optimise(run: Run, clip: DepthClip, split: FrameSplit, clock: Stopwatch, hooks: Hooks, seconds: Seconds) -> None:
-    """Train run to its last iteration, scoring held-out frames and showing snapshots on the way."""
-    started_s, scale = clock.elapsed_s, run.frames.scale
-    view_of = view_function(run, scale)
-    train(
-        run,
-        clock,
-        evaluate=lambda: held_out_psnr(clip, split, view_of, hooks),
-        hooks=hooks,
-        copy_scene=lambda: snapshot_of(run, clip, split, scale, run.seed),
-    )
-    seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
+def optimise(run: Run) -> None:
+    """Train run to its last iteration; score held-out frames and offer snapshots on the way."""
+    clock, started_s = run.setup.clock, run.setup.clock.elapsed_s
+    render = frame_renderer(run)
+    train(run, clock, lambda: held_out_psnr(run, render), run.setup.hooks, copy_scene=lambda: snapshot_of(run))
+    run.setup.timings.seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
 
 
-def finish(run: Run, clip: DepthClip, split: FrameSplit, hooks: Hooks, seconds: Seconds) -> tuple[Scene, Shrunk | None]:
-    """What is kept of a trained run, in whole numbers where that loses next to nothing, and what it did lose."""
-    hooks.on_progress(Progress("finish", 0.0, run.iteration, run.iterations))
-    scene = timed(seconds, "finish_s", lambda: scene_of(run, clip, split, run.frames.scale, run.seed))
-    shrunk = timed(seconds, "shrink_s", lambda: shrink(scene, clip, run.frames, device=run.device))
-    return (shrunk.scene if shrunk else scene), shrunk
+def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
+    """The scene to keep, quantized where that loses next to nothing, and what it loses."""
+    run.setup.hooks.on_progress(Progress("finish", 0.0, run.iteration, run.iterations))
+    with run.setup.timings.measure("finish_s"):
+        scene = scene_of(run)
+    with run.setup.timings.measure("shrink_s"):
+        quantized = quantize_scene(scene, run.setup.clip, run.frames, device=run.device)
+    return (quantized.scene if quantized else scene), quantized
 
 
-def reporting(run: Run, view_of: Callable[[int], View], split: FrameSplit, hooks: Hooks) -> Callable[[int], View]:
-    """view_of that reports the scoring of frames as it goes."""
-    total, done = len(split.held_out) + len(sample_frames(split.train)), 0
-
-    def reported(index: int) -> View:
-        nonlocal done
-        latest = run.curve[-1].psnr_tissue_db if run.curve else None
-        hooks.on_progress(Progress("score", done / total, run.iteration, run.iterations, latest))
-        if hooks.should_stop():
-            raise Cancelled("Stopped while scoring.")
-        done += 1
-        return view_of(index)
-
-    return reported
+def scene_of(run: Run) -> Scene:
+    """The scene of a trained run; strays are removed from its model first."""
+    drop_strays(run.model, run.setup.clip, run.frames)
+    seen = torch.from_numpy(seen_share(run.model, run.setup.clip, run.frames))
+    return dataclasses.replace(snapshot_of(run), seen=seen)
 
 
-def scene_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: int) -> Scene:
-    """What is kept of a finished run; strays are taken out of its model first."""
-    drop_strays(run.model, clip, run.frames)
-    seen = torch.from_numpy(seen_share(run.model, clip, run.frames))
-    return dataclasses.replace(snapshot_of(run, clip, split, scale, seed), seen=seen)
-
-
-def snapshot_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed: int) -> Scene:
-    """A copy of what training has come to. Nobody has looked yet what it saw: seen is 0, and so is the confidence."""
+def snapshot_of(run: Run) -> Scene:
+    """A copy of the model as it is now. What it saw is not measured: seen is 0, and so is the confidence."""
     gaussians, deformation = run.model.export()
+    clip = run.setup.clip
     return Scene(
         gaussians=gaussians,
         deformation=deformation,
         intrinsics=clip.intrinsics,
         world_from_camera=clip.world_from_camera,
         frame_times_s=clip.frame_times_s,
-        units_per_mm=scale,
+        units_per_mm=run.frames.scale,
         preset=run.preset.name,
-        trained_t=tuple(float(clip.t[i]) for i in split.train),
+        trained_t=tuple(float(clip.t[i]) for i in run.setup.split.train),
         seen=torch.zeros(len(gaussians)),
-        seed=seed,
+        seed=run.seed,
         settings={
             "made_iterations": run.iteration,
             "schedule": run.schedule.settings,
@@ -183,37 +165,43 @@ def snapshot_of(run: Run, clip: DepthClip, split: FrameSplit, scale: float, seed
     )
 
 
-def report_of(
-    run: Run,
-    clip: DepthClip,
-    split: FrameSplit,
-    scene: Scene,
-    shrunk: Shrunk | None,
-    request: ReconstructionRequest,
-    seconds: Seconds,
-    view_of: Callable[[int], View],
-    accepted_at_s: float,
-) -> Report:
-    """Score the held-out frames beside the copy baselines and say what to distrust.
+def assess(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Report:
+    """Score the held-out frames beside the copy baselines, and say what to distrust.
 
-    The curve's last point becomes the score over all held-out frames of the model as it is kept; the points before it
+    The curve's last point becomes the score over all held-out frames of the scene as it is kept; the points before it
     are over at most sixteen of them.
     """
-    start = time.perf_counter()
-    held_out = measure(clip, split.held_out, view_of)
-    trained = measure(clip, sample_frames(split.train), view_of)
-    baselines = copy_baselines(clip, split.train, split.held_out)
-    seconds |= {"score_s": time.perf_counter() - start, "t_post_s": time.time() - accepted_at_s}
-    training = training_of(run, scene, shrunk, request, seconds)
-    report = build_report(clip, split, held_out, trained, baselines, training)
+    clip, split, timings = run.setup.clip, run.setup.split, run.setup.timings
+    render = _reporting(run, frame_renderer(run, model_of(scene, run.setup.device) if quantized else None))
+    with timings.measure("score_s"):
+        held_out = measure(clip, split.held_out, render)
+        trained = measure(clip, sample_frames(split.train), render)
+        baselines = copy_baselines(clip, split.train, split.held_out)
+    timings.seconds["t_post_s"] = time.time() - run.setup.accepted_at_s
+    report = build_report(clip, split, held_out, trained, baselines, _training(run, scene, quantized))
     if report.psnr_tissue_db is not None and run.curve:
         run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=report.psnr_tissue_db)
+    run.setup.hooks.on_progress(Progress("score", 1.0, run.iteration, run.iterations, report.psnr_tissue_db))
     return report
 
 
-def training_of(
-    run: Run, scene: Scene, shrunk: Shrunk | None, request: ReconstructionRequest, seconds: Seconds
-) -> Training:
+def _reporting(run: Run, render: FrameRenderer) -> FrameRenderer:
+    """The renderer, which reports the progress of scoring at each frame."""
+    total, done = len(run.setup.split.held_out) + len(sample_frames(run.setup.split.train)), 0
+
+    def reported(index: int) -> RenderedFrame:
+        nonlocal done
+        latest = run.curve[-1].psnr_tissue_db if run.curve else None
+        run.setup.hooks.on_progress(Progress("score", done / total, run.iteration, run.iterations, latest))
+        if run.setup.hooks.should_stop():
+            raise Cancelled("Stopped while scoring.")
+        done += 1
+        return render(index)
+
+    return reported
+
+
+def _training(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Training:
     """What the report repeats of the run: what it was made of, what it chose, how long it took."""
     return Training(
         preset=run.preset.name,
@@ -225,26 +213,26 @@ def training_of(
         bases=scene.deformation.bases,
         scene_bytes=scene.file_bytes,
         units_per_mm=scene.units_per_mm,
-        seconds=seconds,
-        assumptions=(*run.chosen, *run.schedule.words, *(shrunk.words if shrunk else ())),
-        measurements=shrunk.measurements if shrunk else {},
-        warnings=training_warnings(run, request),
+        seconds=run.setup.timings.seconds,
+        assumptions=(*run.chosen, *run.schedule.words, *(quantized.words if quantized else ())),
+        measurements=quantized.measurements if quantized else {},
+        warnings=_warnings(run),
         versions={"python": platform.python_version(), **{name: version(name) for name in VERSIONED}},
     )
 
 
-def training_warnings(run: Run, request: ReconstructionRequest) -> tuple[str, ...]:
-    """What the run itself has to say."""
+def _warnings(run: Run) -> tuple[str, ...]:
+    """The warnings of the run itself."""
     said = []
-    if fixed_iterations(request.options, run.preset) is None and run.schedule.planned == run.schedule.epoch:
+    if run.setup.fixed_iterations is None and run.schedule.planned == run.schedule.epoch:
         said.append("The time given allowed less than one step a training frame; one a frame was made all the same.")
-    if run.device != choose_device(request.device):
+    if run.setup.gpu_is_idle:
         said.append(f"The motion of preset {run.preset.name} trains on the CPU only, so the GPU was left idle.")
     return tuple(said)
 
 
-def publish(out_dir: Path, scene: Scene, report: Report, run: Run) -> None:
-    """Write the report, the curve and the scene; what was kept of a stopped run is not needed any more."""
+def publish(out_dir: Path, run: Run, scene: Scene, report: Report) -> None:
+    """Write the report, the curve and the scene; remove the state of a stopped run."""
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)
     save_scene(out_dir, scene, beside=(REPORT, CURVE))

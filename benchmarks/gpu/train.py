@@ -23,13 +23,15 @@ from benchmarks.gpu.rows import CLIP, CLIP_READY, KERNELS_READY, Part
 from contract.wire.errors import Cancelled
 from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, split_frames
-from worker.machine.hooks import Hooks
 from worker.raster.backend import CPU, Device
 from worker.train import loop as training
-from worker.train.looking import held_out_psnr, view_function
-from worker.train.loop import CurvePoint, Run, Stopwatch, train
+from worker.train.hooks import TrainingHooks
+from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS, Preset
+from worker.train.run import CurvePoint, Run
+from worker.train.scoring import frame_renderer, held_out_psnr
+from worker.train.setup import Setup
 
 STAGES = ("motion_s", "capacity_s", "fusion_s", "start_s", "targets_s", "optimise_s", "compile_s")
 THRESHOLDS_DB = {"s_to_paper_less_4_db": -4, "s_to_paper_less_2_db": -2, "s_to_paper_db": 0, "s_to_paper_plus_2_db": 2}
@@ -121,13 +123,12 @@ class Trials:
         """The run, seconds by stage, and why it was cut short if it was."""
         split = split_frames(self._clip, "every8")
         options = ReconstructionOptions(seed=seed, **length)  # type: ignore[arg-type]
-        clock = Stopwatch()
-        seconds: dict[str, float] = {}
-        hooks = Hooks(should_stop=lambda: self._part.left_s < 4)
-        run, scale = prepare(self._clip, split, preset, options, clock, hooks, seconds, device)
-        view_of, begun_s, note = view_function(run, scale), clock.elapsed_s, ""
+        hooks = TrainingHooks(should_stop=lambda: self._part.left_s < 4)
+        run = prepare(Setup(self._clip, split, preset, options, device, hooks))
+        clock, seconds = run.setup.clock, run.setup.timings.seconds
+        render, begun_s, note = frame_renderer(run), clock.elapsed_s, ""
         try:
-            train(run, clock, lambda: held_out_psnr(self._clip, split, view_of), hooks)
+            train(run, clock, lambda: held_out_psnr(run, render), hooks)
         except Cancelled:
             run.model.wait()
             note = f"cut short after {run.iteration} of {run.iterations} iterations"

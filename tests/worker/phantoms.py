@@ -8,13 +8,16 @@ import numpy as np
 
 from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, FrameSplit, split_frames
-from worker.machine.hooks import Hooks
+from worker.machine.timing import Stopwatch
 from worker.phantom import Motion, PhantomSettings, make_phantom
 from worker.pipeline import scene_of
-from worker.train.looking import View, view_function
-from worker.train.loop import Run, Stopwatch, train
+from worker.train.hooks import RenderedFrame, TrainingHooks
+from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS, Preset
+from worker.train.run import Run
+from worker.train.scoring import frame_renderer
+from worker.train.setup import Setup
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 12
 
@@ -58,21 +61,21 @@ def prepared_on(
     """The same on a given split."""
     chosen = PRESETS[preset] if isinstance(preset, str) else preset
     options = ReconstructionOptions(iterations=iterations, seed=seed)
-    return prepare(clip, split, chosen, options, Stopwatch())[0]
+    return prepare(Setup(clip, split, chosen, options))
 
 
-def trained(run: Run, hooks: Hooks | None = None) -> Run:
+def trained(run: Run, hooks: TrainingHooks | None = None) -> Run:
     """The run after its last step, nothing scored."""
-    train(run, Stopwatch(), lambda: float("nan"), hooks or Hooks())
+    train(run, Stopwatch(), lambda: float("nan"), hooks or TrainingHooks())
     return run
 
 
-def view(run: Run, index: int) -> View:
+def view(run: Run, index: int) -> RenderedFrame:
     """Frame `index` as the model shows it from the endoscope's pose."""
-    return view_function(run, run.frames.scale)(index)
+    return frame_renderer(run)(index)
 
 
-def bits(run: Run, clip: DepthClip, split: FrameSplit) -> dict[str, bytes]:
+def bits(run: Run) -> dict[str, bytes]:
     """Every tensor of the scene that the run makes, as bytes."""
-    scene = scene_of(run, clip, split, run.frames.scale, run.seed)
+    scene = scene_of(run)
     return {name: np.ascontiguousarray(each.numpy()).tobytes() for name, each in scene.tensors().items()}

@@ -20,17 +20,19 @@ from contract.wire.options import ReconstructionOptions, parse_options
 from contract.wire.report import Report
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared_on, trained, view
 from worker.input.clip import DepthClip, open_clip, split_frames
-from worker.machine.hooks import Hooks, Progress
+from worker.machine.hooks import Progress
 from worker.model.metrics import coverage, psnr_tissue
 from worker.model.optimize import Rate
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
 from worker.pipeline import reconstruct, scene_of
 from worker.raster.step import camera_vector
-from worker.render.shrink import TOLERANCE_DB, model_of, shrink
 from worker.render.view import render_frame
 from worker.scene.checkpoint import load_scene
+from worker.scene.model import model_of
 from worker.scene.resume_file import RESUME_FILE, load_resume
+from worker.train.hooks import TrainingHooks
 from worker.train.presets import PRESETS, Preset
+from worker.train.rate_distortion import TOLERANCE_DB, quantize_scene
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units
 
@@ -89,7 +91,7 @@ def stereo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(clip: Path, out: Path, hooks: Hooks | None = None, **options: Any) -> Report:
+def run(clip: Path, out: Path, hooks: TrainingHooks | None = None, **options: Any) -> Report:
     """Reconstruct with options and fields of the request by their names; `preset` may be a preset of one's own."""
     options = {"iterations": ITERATIONS, **options}
     if isinstance(options.get("preset"), Preset):
@@ -97,7 +99,7 @@ def run(clip: Path, out: Path, hooks: Hooks | None = None, **options: Any) -> Re
     fields = {field.name for field in dataclasses.fields(ReconstructionRequest)}
     of_request = {name: options.pop(name) for name in fields & options.keys()}
     asked = parse_options(ReconstructionOptions, options)
-    return reconstruct(ReconstructionRequest(clip, asked, **of_request), out, hooks or Hooks())
+    return reconstruct(ReconstructionRequest(clip, asked, **of_request), out, hooks or TrainingHooks())
 
 
 def files(folder: Path) -> set[str]:
@@ -108,8 +110,8 @@ def tensor_bits(folder: Path) -> dict[str, bytes]:
     return {name: tensor.numpy().tobytes() for name, tensor in load_scene(folder).tensors().items()}
 
 
-def stopping_after(iterations: int) -> Hooks:
-    """Hooks that let a run come this far in its training."""
+def stopping_after(iterations: int) -> TrainingHooks:
+    """TrainingHooks that let a run come this far in its training."""
     stages: set[str] = set()
     asked = 0
 
@@ -118,7 +120,7 @@ def stopping_after(iterations: int) -> Hooks:
         asked += "train" in stages
         return asked > iterations
 
-    return Hooks(lambda progress: stages.add(progress.stage), should_stop)
+    return TrainingHooks(lambda progress: stages.add(progress.stage), should_stop)
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -137,7 +139,7 @@ def test_every_preset_makes_a_scene_that_renders(name: str, whole: Whole) -> Non
 
 def test_the_report_tells_what_was_done(clip: Path, tmp_path: Path) -> None:
     told: list[Progress] = []
-    report = run(clip, tmp_path, Hooks(on_progress=told.append), seed=5)
+    report = run(clip, tmp_path, TrainingHooks(on_progress=told.append), seed=5)
     assert Report.model_validate_json((tmp_path / "report.json").read_text()) == report
     assert (report.seed, report.held_out, report.train_count) == (5, (1, 9), FRAMES - 2)
     stages = {"decode_s", "compile_s", "fusion_s", "motion_s", "start_s", "targets_s", "optimise_s", "score_s"}
@@ -184,7 +186,7 @@ def test_a_stopped_run_goes_on_in_its_folder(name: str, clip: Path, whole: Whole
 def test_a_run_stopped_while_it_is_scored_goes_on_from_there(clip: Path, whole: Whole, tmp_path: Path) -> None:
     straight, out = whole("fast")
     stages: set[str] = set()
-    hooks = Hooks(lambda progress: stages.add(progress.stage), lambda: "score" in stages)
+    hooks = TrainingHooks(lambda progress: stages.add(progress.stage), lambda: "score" in stages)
     with pytest.raises(Cancelled, match="scoring"):
         run(clip, tmp_path / "stopped", hooks, preset="fast")
     assert load_resume(tmp_path / "stopped")[1]["iteration"] == ITERATIONS
@@ -238,7 +240,7 @@ def test_a_damaged_stopped_run_is_refused(clip: Path, tmp_path: Path) -> None:
 
 def test_a_stop_before_training_publishes_nothing(clip: Path, tmp_path: Path) -> None:
     with pytest.raises(Cancelled):
-        run(clip, tmp_path, Hooks(should_stop=lambda: True))
+        run(clip, tmp_path, TrainingHooks(should_stop=lambda: True))
     assert files(tmp_path) <= {RESUME_FILE}
 
 
@@ -321,7 +323,7 @@ def test_tissue_whose_depth_is_never_known_is_covered_all_the_same() -> None:
     holed = dataclasses.replace(whole, depth_mm=depth_mm, depth_confidence=unsure)
     split = split_frames(holed)
     made = trained(prepared_on(holed, split, "fast", iterations=60))
-    scene_of(made, holed, split, made.frames.scale, seed=0)  # takes strays out of the model
+    scene_of(made)  # takes strays out of the model
     where = np.zeros_like(whole.tissue[0])
     where[25:50, 30:60] = True
     assert min(coverage(view(made, index).alpha, where) for index in range(FRAMES)) >= 0.98
@@ -359,7 +361,7 @@ def test_a_stereo_video_becomes_a_scene_of_the_right_size_in_mm(stereo: Path, tm
 def test_a_stopped_run_on_a_stereo_clip_goes_on_with_the_same_depth(stereo: Path, tmp_path: Path) -> None:
     beside: dict[str, Any] = {"calibration": stereo / "calibration.json", "masks": stereo / "masks.zip"}
     stages: set[str] = set()
-    in_training = Hooks(lambda progress: stages.add(progress.stage), lambda: "train" in stages)
+    in_training = TrainingHooks(lambda progress: stages.add(progress.stage), lambda: "train" in stages)
     with pytest.raises(Cancelled):
         run(stereo / "stereo.webm", tmp_path / "stopped", in_training, **beside)
     run(stereo / "stereo.webm", tmp_path / "stopped", **beside)
@@ -372,10 +374,10 @@ def test_the_pipeline_and_the_loop_make_the_same_model(clip: Path, whole: Whole)
     assert isinstance(opened, DepthClip)
     split = split_frames(opened)
     loop = trained(prepared_on(opened, split, "fast", iterations=ITERATIONS))
-    shrunk = shrink(scene_of(loop, opened, split, loop.frames.scale, loop.seed), opened, loop.frames)
-    assert shrunk is not None
+    quantized = quantize_scene(scene_of(loop), opened, loop.frames)
+    assert quantized is not None
     assert tensor_bits(whole("fast")[1]) == {
-        name: each.numpy().tobytes() for name, each in shrunk.scene.tensors().items()
+        name: each.numpy().tobytes() for name, each in quantized.scene.tensors().items()
     }
 
 

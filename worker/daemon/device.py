@@ -34,12 +34,13 @@ from worker.daemon.pace import Pace
 from worker.daemon.serve import RequestServer
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
-from worker.machine.hooks import Hooks, Progress
+from worker.machine.hooks import Progress
 from worker.pipeline import reconstruct
 from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lost
 from worker.raster.cpu import compile_kernels
 from worker.scene.compact import compile_coder
 from worker.scene.resume_file import RESUME_FILE
+from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
 
 REPORT_PERIOD_S = 0.1
@@ -111,7 +112,7 @@ def work_on(
     """Run one job; every error is its end and not this process's, unless it takes the GPU along."""
     run = task.run
     reporter = _Reporter(channel)
-    hooks = Hooks(
+    hooks = TrainingHooks(
         on_progress=reporter.report,
         should_stop=task.stop.is_set,
         wants_snapshot=snapshots.wanted,
@@ -164,7 +165,7 @@ def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits |
     )
 
 
-def run_or_start_anew(request: ReconstructionRequest, out: Path, hooks: Hooks) -> None:
+def run_or_start_anew(request: ReconstructionRequest, out: Path, hooks: TrainingHooks) -> None:
     """Reconstruct; from the beginning if the state in `out` is damaged, or of an earlier version of this program."""
     resumes = (out / RESUME_FILE).exists()
     try:

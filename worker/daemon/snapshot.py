@@ -55,14 +55,14 @@ class Snapshots:
                 self._changed.notify_all()
 
     def wanted(self) -> bool:
-        """Whether the training loop should offer a copy now (Hooks.wants_snapshot)."""
+        """Whether the training loop should offer a copy now (TrainingHooks.wants_snapshot)."""
         with self._changed:
             if self._job_id is None:
                 return False
             return self._newest is None or (self._asked and self._is_due(self._newest))
 
     def offer(self, scene: Scene, iteration: int) -> None:
-        """Show this copy from now on (Hooks.on_snapshot)."""
+        """Show this copy from now on (TrainingHooks.on_snapshot)."""
         with self._changed:
             if self._job_id is not None:
                 self._newest = Snapshot(scene, iteration, time.monotonic())

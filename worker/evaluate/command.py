@@ -22,8 +22,9 @@ from worker.evaluate.measure import Bench
 from worker.evaluate.rows import Results, adding_alone, write_rows
 from worker.evaluate.sources import source_of
 from worker.evaluate.summary import SUMMARY_FIELDS, Sooner, capacities, groups_of, orderings, sooner
-from worker.machine.hooks import Hooks, Progress
+from worker.machine.hooks import Progress
 from worker.raster.backend import choose_device
+from worker.train.hooks import TrainingHooks
 
 SUMMARY = "summary.csv"
 FILES = ("calibration", "masks")
@@ -111,7 +112,7 @@ def measure_all(bench: Bench, cells: Sequence[Cell], results: Results) -> None:
         for place, cell in enumerate(cells):
             with ProgressBar(sys.stderr) as bar:
                 show = _reporter(bar, place, len(cells))
-                row, curve = bench.measure(cell, Hooks(on_progress=show, should_stop=end.is_set))
+                row, curve = bench.measure(cell, TrainingHooks(on_progress=show, should_stop=end.is_set))
             results.add(row, curve)
             print(f"{' '.join(cell.key)}: {_outcome(row)}", flush=True)
 

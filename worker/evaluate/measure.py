@@ -28,15 +28,14 @@ from worker.evaluate.rows import KEY, NO_RESULT, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
 from worker.evaluate.truth import ShownScene, Truth
 from worker.input.clip import DepthClip
-from worker.machine.hooks import Hooks
 from worker.model.metrics import depth_agreement_mm, depth_errors_mm, psnr_tissue, ssim
 from worker.pipeline import reconstruct
 from worker.raster.backend import Device, choose_device
 from worker.raster.step import camera_vector
-from worker.render.view import model_of
 from worker.scene.checkpoint import load_scene
+from worker.scene.model import model_of
 from worker.scene.scene import Scene
-from worker.train.looking import View
+from worker.train.hooks import RenderedFrame, TrainingHooks
 from worker.train.presets import PRESETS
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units
@@ -61,7 +60,7 @@ class Bench:
     _open: dict[tuple[str, str], OpenClip] = field(default_factory=dict)
     _truth: dict[tuple[str, str], Truth] = field(default_factory=dict)
 
-    def measure(self, cell: Cell, hooks: Hooks) -> tuple[Values, list[Values]]:
+    def measure(self, cell: Cell, hooks: TrainingHooks) -> tuple[Values, list[Values]]:
         """The row and the curve of a cell; a failure's row says why in `error` and has no curve.
 
         Raises:
@@ -84,7 +83,7 @@ class Bench:
             return {**row, "error": f"{type(error).__name__}: {problem}"[:LONGEST_ERROR]}, []
         return {**row, **values}, curve
 
-    def _measured(self, cell: Cell, source: Source, hooks: Hooks) -> tuple[Values, list[Values]]:
+    def _measured(self, cell: Cell, source: Source, hooks: TrainingHooks) -> tuple[Values, list[Values]]:
         place = (cell.clip, cell.holdout)
         if place not in self._open:
             self._open.clear()
@@ -145,7 +144,7 @@ class _OnTheWay:
         self._ssim: list[list[float]] = []
         self._errors_mm: list[list[NDArray[np.float32]]] = []
 
-    def judge(self, frame: int, view: View) -> None:
+    def judge(self, frame: int, view: RenderedFrame) -> None:
         """Frames come in rising order; one that does not rise begins the next scoring."""
         start = time.perf_counter()
         if frame <= self._last or not self._ssim:

@@ -18,8 +18,9 @@ from contract.wire.errors import InputError
 from contract.wire.options import ClipOptions, ReconstructionOptions
 from worker.input.clip import DepthClip
 from worker.machine.hooks import Hooks
+from worker.machine.timing import Timings
 from worker.phantom import MOTIONS, Phantom, PhantomSettings, make_phantom
-from worker.pipeline import depth_clip_of
+from worker.pipeline import open_with_depth
 from worker.raster.backend import CPU, Device
 from worker.train.request import ReconstructionRequest
 
@@ -88,13 +89,13 @@ def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU
     if source.phantom is not None:
         phantom = make_phantom(source.phantom)
         return OpenClip(phantom.depth_clip(), phantom, {})
-    seconds: dict[str, float] = {}
+    timings = Timings()
     options, files = ReconstructionOptions(holdout=holdout, **source.options.model_dump()), source.files
     request = ReconstructionRequest(
         source.clip, options, calibration=files.get("calibration"), masks=files.get("masks")
     )
-    clip = depth_clip_of(request, hooks, seconds, device)
-    return OpenClip(clip, None, seconds)
+    clip = open_with_depth(request, hooks, timings, device)
+    return OpenClip(clip, None, timings.seconds)
 
 
 def _recording(argument: str) -> Source:

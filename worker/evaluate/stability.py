@@ -40,14 +40,14 @@ from worker.evaluate.conditions import (
     write_recording,
 )
 from worker.evaluate.rows import NO_RESULT, Row, commit, machine, read_rows, write_rows
-from worker.machine.hooks import Hooks
 from worker.model.metrics import psnr_tissue
 from worker.phantom import PhantomSettings
 from worker.pipeline import reconstruct
 from worker.raster.step import camera_vector
-from worker.render.view import model_of
 from worker.scene.checkpoint import load_scene
+from worker.scene.model import model_of
 from worker.scene.scene import Scene
+from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units, solid_depth_mm
 
@@ -137,7 +137,7 @@ class Atlas:
         there = {tuple(row[name] for name in KEY) for row in self.rows}
         return [cell for cell in cells if cell.key(self.grid) not in there]
 
-    def measure(self, cell: StabilityCell, hooks: Hooks) -> Row:
+    def measure(self, cell: StabilityCell, hooks: TrainingHooks) -> Row:
         """Train and judge a cell, and keep its row.
 
         Raises:
@@ -158,7 +158,7 @@ class Atlas:
         return row
 
 
-def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: Hooks) -> Row:
+def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: TrainingHooks) -> Row:
     """The row of a cell, without its verdict and origin; a failure's row says why in `error`.
 
     Raises:
@@ -232,7 +232,7 @@ def moments_of(given: Given, held_out: Sequence[int], frame_count: int) -> list[
     return found or [Moment(0.0, 0, given.source[0])]
 
 
-def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Hooks) -> Row:
+def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: TrainingHooks) -> Row:
     """What `reconstruct` makes of the clip, judged by the truth and as it judges itself."""
     with tempfile.TemporaryDirectory() as folder:
         asked = (

@@ -17,7 +17,7 @@ from worker.evaluate.atlas import count_outcomes, draw_map, places_of, series_in
 from worker.evaluate.conditions import CONDITIONS, SEVERITIES
 from worker.evaluate.rows import Row, adding_alone, read_rows
 from worker.evaluate.stability import STABILITY, Atlas, Grid, StabilityCell, plan
-from worker.machine.hooks import Hooks
+from worker.train.hooks import TrainingHooks
 
 DEFAULT_SERIES = ("fast", "paper", "pfs", "hexplane", "without_mapf")
 TABLE = "stability.md"
@@ -79,7 +79,7 @@ def measure_all(atlas: Atlas, cells: Sequence[StabilityCell]) -> None:
         for place, cell in enumerate(cells):
             with ProgressBar(sys.stderr) as bar:
                 bar.show(JobProgress(stage=f"{place + 1}/{len(cells)}", fraction=place / len(cells)))
-                row = atlas.measure(cell, Hooks(should_stop=end.is_set))
+                row = atlas.measure(cell, TrainingHooks(should_stop=end.is_set))
             print(_line(row), flush=True)
 
 

@@ -36,9 +36,10 @@ from worker.input.clip import DepthClip
 from worker.model.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
 from worker.phantom import Phantom
 from worker.raster.step import camera_vector
-from worker.render.view import model_of
+from worker.scene.model import model_of
 from worker.scene.scene import Scene
-from worker.train.looking import View, sample_frames
+from worker.train.hooks import RenderedFrame
+from worker.train.scoring import sample_frames
 from worker.train.targets import camera_in_units, solid_depth_mm
 
 Pose = NDArray[np.float64]
@@ -59,7 +60,7 @@ three pixels wide, and in all squares about it."""
 class Shown(Protocol):
     """What can be judged against the truth."""
 
-    def view(self, frame: int, pose: Pose) -> View:
+    def view(self, frame: int, pose: Pose) -> RenderedFrame:
         """The tissue at a frame from world_from_camera [4, 4] in mm, with the clip's intrinsics."""
         ...
 
@@ -180,10 +181,10 @@ class ShownScene:
     def __init__(self, scene: Scene) -> None:
         self._scene, self._model = scene, model_of(scene)
 
-    def view(self, frame: int, pose: Pose) -> View:
+    def view(self, frame: int, pose: Pose) -> RenderedFrame:
         image = self._image(frame, pose)
         depth_mm = solid_depth_mm(image[3], image[4], self._scene.units_per_mm)
-        return View(image[:3].transpose(1, 2, 0), depth_mm, image[4])
+        return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
 
     def motion_mm(self, frame: int) -> NDArray[np.floating]:
         start, end = (self._model.deformed_mean(each / self._scene.frame_count) for each in (0, frame))

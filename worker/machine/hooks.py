@@ -1,10 +1,11 @@
-"""What a running reconstruction tells its caller, and how the caller stops it."""
+"""How a stage of a reconstruction reports its progress to its caller, and learns that it must stop."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+
+from contract.wire.errors import Cancelled
 
 
 @dataclass(frozen=True)
@@ -19,34 +20,29 @@ class Progress:
     seconds_left: float | None = None
 
 
-def _ignore(progress: Progress) -> None:
-    del progress
+def ignore(*arguments: object) -> None:
+    """A callback that does nothing."""
+    del arguments
 
 
-def _never() -> bool:
+def never() -> bool:
+    """A question that is always answered with no."""
     return False
-
-
-def _show_nobody(scene: Any, iteration: int) -> None:
-    del scene, iteration
-
-
-def _judge_no_further(frame: int, view: Any) -> None:
-    del frame, view
 
 
 @dataclass(frozen=True)
 class Hooks:
-    """on_progress is called at least once a second while work goes on; should_stop is asked between steps.
+    """The caller's callbacks: on_progress is called at least once a second during work, should_stop between steps."""
 
-    wants_snapshot is asked between steps of training; if it says so, on_snapshot is given the model as it is then, a
-    Scene of worker/scene/checkpoint.py, and how many iterations made it. on_held_out is given each held-out frame
-    that is rendered to be scored while training goes on: its number and the View of worker/train/looking.py;
-    training's clock stands still meanwhile. None of these changes what training comes to.
-    """
+    on_progress: Callable[[Progress], None] = ignore
+    should_stop: Callable[[], bool] = never
 
-    on_progress: Callable[[Progress], None] = _ignore
-    should_stop: Callable[[], bool] = _never
-    wants_snapshot: Callable[[], bool] = _never
-    on_snapshot: Callable[[Any, int], None] = _show_nobody
-    on_held_out: Callable[[int, Any], None] = _judge_no_further
+    def report_stage(self, stage: str, fraction: float) -> None:
+        """Report how far a stage has come.
+
+        Raises:
+            Cancelled: the caller wants to stop.
+        """
+        self.on_progress(Progress(stage, fraction))
+        if self.should_stop():
+            raise Cancelled(f"Stopped during stage {stage!r}.")

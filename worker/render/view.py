@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from worker.input.camera import Intrinsics
 from worker.model.metrics import COVERED_ALPHA
-from worker.raster.backend import CPU, Device, make_model
-from worker.raster.model import Model
+from worker.raster.backend import CPU, Device
 from worker.raster.step import camera_vector
+from worker.scene.model import model_of
 from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
 
@@ -47,12 +47,6 @@ class Frame:
     depth_mm: NDArray[np.float32]
     confidence: NDArray[np.float32]
     warnings: tuple[str, ...]
-
-
-def model_of(scene: Scene, device: Device = CPU) -> Model:
-    """The scene's Gaussians and their motion in the form that the device renders."""
-    size = scene.intrinsics.width, scene.intrinsics.height
-    return make_model(scene.gaussians, scene.deformation, *size, device)
 
 
 class SceneRenderer:

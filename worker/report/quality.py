@@ -22,7 +22,7 @@ from worker.input.clip.types import DepthClip
 from worker.model.metrics import coverage, depth_agreement_mm, depth_errors_mm, psnr_paper, psnr_tissue, ssim
 from worker.report.baselines import CopyBaselines
 from worker.report.doubts import course_doubts, picture_doubts
-from worker.train.looking import View, sample_frames
+from worker.train.scoring import FrameRenderer, sample_frames
 
 LEAST_COVERAGE = 0.98
 LEAST_TRAIN_DB = 25.0
@@ -84,23 +84,23 @@ class Training:
 _MERGED_FIELDS = ("assumptions", "warnings", "measurements")  # the clip has them, too; the report holds both
 
 
-def measure(clip: DepthClip, frames: Sequence[int], view_of: Callable[[int], View]) -> Scores:
-    """Scores the views of these frames (clip indices) against the clip.
+def measure(clip: DepthClip, frames: Sequence[int], render: FrameRenderer) -> Scores:
+    """Scores the renders of these frames (clip indices) against the clip.
 
     Raises:
-        TrainingDiverged: a view holds NaN or infinity.
+        TrainingDiverged: a render holds NaN or infinity.
     """
     tissue_db, paper_db, similarity, covered = [], [], [], []
     errors_mm, depths_mm = [], []
     for index in frames:
-        view, truth, tissue = view_of(index), clip.rgb[index], clip.tissue[index]
-        if not (np.isfinite(view.rgb).all() and np.isfinite(view.depth_mm).all() and np.isfinite(view.alpha).all()):
+        shown, truth, tissue = render(index), clip.rgb[index], clip.tissue[index]
+        if not (np.isfinite(shown.rgb).all() and np.isfinite(shown.depth_mm).all() and np.isfinite(shown.alpha).all()):
             raise TrainingDiverged(f"Frame {index} renders as NaN or infinity: training has diverged.")
-        tissue_db.append(psnr_tissue(view.rgb, truth, tissue))
-        paper_db.append(psnr_paper(view.rgb, truth, tissue))
-        similarity.append(ssim(view.rgb, truth, tissue))
-        covered.append(coverage(view.alpha, tissue))
-        errors_mm.append(depth_errors_mm(view.depth_mm, clip.depth_mm[index], tissue))
+        tissue_db.append(psnr_tissue(shown.rgb, truth, tissue))
+        paper_db.append(psnr_paper(shown.rgb, truth, tissue))
+        similarity.append(ssim(shown.rgb, truth, tissue))
+        covered.append(coverage(shown.alpha, tissue))
+        errors_mm.append(depth_errors_mm(shown.depth_mm, clip.depth_mm[index], tissue))
         depths_mm.append(clip.depth_mm[index][tissue & (clip.depth_mm[index] > 0)])
     return Scores(
         frames=tuple(frames),

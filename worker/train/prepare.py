@@ -2,107 +2,73 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
 
-from contract.wire.errors import Cancelled
-from contract.wire.options import ReconstructionOptions
 from worker.fusion import fuse
-from worker.input.clip import DepthClip, FrameSplit
-from worker.machine.hooks import Hooks, Progress
 from worker.model.deformation import SharedBasis
-from worker.motion.tracks import moved_along, track
-from worker.raster.backend import CPU, Device, examine
-from worker.raster.model import Model
+from worker.motion.tracks import Tracks, moved_along, track
+from worker.raster.backend import CPU, examine
+from worker.train.calibrate import iterations_within, warm_up
 from worker.train.densify import Densifier
-from worker.train.loop import Run, Stopwatch, iterations_within, steps_an_epoch, warm_up
-from worker.train.presets import Preset
-from worker.train.schedule import Schedule, left_out
+from worker.train.run import Run
+from worker.train.schedule import Schedule, validation_frames
+from worker.train.setup import Setup
 from worker.train.start import fusion_for, settled, start_model
 from worker.train.targets import TrainingFrames, units_per_mm
 
-_Result = TypeVar("_Result")
-Seconds = dict[str, float]  # by stage; each stage that is timed adds its own
 
-
-def timed(seconds: Seconds, name: str, work: Callable[[], _Result]) -> _Result:
-    """work(), its duration stored under name."""
-    start = time.perf_counter()
-    result = work()
-    seconds[name] = time.perf_counter() - start
-    return result
-
-
-def report_stage(hooks: Hooks, stage: str, share: float) -> None:
-    """Say how far a stage has come.
+def prepare(setup: Setup) -> Run:
+    """The run before its first step. Compiling a GPU's kernels is no part of training: the clock is paused meanwhile.
 
     Raises:
-        Cancelled: the caller wants to stop.
+        InputError: no training frame has valid depth.
+        Cancelled: hooks.should_stop said so.
     """
-    hooks.on_progress(Progress(stage, share))
-    if hooks.should_stop():
-        raise Cancelled(f"Stopped during stage {stage!r}.")
-
-
-def prepare(
-    clip: DepthClip,
-    split: FrameSplit,
-    preset: Preset,
-    options: ReconstructionOptions,
-    clock: Stopwatch,
-    hooks: Hooks | None = None,
-    seconds: Seconds | None = None,
-    device: Device = CPU,
-) -> tuple[Run, float]:
-    """Fuse points, start the model, and settle how many iterations are made; seconds by stage go into `seconds`."""
-    hooks, seconds = hooks or Hooks(), {} if seconds is None else seconds
-    scale = units_per_mm(clip, split.train)
-    if device != CPU:  # what a GPU's kernels take to be compiled, here and below, is no part of training
-        report_stage(hooks, "compile", 0.0)
-        seconds["compile_s"] = seconds.get("compile_s", 0.0) + clock.pause(lambda: examine(device))
-    tracks = None
-    if preset.tracks and preset.deformation == SharedBasis.kind and len(split.train) > 1:
-        tracks = timed(
-            seconds, "motion_s", lambda: track(clip, split.train, lambda share: report_stage(hooks, "motion", share))
-        )
-    report_stage(hooks, "fusion", 0.0)
-    preset, chosen = timed(seconds, "capacity_s", lambda: settled(preset, tracks, clip, split.train))
-    fusion = fusion_for(preset, clip.intrinsics)
-    moved = moved_along(tracks, split.train, clip.intrinsics.width) if tracks is not None else None
-    cloud = timed(seconds, "fusion_s", lambda: fuse(clip, split.train, fusion, seed=options.seed, moved=moved))
-    report_stage(hooks, "start", 0.0)
-    model = timed(
-        seconds, "start_s", lambda: start_model(cloud, tracks, clip, split.train, preset, scale, options.seed, device)
-    )
-    frames = timed(seconds, "targets_s", lambda: TrainingFrames(clip, split.train, scale))
+    clip, train, timings = setup.clip, setup.split.train, setup.timings
+    scale = units_per_mm(clip, train)
+    if setup.device != CPU:
+        setup.hooks.report_stage("compile", 0.0)
+        with setup.clock.paused():
+            timings.add("compile_s", examine(setup.device))
+    tracks = _tracks(setup)
+    setup.hooks.report_stage("fusion", 0.0)
+    with timings.measure("capacity_s"):
+        preset, chosen = settled(setup.preset, tracks, clip, train)
+    with timings.measure("fusion_s"):
+        moved = moved_along(tracks, train, clip.intrinsics.width) if tracks is not None else None
+        cloud = fuse(clip, train, fusion_for(preset, clip.intrinsics), seed=setup.options.seed, moved=moved)
+    setup.hooks.report_stage("start", 0.0)
+    with timings.measure("start_s"):
+        model = start_model(cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device)
+    with timings.measure("targets_s"):
+        frames = TrainingFrames(clip, train, scale)
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
-    if device != CPU:
-        seconds["compile_s"] += clock.pause(
-            lambda: warm_up(model, frames, preset, partial(report_stage, hooks, "compile"))
-        )
-    schedule, asked = schedule_of(model, frames, preset, options, clock, hooks)
-    run = Run(model, frames, preset, schedule, options.seed, asked, densifier=densifier, device=device, chosen=chosen)
-    return run, scale
+    run = Run(setup, model, frames, preset, Schedule(planned=0), densifier=densifier, chosen=chosen)
+    if setup.device != CPU:
+        with setup.clock.paused():
+            timings.add("compile_s", warm_up(run, partial(setup.hooks.report_stage, "compile")))
+    run.schedule, run.asked = _schedule(run)
+    return run
 
 
-def fixed_iterations(options: ReconstructionOptions, preset: Preset) -> int | None:
-    """The iterations that were asked for, or else are the preset's own; None where seconds say how long a run is."""
-    return options.iterations or (None if options.budget_s else preset.iterations)
+def _tracks(setup: Setup) -> Tracks | None:
+    """Optical-flow tracks of the training frames, where the preset starts its motion with them."""
+    train = setup.split.train
+    if not setup.preset.tracks or setup.preset.deformation != SharedBasis.kind or len(train) < 2:
+        return None
+    with setup.timings.measure("motion_s"):
+        return track(setup.clip, train, partial(setup.hooks.report_stage, "motion"))
 
 
-def schedule_of(
-    model: Model, frames: TrainingFrames, preset: Preset, options: ReconstructionOptions, clock: Stopwatch, hooks: Hooks
-) -> tuple[Schedule, str]:
-    """How many iterations are made and how rates fall in them; and, in words, the length that was asked for."""
-    epoch = steps_an_epoch(frames, preset)
-    fixed = fixed_iterations(options, preset)
+def _schedule(run: Run) -> tuple[Schedule, str]:
+    """How many iterations are made and how rates fall in them; and, in words, the length that was requested."""
+    setup, preset, epoch = run.setup, run.preset, run.steps_an_epoch
+    fixed = setup.fixed_iterations
     if fixed is not None:
-        return Schedule(fixed, preset.cycles, epoch=epoch), f"{fixed} iterations"
-    budget_s = options.budget_s or preset.budget_s
+        return Schedule(fixed, preset.warm_restarts, epoch=epoch), f"{fixed} iterations"
+    budget_s = setup.options.budget_s or preset.budget_s
     assert budget_s is not None
-    report_stage(hooks, "calibrate", 0.0)
-    planned = iterations_within(model, frames, preset, options.seed, budget_s, clock.elapsed_s)
-    worth_db = preset.worth_db if left_out(frames.indices) else None
-    return Schedule(planned, preset.cycles, worth_db, epoch), f"{budget_s} s"
+    setup.hooks.report_stage("calibrate", 0.0)
+    planned = iterations_within(run, budget_s, setup.clock.elapsed_s)
+    min_gain_db = preset.min_gain_db if validation_frames(run.frames.indices) else None
+    return Schedule(planned, preset.warm_restarts, min_gain_db, epoch), f"{budget_s} s"

@@ -1,6 +1,6 @@
-"""What distinguishes the ways of training: ours, `instant`, `fast`, `quality`, `small`; `paper`, its variants, rivals.
+"""Every way of training, by name: ours `instant`, `fast`, `quality`, `small`; `paper`, its variants and its rivals.
 
-A preset is data only; train.py reads it. Rates are in optimiser units (median depth 60).
+A preset is data only. Rates are in optimiser units (median depth 60).
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ class Preset:
     fusion           which points become Gaussians
     points_per_image "fill" fusion takes the grid stride that comes nearest to this many points a frame; None: as far
                      apart as the scene's detail allows
-    points_by_budget whether a run with budget_s takes as many points as pay within it instead
+    points_by_budget whether budget_s decides points_per_image instead (preset_named)
     deformation      name of a motion in the registry (worker/model/deformation)
     bases            B of the deformation; None: as many as the scene's motion needs ("shared" alone)
-    most_bases       of those the scene may choose; None: as many as there are to choose from
+    max_bases        limit for `bases` where the scene decides; None: no limit
     tracks           whether optical-flow tracks start the motion ("shared" only)
     start_width      sigma at the start, model time; None where the deformation places its own
     opacity, spread  of a Gaussian at the start; spread is its standard deviation over the distance to its neighbours
     sh_degree        of the colour; from 1 on, a degree is added every sh_every iterations
     order            "epochs": every training frame once, shuffled, again and again; "random": drawn each iteration
-    frames_a_step    training frames of which an iteration sees so many: one step down the sum of their losses
-    cycles           whether rates rise again when the steps have doubled, if there are enough for two cycles, and the
-                     last models of each are averaged (schedule.py); else rates fall once and nothing is averaged
-    worth_db         a run with budget_s ends where a doubling of its steps is worth less; None: never before its time
+    frames_a_step    training frames of one iteration, which descends the sum of their losses
+    warm_restarts    whether rates rise again when the iterations have doubled, if there are enough for two cycles, and
+                     the last models of each are averaged (schedule.py); else rates fall once and nothing is averaged
+    min_gain_db      a run with budget_s stops early where doubling its iterations gains less; None: no early stopping
     iterations       of a run without budget_s and iterations; None: budget_s
     budget_s         seconds of training of a run without either
 
     Raises:
-        ValueError: cycles with densification, worth_db without cycles, or a number that nothing can be trained with.
+        ValueError: warm restarts with densification, min_gain_db without warm restarts, or a number out of its range.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Preset:
     points_by_budget: bool
     deformation: str
     bases: int | None
-    most_bases: int | None
+    max_bases: int | None
     tracks: bool
     start_width: float | None
     opacity: float
@@ -62,8 +62,8 @@ class Preset:
     sh_every: int
     order: Literal["epochs", "random"]
     frames_a_step: int
-    cycles: bool
-    worth_db: float | None
+    warm_restarts: bool
+    min_gain_db: float | None
     rates: Rates
     loss: LossSettings
     densify: DensifySettings | None
@@ -71,35 +71,37 @@ class Preset:
     budget_s: float | None
 
     def __post_init__(self) -> None:
-        if self.cycles and self.densify is not None:
-            raise ValueError("cycles end in an average of models, which are not of one size with densification")
-        if self.worth_db is not None and not self.cycles:
-            raise ValueError("worth_db compares the ends of cycles, so it needs cycles")
-        least_bases = motion_named(self.deformation).min_bases
+        if self.warm_restarts and self.densify is not None:
+            raise ValueError("warm_restarts average models, which differ in size with densification")
+        if self.min_gain_db is not None and not self.warm_restarts:
+            raise ValueError("min_gain_db compares the ends of cycles, so it needs warm_restarts")
+        min_bases = motion_named(self.deformation).min_bases
         ranges: tuple[tuple[str, float, float], ...] = (
-            ("bases", least_bases, math.inf),
-            ("most_bases", least_bases, math.inf),
+            ("bases", min_bases, math.inf),
+            ("max_bases", min_bases, math.inf),
             ("points_per_image", 1, math.inf),
-            ("frames_a_step", 1, MOST_FRAMES_A_STEP),
+            ("frames_a_step", 1, MAX_FRAMES_A_STEP),
             ("sh_degree", 0, MAX_SH_DEGREE),
-            ("opacity", SMALLEST, 1 - SMALLEST),
-            ("spread", SMALLEST, math.inf),
-            ("start_width", SMALLEST, math.inf),
+            ("opacity", MIN_START, 1 - MIN_START),
+            ("spread", MIN_START, math.inf),
+            ("start_width", MIN_START, math.inf),
         )
-        for name, least, most in ranges:
+        for name, minimum, maximum in ranges:
             value = getattr(self, name)
-            if value is not None and not least <= value <= most:
-                trainable = f"{least:g} or more" if most == math.inf else f"{least:g} to {most:g}"
+            if value is not None and not minimum <= value <= maximum:
+                trainable = f"{minimum:g} or more" if maximum == math.inf else f"{minimum:g} to {maximum:g}"
                 raise ValueError(f"{name} is {value}, and {trainable} can be trained with")
 
 
-MOST_FRAMES_A_STEP = 16
+MAX_FRAMES_A_STEP = 16
 """As many as a GPU's kernels draw at once (worker/raster/cuda/bins.py)."""
-SMALLEST = 1e-3
+MIN_START = 1e-3
 """Of an opacity, a spread and a width at the start; an opacity stays as far below 1, for its logit is trained."""
-FEWEST_POINTS, FEW_POINTS, MANY_POINTS = 20_000, 40_000, 80_000
-PAYS_FROM_S = 9.0
-"""From this budget on, twice the points are worth the time they take (docs/decisions/015)."""
+MIN_POINTS, FEW_POINTS, MANY_POINTS = 20_000, 40_000, 80_000
+MANY_POINTS_FROM_S = 9.0
+"""From this budget on MANY_POINTS score more than FEW_POINTS. This is wall-clock time of the two cores of
+docs/decisions/015; a faster machine could afford them sooner. Nothing measures it at run time, because a run that is
+resumed must start with the same points."""
 
 _PAPER_ITERATIONS = 3000
 _PAPER_DECAY = (1.6e-3, 5.06e-5)
@@ -124,7 +126,7 @@ _PAPER = Preset(
     points_by_budget=False,
     deformation=GaussianFdm.kind,
     bases=17,
-    most_bases=None,
+    max_bases=None,
     tracks=False,
     start_width=0.01,
     opacity=0.1,
@@ -133,8 +135,8 @@ _PAPER = Preset(
     sh_every=500,
     order="random",
     frames_a_step=1,
-    cycles=False,
-    worth_db=None,
+    warm_restarts=False,
+    min_gain_db=None,
     rates=_PAPER_RATES,
     loss=LossSettings(normalised_depth=False),
     densify=DensifySettings(),
@@ -170,7 +172,7 @@ _FAST = Preset(
     points_by_budget=True,
     deformation=SharedBasis.kind,
     bases=None,
-    most_bases=None,
+    max_bases=None,
     tracks=True,
     start_width=None,
     opacity=0.9,
@@ -179,8 +181,8 @@ _FAST = Preset(
     sh_every=0,
     order="epochs",
     frames_a_step=1,
-    cycles=True,
-    worth_db=0.25,
+    warm_restarts=True,
+    min_gain_db=0.25,
     rates=_FAST_RATES,
     loss=LossSettings(colour_zone=0.1),
     densify=None,
@@ -194,13 +196,13 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
         for preset in (
             replace(_FAST, name="instant", points_per_image=FEW_POINTS, budget_s=6.0),
             _FAST,
-            replace(_FAST, name="quality", worth_db=0.05, budget_s=240.0),
+            replace(_FAST, name="quality", min_gain_db=0.05, budget_s=240.0),
             replace(
                 _FAST,
                 name="small",
-                points_per_image=FEWEST_POINTS,
+                points_per_image=MIN_POINTS,
                 points_by_budget=False,
-                most_bases=17,
+                max_bases=17,
                 rates=_SMALL_RATES,
                 budget_s=30.0,
             ),
@@ -218,7 +220,7 @@ room; `paper-wide` starts FDM's bases as wide as 0.6 of their spacing."""
 
 
 def preset_named(name: str, budget_s: float | None = None) -> Preset:
-    """The preset of this name; with points_by_budget, as many points as pay within budget_s if that is given.
+    """The preset of this name; with points_by_budget, budget_s decides its points_per_image if it is given.
 
     Raises:
         InputError: there is none.
@@ -228,4 +230,4 @@ def preset_named(name: str, budget_s: float | None = None) -> Preset:
     preset = PRESETS[name]
     if budget_s is None or not preset.points_by_budget:
         return preset
-    return replace(preset, points_per_image=FEW_POINTS if budget_s < PAYS_FROM_S else MANY_POINTS)
+    return replace(preset, points_per_image=FEW_POINTS if budget_s < MANY_POINTS_FROM_S else MANY_POINTS)

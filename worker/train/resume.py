@@ -1,6 +1,6 @@
-"""What a stopped run leaves in its folder, and how it goes on from there to the bits of an unstopped one.
+"""A stopped run stores its state in its folder; resumed, it reaches the bits of an uninterrupted run.
 
-What is stored names no device: a run may go on on another one, but then to bits of its own.
+The state names no device: a run may be resumed on another one, but then reaches other bits.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 
 from contract.wire.errors import InputError, SceneError
 from worker.scene.resume_file import RESUME_FILE, load_resume, save_resume
-from worker.train.loop import CurvePoint, Run
+from worker.train.run import CurvePoint, Run
 from worker.train.schedule import Schedule
 
 
 def resume(out_dir: Path, run: Run) -> float | None:
-    """Go on with the run stored in out_dir, if there is one; its t_train_s.
+    """Resume the run stored in out_dir, if there is one; returns its t_train_s.
 
     Raises:
         InputError: it was started with another preset, seed, length or clip, or cannot be read.
@@ -33,7 +33,7 @@ def resume(out_dir: Path, run: Run) -> float | None:
 
 
 def save_run(directory: Path, run: Run, t_train_s: float) -> None:
-    """Write what load_run needs to go on: parameters, moments, averages, densification statistics, curve."""
+    """Write what load_run needs: parameters, moments, averages, densification statistics, schedule, curve."""
     arrays = {**run.model.arrays(), **run.average.arrays(), **(run.densifier.arrays() if run.densifier else {})}
     tensors = {name: values.cpu().contiguous() for name, values in arrays.items()}
     state = {
@@ -49,7 +49,7 @@ def save_run(directory: Path, run: Run, t_train_s: float) -> None:
 
 
 def load_run(directory: Path, run: Run) -> float:
-    """Put a freshly built run where a stored one was; returns its t_train_s.
+    """Bring a new run to the state of the stored one; returns its t_train_s.
 
     Raises:
         SceneError: nothing usable is stored there.
@@ -74,7 +74,7 @@ def load_run(directory: Path, run: Run) -> float:
 
 
 def _identity(run: Run) -> dict[str, str]:
-    """By the words for it, what a stored run must share with the one that goes on from it."""
+    """What a stored run must share with the one that resumes it, by the words of the error."""
     return {
         "preset": run.preset.name,
         "settings of the preset": hashlib.sha256(repr(run.preset).encode()).hexdigest(),

@@ -46,7 +46,7 @@ def settled(
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
     trials = Trials({})
     if tracks is not None and left_open:
-        trials = try_bases(tracks, clip, train, basis_values, preset.most_bases)
+        trials = try_bases(tracks, clip, train, basis_values, preset.max_bases)
     fusion = fusion_for(preset, clip.intrinsics)
     if fusion.mode == "fill" and preset.points_per_image is not None:
         least = ", the least there is" if fusion.stride == MIN_STRIDE else ""
@@ -62,7 +62,7 @@ def settled(
         words.append(f"Gaussians start {choice.count} pixels apart: {choice.reason}.")
     if preset.bases is None:
         floor = floor_error(clip, train[0], fusion.stride)
-        choice = choose_bases(trials, floor, len(train), preset.most_bases)
+        choice = choose_bases(trials, floor, len(train), preset.max_bases)
         preset = dataclasses.replace(preset, bases=choice.count)
         words.append(f"Motion has {choice.count} {'basis' if choice.count == 1 else 'bases'}: {choice.reason}.")
     return preset, tuple(words)

@@ -26,9 +26,9 @@ from worker.daemon.child import DeviceChild, Keeper
 from worker.daemon.device import request_of, run_or_start_anew
 from worker.daemon.faults import describe
 from worker.daemon.orders import Advanced, Failed, Finished, Run, Stop, Stopped
-from worker.machine.hooks import Hooks
 from worker.scene.checkpoint import load_scene
 from worker.scene.resume_file import RESUME_FILE, load_resume
+from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
 
 SPOOL = Path("spool")
@@ -170,7 +170,7 @@ def is_alive(process_id: int) -> bool:
 def test_a_state_of_another_version_is_left_behind_and_training_starts_anew(tmp_path: Path, clip: Path) -> None:
     request_here = ReconstructionRequest(clip, ReconstructionOptions(iterations=3))
     (tmp_path / RESUME_FILE).write_bytes(b"of another version")
-    run_or_start_anew(request_here, tmp_path, Hooks())
+    run_or_start_anew(request_here, tmp_path, TrainingHooks())
     assert (tmp_path / REPORT).exists()
     assert not (tmp_path / RESUME_FILE).exists()
 
@@ -198,7 +198,7 @@ def test_other_trouble_with_the_input_is_not_tried_twice(tmp_path: Path) -> None
     (tmp_path / RESUME_FILE).write_bytes(b"kept")
     asked = ReconstructionRequest(tmp_path / "no.zip", ReconstructionOptions(iterations=3))
     with pytest.raises(InputError, match="clip"):
-        run_or_start_anew(asked, tmp_path, Hooks())
+        run_or_start_anew(asked, tmp_path, TrainingHooks())
     assert (tmp_path / RESUME_FILE).read_bytes() == b"kept"
 
 

@@ -10,9 +10,10 @@ from contract.wire.job import JobProgress
 from contract.wire.options import ReconstructionOptions
 from worker.daemon.liveness import LONGEST_LOOK_S, OTHER_LIMIT_S, STAGE_LIMITS_S, Watch
 from worker.daemon.orders import job_progress
-from worker.machine.hooks import Hooks, Progress
+from worker.machine.hooks import Progress
 from worker.phantom import PhantomSettings, make_phantom, write_stereo_video
 from worker.pipeline import reconstruct
+from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
 
 
@@ -87,7 +88,7 @@ def test_a_reconstruction_from_stereo_advances_with_every_frame_and_knows_no_sta
     write_stereo_video(make_phantom(PhantomSettings(width=192, height=160, frames=frames)), tmp_path / "clip")
     told: list[Progress] = []
     request = ReconstructionRequest(tmp_path / "clip", ReconstructionOptions(iterations=5))
-    reconstruct(request, tmp_path / "out", Hooks(on_progress=told.append))
+    reconstruct(request, tmp_path / "out", TrainingHooks(on_progress=told.append))
     places = {stage: {each.fraction for each in told if each.stage == stage} for stage in STAGE_LIMITS_S}
     assert {each.stage for each in told} <= set(STAGE_LIMITS_S)
     assert len(places["stereo"]) >= frames

@@ -18,25 +18,28 @@ from tests.worker.scenes import random_scene
 from worker.daemon.serve import NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
-from worker.machine.hooks import Hooks, Progress
+from worker.machine.hooks import Progress
+from worker.machine.timing import Stopwatch
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf
 from worker.pipeline import reconstruct, snapshot_of
 from worker.render.view import render_frame
 from worker.scene.checkpoint import SCENE_FILE
 from worker.scene.scene import Scene
-from worker.train.loop import Run, Stopwatch, train
+from worker.train.hooks import TrainingHooks
+from worker.train.loop import train
 from worker.train.request import ReconstructionRequest
+from worker.train.run import Run
 
 JOB, OTHER = "0" * 32, "1" * 32
 ITERATIONS = 16
 ALWAYS, NEVER = 0.0, 1e9
 
 
-def hooks_of(snapshots: Snapshots) -> Hooks:
-    return Hooks(wants_snapshot=snapshots.wanted, on_snapshot=snapshots.offer)
+def hooks_of(snapshots: Snapshots) -> TrainingHooks:
+    return TrainingHooks(wants_snapshot=snapshots.wanted, on_snapshot=snapshots.offer)
 
 
-def trained_with(run: Run, copy_scene: Callable[[], Scene], hooks: Hooks) -> Run:
+def trained_with(run: Run, copy_scene: Callable[[], Scene], hooks: TrainingHooks) -> Run:
     train(run, Stopwatch(), lambda: float("nan"), hooks, copy_scene)
     return run
 
@@ -66,19 +69,18 @@ def watching(snapshots: Snapshots, store: Store) -> Iterator[list[bytes]]:
 @pytest.mark.parametrize("preset", ["fast", "paper", "hexplane"])
 def test_a_watched_run_comes_to_the_bits_of_an_unwatched_one(preset: str, tmp_path: Path) -> None:
     clip = phantom_clip()
-    alone, split = prepared(clip, preset, iterations=ITERATIONS)
-    scale = alone.frames.scale
-    trained_with(alone, lambda: snapshot_of(alone, clip, split, scale, 0), Hooks())
+    alone, _ = prepared(clip, preset, iterations=ITERATIONS)
+    trained_with(alone, lambda: snapshot_of(alone), TrainingHooks())
     watched, _ = prepared(clip, preset, iterations=ITERATIONS)
     snapshots = Snapshots(period_s=ALWAYS)
     snapshots.begin(JOB)
     with watching(snapshots, Store(tmp_path)) as seen:
-        trained_with(watched, lambda: snapshot_of(watched, clip, split, scale, 0), hooks_of(snapshots))
+        trained_with(watched, lambda: snapshot_of(watched), hooks_of(snapshots))
     newest = snapshots.newest(JOB)
     assert newest is not None
     assert newest.iteration > 0
     assert len(set(seen)) > 1
-    assert bits(watched, clip, split) == bits(alone, clip, split)
+    assert bits(watched) == bits(alone)
 
 
 def test_a_reconstruction_can_be_watched_from_its_clip_to_its_scene(tmp_path: Path) -> None:
@@ -91,9 +93,9 @@ def test_a_reconstruction_can_be_watched_from_its_clip_to_its_scene(tmp_path: Pa
         if snapshots.newest(JOB) is not None:
             stages.add(progress.stage)
 
-    hooks = Hooks(on_progress=note, wants_snapshot=snapshots.wanted, on_snapshot=snapshots.offer)
+    hooks = TrainingHooks(on_progress=note, wants_snapshot=snapshots.wanted, on_snapshot=snapshots.offer)
     reconstruct(request, tmp_path / "watched", hooks)
-    reconstruct(request, tmp_path / "alone", Hooks())
+    reconstruct(request, tmp_path / "alone", TrainingHooks())
     newest = snapshots.newest(JOB)
     assert newest is not None
     assert {"train", "score"} <= stages <= {"train", "finish", "score"}
@@ -103,12 +105,12 @@ def test_a_reconstruction_can_be_watched_from_its_clip_to_its_scene(tmp_path: Pa
 
 def test_a_run_that_nobody_watches_is_copied_once_at_its_start() -> None:
     clip = phantom_clip()
-    run, split = prepared(clip, iterations=4)
+    run, _ = prepared(clip, iterations=4)
     snapshots, copies = Snapshots(period_s=ALWAYS), list[int]()
 
     def copy() -> Scene:
         copies.append(run.iteration)
-        return snapshot_of(run, clip, split, run.frames.scale, 0)
+        return snapshot_of(run)
 
     snapshots.begin(JOB)
     trained_with(run, copy, hooks_of(snapshots))
@@ -117,10 +119,10 @@ def test_a_run_that_nobody_watches_is_copied_once_at_its_start() -> None:
 
 def test_a_snapshot_shows_what_the_model_shows_and_training_does_not_move_it() -> None:
     clip = phantom_clip()
-    run, split = prepared(clip, iterations=4)
-    scene = snapshot_of(run, clip, split, run.frames.scale, 0)
+    run, _ = prepared(clip, iterations=4)
+    scene = snapshot_of(run)
     before, t = view(run, 3), float(clip.t[3])
-    trained_with(run, lambda: scene, Hooks())
+    trained_with(run, lambda: scene, TrainingHooks())
     frame = render_frame(scene, t)
     np.testing.assert_allclose(frame.rgb / 255.0, np.clip(before.rgb, 0, 1), atol=0.51 / 255)
     assert not np.array_equal(view(run, 3).rgb, before.rgb)

@@ -25,11 +25,11 @@ from contract.wire.job import JobState
 from contract.wire.options import ReconstructionOptions
 from tests.worker.jobs import STANDIN, WAIT_S, Jobs, eventually
 from worker.daemon.supervisor import run_supervisor
-from worker.machine.hooks import Hooks
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf
 from worker.pipeline import reconstruct
 from worker.scene.checkpoint import load_scene
 from worker.scene.resume_file import load_resume
+from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
 
 LEASE_S = 6.0
@@ -115,7 +115,8 @@ def test_a_real_worker_told_to_end_keeps_what_was_trained_and_the_next_comes_to_
 ) -> None:
     write_endonerf(make_phantom(PhantomSettings(width=96, height=80, frames=8)), tmp_path / "clip")
     clip = Path(shutil.make_archive(str(tmp_path / "clip"), "zip", tmp_path / "clip"))
-    reconstruct(ReconstructionRequest(clip, ReconstructionOptions(iterations=500)), tmp_path / "whole", Hooks())
+    request = ReconstructionRequest(clip, ReconstructionOptions(iterations=500))
+    reconstruct(request, tmp_path / "whole", TrainingHooks())
     real = [sys.executable, "-m", "worker", "consume"]
     job_id = bench.submit(clip, iterations=500)
     with bench.worker(command=real) as worker:

@@ -13,7 +13,7 @@ def test_a_series_is_a_preset_with_its_changes_made() -> None:
     changed = preset_of("fast:tracks=false,spread=0.5,start_width=none,bases=9,order=random")
     assert (changed.tracks, changed.spread, changed.start_width) == (False, 0.5, None)
     assert (changed.bases, changed.order) == (9, "random")
-    assert not preset_of("fast:cycles=false,worth_db=none").cycles
+    assert not preset_of("fast:warm_restarts=false,min_gain_db=none").warm_restarts
     assert preset_of("fast:start_width=0.1").start_width == 0.1
     assert preset_of("fast:frames_a_step=2").frames_a_step == 2
     assert preset_of("paper") is PRESETS["paper"]
@@ -37,8 +37,9 @@ def test_what_no_preset_has_is_refused_with_its_name(series: str) -> None:
 @pytest.mark.parametrize(
     "series",
     [
-        "paper:cycles=true", "paper:worth_db=0.1", "fast:cycles=false", "fast:frames_a_step=0", "fast:frames_a_step=17",
-        "fast:bases=0", "fast:bases=-1", "hexplane:bases=-1", "fast:most_bases=0", "fast:points_per_image=0",
+        "paper:warm_restarts=true", "paper:min_gain_db=0.1", "fast:warm_restarts=false",
+        "fast:frames_a_step=0", "fast:frames_a_step=17",
+        "fast:bases=0", "fast:bases=-1", "hexplane:bases=-1", "fast:max_bases=0", "fast:points_per_image=0",
         "fast:opacity=1", "fast:spread=0", "paper:start_width=0", "paper:sh_degree=4",
     ],
 )  # fmt: skip
@@ -66,8 +67,8 @@ def test_a_series_is_one_row_however_it_is_spelt() -> None:
     names = [cell.series for cell in plan(["a"], spelt, ["every8"], [0])]
     assert names == ["fast:bases=3,spread=0.5", "fast"]
     assert preset_of(names[0]) == preset_of(spelt[0])
-    (free,) = plan(["a"], ["fast:cycles=false,worth_db=none"], ["every8"], [0])
-    assert free.series == "fast:cycles=false,worth_db=none"
+    (free,) = plan(["a"], ["fast:warm_restarts=false,min_gain_db=none"], ["every8"], [0])
+    assert free.series == "fast:min_gain_db=none,warm_restarts=false"
 
 
 @pytest.mark.parametrize(("holdouts", "seeds", "field"), [

@@ -20,7 +20,8 @@ from worker.evaluate.command import SUMMARY, measure_all
 from worker.evaluate.measure import Bench, Values, command_of, seconds_of
 from worker.evaluate.rows import CURVES, KEY, LOCK, RUN_FIELDS, RUNS, Results, adding_alone, read_rows
 from worker.evaluate.sources import DATA_VARIABLE, source_of
-from worker.machine.hooks import Hooks, Progress
+from worker.machine.hooks import Progress
+from worker.train.hooks import TrainingHooks
 
 CLIP = "phantom:pull:96x80:12frames"
 NAME = "phantom-pull-96x80-12frames"
@@ -150,7 +151,7 @@ def test_what_this_machine_lacks_ends_measuring_and_is_no_row(tmp_path: Path, la
     source = source_of(CLIP)
     (cell,) = plan([source.name], ["fast"], ["every8"], [0], iterations=[3])
     with pytest.raises(type(lacking), match=str(lacking)):
-        Bench({source.name: source}).measure(cell, Hooks(on_progress=fail))
+        Bench({source.name: source}).measure(cell, TrainingHooks(on_progress=fail))
 
 
 def test_what_failed_is_measured_again_only_if_asked_to(tmp_path: Path) -> None:
@@ -194,7 +195,7 @@ def test_a_process_that_was_killed_leaves_the_folder_to_the_next(tmp_path: Path)
 class InterruptedAfterOne(Bench):
     """Ctrl-C comes when the first cell has been measured."""
 
-    def measure(self, cell: Cell, hooks: Hooks) -> tuple[Values, list[Values]]:
+    def measure(self, cell: Cell, hooks: TrainingHooks) -> tuple[Values, list[Values]]:
         found = super().measure(cell, hooks)
         signal.raise_signal(signal.SIGINT)
         return found

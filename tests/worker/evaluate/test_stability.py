@@ -26,7 +26,8 @@ from worker.evaluate.stability import (
     plan,
     verdict,
 )
-from worker.machine.hooks import Hooks, Progress
+from worker.machine.hooks import Progress
+from worker.train.hooks import TrainingHooks
 
 SMALL = Grid(width=96, height=80, frames=12, iterations=15)
 
@@ -94,7 +95,7 @@ def test_a_few_cells_are_measured_judged_kept_and_not_measured_again(tmp_path: P
     cells = plan(["smoke", "few_frames"], [5], ["fast"], [0])
     atlas = Atlas(tmp_path, SMALL)
     assert atlas.missing(cells) == cells
-    found = {cell.condition: atlas.measure(cell, Hooks()) for cell in cells[:2]}
+    found = {cell.condition: atlas.measure(cell, TrainingHooks()) for cell in cells[:2]}
     assert found[CLEAN]["outcome"] == "held"
     assert float(found[CLEAN]["loss_db"]) == 0.0
     assert found["smoke"]["outcome"] == "told"
@@ -102,7 +103,7 @@ def test_a_few_cells_are_measured_judged_kept_and_not_measured_again(tmp_path: P
     assert "smoke" in found["smoke"]["new_warnings"]
     again = Atlas(tmp_path, SMALL)
     assert again.missing(cells) == cells[2:]
-    few = again.measure(cells[2], Hooks())
+    few = again.measure(cells[2], TrainingHooks())
     assert few["outcome"] in ("held", "told")
     assert few["reported_db"] == ""
     assert "Only 1 frames" in few["warnings"]
@@ -112,7 +113,9 @@ def test_a_few_cells_are_measured_judged_kept_and_not_measured_again(tmp_path: P
 
 
 def test_a_recording_is_read_as_any_other_and_its_checks_speak() -> None:
-    found = measured(StabilityCell("inverted_masks", 2, "fast", 0), clean_clip(SMALL.settings(0)), SMALL, Hooks())
+    found = measured(
+        StabilityCell("inverted_masks", 2, "fast", 0), clean_clip(SMALL.settings(0)), SMALL, TrainingHooks()
+    )
     assert found["error"].startswith("InputError: masks")
     assert verdict(found, None)["outcome"] == "refused"
 
@@ -120,7 +123,7 @@ def test_a_recording_is_read_as_any_other_and_its_checks_speak() -> None:
 def test_a_cell_that_is_interrupted_leaves_no_row(tmp_path: Path) -> None:
     atlas = Atlas(tmp_path, SMALL)
     with pytest.raises(Cancelled):
-        atlas.measure(StabilityCell(CLEAN, 0, "fast", 0), Hooks(should_stop=lambda: True))
+        atlas.measure(StabilityCell(CLEAN, 0, "fast", 0), TrainingHooks(should_stop=lambda: True))
     assert not (tmp_path / STABILITY).exists()
 
 
@@ -130,7 +133,7 @@ def test_what_this_machine_lacks_ends_measuring_and_is_no_row(tmp_path: Path) ->
 
     atlas = Atlas(tmp_path, SMALL)
     with pytest.raises(UnavailableError, match="The disk is full"):
-        atlas.measure(StabilityCell(CLEAN, 0, "fast", 0), Hooks(on_progress=fail))
+        atlas.measure(StabilityCell(CLEAN, 0, "fast", 0), TrainingHooks(on_progress=fail))
     assert not (tmp_path / STABILITY).exists()
 
 

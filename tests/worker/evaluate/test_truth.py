@@ -17,7 +17,7 @@ from worker.model.gaussians import initial_gaussians
 from worker.model.metrics import BEST_PSNR_DB
 from worker.phantom import Phantom, PhantomSettings, make_phantom
 from worker.scene.scene import Scene
-from worker.train.looking import View
+from worker.train.hooks import RenderedFrame
 from worker.train.targets import MEDIAN_DEPTH_UNITS
 
 FRAMES = 12
@@ -31,9 +31,9 @@ class PhantomShown:
     def __init__(self, phantom: Phantom) -> None:
         self._phantom = phantom
 
-    def view(self, frame: int, pose: NDArray[np.float64]) -> View:
+    def view(self, frame: int, pose: NDArray[np.float64]) -> RenderedFrame:
         rgb, depth_mm = self._phantom.render(frame, pose)
-        return View(rgb, depth_mm, (depth_mm > 0).astype(np.float32))
+        return RenderedFrame(rgb, depth_mm, (depth_mm > 0).astype(np.float32))
 
     def motion_mm(self, frame: int) -> NDArray[np.floating]:
         tracks = self._phantom.trajectories(stride_px=1)
@@ -46,10 +46,10 @@ class PhantomShown:
 class BakedPhantom(PhantomShown):
     """The phantom with its highlights where the endoscope sees them, whoever looks."""
 
-    def view(self, frame: int, pose: NDArray[np.float64]) -> View:
+    def view(self, frame: int, pose: NDArray[np.float64]) -> RenderedFrame:
         eye_mm = self._phantom.world_from_camera(frame)[:3, 3]
         rgb, depth_mm = self._phantom.render(frame, pose, eye_mm=eye_mm)
-        return View(rgb, depth_mm, (depth_mm > 0).astype(np.float32))
+        return RenderedFrame(rgb, depth_mm, (depth_mm > 0).astype(np.float32))
 
 
 @cache

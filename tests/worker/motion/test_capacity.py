@@ -223,7 +223,7 @@ def test_where_nothing_could_be_followed_bases_come_by_the_frames_up_to_the_most
 @pytest.mark.parametrize("most", [2, 5, 12, 1000])
 def test_a_preset_may_allow_fewer_bases_than_the_scene_would_get(most: int) -> None:
     clip, train, tracks = followed("breathing")
-    limited, words = settled(dataclasses.replace(FAST, most_bases=most), tracks, clip, train)
+    limited, words = settled(dataclasses.replace(FAST, max_bases=most), tracks, clip, train)
     assert limited.bases is not None
     assert limited.bases <= most
     assert limited.bases == bases_for("breathing") or most < bases_for("breathing")

@@ -11,8 +11,9 @@ pytest.importorskip("triton", reason="Triton is not installed")
 
 from contract.wire.errors import UnavailableError
 from worker.machine.hooks import Hooks
+from worker.machine.timing import Timings
 from worker.phantom import PhantomSettings, make_phantom, write_stereomis
-from worker.pipeline import depth_clip_of
+from worker.pipeline import open_with_depth
 from worker.raster import Rendered
 from worker.raster.backend import Device
 from worker.raster.cuda import agreement, rasterize
@@ -55,6 +56,6 @@ def test_one_that_does_not_matches_no_stereo_clip_either(
     stages: list[str] = []
     hooks = Hooks(on_progress=lambda progress: stages.append(progress.stage))
     with pytest.raises(UnavailableError, match="GPU 9001 is not to be trusted"):
-        depth_clip_of(ReconstructionRequest(clip=tmp_path), hooks, {}, Device("cuda", "GPU 9001", device))
+        open_with_depth(ReconstructionRequest(clip=tmp_path), hooks, Timings(), Device("cuda", "GPU 9001", device))
     assert stages[-1] == "compile"
     assert "stereo" not in stages

@@ -21,17 +21,17 @@ from worker.pipeline import scene_of
 from worker.render.view import FAR_POSE, endoscope_pose, render_frame
 from worker.scene.checkpoint import load_scene, save_scene
 from worker.scene.scene import Scene
-from worker.train.loop import Run
 from worker.train.presets import PRESETS
+from worker.train.run import Run
 
 LAST = (FRAMES - 1) / FRAMES
 
 
 def made(preset: str = "fast", *, moving_camera: bool = False, iterations: int = 20) -> tuple[Run, Scene]:
     clip = phantom_clip(moving_camera=moving_camera)
-    run, split = prepared(clip, preset, iterations=iterations)
+    run, _ = prepared(clip, preset, iterations=iterations)
     trained(run)
-    return run, scene_of(run, clip, split, run.frames.scale, run.seed)
+    return run, scene_of(run)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from worker.evaluate.conditions import CONDITIONS, CleanClip, clean_clip
 from worker.input.clip import DepthClip, open_clip, split_frames
 from worker.phantom import MOTIONS, Motion, PhantomSettings
 from worker.report.doubts import course_doubts, picture_doubts
-from worker.train.looking import sample_frames
+from worker.train.scoring import sample_frames
 
 DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 

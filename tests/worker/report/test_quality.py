@@ -18,7 +18,8 @@ from worker.input.clip.types import DepthClip
 from worker.model.metrics import psnr_tissue
 from worker.report.baselines import CopyBaselines, copy_baselines
 from worker.report.quality import Scores, Training, build_report, clip_warnings, measure, score_warnings
-from worker.train.looking import View, sample_frames
+from worker.train.hooks import RenderedFrame
+from worker.train.scoring import sample_frames
 
 TRAINING = Training(
     preset="fast",
@@ -45,15 +46,15 @@ def long_clip() -> DepthClip:
     return dataclasses.replace(clip, assumptions=("masks: as given",), measurements={"vertical_px": 0.2})
 
 
-def views(clip: DepthClip, noise: float = 0.01) -> Callable[[int], View]:
+def views(clip: DepthClip, noise: float = 0.01) -> Callable[[int], RenderedFrame]:
     """A model that renders the clip itself, with some noise."""
 
-    def view_of(index: int) -> View:
+    def render(index: int) -> RenderedFrame:
         random = np.random.default_rng(index)
         rgb = clip.rgb[index] / 255 + random.normal(0, noise, clip.rgb[index].shape)
-        return View(rgb.astype(np.float32), clip.depth_mm[index] + 0.5, np.ones_like(clip.depth_mm[index]))
+        return RenderedFrame(rgb.astype(np.float32), clip.depth_mm[index] + 0.5, np.ones_like(clip.depth_mm[index]))
 
-    return view_of
+    return render
 
 
 def report_of(clip: DepthClip, holdout: str = "every8", noise: float = 0.01) -> Report:
@@ -129,13 +130,13 @@ def test_held_out_frames_without_tissue_are_left_out_of_the_means() -> None:
 def test_a_view_that_is_not_finite_stops_the_scene(broken: str) -> None:
     clip = long_clip()
 
-    def view_of(index: int) -> View:
+    def render(index: int) -> RenderedFrame:
         view = views(clip)(index)
         getattr(view, broken)[3, 3] = np.nan
         return view
 
     with pytest.raises(TrainingDiverged, match="Frame 9"):
-        measure(clip, [9], view_of)
+        measure(clip, [9], render)
 
 
 @pytest.mark.parametrize(

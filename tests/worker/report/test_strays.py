@@ -11,7 +11,7 @@ from tests.worker.clips import plane_clip
 from tests.worker.phantoms import prepared
 from worker.input.clip import DepthClip
 from worker.report.visibility import WIDEST_UNSEEN, drop_strays, seen_share
-from worker.train.loop import Run
+from worker.train.run import Run
 
 LOG_SCALE = slice(7, 10)
 OUT_OF_SIGHT = 200.0

@@ -14,7 +14,7 @@ from tests.worker.phantoms import prepared
 from worker.fusion import COMPLETED_CONFIDENCE
 from worker.input.clip import DepthClip
 from worker.report.visibility import SAMPLED_FRAMES, WIDEST_UNSEEN, drop_strays, seen_share
-from worker.train.loop import Run
+from worker.train.run import Run
 
 
 @pytest.fixture

@@ -18,20 +18,19 @@ from contract.wire.errors import SceneError
 from tests.worker.phantoms import phantom_clip, prepared, trained
 from tests.worker.scene.plain_reader import read_plainly
 from tests.worker.scenes import random_scene
-from worker.input.clip import DepthClip
+from worker.input.clip import DepthClip, spread
 from worker.model.deformation import SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.metrics import psnr_tissue
 from worker.pipeline import scene_of
-from worker.render.shrink import JUDGED_FRAMES, TOLERANCE_DB, shrink
-from worker.render.view import model_of
-from worker.report.visibility import spread
 from worker.scene import compact
 from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
 from worker.scene.compact import MIN_POWER, STATE, Compact, unpack
 from worker.scene.differences import MAX_STORED
+from worker.scene.model import model_of
 from worker.scene.quantize import prepare, round_to
 from worker.scene.scene import Scene
+from worker.train.rate_distortion import SCORED_FRAMES, TOLERANCE_DB, quantize_scene
 from worker.train.targets import TrainingFrames
 
 TIMES = tuple(np.arange(6) / 6)
@@ -325,20 +324,20 @@ def test_damage_to_a_compact_file_is_found(tmp_path: Path, damage: str) -> None:
 
 def test_shrinking_keeps_its_tolerance_and_says_what_it_took() -> None:
     clip = phantom_clip()
-    run, split = prepared(clip, iterations=40)
+    run, _ = prepared(clip, iterations=40)
     trained(run)
-    scene = scene_of(run, clip, split, run.frames.scale, 0)
-    small, tiny = (shrink(scene, clip, run.frames, tolerance_db) for tolerance_db in (0.1, 0.5))
+    scene = scene_of(run)
+    small, tiny = (quantize_scene(scene, clip, run.frames, tolerance_db) for tolerance_db in (0.1, 0.5))
     assert small is not None
     assert tiny is not None
     assert small.loss_db <= 0.1 < tiny.loss_db <= 0.5
     assert tiny.scene.file_bytes < small.scene.file_bytes < 0.25 * scene.byte_count
     assert f"{small.scene.file_bytes / 1e6:.2f} MB" in small.words[0]
-    judged = spread(run.frames.indices, JUDGED_FRAMES)
+    judged = spread(run.frames.indices, SCORED_FRAMES)
     assert small.frames == len(judged)
     exact, kept = (mean_db(each, clip, run.frames, judged) for each in (scene, small.scene))
     assert small.loss_db == pytest.approx(exact - kept, abs=1e-3)
-    again = shrink(scene, clip, run.frames, 0.1)
+    again = quantize_scene(scene, clip, run.frames, 0.1)
     assert again is not None
     assert again.step == small.step
     assert save(dict(again.scene.stored or {})) == save(dict(small.scene.stored or {}))
@@ -353,14 +352,14 @@ def mean_db(scene: Scene, clip: DepthClip, frames: TrainingFrames, judged: list[
 
 def test_frames_without_tissue_are_not_judged_and_where_there_is_none_floats_are_kept() -> None:
     clip = phantom_clip()
-    run, split = prepared(clip, iterations=10)
+    run, _ = prepared(clip, iterations=10)
     trained(run)
-    scene = scene_of(run, clip, split, run.frames.scale, 0)
+    scene = scene_of(run)
     hidden = np.zeros_like(clip.tissue)
-    assert shrink(scene, dataclasses.replace(clip, tissue=hidden), run.frames) is None
+    assert quantize_scene(scene, dataclasses.replace(clip, tissue=hidden), run.frames) is None
     first, second = run.frames.indices[:2]
     hidden[[first, second]] = clip.tissue[[first, second]]
-    small = shrink(scene, dataclasses.replace(clip, tissue=hidden), run.frames)
+    small = quantize_scene(scene, dataclasses.replace(clip, tissue=hidden), run.frames)
     assert small is not None
     assert small.frames == 2
     assert small.loss_db <= TOLERANCE_DB
@@ -368,17 +367,17 @@ def test_frames_without_tissue_are_not_judged_and_where_there_is_none_floats_are
 
 def test_a_scene_that_whole_numbers_cannot_hold_stays_as_floats(monkeypatch: pytest.MonkeyPatch) -> None:
     clip = phantom_clip()
-    run, split = prepared(clip, iterations=10)
-    scene = scene_of(run, clip, split, run.frames.scale, 0)
+    run, _ = prepared(clip, iterations=10)
+    scene = scene_of(run)
     scene.gaussians.mean[3, 0] = 1e9
-    assert shrink(scene, clip, run.frames) is None
+    assert quantize_scene(scene, clip, run.frames) is None
     scene.gaussians.mean[3, 0] = 0
     monkeypatch.setattr(compact, "MAX_NUMBERS", 1000)
-    assert shrink(scene, clip, run.frames) is None
+    assert quantize_scene(scene, clip, run.frames) is None
 
 
 def test_models_that_are_not_known_are_left_as_floats() -> None:
     clip = phantom_clip()
     run, _ = prepared(clip, iterations=1)
     for scene in (random_scene("fdm-gaussian"), random_scene("hexplane"), random_scene("shared", sh_degree=1)):
-        assert shrink(scene, clip, run.frames) is None
+        assert quantize_scene(scene, clip, run.frames) is None

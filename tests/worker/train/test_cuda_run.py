@@ -21,10 +21,12 @@ from worker.pipeline import scene_of
 from worker.raster.backend import CPU, Device
 from worker.raster.cuda.model import CudaModel
 from worker.render.view import render_frame
-from worker.train.loop import Run, Stopwatch, step
+from worker.train.loop import step
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
 from worker.train.resume import load_run, save_run
+from worker.train.run import Run
+from worker.train.setup import Setup
 
 WIDTH, HEIGHT, FRAMES, ITERATIONS = 24, 16, 2, 3
 SMALL = dataclasses.replace(
@@ -60,9 +62,8 @@ def split(clip: DepthClip) -> FrameSplit:
 
 def prepared(clip: DepthClip, split: FrameSplit, device: Device) -> Run:
     options = ReconstructionOptions(iterations=ITERATIONS)
-    seconds: dict[str, float] = {}
-    run, _ = prepare(clip, split, SMALL, options, Stopwatch(), seconds=seconds, device=device)
-    assert ("compile_s" in seconds) == (device != CPU)
+    run = prepare(Setup(clip, split, SMALL, options, device))
+    assert ("compile_s" in run.setup.timings.seconds) == (device != CPU)
     return run
 
 
@@ -113,7 +114,7 @@ def test_a_scene_looks_the_same_from_both_devices(
 ) -> None:
     """Also in another size, and to the confidence layer."""
     run = runs[gpu]
-    scene = scene_of(run, clip, split, run.frames.scale, run.seed)
+    scene = scene_of(run)
     assert float(scene.seen.max()) > 0.5
     for size in ((WIDTH, HEIGHT), (15, 10), (WIDTH, HEIGHT)):
         views = [

@@ -11,8 +11,9 @@ import pytest
 from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, held_out_frames
 from worker.machine.hooks import Hooks
+from worker.machine.timing import Timings
 from worker.phantom import PhantomSettings, make_phantom, write_stereomis
-from worker.pipeline import depth_clip_of
+from worker.pipeline import open_with_depth
 from worker.train.request import ReconstructionRequest
 
 FRAMES = 12
@@ -36,7 +37,7 @@ def test_held_out_frames_of_a_stereo_clip_change_no_bit_of_the_others(holdout: s
     request = ReconstructionRequest(tmp_path, ReconstructionOptions(holdout=holdout))
 
     def depth_clip() -> DepthClip:
-        return depth_clip_of(request, Hooks(), {})
+        return open_with_depth(request, Hooks(), Timings())
 
     clean = depth_clip()
     held_out = held_out_frames(FRAMES, holdout)

@@ -12,13 +12,16 @@ import torch
 
 from contract.wire.errors import TrainingDiverged
 from tests.worker.phantoms import bits, phantom_clip, prepared, trained
-from worker.machine.hooks import Hooks
+from worker.machine.timing import Stopwatch
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
 from worker.raster.cpu.model import CpuModel
 from worker.raster.step import StepSums, TrainingFrame
-from worker.train.loop import CALIBRATION_STEPS, LATER_STEPS, Run, Stopwatch, iterations_within, train, warm_up
+from worker.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, iterations_within, warm_up
+from worker.train.hooks import TrainingHooks
+from worker.train.loop import train
 from worker.train.presets import PRESETS
+from worker.train.run import Run
 from worker.train.schedule import Schedule
 
 LAG = 5
@@ -58,8 +61,8 @@ def lagging(iterations: int) -> tuple[Run, LaggingModel]:
 @pytest.mark.parametrize("iterations", [20, 23])
 def test_it_ends_with_the_bits_of_a_model_that_answers_every_step(iterations: int) -> None:
     clip = phantom_clip()
-    run, split = prepared(clip, iterations=iterations)
-    assert bits(trained(lagging(iterations)[0]), clip, split) == bits(trained(run), clip, split)
+    run, _ = prepared(clip, iterations=iterations)
+    assert bits(trained(lagging(iterations)[0])) == bits(trained(run))
 
 
 @pytest.mark.parametrize(("iterations", "noticed_by"), [(20, LAG), (LAG - 2, LAG - 2)])
@@ -82,13 +85,13 @@ def test_a_step_that_saw_nothing_is_noticed_though_later_ones_see_again() -> Non
         return False
 
     with pytest.raises(TrainingDiverged, match="No Gaussian is left in view"):
-        trained(run, Hooks(should_stop=turn_away_for_a_step))
+        trained(run, TrainingHooks(should_stop=turn_away_for_a_step))
     assert run.iteration < LAG
 
 
 def test_a_cycle_does_not_end_before_its_steps_are_known_to_be_sound() -> None:
     run, model = lagging(23)
-    run.schedule = Schedule(23, cycles=True)
+    run.schedule = Schedule(23, warm_restarts=True)
     scored: list[int] = []
 
     def spoil() -> bool:
@@ -101,19 +104,19 @@ def test_a_cycle_does_not_end_before_its_steps_are_known_to_be_sound() -> None:
         return 30.0
 
     with pytest.raises(TrainingDiverged):
-        train(run, Stopwatch(), evaluate, Hooks(should_stop=spoil))
+        train(run, Stopwatch(), evaluate, TrainingHooks(should_stop=spoil))
     assert 23 not in scored
 
 
 def test_a_budget_is_measured_on_all_steps_up_to_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     run, model = lagging(20)
-    untimed, timed = CALIBRATION_STEPS
+    untimed, timed = UNTIMED_STEPS, TIMED_STEPS
     answer_s = 0.1
     times_s = np.cumsum([0.0, 0.5, *[answer_s] * (untimed + timed), 0.0])
     clock = iter(times_s.tolist())
-    monkeypatch.setattr("worker.train.loop.time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    planned = iterations_within(model, run.frames, run.preset, run.seed, 60.0, 0.0)
-    assert planned == pytest.approx((60 - times_s[-1]) / (answer_s / LAG * LATER_STEPS), abs=1)
+    monkeypatch.setattr("worker.train.calibrate.time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    planned = iterations_within(run, 60.0, 0.0)
+    assert planned == pytest.approx((60 - times_s[-1]) / (answer_s / LAG * GROWTH_ALLOWANCE), abs=1)
     assert model.steps_made == LAG * (untimed + timed)
 
 
@@ -122,7 +125,7 @@ def test_warming_up_leaves_a_model_as_it_was(name: str) -> None:
     run, _ = prepared(phantom_clip(), name)
     before = {key: values.clone() for key, values in run.model.arrays().items()}
     shares: list[float] = []
-    assert warm_up(run.model, run.frames, run.preset, shares.append) > 0
+    assert warm_up(run, shares.append) > 0
     assert shares == sorted(shares)
     assert shares[-1] == 1
     for key, values in run.model.arrays().items():

@@ -51,7 +51,7 @@ def test_a_rival_differs_from_the_paper_in_what_it_is_named_for_alone(name: str,
 def test_ours_differ_in_time_and_in_how_many_gaussians_it_pays_for() -> None:
     instant, fast, quality = (PRESETS[name] for name in ("instant", "fast", "quality"))
     for other in (instant, quality):
-        assert differing(other, fast) <= {"points_per_image", "budget_s", "worth_db"}
+        assert differing(other, fast) <= {"points_per_image", "budget_s", "min_gain_db"}
         assert other.points_by_budget
     budgets = [preset.budget_s or 0.0 for preset in (instant, fast, quality)]
     assert budgets == sorted(set(budgets))
@@ -59,29 +59,29 @@ def test_ours_differ_in_time_and_in_how_many_gaussians_it_pays_for() -> None:
 
 def test_small_is_fast_with_less_to_store() -> None:
     small, fast = PRESETS["small"], PRESETS["fast"]
-    assert differing(small, fast) == {"points_per_image", "points_by_budget", "most_bases", "rates", "budget_s"}
+    assert differing(small, fast) == {"points_per_image", "points_by_budget", "max_bases", "rates", "budget_s"}
     assert (small.points_per_image or 0) < (PRESETS["instant"].points_per_image or 0)
     still = dataclasses.replace(fast.rates, motion_log_scale=Rate(0.0))
     assert small.rates == still
 
 
-def test_cycles_are_ours_alone() -> None:
-    assert {name for name, preset in PRESETS.items() if preset.cycles} == {"instant", "fast", "quality", "small"}
+def test_warm_restarts_are_ours_alone() -> None:
+    assert {name for name, preset in PRESETS.items() if preset.warm_restarts} == {"instant", "fast", "quality", "small"}
 
 
 def test_an_average_of_models_needs_a_fixed_number_of_gaussians() -> None:
     with pytest.raises(ValueError, match="densification"):
-        dataclasses.replace(PRESETS["paper"], cycles=True)
+        dataclasses.replace(PRESETS["paper"], warm_restarts=True)
     with pytest.raises(ValueError, match="densification"):
         dataclasses.replace(PRESETS["fast"], densify=PRESETS["paper"].densify)
 
 
-def test_what_a_doubling_is_worth_cannot_be_asked_without_cycles() -> None:
-    with pytest.raises(ValueError, match="needs cycles"):
-        dataclasses.replace(PRESETS["paper"], worth_db=0.1)
-    with pytest.raises(ValueError, match="needs cycles"):
-        dataclasses.replace(PRESETS["fast"], cycles=False)
-    assert not dataclasses.replace(PRESETS["fast"], cycles=False, worth_db=None).cycles
+def test_early_stopping_needs_warm_restarts() -> None:
+    with pytest.raises(ValueError, match="needs warm_restarts"):
+        dataclasses.replace(PRESETS["paper"], min_gain_db=0.1)
+    with pytest.raises(ValueError, match="needs warm_restarts"):
+        dataclasses.replace(PRESETS["fast"], warm_restarts=False)
+    assert not dataclasses.replace(PRESETS["fast"], warm_restarts=False, min_gain_db=None).warm_restarts
 
 
 def test_little_time_is_not_spent_on_many_gaussians() -> None:

@@ -16,23 +16,17 @@ import pytest
 from contract.wire.errors import Cancelled, SceneError, TrainingDiverged
 from tests.worker.phantoms import bits, phantom_clip, prepared, prepared_on, trained, view
 from worker.input.clip import DepthClip, split_frames
-from worker.machine.hooks import Hooks, Progress
+from worker.machine.hooks import Progress
+from worker.machine.timing import Stopwatch
 from worker.model.metrics import psnr_tissue
 from worker.model.optimize import Rate
+from worker.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, iterations_within
 from worker.train.densify import DensifySettings
-from worker.train.loop import (
-    CALIBRATION_STEPS,
-    LATER_STEPS,
-    CurvePoint,
-    Run,
-    Stopwatch,
-    frames_at,
-    iterations_within,
-    train,
-    write_curve,
-)
+from worker.train.hooks import TrainingHooks
+from worker.train.loop import train
 from worker.train.presets import PRESETS, Preset
 from worker.train.resume import load_run, save_run
+from worker.train.run import CurvePoint, Run, frames_at, write_curve
 
 SOON = DensifySettings(from_iteration=6, every=6, gradient_threshold=1e-5)
 """Splits early enough to happen in these short runs; so does splitting_soon add harmonics."""
@@ -44,8 +38,8 @@ def splitting_soon(name: str) -> Preset:
     return dataclasses.replace(preset, densify=SOON, sh_every=7) if preset.densify else preset
 
 
-def stopping_after(iterations: int) -> Hooks:
-    """Hooks that ask to stop once so many iterations are made."""
+def stopping_after(iterations: int) -> TrainingHooks:
+    """TrainingHooks that ask to stop once so many iterations are made."""
     asked = 0
 
     def should_stop() -> bool:
@@ -53,12 +47,12 @@ def stopping_after(iterations: int) -> Hooks:
         asked += 1
         return asked > iterations
 
-    return Hooks(should_stop=should_stop)
+    return TrainingHooks(should_stop=should_stop)
 
 
 def run_bits(clip: DepthClip, preset: Preset, *, iterations: int = ITERATIONS, seed: int = 0) -> dict[str, bytes]:
-    run, split = prepared(clip, preset, iterations=iterations, seed=seed)
-    return bits(trained(run), clip, split)
+    run, _ = prepared(clip, preset, iterations=iterations, seed=seed)
+    return bits(trained(run))
 
 
 @cache
@@ -77,7 +71,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_others(name: str) ->
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_stopped_run_goes_on_to_the_bits_of_an_unstopped_one(name: str, tmp_path: Path) -> None:
     clip, preset = phantom_clip(), splitting_soon(name)
-    run, split = prepared(clip, preset, iterations=ITERATIONS)
+    run, _ = prepared(clip, preset, iterations=ITERATIONS)
     count = run.model.count
     with pytest.raises(Cancelled):
         trained(run, stopping_after(STOPPED_AFTER))
@@ -86,7 +80,7 @@ def test_a_stopped_run_goes_on_to_the_bits_of_an_unstopped_one(name: str, tmp_pa
     save_run(tmp_path, run, 1.5)
     again, _ = prepared(clip, preset, iterations=ITERATIONS)
     assert load_run(tmp_path, again) == 1.5
-    assert bits(trained(again), clip, split) == straight_bits(name)
+    assert bits(trained(again)) == straight_bits(name)
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -104,7 +98,7 @@ def test_held_out_frames_change_nothing_in_a_trained_model(name: str, rng: np.ra
     poisoned.depth_confidence[split.held_out] = rng.integers(0, 256, shape)
     clean_run = trained(prepared_on(clip, split, preset, iterations=ITERATIONS))
     poisoned_run = trained(prepared_on(poisoned, split, preset, iterations=ITERATIONS))
-    assert bits(poisoned_run, poisoned, split) == bits(clean_run, clip, split)
+    assert bits(poisoned_run) == bits(clean_run)
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -148,7 +142,7 @@ def test_frames_are_seen_in_one_order_however_many_make_a_step(frames_a_step: in
 @pytest.mark.parametrize("name", ["fast", "paper", "hexplane"])
 def test_steps_on_several_frames_keep_their_bits_over_a_stop(name: str, tmp_path: Path) -> None:
     clip, preset = phantom_clip(), dataclasses.replace(splitting_soon(name), frames_a_step=3)
-    whole, split = prepared(clip, preset, iterations=9)
+    whole, _ = prepared(clip, preset, iterations=9)
     stopped, _ = prepared(clip, preset, iterations=9)
     with pytest.raises(Cancelled):
         trained(stopped, stopping_after(4))
@@ -156,7 +150,7 @@ def test_steps_on_several_frames_keep_their_bits_over_a_stop(name: str, tmp_path
     again, _ = prepared(clip, preset, iterations=9)
     load_run(tmp_path, again)
     assert again.frames_seen == 12
-    assert bits(trained(again), clip, split) == bits(trained(whole), clip, split)
+    assert bits(trained(again)) == bits(trained(whole))
     with pytest.raises(ValueError, match="another settings of the preset"):
         load_run(tmp_path, prepared(clip, splitting_soon(name), iterations=9)[0])
 
@@ -165,7 +159,7 @@ def test_the_curve_tells_iterations_and_the_frames_they_saw(tmp_path: Path) -> N
     preset = dataclasses.replace(PRESETS["fast"], frames_a_step=2)
     run, split = prepared(phantom_clip(), preset, iterations=5)
     assert run.schedule.epoch == -(-len(split.train) // 2)
-    train(run, Stopwatch(), lambda: 31.5, Hooks())
+    train(run, Stopwatch(), lambda: 31.5, TrainingHooks())
     write_curve(tmp_path / "curve.csv", run)
     with (tmp_path / "curve.csv").open() as file:
         (row,) = csv.DictReader(file)
@@ -173,12 +167,12 @@ def test_the_curve_tells_iterations_and_the_frames_they_saw(tmp_path: Path) -> N
 
 
 def fitting(run: Run, budget_s: float, elapsed_s: float = 0.0) -> int:
-    return iterations_within(run.model, run.frames, run.preset, run.seed, budget_s, elapsed_s)
+    return iterations_within(run, budget_s, elapsed_s)
 
 
 def test_a_budget_allows_what_is_left_of_it_over_the_median_step(monkeypatch: pytest.MonkeyPatch) -> None:
     run, split = prepared(phantom_clip(), "fast")
-    untimed, timed = CALIBRATION_STEPS
+    untimed, timed = UNTIMED_STEPS, TIMED_STEPS
     storing_s, step_s, later_s = 0.5, 0.02, 0.25
     steps_s = [0.9] * untimed + [step_s] * (timed - 2) + [step_s / 2, 3.0]
     durations_s = [storing_s, *steps_s, later_s]
@@ -186,11 +180,11 @@ def test_a_budget_allows_what_is_left_of_it_over_the_median_step(monkeypatch: py
 
     def fitting_by_this_clock(budget_s: float) -> int:
         clock = iter(times_s)
-        monkeypatch.setattr("worker.train.loop.time", SimpleNamespace(perf_counter=lambda: next(clock)))
+        monkeypatch.setattr("worker.train.calibrate.time", SimpleNamespace(perf_counter=lambda: next(clock)))
         return fitting(run, budget_s, elapsed_s=1.0)
 
     for budget_s in (10.0, 30.0, 61.0):
-        assert fitting_by_this_clock(budget_s) == int((budget_s - 1.0 - times_s[-1]) / (LATER_STEPS * step_s))
+        assert fitting_by_this_clock(budget_s) == int((budget_s - 1.0 - times_s[-1]) / (GROWTH_ALLOWANCE * step_s))
     assert fitting_by_this_clock(1.0) == len(split.train)
 
 
@@ -210,9 +204,9 @@ def test_calibration_leaves_the_model_as_it_was() -> None:
 def test_calibration_does_not_change_what_training_makes() -> None:
     clip = phantom_clip()
     for name in ("fast", "hexplane"):
-        run, split = prepared(clip, name, iterations=ITERATIONS)
+        run, _ = prepared(clip, name, iterations=ITERATIONS)
         fitting(run, 1.0)
-        assert bits(trained(run), clip, split) == run_bits(clip, PRESETS[name])
+        assert bits(trained(run)) == run_bits(clip, PRESETS[name])
 
 
 def spoil(run: Run) -> None:
@@ -240,14 +234,14 @@ def test_training_that_leaves_the_numbers_is_an_error(name: str, break_it: Calla
 def test_a_stop_before_the_first_step_makes_none() -> None:
     run, _ = prepared(phantom_clip())
     with pytest.raises(Cancelled, match="iteration 0 of 20"):
-        trained(run, Hooks(should_stop=lambda: True))
+        trained(run, TrainingHooks(should_stop=lambda: True))
     assert run.iteration == 0
 
 
 def test_the_last_iteration_is_scored_and_reported() -> None:
     run, _ = prepared(phantom_clip(), iterations=5)
     told: list[Progress] = []
-    train(run, Stopwatch(), lambda: 31.5, Hooks(on_progress=told.append))
+    train(run, Stopwatch(), lambda: 31.5, TrainingHooks(on_progress=told.append))
     assert [(point.iteration, point.psnr_tissue_db) for point in run.curve] == [(5, 31.5)]
     assert told
     assert all(each.stage == "train" and 0 <= each.fraction <= 1 and each.iterations == 5 for each in told)

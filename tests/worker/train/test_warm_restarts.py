@@ -1,4 +1,4 @@
-"""What training makes of its schedule: an average ends a cycle, frames left out judge it, a stop is a real one."""
+"""Training by its schedule: an average ends a cycle, validation frames score it, early stopping ends the run."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from contract.wire.errors import Cancelled
 from contract.wire.options import ReconstructionOptions
 from tests.worker.phantoms import bits, phantom_clip, prepared_on, trained
 from worker.input.clip import DepthClip, FrameSplit, split_frames
-from worker.machine.hooks import Hooks
+from worker.machine.timing import Stopwatch
 from worker.model.metrics import psnr_tissue
 from worker.pipeline import snapshot_of
 from worker.raster.model import Model
-from worker.train.loop import Run, Stopwatch, frames_at, train
+from worker.train.hooks import TrainingHooks
+from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
 from worker.train.resume import load_run, save_run
-from worker.train.schedule import AVERAGED, Schedule, left_out
+from worker.train.run import Run, frames_at
+from worker.train.schedule import AVERAGED, Schedule, validation_frames
+from worker.train.setup import Setup
 from worker.train.targets import TrainingFrames
 
 SHORTEST, PLANNED = 24, 192
@@ -34,7 +37,7 @@ STOPPED_AT, CLOSED_AT = 48, 60
 @pytest.fixture(scope="module", autouse=True)
 def short_cycles() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("worker.train.schedule.SHORTEST_CYCLE", SHORTEST)
+        patched.setattr("worker.train.schedule.MIN_CYCLE_ITERATIONS", SHORTEST)
         yield
 
 
@@ -46,33 +49,33 @@ def clip() -> DepthClip:
 @pytest.fixture(scope="module")
 def split(clip: DepthClip) -> FrameSplit:
     found = split_frames(clip, "every8")
-    assert len(left_out(found.train)) == 2
+    assert len(validation_frames(found.train)) == 2
     return found
 
 
-def judged(clip: DepthClip, split: FrameSplit, worth_db: float | None = NEVER_ENOUGH_DB) -> Run:
-    """A run of `fast` before its first step that judges itself, though its length is given."""
+def validated(clip: DepthClip, split: FrameSplit, min_gain_db: float | None = NEVER_ENOUGH_DB) -> Run:
+    """A run of `fast` before its first step with validation frames, though its length is given."""
     run = prepared_on(clip, split, "fast", iterations=PLANNED)
-    run.schedule = Schedule(PLANNED, cycles=True, worth_db=worth_db)
+    run.schedule = Schedule(PLANNED, warm_restarts=True, min_gain_db=min_gain_db)
     return run
 
 
 @pytest.fixture(scope="module")
 def straight(clip: DepthClip, split: FrameSplit) -> Run:
-    """A run that judged itself and ended: to be looked at."""
-    return trained(judged(clip, split))
+    """A run that ended early, to be read."""
+    return trained(validated(clip, split))
 
 
 @pytest.fixture(scope="module")
 def untrained(clip: DepthClip, split: FrameSplit) -> Run:
     """A run of which the tests change seed, frames and schedule before they look, and nothing else."""
-    return judged(clip, split)
+    return validated(clip, split)
 
 
 def until(iteration: int, run: Run) -> Run:
     """The run stopped after an iteration, to go on later."""
     with pytest.raises(Cancelled):
-        trained(run, Hooks(should_stop=lambda: run.iteration == iteration))
+        trained(run, TrainingHooks(should_stop=lambda: run.iteration == iteration))
     return run
 
 
@@ -92,9 +95,9 @@ def poisoned(clip: DepthClip, frames: list[int], rng: np.random.Generator) -> De
     return spoilt
 
 
-def test_a_run_whose_doubling_is_worth_too_little_ends_early_and_says_so(clip: DepthClip, split: FrameSplit) -> None:
-    run = judged(clip, split)
-    train(run, Stopwatch(), lambda: 31.5, Hooks())
+def test_a_run_whose_doubling_gains_too_little_ends_early_and_says_so(clip: DepthClip, split: FrameSplit) -> None:
+    run = validated(clip, split)
+    train(run, Stopwatch(), lambda: 31.5, TrainingHooks())
     assert run.schedule.stopped_at == STOPPED_AT
     assert run.iteration == run.iterations == CLOSED_AT
     assert [point.iteration for point in run.curve if point.iteration in run.schedule.ends] == [24, 48, 60]
@@ -102,17 +105,17 @@ def test_a_run_whose_doubling_is_worth_too_little_ends_early_and_says_so(clip: D
     assert f"after {CLOSED_AT} of {PLANNED} iterations" in run.schedule.words[0]
 
 
-def test_a_run_whose_doublings_are_worth_enough_goes_on_as_planned(clip: DepthClip, split: FrameSplit) -> None:
-    run = trained(judged(clip, split, ALWAYS_ENOUGH_DB))
+def test_a_run_whose_doublings_gain_enough_goes_on_as_planned(clip: DepthClip, split: FrameSplit) -> None:
+    run = trained(validated(clip, split, ALWAYS_ENOUGH_DB))
     assert run.iteration == PLANNED
     assert len(run.schedule.scores) == 3
     assert run.schedule.words == ()
 
 
-def test_a_score_is_how_near_the_finished_model_is_to_the_frames_left_out(clip: DepthClip, split: FrameSplit) -> None:
-    run = until(SHORTEST, judged(clip, split))
+def test_a_score_is_how_near_the_finished_model_is_to_the_validation_frames(clip: DepthClip, split: FrameSplit) -> None:
+    run = until(SHORTEST, validated(clip, split))
     scores = []
-    for index in left_out(split.train):
+    for index in validation_frames(split.train):
         image = run.model.render(run.frames.cameras[index], float(clip.t[index]))[:3].transpose(1, 2, 0)
         scores.append(psnr_tissue(image, clip.rgb[index], clip.tissue[index]))
     assert list(run.schedule.scores) == pytest.approx([float(np.mean(scores))])
@@ -120,15 +123,16 @@ def test_a_score_is_how_near_the_finished_model_is_to_the_frames_left_out(clip: 
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("count", [28, 47, 63, 64, 83, 84, 131, 200])
-def test_frames_left_out_are_not_shown_before_the_decision_and_are_after_it(
+def test_validation_frames_are_not_shown_before_the_decision_and_are_after_it(
     untrained: Run, count: int, seed: int
 ) -> None:
     """Of clips of any length: which frame an iteration shows depends on how many there are alone."""
-    run = untrained
-    run.seed, run.frames.indices = seed, list(range(count))
-    planned = Schedule(24 * count + seed, cycles=True, worth_db=NEVER_ENOUGH_DB, epoch=count)
+    options = ReconstructionOptions(seed=seed)
+    run = dataclasses.replace(untrained, setup=dataclasses.replace(untrained.setup, options=options))
+    run.frames.indices = list(range(count))
+    planned = Schedule(24 * count + seed, warm_restarts=True, min_gain_db=NEVER_ENOUGH_DB, epoch=count)
     run.schedule = planned.with_score(30.0).with_score(30.0)
-    stopped_at, judges = run.schedule.stopped_at, set(left_out(range(count)))
+    stopped_at, judges = run.schedule.stopped_at, set(validation_frames(range(count)))
     assert stopped_at is not None
     before = [frames_at(run, iteration)[0] for iteration in range(1, stopped_at + 1)]
     assert set(before) == set(range(count)) - judges
@@ -138,19 +142,19 @@ def test_frames_left_out_are_not_shown_before_the_decision_and_are_after_it(
     assert before == [frames_at(run, iteration)[0] for iteration in range(1, stopped_at + 1)]
 
 
-def test_what_frames_left_out_show_trains_nothing_until_the_decision(
+def test_what_validation_frames_show_trains_nothing_until_the_decision(
     clip: DepthClip, split: FrameSplit, rng: np.random.Generator
 ) -> None:
     """Where a model starts is settled on every training frame; so only what is trained on is spoilt."""
-    runs = judged(clip, split), judged(clip, split)
-    spoilt = poisoned(clip, list(left_out(split.train)), rng)
+    runs = validated(clip, split), validated(clip, split)
+    spoilt = poisoned(clip, list(validation_frames(split.train)), rng)
     runs[1].frames = TrainingFrames(spoilt, split.train, runs[1].frames.scale)
-    decided = [bits(until(STOPPED_AT, run), clip, split) for run in runs]
+    decided = [bits(until(STOPPED_AT, run)) for run in runs]
     assert decided[0] == decided[1]
     assert runs[0].schedule.scores != runs[1].schedule.scores
     for run in runs:  # so short a closing cycle might not come to them
-        run.schedule = Schedule(PLANNED, cycles=True)
-    ended = [bits(trained(run), clip, split) for run in runs]
+        run.schedule = Schedule(PLANNED, warm_restarts=True)
+    ended = [bits(trained(run)) for run in runs]
     assert ended[0] != ended[1]
 
 
@@ -159,8 +163,8 @@ def test_frames_without_tissue_decide_nothing(
     clip: DepthClip, split: FrameSplit, without_tissue: int, ends_at: int
 ) -> None:
     tissue = clip.tissue.copy()
-    tissue[list(left_out(split.train)[:without_tissue])] = False
-    assert trained(judged(dataclasses.replace(clip, tissue=tissue), split)).iteration == ends_at
+    tissue[list(validation_frames(split.train)[:without_tissue])] = False
+    assert trained(validated(dataclasses.replace(clip, tissue=tissue), split)).iteration == ends_at
 
 
 def test_held_out_frames_do_not_decide_when_a_run_ends(
@@ -168,10 +172,10 @@ def test_held_out_frames_do_not_decide_when_a_run_ends(
 ) -> None:
     spoilt = poisoned(clip, split.held_out, rng)
     for score in (10.0, 50.0):
-        run = judged(spoilt, split)
-        train(run, Stopwatch(), lambda score=score: score, Hooks())  # type: ignore[misc]
+        run = validated(spoilt, split)
+        train(run, Stopwatch(), lambda score=score: score, TrainingHooks())  # type: ignore[misc]
         assert run.schedule == straight.schedule
-        assert bits(run, spoilt, split) == bits(straight, clip, split)
+        assert bits(run) == bits(straight)
 
 
 @pytest.mark.parametrize(
@@ -187,23 +191,23 @@ def test_held_out_frames_do_not_decide_when_a_run_ends(
         CLOSED_AT - 2,  # averaging again
     ],
 )
-def test_a_judged_run_goes_on_to_the_bits_of_an_unstopped_one(
+def test_a_validated_run_goes_on_to_the_bits_of_an_unstopped_one(
     straight: Run, clip: DepthClip, split: FrameSplit, stopped_after: int, tmp_path: Path
 ) -> None:
-    save_run(tmp_path, until(stopped_after, judged(clip, split)), 1.5)
-    again = judged(clip, split)
+    save_run(tmp_path, until(stopped_after, validated(clip, split)), 1.5)
+    again = validated(clip, split)
     load_run(tmp_path, again)
     assert again.iteration == stopped_after
-    assert bits(trained(again), clip, split) == bits(straight, clip, split)
+    assert bits(trained(again)) == bits(straight)
     assert again.schedule == straight.schedule
 
 
 def test_a_cycle_ends_with_the_mean_of_its_last_models(clip: DepthClip, split: FrameSplit) -> None:
-    run, models = judged(clip, split, None), []
+    run, models = validated(clip, split, None), []
     for iteration in range(SHORTEST - AVERAGED + 1, SHORTEST):
         models.append(copied(until(iteration, run).model))
     alone = prepared_on(
-        clip, split, dataclasses.replace(PRESETS["fast"], cycles=False, worth_db=None), iterations=SHORTEST
+        clip, split, dataclasses.replace(PRESETS["fast"], warm_restarts=False, min_gain_db=None), iterations=SHORTEST
     )
     models.append(copied(trained(alone).model))  # the same steps, and nothing averaged
     averaged = copied(until(SHORTEST, run).model)
@@ -213,25 +217,25 @@ def test_a_cycle_ends_with_the_mean_of_its_last_models(clip: DepthClip, split: F
     assert not np.array_equal(averaged["motion.weight"], models[-1]["motion.weight"])
 
 
-@pytest.mark.parametrize("worth_db", [NEVER_ENOUGH_DB, ALWAYS_ENOUGH_DB])
+@pytest.mark.parametrize("min_gain_db", [NEVER_ENOUGH_DB, ALWAYS_ENOUGH_DB])
 def test_the_schedule_that_a_scene_names_makes_the_same_steps_again(
-    clip: DepthClip, split: FrameSplit, worth_db: float
+    clip: DepthClip, split: FrameSplit, min_gain_db: float
 ) -> None:
-    run = trained(judged(clip, split, worth_db))
-    settings = json.dumps(snapshot_of(run, clip, split, run.frames.scale, run.seed).settings, allow_nan=False)
+    run = trained(validated(clip, split, min_gain_db))
+    settings = json.dumps(snapshot_of(run).settings, allow_nan=False)
     again = prepared_on(clip, split, "fast", iterations=1)
     again.schedule = Schedule.of(json.loads(settings)["schedule"])
-    assert bits(trained(again), clip, split) == bits(run, clip, split)
+    assert bits(trained(again)) == bits(run)
     assert again.iteration == run.iteration
 
 
 def prepared_for(clip: DepthClip, split: FrameSplit, **length: float) -> Run:
     options = ReconstructionOptions(**length)  # type: ignore[arg-type]
-    return prepare(clip, split, PRESETS["fast"], options, Stopwatch())[0]
+    return prepare(Setup(clip, split, PRESETS["fast"], options))
 
 
 def test_only_a_run_that_is_given_time_may_end_before_it(clip: DepthClip, split: FrameSplit) -> None:
-    assert prepared_for(clip, split, iterations=PLANNED).schedule.worth_db is None
-    assert prepared_for(clip, split, budget_s=0.01).schedule.worth_db == PRESETS["fast"].worth_db
+    assert prepared_for(clip, split, iterations=PLANNED).schedule.min_gain_db is None
+    assert prepared_for(clip, split, budget_s=0.01).schedule.min_gain_db == PRESETS["fast"].min_gain_db
     few = phantom_clip()
-    assert prepared_for(few, split_frames(few, "every8"), budget_s=0.01).schedule.worth_db is None
+    assert prepared_for(few, split_frames(few, "every8"), budget_s=0.01).schedule.min_gain_db is None

@@ -1,0 +1,82 @@
+"""Steps of a new model that are taken back: to compile its kernels, and to time how many fit into a budget."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from worker.model.optimize import rates_at
+from worker.raster.model import Model
+from worker.train.loop import check_sums, step
+from worker.train.run import Run
+from worker.train.schedule import Schedule
+
+UNTIMED_STEPS, TIMED_STEPS = 3, 12
+"""The median of the timed steps counts: the first steps fill caches, and other processes come and go. Where the device
+does not answer every step, so many times the steps from one answer to the next."""
+GROWTH_ALLOWANCE = 1.15
+"""Later steps are slower, because Gaussians grow. A judgement: it differs from clip to clip."""
+
+
+@contextmanager
+def taken_back(model: Model) -> Iterator[None]:
+    """Steps of a model that has made none yet: afterwards it is as it was."""
+    stored = {name: values.clone() for name, values in model.parameters().items()}
+
+    def restore() -> None:
+        for name, values in model.arrays().items():  # moments and their counts are 0 before the first step
+            values.copy_(stored[name]) if name in stored else values.zero_()
+
+    restore()  # touches the moments' memory once: the first touch of a page costs as much as a step
+    yield
+    restore()
+
+
+def warm_up(run: Run, on_progress: Callable[[float], None]) -> float:
+    """Make each kind of step and render of a new run once, on a device whose kernels are compiled for the very model.
+
+    Returns seconds; on_progress receives the share done, in (0, 1].
+    """
+    start = time.perf_counter()
+    model, preset = run.model, run.preset
+    frame = run.frames.frame(run.frames.indices[0])
+    seen = [frame] * preset.frames_a_step
+    nothing = np.zeros((5, int(frame.camera[5]), int(frame.camera[4])), np.float32)
+    parts: list[Callable[[], object]] = [
+        lambda degree=degree: model.step(seen, preset.loss, rates_at(preset.rates, 1.0), 1, degree)  # type: ignore[misc]
+        for degree in range(preset.sh_degree + 1)
+    ]
+    parts += [
+        model.wait,
+        lambda: model.render(frame.camera, frame.t, np.zeros(model.count, np.float32)),
+        lambda: model.image_gradient(frame.camera, frame.t, nothing),
+    ]
+    with taken_back(model):
+        for done, part in enumerate(parts, start=1):
+            part()
+            on_progress(done / len(parts))
+    return time.perf_counter() - start
+
+
+def iterations_within(run: Run, budget_s: float, elapsed_s: float) -> int:
+    """How many iterations of a new run fit into what is left of budget_s, by timing a few and taking them back.
+
+    At least as many as show every training frame once.
+    """
+    start = time.perf_counter()
+    model, steps_an_answer = run.model, run.model.answers_every
+    trial = replace(run, schedule=Schedule((UNTIMED_STEPS + TIMED_STEPS) * steps_an_answer))
+    with taken_back(model):
+        ends = [time.perf_counter()]
+        for iteration in range(1, trial.iterations + 1):
+            step(trial, iteration)
+            if iteration % steps_an_answer == 0:
+                check_sums(model.wait(), iteration)
+                ends.append(time.perf_counter())
+    step_s = float(np.median(np.diff(ends)[UNTIMED_STEPS:])) / steps_an_answer * GROWTH_ALLOWANCE
+    left_s = budget_s - elapsed_s - (time.perf_counter() - start)
+    return max(run.steps_an_epoch, int(left_s / step_s))

@@ -1,0 +1,195 @@
+"""The coarsest quantisation step of a scene whose measured loss on training frames stays within a tolerance.
+
+Symbols: N Gaussians. Held-out frames are not used.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from worker.input.clip import DepthClip, spread
+from worker.model.deformation import SharedBasis
+from worker.raster.backend import CPU, Device
+from worker.raster.model import Model
+from worker.scene.compact import STATE, Compact
+from worker.scene.model import model_of
+from worker.scene.quantize import prepare, round_to
+from worker.scene.scene import Scene
+from worker.train.targets import TrainingFrames
+
+TOLERANCE_DB = 0.1
+"""psnr_tissue that a stored scene may lose on its training frames; held-out frames lost less (docs/decisions/012)."""
+SENSITIVITY_FRAMES = 12
+"""Training frames in which the sensitivity to each number is measured."""
+SCORED_FRAMES = 8
+MAX_TRIALS = 6
+ENOUGH = 0.85
+"""A trial that uses this share of the tolerance is the last."""
+MIN_STEP = 1e-5
+FIRST_STEP = 4e-4
+"""Of white; what scenes of 38 dB took."""
+RATE_EXPONENT = 1.7
+"""The distortion grows about as this power of the step (1.2 to 2.2 were measured): as its square for fine steps, less
+where most numbers are 0 already."""
+SAFETY = 0.95
+"""The step that should just keep the tolerance is multiplied by it, so that the next trial most likely does."""
+
+
+@dataclass(frozen=True, eq=False)
+class QuantizedScene:
+    """A scene as it will be read back, and the price.
+
+    scene        the model after rounding, its numbers in scene.stored
+    step         mean change of the picture by one step of a number; 1 is from black to white
+    loss_db      psnr_tissue lost on so many training `frames`
+    float_bytes  size of the model before
+    """
+
+    scene: Scene
+    step: float
+    loss_db: float
+    frames: int
+    float_bytes: int
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What was chosen, for the report."""
+        return (
+            f"Numbers are stored in steps that change the picture by {255 * self.step:.2g} of 255: "
+            f"{self.scene.file_bytes / 1e6:.2f} MB instead of {self.float_bytes / 1e6:.1f}, for {self.loss_db:.2f} dB "
+            f"on {self.frames} training frames. All scores are of the stored scene.",
+        )
+
+    @property
+    def measurements(self) -> dict[str, float]:
+        """The same as numbers."""
+        return {"stored_step": self.step, "stored_loss_db": self.loss_db}
+
+
+def quantize_scene(
+    scene: Scene,
+    clip: DepthClip,
+    frames: TrainingFrames,
+    tolerance_db: float = TOLERANCE_DB,
+    device: Device = CPU,
+) -> QuantizedScene | None:
+    """The scene in whole numbers; None for a model that is stored as floats, or if no trial kept the tolerance."""
+    with_tissue = [index for index in frames.indices if clip.tissue[index].any()]
+    if not isinstance(scene.deformation, SharedBasis) or scene.gaussians.sh_degree > 0 or not with_tissue:
+        return None
+    model, scored = model_of(scene, device), spread(with_tissue, SCORED_FRAMES)
+    exact_db = _mean_db((model.render(frames.cameras[i], float(frames.t[i])) for i in scored), frames, scored)
+    if not math.isfinite(exact_db):
+        return None
+    sensitivity = _sensitivity(model, clip, frames, with_tissue, len(scene.deformation.centre))
+    times = [float(frames.t[index]) for index in frames.indices]
+    prepared = prepare(scene.gaussians, scene.deformation, scene.seen, sensitivity, times)
+
+    def trial(step: float) -> tuple[Compact, float]:
+        compact = round_to(prepared, step)
+        return compact, exact_db - _mean_db(_renders(compact, scene, frames, scored, device), frames, scored)
+
+    found = _coarsest(trial, tolerance_db)
+    return None if found is None else _stored(scene, *found, len(scored))
+
+
+def _coarsest(
+    trial: Callable[[float], tuple[Compact, float]], tolerance_db: float
+) -> tuple[Compact, float, float] | None:
+    """The coarsest step tried that kept the tolerance: what it stores, its loss in dB, the step.
+
+    Each trial predicts the step that should just keep the tolerance.
+    """
+    step, good, bad, best = FIRST_STEP, MIN_STEP, math.inf, None
+    for _ in range(MAX_TRIALS):
+        try:
+            compact, loss_db = trial(step)
+        except ValueError:  # finer than whole numbers of this size can be
+            loss_db = math.inf
+        if not loss_db <= tolerance_db:
+            bad = min(bad, step)
+        elif step > good:
+            good, best = step, (compact, loss_db, step)
+            if loss_db >= ENOUGH * tolerance_db:
+                break
+        allowed = _added_error(tolerance_db)
+        predicted = SAFETY * step * (allowed / max(_added_error(loss_db), 1e-2 * allowed)) ** (1 / RATE_EXPONENT)
+        step = predicted if good < predicted < bad else math.sqrt(good * min(bad, 100 * good))
+    return best
+
+
+def _stored(scene: Scene, compact: Compact, loss_db: float, step: float, frames: int) -> QuantizedScene:
+    gaussians, deformation, seen = compact.model()
+    stored = compact.tensors()
+    small = dataclasses.replace(scene, gaussians=gaussians, deformation=deformation, seen=seen, stored=stored)
+    return QuantizedScene(small, step, loss_db, frames, scene.byte_count)
+
+
+def _added_error(loss_db: float) -> float:
+    """The squared error that a loss of so many dB adds, as a share of the squared error before."""
+    return float(10 ** (loss_db / 10) - 1)
+
+
+def _mean_db(images: Iterable[NDArray[np.float32]], frames: TrainingFrames, scored: Sequence[int]) -> float:
+    return float(np.mean([frames.psnr_tissue_db(i, image) for i, image in zip(scored, images, strict=True)]))
+
+
+def _renders(
+    compact: Compact, scene: Scene, frames: TrainingFrames, scored: Sequence[int], device: Device
+) -> Iterator[NDArray[np.float32]]:
+    """The scored frames, rendered from what is stored. Decodes the Gaussians at their times only, not all weights."""
+    rest = SharedBasis.initial(len(scene.gaussians), bases=1)
+    for index, gaussians in zip(scored, compact.at([float(frames.t[index]) for index in scored]), strict=True):
+        still = model_of(dataclasses.replace(scene, gaussians=gaussians, deformation=rest), device)
+        yield still.render(frames.cameras[index], 0.0)
+
+
+def _sensitivity(
+    model: Model, clip: DepthClip, frames: TrainingFrames, indices: Sequence[int], bases: int
+) -> NDArray[np.float64]:
+    """[STATE, N]: an error e in a number adds sensitivity * e**2 / N to the mean squared error of the tissue's pixels.
+
+    The square of a pixel's derivative, summed over the pixels, is the mean square of the gradient of their sum with
+    random signs: one gradient a frame gives all of them (Hutchinson 1990).
+
+    A depth also decides which of two Gaussians hides the other, and that has no derivative. Its sensitivity is
+    therefore measured once for all Gaussians, with noise of the size that rounding makes.
+    """
+    random, sampled = np.random.default_rng(0), spread(indices, SENSITIVITY_FRAMES)
+    sensitivity = np.zeros((STATE, model.count))
+    for index in sampled:
+        tissue = clip.tissue[index]
+        signs = np.zeros((5, *tissue.shape), np.float32)
+        signs[:3] = random.choice(np.array([-1, 1], np.float32), (3, *tissue.shape)) * tissue
+        found = model.image_gradient(frames.cameras[index], float(frames.t[index]), signs)
+        sensitivity += found.astype(np.float64) ** 2 * (model.count / max(3 * int(tissue.sum()), 1) / len(sampled))
+    across, middle = max(float(sensitivity[:2].mean()), 1e-12), indices[len(indices) // 2]
+    sensitivity[2] = sensitivity[:2].mean(0) * _depth_over_place(model, clip, frames, across, middle, bases)
+    return sensitivity
+
+
+def _depth_over_place(
+    model: Model, clip: DepthClip, frames: TrainingFrames, across: float, index: int, bases: int
+) -> float:
+    """How much more an error along the first camera's axis changes frame `index` than one across it, squared.
+
+    `across` is the mean sensitivity to an error across the axis.
+    """
+    size = FIRST_STEP * math.sqrt(bases / (12 * across))  # so many numbers of a channel add their errors at any time
+    noise = size * np.random.default_rng(0).standard_normal(model.count).astype(np.float32)
+    depth = model.parameters()["canonical"][2]
+    exact_depth = depth.clone()
+    camera, t = frames.cameras[index], float(frames.t[index])
+    exact = model.render(camera, t)[:3].copy()
+    depth += torch.from_numpy(noise).to(depth.device)
+    error = (model.render(camera, t)[:3] - exact)[:, clip.tissue[index]]
+    depth.copy_(exact_depth)
+    measured = float(np.mean(error.astype(np.float64) ** 2))
+    return max(measured / size**2 / across, 1.0)

@@ -1,0 +1,43 @@
+"""What a run is set up with: the clip with depth, its split, the request, the caller's hooks, the clocks."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from contract.wire.options import ReconstructionOptions
+from worker.input.clip import DepthClip, FrameSplit
+from worker.machine.timing import Stopwatch, Timings
+from worker.raster.backend import CPU, Device
+from worker.train.hooks import TrainingHooks
+from worker.train.presets import Preset
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Everything that is fixed before training, and the clocks.
+
+    clip           left frames with depth
+    split          the frames to train on, and the held-out ones
+    preset         as requested: prepare() settles what it leaves to the scene
+    options        for their seed and length
+    clock          t_train_s, which begins with the setup
+    accepted_at_s  Unix time, from which t_post_s counts
+    gpu_is_idle    whether there is a GPU that the preset's motion cannot use
+    """
+
+    clip: DepthClip
+    split: FrameSplit
+    preset: Preset
+    options: ReconstructionOptions
+    device: Device = CPU
+    hooks: TrainingHooks = field(default_factory=TrainingHooks)
+    timings: Timings = field(default_factory=Timings)
+    clock: Stopwatch = field(default_factory=Stopwatch)
+    accepted_at_s: float = field(default_factory=time.time)
+    gpu_is_idle: bool = False
+
+    @property
+    def fixed_iterations(self) -> int | None:
+        """The requested iterations, else the preset's own; None where seconds limit the run."""
+        return self.options.iterations or (None if self.options.budget_s else self.preset.iterations)
