@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -95,7 +95,7 @@ class Client:
         """Queue a failed job again."""
         return run(self._core.retry(job_id))
 
-    def watch(self, job_id: str) -> Iterator[JobView]:
+    def watch(self, job_id: str) -> Generator[JobView, None, None]:
         """The job whenever something happens to it, the last time in its terminal state."""
         return iterate(self._core.watch(job_id))
 

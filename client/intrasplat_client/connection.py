@@ -7,7 +7,7 @@ AwaitedConnection, but its verbs never suspend, so `run` takes such a coroutine 
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Generator, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
@@ -136,7 +136,7 @@ def run(coroutine: Coroutine[Any, Any, Result]) -> Result:
     raise RuntimeError("A coroutine of the blocking client was suspended.")
 
 
-def iterate(items: AsyncGenerator[Result, None]) -> Iterator[Result]:
+def iterate(items: AsyncGenerator[Result, None]) -> Generator[Result, None, None]:
     """The items of an asynchronous generator that only waits on a BlockingConnection."""
     try:
         while True:

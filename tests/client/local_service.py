@@ -137,6 +137,10 @@ class Line:
         self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
 
+    @property
+    def open_connections(self) -> int:
+        return sum(end.fileno() >= 0 for end in self._open) // 2
+
     def cut(self) -> None:
         cut, self._open = self._open, []
         for end in cut:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,6 +31,8 @@ from intrasplat_client import (
     submission,
 )
 from tests.client.local_service import SNAPSHOT_ITERATION, LocalService, line_to, local_service
+
+WAIT_S = 10.0
 
 
 def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(
@@ -102,6 +106,29 @@ def test_watching_shows_each_state_and_ends_with_the_last(service: LocalService,
     assert (states[0], states[-1]) == (JobState.QUEUED, JobState.CANCELLED)
     with pytest.raises(JobCancelled):
         client.wait(job.id)
+
+
+def test_a_watch_that_is_left_early_lets_go_of_its_connection(service: LocalService, clip: Path) -> None:
+    with line_to(service) as line, Client(line.url) as far:
+        job = far.reconstruct(clip)
+        for _ in range(3):
+            watching = far.watch(job.id)
+            assert next(watching).state is JobState.QUEUED
+            watching.close()
+            assert far.job(job.id).id == job.id
+        deadline_s = time.monotonic() + WAIT_S
+        while line.open_connections > 1:  # the one that is kept for the next call
+            assert time.monotonic() < deadline_s
+            time.sleep(0.02)
+
+
+def test_the_blocking_client_works_where_an_event_loop_runs(service: LocalService, client: Client, clip: Path) -> None:
+    async def use() -> JobState:
+        job = client.reconstruct(clip)
+        service.finish()
+        return client.wait(job.id).state
+
+    assert asyncio.run(use()) is JobState.DONE
 
 
 def test_a_watch_that_is_cut_off_goes_on_and_misses_nothing(service: LocalService, client: Client, clip: Path) -> None:
