@@ -8,7 +8,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
 from typing import Any
 
@@ -71,38 +71,19 @@ def generate() -> str:
     """The whole file, formatted."""
     _, document = models_json_schema([(each, "validation") for each in READ])
     definitions: dict[str, Any] = document["$defs"]
-    ordered: dict[str, str] = {}
-    for each in READ:
-        _emit(each.__name__, definitions, ordered)
+    enums = {name: schema for name, schema in definitions.items() if "enum" in schema}
+    open_enums = {*enums} - {*CLOSED}
     states = ", ".join(f"JobState.{state.name}" for state in sorted(TERMINAL_STATES))
-    constants = [
+    parts = [
+        HEAD,
+        *("".join(_enum(name, schema)) for name, schema in enums.items()),
+        *("".join(_model(name, schema, open_enums)) for name, schema in definitions.items() if name not in enums),
         f'TERMINAL_STATES = frozenset({{{states}}})\n"""States that a job does not leave by itself."""\n',
         f'EXCLUSIVE_OPTIONS = {EXCLUSIVE_OPTIONS!r}\n"""Of each group at most one may be given."""\n',
+        "".join(_given(definitions[JobOptions.__name__])),
     ]
-    text = "\n\n".join([HEAD, *ordered.values(), *constants, "".join(_given(definitions[JobOptions.__name__]))])
     command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", MODELS.name, "--line-length", "120", "-"]
-    return subprocess.run(command, input=text, capture_output=True, text=True, check=True).stdout
-
-
-def _emit(name: str, definitions: Mapping[str, Any], done: dict[str, str]) -> None:
-    """Add the class `name` to `done`, after the classes that it contains."""
-    if name in done:
-        return
-    for other in _references(definitions[name]):
-        _emit(other, definitions, done)
-    schema = definitions[name]
-    done[name] = "".join(_enum(name, schema) if "enum" in schema else _model(name, schema, definitions))
-
-
-def _references(schema: object) -> Iterator[str]:
-    if isinstance(schema, dict):
-        if "$ref" in schema:
-            yield _name_of(schema)
-        for each in schema.values():
-            yield from _references(each)
-    elif isinstance(schema, list):
-        for each in schema:
-            yield from _references(each)
+    return subprocess.run(command, input="\n\n".join(parts), capture_output=True, text=True, check=True).stdout
 
 
 def _enum(name: str, schema: Mapping[str, Any]) -> Iterator[str]:
@@ -111,12 +92,12 @@ def _enum(name: str, schema: Mapping[str, Any]) -> Iterator[str]:
         yield f"    {_member(value)} = {value!r}\n"
 
 
-def _model(name: str, schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> Iterator[str]:
+def _model(name: str, schema: Mapping[str, Any], open_enums: Set[str]) -> Iterator[str]:
     yield f"class {name}(Model):\n" + _docstring(schema["description"]) + "\n"
     required = schema.get("required", ())
     for field, kind in schema["properties"].items():
         default = "" if field in required else f" = {_default(kind)}"
-        yield f"    {field}: {_read_type(kind, definitions)}{default}\n" + _docstring(kind.get("description"))
+        yield f"    {field}: {_read_type(kind, open_enums)}{default}\n" + _docstring(kind.get("description"))
 
 
 def _given(schema: Mapping[str, Any]) -> Iterator[str]:
@@ -126,18 +107,17 @@ def _given(schema: Mapping[str, Any]) -> Iterator[str]:
         yield f"    {field}: {_given_type(kind)}{also}\n" + _docstring(kind.get("description"))
 
 
-def _read_type(kind: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
+def _read_type(kind: Mapping[str, Any], open_enums: Set[str]) -> str:
     """The type of a field that the service sends: no bounds and no fixed choices, because a later version adds some."""
     if "$ref" in kind:
         name = _name_of(kind)
-        is_open = "enum" in definitions[name] and name not in CLOSED
-        return f'Annotated[{name} | str, Field(union_mode="left_to_right")]' if is_open else name
+        return f'Annotated[{name} | str, Field(union_mode="left_to_right")]' if name in open_enums else name
     if "anyOf" in kind:
-        return " | ".join(_read_type(each, definitions) for each in kind["anyOf"])
+        return " | ".join(_read_type(each, open_enums) for each in kind["anyOf"])
     if kind["type"] == "array":
-        return f"tuple[{_read_type(kind['items'], definitions)}, ...]"
+        return f"tuple[{_read_type(kind['items'], open_enums)}, ...]"
     if kind["type"] == "object":
-        return f"dict[str, {_read_type(kind['additionalProperties'], definitions)}]"
+        return f"dict[str, {_read_type(kind['additionalProperties'], open_enums)}]"
     return SCALARS[kind["type"]]
 
 

@@ -25,6 +25,18 @@ class JobState(StrEnum):
     CANCELLED = "cancelled"
 
 
+class FrameScore(Model):
+    """One held-out frame: the model's scores beside those of copying its neighbours. None: no tissue to judge."""
+
+    frame: int
+    psnr_tissue_db: float | None
+    psnr_paper_db: float | None
+    ssim: float | None
+    coverage: float | None
+    baseline_blend_db: float | None
+    baseline_flow_db: float | None
+
+
 class JobError(Model):
     """Why a job failed: one sentence, the field at fault if it was the input, and what to do about it."""
 
@@ -82,18 +94,6 @@ class JobView(Model):
     started_at_s: float | None = None
     finished_at_s: float | None = None
     links: dict[str, str]
-
-
-class FrameScore(Model):
-    """One held-out frame: the model's scores beside those of copying its neighbours. None: no tissue to judge."""
-
-    frame: int
-    psnr_tissue_db: float | None
-    psnr_paper_db: float | None
-    ssim: float | None
-    coverage: float | None
-    baseline_blend_db: float | None
-    baseline_flow_db: float | None
 
 
 class Report(Model):
