@@ -33,15 +33,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from worker.evaluate.rows import commit, write_rows
+from worker.model.constants import LOG2E, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from worker.model.deformation import Deformation, GaussianFdm, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
-from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera
+from worker.raster import Camera
 from worker.raster.cpu import Rasterizer, compile_kernels
 from worker.raster.cpu.model import CpuModel
 from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion
-from worker.raster.cpu.project import LOG2E
 from worker.raster.cpu.simd import fma, lane_sum, load, splat
 from worker.raster.cpu.threads import run, thread_count
 from worker.raster.cpu.vectors import LANES

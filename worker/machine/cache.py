@@ -2,8 +2,8 @@
 
 Numba keys a kernel's cache by its own source file and does not see a change in a module it was compiled from (a
 constant, an inlined helper, the vector type), so a stale kernel could run with a new layout of its arrays. All kernels
-therefore live in a folder named after a hash of the rasteriser's source files, the only ones that build on each other:
-any change there starts afresh.
+therefore live in a folder named after a hash of the rasteriser's source files and of the numbers compiled into
+them, the only files that build on each other: any change there starts afresh.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ def kernel_cache_directory() -> Path:
     """
     digest = hashlib.sha256(numba.__version__.encode())
     worker = Path(__file__).resolve().parents[1]
-    for source in [Path(__file__), worker / "raster" / "__init__.py", *sorted(worker.glob("raster/cpu/*.py"))]:
+    compiled_in = ("model/constants.py", "model/layout.py")
+    for source in [Path(__file__), *(worker / each for each in compiled_in), *sorted(worker.glob("raster/cpu/*.py"))]:
         digest.update(source.read_bytes())
     chosen = os.environ.get("INTRASPLAT_CACHE")
     base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "intrasplat"

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from contract.wire.errors import InputError
+from worker.model.constants import SH_C0, SH_C1, SH_C2, SH_C3
 
 MAX_SH_DEGREE = 3
 NEIGHBOURS = 3
@@ -24,18 +25,6 @@ MIN_START_SCALE = 3e-4
 """Units. Coincident points would start at scale 0, whose logarithm is -infinity."""
 MAX_START_SCALE = 6.0
 """Units, a tenth of the median depth. A stray stereo point far from all others would otherwise cover the image."""
-
-# Normalisation of the real spherical harmonics, Condon-Shortley phase included: the signs every splat viewer expects.
-SH_C0 = math.sqrt(1 / math.pi) / 2  # 0.28209479177387814
-_C1 = math.sqrt(3 / math.pi) / 2
-_C2 = (math.sqrt(15 / math.pi) / 2, math.sqrt(5 / math.pi) / 4, math.sqrt(15 / math.pi) / 4)
-_C3 = (
-    math.sqrt(35 / (2 * math.pi)) / 4,
-    math.sqrt(105 / math.pi) / 2,
-    math.sqrt(21 / (2 * math.pi)) / 4,
-    math.sqrt(7 / math.pi) / 4,
-    math.sqrt(105 / math.pi) / 4,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,30 +80,33 @@ class Gaussians:
 
 
 def sh_basis(degree: int, direction: Tensor) -> Tensor:
-    """Real spherical harmonics of unit directions [N, 3]: [N, (degree + 1)^2], ordered by l, then m = -l..l."""
+    """Real spherical harmonics of unit directions [N, 3]: [N, (degree + 1)^2], ordered by l, then m = -l..l.
+
+    The signs, Condon-Shortley phase included, are those that splat viewers expect.
+    """
     if not 0 <= degree <= MAX_SH_DEGREE:
         raise ValueError(f"degree must be 0..{MAX_SH_DEGREE}, not {degree}")
     x, y, z = direction.unbind(-1)
     columns = [torch.full_like(x, SH_C0)]
     if degree >= 1:
-        columns += [-_C1 * y, _C1 * z, -_C1 * x]
+        columns += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
     if degree >= 2:
         columns += [
-            _C2[0] * x * y,
-            -_C2[0] * y * z,
-            _C2[1] * (2 * z * z - x * x - y * y),
-            -_C2[0] * x * z,
-            _C2[2] * (x * x - y * y),
+            SH_C2[0] * x * y,
+            -SH_C2[0] * y * z,
+            SH_C2[1] * (2 * z * z - x * x - y * y),
+            -SH_C2[0] * x * z,
+            SH_C2[2] * (x * x - y * y),
         ]
     if degree >= 3:
         columns += [
-            -_C3[0] * y * (3 * x * x - y * y),
-            _C3[1] * x * y * z,
-            -_C3[2] * y * (4 * z * z - x * x - y * y),
-            _C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y),
-            -_C3[2] * x * (4 * z * z - x * x - y * y),
-            _C3[4] * z * (x * x - y * y),
-            -_C3[0] * x * (x * x - 3 * y * y),
+            -SH_C3[0] * y * (3 * x * x - y * y),
+            SH_C3[1] * x * y * z,
+            -SH_C3[2] * y * (4 * z * z - x * x - y * y),
+            SH_C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -SH_C3[2] * x * (4 * z * z - x * x - y * y),
+            SH_C3[4] * z * (x * x - y * y),
+            -SH_C3[0] * x * (x * x - 3 * y * y),
         ]
     return torch.stack(columns, dim=-1)
 

@@ -16,8 +16,8 @@ h'(e) = clip(e / delta, -1, 1), sign(e) without a zone. So the gradients that re
     dL/dZ = -depth_weight / |M_d| h'(D - 1 / d) D / Z                     on M_d, else 0   (both forms)
     dL/dA =  depth_weight / |M_d| h'(D - 1 / d) / Z                       normalised; 0 for "paper"
 
-A pixel of M_d with A < 0.01 has no depth to correct: it adds nothing to L_d but stays in |M_d|, so that neither the
-divisions nor the scale depend on what has been covered so far.
+A pixel of M_d with A < MIN_COVERAGE has no depth to correct: it adds nothing to L_d but stays in |M_d|, so that neither
+the divisions nor the scale depend on what has been covered so far.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-MIN_COVERAGE = 1e-2
-"""Least A at which a pixel's depth is compared; the divisions by Z need a bound."""
+from worker.model.constants import MIN_COVERAGE
 
 
 @dataclass(frozen=True)

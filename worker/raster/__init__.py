@@ -2,7 +2,8 @@
 
     rasterize(mean, quaternion, scale, opacity, colour, camera) -> Rendered
 
-Symbols: N Gaussians, H W pixels (rows i, columns j), T transmittance. Lengths in optimiser units.
+Symbols: N Gaussians, H W pixels (rows i, columns j), T transmittance. Lengths in optimiser units. Names in capitals are
+the bounds of worker/model/constants.py.
 
     mean        [N, 3]  world                    opacity  [N]     in [0, 1]
     quaternion  [N, 4]  wxyz, any length but 0   colour   [N, 3]  blended as it is, not clamped
@@ -12,7 +13,7 @@ Projection. (x, y, z) = camera_from_world mean; R, S rotation and scale; W the r
     mean2d = (fx x / z + cx, fy y / z + cy); the centre of pixel (i, j) is at (j + 0.5, i + 0.5)
     Sigma  = R S S^T R^T, R from the normalised quaternion
     J      = [[fx / z, 0, -fx u / z], [0, fy / z, -fy v / z]]
-             u = x / z clamped to [-cx / fx - LIMIT W / fx, (W - cx) / fx + LIMIT W / fx], LIMIT = 0.15
+             u = x / z clamped to [-(cx + margin) / fx, (W - cx + margin) / fx], margin = IMAGE_MARGIN W
              v = y / z clamped likewise, with H, fy, cy
     cov2d  = J W Sigma W^T J^T + 0.3 I (EPS2D, pixels^2);  conic = cov2d^-1
 
@@ -44,19 +45,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-NEAR = 0.2
-"""Units of depth; the projection of anything nearer is unbounded."""
-EPS2D = 0.3
-"""Pixels^2 added to both variances on the image: no Gaussian is thinner than about a pixel."""
-LIMIT = 0.15
-"""Share of the image's size by which a centre may lie outside before J is taken at the limit instead: far outside,
-the linear projection would smear the Gaussian over the whole image."""
-MIN_ALPHA = 1 / 255
-"""Fainter contributions are dropped: less than one 8-bit step."""
-MAX_ALPHA = 0.99
-"""Keeps T positive, so that what lies behind still gets gradients."""
-MIN_TRANSMITTANCE = 1e-4
-"""A pixel with less light left than this is full."""
+from worker.model.constants import IMAGE_MARGIN
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +81,7 @@ class Camera:
 
     def ratio_limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Least and greatest x / z, then y / z, at which J is taken."""
-        beyond_x, beyond_y = LIMIT * self.width / self.fx, LIMIT * self.height / self.fy
+        beyond_x, beyond_y = IMAGE_MARGIN * self.width / self.fx, IMAGE_MARGIN * self.height / self.fy
         return (
             (-self.cx / self.fx - beyond_x, (self.width - self.cx) / self.fx + beyond_x),
             (-self.cy / self.fy - beyond_y, (self.height - self.cy) / self.fy + beyond_y),

@@ -8,13 +8,13 @@ from torch import Tensor
 from worker.raster import Camera, Rendered
 from worker.raster.reference import check_shapes
 
-LARGEST_LOGIT = 30.0
+MAX_LOGIT = 30.0
 """Stands for opacities 0 and 1, which have no finite logit; sigmoid(30) differs from 1 by 1e-13."""
 
 
 def logit_of(opacity: Tensor) -> Tensor:
     """[N] float32 logits, finite."""
-    return torch.logit(opacity.double()).clamp(-LARGEST_LOGIT, LARGEST_LOGIT).float()
+    return torch.logit(opacity.double()).clamp(-MAX_LOGIT, MAX_LOGIT).float()
 
 
 def opacity_gradient(v_logit: Tensor, logit: Tensor) -> Tensor:

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from worker.raster import EPS2D, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR, Camera, Rendered
+from worker.model.constants import EPS2D, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR
+from worker.raster import Camera, Rendered
 
 TILE = 16
 """Pixels: the side of a tile."""

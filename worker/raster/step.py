@@ -11,16 +11,28 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from worker.model.layout import HEIGHT, POSE, WIDTH
 from worker.model.loss import LossSettings
 from worker.raster import Camera
 
 
 def camera_vector(camera: Camera) -> NDArray[np.float64]:
-    """fx, fy, cx, cy, W, H and camera_from_world [3, 4] row-major, as the kernels read a camera."""
+    """[CAMERA] numbers of a camera as the kernels read it (worker/model/layout.py)."""
     given = camera.camera_from_world
     matrix = given.detach().double().cpu().numpy() if isinstance(given, torch.Tensor) else given
     pose = np.asarray(matrix, np.float64)[:3].ravel()
     return np.concatenate([[camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], pose])
+
+
+def image_size(camera: NDArray[np.float64]) -> tuple[int, int]:
+    """W, H of a camera vector."""
+    return int(camera[WIDTH]), int(camera[HEIGHT])
+
+
+def camera_centre(camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3] where the camera of a camera vector is in the world."""
+    pose = camera[POSE:].reshape(3, 4)
+    return np.asarray(-pose[:, :3].T @ pose[:, 3])
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from worker.fusion import COMPLETED_CONFIDENCE
 from worker.input.clip import DepthClip, spread
 from worker.model.gaussians import Gaussians
+from worker.model.layout import CX, CY, FX, FY, POSE
 from worker.raster.model import Model
 from worker.train.targets import TrainingFrames
 
@@ -120,7 +121,7 @@ def _pixels(
     """Which centres [N] lie in frame `index`; row, column and camera z of those."""
     camera, (height, width) = frames.cameras[index], clip.tissue[index].shape
     x, y, z = _camera_points(model.deformed_mean(float(frames.t[index])), camera)
-    column, row = np.floor(camera[0] * x / z + camera[2]), np.floor(camera[1] * y / z + camera[3])
+    column, row = np.floor(camera[FX] * x / z + camera[CX]), np.floor(camera[FY] * y / z + camera[CY])
     inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return inside, row[inside].astype(np.intp), column[inside].astype(np.intp), z[inside]
 
@@ -129,7 +130,7 @@ def _camera_points(
     mean: NDArray[np.float32], camera: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Camera x, y, z of means [3, N]; z that is not positive becomes -1 so that nothing divides by 0."""
-    pose = camera[6:].reshape(3, 4)
+    pose = camera[POSE:].reshape(3, 4)
     points = pose[:, :3] @ mean + pose[:, 3:]
     z = np.where(points[2] > 0, points[2], -1.0)
     return points[0], points[1], z

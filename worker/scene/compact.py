@@ -18,9 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from worker.model.deformation import CHANNELS, SharedBasis
+from worker.model.deformation import SharedBasis
 from worker.model.deformation.shared import CHANNELS_WITH_COLOUR
 from worker.model.gaussians import Gaussians
+from worker.model.layout import CHANNELS
 from worker.scene.differences import MAX_POWER, MAX_STORED, add_differences, coding_order, take_differences
 from worker.scene.rangecoder import PARTS, decode, encode
 

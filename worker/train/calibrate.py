@@ -11,6 +11,7 @@ import numpy as np
 
 from worker.model.optimize import rates_at
 from worker.raster.model import Model
+from worker.raster.step import image_size
 from worker.train.loop import check_sums, step
 from worker.train.run import Run
 from worker.train.schedule import Schedule
@@ -45,7 +46,8 @@ def warm_up(run: Run, on_progress: Callable[[float], None]) -> float:
     model, preset = run.model, run.preset
     frame = run.frames.frame(run.frames.indices[0])
     seen = [frame] * preset.frames_a_step
-    nothing = np.zeros((5, int(frame.camera[5]), int(frame.camera[4])), np.float32)
+    width, height = image_size(frame.camera)
+    nothing = np.zeros((5, height, width), np.float32)
     parts: list[Callable[[], object]] = [
         lambda degree=degree: model.step(seen, preset.loss, rates_at(preset.rates, 1.0), 1, degree)  # type: ignore[misc]
         for degree in range(preset.sh_degree + 1)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from contract.wire.errors import TrainingDiverged
-from worker.model.deformation import LOG_SCALE, MEAN, QUATERNION
+from worker.model.layout import LOG_SCALE, MEAN, QUATERNION
 from worker.raster.model import Model
 
 SPLIT_SHRINK = 0.8

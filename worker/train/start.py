@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from worker.fusion import FusionSettings, PointCloud
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip
-from worker.model.deformation import CHANNELS, MEAN, AtRest, SharedBasis, motion_named
-from worker.model.gaussians import SH_C0, Gaussians, initial_gaussians
+from worker.model.constants import SH_C0
+from worker.model.deformation import AtRest, SharedBasis, motion_named
+from worker.model.gaussians import Gaussians, initial_gaussians
+from worker.model.layout import CHANNELS, MEAN
 from worker.motion.capacity import MAX_POINTS, Trials, choose_bases, choose_stride, floor_error, try_bases
 from worker.motion.tracks import GUESSED, Tracks, fit_tracks
 from worker.raster.backend import CPU, Device, make_model

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from tests.helpers import assert_close
 from worker.model.deformation import (
-    CHANNELS,
     Deformation,
     FlexibleDeformation,
     GaussianFdm,
@@ -23,6 +22,7 @@ from worker.model.deformation import (
     restore,
 )
 from worker.model.gaussians import Gaussians
+from worker.model.layout import CHANNELS
 
 COUNT = 6
 TIMES = [0.0, 0.13, 0.5, 0.97]

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from contract.wire.errors import InputError
 from tests.helpers import assert_close
+from worker.model.constants import SH_C0
 from worker.model.gaussians import (
     MAX_START_SCALE,
     MIN_START_SCALE,
-    SH_C0,
     Gaussians,
     initial_gaussians,
     sh_basis,

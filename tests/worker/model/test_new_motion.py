@@ -11,17 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from contract.wire.options import ReconstructionOptions
 from tests.worker.phantoms import phantom_clip
 from worker.machine.hooks import Hooks
-from worker.model.deformation import (
-    CHANNELS,
-    MOTIONS,
-    AtRest,
-    Deformation,
-    LinearDeformation,
-    add_offsets,
-)
+from worker.model.deformation import MOTIONS, AtRest, Deformation, LinearDeformation, add_offsets
 from worker.model.gaussians import Gaussians
+from worker.model.layout import CHANNELS
 from worker.pipeline import reconstruct
 from worker.render.view import render_frame
 from worker.scene.checkpoint import load_scene
@@ -89,7 +84,7 @@ def test_a_motion_from_outside_is_trained_stored_loaded_and_rendered(
         # new Gaussians within the run, so that the motion is asked for more rows
         densify=DensifySettings(from_iteration=5, every=5),
     )
-    request = ReconstructionRequest(clip, preset=preset, iterations=12, device="cpu")
+    request = ReconstructionRequest(clip, ReconstructionOptions(iterations=12), own_preset=preset, device="cpu")
     report = reconstruct(request, tmp_path, Hooks())
     scene = load_scene(tmp_path)
     assert type(scene.deformation) is motion

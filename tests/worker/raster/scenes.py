@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Camera, Rendered, cpu, reference
+from worker.model.constants import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from worker.raster import Camera, Rendered, cpu, reference
 
 Rasterize = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Camera], Rendered]
 

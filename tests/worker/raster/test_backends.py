@@ -27,9 +27,10 @@ from tests.worker.raster.scenes import (
     pixels_near_a_cut,
     random_scene,
 )
-from worker.raster import MIN_TRANSMITTANCE, Rendered, reference
+from worker.model.constants import MIN_TRANSMITTANCE
+from worker.raster import Rendered, reference
 
-MOST_LEFT_OUT = 0.05
+MAX_LEFT_OUT = 0.05
 """Share of an image's pixels that may lie near a cut before a comparison says too little."""
 
 SCENES: dict[str, Callable[[], Scene]] = {
@@ -86,7 +87,7 @@ def test_values_and_gradients_are_the_references(
     exact = single.to(torch.float64)  # the same numbers, so that only the arithmetic differs
     left_out = pixels_near_a_cut(exact)
     record_property("pixels_left_out", int(left_out.sum()))
-    assert left_out.mean() <= MOST_LEFT_OUT
+    assert left_out.mean() <= MAX_LEFT_OUT
     cotangent = random_cotangent(exact, left_out)
 
     wanted, wanted_gradients = values_and_gradients(exact, reference.rasterize, cotangent)

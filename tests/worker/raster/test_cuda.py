@@ -25,7 +25,7 @@ from worker.model.loss import LossSettings
 from worker.raster import Camera, cpu, reference
 from worker.raster.cpu import padded
 from worker.raster.cuda import rasterize
-from worker.raster.cuda.bins import MOST_FRAMES
+from worker.raster.cuda.bins import MAX_FRAMES
 from worker.raster.cuda.rasterizer import CudaRasterizer, Gradients
 from worker.raster.step import camera_vector
 
@@ -333,7 +333,7 @@ def test_a_gaussian_with_a_parameter_that_is_no_number_is_not_drawn(row: int | s
 
 
 def test_more_tiles_than_16_bits_can_number_are_sorted_with_32(memory: str) -> None:
-    width, frames = 8 * 2100, MOST_FRAMES
+    width, frames = 8 * 2100, MAX_FRAMES
     scene = random_scene(3, width=width, height=1, seed=3, pixels=4.0).to(torch.float32)
     rasterizer = CudaRasterizer(width, 1, memory, frames=frames)
     rasterizer.project(*View([scene] * frames, memory).arguments())
@@ -345,8 +345,8 @@ def test_more_tiles_than_16_bits_can_number_are_sorted_with_32(memory: str) -> N
 
 
 def test_more_frames_than_can_be_sorted_are_refused(memory: str) -> None:
-    with pytest.raises(ValueError, match=f"{MOST_FRAMES + 1} frames at once"):
-        CudaRasterizer(WIDTH, HEIGHT, memory, frames=MOST_FRAMES + 1)
+    with pytest.raises(ValueError, match=f"{MAX_FRAMES + 1} frames at once"):
+        CudaRasterizer(WIDTH, HEIGHT, memory, frames=MAX_FRAMES + 1)
 
 
 @pytest.mark.parametrize("size", [(0, 5), (5, 0)])
@@ -357,7 +357,7 @@ def test_an_image_without_pixels_is_refused(size: tuple[int, int], memory: str) 
 
 @pytest.mark.parametrize("gaussians", [200_000_000, 40_000_000])
 def test_more_than_32_bits_can_number_is_refused(gaussians: int, memory: str) -> None:
-    rasterizer = CudaRasterizer(WIDTH, HEIGHT, memory, frames=MOST_FRAMES)
+    rasterizer = CudaRasterizer(WIDTH, HEIGHT, memory, frames=MAX_FRAMES)
     with pytest.raises(ValueError, match=f"{gaussians} Gaussians"):
         rasterizer.reserve(gaussians)
 

@@ -24,7 +24,7 @@ from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings
 from worker.raster.cpu import padded
 from worker.raster.cpu.model import CpuModel
-from worker.raster.cuda.bins import MOST_FRAMES
+from worker.raster.cuda.bins import MAX_FRAMES
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
 from worker.raster.step import Target, TrainingFrame, camera_vector
 from worker.train.presets import MAX_FRAMES_A_STEP
@@ -242,8 +242,8 @@ def test_steps_on_several_frames_change_a_model_as_they_do_on_the_cpu(kind: str,
 
 
 def test_more_frames_than_can_be_drawn_at_once_are_refused_and_no_preset_asks_for_them(device: str) -> None:
-    assert MAX_FRAMES_A_STEP == MOST_FRAMES
-    for count in (0, MOST_FRAMES + 1):
+    assert MAX_FRAMES_A_STEP == MAX_FRAMES
+    for count in (0, MAX_FRAMES + 1):
         with pytest.raises(ValueError, match=f"{count} frames at once"):
             model(device).step(frames(1) * count, LOSS, RATES, 1)
 

@@ -17,15 +17,17 @@ pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA 
 
 from tests.helpers import assert_close
 from tests.worker.raster.test_cpu import KINDS, RATES, Fused, moving_gaussians
+from worker.model.constants import SH_C0
 from worker.model.deformation import GaussianFdm, SharedBasis, restore
-from worker.model.gaussians import SH_C0, Gaussians
+from worker.model.gaussians import Gaussians
+from worker.model.layout import ROWS, VALUES
 from worker.model.optimize import StepRates
 from worker.raster.cpu.motion import NEGLIGIBLE
 from worker.raster.cpu.motion import motion_of as cpu_motion_of
 from worker.raster.cuda import harmonics
 from worker.raster.cuda.control import Control, adam_fields, write_adam
 from worker.raster.cuda.motion import LinearMotion, Motion, Trained, motion_of
-from worker.raster.cuda.update import MADE, ROWS, SEEN, SUMS, VALUES, padded
+from worker.raster.cuda.update import MADE, SEEN, SUMS, padded
 
 COUNT = 30
 TIMES = (0.4, 0.55)

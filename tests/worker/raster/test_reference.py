@@ -17,7 +17,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.helpers import assert_close
 from tests.worker.raster.scenes import Scene, camera, pixels_near_a_cut, random_scene, unproject
-from worker.raster import MIN_ALPHA, NEAR, Camera, Rendered, reference
+from worker.model.constants import MIN_ALPHA, NEAR
+from worker.raster import Camera, Rendered, reference
 
 STEP = 1e-6
 """Of the central differences, in each input's own unit."""

@@ -25,8 +25,9 @@ from tests.worker.models import (
     training_frames,
     wall,
 )
-from worker.model.deformation import LOG_SCALE, MEAN, FlexibleDeformation, SharedBasis
+from worker.model.deformation import FlexibleDeformation, SharedBasis
 from worker.model.gaussians import Gaussians
+from worker.model.layout import LOG_SCALE, MEAN
 from worker.model.loss import LossSettings
 from worker.raster.cpu.model import CpuModel
 from worker.raster.cpu.unfused import AutogradMotion

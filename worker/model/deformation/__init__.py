@@ -15,10 +15,6 @@ from __future__ import annotations
 from torch import Tensor
 
 from worker.model.deformation.base import (
-    CHANNELS,
-    LOG_SCALE,
-    MEAN,
-    QUATERNION,
     AtRest,
     Deformation,
     LinearDeformation,
@@ -30,11 +26,7 @@ from worker.model.deformation.polynomial import PolynomialFourier
 from worker.model.deformation.shared import SharedBasis
 
 __all__ = [
-    "CHANNELS",
-    "LOG_SCALE",
-    "MEAN",
     "MOTIONS",
-    "QUATERNION",
     "AtRest",
     "Deformation",
     "FlexibleDeformation",

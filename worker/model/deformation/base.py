@@ -1,8 +1,8 @@
 """What all motions share: the channels they move and the promises they keep.
 
 Symbols: N Gaussians, B bases or weights a channel, C = 10 channels, t model time in [0, 1).
-Channels: mean 0:3, quaternion 3:7, log-scale 7:10. Opacity never deforms; colour does
-where a motion has channels 10:13 for it.
+The channels are the rows of a state (worker/model/layout.py). Opacity never deforms; colour does where a motion has
+channels 10:13 for it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,7 @@ import torch
 from torch import Tensor
 
 from worker.model.gaussians import Gaussians
-
-CHANNELS = 10
-MEAN = slice(0, 3)
-QUATERNION = slice(3, 7)
-LOG_SCALE = slice(7, 10)
+from worker.model.layout import CHANNELS, LOG_SCALE, MEAN, QUATERNION
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,14 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from worker.model.deformation.base import CHANNELS, AtRest, Deformation, add_offsets
+from worker.model.constants import MIN_WIDTH, QUARTIC_FLOOR
+from worker.model.deformation.base import AtRest, Deformation, add_offsets
 from worker.model.gaussians import Gaussians
+from worker.model.layout import CHANNELS
 
 PAPER_BASES = 17
 PAPER_WIDTH = 0.01
 """Share of the clip. Leaves most of the timeline between two bases without any; wider starts cover it."""
-MIN_WIDTH = 1e-3
-"""Share of the clip. Below it a basis falls between frames and its exponent overflows."""
-QUARTIC_FLOOR = 1e-4
-"""Added to the squared width by the quartic form, which needs no other lower bound."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +86,7 @@ class FlexibleDeformation(Deformation):
 class GaussianFdm(FlexibleDeformation):
     """The paper's form: b_j(t) = exp(-(t - theta_j)^2 / (2 sigma_j^2)).
 
-    |sigma_j| is held at 1e-3 where it is smaller, and gets no gradient there.
+    |sigma_j| is held at MIN_WIDTH where it is smaller, and gets no gradient there.
     """
 
     kind = "fdm-gaussian"
@@ -100,7 +98,7 @@ class GaussianFdm(FlexibleDeformation):
 
 
 class QuarticFdm(FlexibleDeformation):
-    """The released code's form: b_j(t) = exp(-((t - theta_j)^2 / (sigma_j^2 + 1e-4))^2)."""
+    """The released code's form: b_j(t) = exp(-((t - theta_j)^2 / (sigma_j^2 + QUARTIC_FLOOR))^2)."""
 
     kind = "fdm-quartic"
     quartic = True

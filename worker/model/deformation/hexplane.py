@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, linear, relu
 
-from worker.model.deformation.base import CHANNELS, AtRest, Deformation, add_offsets
+from worker.model.deformation.base import AtRest, Deformation, add_offsets
 from worker.model.gaussians import Gaussians
+from worker.model.layout import CHANNELS
 
 AXES = "xyzt"
 PLANE_PAIRS = (("xy", "zt"), ("xz", "yt"), ("yz", "xt"))

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from worker.model.deformation.base import CHANNELS, AtRest, LinearDeformation
+from worker.model.deformation.base import AtRest, LinearDeformation
 from worker.model.gaussians import Gaussians
+from worker.model.layout import CHANNELS
 
 DEFAULT_WEIGHTS = 17
 """As many weights a channel as the paper's FDM has bases."""

@@ -12,15 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from worker.model.deformation.base import CHANNELS, AtRest, LinearDeformation
+from worker.model.constants import MIN_WIDTH
+from worker.model.deformation.base import AtRest, LinearDeformation
 from worker.model.gaussians import Gaussians
+from worker.model.layout import CHANNELS
 
 CHANNELS_WITH_COLOUR = CHANNELS + 3
 DEFAULT_BASES = 9
 WIDTH_IN_SPACINGS = 0.6
 """Neighbouring bases of this width cross at 0.7, so that no time is left without one."""
-MIN_WIDTH = 1e-3
-"""Model time; repeated quantiles of few frames would give a width of 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class SharedBasis(LinearDeformation):
         return cls(
             weight=torch.zeros(count, CHANNELS_WITH_COLOUR if colour else CHANNELS, bases),
             centre=torch.from_numpy(centre).float(),
-            width=torch.from_numpy(np.maximum(width, MIN_WIDTH)).float(),
+            width=torch.from_numpy(np.maximum(width, MIN_WIDTH)).float(),  # repeated quantiles of few frames: 0
         )
 
     @classmethod

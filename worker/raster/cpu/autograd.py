@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from worker.model.layout import LOG_SCALE, MEAN, QUATERNION
 from worker.raster import Camera, Rendered
 from worker.raster.autograd import (
-    LARGEST_LOGIT,
+    MAX_LOGIT,
     logit_of,
     opacity_gradient,
     pose_gradient,
@@ -38,7 +39,7 @@ class _Rasterize(torch.autograd.Function):
         logit = logit_of(opacity)
         state = np.concatenate([_rows(mean, count), _rows(quaternion, count, 1.0), _rows(scale.log(), count)])
         rasterizer = Rasterizer(camera.width, camera.height)
-        rasterizer.project(camera_vector(camera), state, _rows(logit, count, -LARGEST_LOGIT)[0], _rows(colour, count))
+        rasterizer.project(camera_vector(camera), state, _rows(logit, count, -MAX_LOGIT)[0], _rows(colour, count))
         image = torch.from_numpy(rasterizer.render().copy())
         ctx.rasterizer, ctx.count = rasterizer, mean.shape[0]
         ctx.save_for_backward(scale, logit, camera_from_world)
@@ -51,9 +52,9 @@ class _Rasterize(torch.autograd.Function):
         state = torch.from_numpy(gradients.state[:, : ctx.count].T.copy())
         v_logit = torch.from_numpy(gradients.opacity_logit[: ctx.count].copy())
         return (
-            state[:, 0:3],
-            state[:, 3:7],
-            state[:, 7:10] / scale,
+            state[:, MEAN],
+            state[:, QUATERNION],
+            state[:, LOG_SCALE] / scale,
             opacity_gradient(v_logit, logit),
             torch.from_numpy(gradients.colour[:, : ctx.count].T.copy()),
             pose_gradient(torch.from_numpy(gradients.pose.sum(0)), camera_from_world),

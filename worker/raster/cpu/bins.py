@@ -39,7 +39,7 @@ GRADIENT = 12
 EXTENT = 6
 """What project tells of the ellipse of a splat, a dx^2 + 2 b dx dy + c dy^2 = r: its half-width in pixels, dx where it
 is lowest, -b / c, r / c, (ac - b^2) / c^2, and its half-height."""
-MOST_GAUSSIANS = 1 << (32 - 2 * ROW_BITS)
+MAX_GAUSSIANS = 1 << (32 - 2 * ROW_BITS)
 """A million: more would not fit beside the rows in an entry. As many tiles are an image of 23000 x 23000."""
 ROUNDING = np.float32(2e-3)
 """Pixels by which row bounds are widened, against rounding; the exact test is made on every pixel anyway."""

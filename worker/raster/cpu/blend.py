@@ -23,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from worker.machine.cache import kernel
-from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from worker.model.constants import MAX_ALPHA, MIN_ALPHA, MIN_COVERAGE, MIN_TRANSMITTANCE
 from worker.raster.cpu.bins import BLOCK_TILES, GRADIENT, ROW_BITS, TILE_ROWS
 from worker.raster.cpu.simd import (
     add_sums,
@@ -49,7 +49,7 @@ PLANE = TILE_ROWS * LANES + 16
 PLANES = 6
 BEND, COLOUR, PLACE, VALUE = 2 * LANES, 2 * LANES + 1, 2 * LANES + 5, 2 * LANES + 7
 RECORD = 2 * LANES + 8
-MOST_ROWS = 16
+MAX_ROWS = 16
 """Rows of a record: the products' rounding grows with their square, to 1e-5 of alpha after sixteen."""
 RENDER, LOSS, COTANGENT = 0, 1, 2
 """Modes: images only; images never, gradients of the built-in loss; gradients of given image cotangents."""
@@ -60,6 +60,7 @@ _CUT = np.float32(MIN_ALPHA)
 _CAP = np.float32(MAX_ALPHA)
 _DEEP = np.float32(-60.0)  # below this power2, products may leave float32's range: such rows are single records
 _STOP = np.float32(MIN_TRANSMITTANCE)
+_MIN_COVERAGE = np.float32(MIN_COVERAGE)
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
@@ -129,7 +130,7 @@ def _gather(  # type: ignore[no-untyped-def]
         dy, end_dy = y + np.float32(top), y + np.float32(bottom - 1)
         head = fma(lean, splat(dy), along) + splat(k_yy * dy * dy)
         foot = fma(lean, splat(end_dy), along) + splat(k_yy * end_dy * end_dy)
-        stretch = MOST_ROWS if all_less(splat(_DEEP), minimum(head, foot)) else 1
+        stretch = MAX_ROWS if all_less(splat(_DEEP), minimum(head, foot)) else 1
         home = homes[g, 2] + homes[g, 3] * band + block_x
         while top < bottom:
             dy = y + np.float32(top)
@@ -287,8 +288,8 @@ def _depth_loss(planes, p, tissue, wanted, normalised, sharpness, depth_weight):
     """The depth's share of _loss at the LANES pixels from p: its L1, and its gradient into the planes Z and T."""
     zero, one = splat(_ZERO), splat(_ONE)
     coverage = one - load(planes, p)
-    # Where nothing was blended there is no depth to correct; 1e-2 keeps the divisions finite.
-    solid = where_less(splat(np.float32(1e-2)), coverage, one, zero)
+    # Where nothing was blended there is no depth to correct; the bound keeps the divisions finite.
+    solid = where_less(splat(_MIN_COVERAGE), coverage, one, zero)
     usable = where_less(zero, wanted, tissue * solid, zero)
     divisor = where_less(zero, usable, load(planes, p + 4 * PLANE), one)
     inverse = one / divisor

@@ -1,7 +1,7 @@
 """Spherical harmonics to colour and back, for scenes whose camera moves (worker/model/gaussians.py: the same in torch).
 
-N Gaussians, K = (degree + 1)^2 coefficients a channel: the constant one in state[10:13], the others in
-rest [K - 1, 3, N]; colour [3, N], mean in state[0:3].
+N Gaussians, K = (degree + 1)^2 coefficients a channel: the constant one in state[COLOUR], the others in
+rest [K - 1, 3, N]; colour [3, N], mean in state[MEAN].
 """
 
 from __future__ import annotations
@@ -11,14 +11,11 @@ import math
 import numpy as np
 
 from worker.machine.cache import kernel
-from worker.model.gaussians import SH_C0  # a kernel keeps its value: no other will ever be right
+from worker.model.constants import SH_C0, SH_C1, SH_C2, SH_C3
+from worker.model.layout import COLOUR_ROW, MEAN_ROW
 
-_C1 = 0.4886025119029199
-_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
-_C3 = (
-    -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
-    -0.4570457994644658, 1.445305721320277, -0.5900435899266435,
-)  # fmt: skip
+_C2 = (SH_C2[0], -SH_C2[0], SH_C2[1], -SH_C2[0], SH_C2[2])
+_C3 = (-SH_C3[0], SH_C3[1], -SH_C3[2], SH_C3[3], -SH_C3[2], SH_C3[4], -SH_C3[0])
 
 
 @kernel
@@ -27,8 +24,8 @@ def _terms(degree, x, y, z, value, slope):  # type: ignore[no-untyped-def]
     value[0] = SH_C0
     slope[:, :] = 0.0
     if degree >= 1:
-        value[1], value[2], value[3] = -_C1 * y, _C1 * z, -_C1 * x
-        slope[1, 1], slope[2, 2], slope[3, 0] = -_C1, _C1, -_C1
+        value[1], value[2], value[3] = -SH_C1 * y, SH_C1 * z, -SH_C1 * x
+        slope[1, 1], slope[2, 2], slope[3, 0] = -SH_C1, SH_C1, -SH_C1
     if degree >= 2:
         a, b, c, d, e = _C2
         value[4], value[5], value[6] = a * x * y, b * y * z, c * (2 * z * z - x * x - y * y)
@@ -64,11 +61,13 @@ def colour_from_sh(thread, threads, degree, centre, state, rest, colour):  # typ
     value, slope = np.empty(terms), np.empty((terms, 3))
     count = state.shape[1]
     for g in range(count * thread // threads, count * (thread + 1) // threads):
-        x, y, z = state[0, g] - centre[0], state[1, g] - centre[1], state[2, g] - centre[2]
+        x = state[MEAN_ROW, g] - centre[0]
+        y = state[MEAN_ROW + 1, g] - centre[1]
+        z = state[MEAN_ROW + 2, g] - centre[2]
         n = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
         _terms(degree, x * n, y * n, z * n, value, slope)
         for channel in range(3):
-            total = 0.5 + SH_C0 * state[10 + channel, g]
+            total = 0.5 + SH_C0 * state[COLOUR_ROW + channel, g]
             for k in range(1, terms):
                 total += rest[k - 1, channel, g] * value[k]
             colour[channel, g] = max(total, 0.0)
@@ -78,24 +77,26 @@ def colour_from_sh(thread, threads, degree, centre, state, rest, colour):  # typ
 def colour_from_sh_backward(  # type: ignore[no-untyped-def]
     thread, threads, degree, centre, state, rest, colour, v_colour, v_rest, v_state
 ):
-    """Write v_rest [K - 1, 3, N] and v_state[10:13]; add the direction's share to v_state[0:3]."""
+    """Write v_rest [K - 1, 3, N] and v_state[COLOUR]; add the direction's share to v_state[MEAN]."""
     terms = (degree + 1) * (degree + 1)
     value, slope, v_direction = np.empty(terms), np.empty((terms, 3)), np.empty(3)
     count = state.shape[1]
     for g in range(count * thread // threads, count * (thread + 1) // threads):
-        x, y, z = state[0, g] - centre[0], state[1, g] - centre[1], state[2, g] - centre[2]
+        x = state[MEAN_ROW, g] - centre[0]
+        y = state[MEAN_ROW + 1, g] - centre[1]
+        z = state[MEAN_ROW + 2, g] - centre[2]
         n = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
         x, y, z = x * n, y * n, z * n
         _terms(degree, x, y, z, value, slope)
         v_direction[:] = 0.0
         for channel in range(3):
             gradient = v_colour[channel, g] if colour[channel, g] > 0.0 else np.float32(0.0)
-            v_state[10 + channel, g] = gradient * SH_C0
+            v_state[COLOUR_ROW + channel, g] = gradient * SH_C0
             for k in range(1, terms):
                 v_rest[k - 1, channel, g] = gradient * value[k]
                 for axis in range(3):
                     v_direction[axis] += gradient * rest[k - 1, channel, g] * slope[k, axis]
         along = v_direction[0] * x + v_direction[1] * y + v_direction[2] * z
-        v_state[0, g] += n * (v_direction[0] - along * x)
-        v_state[1, g] += n * (v_direction[1] - along * y)
-        v_state[2, g] += n * (v_direction[2] - along * z)
+        v_state[MEAN_ROW, g] += n * (v_direction[0] - along * x)
+        v_state[MEAN_ROW + 1, g] += n * (v_direction[1] - along * y)
+        v_state[MEAN_ROW + 2, g] += n * (v_direction[2] - along * z)

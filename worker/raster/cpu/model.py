@@ -1,6 +1,6 @@
 """The fused training step: deform, project, bin, blend with loss and gradients, then Adam on every parameter.
 
-N Gaussians (padded to whole vectors), rows of N floats, F frames a step; canonical and state [13, N] as in update.py.
+N Gaussians (padded to whole vectors), rows of N floats, F frames a step; canonical and state [ROWS, N].
 """
 
 from __future__ import annotations
@@ -14,15 +14,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from worker.model.constants import SH_C0
 from worker.model.deformation import Deformation
-from worker.model.gaussians import SH_C0, Gaussians
+from worker.model.gaussians import Gaussians
+from worker.model.layout import COLOUR, GEOMETRY, LOG_SCALE, MEAN, QUATERNION, QUATERNION_ROW, ROWS
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu import harmonics, update
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
 from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, padded
 from worker.raster.cpu.threads import run
-from worker.raster.step import StepSums, TrainingFrame
+from worker.raster.step import StepSums, TrainingFrame, camera_centre, image_size
 
 PAD_LOGIT = -30.0
 """Opacity logit of the columns that only fill the last vector: never drawn."""
@@ -47,10 +49,10 @@ class CpuModel:
         self.count = len(gaussians)
         columns = padded(self.count)
         canonical = torch.cat([gaussians.mean, gaussians.quaternion, gaussians.log_scale], 1).numpy()
-        self.canonical = np.zeros((update.ROWS, columns), np.float32)
-        self.canonical[3] = 1.0
-        self.canonical[:10, : self.count] = canonical.T
-        self.canonical[10:13, : self.count] = gaussians.sh[:, 0].T.numpy()
+        self.canonical = np.zeros((ROWS, columns), np.float32)
+        self.canonical[QUATERNION_ROW] = 1.0
+        self.canonical[GEOMETRY, : self.count] = canonical.T
+        self.canonical[COLOUR, : self.count] = gaussians.sh[:, 0].T.numpy()
         self.opacity_logit = np.full(columns, PAD_LOGIT, np.float32)
         self.opacity_logit[: self.count] = gaussians.opacity_logit.numpy()
         self.sh_rest = np.zeros((gaussians.sh.shape[1] - 1, 3, columns), np.float32)
@@ -68,9 +70,9 @@ class CpuModel:
     def _allocate(self, frames: int = 1) -> None:
         """Room for the Gaussians at one time, and for their gradients in so many frames a step."""
         columns = self.canonical.shape[1]
-        self.state = np.zeros((update.ROWS, columns), np.float32)
+        self.state = np.zeros((ROWS, columns), np.float32)
         self.colour = np.zeros((3, columns), np.float32)
-        self._v_state = np.zeros((frames, update.ROWS, columns), np.float32)
+        self._v_state = np.zeros((frames, ROWS, columns), np.float32)
         self._v_rest = np.zeros((frames, *self.sh_rest.shape), np.float32)
         self._gradients = [Gradients.room(v_state) for v_state in self._v_state]
         self._seen = np.zeros(columns, np.bool_)
@@ -96,14 +98,14 @@ class CpuModel:
 
     def project(self, camera: NDArray[np.float64], t: float, sh_degree: int, *, trains: bool = False) -> None:
         """The Gaussians at time t on this camera's image. Where trains, a step of Adam follows."""
-        self.rasterizer = self._rasterizer(int(camera[4]), int(camera[5]))
+        self.rasterizer = self._rasterizer(*image_size(camera))
         self.motion.deform(self.canonical, t, self.state, trains=trains)
         if sh_degree == 0:
-            np.multiply(self.state[10:13], np.float32(SH_C0), out=self.colour)
+            np.multiply(self.state[COLOUR], np.float32(SH_C0), out=self.colour)
             self.colour += np.float32(0.5)
             np.maximum(self.colour, 0, out=self.colour)
         else:
-            run(harmonics.colour_from_sh, sh_degree, _centre(camera), self.state, self.sh_rest, self.colour)
+            run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
         self.rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
@@ -121,12 +123,12 @@ class CpuModel:
         self.project(camera, t, 0)
         gradients = self.rasterizer.cotangent_backward(cotangents)
         colour = gradients.colour * np.float32(SH_C0)
-        return np.concatenate([gradients.state[:10], colour, gradients.opacity_logit[None]])[:, : self.count]
+        return np.concatenate([gradients.state[GEOMETRY], colour, gradients.opacity_logit[None]])[:, : self.count]
 
     def deformed_mean(self, t: float) -> Floats:
         """Centres at time t, [3, N] in units, as a copy."""
         self.motion.deform(self.canonical, t, self.state)
-        return self.state[:3, : self.count].copy()
+        return self.state[MEAN, : self.count].copy()
 
     def step(
         self, frames: Sequence[TrainingFrame], loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
@@ -148,11 +150,11 @@ class CpuModel:
         self.project(frame.camera, frame.t, sh_degree, trains=True)
         self.rasterizer.loss_backward(frame.target, frame.loss_settings(loss), gradients)
         if sh_degree == 0:
-            np.multiply(gradients.colour, np.float32(SH_C0), out=gradients.state[10:13])
-            gradients.state[10:13] *= self.colour > 0
+            np.multiply(gradients.colour, np.float32(SH_C0), out=gradients.state[COLOUR])
+            gradients.state[COLOUR] *= self.colour > 0
         else:
             run(
-                harmonics.colour_from_sh_backward, sh_degree, _centre(frame.camera), self.state, self.sh_rest,
+                harmonics.colour_from_sh_backward, sh_degree, camera_centre(frame.camera), self.state, self.sh_rest,
                 self.colour, gradients.colour, self._v_rest[place], gradients.state,
             )  # fmt: skip
         self._seen |= self.rasterizer.radius2 >= 0
@@ -174,9 +176,13 @@ class CpuModel:
     def update_canonical(self, gradients: Gradients, rates: StepRates, iteration: int, sh_degree: int) -> None:
         """One Adam step of everything but the motion, given dL/dcanonical."""
         canonical, moments = self.canonical, self._moments["canonical"]
-        groups = ((0, 3, rates.mean), (3, 7, rates.quaternion), (7, 10, rates.log_scale), (10, 13, rates.colour))
-        for first, last, rate in groups:
-            rows = slice(first, last)
+        groups = (
+            (MEAN, rates.mean),
+            (QUATERNION, rates.quaternion),
+            (LOG_SCALE, rates.log_scale),
+            (COLOUR, rates.colour),
+        )
+        for rows, rate in groups:
             _adam(canonical[rows], gradients.state[rows], moments[:, rows], rate, rates, iteration)
         opacity_moments = self._moments["opacity_logit"]
         _adam(self.opacity_logit, gradients.opacity_logit, opacity_moments, rates.opacity, rates, iteration)
@@ -220,21 +226,16 @@ class CpuModel:
 
     def export(self) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as torch tensors (copies)."""
-        canonical = torch.from_numpy(np.ascontiguousarray(self.canonical[:10, : self.count].T))
-        sh = np.concatenate([self.canonical[None, 10:13], self.sh_rest])[:, :, : self.count]
+        canonical = torch.from_numpy(np.ascontiguousarray(self.canonical[GEOMETRY, : self.count].T))
+        sh = np.concatenate([self.canonical[None, COLOUR], self.sh_rest])[:, :, : self.count]
         gaussians = Gaussians(
-            canonical[:, 0:3].contiguous(),
-            canonical[:, 3:7].contiguous(),
-            canonical[:, 7:10].contiguous(),
+            canonical[:, MEAN].contiguous(),
+            canonical[:, QUATERNION].contiguous(),
+            canonical[:, LOG_SCALE].contiguous(),
             torch.from_numpy(self.opacity_logit[: self.count].copy()),
             torch.from_numpy(np.ascontiguousarray(sh.transpose(2, 0, 1))),
         )
         return gaussians, self.motion.export(self.count)
-
-
-def _centre(camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    pose = camera[6:].reshape(3, 4)
-    return np.asarray(-pose[:, :3].T @ pose[:, 3])
 
 
 def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, rates: StepRates, iteration: int) -> None:

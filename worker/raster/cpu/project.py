@@ -1,7 +1,7 @@
 """Gaussians to the image and back: the per-Gaussian half of the rasteriser.
 
-N Gaussians, stored as rows of N: state [10, N] = mean 0:3, quaternion wxyz 3:7, log-scale 7:10 (deformed to the frame's
-time), opacity_logit [N], colour [3, N]. A splat is a Gaussian on the image, SPLAT floats:
+N Gaussians, stored as rows of N: state [10 or more, N] (worker/model/layout.py) deformed to the frame's time,
+opacity_logit [N], colour [3, N]. A splat is a Gaussian on the image, SPLAT floats:
     0 1   mean2d x, y in px
     2 3 4 the conic times -log2(e) / 2, -log2(e), -log2(e) / 2: power2 = lo + k_xx dx^2 + k_xy dx dy + k_yy dy^2
     5     lo = log2(opacity), so that alpha = 2**power2
@@ -10,7 +10,7 @@ time), opacity_logit [N], colour [3, N]. A splat is a Gaussian on the image, SPL
     10    2**(2 k_yy): by this factor the ratio of alpha from row to row changes from row to row
     11    a value of the caller's that is blended as colour is, at first 0
 Arithmetic is float64 on LANES Gaussians at once, storage float32; exponentials have float32's precision and end at
-LARGEST_EXP, so no log-scale or logit, however far out, leaves the numbers.
+2**MAX_LOG2_EXP, so no log-scale or logit, however far out, leaves the numbers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from __future__ import annotations
 import numpy as np
 
 from worker.machine.cache import kernel
-from worker.raster import EPS2D, LIMIT, MIN_ALPHA, NEAR
+from worker.model.constants import EPS2D, IMAGE_MARGIN, LN2, LOG2E, MAX_DETERMINANT, MAX_LOG2_EXP, MIN_ALPHA, NEAR
+from worker.model.layout import CX, CY, FX, FY, HEIGHT, LOG_SCALE_ROW, MEAN_ROW, POSE, QUATERNION_ROW, WIDTH
 from worker.raster.cpu.bins import EXTENT, GRADIENT
 from worker.raster.cpu.simd import (
     exp2,
@@ -40,13 +41,6 @@ from worker.raster.cpu.vectors import LANES
 
 SPLAT = 12
 """Floats a splat record holds."""
-LOG2E = 1.4426950408889634
-_LN2 = 0.6931471805599453
-_LARGEST = 1e300
-_MOST_POWER = 20.0
-LARGEST_EXP = 2.0**_MOST_POWER
-"""The most that e^x gives. A Gaussian that wide, 17,000 times the median depth, covers any image evenly, and its extent
-still fits into float32; an opacity of one in as many is never drawn."""
 
 
 @kernel
@@ -90,16 +84,16 @@ def _rows_of(state, first, i):  # type: ignore[no-untyped-def]
 
 @kernel
 def _exp(x):  # type: ignore[no-untyped-def]
-    """e^x, at most LARGEST_EXP; NaN of NaN."""
-    power, most = x * LOG2E, widen(splat(np.float32(_MOST_POWER)))
+    """e^x, at most 2**MAX_LOG2_EXP; NaN of NaN."""
+    power, most = x * LOG2E, widen(splat(np.float32(MAX_LOG2_EXP)))
     return widen(exp2(narrow(where_less(most, power, most, power))))
 
 
 @kernel
 def _quaternion(state, i):  # type: ignore[no-untyped-def]
     """Unit quaternions wxyz of the Gaussians from i and 1 / the lengths they were stored with."""
-    q0 = widen(load(state[3], i))
-    q1, q2, q3 = _rows_of(state, 4, i)
+    q0 = widen(load(state[QUATERNION_ROW], i))
+    q1, q2, q3 = _rows_of(state, QUATERNION_ROW + 1, i)
     n = 1.0 / sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     return (q0 * n, q1 * n, q2 * n, q3 * n), n
 
@@ -131,21 +125,22 @@ def _quaternion_gradient(q, n, p):  # type: ignore[no-untyped-def]
 def _pose(camera):  # type: ignore[no-untyped-def]
     """W as three rows, and the translation."""
     return (
-        (camera[6], camera[7], camera[8]),
-        (camera[10], camera[11], camera[12]),
-        (camera[14], camera[15], camera[16]),
-    ), (camera[9], camera[13], camera[17])
+        (camera[POSE], camera[POSE + 1], camera[POSE + 2]),
+        (camera[POSE + 4], camera[POSE + 5], camera[POSE + 6]),
+        (camera[POSE + 8], camera[POSE + 9], camera[POSE + 10]),
+    ), (camera[POSE + 3], camera[POSE + 7], camera[POSE + 11])
 
 
 @kernel
 def _limits(camera):  # type: ignore[no-untyped-def]
     """Least and greatest x / z and y / z at which J is taken (Camera.ratio_limits)."""
-    fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
+    fx, fy, cx, cy = camera[FX], camera[FY], camera[CX], camera[CY]
+    width, height = camera[WIDTH], camera[HEIGHT]
     return (
-        (-cx - LIMIT * width) / fx,
-        (width - cx + LIMIT * width) / fx,
-        (-cy - LIMIT * height) / fy,
-        (height - cy + LIMIT * height) / fy,
+        (-cx - IMAGE_MARGIN * width) / fx,
+        (width - cx + IMAGE_MARGIN * width) / fx,
+        (-cy - IMAGE_MARGIN * height) / fy,
+        (height - cy + IMAGE_MARGIN * height) / fy,
     )
 
 
@@ -161,7 +156,7 @@ def _unless_culled(extent2, z, det, centre, reach, width, height):  # type: igno
     zero = widen(splat(np.float32(0.0)))
     culled = zero - 1.0
     visible = where_less(zero, det, extent2, culled)
-    visible = where_less(det, zero + _LARGEST, visible, culled)
+    visible = where_less(det, zero + MAX_DETERMINANT, visible, culled)
     visible = where_less(zero + NEAR, z, visible, culled)
     visible = where_less(centre[0] + reach[0], zero + 0.5, culled, visible)
     visible = where_less(zero + (width - 0.5), centre[0] - reach[0], culled, visible)
@@ -205,9 +200,10 @@ def project(  # type: ignore[no-untyped-def]
     """Fill splats [N * SPLAT], extent [N * EXTENT] (bins.py) and radius2 [N]: 2 ln(opacity / MIN_ALPHA), the squared
     Mahalanobis radius; -1 if culled, and then the others hold nothing of use.
 
-    camera: float64 [18] = fx, fy, cx, cy, W, H, camera_from_world row-major [3, 4].
+    camera: float64 [CAMERA] (worker/model/layout.py).
     """
-    fx, fy, cx, cy, width, height = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
+    fx, fy, cx, cy = camera[FX], camera[FY], camera[CX], camera[CY]
+    width, height = camera[WIDTH], camera[HEIGHT]
     w, shift = _pose(camera)
     zero = widen(splat(np.float32(0.0)))
     limits = _limits(camera)
@@ -215,11 +211,11 @@ def project(  # type: ignore[no-untyped-def]
     vectors = state.shape[1] // LANES
     for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
         i = k * LANES
-        mean = _rows_of(state, 0, i)
+        mean = _rows_of(state, MEAN_ROW, i)
         x, y, z = _dot(w[0], mean) + shift[0], _dot(w[1], mean) + shift[1], _dot(w[2], mean) + shift[2]
         q, _ = _quaternion(state, i)
         r = _rotation(q)
-        s0, s1, s2 = _rows_of(state, 7, i)
+        s0, s1, s2 = _rows_of(state, LOG_SCALE_ROW, i)
         scale = (_exp(s0), _exp(s1), _exp(s2))
         # A = J W (2 x 3), then K = A R S (2 x 3), cov2d = K K^T + EPS2D I.
         inverse_z = 1.0 / z
@@ -229,7 +225,7 @@ def project(  # type: ignore[no-untyped-def]
         k1 = _each(_through(_sum(j1, w[1], zero - j1 * v, w[2]), r), scale)
         cxx, cxy, cyy = _dot(k0, k0) + EPS2D, _dot(k0, k1), _dot(k1, k1) + EPS2D
         log2_opacity = zero - log2(1.0 + _exp(zero - widen(load(opacity_logit, i))))
-        extent2 = 2.0 * _LN2 * (log2_opacity - np.log2(MIN_ALPHA))
+        extent2 = 2.0 * LN2 * (log2_opacity - np.log2(MIN_ALPHA))
         det = cxx * cyy - cxy * cxy
         centre, reach = (j0 * x + cx, j1 * y + cy), (sqrt(extent2 * cxx), sqrt(extent2 * cyy))
         store(radius2, i, narrow(_unless_culled(extent2, z, det, centre, reach, width, height)))
@@ -279,7 +275,7 @@ def project_backward(  # type: ignore[no-untyped-def]
     With G = dL/dconic: dL/dcov2d = -conic G conic; dL/dSigma = A^T dL/dcov2d A.
     One long function, because each step of this chain needs most of what the steps before it computed.
     """
-    fx, fy, width, height = camera[0], camera[1], camera[4], camera[5]
+    fx, fy, width, height = camera[FX], camera[FY], camera[WIDTH], camera[HEIGHT]
     w, shift = _pose(camera)
     none, zero = splat(np.float32(0.0)), widen(splat(np.float32(0.0)))
     limits = _limits(camera)
@@ -299,12 +295,12 @@ def project_backward(  # type: ignore[no-untyped-def]
         store(v_opacity_logit, i, narrow(widen(load_strided(totals, 4, GRADIENT)) * odds / (1.0 + odds)))
 
         # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + EPS2D I.
-        mean = _rows_of(state, 0, i)
+        mean = _rows_of(state, MEAN_ROW, i)
         x, y, z = _dot(w[0], mean) + shift[0], _dot(w[1], mean) + shift[1], _dot(w[2], mean) + shift[2]
         inverse_z = 1.0 / z
         q, n = _quaternion(state, i)
         r = _rotation(q)
-        s0, s1, s2 = _rows_of(state, 7, i)
+        s0, s1, s2 = _rows_of(state, LOG_SCALE_ROW, i)
         scale = (_exp(s0), _exp(s1), _exp(s2))
         variance = _each(scale, scale)
         ratio_x, ratio_y = x * inverse_z, y * inverse_z
@@ -332,13 +328,15 @@ def project_backward(  # type: ignore[no-untyped-def]
         e0, e1 = _sum(2 * c00, t0, 2 * c01, t1), _sum(2 * c01, t0, 2 * c11, t1)
         by_scale = _each(b0, e0), _each(b1, e1)
         for c in range(3):
-            store(v_state[7 + c], i, where_less(visible, none, none, narrow(by_scale[0][c] + by_scale[1][c])))
+            store(
+                v_state[LOG_SCALE_ROW + c], i, where_less(visible, none, none, narrow(by_scale[0][c] + by_scale[1][c]))
+            )
 
         # dL/dR = A^T E, then through R(q / |q|).
         p = (_sum(a0[0], e0, a1[0], e1), _sum(a0[1], e0, a1[1], e1), _sum(a0[2], e0, a1[2], e1))
         v_quaternion = _quaternion_gradient(q, n, p)
         for c in range(4):
-            store(v_state[3 + c], i, where_less(visible, none, none, narrow(v_quaternion[c])))
+            store(v_state[QUATERNION_ROW + c], i, where_less(visible, none, none, narrow(v_quaternion[c])))
 
         # dL/dA = E R^T =: F, then to the camera point through A = diag(j) (W_xy - (u, v) W_z).
         f0, f1 = _onto(r, e0), _onto(r, e1)
@@ -351,7 +349,7 @@ def project_backward(  # type: ignore[no-untyped-def]
         v_x, v_y, v_z = v_x + v_u, v_y + v_v, v_z - v_u * ratio_x - v_v * ratio_y
         v_mean = _through((v_x, v_y, v_z), w)
         for c in range(3):
-            store(v_state[c], i, where_less(visible, none, none, narrow(v_mean[c])))
+            store(v_state[MEAN_ROW + c], i, where_less(visible, none, none, narrow(v_mean[c])))
         # dL/d camera_from_world: what reaches x, y, z times the mean, and J^T dL/dA.
         j0_u, j1_v = j0 * u, j1 * v
         to_x, to_y = _sum(v_x, mean, j0, f0), _sum(v_y, mean, j1, f1)

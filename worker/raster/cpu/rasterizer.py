@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.model.layout import ROWS
 from worker.raster.cpu import bins, project
 from worker.raster.cpu.blend import COTANGENT, LOSS, PLANE, PLANES, RECORD, RENDER, STATISTICS, blend
 from worker.raster.cpu.threads import run, thread_count
@@ -36,7 +37,7 @@ def padded(count: int) -> int:
 class Gradients:
     """dL/d of every Gaussian's deformed state, opacity logit and colour, and of camera_from_world; |dL/dmean2d|."""
 
-    state: Floats  # [13, N]; rows 10:13, the constant harmonic, are the caller's to fill
+    state: Floats  # [ROWS, N]; COLOUR is the caller's to fill
     opacity_logit: Floats  # [N]
     colour: Floats  # [3, N]
     mean2d_norm: Floats  # [N], in normalised device coordinates
@@ -71,8 +72,8 @@ class Rasterizer:
         self._allocate_slots(0, 0)
 
     def _allocate_gaussians(self, count: int) -> None:
-        if count > bins.MOST_GAUSSIANS:
-            raise ValueError(f"{count} Gaussians; these kernels number at most {bins.MOST_GAUSSIANS}")
+        if count > bins.MAX_GAUSSIANS:
+            raise ValueError(f"{count} Gaussians; these kernels number at most {bins.MAX_GAUSSIANS}")
         self.splats = np.zeros((count, project.SPLAT), np.float32)
         self.radius2 = np.full(count, -1.0, np.float32)
         self.slot_start = np.zeros(count, np.int32)
@@ -81,7 +82,7 @@ class Rasterizer:
         self._homes = np.zeros((count, 4), np.int32)
         self._order = np.zeros((2, count), np.int32)
         self._keys = np.zeros((2, count), np.uint32)
-        self.gradients = Gradients.room(np.zeros((13, count), np.float32))
+        self.gradients = Gradients.room(np.zeros((ROWS, count), np.float32))
 
     def _allocate_slots(self, slots: int, homes: int) -> None:
         """Room for so many a thread."""

@@ -3,8 +3,7 @@
 The rest of a step is that of every motion, so two deformations compared with each other differ in nothing else. Only
 the time of a step is not comparable: tables of speed must say so.
 
-Symbols: N Gaussians (padded to whole vectors), rows of N floats, F frames a step; canonical and state [13, N] as in
-update.py.
+Symbols: N Gaussians (padded to whole vectors), rows of N floats, F frames a step; canonical and state [ROWS, N].
 """
 
 from __future__ import annotations
@@ -16,13 +15,11 @@ import torch
 from torch import Tensor
 
 from contract.wire.errors import TrainingDiverged
-from worker.model.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation
+from worker.model.deformation import Deformation
 from worker.model.gaussians import Gaussians
+from worker.model.layout import COLOUR, LOG_SCALE, MEAN, QUATERNION
 from worker.model.optimize import AdamStep, StepRates, adam_step
 from worker.raster.cpu.rasterizer import Floats
-
-COLOUR = slice(10, 13)
-"""Rows of the constant harmonic."""
 
 
 class AutogradMotion:

@@ -1,10 +1,10 @@
 """Deformation and Adam: the per-parameter half of a training step.
 
-N Gaussians padded to a multiple of LANES, B bases, F frames a step. The canonical state has ROWS = 13 rows: mean 0:3,
-quaternion 3:7, log-scale 7:10 and the constant harmonic of the colour 10:13; FDM moves the first CHANNELS = 10, shared
-bases the first 10 or all. Rows of N floats everywhere, so that a vector is LANES Gaussians; a gradient is a sum over
-the frames, in their order. Adam (Kingma and Ba 2015) with bias correction folded into the step:
-rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and eps scaled by the same square root.
+N Gaussians padded to a multiple of LANES, B bases, F frames a step. The canonical state has the ROWS of
+worker/model/layout.py; FDM moves the first CHANNELS of them, shared bases those or all. Rows of N floats everywhere, so
+that a vector is LANES Gaussians; a gradient is a sum over the frames, in their order. Adam (Kingma and Ba 2015) with
+bias correction folded into the step: rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and eps scaled by the same square
+root.
 """
 
 from __future__ import annotations
@@ -12,18 +12,15 @@ from __future__ import annotations
 import numpy as np
 
 from worker.machine.cache import kernel
+from worker.model.constants import LOG2E, MIN_WIDTH, QUARTIC_FLOOR
+from worker.model.layout import CHANNELS, ROWS
 from worker.raster.cpu.simd import exp2, fma, load, splat, sqrt, store, where_less
 from worker.raster.cpu.vectors import LANES
 
-CHANNELS, ROWS = 10, 13
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
-_HALF_LOG2E = np.float32(0.5 * 1.4426950408889634)
-_LOG2E = np.float32(1.4426950408889634)
+_HALF_LOG2E, _LOG2E = np.float32(0.5 * LOG2E), np.float32(LOG2E)
+_MIN_WIDTH, _QUARTIC_FLOOR = np.float32(MIN_WIDTH), np.float32(QUARTIC_FLOOR)
 _STRETCH = 64  # vectors
-MIN_WIDTH = np.float32(1e-3)
-"""Smallest |sigma| of a basis, in model time."""
-QUARTIC_FLOOR = np.float32(1e-4)
-"""Added to sigma^2 in the released form of the basis."""
 
 
 @kernel(inline="always")
@@ -89,13 +86,13 @@ def _basis(t, centre, width, quartic):  # type: ignore[no-untyped-def]
     zero = splat(_ZERO)
     d = t - centre
     if quartic:
-        spread = fma(width, width, splat(QUARTIC_FLOOR))
+        spread = fma(width, width, splat(_QUARTIC_FLOOR))
         ratio = d * d / spread
         value = exp2(zero - splat(_LOG2E) * ratio * ratio)
         slope = splat(np.float32(4.0)) * ratio / spread
         return value, slope * d, slope * ratio * width
     size = where_less(width, zero, zero - width, width)
-    low = splat(MIN_WIDTH)
+    low = splat(_MIN_WIDTH)
     bounded = where_less(size, low, low, size)
     inverse = splat(_ONE) / bounded
     along = d * inverse

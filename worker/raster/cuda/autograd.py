@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from worker.model.layout import LOG_SCALE, MEAN, QUATERNION
 from worker.raster import Camera, Rendered
 from worker.raster.autograd import logit_of, opacity_gradient, pose_gradient, rasterize_by, stacked
 from worker.raster.cuda.rasterizer import CudaRasterizer
@@ -44,9 +45,9 @@ class _Rasterize(torch.autograd.Function):
         gradients = ctx.rasterizer.cotangent_backward(stacked(*cotangents)[None], pose=True)
         state = gradients.state[0].T.clone()
         return (
-            state[:, 0:3],
-            state[:, 3:7],
-            state[:, 7:10] / scale,
+            state[:, MEAN],
+            state[:, QUATERNION],
+            state[:, LOG_SCALE] / scale,
             opacity_gradient(gradients.opacity_logit[0], logit),
             gradients.colour[0].T.clone(),
             pose_gradient(gradients.pose.sum((0, 1)), camera_from_world),

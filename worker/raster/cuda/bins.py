@@ -31,7 +31,7 @@ SLOT = 16
 """Floats of an instance's gradient (blend.py): the moments 1, x, y, xx, xy, yy of dL/dpower about the tile's middle, x
 and y of that middle, and dL/d(r, g, b, z) as 8:12 plus 12:16."""
 FILL_BLOCK = 256
-MOST_FRAMES = 16
+MAX_FRAMES = 16
 """Frames whose depths can be sorted as one: 4 bits of a depth key."""
 DEPTH_BITS = 28
 """Bits of a depth's key, a float32 above NEAR: 32 powers of two, exactly; farther is all the same."""

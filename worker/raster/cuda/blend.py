@@ -24,7 +24,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from worker.raster import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from worker.model.constants import MAX_ALPHA, MIN_ALPHA, MIN_COVERAGE, MIN_TRANSMITTANCE
 from worker.raster.cuda.bins import SLOT
 from worker.raster.cuda.project import RECORD
 
@@ -44,7 +44,7 @@ _MIN_ALPHA, _MAX_ALPHA = tl.constexpr(MIN_ALPHA), tl.constexpr(MAX_ALPHA)
 _STOP = tl.constexpr(MIN_TRANSMITTANCE)
 _UPPER_BITS = tl.constexpr(-(1 << 13))  # the sign, the exponent and 10 bits of a float32: what TF32 keeps
 _PER_BYTE = tl.constexpr(1.0 / 255.0)
-_LEAST_COVER = tl.constexpr(1e-2)
+_MIN_COVERAGE = tl.constexpr(MIN_COVERAGE)
 _NOWHERE = tl.constexpr(-1000.0)  # log2 of an opacity that is never drawn
 
 
@@ -176,8 +176,8 @@ def _colour_loss(colour, target, q, inside, tissue, sharpness, weight):  # type:
 @triton.jit
 def _depth_loss(depth, cover, wanted, tissue, normalised, sharpness, weight):  # type: ignore[no-untyped-def]
     """L1 of the inverse depth, and its gradients to sum w z and sum w."""
-    # Where nothing was blended there is no depth to correct; _LEAST_COVER keeps the divisions finite.
-    usable = (wanted > 0.0) & (cover > _LEAST_COVER)
+    # Where nothing was blended there is no depth to correct; _MIN_COVERAGE keeps the divisions finite.
+    usable = (wanted > 0.0) & (cover > _MIN_COVERAGE)
     inverse = 1.0 / tl.where(usable & (tissue > 0.0), depth, 1.0)
     rendered = tl.where(normalised, cover * inverse, inverse)
     error = rendered - wanted

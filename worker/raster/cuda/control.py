@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from worker.model.layout import COLOUR, LOG_SCALE, MEAN, OPACITY_ROW, QUATERNION, VALUES
 from worker.model.optimize import StepRates, adam_step
-from worker.raster.cuda.update import VALUES
 
 ALIGNMENT = 16
 """Bytes: a field begins at a multiple of so many, as kernels are compiled for."""
@@ -82,8 +82,8 @@ def write_adam(row: Mapping[str, np.ndarray], slot: int, rates: StepRates, itera
     row["slot"][0] = slot
     unit = adam_step(1.0, rates, iteration)
     size = row["size"]
-    size[0:3], size[3:7], size[7:10] = rates.mean, rates.quaternion, rates.log_scale
-    size[10:13], size[13] = rates.colour, rates.opacity
+    size[MEAN], size[QUATERNION], size[LOG_SCALE] = rates.mean, rates.quaternion, rates.log_scale
+    size[COLOUR], size[OPACITY_ROW] = rates.colour, rates.opacity
     size *= np.float32(unit.size)
     row["rest_size"][0] = rates.sh_rest * unit.size
     row["floor"][0] = unit.floor

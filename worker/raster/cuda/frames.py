@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from worker.raster.step import TrainingFrame
+from worker.raster.step import TrainingFrame, image_size
 
 FIRST_ROOM = 32
 """Frames there is room for from the first on; when it is used up it doubles: all that holds addresses begins anew."""
@@ -42,7 +42,7 @@ class FrameStore:
         """
         if frame in self._rows:
             return self._rows[frame]
-        width, height = int(frame.camera[4]), int(frame.camera[5])
+        width, height = image_size(frame.camera)
         if (width, height) != (self._width, self._height):
             raise ValueError(f"a frame of {width} x {height} pixels, the others have {self._width} x {self._height}")
         if len(self._rows) == self.room:

@@ -10,26 +10,29 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from worker.raster import LIMIT
+from worker.model.constants import IMAGE_MARGIN, LN2, LOG2E, MAX_LOG2_EXP
+from worker.model.layout import CX, FX, LOG_SCALE_ROW, MEAN_ROW, POSE, QUATERNION_ROW, WIDTH
 
-_LIMIT, _LOG2E = tl.constexpr(LIMIT), tl.constexpr(1.4426950408889634)
-_LEAST, _MOST = tl.constexpr(-200.0), tl.constexpr(13.862943611198906)  # 0 as a float32, and 20 ln 2
+_MARGIN, _LOG2E = tl.constexpr(IMAGE_MARGIN), tl.constexpr(LOG2E)
+_MIN_EXPONENT, _MAX_EXPONENT = tl.constexpr(-200.0), tl.constexpr(MAX_LOG2_EXP * LN2)  # below: 0 as a float32
+_X, _Q, _S = tl.constexpr(MEAN_ROW), tl.constexpr(QUATERNION_ROW), tl.constexpr(LOG_SCALE_ROW)
+_FOCAL, _CENTRE, _SIZE, _POSE = tl.constexpr(FX), tl.constexpr(CX), tl.constexpr(WIDTH), tl.constexpr(POSE)
 
 
 @triton.jit
 def exp(x):  # type: ignore[no-untyped-def]
     """e^x of a float32, at most 2**20; NaN of NaN."""
-    held = tl.maximum(x, _LEAST, propagate_nan=tl.PropagateNan.ALL)
-    return tl.exp2(tl.minimum(held, _MOST, propagate_nan=tl.PropagateNan.ALL) * _LOG2E)
+    held = tl.maximum(x, _MIN_EXPONENT, propagate_nan=tl.PropagateNan.ALL)
+    return tl.exp2(tl.minimum(held, _MAX_EXPONENT, propagate_nan=tl.PropagateNan.ALL) * _LOG2E)
 
 
 @triton.jit
 def rotation_of(state, n, there, N):  # type: ignore[no-untyped-def]
     """Unit quaternion wxyz, 1 / its stored length, and its rotation matrix, row by row."""
-    w = tl.load(state + 3 * N + n, mask=there, other=1.0).to(tl.float64)
-    x = tl.load(state + 4 * N + n, mask=there, other=0.0).to(tl.float64)
-    y = tl.load(state + 5 * N + n, mask=there, other=0.0).to(tl.float64)
-    z = tl.load(state + 6 * N + n, mask=there, other=0.0).to(tl.float64)
+    w = tl.load(state + _Q * N + n, mask=there, other=1.0).to(tl.float64)
+    x = tl.load(state + (_Q + 1) * N + n, mask=there, other=0.0).to(tl.float64)
+    y = tl.load(state + (_Q + 2) * N + n, mask=there, other=0.0).to(tl.float64)
+    z = tl.load(state + (_Q + 3) * N + n, mask=there, other=0.0).to(tl.float64)
     inverse = 1.0 / tl.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     return (
@@ -43,17 +46,17 @@ def rotation_of(state, n, there, N):  # type: ignore[no-untyped-def]
 @triton.jit
 def variances_of(state, n, there, N):  # type: ignore[no-untyped-def]
     """Squared scales."""
-    a = exp(tl.load(state + 7 * N + n, mask=there, other=0.0)).to(tl.float64)
-    b = exp(tl.load(state + 8 * N + n, mask=there, other=0.0)).to(tl.float64)
-    c = exp(tl.load(state + 9 * N + n, mask=there, other=0.0)).to(tl.float64)
+    a = exp(tl.load(state + _S * N + n, mask=there, other=0.0)).to(tl.float64)
+    b = exp(tl.load(state + (_S + 1) * N + n, mask=there, other=0.0)).to(tl.float64)
+    c = exp(tl.load(state + (_S + 2) * N + n, mask=there, other=0.0)).to(tl.float64)
     return a * a, b * b, c * c
 
 
 @triton.jit
 def mean_of(state, n, there, N):  # type: ignore[no-untyped-def]
-    a = tl.load(state + n, mask=there, other=0.0).to(tl.float64)
-    b = tl.load(state + N + n, mask=there, other=0.0).to(tl.float64)
-    c = tl.load(state + 2 * N + n, mask=there, other=0.0).to(tl.float64)
+    a = tl.load(state + _X * N + n, mask=there, other=0.0).to(tl.float64)
+    b = tl.load(state + (_X + 1) * N + n, mask=there, other=0.0).to(tl.float64)
+    c = tl.load(state + (_X + 2) * N + n, mask=there, other=0.0).to(tl.float64)
     return a, b, c
 
 
@@ -65,17 +68,19 @@ def dot(a0, a1, a2, b0, b1, b2):  # type: ignore[no-untyped-def]
 @triton.jit
 def seen(camera, a, b, c):  # type: ignore[no-untyped-def]
     """Camera coordinates of world points."""
-    x = dot(tl.load(camera + 6), tl.load(camera + 7), tl.load(camera + 8), a, b, c) + tl.load(camera + 9)
-    y = dot(tl.load(camera + 10), tl.load(camera + 11), tl.load(camera + 12), a, b, c) + tl.load(camera + 13)
-    z = dot(tl.load(camera + 14), tl.load(camera + 15), tl.load(camera + 16), a, b, c) + tl.load(camera + 17)
+    row = camera + _POSE
+    x = dot(tl.load(row), tl.load(row + 1), tl.load(row + 2), a, b, c) + tl.load(row + 3)
+    y = dot(tl.load(row + 4), tl.load(row + 5), tl.load(row + 6), a, b, c) + tl.load(row + 7)
+    z = dot(tl.load(row + 8), tl.load(row + 9), tl.load(row + 10), a, b, c) + tl.load(row + 11)
     return x, y, z
 
 
 @triton.jit
 def limits(camera, first: tl.constexpr):  # type: ignore[no-untyped-def]
     """Least and greatest x / z (first 0) or y / z (first 1) at which J is taken (Camera.ratio_limits)."""
-    focal, centre, size = tl.load(camera + first), tl.load(camera + 2 + first), tl.load(camera + 4 + first)
-    return (-centre - size * _LIMIT) / focal, (size - centre + size * _LIMIT) / focal
+    focal, centre = tl.load(camera + _FOCAL + first), tl.load(camera + _CENTRE + first)
+    size = tl.load(camera + _SIZE + first)
+    return (-centre - size * _MARGIN) / focal, (size - centre + size * _MARGIN) / focal
 
 
 @triton.jit
@@ -83,12 +88,12 @@ def image_row(camera, first: tl.constexpr, ratio, inverse_z):  # type: ignore[no
     """A row of A = J W (2 x 3): its factor j = focal / z, the clamped ratio u, and j (W_row - u W_z)."""
     low, high = limits(camera, first)
     held = tl.minimum(tl.maximum(ratio, low), high)
-    j = tl.load(camera + first) * inverse_z
-    row = camera + 6 + 4 * first
+    j = tl.load(camera + _FOCAL + first) * inverse_z
+    row, away = camera + _POSE + 4 * first, camera + _POSE + 8
     return (
         j,
         held,
-        j * (tl.load(row) - held * tl.load(camera + 14)),
-        j * (tl.load(row + 1) - held * tl.load(camera + 15)),
-        j * (tl.load(row + 2) - held * tl.load(camera + 16)),
+        j * (tl.load(row) - held * tl.load(away)),
+        j * (tl.load(row + 1) - held * tl.load(away + 1)),
+        j * (tl.load(row + 2) - held * tl.load(away + 2)),
     )

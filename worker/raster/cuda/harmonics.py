@@ -13,20 +13,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from worker.model.constants import SH_C1, SH_C2, SH_C3
 from worker.raster.cuda.update import COLOUR_ROW, CONSTANT_HARMONIC, STATE_ROWS, adam, load_trained, store_trained
 
 BLOCK = 128
 """Gaussians a program, one a thread: a direction and its slopes stay in registers."""
 
-C1 = tl.constexpr(0.4886025119029199)
-C2_XY = tl.constexpr(1.0925484305920792)
-C2_ZZ = tl.constexpr(0.31539156525252005)
-C2_XX = tl.constexpr(0.5462742152960396)
-C3_YYY = tl.constexpr(0.5900435899266435)
-C3_XYZ = tl.constexpr(2.890611442640554)
-C3_YZZ = tl.constexpr(0.4570457994644658)
-C3_ZZZ = tl.constexpr(0.3731763325901154)
-C3_XXZ = tl.constexpr(1.445305721320277)
+C1 = tl.constexpr(SH_C1)
+C2_XY, C2_ZZ, C2_XX = (tl.constexpr(each) for each in SH_C2)
+C3_YYY, C3_XYZ, C3_YZZ, C3_ZZZ, C3_XXZ = (tl.constexpr(each) for each in SH_C3)
 
 
 @triton.jit

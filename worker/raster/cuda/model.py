@@ -23,8 +23,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from worker.model.deformation import LOG_SCALE, MEAN, QUATERNION, Deformation
-from worker.model.gaussians import SH_C0, Gaussians
+from worker.model.constants import SH_C0
+from worker.model.deformation import Deformation
+from worker.model.gaussians import Gaussians
+from worker.model.layout import COLOUR, LOG_SCALE, MEAN, OPACITY_ROW, QUATERNION, ROWS, VALUES
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
 from worker.raster.cuda import harmonics
@@ -32,9 +34,9 @@ from worker.raster.cuda.control import write_adam
 from worker.raster.cuda.frames import FrameStore
 from worker.raster.cuda.motion import Motion, Trained, kept_where_old, motion_of
 from worker.raster.cuda.rasterizer import Gradients
-from worker.raster.cuda.update import MADE, ROWS, SEEN, SUMS, VALUES, padded
+from worker.raster.cuda.update import MADE, SEEN, SUMS, padded
 from worker.raster.cuda.view import View
-from worker.raster.step import StepSums, TrainingFrame
+from worker.raster.step import StepSums, TrainingFrame, image_size
 
 Floats = NDArray[np.float32]
 PAD_LOGIT = -30.0
@@ -94,7 +96,7 @@ class CudaModel:
             What the steps since the last answer add up to, where the host has looked.
 
         Raises:
-            ValueError: no frame, or more than the rasteriser draws at once (bins.MOST_FRAMES).
+            ValueError: no frame, or more than the rasteriser draws at once (bins.MAX_FRAMES).
         """
         if len(frames) != self._training.frames:
             self._settle()
@@ -161,7 +163,7 @@ class CudaModel:
         self.motion.deform(self._values, control, view.state, view.colour)
         if sh_degree > 0:
             harmonics.show(self._sh_rest, view.state, control["centre"], view.colour, sh_degree)
-        view.rasterizer.project(control["camera"], view.state, self._values[ROWS], view.colour)
+        view.rasterizer.project(control["camera"], view.state, self._values[OPACITY_ROW], view.colour)
 
     def _settle(self) -> None:
         """Wait for the steps sent, and send those again that found no room."""
@@ -232,7 +234,7 @@ class CudaModel:
     def _steer(self, camera: NDArray[np.float64], times: Sequence[float]) -> View:
         """Settle, and have a view that sees these times through this camera."""
         self._settle()
-        view = self._view(int(camera[4]), int(camera[5]), len(times))
+        view = self._view(*image_size(camera), len(times))
         view.write_cameras(0, [camera] * len(times))
         self.motion.write_times(view.control.rows[0], times)
         view.control.send(0)
@@ -251,7 +253,7 @@ class CudaModel:
         With values [N], a number a Gaussian, they are blended as colour is, and [F, 6, H, W] ends with them.
 
         Raises:
-            ValueError: more times than the rasteriser draws at once (bins.MOST_FRAMES).
+            ValueError: more times than the rasteriser draws at once (bins.MAX_FRAMES).
         """
         view = self._shown = self._steer(camera, times)
         with_values = values is not None
@@ -301,7 +303,7 @@ class CudaModel:
         self.motion.write_times(view.control.rows[0], [t])
         view.control.send(0)
         self.motion.deform(self._values, view.control.values, view.state, view.colour)
-        mean: Floats = view.state[0, :3, : self.count].cpu().numpy().copy()
+        mean: Floats = view.state[0, MEAN, : self.count].cpu().numpy().copy()
         return mean
 
     # What is stored
@@ -318,7 +320,7 @@ class CudaModel:
             kept_where_old(each, chosen, is_fresh) for each in (self._moments, self._rest_moments)
         )
         self.motion.take(chosen, is_fresh)
-        self._values[ROWS, count:] = PAD_LOGIT
+        self._values[OPACITY_ROW, count:] = PAD_LOGIT
         self.count = count
         self._training.fit(len(chosen))
         for view in self._views.values():
@@ -332,7 +334,7 @@ class CudaModel:
 
     def _own(self, values: Tensor, sh_rest: Tensor, prefix: str = "") -> dict[str, Tensor]:
         """By their names, without the columns that only fill the rows; [..., VALUES, N] and [..., K - 1, 3, N]."""
-        named = {"canonical": values[..., :ROWS, :], "opacity_logit": values[..., ROWS, :], "sh_rest": sh_rest}
+        named = {"canonical": values[..., :ROWS, :], "opacity_logit": values[..., OPACITY_ROW, :], "sh_rest": sh_rest}
         return {prefix + name: each[..., : self.count] for name, each in named.items()}
 
     def arrays(self) -> dict[str, Tensor]:
@@ -356,6 +358,6 @@ class CudaModel:
         mean, quaternion, log_scale = (
             values[rows].T.clone(memory_format=torch.contiguous_format) for rows in (MEAN, QUATERNION, LOG_SCALE)
         )
-        sh = torch.cat([values[None, 10:ROWS], sh_rest]).permute(2, 0, 1).contiguous()
-        gaussians = Gaussians(mean, quaternion, log_scale, values[ROWS].clone(), sh)
+        sh = torch.cat([values[None, COLOUR], sh_rest]).permute(2, 0, 1).contiguous()
+        gaussians = Gaussians(mean, quaternion, log_scale, values[OPACITY_ROW].clone(), sh)
         return gaussians, self.motion.export(self.count)

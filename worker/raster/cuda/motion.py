@@ -16,11 +16,12 @@ import torch
 from torch import Tensor
 
 from worker.model.deformation import Deformation, FlexibleDeformation, LinearDeformation
+from worker.model.layout import COLOUR, LOG_SCALE, MEAN, QUATERNION, ROWS
 from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu.motion import NEGLIGIBLE
 from worker.raster.cuda import motion_kernels as kernels
 from worker.raster.cuda.control import ADAM, Field
-from worker.raster.cuda.update import COLUMNS, ROWS
+from worker.raster.cuda.update import COLUMNS
 
 
 @dataclass(frozen=True)
@@ -180,8 +181,8 @@ class LinearMotion:
             adam = adam_step(1.0, rates, int(self._counts[j]))
             row["basis_size"][j], row["basis_floor"][j] = adam.size, adam.floor
         channel_rate = row["channel_rate"]
-        channel_rate[0:3], channel_rate[3:7] = rates.motion_mean, rates.motion_quaternion
-        channel_rate[7:10], channel_rate[10:13] = rates.motion_log_scale, rates.motion_colour
+        channel_rate[MEAN], channel_rate[QUATERNION] = rates.motion_mean, rates.motion_quaternion
+        channel_rate[LOG_SCALE], channel_rate[COLOUR] = rates.motion_log_scale, rates.motion_colour
 
     def deform(self, values: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
         frames, _, columns = state.shape

@@ -10,6 +10,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from worker.model import constants
+from worker.model.layout import CHANNELS
 from worker.raster.cuda.update import (
     COLOUR_ROW,
     COLUMNS,
@@ -24,12 +26,9 @@ from worker.raster.cuda.update import (
     update_values,
 )
 
-MIN_WIDTH = tl.constexpr(1e-3)
-"""Smallest |sigma| of a basis, in model time."""
-QUARTIC_FLOOR = tl.constexpr(1e-4)
-"""Added to sigma^2 in the released form of the basis."""
-LOG2E = tl.constexpr(1.4426950408889634)
-FDM_CHANNELS = tl.constexpr(10)
+_MIN_WIDTH, _QUARTIC_FLOOR = tl.constexpr(constants.MIN_WIDTH), tl.constexpr(constants.QUARTIC_FLOOR)
+_LOG2E = tl.constexpr(constants.LOG2E)
+FDM_CHANNELS = tl.constexpr(CHANNELS)
 LINE = tl.constexpr(COLUMNS)
 
 
@@ -111,19 +110,19 @@ def fdm_basis(t, centre, width, QUARTIC: tl.constexpr):  # type: ignore[no-untyp
     """
     d = t - centre
     if QUARTIC:
-        spread = width * width + QUARTIC_FLOOR
+        spread = width * width + _QUARTIC_FLOOR
         ratio = d * d / spread
-        value = tl.exp2(ratio * ratio * -LOG2E)
+        value = tl.exp2(ratio * ratio * -_LOG2E)
         slope = 4.0 * ratio / spread
         by_centre, by_width = slope * d, slope * ratio * width
     else:
         size = tl.abs(width)
-        inverse = 1.0 / tl.maximum(size, MIN_WIDTH)
+        inverse = 1.0 / tl.maximum(size, _MIN_WIDTH)
         along = d * inverse
-        value = tl.exp2(along * along * (-0.5 * LOG2E))
+        value = tl.exp2(along * along * (-0.5 * _LOG2E))
         sign = tl.where(width < 0.0, -1.0, 1.0)
         by_centre = along * inverse
-        by_width = tl.where(size < MIN_WIDTH, 0.0, along * along * inverse * sign)  # no gradient through the floor
+        by_width = tl.where(size < _MIN_WIDTH, 0.0, along * along * inverse * sign)  # no gradient through the floor
     return value, by_centre, by_width
 
 

@@ -1,7 +1,7 @@
 """Gaussians to the image and back, on the device: the per-Gaussian half of the rasteriser.
 
-N Gaussians, F frames; rows of N floats: state [F, 10 or more, N] = mean 0:3, quaternion wxyz 3:7, log-scale 7:10
-(deformed to each frame's time), opacity_logit [N], colour [F, 3, N]. A splat is a Gaussian on the image, RECORD floats:
+N Gaussians, F frames; rows of N floats: state [F, 10 or more, N] (worker/model/layout.py) deformed to each
+frame's time, opacity_logit [N], colour [F, 3, N]. A splat is a Gaussian on the image, RECORD floats:
     0 1   mean2d x, y in px
     2 3 4 the conic times -log2(e) / 2, -log2(e), -log2(e) / 2: power2 = lo + k_xx dx^2 + k_xy dx dy + k_yy dy^2
     5     lo = log2(opacity), so that alpha = 2**power2
@@ -14,10 +14,13 @@ Arithmetic is float64 as on the CPU (geometry.py), storage float32.
 
 from __future__ import annotations
 
+import math
+
 import triton
 import triton.language as tl
 
-from worker.raster import EPS2D, MIN_ALPHA, NEAR
+from worker.model.constants import EPS2D, LN2, LOG2E, MAX_DETERMINANT, MIN_ALPHA, NEAR
+from worker.model.layout import CAMERA, CX, CY
 from worker.raster.cuda.bins import DEPTH_BITS, EXTENT, count_tiles
 from worker.raster.cuda.geometry import dot, exp, image_row, mean_of, rotation_of, seen, variances_of
 
@@ -27,11 +30,11 @@ PROJECT_BLOCK = 128
 
 _RECORD, _EXTENT = tl.constexpr(RECORD), tl.constexpr(EXTENT)
 _NEAR, _EPS2D = tl.constexpr(NEAR), tl.constexpr(EPS2D)
-_LOG2E, _LN2 = tl.constexpr(1.4426950408889634), tl.constexpr(0.6931471805599453)
-_LOG2_MIN_ALPHA = tl.constexpr(-7.994353436858858)
-assert abs(2.0**_LOG2_MIN_ALPHA.value - MIN_ALPHA) < 1e-12
+_LOG2E, _LN2 = tl.constexpr(LOG2E), tl.constexpr(LN2)
+_LOG2_MIN_ALPHA = tl.constexpr(math.log2(MIN_ALPHA))
+_CAMERA, _CX, _CY = tl.constexpr(CAMERA), tl.constexpr(CX), tl.constexpr(CY)
 _EXTENT_SLACK = tl.constexpr(1e-3)  # of the squared Mahalanobis radius: where alpha is 1/2000 below MIN_ALPHA
-_LARGEST = tl.constexpr(1e300)
+_MAX_DETERMINANT = tl.constexpr(MAX_DETERMINANT)
 _DEPTHS = tl.constexpr(1 << DEPTH_BITS)
 _NEAR_BITS = tl.constexpr(0x3E4CCCCD)  # of NEAR as a float32
 _HALF_RANGE = tl.constexpr(1 << 31)
@@ -55,12 +58,12 @@ def project(  # type: ignore[no-untyped-def]
     half as many; count [F N] of tiles, 0 for a culled one; depth_key [F N], which sorts by frame, then depth, culled
     ones last.
 
-    camera: float64 [F, 18] = fx, fy, cx, cy, W, H, camera_from_world row-major [3, 4].
+    camera: float64 [F, CAMERA] (worker/model/layout.py).
     """
     f = tl.program_id(1)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = n < N
-    camera += 18 * f
+    camera += _CAMERA * f
     state += (f * state_rows).to(tl.int64) * N
     a, b, c = mean_of(state, n, there, N)
     x, y, z = seen(camera, a, b, c)
@@ -82,12 +85,12 @@ def project(  # type: ignore[no-untyped-def]
     log2_opacity = -tl.log2(1.0 + exp(-logit))
 
     extent2 = (log2_opacity - _LOG2_MIN_ALPHA) * (2.0 * _LN2) + _EXTENT_SLACK
-    drawn = in_front & (extent2 >= 0.0) & (det > 0.0) & (det < _LARGEST)
+    drawn = in_front & (extent2 >= 0.0) & (det > 0.0) & (det < _MAX_DETERMINANT)
     # What is not drawn has numbers all the same, lest a NaN become a tile.
     cxx, cxy, cyy = tl.where(drawn, cxx, 1.0), tl.where(drawn, cxy, 0.0), tl.where(drawn, cyy, 1.0)
     x, y, det = tl.where(drawn, x, 0.0), tl.where(drawn, y, 0.0), tl.where(drawn, det, 1.0)
     inverse_det = 1.0 / det
-    mean_x, mean_y = (j0 * x + tl.load(camera + 2)).to(tl.float32), (j1 * y + tl.load(camera + 3)).to(tl.float32)
+    mean_x, mean_y = (j0 * x + tl.load(camera + _CX)).to(tl.float32), (j1 * y + tl.load(camera + _CY)).to(tl.float32)
     extent2 = tl.where(drawn, extent2, 0.0).to(tl.float64)
     reach = tl.sqrt(extent2 * cyy).to(tl.float32)
     turn = (cxy * tl.sqrt(extent2 / cxx)).to(tl.float32)

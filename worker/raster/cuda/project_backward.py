@@ -9,7 +9,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from worker.raster import EPS2D
+from worker.model.constants import EPS2D
+from worker.model.layout import CAMERA, CHANNELS, HEIGHT, LOG_SCALE_ROW, POSE, QUATERNION_ROW, WIDTH
 from worker.raster.cuda.bins import SLOT
 from worker.raster.cuda.geometry import dot, exp, image_row, limits, mean_of, rotation_of, seen, variances_of
 
@@ -19,9 +20,12 @@ SPLATS_BLOCK, LANES, SUM_WARPS = 16, 8, 1
 """sum_slots: splats a program, slots of each that are added at once, warps. A splat has some five to ten slots; one
 with hundreds keeps only its own program waiting."""
 BACKWARD_BLOCK = 128
-POSE = 12
+POSE_SHARE = 12
 
-_SLOT, _POSE, _EPS2D = tl.constexpr(SLOT), tl.constexpr(POSE), tl.constexpr(EPS2D)
+_SLOT, _SHARE, _EPS2D = tl.constexpr(SLOT), tl.constexpr(POSE_SHARE), tl.constexpr(EPS2D)
+_CAMERA, _POSE = tl.constexpr(CAMERA), tl.constexpr(POSE)
+_WIDTH, _HEIGHT = tl.constexpr(WIDTH), tl.constexpr(HEIGHT)
+_ROWS, _Q, _S = tl.constexpr(CHANNELS), tl.constexpr(QUATERNION_ROW), tl.constexpr(LOG_SCALE_ROW)
 
 
 @triton.jit
@@ -132,7 +136,7 @@ def project_backward(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Gradients of frame program_id(1): v_state [F, 10, N], v_opacity_logit [F, N], v_colour [F, 3, N], zeros for
     culled Gaussians; v_mean2d_norm [F, N]: |dL/dmean2d| in normalised device coordinates (x times W / 2, y times
-    H / 2), the unit in which densification thresholds are published. v_pose float64 [programs, F, POSE]: each
+    H / 2), the unit in which densification thresholds are published. v_pose float64 [programs, F, 12]: each
     program's share of dL/d camera_from_world.
 
     With G = dL/dconic: dL/dcov2d = -conic G conic; dL/dSigma = A^T dL/dcov2d A.
@@ -143,7 +147,7 @@ def project_backward(  # type: ignore[no-untyped-def]
     there = n < N
     splat = f * N + n
     drawn = tl.load(count + splat, mask=there, other=0) > 0
-    camera += 18 * f
+    camera += _CAMERA * f
     state += (f * state_rows).to(tl.int64) * N
     sums += splat
     colour = v_colour + (3 * f).to(tl.int64) * N + n
@@ -178,7 +182,7 @@ def project_backward(  # type: ignore[no-untyped-def]
     m_x = tl.load(sums + splats, mask=drawn, other=0.0).to(tl.float64)
     m_y = tl.load(sums + 2 * splats, mask=drawn, other=0.0).to(tl.float64)
     v_mx, v_my = ka * m_x + kb * m_y, kb * m_x + kc * m_y
-    across, down = 0.5 * tl.load(camera + 4) * v_mx, 0.5 * tl.load(camera + 5) * v_my
+    across, down = 0.5 * tl.load(camera + _WIDTH) * v_mx, 0.5 * tl.load(camera + _HEIGHT) * v_my
     _store(v_mean2d_norm + splat, tl.sqrt(across * across + down * down), drawn, there)
     g00 = -0.5 * tl.load(sums + 3 * splats, mask=drawn, other=0.0).to(tl.float64)  # dL/dconic, symmetric halves
     g01 = -0.5 * tl.load(sums + 4 * splats, mask=drawn, other=0.0).to(tl.float64)
@@ -190,10 +194,10 @@ def project_backward(  # type: ignore[no-untyped-def]
     # dL/dB = 2 dL/dcov2d B S^2 =: E; dL/dlog s_k = b_k . e_k, the sum over both rows of column k.
     e00, e01, e02 = c00 * t00 + c01 * t10, c00 * t01 + c01 * t11, c00 * t02 + c01 * t12
     e10, e11, e12 = c01 * t00 + c11 * t10, c01 * t01 + c11 * t11, c01 * t02 + c11 * t12
-    out = v_state + (10 * f).to(tl.int64) * N + n
-    _store(out + 7 * N, b00 * e00 + b10 * e10, drawn, there)
-    _store(out + 8 * N, b01 * e01 + b11 * e11, drawn, there)
-    _store(out + 9 * N, b02 * e02 + b12 * e12, drawn, there)
+    out = v_state + (_ROWS * f).to(tl.int64) * N + n
+    _store(out + _S * N, b00 * e00 + b10 * e10, drawn, there)
+    _store(out + (_S + 1) * N, b01 * e01 + b11 * e11, drawn, there)
+    _store(out + (_S + 2) * N, b02 * e02 + b12 * e12, drawn, there)
 
     # dL/dR = A^T E, then through R(q / |q|).
     d0, d1, d2, d3 = _quaternion_gradient(
@@ -202,16 +206,17 @@ def project_backward(  # type: ignore[no-untyped-def]
         a01 * e00 + a11 * e10, a01 * e01 + a11 * e11, a01 * e02 + a11 * e12,
         a02 * e00 + a12 * e10, a02 * e01 + a12 * e11, a02 * e02 + a12 * e12,
     )  # fmt: skip
-    _store(out + 3 * N, d0 * length, drawn, there)
-    _store(out + 4 * N, d1 * length, drawn, there)
-    _store(out + 5 * N, d2 * length, drawn, there)
-    _store(out + 6 * N, d3 * length, drawn, there)
+    _store(out + _Q * N, d0 * length, drawn, there)
+    _store(out + (_Q + 1) * N, d1 * length, drawn, there)
+    _store(out + (_Q + 2) * N, d2 * length, drawn, there)
+    _store(out + (_Q + 3) * N, d3 * length, drawn, there)
 
     # dL/dA = E R^T =: F, then to the camera point through A = diag(j) (W_xy - (u, v) W_z).
     f00, f01 = dot(e00, e01, e02, r00, r01, r02), dot(e00, e01, e02, r10, r11, r12)
     f02, f10 = dot(e00, e01, e02, r20, r21, r22), dot(e10, e11, e12, r00, r01, r02)
     f11, f12 = dot(e10, e11, e12, r10, r11, r12), dot(e10, e11, e12, r20, r21, r22)
-    w0, w1, w2 = tl.load(camera + 14), tl.load(camera + 15), tl.load(camera + 16)
+    w = camera + _POSE  # rows of W are 4 numbers apart
+    w0, w1, w2 = tl.load(w + 8), tl.load(w + 9), tl.load(w + 10)
     v_x, v_y = j0 * v_mx, j1 * v_my
     v_z = tl.load(sums + 9 * splats, mask=drawn, other=0.0).to(tl.float64)
     v_z -= (x * v_x + y * v_y + dot(f00, f01, f02, a00, a01, a02) + dot(f10, f11, f12, a10, a11, a12)) * inverse_z
@@ -220,13 +225,13 @@ def project_backward(  # type: ignore[no-untyped-def]
     v_x += v_u
     v_y += v_v
     v_z -= v_u * ratio_x + v_v * ratio_y
-    _store(out, v_x * tl.load(camera + 6) + v_y * tl.load(camera + 10) + v_z * w0, drawn, there)
-    _store(out + N, v_x * tl.load(camera + 7) + v_y * tl.load(camera + 11) + v_z * w1, drawn, there)
-    _store(out + 2 * N, v_x * tl.load(camera + 8) + v_y * tl.load(camera + 12) + v_z * w2, drawn, there)
+    _store(out, v_x * tl.load(w) + v_y * tl.load(w + 4) + v_z * w0, drawn, there)
+    _store(out + N, v_x * tl.load(w + 1) + v_y * tl.load(w + 5) + v_z * w1, drawn, there)
+    _store(out + 2 * N, v_x * tl.load(w + 2) + v_y * tl.load(w + 6) + v_z * w2, drawn, there)
 
     if WITH_POSE:
         # What reaches x, y, z times the mean, and J^T dL/dA.
-        pose = v_pose + (tl.program_id(0) * tl.num_programs(1) + f) * _POSE
+        pose = v_pose + (tl.program_id(0) * tl.num_programs(1) + f) * _SHARE
         tl.store(pose, _sum_of(v_x * a + j0 * f00, drawn))
         tl.store(pose + 1, _sum_of(v_x * b + j0 * f01, drawn))
         tl.store(pose + 2, _sum_of(v_x * c + j0 * f02, drawn))

@@ -22,13 +22,14 @@ import torch
 import triton
 from torch import Tensor
 
-from worker.raster.cuda.bins import EXTENT, FILL_BLOCK, MOST_FRAMES, SLOT, TILE_HEIGHT, TILE_WIDTH, fill_slots
+from worker.model.layout import CAMERA, CHANNELS
+from worker.raster.cuda.bins import EXTENT, FILL_BLOCK, MAX_FRAMES, SLOT, TILE_HEIGHT, TILE_WIDTH, fill_slots
 from worker.raster.cuda.blend import CHUNK, COTANGENT, LOSS, RENDER, STATISTICS, WARPS, blend
 from worker.raster.cuda.project import PROJECT_BLOCK, RECORD, project
 from worker.raster.cuda.project_backward import (
     BACKWARD_BLOCK,
     LANES,
-    POSE,
+    POSE_SHARE,
     SPLATS_BLOCK,
     SUM_WARPS,
     SUMS,
@@ -41,7 +42,7 @@ _FIRST_GUESS = 8
 tile, for a few Gaussians that cover the image."""
 _SPARE = 1.25
 """Room beyond what was needed, so that a scene that grows slowly seldom needs more."""
-_MOST_NUMBERS = 2**31 - 1
+_MAX_NUMBERS = 2**31 - 1
 """Kernels number the floats of records and slots with 32 bits."""
 
 
@@ -77,14 +78,14 @@ class CudaRasterizer:
     tissue; ``ok`` and ``needed`` int32 [1]; ``capacity``.
 
     Raises:
-        ValueError: no image, or more frames than MOST_FRAMES.
+        ValueError: no image, or more frames than MAX_FRAMES.
     """
 
     def __init__(self, width: int, height: int, device: str | torch.device, frames: int = 1) -> None:
         if min(width, height) < 1:
             raise ValueError(f"no image of {width} x {height}")
-        if not 1 <= frames <= MOST_FRAMES:
-            raise ValueError(f"{frames} frames at once; these kernels sort 1 to {MOST_FRAMES}")
+        if not 1 <= frames <= MAX_FRAMES:
+            raise ValueError(f"{frames} frames at once; these kernels sort 1 to {MAX_FRAMES}")
         self.width, self.height, self.frames, self.device = width, height, frames, torch.device(device)
         self.tiles_x, self.tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
         self.tiles = self.tiles_x * self.tiles_y
@@ -121,8 +122,8 @@ class CudaRasterizer:
 
     def _allocate_splats(self, gaussians: int) -> None:
         frames, splats = self.frames, self.frames * gaussians
-        if splats * max(RECORD, SUMS) > _MOST_NUMBERS:
-            raise ValueError(f"{gaussians} Gaussians in {frames} frames; these kernels number {_MOST_NUMBERS} floats")
+        if splats * max(RECORD, SUMS) > _MAX_NUMBERS:
+            raise ValueError(f"{gaussians} Gaussians in {frames} frames; these kernels number {_MAX_NUMBERS} floats")
         self.gaussians = gaussians
         self.count = self._integers(frames, gaussians)
         self._records = self._floats(splats, RECORD)
@@ -133,16 +134,16 @@ class CudaRasterizer:
         self._sums = self._floats(SUMS, splats)
         self._programs = -(-gaussians // BACKWARD_BLOCK)
         self.gradients = Gradients(
-            self._floats(frames, 10, gaussians),
+            self._floats(frames, CHANNELS, gaussians),
             self._floats(frames, gaussians),
             self._floats(frames, 3, gaussians),
             self._floats(frames, gaussians),
-            self._integers(self._programs, frames, POSE, dtype=torch.float64),
+            self._integers(self._programs, frames, POSE_SHARE, dtype=torch.float64),
         )
 
     def _allocate_slots(self, capacity: int) -> None:
-        if capacity * SLOT > _MOST_NUMBERS:
-            raise ValueError(f"{capacity} tiles touched at once; these kernels number {_MOST_NUMBERS} floats")
+        if capacity * SLOT > _MAX_NUMBERS:
+            raise ValueError(f"{capacity} tiles touched at once; these kernels number {_MAX_NUMBERS} floats")
         self.capacity = capacity
         self._key, self._sorted_key = (self._integers(capacity, dtype=self._key_type) for _ in range(2))
         self._owner, self._sorted_owner = self._integers(capacity), self._integers(capacity)
@@ -167,14 +168,14 @@ class CudaRasterizer:
     def project(self, camera: Tensor, state: Tensor, opacity_logit: Tensor, colour: Tensor) -> None:
         """Splats of every frame's camera in tiles, nearest first.
 
-        camera: float64 [F, 18], rows as camera_vector gives; state [F, 10 or more, N]; opacity_logit [N];
+        camera: float64 [F, CAMERA], rows as camera_vector gives; state [F, 10 or more, N]; opacity_logit [N];
         colour [F, 3, N].
 
         Raises:
             ValueError: anything else, or more than 32 bits can number.
         """
         gaussians = state.shape[-1]
-        _check(camera, "camera", (self.frames, 18), torch.float64)
+        _check(camera, "camera", (self.frames, CAMERA), torch.float64)
         _check(state, "state", (self.frames, None, gaussians))
         _check(opacity_logit, "opacity_logit", (gaussians,))
         _check(colour, "colour", (self.frames, 3, gaussians))

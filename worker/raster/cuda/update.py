@@ -15,18 +15,17 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from worker.model.gaussians import SH_C0
+from worker.model import layout
+from worker.model.constants import SH_C0
 
 COLUMNS = 32
 """Rows are padded to a multiple of so many floats, 128 bytes: they begin where lines of memory begin. A program has one
 such line of every row; with two of them, steps on several frames spill registers."""
-ROWS, VALUES = 13, 14
-"""Of the state; and with the opacity."""
 TILE_ROWS = tl.constexpr(16)
-STATE_ROWS, VALUE_ROWS = tl.constexpr(ROWS), tl.constexpr(VALUES)
-COLOUR_ROW = tl.constexpr(10)
-"""First row of the constant harmonic. Of the rows before it the rasteriser gives gradients."""
-OPACITY_ROW = tl.constexpr(13)
+STATE_ROWS, VALUE_ROWS = tl.constexpr(layout.ROWS), tl.constexpr(layout.VALUES)
+COLOUR_ROW = tl.constexpr(layout.COLOUR_ROW)
+"""Of the rows before it the rasteriser gives gradients."""
+OPACITY_ROW = tl.constexpr(layout.OPACITY_ROW)
 CONSTANT_HARMONIC = tl.constexpr(SH_C0)
 SUMS, MADE, SEEN = 4, 4, 5
 """The report: floats before SUMS, the sums that rasterizer.statistics lists; then, as int32, how many steps were made,

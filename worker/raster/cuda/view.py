@@ -12,11 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from worker.model.layout import CAMERA, ROWS
 from worker.raster.cuda.captured import Captured
 from worker.raster.cuda.control import Control, Field, adam_fields
 from worker.raster.cuda.motion import Motion
 from worker.raster.cuda.rasterizer import CudaRasterizer
-from worker.raster.cuda.update import ROWS
+from worker.raster.step import camera_centre
 
 
 class View:
@@ -32,7 +33,7 @@ class View:
     ) -> None:
         self.frames, self._device = frames, device
         self.rasterizer = CudaRasterizer(width, height, device, frames=frames)
-        cameras = {"camera": Field((frames, 18), "double"), "centre": Field((frames, 3))}
+        cameras = {"camera": Field((frames, CAMERA), "double"), "centre": Field((frames, 3))}
         training = {"loss": Field((frames, 5)), "frame": Field((frames,), "int")} | adam_fields()
         self.control = Control(cameras | motion.fields(frames) | training, rows, device)
         self.launches = Captured(device)
@@ -50,5 +51,4 @@ class View:
         """Fill a row's cameras."""
         written = self.control.rows[row]
         for frame, camera in enumerate(cameras):
-            pose = camera[6:].reshape(3, 4)
-            written["camera"][frame], written["centre"][frame] = camera, -pose[:, :3].T @ pose[:, 3]
+            written["camera"][frame], written["centre"][frame] = camera, camera_centre(camera)
