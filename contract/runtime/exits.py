@@ -1,4 +1,4 @@
-"""Exit codes of every intrasplat command, the same whether the work runs here or on a server."""
+"""Exit codes of every intrasplat command, the same for work here and on a server; and the last words of a process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from contract.wire.errors import Cancelled, InputError, IntrasplatError, Unavail
 
 
 class ExitCode(IntEnum):
-    """What a command's exit status says; scripts may rely on it."""
+    """The meaning of a command's exit status. Scripts may rely on it."""
 
     OK = 0
     USAGE = 2
@@ -29,7 +29,7 @@ EXIT_CODES_HELP = (
 
 
 def exit_code_of(error: IntrasplatError) -> ExitCode:
-    """The exit code that tells of `error`."""
+    """The exit code that stands for `error`."""
     if isinstance(error, InputError):
         return ExitCode.BAD_INPUT
     if isinstance(error, UnavailableError):
@@ -40,11 +40,11 @@ def exit_code_of(error: IntrasplatError) -> ExitCode:
 
 
 LAST_WORDS_VARIABLE = "INTRASPLAT_LAST_WORDS"
-"""Set by whoever starts a process and wants to tell what it lacked: the file that it leaves that in."""
+"""Names the file in which a process leaves the UnavailableError that ends it; Supervised sets it."""
 
 
 def end_by(error: IntrasplatError) -> ExitCode:
-    """Say on stderr why this process ends, leave what is not there to whoever started it, and return the exit code."""
+    """Say on stderr why this process ends, leave an UnavailableError as last words, and return the exit code."""
     print(f"intrasplat: {error}", file=sys.stderr)
     if isinstance(error, UnavailableError):
         leave_last_words(error)
@@ -52,20 +52,20 @@ def end_by(error: IntrasplatError) -> ExitCode:
 
 
 def leave_last_words(error: UnavailableError) -> bool:
-    """Leave what is not there to whoever started this process; False: nobody asked, or the file cannot be written."""
+    """Leave the error to the process that started this one; False: nobody asked, or the file cannot be written."""
     path = os.environ.get(LAST_WORDS_VARIABLE)
     if not path:
         return False
     try:
         words = {"problem": error.problem, "remedy": error.remedy, "may_return": error.may_return}
         Path(path).write_text(json.dumps(words))
-    except OSError:  # room on the disk may be what is not there
+    except OSError:  # the disk may be full
         return False
     return True
 
 
 def take_last_words(path: Path) -> UnavailableError | None:
-    """What a process that has ended left in its file, which is removed; None if it left nothing."""
+    """The last words of a process that has ended; None if it left none. Removes their file."""
     try:
         return UnavailableError(**json.loads(path.read_text()))
     except (OSError, ValueError, TypeError):

@@ -1,4 +1,4 @@
-"""A lock that dies with its holder: one process of a kind for each data directory."""
+"""A lock that ends with the process that holds it: one process of a kind for each data directory."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 
 
 class FolderLock:
-    """Held from take() until release() or the end of the process, however that comes."""
+    """A lock that this process holds from take() until release() or its end, kill -9 included."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._descriptor: int | None = None
 
     def take(self) -> bool:
-        """Take the lock without waiting; False if another process holds it. True again if this object has it."""
+        """Take the lock without waiting; False if another process holds it. True if this object holds it already."""
         if self._descriptor is not None:
             return True
         descriptor = os.open(self._path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
@@ -28,7 +28,7 @@ class FolderLock:
         return True
 
     def release(self) -> None:
-        """Let another process have it."""
+        """Release the lock if this object holds it."""
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None

@@ -1,8 +1,8 @@
-"""How every process logs: text or JSON lines on stderr, with nothing in them that may tell of a patient.
+"""How every process logs: text or JSON lines on stderr that reveal nothing about a patient.
 
-Clips are named after patients, and callers put anything into paths, queries and headers. So a line holds what this
-file allows and nothing else: our own messages, the fields below, of an error its kind and where it was raised but not
-its text, and of other libraries' messages the template without what they filled in.
+Clips are named after patients, and callers put anything into paths, queries and headers. So a line holds only: our own
+messages, the fields below, the kind of an error and where it was raised but not its text, and the template of another
+library's message without its values.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 
 def current_request_id() -> str | None:
-    """Of the request that is being answered here, if one is."""
+    """The id of the request that this context answers; None if there is none."""
     return _request_id.get()
 
 
 @contextmanager
 def answering(request_id: str) -> Iterator[None]:
-    """Lines that are logged in this context carry the request's id."""
+    """Give lines that are logged in this context the request's id."""
     token = _request_id.set(request_id)
     try:
         yield
@@ -51,7 +51,7 @@ def answering(request_id: str) -> Iterator[None]:
 
 
 def configure(settings: Settings, process: str) -> None:
-    """Send what this process logs to stderr, in the format that the settings ask for.
+    """Send the log of this process to stderr, in the format that the settings name.
 
     process: what it is, such as "service" or "worker"; in every line.
     """
@@ -61,12 +61,12 @@ def configure(settings: Settings, process: str) -> None:
     root.handlers[:] = [handler]
     root.setLevel(logging.WARNING)
     logging.getLogger(OURS).setLevel(logging.INFO)
-    for name in ("uvicorn", "uvicorn.error", "uvicorn.access"):  # which bring handlers of their own
+    for name in ("uvicorn", "uvicorn.error", "uvicorn.access"):  # they bring handlers of their own
         logger = logging.getLogger(name)
         logger.handlers.clear()
         logger.propagate = True
     logging.captureWarnings(True)
-    logging.raiseExceptions = False  # it would print what a line was to be made of
+    logging.raiseExceptions = False  # a failing handler would print the values that a line must not hold
     sys.excepthook = _log_uncaught
     threading.excepthook = lambda args: _log_uncaught(args.exc_type, args.exc_value, args.exc_traceback)
 
@@ -105,7 +105,7 @@ class JsonLines(logging.Formatter):
 
 
 def message_of(record: logging.LogRecord) -> str:
-    """Our own message as it is, on one line; of anybody else's the first line of the template."""
+    """Our own message on one line; of another library's message the first line of its template."""
     if _is_ours(record):
         return " ".join(record.getMessage().split())
     if record.name == "py.warnings":
@@ -125,7 +125,7 @@ def fields_of(record: logging.LogRecord) -> dict[str, object]:
 
 
 def frames_of(record: logging.LogRecord) -> list[str]:
-    """Where the line's error was raised, the innermost place last: file, line and function, never its text."""
+    """The places where the line's error was raised, innermost last: file, line and function, never its text."""
     error = record.exc_info[1] if record.exc_info else None
     if error is None:
         return []
@@ -148,7 +148,7 @@ def _places(traceback: TracebackType | None) -> list[str]:
 def _log_uncaught(kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None) -> None:
     if issubclass(kind, KeyboardInterrupt) or error is None:
         return
-    logging.getLogger(OURS).critical("an error that nobody caught", exc_info=(kind, error, traceback))
+    logging.getLogger(OURS).critical("uncaught error", exc_info=(kind, error, traceback))
 
 
 def _is_ours(record: logging.LogRecord) -> bool:

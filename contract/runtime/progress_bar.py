@@ -12,7 +12,7 @@ LINE_COLUMNS = 78
 
 
 def format_progress(progress: JobProgress) -> str:
-    """`train      [######..................]  25 %  31.24 dB  42 s left`; parts that are unknown are left out."""
+    """`train      [######..................]  25 %  31.24 dB  42 s left`, without the parts that are unknown."""
     filled = round(progress.fraction * BAR_CELLS)
     parts = [f"{progress.stage:<10} [{'#' * filled}{'.' * (BAR_CELLS - filled)}] {progress.fraction:4.0%}"]
     if progress.psnr_db is not None:
@@ -23,7 +23,7 @@ def format_progress(progress: JobProgress) -> str:
 
 
 class ProgressBar:
-    """Writes progress to `stream`; use as a context so that the line is closed whatever happens."""
+    """Writes progress to `stream`. As a context it closes the line whatever happens."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -32,7 +32,7 @@ class ProgressBar:
         self._line_open = False
 
     def show(self, progress: JobProgress) -> None:
-        """Redraw the line; where nothing can be redrawn, write once a stage."""
+        """Redraw the line; on anything but a terminal, write one line a stage."""
         if self._on_terminal:
             self._stream.write(f"\r{format_progress(progress):<{LINE_COLUMNS}}")
             self._line_open = True

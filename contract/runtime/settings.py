@@ -1,4 +1,4 @@
-"""What a deployment may set, read once from the environment: every process of one installation sees the same values."""
+"""What a deployment may set, read from the environment. Every process of an installation sees the same values."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from contract.wire.names import DeviceName
 GIB = 2**30
 ENVIRONMENT_PREFIX = "INTRASPLAT_"
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
-"""A service at one of these is reached from this machine alone."""
+"""Only this machine can reach a service at one of these."""
 
 
 def default_data_dir() -> Path:
-    """Where clips and scenes live unless told otherwise: the XDG state directory of this user."""
+    """Where clips and scenes lie by default: the XDG state directory of this user."""
     state_home = os.environ.get("XDG_STATE_HOME")
     return (Path(state_home) if state_home else Path.home() / ".local" / "state") / "intrasplat"
 
 
 def _listed(value: object) -> object:
-    """A list from its comma-separated text."""
+    """The parts of a comma-separated text."""
     return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
 
 def _value(source: Mapping[str, str], variable: str) -> str:
-    """What a variable holds, or the file that its namesake with _FILE names; empty if neither is set."""
+    """The value of a variable, or the content of the file that <variable>_FILE names; empty if neither is set."""
     path = source.get(f"{variable}_FILE")
     if source.get(variable) or not path:
         return source.get(variable, "")
@@ -42,9 +42,9 @@ def _value(source: Mapping[str, str], variable: str) -> str:
 
 
 class Settings(BaseModel):
-    """Each field `name` is read from `INTRASPLAT_NAME`; the queue's address alone has the customary name REDIS_URL.
+    """The settings. Each field `name` is read from `INTRASPLAT_NAME`, only redis_url from the customary REDIS_URL.
 
-    A variable with _FILE after its name (REDIS_URL_FILE) names a file that holds the value: for secrets.
+    For secrets, a variable with _FILE after its name (REDIS_URL_FILE) names a file that holds the value.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -66,11 +66,11 @@ class Settings(BaseModel):
     """Of one eye."""
     max_clip_s: float = Field(default=600.0, gt=0)
     min_free_bytes: int = Field(default=2 * GIB, ge=0)
-    """An upload is refused while the data directory's disk has less than this left."""
+    """The service refuses uploads while the data directory's disk has less room than this."""
     max_uploads: int = Field(default=8, gt=0)
-    """Received at the same time, of all callers."""
+    """At the same time, from all callers."""
     upload_silence_s: float = Field(default=60.0, gt=0)
-    """A request body that brings nothing for so long is given up."""
+    """The service drops a request whose body brings nothing for so long."""
     max_queued: int = Field(default=200, gt=0)
     max_queued_per_tenant: int = Field(default=50, gt=0)
     requests_per_s: float = Field(default=400.0, gt=0)
@@ -78,35 +78,35 @@ class Settings(BaseModel):
 
     # who may come in
     hosts: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
-    """Names besides loopback and `host` that requests may be addressed to."""
+    """Names besides loopback and `host` that a request's Host header may hold."""
     cors_origins: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
-    """Origins of pages from elsewhere that may use the service; none by default."""
+    """Origins of pages on other hosts that may use the service; none by default."""
 
     # how long things are kept
     retention_hours: float | None = Field(default=None, gt=0)
-    """Of jobs that do not say themselves; None keeps them until they are deleted."""
+    """For jobs that name no retention themselves; None keeps them until they are deleted."""
     max_retention_hours: float | None = Field(default=None, gt=0)
 
     # renders
     max_render_pixels: int = Field(default=4096 * 2160, gt=0)
     render_timeout_s: float = Field(default=20.0, gt=0)
     render_endpoint: str | None = Field(default=None, pattern=r"^tcp://[^\s]+:\d+$")
-    """Where the worker answers services on other machines, as they reach it; needs render_secret. None: a socket."""
+    """The address at which services on other machines reach the worker; needs render_secret. None: a unix socket."""
     render_secret: str | None = Field(default=None, min_length=32)
-    """Shared by services and workers; the keys of the encrypted connection between them are made from it."""
+    """Shared by services and workers, which make the keys of their encrypted connection from it."""
     hot_bytes: int = Field(default=2 * GIB, gt=0)
-    """Scenes a worker keeps in memory, together."""
+    """Of all scenes together that a worker keeps in memory."""
 
     # many machines
     store_url: str | None = Field(default=None, pattern=r"^s3://[^\s]+$")
-    """Where clips and scenes are kept for all machines; None: in data_dir."""
+    """The bucket that keeps clips and scenes for all machines; None: data_dir keeps them."""
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] | None = None) -> Settings:
         """Read the settings from environment variables; empty ones count as unset.
 
         Raises:
-            InputError: a variable holds a value its setting does not accept, or names a file that cannot be read.
+            InputError: a variable holds a value that its setting does not accept, or names a file that cannot be read.
         """
         source = os.environ if environment is None else environment
         variables = {name: ENVIRONMENT_PREFIX + name.upper() for name in cls.model_fields}
@@ -122,7 +122,7 @@ class Settings(BaseModel):
             raise InputError(variable, problem, f"Correct or unset {variable}.") from error
 
     def to_environment(self) -> dict[str, str]:
-        """The variables that make another process read these very settings."""
+        """The variables from which another process reads the same settings."""
         values = {
             ENVIRONMENT_PREFIX + name.upper(): ",".join(value) if isinstance(value, tuple) else str(value)
             for name, value in self

@@ -9,6 +9,7 @@ interruption a run either has its row and its curve or is measured again.
 from __future__ import annotations
 
 import csv
+import io
 import os
 import platform
 import subprocess
@@ -18,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from contract.runtime.locks import FolderLock
+from contract.store.durable import FOR_ALL, replace_file
 from contract.wire.errors import Cancelled, InputError, UnavailableError
 
 Row = dict[str, str]
@@ -109,14 +111,11 @@ def read_rows(path: Path) -> list[Row]:
 
 def write_rows(path: Path, fields: Iterable[str], rows: Iterable[Mapping[str, object]]) -> None:
     """The whole file or none of it."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    with aside.open("w", newline="") as file:
-        writer = csv.DictWriter(file, tuple(fields), restval="", extrasaction="ignore", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, tuple(fields), restval="", extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    replace_file(path, text.getvalue().encode(), FOR_ALL)
 
 
 def machine(device: str = "cpu") -> str:

@@ -76,7 +76,7 @@ def test_the_reserve_is_given_up_piece_by_piece_before_anything_is_refused(tmp_p
     assert reserve.stat().st_size == RESERVE_BYTES
     assert reserve.stat().st_blocks * 512 >= RESERVE_BYTES
     pieces = RESERVE_BYTES // RESERVE_PIECE_BYTES
-    assert [log._give_up_a_piece() for _ in range(pieces + 1)] == [True] * pieces + [False]
+    assert [log._shrink_reserve() for _ in range(pieces + 1)] == [True] * pieces + [False]
     log.fill_reserve()
     assert reserve.stat().st_size == RESERVE_BYTES
 

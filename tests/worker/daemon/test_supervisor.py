@@ -77,7 +77,7 @@ class Bench(Jobs):
                 process.terminate()
                 _, errors = process.communicate(timeout=WAIT_S)
                 assert b"Traceback" not in errors
-                assert b"nobody caught" not in errors, errors.decode()
+                assert b"uncaught error" not in errors, errors.decode()
 
     def holder(self, job_id: str) -> str:
         """Name of the worker that holds, or last held, the job."""
