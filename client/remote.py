@@ -28,8 +28,8 @@ def add_remote(commands: Commands) -> None:
     watch = add_command(commands, "watch", "wait for a job, with a progress bar", _watch)
     _add_fetch(commands)
     jobs = add_command(commands, "jobs", "list the newest jobs, newest first", _jobs)
-    jobs.add_argument("--state", choices=[state.value for state in JobState], help="of one state only")
-    jobs.add_argument("--limit", type=count, metavar="N", help="at most so many (default: 200)")
+    jobs.add_argument("--state", choices=[state.value for state in JobState], help="only jobs in this state")
+    jobs.add_argument("--limit", type=count, metavar="N", help="at most N jobs (default: 200)")
     cancel = add_command(commands, "cancel", "stop a job and remove its clip", _cancel)
     retry = add_command(commands, "retry", "queue a failed job again", _retry)
     delete = add_command(commands, "delete", "remove clip, scene and record of a job that has ended", _delete)
@@ -56,7 +56,9 @@ def _add_submit(commands: Commands) -> None:
 def _add_fetch(commands: Commands) -> None:
     parser = add_command(commands, "fetch", "save a finished scene's report, curve, picture and Gaussians", _fetch)
     parser.add_argument("job", metavar="JOB", help="the id that submit printed")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write into; made if need be")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder to write into; created if it is missing"
+    )
     parser.add_argument(
         "--t", type=finite, default=0.0, help="time of picture and Gaussians, as a fraction of the clip (default: 0)"
     )

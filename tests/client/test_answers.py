@@ -33,7 +33,7 @@ JOB = {
 }
 
 
-def test_where_no_events_come_through_the_job_is_polled() -> None:
+def test_the_job_is_polled_where_a_proxy_holds_events_back() -> None:
     def answer(request: httpx.Request) -> httpx.Response:
         if request.url.path.endswith("/events"):
             return httpx.Response(200, text="<html>proxy</html>", headers={"content-type": "text/html"})
@@ -131,7 +131,7 @@ def test_a_clip_is_sent_again_whole_and_under_the_same_key(clip: Path) -> None:
     assert first.headers["idempotency-key"] == second.headers["idempotency-key"]
 
 
-def test_a_clip_that_is_safe_though_the_queue_is_away_is_not_sent_again(clip: Path) -> None:
+def test_an_accepted_clip_is_not_sent_again_while_the_queue_is_away(clip: Path) -> None:
     busy = Busy(503, times=2, job_id=JOB_ID)
     with Client(transport=httpx.MockTransport(busy)) as client:
         assert client.reconstruct(clip).id == JOB_ID

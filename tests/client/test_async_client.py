@@ -1,4 +1,4 @@
-"""The client that is awaited: the same steps, taken without blocking anybody."""
+"""AsyncClient against a real service: what Client does, without blocking the event loop."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_many_views_come_over_one_connection(service: LocalService, clip: Path) 
     asyncio.run(use())
 
 
-def test_a_watch_that_is_cut_off_goes_on_and_misses_nothing(service: LocalService, clip: Path) -> None:
+def test_a_watch_that_is_cut_off_resumes_and_misses_nothing(service: LocalService, clip: Path) -> None:
     async def use() -> list[float | None]:
         seen = []
         async with AsyncClient(line.url) as far:
@@ -86,7 +86,7 @@ def test_a_watch_that_is_cut_off_goes_on_and_misses_nothing(service: LocalServic
         assert line.connections >= 2
 
 
-def test_a_clip_in_pieces_goes_on_from_where_the_line_was_cut(
+def test_an_upload_in_pieces_resumes_where_the_line_was_cut(
     service: LocalService, clip: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = clip.stat().st_size

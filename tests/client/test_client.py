@@ -131,7 +131,7 @@ def test_the_blocking_client_works_where_an_event_loop_runs(service: LocalServic
     assert asyncio.run(use()) is JobState.DONE
 
 
-def test_a_watch_that_is_cut_off_goes_on_and_misses_nothing(service: LocalService, client: Client, clip: Path) -> None:
+def test_a_watch_that_is_cut_off_resumes_and_misses_nothing(service: LocalService, client: Client, clip: Path) -> None:
     job = client.reconstruct(clip)
     seen: list[float] = []
     with line_to(service) as line, Client(line.url) as far:
@@ -164,7 +164,7 @@ def test_a_job_that_failed_by_its_input_differs_from_one_that_failed_otherwise(
         client.retry(broken.id)
 
 
-def test_a_large_clip_goes_in_pieces_and_on_from_where_the_line_was_cut(
+def test_a_large_clip_uploads_in_pieces_and_resumes_where_the_line_was_cut(
     service: LocalService, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(submission, "PIECE_BYTES", 2**22)

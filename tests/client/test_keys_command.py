@@ -61,7 +61,7 @@ def test_a_key_that_cannot_be_recorded_is_not_made(tmp_path: Path, capsys: pytes
         ["revoke", "000000000000"],
     ],
 )
-def test_what_cannot_be_meant_is_refused_in_a_sentence(
+def test_bad_arguments_are_refused_in_a_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str]
 ) -> None:
     assert main(["keys", *arguments, "--data-dir", str(tmp_path)]) == ExitCode.BAD_INPUT

@@ -115,7 +115,7 @@ def test_a_launcher_that_cannot_start_everything_leaves_nothing_behind(tmp_path:
     assert all(FolderLock(tmp_path / each).take() for each in ("run/up.lock", "valkey/lock"))
 
 
-def test_a_port_that_is_taken_is_said_before_anything_starts() -> None:
+def test_a_taken_port_is_reported_before_anything_starts() -> None:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen()
