@@ -47,8 +47,8 @@ class FusionSettings:
     """How points are chosen.
 
     mode               "paper": MAPF as published; "reference_only": the first training frame alone ("w/o MAPF");
-                       "fill": a grid on the first training frame, then what it does not show from later
-                       ones, from where tracks say it has moved to
+                       "fill": a grid on the first training frame; tissue hidden there is read in later
+                       frames, at the positions that tracks give
     stride             "fill": pixels between neighbouring points
     motion_percentile  "paper": the threshold tau is this percentile of the nonzero differences on tissue
     frame_share        "paper": share kept of each later frame's points
@@ -76,7 +76,7 @@ def fuse(
     """The starting cloud of the training frames `train` (clip indices, rising). Same arguments, same bits.
 
     Args:
-        moved: how the tissue has moved since the first training frame, for "fill"; None: it rests.
+        moved: for "fill", the tissue's displacement since the first training frame; None: it rests.
 
     Raises:
         InputError: no training frame has valid depth on tissue.
@@ -87,7 +87,7 @@ def fuse(
         raise InputError(
             "clip", f"has no valid depth on tissue in its {len(train)} training frames.", "Check depth and masks."
         )
-    # Where the very first frame has no depth, the first one that has some takes its part.
+    # If the first frame has no depth, the first frame with depth takes its place.
     frames = [first, *(index for index in train if index != first)]
     if settings.mode == "fill":
         return fill(clip, frames, settings.stride, moved)

@@ -1,4 +1,4 @@
-"""Depth where none was measured: a membrane between its surroundings.
+"""Depth where none was measured: a smooth membrane between the measured surroundings.
 
 Symbols: H W pixels. Lengths in mm.
 """
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 RELAXATIONS = 12
-"""Jacobi sweeps a pyramid level: the coarser level has already settled the long waves."""
+"""Jacobi sweeps a pyramid level. They are few because the coarser level has already solved the long waves."""
 
 
 def complete_depth(

@@ -1,7 +1,7 @@
-"""Points for everything the clip shows: the first frame's tissue, and what an instrument hides there from later frames.
+"""Points for all the tissue that the clip shows: the first frame's, then what later frames show of the rest.
 
-What later frames show is taken from where it has moved to by then, as tracks know or guess it, and keeps its place
-among its neighbours of the first frame (docs/decisions/024).
+Tissue that is hidden in the first frame is read in a later frame, from where the tracks say it has moved to. Its point
+keeps its place among its neighbours in the first frame (docs/decisions/024).
 
 Symbols: H W pixels (row i, column j), M cells, k stride in pixels. Lengths in mm, points in the world frame.
 """
@@ -32,27 +32,27 @@ from worker.input.clip.types import DepthClip
 from worker.motion.tracks import Moved
 
 EDGE_PX = 5
-"""Masks and stereo are unsure this near to an instrument: hidden regions are filled from farther away if possible."""
+"""Masks and stereo are unreliable this near to an instrument. Views from farther away are preferred."""
 MARGIN = 1 / 16
-"""Share of the image's sides by which tissue is looked for beyond the first frame: some comes into view later."""
+"""Margin around the first frame, as a share of its sides, whose tissue gets points, too, if it comes into view."""
 MAX_VIEWS = 32
-"""Later frames, evenly spread, in which hidden cells are looked for along the tracks."""
+"""Later frames, evenly spread, that are searched for hidden cells along the tracks."""
 HIDDEN, COMPLETED, MEASURED, CLEAR = range(4)
-"""How well a frame shows a place, rising: not, with completed depth, with depth, with confidence and well inside."""
+"""How well a frame shows a cell, rising: not; depth completed; depth measured; depth confident, far from masks."""
 
 
 def fill(clip: DepthClip, frames: Sequence[int], stride: int, moved: Moved | None) -> PointCloud:
-    """The grid of the first frame's tissue, then each cell that it does not show, from the frame that shows it best,
-    the earliest of those that are alike.
+    """A grid on the first frame's tissue; then each cell that it does not show, from the frame that shows it best.
 
-    A cell is k x k pixels, its candidate the pixel in the middle, or the one its tissue has moved to.
+    Of frames that show a cell equally well, the earliest is taken. A cell is k x k pixels. Its point comes from the
+    middle pixel, or from the pixel to which the tissue in the middle has moved.
     """
     first, later = frames[0], frames[1:]
     coverage = _Coverage(clip.intrinsics, stride)
     parts = [coverage.add(clip, first, coverage.pixels[clip.tissue[first].reshape(-1)[coverage.pixels]])]
     if moved is not None:
         parts += _along_tracks(clip, first, later, stride, moved)
-        coverage.also(parts[1:])
+        coverage.add_points(parts[1:])
         later = [index for index in later if not same_pose(clip, index, first)]
     for least in (CLEAR, MEASURED, COMPLETED):
         for index in later:
@@ -65,7 +65,7 @@ def fill(clip: DepthClip, frames: Sequence[int], stride: int, moved: Moved | Non
 
 
 def _shown(clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> NDArray[np.uint8]:
-    """[M] how well a frame shows its pixels (flat, [M]). Depth can be completed only in a frame that has some."""
+    """[M] how well a frame shows its pixels (flat, [M]). A frame without any depth shows none."""
     depth_mm, tissue = clip.depth_mm[index], clip.tissue[index]
     on_tissue = tissue.reshape(-1)[pixels]
     measured = on_tissue & (depth_mm.reshape(-1)[pixels] > 0)
@@ -78,11 +78,10 @@ def _shown(clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> NDArray[np.
 
 
 def _along_tracks(clip: DepthClip, first: int, later: Sequence[int], stride: int, moved: Moved) -> Iterator[PointCloud]:
-    """Points for the cells that the first frame does not show, each where it has moved to by the time it is seen, so
-    that neighbouring cells get neighbouring tissue whenever that is.
+    """Points for the cells that the first frame does not show, each read where its tissue is when it is seen.
 
-    By a motion that is guessed, some cells of the first frame never come into sight though others do in their place:
-    those get a colour from there, which is that of tissue near by, and no measured depth.
+    So neighbouring cells get neighbouring tissue, whenever each is seen. A guessed motion may never bring a cell into
+    sight. Such a cell gets the colour that a later frame shows in its place, and a completed depth.
     """
     cells = _hidden_cells(clip, first, stride)
     unseen = cells.in_view.copy()
@@ -106,8 +105,7 @@ def _along_tracks(clip: DepthClip, first: int, later: Sequence[int], stride: int
 def _best_views(
     clip: DepthClip, later: Sequence[int], cells: _Cells, moved: Moved
 ) -> list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]:
-    """Of each cell that some frame shows, the best view: the frames in order, which cells [M'] and the pixels
-    [M'] that show them."""
+    """The best view of each cell that some frame shows: frames in order, each with cells [M'] and their pixels [M']."""
     best = np.full(len(cells.pixels), HIDDEN, np.uint8)
     frame, seen_at = np.full((2, len(best)), -1, np.intp)
     for index in later:
@@ -133,9 +131,9 @@ def _at_rest(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
 class _Cells:
     """Cells of the first frame, or beside it.
 
-    world_mm  [M, 3]  where the tissue in their middle lies in that frame; its depth is completed from what is seen
-    pixels    [M]     flat index of the middle, of the nearest pixel where that lies beyond the image
-    in_view   [M]     which lie in the image
+    world_mm  [M, 3]  tissue in the middle of the cell, at completed depth
+    pixels    [M]     flat index of the middle pixel, or of the nearest pixel in the image
+    in_view   [M]     whether the cell lies in the image
     """
 
     world_mm: NDArray[np.float32]
@@ -168,7 +166,7 @@ def _hidden_cells(clip: DepthClip, first: int, stride: int) -> _Cells:
 
 
 def _middles(side: int, beyond: int, stride: int) -> NDArray[np.intp]:
-    """Where the cells' middles lie along one side of the image, and as far beyond its ends."""
+    """Positions of the cells' middles along one side of the image and `beyond` pixels past both ends."""
     inside = np.minimum(np.arange(0, side, stride) + stride // 2, side - 1)  # the last cell may be smaller
     before, behind = (np.arange(start, start + beyond, stride) + stride // 2 for start in (-beyond, side))
     return np.concatenate([before, inside, behind])
@@ -193,7 +191,7 @@ class _Coverage:
         return self.pixels[~self._covered]
 
     def add(self, clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> PointCloud:
-        """The points of these middle pixels of one frame, which cover their cells from now on."""
+        """The points of these middle pixels of one frame; from now on they cover their cells."""
         self._look_from(clip.world_from_camera[index])
         cloud = points_at(clip, index, pixels)
         rows, columns = np.divmod(pixels, self._intrinsics.width)
@@ -201,8 +199,8 @@ class _Coverage:
         self._points_mm.append(cloud.points_mm)
         return cloud
 
-    def also(self, clouds: Iterable[PointCloud]) -> None:
-        """These points cover what they lie in front of, in the first frame and from any other pose."""
+    def add_points(self, clouds: Iterable[PointCloud]) -> None:
+        """Count these points as covering the cells that they project into, from any pose."""
         self._points_mm += [cloud.reference_mm for cloud in clouds]
 
     def _look_from(self, world_from_camera: NDArray[np.float64]) -> None:
@@ -215,6 +213,6 @@ class _Coverage:
         cells, _ = cells_of(points_mm, self._intrinsics, world_from_camera, self._stride)
         covered = np.zeros(self._shape, dtype=np.uint8)
         covered.reshape(-1)[cells] = 1
-        # From another pose the grid spreads unevenly: a gap of one cell between points is no hole.
+        # Seen from another pose the grid is uneven: a gap of one cell between points is no hole.
         closed = cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         self._covered = np.asarray(closed, dtype=np.bool_).reshape(-1)

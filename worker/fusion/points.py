@@ -1,4 +1,4 @@
-"""Points of a frame, and where they lie in others.
+"""Points of a frame, and the cells of other frames into which they project.
 
 Symbols: H W pixels (row i, column j), M and N points, k stride in pixels. Lengths in mm, points in the world frame.
 """
@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.fusion.complete import complete_depth
-from worker.input.camera import Intrinsics, unproject
+from worker.input.camera import Intrinsics, to_camera, unproject
 from worker.input.clip.types import DepthClip
 
 COMPLETED_CONFIDENCE = 0.1
-"""Confidence of a point whose depth no stereo measured: above 0, since its place in the image is known."""
+"""Confidence of a point with completed depth: above 0, because its position in the image is known."""
 CLEAR_CONFIDENCE = 128
-"""Of 255: left-right consistent, or nearly so."""
+"""Minimum stereo confidence, of 255, of a pixel that is nearly left-right consistent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +28,9 @@ class PointCloud:
 
     points_mm    [N, 3] float32  world
     rgb          [N, 3] float32  in [0, 1]
-    confidence   [N]    float32  in [0, 1], of the depth; COMPLETED_CONFIDENCE where no stereo measured it
-    frame        [N]    int32    clip index of the frame in which each point lay there
-    reference_mm [N, 3] float32  world: where it lay in the first training frame, as far as known, else points_mm
+    confidence   [N]    float32  of the depth, in [0, 1]; COMPLETED_CONFIDENCE where the depth was completed
+    frame        [N]    int32    clip index of the frame in which each point lay at points_mm
+    reference_mm [N, 3] float32  world: where it lay in the first training frame if the tracks say, else points_mm
     """
 
     points_mm: NDArray[np.float32]
@@ -49,7 +49,7 @@ def is_measured(clip: DepthClip, index: int) -> NDArray[np.bool_]:
 
 
 def same_pose(clip: DepthClip, index: int, other: int) -> bool:
-    """Whether the camera looked at both frames from one place."""
+    """Whether both frames have the same camera pose."""
     return np.array_equal(clip.world_from_camera[index], clip.world_from_camera[other])
 
 
@@ -57,7 +57,7 @@ def cells_of(
     points_mm: NDArray[np.floating], intrinsics: Intrinsics, world_from_camera: NDArray[np.float64], stride: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Flat index of the k x k cell each point projects into, and which points they are (those in the image)."""
-    camera_mm = (points_mm - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    camera_mm = to_camera(points_mm, world_from_camera)
     in_front = np.flatnonzero(camera_mm[:, 2] > 0)
     x, y, z = camera_mm[in_front].T
     column = np.floor(intrinsics.fx * x / z + intrinsics.cx)
@@ -74,7 +74,7 @@ def measured_pixels(clip: DepthClip, index: int) -> NDArray[np.intp]:
 
 
 def points_at(clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> PointCloud:
-    """The points of one frame's pixels (flat indices on tissue); depth is completed where it was not measured."""
+    """The points of one frame's tissue pixels (flat indices). Depth that was not measured is completed."""
     depth_mm = clip.depth_mm[index].reshape(-1)[pixels]
     measured = depth_mm > 0
     if not measured.all():
@@ -92,7 +92,7 @@ def points_at(clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> PointClo
 
 
 def sample(count: int, share: float, random: np.random.Generator) -> NDArray[np.intp]:
-    """A random share of range(count) without repeats, rising; at least one of any."""
+    """A random share of range(count) in rising order, without repeats; at least one unless count is 0."""
     kept = min(count, max(1, round(share * count)))
     return np.sort(random.choice(count, kept, replace=False, shuffle=False))
 

@@ -1,4 +1,4 @@
-"""The pinhole camera that every process means: OpenCV axes (x right, y down, z forward), pixels, millimetres.
+"""The pinhole camera of every process: OpenCV axes (x right, y down, z forward), pixels, millimetres.
 
 Symbols: M points.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 class Intrinsics:
     """Pinhole intrinsics in pixels; pixel (i, j) has its centre at (j + 0.5, i + 0.5) (docs/conventions.md).
 
-    A plain dataclass, so that whoever trains on a machine without pydantic has a camera, too.
+    A plain dataclass, so that training needs no pydantic.
 
     Raises:
         ValueError: a size or focal length is not above 0, a size is no whole number, or something is not finite.
@@ -42,10 +43,10 @@ class Intrinsics:
 
     @classmethod
     def parsed(cls, value: object) -> Intrinsics:
-        """The camera that numbers() gave, read from JSON.
+        """The camera whose numbers() were stored as JSON.
 
         Raises:
-            ValueError: it is none.
+            ValueError: the value is no camera.
         """
         names = {each.name for each in fields(cls)}
         if not isinstance(value, dict) or value.keys() != names:
@@ -84,8 +85,13 @@ def unproject_at(
     intrinsics: Intrinsics,
     world_from_camera: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """World points [M, 3] in mm of places [M] in the image, or beyond its borders, with their depths [M]."""
+    """World points [M, 3] in mm of image positions [M] with their depths [M]; positions may lie beyond the borders."""
     x = (column - intrinsics.cx) / intrinsics.fx
     y = (row - intrinsics.cy) / intrinsics.fy
     camera_mm = np.stack([x, y, np.ones_like(x)], axis=1) * depth_mm[:, None].astype(np.float64)
     return np.asarray(camera_mm @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])
+
+
+def to_camera(points_mm: NDArray[Any], world_from_camera: NDArray[np.float64]) -> NDArray[Any]:
+    """Camera coordinates [M, 3] in mm of world points [M, 3]."""
+    return np.asarray((points_mm - world_from_camera[:3, 3]) @ world_from_camera[:3, :3])

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.input.camera import unproject
+from worker.input.camera import to_camera, unproject
 from worker.input.clip import DepthClip
 from worker.motion.tracks import Tracks, cell_means, fit_series
 
@@ -116,7 +116,7 @@ class Trial:
         expected, shown = start + colour, np.empty_like(colour)
         for place, frame in enumerate(np.asarray(self.train)[self.validation]):
             pose = self.clip.world_from_camera[frame]
-            x, y, z = ((self.world_mm + displacement_mm[place] - pose[:3, 3]) @ pose[:3, :3]).T
+            x, y, z = to_camera(self.world_mm + displacement_mm[place], pose).T
             column, row = (k.fx * x / z + k.cx - 0.5)[:, None], (k.fy * y / z + k.cy - 0.5)[:, None]
             image, places = self.clip.rgb[frame].astype(np.float32), (column.astype(np.float32), row.astype(np.float32))
             shown[place] = cv2.remap(image, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
@@ -144,7 +144,7 @@ class Trial:
     def _grey_per_mm(self) -> Reals:
         """[n, 3 channels, 3 axes] grey levels by which the picture changes at a track's start as the tissue moves."""
         k, pose = self.clip.intrinsics, self.clip.world_from_camera[self.train[0]]
-        across, along, z = ((self.world_mm - pose[:3, 3]) @ pose[:3, :3]).T[..., None]
+        across, along, z = to_camera(self.world_mm, pose).T[..., None]
         right, down, away = pose[:3, :3].T  # camera axes in the world
         px_per_mm = np.stack(
             [k.fx / z * (right - across / z * away), k.fy / z * (down - along / z * away)], axis=1

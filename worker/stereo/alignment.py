@@ -1,4 +1,4 @@
-"""What a clip's pairs share, measured on a few of them: the shift between the eyes' rows and the disparities in use.
+"""The shift between the eyes' rows and the disparity range of a clip, measured on a few pairs.
 
 Symbols: H W pixels of one eye; d disparity, x_left - x_right in px; dy = y_right - y_left of matching points in px.
 """
@@ -16,30 +16,28 @@ from contract.wire.errors import InputError
 from worker.stereo.matching import DISPARITY_STEPS, Grey, Image, padded, semi_global_matcher, shift_rows
 
 Agreed = Callable[[NDArray[np.uint8], NDArray[np.uint8], int, int], tuple[Image, NDArray[np.bool_]]]
-"""agreed_disparities, or what does the same on another device."""
+"""The signature of agreed_disparities, which another device may implement."""
 
-FEATURE_WIDTH = (
-    400  # features are found on images at most this wide: the median over pairs is as good, in a third of the time
-)
+FEATURE_WIDTH = 400  # px; images are reduced to it: the median over pairs is as good, in a third of the time
 FEATURES = 1500
 RATIO = 0.8  # Lowe's ratio test
-MAX_SEARCHED_SHIFT_PX = 48.0  # matches farther apart in y are wrong
+MAX_MATCH_DY_PX = 48.0  # matches farther apart in y are wrong
 MIN_MATCHES = 20
-MIN_CORRECTION_PX = 0.2  # resampling for less blurs more than it mends
+MIN_CORRECTION_PX = 0.2  # resampling for less blurs more than it corrects
 MAX_CORRECTION_PX = 8.0  # beyond it the calibration belongs to other frames
-MAX_EQUAL_ROWS_PX = 1.0  # by which the rows of frames that are rectified already may differ
+MAX_EQUAL_ROWS_PX = 1.0  # row difference of frames that are rectified already
 SWAPPED_SHARE = 0.8
-COARSE_WIDTH = 176  # px; wide enough for tissue, and a search of every disparity costs milliseconds
-MIN_DEPTH_MM = 12.0  # an endoscope that close sees nothing sharp
-MAX_DISPARITY_SHARE = 0.6  # of the width: less overlap than that gives no depth worth having
-TEXTURED = 8.0  # mean |gradient| in grey levels from which a match is more than chance
+COARSE_WIDTH = 176  # px; wide enough for tissue, so that a search of all disparities takes milliseconds
+MIN_DEPTH_MM = 12.0  # nearer than this an endoscope is out of focus
+MAX_DISPARITY_SHARE = 0.6  # of the width: beyond it the eyes overlap too little
+MIN_TEXTURE = 8.0  # mean |gradient| in grey levels; below it matches are chance
 RANGE_PERCENTILES = (0.5, 99.5)
 RANGE_MARGIN_PX, RANGE_MARGIN = 3.0, 0.1  # the sampled frames do not show every disparity of the clip
 
 
 @dataclass(frozen=True)
 class RowShift:
-    """Median dy of inlier matches, what is left of |dy| after removing it, and how many matches say so."""
+    """Median dy of the inlier matches, median |dy| after removing it, and the number of inliers."""
 
     shift_px: float
     residual_px: float
@@ -47,9 +45,9 @@ class RowShift:
 
     @property
     def correction_px(self) -> float:
-        """How far the right eye's rows are moved; 0 where it is not worth it or not known."""
-        worth_it = self.matches >= MIN_MATCHES and abs(self.shift_px) >= MIN_CORRECTION_PX
-        return self.shift_px if worth_it else 0.0
+        """Shift to apply to the right eye's rows; 0 if it is below MIN_CORRECTION_PX or has too few matches."""
+        needed = self.matches >= MIN_MATCHES and abs(self.shift_px) >= MIN_CORRECTION_PX
+        return self.shift_px if needed else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +58,9 @@ class Features:
     descriptors: NDArray[np.float32]
 
 
-def find_features(image: Grey, at_most_px: int = FEATURE_WIDTH) -> Features:
-    """Features of the image made at_most_px wide."""
-    scale = min(1.0, at_most_px / image.shape[1])
+def find_features(image: Grey, max_width_px: int = FEATURE_WIDTH) -> Features:
+    """Features of the image, reduced to max_width_px if it is wider."""
+    scale = min(1.0, max_width_px / image.shape[1])
     small = image if scale == 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     points, descriptors = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(small, None)
     if descriptors is None:
@@ -81,19 +79,19 @@ def match_features(left: Features, right: Features) -> NDArray[np.float64]:
     ]
     one, other = np.array(pairs, np.intp).reshape(-1, 2).T
     matches = np.concatenate([left.points[one], right.points[other]], axis=1)
-    near: NDArray[np.float64] = matches[np.abs(matches[:, 3] - matches[:, 1]) <= MAX_SEARCHED_SHIFT_PX]
+    near: NDArray[np.float64] = matches[np.abs(matches[:, 3] - matches[:, 1]) <= MAX_MATCH_DY_PX]
     return near
 
 
 def measure_row_shift(matches: NDArray[np.float64], infinity_px: float, equal_rows_px: float = 0.0) -> RowShift:
     """The shift between the eyes' rows from matches [M, 4] of several frames.
 
-    infinity_px is the disparity of a point infinitely far away; real points lie above it. equal_rows_px is the shift
-    that rectification gave points that were on one row before it.
+    infinity_px is the disparity of a point infinitely far away; real points have more. equal_rows_px is the shift that
+    rectification gives to points on equal rows of the recorded frames.
 
     Raises:
-        InputError: the frames were rectified before they were rectified here, the eyes look swapped,
-            or their rows differ by more than this project corrects.
+        InputError: the frames are rectified already, the eyes look swapped, or their rows differ by more than
+            MAX_CORRECTION_PX.
     """
     dy = matches[:, 3] - matches[:, 1]
     disparity_px = matches[:, 0] - matches[:, 2]
@@ -128,9 +126,9 @@ def choose_range(
     focal_baseline_px_mm: float,
     agreed: Agreed,
 ) -> tuple[float, float]:
-    """The disparities (low, high) in px that the clip needs, from a coarse search of all of them on a few pairs.
+    """The disparity range (low, high) of the clip in px, from a coarse search of all disparities on a few pairs.
 
-    They are those of textured, lit pixels on which both matching directions agree.
+    Only textured pixels count on which both matching directions agree.
 
     Raises:
         InputError: no pair has matching points.
@@ -145,7 +143,7 @@ def choose_range(
     rights = np.stack([_resized(shift_rows(right, row_shift_px), size) for _, right in pairs])
     found, both_agree = agreed(lefts, rights, low, count)
     textured = np.stack([cv2.boxFilter(np.abs(cv2.Sobel(left, cv2.CV_32F, 1, 0)), -1, (5, 5)) for left in lefts])
-    disparities = found[both_agree & (textured > TEXTURED)].astype(np.float64) / scale
+    disparities = found[both_agree & (textured > MIN_TEXTURE)].astype(np.float64) / scale
     if disparities.size < 0.02 * size[0] * size[1] * len(pairs):
         raise InputError(
             "clip",
@@ -158,7 +156,7 @@ def choose_range(
 
 
 def _densest(values: NDArray[np.float64]) -> float:
-    """Centre of the fullest 2 px window: a robust start when most matches are wrong."""
+    """Median of the 2 px window with the most values: a robust start if most matches are wrong."""
     ordered = np.sort(values)
     counts = np.searchsorted(ordered, ordered + 2.0, side="right") - np.arange(len(ordered))
     first = int(np.argmax(counts))
@@ -166,7 +164,7 @@ def _densest(values: NDArray[np.float64]) -> float:
 
 
 def _check_recorded(shift_px: float, equal_rows_px: float) -> None:
-    """Refuse frames whose rows matched before rectification and no longer do: they had been rectified already."""
+    """Refuse frames whose rows match as recorded and no longer after rectification: they are rectified already."""
     if abs(equal_rows_px) <= 2 * MAX_EQUAL_ROWS_PX or abs(shift_px - equal_rows_px) > MAX_EQUAL_ROWS_PX:
         return
     raise InputError(
@@ -192,7 +190,7 @@ def _check_eyes(beyond_infinity_px: NDArray[np.float64]) -> None:
 def agreed_disparities(
     left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, count: int
 ) -> tuple[Image, NDArray[np.bool_]]:
-    """Disparities of pairs [F, h, w], searched in low <= d < low + count, and where both matching directions agree."""
+    """Disparities [F, h, w] of pairs, with low <= d < low + count, and where both matching directions agree."""
     one, other = (np.empty(left.shape, np.float32) for _ in range(2))
     matcher = semi_global_matcher(low, count)
     right_matcher = cv2.ximgproc.createRightMatcher(matcher)

@@ -33,12 +33,10 @@ if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
 
 STAGE = "stereo"
 COMPILATION = "compile"
-"""The stage until a GPU's kernels have been used once: they may have to be compiled then."""
+"""The stage until the GPU's kernels have run once: the first run may compile them."""
 DECODING_SHARE, MEASURING_SHARE = 0.15, 0.05  # of the stage's progress
-RANGE_PAIRS, ALIGNMENT_PAIRS = (
-    7,
-    3,
-)  # spread over the measured frames; a pair costs 10 ms for the range, 100 for the alignment
+RANGE_PAIRS, ALIGNMENT_PAIRS = 7, 3
+"""Pairs, spread over the measured frames. A pair costs 10 ms for the range and 100 ms for the alignment."""
 WARN_SHIFT_PX = 0.5
 WARN_VALID_SHARE = 0.5
 MIN_VALID_SHARE = 0.02  # unrelated images match by chance at 0.2 to 0.4 % of their pixels
@@ -51,19 +49,19 @@ def estimate_depth(
     measured_frames: Sequence[int] | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
 ) -> DepthClip:
-    """Depth and confidence of every frame; the eyes' row shift is measured, corrected up to 8 px, and reported.
+    """Depth and confidence of every frame. A row shift between the eyes of up to 8 px is measured and corrected.
 
-    What all frames share, row shift and disparity range, is measured on measured_frames alone (None: on all); beyond
-    that a frame's depth depends on its own pair only. So frames left out of measured_frames change no other's depth.
-    On "cuda" pairs are matched by many at once by a matcher of its own (worker/stereo/cuda), which needs triton.
+    Row shift and disparity range are common to all frames. They are measured on measured_frames alone (None: on all);
+    for the rest, a frame's depth depends on its own pair only. So frames outside measured_frames do not change the
+    depth of others. On "cuda" another matcher (worker/stereo/cuda, needs triton) matches many pairs at once.
 
     `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| left after the correction),
     min_disparity_px and max_disparity_px (the range searched) and depth_valid_share (of tissue pixels).
 
     Raises:
         ValueError: measured_frames is empty or names a frame that does not exist.
-        InputError: no depth anywhere, the frames had been rectified before, the eyes look swapped,
-            or their rows differ by more than 8 px.
+        InputError: there is no depth, the frames are rectified already, the eyes look swapped, or their rows differ by
+            more than 8 px.
         Cancelled: hooks.should_stop said so.
     """
     hooks = Hooks() if hooks is None else hooks
@@ -102,7 +100,7 @@ def estimate_depth(
 
 
 def _decode(clip: RectifiedClip, hooks: Hooks) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Left frames [T, H, W, 3] and right frames in grey [T, H, W]: one pass over the source, all that is kept of it."""
+    """Left frames [T, H, W, 3] and right frames in grey [T, H, W], from one pass over the source."""
     shape = (clip.frame_count, clip.intrinsics.height, clip.intrinsics.width)
     rgb = np.empty((*shape, 3), np.uint8)
     right = np.empty(shape, np.uint8)
@@ -152,7 +150,7 @@ def _match_all(
     pool: ThreadPoolExecutor,
     hooks: Hooks,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Depth in mm and confidence [T, H, W] of all pairs, matched side by side."""
+    """Depth in mm and confidence [T, H, W] of all pairs, matched in parallel."""
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
     depth_mm = np.zeros(right.shape, np.float32)
     confidence = np.zeros(right.shape, np.uint8)
@@ -176,7 +174,7 @@ def _match_all(
 def _match_on_device(
     clip: RectifiedClip, rgb: NDArray[np.uint8], right: NDArray[np.uint8], plan: MatchPlan, hooks: Hooks
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """As _match_all, by as many pairs at once as their volumes leave room for."""
+    """As _match_all, with as many pairs at once as their cost volumes fit into memory."""
     from worker.stereo.cuda import depth_of, frames_at_once
 
     depth_mm = np.empty(right.shape, np.float32)
@@ -197,7 +195,7 @@ def _match_on_device(
 def _to_depth(
     disparity_px: NDArray[np.float32], confidence: NDArray[np.uint8], focal_baseline: float, offset_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Depth in mm, 0 where it is invalid, and the confidence, 0 at the same pixels."""
+    """Depth in mm and confidence; both are 0 at invalid pixels."""
     beyond_infinity_px = disparity_px - np.float32(offset_px)
     valid = (confidence >= MIN_CONFIDENCE) & (beyond_infinity_px > focal_baseline / MAX_DEPTH_MM)
     depth_mm = np.where(valid, focal_baseline / np.where(valid, beyond_infinity_px, 1.0), 0.0)
@@ -208,7 +206,7 @@ def _valid_share(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) -> fl
     """Share of tissue pixels with depth.
 
     Raises:
-        InputError: there is as good as none.
+        InputError: the share is below MIN_VALID_SHARE.
     """
     valid = sum(int(np.count_nonzero(depth[mask])) for depth, mask in zip(depth_mm, tissue, strict=True))
     share = valid / max(int(np.count_nonzero(tissue)), 1)
@@ -236,7 +234,7 @@ def _warnings(shift: RowShift, valid_share: float) -> tuple[str, ...]:
 
 
 def _scale_assumption(clip: RectifiedClip) -> str:
-    """What no picture can confirm: a wrong baseline scales every distance, and nothing else changes."""
+    """The assumption about the baseline: a wrong one scales every distance, and no picture shows it."""
     return f"scale: the calibration's baseline of {clip.baseline_mm:.4g} mm; every distance is as right as it is"
 
 
@@ -251,5 +249,5 @@ def _grey(rgb: NDArray[np.uint8]) -> Grey:
 
 
 def _pool() -> ThreadPoolExecutor:
-    """One pair a thread and core: OpenCV lets go of the interpreter, and one pair in two threads measured slower."""
+    """One thread a core, one pair a thread: OpenCV releases the GIL, and one pair in two threads measured slower."""
     return ThreadPoolExecutor(cores(), thread_name_prefix=STAGE)

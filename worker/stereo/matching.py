@@ -21,26 +21,26 @@ Image = NDArray[np.float32]  # [H, W]
 
 MATCHING_WIDTH = 480  # px; wider images are matched smaller by a whole factor: 2 for 640, 3 for 1280
 BLOCK_PX = 5
-SPARE_STEPS = 1.5  # of the range's margin, given up where they would cost sixteen more disparities
-DISPARITY_STEPS = 16  # per px, in which OpenCV's matchers count
+SPARE_STEPS = 1.5  # of the range's margin, dropped if they would cost sixteen more disparities
+DISPARITY_STEPS = 16  # a px: the unit of OpenCV's matchers
 SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 8, 32  # SGBM's P1, P2 per block pixel, OpenCV's own advice
 PREFILTER_CAP = 31
 SMOOTHNESS, COLOUR_SIGMA = 8000.0, 1.0  # of the edge-aware filter
-REFERENCE_WIDTH = 640  # px for which windows and gradients are stated: wider images have wider, flatter edges
+REFERENCE_WIDTH = 640  # px at which windows and gradients are stated: wider images have wider, flatter edges
 REFINE_WINDOW_PX, HIGH_PASS_PX = 11, 15
 REFINE_DAMPING = 20.0  # grey levels squared: below this mean squared gradient the matcher's own value wins
-MAX_REFINEMENT_PX = 1.0  # farther away the linearisation of one step does not hold
+MAX_REFINEMENT_PX = 1.0  # beyond it the linearisation of one step does not hold
 TEXTURE_FOR_TRUST = 8.0  # mean squared gradient (grey levels squared) below which errors grow, measured
 RESIDUAL_FOR_TRUST = 8.0  # mean |left - warped right| (grey levels) above which errors grow, measured
 BLACK_LEVEL, SATURATED_LEVEL = 10, 250
-SATURATED_TRUST = 0.25  # highlights move with the eye, so what matches there need not be the surface
+SATURATED_TRUST = 0.25  # highlights move with the eye: a match there may not be the surface
 MIN_CONFIDENCE = 16  # of 255: below it a depth is a guess
 MAX_DEPTH_MM = 400.0  # beyond it an endoscope's disparity is a fraction of a pixel
 
 
 @dataclass(frozen=True)
 class MatchPlan:
-    """What all frames of a clip share: the disparities searched and the shift between the eyes' rows.
+    """The disparities to search and the shift between the eyes' rows, common to all frames of a clip.
 
     min_disparity_px <= d < max_disparity_px. row_shift_px is y_right - y_left of matching points; 0: no resampling.
     """
@@ -77,7 +77,7 @@ def match(left: Grey, right: Grey, plan: MatchPlan) -> tuple[Image, NDArray[np.u
 
 
 def shift_rows(image: Grey, shift_px: float) -> Grey:
-    """The image read shift_px lower: its row y holds what was at row y + shift_px."""
+    """The image moved up by shift_px: row y holds what was at row y + shift_px."""
     if shift_px == 0:
         return image
     matrix = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, shift_px]])
@@ -94,7 +94,7 @@ def semi_global_matcher(low: int, count: int) -> cv2.StereoSGBM:
         blockSize=BLOCK_PX,
         P1=SMALL_STEP_PENALTY * BLOCK_PX**2,
         P2=LARGE_STEP_PENALTY * BLOCK_PX**2,
-        disp12MaxDiff=1_000_000,  # off: the filter does the left-right check with both full maps
+        disp12MaxDiff=1_000_000,  # off: the filter checks left against right with both full maps
         uniquenessRatio=0,
         preFilterCap=PREFILTER_CAP,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
@@ -102,7 +102,7 @@ def semi_global_matcher(low: int, count: int) -> cv2.StereoSGBM:
 
 
 def padded(left: Grey, right: Grey, low: int, count: int) -> tuple[Grey, Grey, int]:
-    """Both images widened so that the matcher keeps their left and right margins; and by how many pixels a side."""
+    """Both images, widened so that the matcher keeps their left and right margins; and the pixels added a side."""
     pad = max(abs(low), abs(low + count)) + BLOCK_PX
     wide_left = cv2.copyMakeBorder(left, 0, 0, pad, pad, cv2.BORDER_REPLICATE)
     wide_right = cv2.copyMakeBorder(right, 0, 0, pad, pad, cv2.BORDER_REPLICATE)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from worker.fusion import FusionSettings, PointCloud
-from worker.input.camera import Intrinsics
+from worker.input.camera import Intrinsics, to_camera
 from worker.input.clip import DepthClip
 from worker.model.constants import SH_C0
 from worker.model.deformation import AtRest, SharedBasis, motion_named
@@ -136,7 +136,7 @@ def _follow_tracks(
 def _reference_pixels(cloud: PointCloud, clip: DepthClip, reference: int) -> NDArray[np.intp]:
     """[N] flat index of the pixel of the reference frame each point lay in, the nearest one if outside."""
     pose, k = clip.world_from_camera[reference], clip.intrinsics
-    x, y, z = ((cloud.reference_mm - pose[:3, 3]) @ pose[:3, :3]).T
+    x, y, z = to_camera(cloud.reference_mm, pose).T
     z = np.maximum(z, 1e-6)
     column = np.clip(np.floor(k.fx * x / z + k.cx), 0, k.width - 1)
     row = np.clip(np.floor(k.fy * y / z + k.cy), 0, k.height - 1)
