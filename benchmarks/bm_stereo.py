@@ -142,7 +142,7 @@ def _print_rows(clip: RectifiedClip, correction_px: float) -> None:
         for left, right in pairs:
             greys = [cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in (left, right)]
             eyes = (greys[0], shift_rows(greys[1], shift_px))
-            found.append(match_features(*(find_features(eye, at_most_px=left.shape[1]) for eye in eyes)))
+            found.append(match_features(*(find_features(eye, max_width_px=left.shape[1]) for eye in eyes)))
         matches = np.concatenate(found)
         shift: RowShift = measure_row_shift(matches, clip.disparity_offset_px)
         dy = np.abs(matches[:, 3] - matches[:, 1])

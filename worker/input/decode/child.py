@@ -1,6 +1,6 @@
-"""`python -m worker.input.decode.child`: the process that reads what came from outside.
+"""`python -m worker.input.decode.child`: the process that reads files from outside.
 
-It gets one request as JSON on its input, locks itself in, and only then loads the decoders. It answers in lines of
+It reads one request as JSON from its input, confines itself, and only then loads the decoders. It answers in lines of
 JSON: any number of {"pictures": ..., "share": ..., "field": ...}, then one {"result": ...} or {"error": ...}.
 """
 
@@ -23,9 +23,9 @@ Work = Callable[[dict[str, Any], Path, Reports], dict[str, Any]]
 
 
 def serve(work_of: Callable[[], Work]) -> None:
-    """Read the request, lock in, work, answer. work_of loads what the work needs, when it is safe to do so."""
+    """Read the request, confine this process, work, answer. work_of imports what the work needs."""
     with os.fdopen(os.dup(1), "wb") as stream:
-        os.dup2(2, 1)  # what a library prints is no answer
+        os.dup2(2, 1)  # output of libraries must not mix with the answer
         request = json.loads(sys.stdin.buffer.readline())
         reports = Reports(stream)
         folder = Path.cwd()

@@ -1,4 +1,4 @@
-"""Runs the decoding process and watches it: whatever becomes of it, the caller gets a result or an error."""
+"""Runs the decoding process and watches it. The caller always gets a result or a typed error."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from typing import Any
 from contract.wire.errors import Cancelled, InputError, LimitError, UnavailableError
 from worker.input.decode.guard import Allowance
 
-MAX_SILENCE_S = 10.0  # without another picture; the largest frame there may be takes well under a second
-MAX_TOTAL_S = 1800.0  # of everything: a clip of the most and the largest frames takes minutes
+MAX_SILENCE_S = 10.0  # without another picture; the largest frame allowed takes well under a second
+MAX_TOTAL_S = 1800.0  # the largest clip allowed takes minutes
 MAX_ANSWER_BYTES = 4 << 20  # a line of the answer; it grows with warnings, not with frames
-POLL_S = 0.1  # how soon a stop is noticed
-MAX_EXIT_S = 5.0  # to end after the answer; what lives on could change the arrays that the worker maps
+POLL_S = 0.1  # a stop is noticed within this time
+MAX_EXIT_S = 5.0  # between answer and exit; a process that lives on could change the arrays that the worker maps
 
 PROGRAM = ("-m", "worker.input.decode.child")
 NONSENSE = "the decoder talks nonsense"
-MALFORMED = (ValueError, KeyError, TypeError, OverflowError, RecursionError)  # what reading a lie may raise
+MALFORMED = (ValueError, KeyError, TypeError, OverflowError, RecursionError)  # what a false answer may raise
 REMEDY = "Export it again as H.264 in mp4, or give its frames as PNG in a zip."
 _PACKAGES = Path(__file__).resolve().parents[3]  # the folder that holds `worker` and `contract`
-_KEPT_VARIABLES = ("LD_LIBRARY_PATH", "SYSTEMROOT")  # without them some installations find no libraries
+_KEPT_VARIABLES = ("LD_LIBRARY_PATH", "SYSTEMROOT")  # some installations find no libraries without them
 
 logger = logging.getLogger("intrasplat.worker")
 
@@ -42,7 +42,7 @@ OnReport = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Patience:
-    """How long the process may take: seconds without another picture, of everything, and from its answer to its end."""
+    """Limits of the process in seconds: without another picture, in total, and from its answer to its exit."""
 
     max_silence_s: float = MAX_SILENCE_S
     max_total_s: float = MAX_TOTAL_S
@@ -68,12 +68,12 @@ def run_contained(
     program: Sequence[str] = PROGRAM,
     patience: Patience = Patience(),
 ) -> dict[str, Any]:
-    """The result of the decoding process, run in `folder`, where its arrays then lie.
+    """The result of the decoding process, which writes its arrays into `folder`.
 
-    on_report gets the share done, should_stop is asked at least every POLL_S.
+    on_report gets the share done. should_stop is called at least every POLL_S.
 
     Raises:
-        InputError, LimitError: what the process found wrong, or that it crashed, hung, or took more than it may.
+        InputError, LimitError: as the process raised them; or it crashed, hung, or exceeded its allowance.
         Cancelled: should_stop said so.
         UnavailableError: the disk is full.
     """
@@ -106,7 +106,7 @@ def run_contained(
 
 
 def _end(process: subprocess.Popen[bytes], max_exit_s: float) -> None:
-    """Wait until the process has ended; it is killed if that takes longer."""
+    """Wait max_exit_s for the process to exit, then kill it."""
     try:
         process.wait(max_exit_s)
     except subprocess.TimeoutExpired:
@@ -115,7 +115,7 @@ def _end(process: subprocess.Popen[bytes], max_exit_s: float) -> None:
 
 
 class _Watch:
-    """Reads a process's lines, and ends it when it is silent, slow, talks nonsense, or is no longer wanted."""
+    """Reads a process's lines. Raises if it is silent, slow or malformed, or if the caller wants to stop."""
 
     def __init__(
         self,
@@ -131,7 +131,7 @@ class _Watch:
         self.answered = False
 
     def answer(self) -> dict[str, Any] | None:
-        """The last line; None when the process ended without one."""
+        """The last line; None if the process exited without one."""
         end_s = time.monotonic() + self._patience.max_total_s
         self._advanced_s = time.monotonic()
         for line in self._lines():
@@ -165,7 +165,7 @@ class _Watch:
             raise _undecodable(self.field, f"the decoder took more than {self._patience.max_total_s:g} s")
 
     def _lines(self) -> Iterator[bytes | None]:
-        """Whole lines as they come, and None whenever POLL_S passed, or a part came, without any."""
+        """Whole lines as they arrive; None after POLL_S without a whole line."""
         assert self._process.stdout is not None
         descriptor = self._process.stdout.fileno()
         poll = select.poll()
@@ -187,7 +187,7 @@ class _Watch:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """Nothing of the parent's but what libraries need to be found."""
+    """The process's environment: of the parent's, only what libraries need to be found."""
     kept = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
     return kept | {
         "PYTHONPATH": str(_PACKAGES),
@@ -217,7 +217,7 @@ def _result(answer: dict[str, Any] | None, status: int, field: str, allowance: A
 
 
 def _fault(error: dict[str, Any], field: str, allowance: Allowance) -> dict[str, Any]:
-    """What nobody foresaw is still the file's doing to the caller; the log says where it happened."""
+    """Raise for an unexpected exception: an InputError for the caller, its place for the log."""
     if error["errno"] == errno.ENOSPC:
         problem = "The disk is full: the clip's frames found no room."
         raise UnavailableError(problem, "Make room where the data directory lies.")

@@ -1,4 +1,4 @@
-"""A clip and its calibration, read where they can do no harm: the parent's side of the decoding process.
+"""The parent's side of the decoding process: what the process wrote down becomes a clip and its calibration.
 
 Symbols: T frames, H W pixels of one eye.
 """
@@ -29,13 +29,13 @@ from worker.input.decode.handover import DEPTH, map_array
 from worker.machine.hooks import Hooks, Progress
 
 STAGE = "decode"
-LIBRARIES_BYTES = 2 * 2**30  # address space of Python, NumPy and OpenCV with a decoder's threads
-CPU_S = 1800  # of all cores together: what MAX_TOTAL_S allows one of them
+LIBRARIES_BYTES = 2 * 2**30  # address space of Python, NumPy, OpenCV and a decoder's threads
+MAX_CPU_S = 1800  # of all cores together; the same as MAX_TOTAL_S of one core
 
 
 @dataclass(frozen=True)
 class StereoRecording:
-    """A stereo clip whose frames lie decoded in files that are mapped into memory, and its calibration."""
+    """A stereo clip, whose decoded frames are mapped into memory, and its calibration."""
 
     clip: StereoClip
     calibration: StereoCalibration
@@ -43,7 +43,7 @@ class StereoRecording:
 
 @dataclass(frozen=True)
 class _MappedPairs:
-    """Left and right frames [T, H, W, 3] as a restartable source."""
+    """Left and right frames [T, H, W, 3]; each call starts again from frame 0."""
 
     left: NDArray[np.uint8]
     right: NDArray[np.uint8]
@@ -62,15 +62,15 @@ def decode_clip(
     limits: ClipLimits | None = None,
     hooks: Hooks | None = None,
 ) -> StereoRecording | DepthClip:
-    """What open_clip and load_calibration make of these files, bit for bit, without this process reading them.
+    """The clip and calibration of these files. The same bits as open_clip and load_calibration give.
 
-    A process of its own decodes every frame into a private folder below tempfile.gettempdir(); it has limited memory
-    and time and, where the kernel allows it, no network and no files but these. `assumptions` say what was in force.
-    The folder is gone when this returns; what is mapped of it stays until the clip is dropped.
+    Another process decodes every frame into a private folder below tempfile.gettempdir(). Its memory and time are
+    limited; if the kernel allows it, it has no network and can read only these files. `assumptions` list the
+    protections that were in force. The folder is removed before this returns; its mapped arrays live with the clip.
 
     Raises:
-        InputError, LimitError: what open_clip and load_calibration raise; a stereo clip came without a calibration; or
-            the decoder crashed, made no progress for 10 s, or took more memory or time than it may.
+        InputError, LimitError: as open_clip and load_calibration raise them; or the stereo clip has no calibration; or
+            the decoder crashed, made no progress for 10 s, or took more memory or time than allowed.
         Cancelled: hooks.should_stop said so.
         UnavailableError: the disk is full.
     """
@@ -85,7 +85,7 @@ def decode_clip(
         "readable": [each for path in (*paths.values(), *layouts) for each in _reached(path)],
         "limits": limits.numbers(),
     }
-    allowance = Allowance(LIBRARIES_BYTES + limits.decoded_bytes, limits.decoded_bytes, CPU_S)
+    allowance = Allowance(LIBRARIES_BYTES + limits.decoded_bytes, limits.decoded_bytes, MAX_CPU_S)
     with private_folder() as folder:
         told = run_contained(
             request,
@@ -102,7 +102,7 @@ def decode_clip(
 
 
 def _reached(path: str) -> list[str]:
-    """A file or folder, and what links in the folder lead to; only who has this machine can give one with links."""
+    """A file or folder, and the targets of links in the folder. Only a user of this machine can give one with links."""
     found = [path]
     for folder, subfolders, files in os.walk(path, followlinks=True):
         if len(Path(folder).relative_to(path).parts) >= MAX_FOLDER_DEPTH:
@@ -141,7 +141,7 @@ def _received(told: dict[str, Any], folder: Path, allowance: Allowance) -> Stere
 
 
 def _protection(granted: list[str], allowance: Allowance) -> str:
-    """What held while the clip was decoded, and what the kernel did not grant."""
+    """The protections in force while the clip was decoded, and those that the kernel did not grant."""
     amounts = {LIMITED_MEMORY: f" of {allowance.memory_bytes / 2**30:.1f} GiB"}
     held = [each + amounts.get(each, "") for each in PROTECTIONS if each in granted]
     lacking = [each for each in PROTECTIONS if each not in granted]
@@ -156,7 +156,7 @@ def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _checked_depth(depth_mm: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth as it must be for all that indexes by it; frame by frame, for it is large."""
+    """The depth, if it is finite and not negative. It is checked frame by frame because it is large."""
     if not all(bool(np.isfinite(frame).all()) and float(frame.min()) >= 0 for frame in depth_mm):
         raise ValueError("depth that is negative or not finite")
     return depth_mm

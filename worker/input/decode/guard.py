@@ -1,7 +1,7 @@
-"""How the decoding process locks itself in, before it opens anything that came from outside.
+"""How the decoding process confines itself before it opens files from outside.
 
-Its limits hold on every system. What a kernel need not grant is named when it did: without it decoding goes on, and the
-report says so. Everything here is for good: nothing in this process can take it back.
+The limits hold on every system. Some protections depend on the kernel. Without them decoding goes on, and the report
+says so. The process cannot undo any of it.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from contract.runtime.processes import die_with_parent
 from worker.input.decode.landlock import confine_files
 from worker.input.decode.seccomp import forbid_network_and_programs
 
-MAX_OPEN_FILES = 128  # a zip, a video, the results, and what Python loads
+MAX_OPEN_FILES = 128  # a zip, a video, the results, and Python's own files
 
 _PR_SET_NO_NEW_PRIVS = 38
 _CLONE_NEWUSER = 0x10000000
 _CLONE_NEWNET = 0x40000000
 _CAPABILITY_VERSION = 0x20080522
-_CAP_DAC_READ_SEARCH = 1 << 2  # kept where it is there: a worker that is root is given files of other users
+_CAP_DAC_READ_SEARCH = 1 << 2  # kept if held: a worker that runs as root gets files of other users
 
 LIMITED_MEMORY = "limited memory"
 NO_NETWORK = "no network"
@@ -35,7 +35,7 @@ PROTECTIONS = (LIMITED_MEMORY, NO_NETWORK, NO_PROGRAMS, OWN_FILES)
 
 @dataclass(frozen=True)
 class Allowance:
-    """What the process may take: memory, the largest file it writes, seconds of all its cores together."""
+    """Limits of the process: memory, size of a file that it writes, seconds of all its cores together."""
 
     memory_bytes: int
     file_bytes: int
@@ -43,10 +43,10 @@ class Allowance:
 
 
 def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> list[str]:
-    """Give up what decoding does not need; what was granted, in words.
+    """Give up rights that decoding does not need. Returns the protections that were granted.
 
-    Must come before the first thread. readable are the files and folders that came from outside, writable the folder
-    for the results.
+    Call it before the first thread starts. readable lists files and folders from outside; writable is the folder for
+    the results.
 
     Raises:
         OSError: a limit cannot be set.
@@ -55,7 +55,7 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
     _gain_no_privileges()
     _limit(resource.RLIMIT_CORE, 0)  # a dump would hold the clip
     _limit(resource.RLIMIT_FSIZE, allowance.file_bytes)
-    _limit(resource.RLIMIT_CPU, allowance.cpu_s, allowance.cpu_s + 1)  # SIGXCPU tells why; SIGKILL follows
+    _limit(resource.RLIMIT_CPU, allowance.cpu_s, allowance.cpu_s + 1)  # SIGXCPU names the cause; SIGKILL follows
     _limit(resource.RLIMIT_NOFILE, MAX_OPEN_FILES)
     granted = [LIMITED_MEMORY] if _limit_memory(allowance.memory_bytes) else []
     apart = _leave_network()
@@ -72,15 +72,15 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
 
 
 def _limit(kind: int, soft: int, hard: int | None = None) -> None:
-    """Lower a limit; one that is lower already stays."""
-    _, most = resource.getrlimit(kind)
+    """Lower a limit. A lower one stays."""
+    _, maximum = resource.getrlimit(kind)
     hard = soft if hard is None else hard
-    hard = hard if most == resource.RLIM_INFINITY else min(hard, most)
+    hard = hard if maximum == resource.RLIM_INFINITY else min(hard, maximum)
     resource.setrlimit(kind, (min(soft, hard), hard))
 
 
 def _limit_memory(max_bytes: int) -> bool:
-    """Whether memory is limited; macOS knows the limit and may refuse to set it."""
+    """Limit memory; False if the system refuses, as macOS may."""
     try:
         _limit(resource.RLIMIT_AS, max_bytes)
     except (ValueError, OSError):
@@ -89,13 +89,13 @@ def _limit_memory(max_bytes: int) -> bool:
 
 
 def _gain_no_privileges() -> None:
-    """No program that this process starts has more rights than it; what follows needs that said."""
+    """Forbid new privileges, which Landlock and seccomp require."""
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
 
 
 def _drop_capabilities() -> None:
-    """Root is root no longer, and who has a user namespace of its own is not root in there."""
+    """Drop all capabilities but one, also those in a user namespace of our own."""
     if not sys.platform.startswith("linux"):
         return
     libc = ctypes.CDLL(None, use_errno=True)
@@ -107,7 +107,7 @@ def _drop_capabilities() -> None:
 
 
 def _leave_network() -> bool:
-    """Move to a network of its own that leads nowhere; a user who may not do so alone gets a user namespace too."""
+    """Move to an empty network namespace; an ordinary user needs a user namespace for it, too."""
     if not sys.platform.startswith("linux"):
         return False
     libc = ctypes.CDLL(None, use_errno=True)
@@ -115,7 +115,7 @@ def _leave_network() -> bool:
 
 
 def _libraries() -> list[Path]:
-    """Where Python and the libraries it loads lie."""
+    """Folders of Python and the libraries that it loads."""
     package = Path(__file__).resolve().parents[2]
     installed = (sys.prefix, sys.base_prefix, *(each for each in sys.path if "-packages" in each))
     return [package, package.parent / "contract", *map(Path, (*installed, "/usr", "/lib", "/lib64"))]

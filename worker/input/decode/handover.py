@@ -1,4 +1,4 @@
-"""The arrays that the decoding process leaves in its folder, as bare bytes: there is no header to be lied in.
+"""The arrays that the decoding process leaves in its folder, as bare bytes: without a header nothing can be forged.
 
 Symbols: T frames, H W pixels of one eye.
 """
@@ -39,7 +39,7 @@ _SHAPES: dict[str, Callable[[int, int, int], tuple[int, ...]]] = {
 
 
 def write_arrays(folder: Path, arrays: Iterable[tuple[str, NDArray[Any]]]) -> None:
-    """Append each array to the file of its name; an array may come whole, or frame by frame."""
+    """Append each array to the file of its name. An array may come whole or frame by frame."""
     files: dict[str, Any] = {}
     try:
         for name, array in arrays:
@@ -52,13 +52,13 @@ def write_arrays(folder: Path, arrays: Iterable[tuple[str, NDArray[Any]]]) -> No
 
 
 def map_array(folder: Path, name: str, size: tuple[int, int, int]) -> NDArray[Any]:
-    """The array of that name in a clip of `size` (T, H, W), mapped into memory; writing to it changes no file.
+    """The array of that name in a clip of `size` (T, H, W), mapped into memory. Writing to it changes no file.
 
-    The file may be removed at once: what is mapped stays until the array goes.
+    The file may be removed at once; the mapping lives as long as the array.
 
     Raises:
-        ValueError: the file is not a plain one of the size that the array must have.
-        OSError: it is not there.
+        ValueError: it is no regular file, or its size is not the array's.
+        OSError: there is no such file.
     """
     shape, dtype = _SHAPES[name](*size), np.dtype(_TYPES[name])
     descriptor = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)

@@ -1,4 +1,4 @@
-"""Access to files by an allow-list (Linux, Landlock): whoever takes a decoder over reads no other clip and no keys."""
+"""An allow-list of files (Linux, Landlock): a decoder that is taken over cannot read other clips or keys."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _PATH_BENEATH = 1
 
 # rights (linux/landlock.h)
 _EXECUTE, _READ_FILE, _READ_FOLDER = 1 << 0, 1 << 2, 1 << 3
-_FILE_RIGHTS = _EXECUTE | 1 << 1 | _READ_FILE | 1 << 14 | 1 << 15  # those that a rule on a file may name
+_FILE_RIGHTS = _EXECUTE | 1 << 1 | _READ_FILE | 1 << 14 | 1 << 15  # the rights that a rule on a file may name
 _RIGHTS_BY_VERSION = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 4: (1 << 15) - 1, 5: (1 << 16) - 1}
 _READING = _EXECUTE | _READ_FILE | _READ_FOLDER
 
 
 def confine_files(readable: Sequence[Path], writable: Path) -> bool:
-    """Whether this thread, and all it starts, can from now on read only `readable` and change only `writable`.
+    """Let this thread and those that it starts read only `readable` and change only `writable`.
 
-    Paths may be files or folders; those that are not there are left out. Needs PR_SET_NO_NEW_PRIVS.
+    False if the kernel cannot. Paths are files or folders; missing ones are ignored. It needs PR_SET_NO_NEW_PRIVS.
     """
     if not sys.platform.startswith("linux"):
         return False

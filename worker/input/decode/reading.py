@@ -1,4 +1,4 @@
-"""What the decoding process does: the clip is opened, its calibration read, every frame written down.
+"""What the decoding process does: open the clip, read its calibration, write down every frame.
 
 Symbols: T frames, H W pixels of one eye.
 """
@@ -23,14 +23,14 @@ _OPENING_SHARE = 0.5  # of the stage; a video is walked once to count its frames
 
 
 def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[str, Any]:
-    """Leaves the clip's arrays in `folder`; what else there is to know of it is the result, for JSON."""
-    most_frames = request["limits"]["frames"]
+    """Write the clip's arrays into `folder`. Returns the rest of the clip, for JSON."""
+    max_frames = request["limits"]["frames"]
     opened = 0
 
     def picture() -> None:
         nonlocal opened
-        opened += 1  # how many there are is not known yet: the share rises towards its end without reaching it
-        reports.share = max(reports.share, _OPENING_SHARE * opened / (opened + most_frames))
+        opened += 1  # their number is not known yet: the share approaches its end without reaching it
+        reports.share = max(reports.share, _OPENING_SHARE * opened / (opened + max_frames))
         reports.picture()
 
     limits = ClipLimits(**request["limits"], on_picture=picture)
@@ -66,7 +66,7 @@ def _depth_arrays(clip: DepthClip, reports: Reports) -> Iterator[tuple[str, NDAr
             done += 1
             share = done / (len(names) * clip.frame_count)
             reports.share = max(reports.share, _OPENING_SHARE + (1 - _OPENING_SHARE) * share)
-            reports.picture()  # a slow disk is no decoder that hangs
+            reports.picture()  # so that a slow disk does not look like a decoder that hangs
             yield name, frame
 
 

@@ -1,4 +1,4 @@
-"""How the decoding process tells its parent how far it is: lines of JSON, of which child.py says what they hold."""
+"""How the decoding process reports its progress to its parent: lines of JSON, which child.py describes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ REPORT_PERIOD_S = 0.05
 
 
 class Reports:
-    """Tells the parent how far it is, not too often; any thread may call it."""
+    """Reports progress to the parent, at most once every REPORT_PERIOD_S. Any thread may call it."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -22,7 +22,7 @@ class Reports:
         self.share = 0.0
 
     def picture(self) -> None:
-        """Another picture was decoded."""
+        """Count another decoded picture."""
         with self._lock:
             self._pictures += 1
             if time.monotonic() >= self._next_s:
@@ -30,13 +30,13 @@ class Reports:
                 self._send({"pictures": self._pictures, "share": self.share, "field": self.field})
 
     def reading(self, field: str) -> None:
-        """From now on it is this input that is read."""
+        """Say that this input is read from now on."""
         with self._lock:
             self.field = field
             self._send({"pictures": self._pictures, "share": self.share, "field": field})
 
     def end(self, answer: dict[str, Any]) -> None:
-        """The last line."""
+        """Send the last line."""
         with self._lock:
             self._send(answer)
 

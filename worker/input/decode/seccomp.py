@@ -1,8 +1,7 @@
-"""A filter of system calls (Linux, seccomp): no sockets, no other programs or processes, no reaching into others.
+"""A filter of system calls (Linux, seccomp): no sockets, no other programs or processes, no access to other processes.
 
-Nor any change to who may read a file or when it was written: Landlock lets those through for every file of this user.
-It holds where a container forbids new namespaces, too. A call that is filtered fails with EPERM, so that a library that
-merely asks goes on.
+It also forbids changing a file's permissions or times, which Landlock allows for every file of this user. It works in
+containers that forbid new namespaces. A filtered call fails with EPERM, so that a library that only tries it goes on.
 """
 
 from __future__ import annotations
@@ -100,7 +99,10 @@ class _Program(ctypes.Structure):
 
 
 def forbid_network_and_programs() -> bool:
-    """Whether the filter is in force; needs PR_SET_NO_NEW_PRIVS. It holds for this thread and all it starts."""
+    """Install the filter for this thread and those that it starts; False if the system has none.
+
+    It needs PR_SET_NO_NEW_PRIVS.
+    """
     machine = platform.machine()
     if not sys.platform.startswith("linux") or machine not in _ARCHITECTURES:
         return False
@@ -112,7 +114,7 @@ def forbid_network_and_programs() -> bool:
 
 
 def _instructions(machine: str) -> list[tuple[int, int, int, int]]:
-    """(code, jump if true, jump if false, value) each; every test is followed by what it decides."""
+    """(code, jump if true, jump if false, value) of each instruction."""
     column = list(_ARCHITECTURES).index(machine)
     numbers = [each[column] for each in _FORBIDDEN.values()]
     program = [
