@@ -10,15 +10,16 @@ holding out. Below 500 iterations a run is one cycle, and `rates fall once, noth
 from __future__ import annotations
 
 import argparse
+import csv
 import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from bm_train import append, commit, machine
 
 from contract.wire.options import ReconstructionOptions
+from worker.evaluate.rows import commit, machine
 from worker.input.clip import DepthClip, open_clip, split_frames
 from worker.model.metrics import psnr_tissue
 from worker.model.optimize import Rate
@@ -78,7 +79,7 @@ def main() -> None:
                     row = measure(change, clip_name, clip, holdout, arguments.iterations, seed)
                     print("  ".join(str(row[name]) for name in FIELDS[:-2]), flush=True)
                     if arguments.csv:
-                        append(arguments.csv, row, FIELDS)
+                        append(arguments.csv, row)
 
 
 def clips(data: Path) -> dict[str, Callable[[], DepthClip]]:
@@ -116,6 +117,19 @@ def measure(
         "machine": machine(), "commit": commit(),
     }  # fmt: skip
     return {name: round(value, 2) if isinstance(value, float) else value for name, value in row.items()}
+
+
+def append(path: Path, row: dict[str, object]) -> None:
+    """Add the row to the CSV, with a header if the file is new; a file of other columns is refused."""
+    fresh = not path.exists()
+    if not fresh and path.read_text().splitlines()[:1] != [",".join(FIELDS)]:
+        raise SystemExit(f"{path} has other columns than {', '.join(FIELDS)}: move it away first.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS)
+        if fresh:
+            writer.writeheader()
+        writer.writerow(row)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """What a stored scene costs and what it loses: bytes against decibels, on frames that training saw and on others.
 
-    python benchmarks/bm_compact.py CLIP ... [--iterations 1200] [--tolerances 0.05 0.1 0.14 0.2 0.4 0.8] [--csv FILE]
+    python benchmarks/bm_compact.py [CLIP ...] [--iterations 1200] [--tolerances 0.05 0.1 0.14 0.2 0.4 0.8] [--csv FILE]
 
-Trains `fast` on each clip for so many iterations, then stores the result at one tolerance after the other. Prints and
-appends a row each: megabytes of the floats, of the compact file and of the manifest, the step, what was lost on the
-judged training frames and on all held-out ones, and the seconds to shrink, store and load.
+Trains `fast` on each clip (default: a synthetic one) for so many iterations, then stores the result at one tolerance
+after the other. Prints a row each: megabytes of the floats, of the compact file and of the manifest, the step, what was
+lost on the judged training frames and on all held-out ones, and the seconds to shrink, store and load.
 """
 
 from __future__ import annotations
@@ -14,12 +14,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from bm_train import append
-
 from contract.wire.options import ReconstructionOptions
-from worker.evaluate.rows import commit, machine
+from worker.evaluate.rows import commit, machine, write_rows
 from worker.input.clip import DepthClip, open_clip, split_frames
 from worker.machine.timing import Stopwatch
+from worker.phantom import PhantomSettings, make_phantom
 from worker.pipeline import scene_of
 from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
 from worker.scene.model import model_of
@@ -40,21 +39,23 @@ TOLERANCES_DB = (0.05, 0.1, 0.14, 0.2, 0.4, 0.8)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("clips", nargs="+", type=Path, help="folders in the EndoNeRF layout")
+    parser.add_argument("clips", nargs="*", type=Path, help="in the EndoNeRF layout (default: synthetic tissue)")
     parser.add_argument("--iterations", type=int, default=1200)
     parser.add_argument("--tolerances", nargs="+", type=float, default=TOLERANCES_DB)
-    parser.add_argument("--csv", type=Path, help="append the rows here")
+    parser.add_argument("--csv", type=Path, help="write the rows here")
     arguments = parser.parse_args()
-    for clip in arguments.clips:
-        for row in rows_of(clip, arguments.iterations, arguments.tolerances):
+    rows: list[dict[str, object]] = []
+    for path in arguments.clips or [None]:
+        for row in rows_of(path, arguments.iterations, arguments.tolerances):
             print("  ".join(f"{name} {row[name]}" for name in FIELDS[:-2]), flush=True)
+            rows.append(row)
             if arguments.csv:
-                append(arguments.csv, row, FIELDS)
+                write_rows(arguments.csv, FIELDS, rows)
 
 
-def rows_of(path: Path, iterations: int, tolerances_db: list[float]) -> list[dict[str, object]]:
+def rows_of(path: Path | None, iterations: int, tolerances_db: list[float]) -> list[dict[str, object]]:
     """One training run, stored at each tolerance."""
-    clip = open_clip(path)
+    clip = open_clip(path) if path else make_phantom(PhantomSettings()).depth_clip()
     if not isinstance(clip, DepthClip):
         raise SystemExit(f"{path} has no depth; give a folder in the EndoNeRF layout.")
     split = split_frames(clip)
@@ -78,7 +79,7 @@ def rows_of(path: Path, iterations: int, tolerances_db: list[float]) -> list[dic
         stored_db = held_out_psnr(run, frame_renderer(run, model_of(loaded)))
         rows.append(
             {
-                "clip": path.name, "iterations": iterations, "gaussians": len(loaded.gaussians),
+                "clip": path.name if path else "phantom", "iterations": iterations, "gaussians": len(loaded.gaussians),
                 "bases": len(quantized.scene.deformation.constants()["centre"]), "held_out_db": f"{exact_db:.2f}",
                 "tolerance_db": tolerance_db, "step": f"{quantized.step:.3g}",
                 "train_loss_db": f"{quantized.loss_db:.3f}",

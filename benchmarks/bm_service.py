@@ -31,10 +31,10 @@ from typing import Any
 
 import httpx
 import numpy as np
-from bm_train import commit, machine
 
 from client.demo import started_service
 from intrasplat_client import Client
+from worker.evaluate.rows import commit, machine
 
 WIDTH, HEIGHT, FRAMES = 640, 512, 48
 SCENE_ITERATIONS = 300

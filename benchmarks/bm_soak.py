@@ -28,12 +28,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from bm_service import PhantomClip, make_clip
-from bm_train import commit, machine
 
 from client.demo import started_service
 from contract.wire.errors import IntrasplatError
 from contract.wire.job import JobState
 from intrasplat_client import Client, Conflict
+from worker.evaluate.rows import commit, machine
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 16
 ROUND_ITERATIONS = 100

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import importlib.util
 import re
 import subprocess
 import tomllib
@@ -21,6 +22,7 @@ TARGETS = (
     "help", "setup", "demo", "test", "check", "bench", "gpu-check", "evaluate", "capacity", "chaos", "sbom", "clean",
 )  # fmt: skip
 MAX_LINES = 400
+OURS = ("contract", "worker", "service", "client", "intrasplat_client", "tests")
 LINK = re.compile(r"\[(?:[^\[\]]|\\.)*\]\(([^)\s]+)\)")
 
 
@@ -153,3 +155,16 @@ def test_long_files_say_why_they_are_long() -> None:
             if len(lines) > MAX_LINES and not any(re.match(r"# long: \S", each) for each in lines):
                 silent.append(f"{path.relative_to(REPOSITORY)} has {len(lines)} lines")
     assert silent == [], "split them, or say why not in a line that begins '# long: '"
+
+
+@pytest.mark.parametrize("path", sorted((REPOSITORY / "benchmarks").rglob("*.py")), ids=lambda path: path.stem)
+def test_a_benchmark_imports_only_names_that_exist(path: Path) -> None:
+    missing = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in OURS:
+            if importlib.util.find_spec(node.module) is None:
+                missing.append(node.module)
+                continue
+            module = importlib.import_module(node.module)
+            missing += [f"{node.module}.{each.name}" for each in node.names if not hasattr(module, each.name)]
+    assert missing == []

@@ -3,7 +3,7 @@
     python -m benchmarks.pages
 
 Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
-stability`), {train,ablation,raster,service}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py);
+stability`), {ablation,raster,service}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py);
 what is missing is left out.
 """
 
@@ -28,14 +28,6 @@ written by `python -m benchmarks.pages`. `d4d-a` is a real da Vinci recording (9
 rest), `surgt_raw` another of 10 raw frames, neither part of the project; the rest is synthetic. `psnr_tissue` is the
 honest score, `psnr_paper` what papers print ([conventions](../conventions.md)). The machines are shared and noisy: rows
 of runs have their load. A section holds for the commits it names; later ones may train or splat differently.
-"""
-_TRAIN = """
-## Whole reconstructions
-
-`python benchmarks/bm_train.py --csv docs/results/train.csv` ([train.csv](train.csv)). Copying is the better of blending
-the neighbouring frames and warping them half-way by optical flow, with the masks respected: a picture without a model.
-With a camera at rest and frames held out one by one (`every8`) copying is hard to beat; it cannot show another pose,
-depth, or what the instrument hides. {passing}
 """
 _ABLATION = """
 ## What each part of fast is worth
@@ -90,8 +82,6 @@ def main() -> None:
     parts = [_INTRODUCTION, *sections(RESULTS), *stability_sections(RESULTS)]
     if rows := _read(STABILITY):
         parts.append(origin(rows))
-    if rows := _latest(_read("train.csv"), "run"):
-        parts += [_TRAIN.format(passing=_passing(rows)), _train_table(rows)]
     if rows := _latest(_read("ablation.csv"), "change", "clip", "holdout", "seed"):
         parts += [_ABLATION, _ablation_table(rows), origin(rows)]
     if rows := _read("raster.csv"):
@@ -122,37 +112,6 @@ def _read(name: str) -> list[Row]:
 def _latest(rows: list[Row], *key: str) -> list[Row]:
     """Of rows that were appended, the last of each key, so that no median mixes what two commits came to."""
     return list({tuple(row[name] for name in key): row for row in rows}.values())
-
-
-def _number(text: str, digits: int) -> str:
-    return f"{float(text):.{digits}f}" if text not in ("", "None") else "–"
-
-
-def _copying_db(row: Row) -> float | None:
-    """The better of both copies; None where neither was scored."""
-    return max((float(row[name]) for name in ("copy_blend_db", "copy_flow_db") if row[name]), default=None)
-
-
-def _passing(rows: list[Row]) -> str:
-    """Which runs score more than copying does."""
-    scored = [(row["run"], float(row["psnr_tissue_db"]), _copying_db(row)) for row in rows if row["psnr_tissue_db"]]
-    better = [run for run, score, copying in scored if copying is not None and score > copying]
-    return f"Above it end {len(better)} of {len(scored)} runs{': ' if better else ''}{', '.join(better)}."
-
-
-def _train_table(rows: list[Row]) -> str:
-    header = ["run", "clip", "limit", "psnr_tissue", "psnr_paper", "copying", "depth, mm", "iterations", "Gaussians",
-              "MB", "t_train_s", "t_post_s", "MiB", "load", "commit"]  # fmt: skip
-    cells = []
-    for row in rows:
-        copying = _copying_db(row)
-        cells.append([
-            row["run"], row["clip"], row["limit"], _number(row["psnr_tissue_db"], 2), _number(row["psnr_paper_db"], 2),
-            "–" if copying is None else f"{copying:.1f}", _number(row["depth_agreement_mm"], 2), row["iterations"],
-            row["gaussians"], f"{int(row['scene_bytes']) / 1e6:.1f}", _number(row["t_train_s"], 1),
-            _number(row["t_post_s"], 1), row["peak_rss_mib"], _number(row["load_1min"], 1), row["commit"],
-        ])  # fmt: skip
-    return table(header, cells) + f"\nMeasured on {'; '.join(sorted({row['machine'] for row in rows}))}.\n"
 
 
 def _ablation_table(rows: list[Row]) -> str:

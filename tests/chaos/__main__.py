@@ -18,13 +18,13 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from benchmarks.bm_train import commit, machine
 from contract.queue.promise import BEAT_PERIOD_S, LEASE_S
 from tests.chaos.campaign import CELLS, NO_MATTER, Outcome, run_kill
 from tests.chaos.deployment import Deployment, Target
 from tests.chaos.history import RERUN_WITHIN_S, ClipHistory, orphans
 from tests.chaos.points import Point
 from tests.chaos.scenarios import Finding, bad_wire, zombie
+from worker.evaluate.rows import commit, machine
 
 CANCEL_EVERY = 5
 """Every fifth kill at a point that a cancel can precede comes after one."""
