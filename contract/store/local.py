@@ -9,7 +9,7 @@ from pathlib import Path
 
 from contract.store.disk_errors import disk_errors
 from contract.store.durable import flush, move_folder
-from contract.store.shelf import MARKERS, Area, Entry, Removed, checked, entry_of, is_job_id
+from contract.store.shelf import MARKERS, Area, Removed, ShelfEntry, checked, entry_of, is_job_id
 
 
 class LocalShelf:
@@ -23,35 +23,35 @@ class LocalShelf:
             (self.data_dir / area).mkdir(mode=0o700, exist_ok=True)
         self._number_old_scenes()
 
-    def path(self, entry: Entry) -> Path:
+    def path(self, entry: ShelfEntry) -> Path:
         """Where the entry's folder lies, or would lie."""
         return self.data_dir / entry.area / entry.name
 
     @disk_errors()
-    def put(self, folder: Path, entry: Entry) -> None:
+    def put(self, folder: Path, entry: ShelfEntry) -> None:
         target = self.path(entry)
         if folder != target:
             _remove_folder(target, entry.marker)
             move_folder(folder, target)
 
-    def get(self, entry: Entry) -> Path | None:
+    def get(self, entry: ShelfEntry) -> Path | None:
         return self.path(entry) if self.holds(entry) else None
 
     @disk_errors()
-    def holds(self, entry: Entry) -> bool:
+    def holds(self, entry: ShelfEntry) -> bool:
         return (self.path(entry) / entry.marker).is_file()
 
     @disk_errors()
-    def read_marker(self, entry: Entry) -> bytes | None:
+    def read_marker(self, entry: ShelfEntry) -> bytes | None:
         with contextlib.suppress(FileNotFoundError):
             return (self.path(entry) / entry.marker).read_bytes()
         return None
 
-    def entries(self, area: Area, job_id: str | None = None) -> list[Entry]:
+    def entries(self, area: Area, job_id: str | None = None) -> list[ShelfEntry]:
         return [entry for entry in self.folders(area, job_id) if self.holds(entry)]
 
     @disk_errors()
-    def folders(self, area: Area, job_id: str | None = None) -> list[Entry]:
+    def folders(self, area: Area, job_id: str | None = None) -> list[ShelfEntry]:
         """As entries(), with folders that lack their marker."""
         # Not by glob: Python keeps each pattern it has seen, and every job would be another.
         start = checked(job_id) if job_id is not None else ""
@@ -64,7 +64,9 @@ class LocalShelf:
         found = [self.path(entry) for entry in self.folders(area, job_id) if attempt in (None, entry.attempt)]
         files = sizes = 0
         for folder in found:
-            with contextlib.suppress(FileNotFoundError):  # its worker has just renamed it, or another purge removes it
+            with contextlib.suppress(
+                FileNotFoundError
+            ):  # its worker has just renamed it, or another process removes it
                 for path in (path for path in folder.rglob("*") if path.is_file()):
                     sizes += path.stat().st_size
                     files += 1
@@ -74,7 +76,7 @@ class LocalShelf:
             flush(self.data_dir / area)
         return Removed({str(area): files}, {str(area): sizes})
 
-    def drop_copy(self, entry: Entry) -> None:
+    def drop_copy(self, entry: ShelfEntry) -> None:
         """Nothing: what lies here is the entry itself."""
 
     @disk_errors()
@@ -93,7 +95,7 @@ class LocalShelf:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a file or a folder with all that is in it, as far as it is there."""
+    """Remove a file, or a folder with all that is in it; nothing if it is not there."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, onerror=_unless_gone)
     else:
@@ -107,6 +109,6 @@ def _remove_folder(folder: Path, marker: str) -> None:
 
 
 def _unless_gone(_: object, __: object, failure: tuple[type[BaseException], BaseException, object]) -> None:
-    """For rmtree: somebody else removing the same is no failure."""
+    """For rmtree: ignore what another process has removed meanwhile."""
     if not isinstance(failure[1], FileNotFoundError):
         raise failure[1]

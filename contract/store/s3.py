@@ -1,13 +1,13 @@
-"""A shelf in an S3 bucket, for many machines; the data directory holds copies of what is in use.
+"""A shelf in an S3 bucket, for many machines. The data directory holds copies of what is in use.
 
     s3://bucket/prefix/
     ├── spool/<job>/        as on disk; submission.json is written last and removed first: without it there is no clip
     ├── scenes/<job>.<n>/   as on disk; the same holds of manifest.json
     └── resume/<job>.<n>/   the state from which attempt n can be continued, put there when its worker released the job
 
-Address and credentials are the customary AWS_* variables (AWS_ENDPOINT_URL for a server that is not Amazon's). Uploads
-in progress stay with the service that receives them. A copy is shown only while its original is there, so that a
-purge on one machine holds on all.
+The customary AWS_* variables give address and credentials (AWS_ENDPOINT_URL for a server that is not Amazon's). Uploads
+in progress stay with the service that receives them. A copy is shown only while its original is there, so a purge on
+one machine takes effect on all.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from contract.store.shelf import (
     ABANDONED_AFTER_S,
     MARKERS,
     Area,
-    Entry,
     Removed,
+    ShelfEntry,
     checked,
     entry_of,
     new_job_id,
@@ -51,12 +51,12 @@ RETRIES = {"mode": "standard", "total_max_attempts": 2}
 LISTING_PAGE = 1000
 """How many objects S3 lists with one call."""
 
-BUCKET_REMEDY = "Look at INTRASPLAT_STORE_URL, the AWS_* variables and the bucket's own state."
+BUCKET_REMEDY = "Check INTRASPLAT_STORE_URL, the AWS_* variables and the bucket itself."
 
 
 @dataclass(frozen=True)
 class Stored:
-    """An object of the bucket; its key counts from the prefix."""
+    """An object of the bucket. Its key is without the prefix."""
 
     key: str
     size_bytes: int
@@ -64,14 +64,14 @@ class Stored:
 
 
 class Bucket:
-    """The few calls of S3 that a store needs, under one prefix.
+    """The calls of S3 that a shelf needs, under one prefix.
 
-    All, the constructor among them, raise UnavailableError when the bucket cannot be reached or refuses.
+    All methods and the constructor raise UnavailableError when the bucket cannot be reached or refuses.
     """
 
     def __init__(self, url: str) -> None:
         try:
-            s3fs = importlib.import_module("s3fs")  # only here: it is an extra, and slow to import
+            s3fs = importlib.import_module("s3fs")  # not at the top: an extra, and slow to import
         except ImportError as error:
             remedy = "pip install 'intrasplat[s3]'"
             raise UnavailableError("A store in a bucket needs the package s3fs.", remedy) from error
@@ -79,15 +79,15 @@ class Bucket:
         self._prefix = f"{prefix}/" if prefix else ""
         calls = {"connect_timeout": CONNECT_TIMEOUT_S, "read_timeout": READ_TIMEOUT_S, "retries": RETRIES}
         self._files: Any = s3fs.S3FileSystem(skip_instance_cache=True, use_listings_cache=False, config_kwargs=calls)
-        self._call("head_bucket")  # from here on, what is not found is an object
+        self._call("head_bucket")  # the bucket exists: from here on, "not found" means an object
 
     def put(self, path: Path, key: str) -> None:
-        """Store a file; it appears whole or not at all."""
+        """Upload a file; the object appears whole or not at all."""
         with _bucket_errors():
             self._files.put_file(str(path), self._path(key))
 
     def get(self, key: str, path: Path) -> None:
-        """Bring an object here."""
+        """Download an object."""
         with _bucket_errors():
             self._files.get_file(self._path(key), str(path))
 
@@ -104,7 +104,7 @@ class Bucket:
             return bool(self._files.exists(self._path(key)))
 
     def objects(self, start: str) -> list[Stored]:
-        """The objects whose keys begin so."""
+        """The objects whose keys begin with `start`."""
         found = []
         for page in self._pages("list_objects_v2", {"ContinuationToken": "NextContinuationToken"}, start):
             for each in page.get("Contents", ()):
@@ -113,7 +113,7 @@ class Bucket:
         return found
 
     def remove(self, start: str, first: str | None = None) -> Removed:
-        """Remove the objects whose keys begin so in every version the bucket keeps; those named `first` go first."""
+        """Remove all versions of the objects whose keys begin with `start`; those named `first` go first."""
         files, size_bytes = 0, 0
         markers = {"KeyMarker": "NextKeyMarker", "VersionIdMarker": "NextVersionIdMarker"}
         while True:
@@ -129,7 +129,7 @@ class Bucket:
                 self._call("delete_object", Key=each["Key"], VersionId=each["VersionId"])
 
     def _pages(self, method: str, markers: dict[str, str], start: str) -> Iterator[dict[str, Any]]:
-        """The pages of a listing; markers: which value of an answer is which argument for the next page."""
+        """The pages of a listing. markers: the next page's arguments, by the values of this page that they take."""
         arguments: dict[str, Any] = {"Prefix": self._prefix + start, "MaxKeys": LISTING_PAGE}
         while True:
             page = self._call(method, **arguments)
@@ -149,13 +149,13 @@ class Bucket:
 
 @contextlib.contextmanager
 def _bucket_errors() -> Iterator[None]:
-    """What S3 or the way to it refuses, as an UnavailableError."""
+    """Raise errors of S3 and of the connection to it as UnavailableError."""
     botocore: Any = importlib.import_module("botocore.exceptions")
     try:
         yield
     except (OSError, botocore.BotoCoreError, botocore.ClientError) as error:
         if isinstance(error, OSError) and error.errno in NO_ROOM:
-            raise  # of this machine's disk, where a copy was to be
+            raise  # this machine's disk has no room for the copy
         problem = f"The bucket does not answer ({type(error).__name__})."
         raise UnavailableError(problem, BUCKET_REMEDY, may_return=True) from error
 
@@ -166,10 +166,10 @@ class S3Shelf:
     def __init__(self, here: LocalShelf, url: str) -> None:
         self._here = here
         self._bucket = Bucket(url)
-        self._seen_s: dict[Entry, float] = {}
+        self._seen_s: dict[ShelfEntry, float] = {}
         """When, on the monotonic clock, an entry was last known to be there."""
 
-    def put(self, folder: Path, entry: Entry) -> None:
+    def put(self, folder: Path, entry: ShelfEntry) -> None:
         self._seen_s.pop(entry, None)
         try:
             self._bucket.remove(_key(entry), first=entry.marker)
@@ -182,7 +182,7 @@ class S3Shelf:
             raise
 
     @disk_errors()
-    def get(self, entry: Entry) -> Path | None:
+    def get(self, entry: ShelfEntry) -> Path | None:
         if not self.holds(entry):
             self._here.remove(entry.area, entry.job_id, entry.attempt)
             return None
@@ -193,7 +193,7 @@ class S3Shelf:
         os.utime(copy)  # tidy() sees that it is in use
         return copy
 
-    def holds(self, entry: Entry) -> bool:
+    def holds(self, entry: ShelfEntry) -> bool:
         if time.monotonic() < self._seen_s.get(entry, -SEEN_FOR_S) + SEEN_FOR_S:
             return True
         if not self._bucket.holds(_key(entry) + entry.marker):
@@ -201,10 +201,10 @@ class S3Shelf:
         self._seen_s[entry] = time.monotonic()
         return True
 
-    def read_marker(self, entry: Entry) -> bytes | None:
+    def read_marker(self, entry: ShelfEntry) -> bytes | None:
         return self._bucket.read(_key(entry) + entry.marker)
 
-    def entries(self, area: Area, job_id: str | None = None) -> list[Entry]:
+    def entries(self, area: Area, job_id: str | None = None) -> list[ShelfEntry]:
         start = f"{FOLDERS[area]}/{checked(job_id) if job_id is not None else ''}"
         names = [each.key.split("/") for each in self._bucket.objects(start)]
         found = [entry_of(area, name[1]) for name in names if name[2:] == [MARKERS[area]]]
@@ -213,13 +213,13 @@ class S3Shelf:
     def remove(self, area: Area, job_id: str, attempt: int | None = None) -> Removed:
         removed = Removed({}, {})
         if area in FOLDERS:
-            start = f"{FOLDERS[area]}/{checked(job_id)}" if attempt is None else _key(Entry(area, job_id, attempt))
+            start = f"{FOLDERS[area]}/{checked(job_id)}" if attempt is None else _key(ShelfEntry(area, job_id, attempt))
             removed = self._bucket.remove(start, first=MARKERS[area])
         for entry in [entry for entry in tuple(self._seen_s) if entry.job_id == job_id]:
             self._seen_s.pop(entry, None)
         return self._here.remove(area, job_id, attempt) + removed
 
-    def drop_copy(self, entry: Entry) -> None:
+    def drop_copy(self, entry: ShelfEntry) -> None:
         self._here.remove(entry.area, entry.job_id, entry.attempt)
 
     def tidy(self) -> None:
@@ -237,9 +237,9 @@ class S3Shelf:
                     if entry.name not in whole or self._here.path(entry).stat().st_mtime < then_s:
                         self._here.remove(entry.area, entry.job_id, entry.attempt)
 
-    def _fetch(self, entry: Entry) -> None:
+    def _fetch(self, entry: ShelfEntry) -> None:
         """Copy the entry to a folder aside, check it, and put it in its place on this machine."""
-        aside = self._here.path(Entry(Area.INCOMING, new_job_id()))
+        aside = self._here.path(ShelfEntry(Area.INCOMING, new_job_id()))
         aside.mkdir(mode=0o700)
         try:
             for each in self._bucket.objects(_key(entry)):
@@ -258,12 +258,12 @@ class S3Shelf:
             remove_tree(aside)
 
 
-def _key(entry: Entry) -> str:
+def _key(entry: ShelfEntry) -> str:
     """What the keys of the entry's files begin with."""
     return f"{FOLDERS[entry.area]}/{entry.name}/"
 
 
-def _files_to_put(folder: Path, entry: Entry) -> list[Path]:
+def _files_to_put(folder: Path, entry: ShelfEntry) -> list[Path]:
     """The files that a bucket keeps of the entry, the marker last."""
     if entry.area is Area.WORK:
         return [folder / entry.marker]
@@ -272,10 +272,10 @@ def _files_to_put(folder: Path, entry: Entry) -> list[Path]:
 
 
 def _check(folder: Path) -> None:
-    """Return if the files are those that the folder's manifest names, or it has none.
+    """Compare the files with the hashes in the folder's manifest, if it has one.
 
     Raises:
-        SceneError: one of them is not.
+        SceneError: a file is missing or differs.
     """
     if not (folder / MANIFEST).is_file():
         return

@@ -1,4 +1,4 @@
-"""The seam between the store and where it keeps things: `Shelf`, on the disk (local.py) or in a bucket (s3.py)."""
+"""Where a store keeps clips and scenes: `Shelf`, on the disk (local.py) or in a bucket (s3.py)."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def checked(job_id: str) -> str:
 
 
 @dataclass(frozen=True)
-class Entry:
+class ShelfEntry:
     """The name of a folder in the store; ValueError if job_id is none. attempt: of entries in WORK and SCENES only."""
 
     area: Area
@@ -72,13 +72,13 @@ class Entry:
         return MARKERS[self.area]
 
 
-def entry_of(area: Area, name: str) -> Entry | None:
+def entry_of(area: Area, name: str) -> ShelfEntry | None:
     """The entry whose folder has that name; None if the name is not one of ours."""
     job_id, dot, attempt = name.partition(".")
     numbered = area in (Area.WORK, Area.SCENES)
     if not is_job_id(job_id) or bool(dot) is not numbered or (numbered and not re.fullmatch(r"[0-9]{1,9}", attempt)):
         return None
-    return Entry(area, job_id, int(attempt) if numbered else None)
+    return ShelfEntry(area, job_id, int(attempt) if numbered else None)
 
 
 @dataclass(frozen=True)
@@ -102,14 +102,14 @@ class Shelf(Protocol):
     All methods raise UnavailableError when the disk or the bucket cannot do what is asked.
     """
 
-    def put(self, folder: Path, entry: Entry) -> None:
+    def put(self, folder: Path, entry: ShelfEntry) -> None:
         """Keep a folder of this machine as the entry, in place of an earlier one; the folder moves to path(entry).
 
         After an error the entry is not there, and the folder is where it was.
         """
         ...
 
-    def get(self, entry: Entry) -> Path | None:
+    def get(self, entry: ShelfEntry) -> Path | None:
         """The entry's folder on this machine, fetched if need be; None if there is no such entry.
 
         Raises:
@@ -117,15 +117,15 @@ class Shelf(Protocol):
         """
         ...
 
-    def holds(self, entry: Entry) -> bool:
+    def holds(self, entry: ShelfEntry) -> bool:
         """Whether the entry is there."""
         ...
 
-    def read_marker(self, entry: Entry) -> bytes | None:
+    def read_marker(self, entry: ShelfEntry) -> bytes | None:
         """The content of the entry's marker; None if there is no such entry."""
         ...
 
-    def entries(self, area: Area, job_id: str | None = None) -> list[Entry]:
+    def entries(self, area: Area, job_id: str | None = None) -> list[ShelfEntry]:
         """The entries of an area, of one job or of all, in the order of their names and attempts."""
         ...
 
@@ -133,7 +133,7 @@ class Shelf(Protocol):
         """Remove a job's entries in an area, also incomplete ones; only that of `attempt` if it is given."""
         ...
 
-    def drop_copy(self, entry: Entry) -> None:
+    def drop_copy(self, entry: ShelfEntry) -> None:
         """Say that this machine needs the entry no more; the entry itself stays."""
         ...
 

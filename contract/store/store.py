@@ -9,11 +9,12 @@
     ├── run/                sockets of live workers
     └── valkey/             the embedded queue's log
 
-A folder in spool/ or scenes/ is complete by its mere presence. Which attempt's scene is THE scene of a job, its record
-in the queue says; an attempt writes to and removes folders of its own number only, so that one that was thought dead
-can spoil nothing. The data directory is readable by its owner only.
+A folder in spool/ or scenes/ that is there is complete. The job's record in the queue says which attempt's scene is THE
+scene of the job. An attempt writes to and removes only folders of its own number, so a worker that was thought dead
+cannot damage another's. Only its owner can read the data directory.
 
-Every method raises UnavailableError when the disk is full (StoreFullError), read-only, missing or failing.
+Every method raises UnavailableError when the disk is full (StoreFullError), read-only, missing or failing, and when the
+bucket does not answer.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from contract.runtime.settings import Settings
 from contract.store.disk_errors import StoreFullError, disk_errors
 from contract.store.local import LocalShelf, remove_tree
 from contract.store.s3 import S3Shelf
-from contract.store.shelf import ABANDONED_AFTER_S, Area, Entry, Removed, Shelf, is_job_id, new_job_id
+from contract.store.shelf import ABANDONED_AFTER_S, Area, Removed, Shelf, ShelfEntry, is_job_id, new_job_id
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.names import RESUME, SUBMISSION
@@ -86,8 +87,8 @@ class Store:
         return folder
 
     def incoming_folder(self, job_id: str) -> Path:
-        """Where an upload lies, or lay."""
-        return self._here.path(Entry(Area.INCOMING, job_id))
+        """Where the upload of that id lies, or would lie."""
+        return self._here.path(ShelfEntry(Area.INCOMING, job_id))
 
     @disk_errors()
     def discard_incoming(self, job_id: str) -> None:
@@ -95,11 +96,11 @@ class Store:
         remove_tree(self.incoming_folder(job_id))
 
     def accept(self, record: JobRecord) -> None:
-        """Make an upload a clip of the spool; it survives a crash and a loss of power when this returns.
+        """Make an upload an accepted clip, which survives a crash and a loss of power when this returns.
 
-        After an error nothing is accepted, and the upload is still there, to be discarded.
+        After an error nothing is accepted, and the upload is still there.
         """
-        folder, clip = self.incoming_folder(record.job_id), Entry(Area.SPOOL, record.job_id)
+        folder, clip = self.incoming_folder(record.job_id), ShelfEntry(Area.SPOOL, record.job_id)
         with disk_errors():
             (folder / SUBMISSION).write_text(record.model_dump_json(indent=1))
         self._shelf.put(folder, clip)
@@ -112,24 +113,24 @@ class Store:
 
     def submission(self, job_id: str) -> JobRecord | None:
         """The record with which a clip was accepted; None if it is gone, or cannot be read as one."""
-        content = self._shelf.read_marker(Entry(Area.SPOOL, job_id))
+        content = self._shelf.read_marker(ShelfEntry(Area.SPOOL, job_id))
         with contextlib.suppress(ValidationError):
             return JobRecord.model_validate_json(content) if content is not None else None
         return None
 
     def spool_folder(self, job_id: str) -> Path:
-        """Where the job's clip lies, or lay, on this machine."""
-        return self._here.path(Entry(Area.SPOOL, job_id))
+        """Where the job's clip lies, or would lie, on this machine."""
+        return self._here.path(ShelfEntry(Area.SPOOL, job_id))
 
     def fetch_clip(self, job_id: str) -> Path:
-        """The folder with the job's clip, brought to this machine if need be.
+        """The folder with the job's clip, which is downloaded if need be.
 
         Raises:
             UnavailableError: there is no such clip.
         """
-        folder = self._shelf.get(Entry(Area.SPOOL, job_id))
+        folder = self._shelf.get(ShelfEntry(Area.SPOOL, job_id))
         if folder is None:
-            raise UnavailableError(f"The clip of job {job_id} is not there.", "It was purged: send it again.")
+            raise UnavailableError(f"The clip of job {job_id} is not there.", "It was purged. Send it again.")
         return folder
 
     # attempts
@@ -140,7 +141,7 @@ class Store:
         The folders of earlier attempts are removed; a later attempt's is not touched.
         """
         self._fetch_resume(job_id, attempt)
-        folder = self._here.path(Entry(Area.WORK, job_id, attempt))
+        folder = self._here.path(ShelfEntry(Area.WORK, job_id, attempt))
         with disk_errors():
             folder.mkdir(mode=0o700, exist_ok=True)
             for path in [path for path in folder.iterdir() if path.name != RESUME]:
@@ -155,60 +156,60 @@ class Store:
 
     def hand_over(self, job_id: str, attempt: int) -> None:
         """Let an attempt on any machine continue from this one's resume state; call it before releasing the job."""
-        entry = Entry(Area.WORK, job_id, attempt)
+        entry = ShelfEntry(Area.WORK, job_id, attempt)
         if self._here.holds(entry):
             self._shelf.put(self._here.path(entry), entry)
 
     def publish_scene(self, job_id: str, attempt: int) -> Path:
-        """Put what the attempt has made where finished scenes are looked for; may be repeated.
+        """Make the attempt's work folder its finished scene. May be repeated.
 
         Raises:
-            SceneError: the attempt has left nothing, because a later one removed it.
+            SceneError: there is no work folder, because a later attempt has removed it.
         """
-        work = self._here.path(Entry(Area.WORK, job_id, attempt))
+        work = self._here.path(ShelfEntry(Area.WORK, job_id, attempt))
         if work.is_dir():
-            self._shelf.put(work, Entry(Area.SCENES, job_id, attempt))
+            self._shelf.put(work, ShelfEntry(Area.SCENES, job_id, attempt))
         return self.scene_folder(job_id, attempt)
 
     def scene_folder(self, job_id: str, attempt: int) -> Path:
-        """The scene that one attempt has finished, brought to this machine if need be.
+        """The folder of the attempt's finished scene, which is downloaded if need be.
 
         Raises:
             SceneError: there is none, or the bucket's is damaged.
         """
-        folder = self._shelf.get(Entry(Area.SCENES, job_id, attempt)) if is_job_id(job_id) else None
+        folder = self._shelf.get(ShelfEntry(Area.SCENES, job_id, attempt)) if is_job_id(job_id) else None
         if folder is None:
             raise SceneError(f"There is no scene {job_id[:40]!r}.")
         return folder
 
     def has_scene(self, job_id: str, attempt: int) -> bool:
         """Whether the attempt's scene is there."""
-        return self._shelf.holds(Entry(Area.SCENES, job_id, attempt))
+        return self._shelf.holds(ShelfEntry(Area.SCENES, job_id, attempt))
 
     def scene_attempts(self, job_id: str) -> list[int]:
-        """The attempts whose scenes are there; more than one only until the last is reported and tidies up."""
+        """The attempts whose scenes are there. There may be several until remove_other_attempts()."""
         return [entry.attempt for entry in self._shelf.entries(Area.SCENES, job_id) if entry.attempt is not None]
 
     def published_attempt(self, job_id: str) -> int | None:
-        """The last attempt whose scene is there, for a record that was lost; None if there is no scene."""
+        """The last attempt whose scene is there; None if there is no scene. For a job whose record was lost."""
         return max(self.scene_attempts(job_id), default=None)
 
     def remove_attempt(self, job_id: str, attempt: int) -> None:
-        """Remove what one attempt has written, also if it is in place and its report was refused."""
+        """Remove all that one attempt has written, its published scene included."""
         for area in (Area.WORK, Area.SCENES):
             self._shelf.remove(area, job_id, attempt)
 
     def remove_other_attempts(self, job_id: str, attempt: int) -> None:
-        """Remove all work on the job, and scenes other than that of the attempt, whose report was accepted."""
+        """Remove all work on the job and all scenes but that of the attempt, which the queue has accepted."""
         self._shelf.remove(Area.WORK, job_id)
         for other in {*self._shelf.entries(Area.SCENES, job_id), *self._here.folders(Area.SCENES, job_id)}:
             if other.attempt != attempt:
                 self._shelf.remove(Area.SCENES, job_id, other.attempt)
-        self._shelf.drop_copy(Entry(Area.SPOOL, job_id))
+        self._shelf.drop_copy(ShelfEntry(Area.SPOOL, job_id))
 
     @disk_errors()
     def scratch_folder(self, worker_name: str) -> Path:
-        """Where one worker unpacks clips, emptied of what an earlier process of that name left."""
+        """An empty folder in which a worker unpacks clips; what an earlier process of that name left is removed."""
         folder = self.data_dir / Area.WORK / f"tmp-{worker_name}"
         remove_tree(folder)
         folder.mkdir(mode=0o700)
@@ -217,9 +218,9 @@ class Store:
     # removal
 
     def purge(self, job_id: str) -> Removed:
-        """Remove clip, work and scenes of a job, and make sure that nothing of it is left; may be repeated.
+        """Remove clip, work and scenes of a job, and check that nothing is left. May be repeated.
 
-        In a bucket every version goes. Other machines show their copies no more, and remove them in time.
+        A bucket loses every version. Other machines stop showing their copies within seconds, and remove them later.
 
         Raises:
             UnavailableError: something could not be removed.
@@ -229,7 +230,7 @@ class Store:
             removed += self._shelf.remove(area, job_id)
         left = sum(len(self._here.folders(area, job_id)) for area in Area)
         if left:
-            raise UnavailableError(f"{left} folders of job {job_id} could not be removed.", "Ask for it once more.")
+            raise UnavailableError(f"{left} folders of job {job_id} could not be removed.", "Purge it once more.")
         return removed
 
     def tidy(self) -> None:
