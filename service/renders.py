@@ -175,8 +175,9 @@ def image_response(scene_id: str, answer: Answer) -> Response:
     if head.iteration is not None:
         headers["X-Intrasplat-Iteration"] = str(head.iteration)
     if head.warnings:
-        text = "; ".join(head.warnings)
+        text = "; ".join(each.text for each in head.warnings)
         headers["X-Intrasplat-Warning"] = " ".join(text.encode("ascii", "replace").decode().split())
+        headers["X-Intrasplat-Warning-Codes"] = ", ".join(each.code for each in head.warnings)
     return Response(answer.body, media_type=head.media_type, headers=headers)
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ValidationError
@@ -18,6 +17,7 @@ from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.names import CURVE, REPORT
 from contract.wire.rendering import ExportName, ExportRequest
+from contract.wire.report import Report
 from service.access import Caller
 from service.deps import AnyCaller, Deps, ListingLimit, Services, no_such_scene, owned_scene
 from service.problems import Problem
@@ -46,7 +46,7 @@ def list_scenes(services: Services, caller: AnyCaller, limit: ListingLimit = MAX
 
 
 @router.get("/{scene_id}", operation_id="get_scene")
-async def get_scene(scene_id: str, services: Services, caller: AnyCaller) -> dict[str, Any]:
+async def get_scene(scene_id: str, services: Services, caller: AnyCaller) -> Report:
     """The scene's quality report: held-out quality, what was assumed, warnings."""
     caller.require(KeyScope.VIEW)
     record = await run_in_threadpool(finished_job, services, caller, scene_id)
@@ -122,24 +122,14 @@ def _summary(services: Deps, record: JobRecord) -> SceneSummary:
     scene_id = record.job_id
     links = {"report": f"/scenes/{scene_id}", "render": f"/render?scene={scene_id}"}
     try:
-        quality_db = _report(services, record).get("psnr_tissue_db")
-        return SceneSummary(id=scene_id, psnr_tissue_db=quality_db, links=links)
+        return SceneSummary(id=scene_id, psnr_tissue_db=_report(services, record).psnr_tissue_db, links=links)
     except SceneError as error:
         return SceneSummary(id=scene_id, error=str(error), links=links)
-    except ValidationError:
-        return SceneSummary(id=scene_id, error="The report of this scene holds no quality.", links=links)
 
 
-def _report(services: Deps, record: JobRecord) -> dict[str, Any]:
+def _report(services: Deps, record: JobRecord) -> Report:
     path = services.store.scene_folder(record.job_id, record.attempt) / REPORT
     try:
-        report = json.loads(path.read_text(), parse_constant=_refuse)
-    except (OSError, ValueError) as error:
+        return Report.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
         raise SceneError(f"The report of scene {record.job_id} cannot be read ({type(error).__name__}).") from error
-    if not isinstance(report, dict):
-        raise SceneError(f"The report of scene {record.job_id} is not a JSON object.")
-    return report
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no number of JSON's")

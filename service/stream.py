@@ -27,6 +27,7 @@ from starlette.types import Message
 
 from contract.access.keys import KeyScope
 from contract.wire.job import JobState
+from contract.wire.notices import Notice
 from service.access import Caller, Refusal, key_missing
 from service.connection import Answer
 from service.deps import Deps, EarlyCaller, Services, address_of
@@ -69,7 +70,7 @@ class StreamHead(BaseModel):
     state: JobState
     t: float
     iteration: int | None
-    warnings: tuple[str, ...]
+    warnings: tuple[Notice, ...]
     media_type: str
     render_ms: float
     total_ms: float

@@ -8,14 +8,13 @@ without torch.
 from __future__ import annotations
 
 import argparse
-import json
 import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any, get_args
+from typing import get_args
 
 from pydantic import ValidationError
 
@@ -26,9 +25,10 @@ from contract.runtime.processes import told_to_end
 from contract.runtime.progress_bar import ProgressBar
 from contract.runtime.settings import Settings
 from contract.wire.errors import Cancelled, InputError, IntrasplatError, UnavailableError
-from contract.wire.names import MANIFEST, REPORT, DeviceName
+from contract.wire.names import MANIFEST, DeviceName
 from contract.wire.options import ReconstructionOptions
 from contract.wire.rendering import ImageFormat, IntrinsicsOverride, Layer
+from contract.wire.report import Report
 
 SUFFIX_FORMATS = {
     ".png": ImageFormat.PNG,
@@ -178,7 +178,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     try:
         with ProgressBar(sys.stderr) as bar:
             hooks = TrainingHooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
-            reconstruct(request, out, hooks)
+            report = reconstruct(request, out, hooks)
     except Cancelled as error:
         again = " The same command goes on from there." if (out / RESUME_FILE).exists() else ""
         raise Cancelled(f"{error}{again}") from error
@@ -187,7 +187,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
             signal.signal(number, handler)
         if is_new and not any(out.iterdir()):
             out.rmdir()
-    _print_report(json.loads((out / REPORT).read_text()), out)
+    _print_report(report, out)
     return ExitCode.OK
 
 
@@ -201,12 +201,12 @@ def _once(event: threading.Event) -> Callable[[int, FrameType | None], None]:
     return handle
 
 
-def _print_report(report: dict[str, Any], out: Path) -> None:
-    quality = report["psnr_tissue_db"]
+def _print_report(report: Report, out: Path) -> None:
+    quality = report.psnr_tissue_db
     shown = "not measured (no frames were held out)" if quality is None else f"{quality:.2f} dB on held-out frames"
     print(f"scene: {out}\npsnr_tissue: {shown}")
-    for warning in report["warnings"]:
-        print(f"warning: {warning}")
+    for notice in report.warnings:
+        print(f"{notice.severity}: {notice.text}")
 
 
 def _render(options: argparse.Namespace) -> int:
@@ -233,7 +233,7 @@ def _render(options: argparse.Namespace) -> int:
         path.write_bytes(encode_layer(frame, Layer(options.layer), image_format))
         print(path)
         for warning in frame.warnings:
-            print(f"warning: {warning}", file=sys.stderr)
+            print(f"{warning.severity}: {warning.text}", file=sys.stderr)
     return ExitCode.OK
 
 

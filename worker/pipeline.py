@@ -15,6 +15,7 @@ import torch
 
 from contract.wire.errors import Cancelled
 from contract.wire.names import CURVE, REPORT
+from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import Report
 from worker.input.calibration import rectify
 from worker.input.clip import DepthClip, held_out_frames, split_frames
@@ -214,21 +215,23 @@ def _training(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Train
         scene_bytes=scene.file_bytes,
         units_per_mm=scene.units_per_mm,
         seconds=run.setup.timings.seconds,
-        assumptions=(*run.chosen, *run.schedule.words, *(quantized.words if quantized else ())),
+        assumptions=(*run.chosen, *run.schedule.notices, *(quantized.notices if quantized else ())),
         measurements=quantized.measurements if quantized else {},
         warnings=_warnings(run),
         versions={"python": platform.python_version(), **{name: version(name) for name in VERSIONED}},
     )
 
 
-def _warnings(run: Run) -> tuple[str, ...]:
+def _warnings(run: Run) -> tuple[Notice, ...]:
     """The warnings of the run itself."""
-    said = []
+    found = []
     if run.setup.fixed_iterations is None and run.schedule.planned == run.schedule.epoch:
-        said.append("The time given allowed less than one step a training frame; one a frame was made all the same.")
+        text = "The time given allowed less than one step a training frame; one a frame was made all the same."
+        found.append(Notice.warning(NoticeCode.TIME_TOO_SHORT, text))
     if run.setup.gpu_is_idle:
-        said.append(f"The motion of preset {run.preset.name} trains on the CPU only, so the GPU was left idle.")
-    return tuple(said)
+        text = f"The motion of preset {run.preset.name} trains on the CPU only, so the GPU was left idle."
+        found.append(Notice.warning(NoticeCode.GPU_IDLE, text))
+    return tuple(found)
 
 
 def publish(out_dir: Path, run: Run, scene: Scene, report: Report) -> None:

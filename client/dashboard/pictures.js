@@ -17,14 +17,13 @@ async function renderOnce(view, signal) {
   const response = await request(`/render?${new URLSearchParams(view)}`, { signal });
   const header = (name) => response.headers.get(`X-Intrasplat-${name}`);
   const total = /total;dur=([\d.]+)/.exec(response.headers.get("Server-Timing") ?? "");
-  const warning = header("Warning");
   return {
     blob: await response.blob().catch(() => Promise.reject(connectionLost())),
     scene: header("Scene"),
     state: header("State"),
     t: Number(header("T")),
     iteration: header("Iteration") === null ? null : Number(header("Iteration")),
-    warnings: warning ? warning.split("; ") : [],
+    warning: header("Warning") ?? "",
     totalMs: total ? Number(total[1]) : NaN,
     way: "single pictures",
   };

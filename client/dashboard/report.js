@@ -8,7 +8,7 @@ const share = (value) => (Number.isFinite(value) ? `${Math.round(value * 100)} %
 
 /**
  * What copying neighbouring frames reaches, by name.
- * @param {Record<string, any>} report
+ * @param {import("./wire.js").Report} report
  * @returns {{name: string, db: number}[]}
  */
 export function baselinesOf(report) {
@@ -33,7 +33,7 @@ function verdict(report) {
   const best = Math.max(...baselinesOf(report).map(({ db }) => db));
   if (!Number.isFinite(report.psnr_tissue_db)) return "Its likeness is not known: trust nothing but its looks.";
   if (report.psnr_tissue_db <= best) return "Between the frames it is no better than copying them.";
-  const count = report.warnings?.length ?? 0;
+  const count = report.warnings.filter(isWarning).length;
   if (count === 0) return "Measured; nothing to distrust was found.";
   return `Measured, with ${count === 1 ? "a warning" : `${count} warnings`}; read on.`;
 }
@@ -54,9 +54,12 @@ function rows(report) {
   ].filter(([, text]) => text !== null);
 }
 
-function list(title, texts, kind) {
-  if (!texts?.length) return [];
-  const items = texts.map((text) => element("li", { text }));
+/** @param {import("./wire.js").Notice} notice */
+const isWarning = (notice) => notice.severity === "warning";
+
+function list(title, notices, kind) {
+  if (notices.length === 0) return [];
+  const items = notices.map(({ text }) => element("li", { text }));
   return [element("dt", { text: title }), element("dd", {}, element("ul", { class: kind }, ...items))];
 }
 
@@ -76,13 +79,14 @@ async function download(id, message) {
 /**
  * @param {HTMLElement} target
  * @param {string} id
- * @param {Record<string, any>} report
+ * @param {import("./wire.js").Report} report
  */
 export function showReport(target, id, report) {
   const lines = element("dl");
   lines.append(element("dt", { text: "How far to trust it" }));
   lines.append(element("dd", { class: "verdict", text: verdict(report) }));
-  lines.append(...list("Warnings", report.warnings, "warning"));
+  lines.append(...list("Warnings", report.warnings.filter(isWarning), "warning"));
+  lines.append(...list("Good to know", report.warnings.filter((notice) => !isWarning(notice)), ""));
   for (const [title, text] of rows(report)) lines.append(element("dt", { text: title }), element("dd", { text }));
   lines.append(...list("Assumed", report.assumptions, ""));
   const message = element("p", { class: "message bad" });

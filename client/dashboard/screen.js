@@ -66,8 +66,7 @@ export class Screen {
     this.badge.hidden = badge === "";
     setText(this.message, message);
     this.message.hidden = message === "";
-    const warnings = state === "stale" ? [] : (this.shown?.warnings ?? []);
-    setText(this.warning, warnings.join(" "));
+    setText(this.warning, state === "stale" ? "" : (this.shown?.warning ?? ""));
   }
 
   /** @returns {[string, string, string]} state, badge, message over the picture */
@@ -79,7 +78,7 @@ export class Screen {
       return ["stale", "STALE", `Last picture ${clockTime(this.shownAt)}. ${reason} Reconnecting.`];
     }
     if (this.shown.state === "running") return ["training", `TRAINING, iteration ${this.shown.iteration}`, ""];
-    return this.shown.warnings.length > 0 ? ["extrapolated", "EXTRAPOLATED", ""] : ["live", "CURRENT", ""];
+    return this.shown.warning !== "" ? ["extrapolated", "EXTRAPOLATED", ""] : ["live", "CURRENT", ""];
   }
 }
 

@@ -10,7 +10,7 @@ import { connectionLost, Problem } from "./problem.js";
 /**
  * What came.
  * @typedef {{blob: Blob, scene: string, state: "running"|"done", t: number, iteration: number | null,
- *   warnings: string[], totalMs: number, way: string}} Picture
+ *   warning: string, totalMs: number, way: string}} Picture
  */
 
 const LENGTH_BYTES = 4;
@@ -82,7 +82,8 @@ export class Stream {
     const { resolve } = this.pending;
     this.pending = null;
     const { scene, state, t, iteration, warnings, total_ms: totalMs } = head;
-    resolve({ blob, scene, state, t, iteration, warnings, totalMs, way: "stream" });
+    const warning = warnings.map(({ text }) => text).join(" ");
+    resolve({ blob, scene, state, t, iteration, warning, totalMs, way: "stream" });
   }
 
   #fail(problem) {

@@ -25,6 +25,77 @@ class JobState(StrEnum):
     CANCELLED = "cancelled"
 
 
+class NoticeCode(StrEnum):
+    """The kind of a notice. Two notices of one code differ in their numbers and names only."""
+
+    BASELINE = "baseline"
+    CALIBRATION = "calibration"
+    DECODING = "decoding"
+    DEPTH_UNIT = "depth_unit"
+    FRAME_TIMES = "frame_times"
+    INTRINSICS = "intrinsics"
+    LAYOUT = "layout"
+    MASKS = "masks"
+    MIDDLE_LINE_UNUSED = "middle_line_unused"
+    POSES = "poses"
+    RECTIFICATION = "rectification"
+    SYNTHETIC = "synthetic"
+    BASES = "bases"
+    EARLY_STOPPING = "early_stopping"
+    SPACING = "spacing"
+    STORED_PRECISION = "stored_precision"
+    ALIGNMENT_UNKNOWN = "alignment_unknown"
+    BLOOD = "blood"
+    BLURRED_FRAMES = "blurred_frames"
+    BRIGHTNESS_CHANGES = "brightness_changes"
+    COLOUR_CHANGES = "colour_changes"
+    DEPTH_JUMPS = "depth_jumps"
+    DEPTH_UNUSUAL = "depth_unusual"
+    FEW_FRAMES = "few_frames"
+    FRAMES_WITHOUT_TISSUE = "frames_without_tissue"
+    FRAME_COUNT_UNKNOWN = "frame_count_unknown"
+    HIDDEN_AT_FIRST = "hidden_at_first"
+    LITTLE_DEPTH = "little_depth"
+    LITTLE_STEREO_DEPTH = "little_stereo_depth"
+    LITTLE_TISSUE = "little_tissue"
+    MAGNIFIED = "magnified"
+    MASKS_MARK_NOTHING = "masks_mark_nothing"
+    MASK_GAPS = "mask_gaps"
+    NO_INSTRUMENT_MASKED = "no_instrument_masked"
+    NO_TEXTURE = "no_texture"
+    OUT_OF_FOCUS = "out_of_focus"
+    POSE_JITTER = "pose_jitter"
+    REPEATED_FRAMES = "repeated_frames"
+    ROWS_MISALIGNED = "rows_misaligned"
+    STEREO_UNSURE = "stereo_unsure"
+    VEILED = "veiled"
+    COPYING_SCORES_MORE = "copying_scores_more"
+    DEPTH_DISAGREES = "depth_disagrees"
+    DEPTH_NOT_COMPARED = "depth_not_compared"
+    GENERALISATION_GAP = "generalisation_gap"
+    GPU_IDLE = "gpu_idle"
+    HELD_OUT_REPEATED = "held_out_repeated"
+    HELD_OUT_SCORE_LOW = "held_out_score_low"
+    HELD_OUT_WITHOUT_TISSUE = "held_out_without_tissue"
+    HOLES = "holes"
+    NOTHING_HELD_OUT = "nothing_held_out"
+    OUTLIER_FRAMES = "outlier_frames"
+    TIME_TOO_SHORT = "time_too_short"
+    TRAINING_SCORE_LOW = "training_score_low"
+    HARDLY_SEEN = "hardly_seen"
+    POSE_FAR = "pose_far"
+    TIME_OUTSIDE_CLIP = "time_outside_clip"
+    TRAINING_GOES_ON = "training_goes_on"
+    UNCLASSIFIED = "unclassified"
+
+
+class Severity(StrEnum):
+    """info: good to know; warning: a reason to distrust the result."""
+
+    INFO = "info"
+    WARNING = "warning"
+
+
 class FrameScore(Model):
     """One held-out frame: the model's scores beside those of copying its neighbours. None: no tissue to judge."""
 
@@ -96,6 +167,14 @@ class JobView(Model):
     links: dict[str, str]
 
 
+class Notice(Model):
+    """One thing to know about a scene or a picture."""
+
+    code: Annotated[NoticeCode | str, Field(union_mode="left_to_right")]
+    severity: Annotated[Severity | str, Field(union_mode="left_to_right")]
+    text: str
+
+
 class Report(Model):
     """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why.
 
@@ -104,7 +183,7 @@ class Report(Model):
     not exceed the two baselines, copying the neighbouring frames would have served as well.
     """
 
-    report_version: int = 1
+    report_version: int = 2
     notice: str = "Research use only. Not a medical device; it must not guide treatment."
     versions: dict[str, str] = Field(default={})
     """of intrasplat and what it computes with"""
@@ -122,9 +201,9 @@ class Report(Model):
     train_psnr_tissue_db: float | None
     """psnr_tissue_db over some training frames, to compare"""
     frames: tuple[FrameScore, ...] = ()
-    warnings: tuple[str, ...]
-    """what to distrust, in plain words; empty if nothing was found"""
-    assumptions: tuple[str, ...]
+    warnings: tuple[Notice, ...]
+    """what to distrust; empty if nothing was found"""
+    assumptions: tuple[Notice, ...]
     """what was taken for granted about the input"""
     measurements: dict[str, float] = Field(default={})
     """of the input, such as its misalignment in px"""

@@ -119,7 +119,7 @@ def image_of_message(message: bytes | str) -> tuple[object, Image | IntrasplatEr
             t=head["t"],
             state=head["state"],
             iteration=head["iteration"],
-            warning="; ".join(head["warnings"]) or None,
+            warning="; ".join(each["text"] for each in head["warnings"]) or None,
             render_ms=head["render_ms"],
         )
         return head["id"], image

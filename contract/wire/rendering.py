@@ -13,6 +13,7 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.job import JOB_ID_PATTERN
+from contract.wire.notices import Notice
 from contract.wire.pose import MatrixPose, OrbitPose
 
 
@@ -116,7 +117,7 @@ class WorkerReply(BaseModel):
     error: ReplyError | None = None
     media_type: str = "application/octet-stream"
     t: float = 0.0
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     iteration: int | None = None
     """Of the snapshot that is shown; None: the scene is finished."""
     render_ms: float = 0.0

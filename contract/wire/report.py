@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from collections.abc import Iterable
 
-REPORT_VERSION = 1
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+
+from contract.wire.notices import Notice, NoticeCode, Severity
+
+REPORT_VERSION = 2
 """Raised when a field changes its meaning; new fields do not raise it."""
 RESEARCH_USE = "Research use only. Not a medical device; it must not guide treatment."
 
@@ -47,8 +51,8 @@ class Report(BaseModel):
     train_psnr_tissue_db: float | None = Field(description="psnr_tissue_db over some training frames, to compare")
     frames: tuple[FrameScore, ...] = ()
 
-    warnings: tuple[str, ...] = Field(description="what to distrust, in plain words; empty if nothing was found")
-    assumptions: tuple[str, ...] = Field(description="what was taken for granted about the input")
+    warnings: tuple[Notice, ...] = Field(description="what to distrust; empty if nothing was found")
+    assumptions: tuple[Notice, ...] = Field(description="what was taken for granted about the input")
     measurements: dict[str, float] = Field(default={}, description="of the input, such as its misalignment in px")
 
     preset: str
@@ -69,3 +73,18 @@ class Report(BaseModel):
     held_out: tuple[int, ...]
     repeated: tuple[int, ...] = Field(description="frames in neither set, because they repeat a held-out one")
     frame_times_s: tuple[float, ...]
+
+    @field_validator("report_version")
+    @classmethod
+    def _as_it_is_read(cls, written: int) -> int:
+        return max(written, REPORT_VERSION)
+
+    @field_validator("warnings", "assumptions", mode="before")
+    @classmethod
+    def _of_plain_text(cls, notices: object, info: ValidationInfo) -> object:
+        """Reports of version 1 hold texts without codes."""
+        if not isinstance(notices, Iterable) or isinstance(notices, str):
+            return notices
+        severity = Severity.WARNING if info.field_name == "warnings" else Severity.INFO
+        plain = {"code": NoticeCode.UNCLASSIFIED, "severity": severity}
+        return tuple(plain | {"text": each} if isinstance(each, str) else each for each in notices)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from pathlib import Path
@@ -12,6 +11,7 @@ from contract.runtime.settings import Settings
 from contract.wire.job import JobProgress
 from contract.wire.names import MANIFEST, REPORT
 from tests.chaos.points import Point, reach
+from tests.reports import REPORT_OF_A_SCENE
 from worker.daemon.channel import Channel, Orders, Task
 from worker.daemon.orders import Advanced, Finished, Ready, Stopped
 
@@ -45,7 +45,7 @@ def _train(task: Task, channel: Channel) -> Finished | Stopped:
 
 
 def _write_scene(out: Path) -> None:
-    (out / REPORT).write_text(json.dumps({"psnr_tissue_db": 36.2, "warnings": []}))
+    (out / REPORT).write_text(REPORT_OF_A_SCENE.model_dump_json())
     (out / MANIFEST).write_text("{}")
 
 

@@ -23,42 +23,14 @@ from contract.store.store import Store
 from contract.wire.job import JobError
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
-from contract.wire.report import Report
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
+from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.serve import Reply, RequestServer
 
 CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
 SNAPSHOT_ITERATION = 7
-REPORT_OF_A_SCENE = Report(
-    psnr_tissue_db=36.2,
-    psnr_paper_db=37.0,
-    ssim=0.95,
-    baseline_blend_db=30.0,
-    baseline_flow_db=None,
-    depth_agreement_mm=0.5,
-    coverage=0.99,
-    train_psnr_tissue_db=37.5,
-    warnings=(),
-    assumptions=(),
-    preset="fast",
-    seed=0,
-    device="cpu",
-    iterations=30,
-    seconds={"t_train_s": 1.0},
-    gaussians=1000,
-    bases=17,
-    scene_bytes=10_000,
-    units_per_mm=1.0,
-    width=6,
-    height=4,
-    frame_count=12,
-    train_count=10,
-    held_out=(1, 9),
-    repeated=(),
-    frame_times_s=tuple(each / 12 for each in range(12)),
-)
 
 
 def paint(request: RenderRequest | ExportRequest) -> Reply:
@@ -68,7 +40,7 @@ def paint(request: RenderRequest | ExportRequest) -> Reply:
     buffer = io.BytesIO()
     np.save(buffer, np.full((4, 6), request.t, np.float32))
     iteration = SNAPSHOT_ITERATION if request.attempt is None else None
-    return Reply(buffer.getvalue(), MEDIA_TYPES[request.format], request.t, ("seen from afar",), iteration)
+    return Reply(buffer.getvalue(), MEDIA_TYPES[request.format], request.t, (a_warning("seen from afar"),), iteration)
 
 
 class LocalService:

@@ -30,11 +30,13 @@ from contract.runtime.settings import Settings
 from contract.store.store import Store, new_job_id
 from contract.wire.job import JobFiles, JobProgress, JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
+from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import OrbitPose
 from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
+from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.serve import Reply, RequestServer
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -44,10 +46,18 @@ WORKER = "worker-1"
 SNAPSHOT_ITERATION = 40
 FAR_DEG = 25.0
 FAR = "This pose is far from the endoscope's: most of it is a guess."
-REPORT_TEXT = (
-    '{"psnr_tissue_db": 31.2, "baseline_blend_db": 29.0, "baseline_flow_db": 29.5, "coverage": 0.97,'
-    ' "depth_agreement_mm": 0.8, "gaussians": 31000, "warnings": ["The clip is short."],'
-    ' "assumptions": ["Bright in the masks is the instrument."], "seconds": {"t_train_s": 12.5}}'
+REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
+    update={
+        "psnr_tissue_db": 31.2,
+        "baseline_blend_db": 29.0,
+        "baseline_flow_db": 29.5,
+        "coverage": 0.97,
+        "depth_agreement_mm": 0.8,
+        "gaussians": 31000,
+        "warnings": (a_warning("The clip is short."),),
+        "assumptions": (Notice.info(NoticeCode.MASKS, "Bright in the masks is the instrument."),),
+        "seconds": {"t_train_s": 12.5},
+    }
 )
 
 
@@ -70,7 +80,13 @@ class Painter:
         is_far = isinstance(request.pose, OrbitPose) and abs(request.pose.yaw_deg) > FAR_DEG
         image = cv2.imencode(f".{request.format.value}", picture)[1].tobytes()
         iteration = SNAPSHOT_ITERATION if request.attempt is None else None
-        return Reply(image, MEDIA_TYPES[request.format], request.t, (FAR,) if is_far else (), iteration)
+        return Reply(
+            image,
+            MEDIA_TYPES[request.format],
+            request.t,
+            (a_warning(FAR, NoticeCode.POSE_FAR),) if is_far else (),
+            iteration,
+        )
 
 
 class Site:
@@ -126,7 +142,7 @@ class Site:
     def finish(self, claim: Claim) -> str:
         folder = self.store.work_folder(claim.job_id, claim.attempt)
         (folder / MANIFEST).write_text("{}")
-        (folder / REPORT).write_text(REPORT_TEXT)
+        (folder / REPORT).write_text(REPORT_OF_THE_PAGE.model_dump_json())
         (folder / CURVE).write_text("t_train_s,iteration,psnr_tissue_db\n1,10,27\n2,50,30\n3,100,31.2\n")
         self.store.publish_scene(claim.job_id, claim.attempt)
         assert self.queue.finish(claim)

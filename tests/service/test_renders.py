@@ -18,6 +18,8 @@ from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.names import MANIFEST, REPORT
 from contract.wire.rendering import RenderRequest, WorkerAddress, WorkerReply
+from contract.wire.report import Report
+from tests.reports import REPORT_OF_A_SCENE
 from tests.service.under_test import IDENTITY, ServiceUnderTest, assert_problem, running_service
 
 
@@ -44,6 +46,7 @@ def test_warnings_of_a_render_come_as_a_header(service: ServiceUnderTest) -> Non
     response = service.http.get("/render", params={"t": 2, "pose": IDENTITY})
     assert response.headers["x-intrasplat-t"] == "1"
     assert response.headers["x-intrasplat-warning"].startswith("t is after the last frame; ansicht")
+    assert response.headers["x-intrasplat-warning-codes"] == "time_outside_clip, unclassified"
 
 
 def test_the_scene_may_be_left_out_only_while_there_is_exactly_one(service: ServiceUnderTest) -> None:
@@ -255,7 +258,7 @@ def test_a_job_that_ends_while_it_is_asked_for_is_shown_as_its_scene(tmp_path: P
 def test_scenes_have_report_curve_and_export_until_they_are_deleted(service: ServiceUnderTest) -> None:
     scene = service.finished_scene()
     assert service.http.get("/scenes").json()[0]["psnr_tissue_db"] == 36.2
-    assert service.http.get(f"/scenes/{scene}").json()["warnings"] == []
+    assert Report.model_validate(service.http.get(f"/scenes/{scene}").json()) == REPORT_OF_A_SCENE
     assert service.http.get(f"/scenes/{scene}/curve").text.startswith("t_train_s")
     exported = service.http.get(f"/scenes/{scene}/export", params={"format": "ply", "t": 0.5})
     assert exported.content == b"ply\n"

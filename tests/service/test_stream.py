@@ -16,6 +16,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
 from contract.wire.rendering import ExportRequest, RenderRequest
+from tests.reports import a_warning
 from tests.service.live import LiveService, live_service
 from worker.daemon.serve import NotYetError, Reply
 
@@ -42,7 +43,10 @@ class Painter:
         if request.t == 600:
             raise RuntimeError("patient Smith")
         iteration = 7 if request.attempt is None else None
-        return Reply(b"\xff" * self.bytes, "image/jpeg", request.t, ("look out",), iteration)
+        return Reply(b"\xff" * self.bytes, "image/jpeg", request.t, (LOOK_OUT,), iteration)
+
+
+LOOK_OUT = a_warning("look out")
 
 
 @pytest.fixture
@@ -96,7 +100,7 @@ def test_one_connection_shows_a_finished_scene_and_a_running_job(service: LiveSe
             "state": "done",
             "t": 0.5,
             "iteration": None,
-            "warnings": ["look out"],
+            "warnings": [LOOK_OUT.model_dump()],
             "media_type": "image/jpeg",
         }
         ask(viewer, scene=job_id, id=2)

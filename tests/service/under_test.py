@@ -17,15 +17,20 @@ from contract.store.store import Store
 from contract.wire.errors import InputError, SceneError
 from contract.wire.job import JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
+from contract.wire.notices import NoticeCode
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
+from tests.reports import REPORT_OF_A_SCENE, a_warning
 from tests.service.asgi import AsgiClient, serving
 from worker.daemon.serve import Reply, RequestServer
 
 CLIP = (Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4").read_bytes()
 EMPTY_ZIP = b"PK\x05\x06" + bytes(18)
 IDENTITY = "1,0,0,0,0,1,0,0,0,0,1,0"
+
+
+AFTER_THE_END = a_warning("t is after the last frame", NoticeCode.TIME_OUTSIDE_CLIP)
 
 
 def another_clip(mark: bytes) -> bytes:
@@ -49,7 +54,7 @@ class Painter:
             raise SceneError("The scene is damaged.")
         if request.camera.width == 10:
             raise RuntimeError("patient Smith")
-        warnings = ("t is after the last frame", "ansicht – geschätzt") if request.t > 1 else ()
+        warnings = (AFTER_THE_END, a_warning("ansicht – geschätzt")) if request.t > 1 else ()
         iteration = 7 if request.attempt is None else None
         media_type, shown_t = f"image/{request.format.value}", min(request.t, 1.0)
         return Reply(request.format.value.encode(), media_type, shown_t, warnings, iteration)
@@ -83,7 +88,7 @@ class ServiceUnderTest:
         record, claim = self.claimed()
         folder = self.store.work_folder(record.job_id, record.attempt)
         (folder / MANIFEST).write_text("{}")
-        (folder / REPORT).write_text('{"psnr_tissue_db": 36.2, "warnings": []}')
+        (folder / REPORT).write_text(REPORT_OF_A_SCENE.model_dump_json())
         (folder / CURVE).write_text("t_train_s,psnr_tissue_db\n1,30\n")
         self.store.publish_scene(record.job_id, record.attempt)
         assert self.queue.finish(claim)

@@ -21,6 +21,7 @@ from zmq.auth.thread import ThreadAuthenticator
 
 from contract.access.render_keys import service_keys, worker_keys
 from contract.wire.errors import InputError, IntrasplatError, SceneError, UnavailableError
+from contract.wire.notices import Notice
 from contract.wire.rendering import ExportRequest, RenderRequest, ReplyError, WorkerReply, WorkerRequest
 
 POLL_MS = 50
@@ -48,7 +49,7 @@ class Reply:
     body: bytes
     media_type: str
     t: float
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     iteration: int | None = None
 
 

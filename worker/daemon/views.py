@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from contract.runtime.settings import GIB
 from contract.store.store import Store
 from contract.wire.errors import InputError, LimitError
+from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import MatrixPose, OrbitPose, world_from_camera
 from contract.wire.rendering import MEDIA_TYPES, ExportRequest, IntrinsicsOverride, RenderRequest
 from worker.daemon.pace import Pace
@@ -22,7 +23,7 @@ from worker.daemon.snapshot import Snapshots
 from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
 from worker.render.encode import encode_layer
-from worker.render.view import HARDLY_SEEN, ROUNDING, render_frame
+from worker.render.view import ROUNDING, render_frame
 from worker.scene.checkpoint import load_scene
 from worker.scene.export import EXPORTS
 from worker.scene.scene import Scene
@@ -115,8 +116,9 @@ def _render(scene: Scene, request: RenderRequest, device: Device, iteration: int
     warnings = frame.warnings
     if iteration is not None:
         # What the clip shows of each place is counted when training has ended: until then nothing is vouched for.
-        goes_on = f"Training goes on: this is iteration {iteration}, and how far to trust it is not known yet."
-        warnings = (goes_on, *(each for each in warnings if each != HARDLY_SEEN))
+        text = f"Training goes on: this is iteration {iteration}, and how far to trust it is not known yet."
+        goes_on = Notice.warning(NoticeCode.TRAINING_GOES_ON, text)
+        warnings = (goes_on, *(each for each in warnings if each.code is not NoticeCode.HARDLY_SEEN))
     return Reply(body, MEDIA_TYPES[request.format], shown_time(scene, request.t), warnings, iteration)
 
 
@@ -127,7 +129,7 @@ def _export(scene: Scene, request: ExportRequest) -> Reply:
         raise InputError("format", f"{request.format} is not an export format.", f"Use one of: {', '.join(EXPORTS)}.")
     shown = shown_time(scene, request.t)
     outside = f"t = {request.t:g} lies outside the clip; t = {shown:.4g} is exported."
-    warnings = (outside,) if request.t > shown + ROUNDING else ()
+    warnings = (Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, outside),) if request.t > shown + ROUNDING else ()
     return Reply(export_format.encode(scene, shown), export_format.media_type, shown, warnings)
 
 

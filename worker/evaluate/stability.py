@@ -5,8 +5,8 @@ Symbols: T frames of the clean clip, S frames of the given one, H W pixels.
 A cell is harmed when it scores more than LARGEST_LOSS_DB below the clean cell of the same series and seed, or its
 depth errs by LARGEST_DEPTH_LOSS_MM more. The clean cell has severity 0: the clean clip, or the condition's own motion
 where that is calm. A harmed cell is `told` if its report has a kind of warning that the clean cell's has not, else
-`silent`: that is the defect. `refused` and `diverged` end in an error that says why, `crashed` in one that nobody
-foresaw.
+`silent`: that is the defect. The kind of a warning is its code. `refused` and `diverged` end in an error that says why,
+`crashed` in one that nobody foresaw.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import re
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -24,7 +23,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.wire.errors import InputError
+from contract.wire.errors import InputError, TrainingDiverged
+from contract.wire.notices import Severity
 from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
 from worker.evaluate.cells import preset_of
@@ -56,17 +56,15 @@ KEY = ("condition", "severity", "series", "seed", "iterations", "width", "height
 VERDICT = ("outcome", "loss_db", "depth_loss_mm")
 FIELDS = (
     *KEY, "level", *VERDICT, "psnr_db", "depth_error_mm", "reported_db", "seconds", "new_warnings", "warnings",
-    "error", "machine", "commit",
+    "codes", "error", "machine", "commit",
 )  # fmt: skip
-"""psnr_db and depth_error_mm (mean) are against the truth, reported_db is what the report says of itself."""
+"""psnr_db and depth_error_mm (mean) are against the truth, reported_db is what the report says of itself; codes
+has SEVERITY:CODE of each of the warnings."""
 LARGEST_LOSS_DB = 3.0
 """Twice the squared error: nobody would call that the same quality."""
 LARGEST_DEPTH_LOSS_MM = 2.0
 """About the width of a grasper's jaw."""
-NO_EXPLANATION = "copying the neighbouring frames scores more"
-"""A warning with these words speaks of an alternative, not of what is wrong: it tells nothing that counts here."""
 SEPARATOR = " | "
-_NUMBER = re.compile(r"[-+]?\d+(\.\d+)?")
 
 
 @dataclass(frozen=True)
@@ -179,22 +177,26 @@ def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: TrainingH
     except NO_RESULT:
         raise
     except Exception as error:
-        row["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        row |= {"error": f"{type(error).__name__}: {' '.join(str(error).split())}", "outcome": failure(error)}
     return row | {"seconds": f"{time.perf_counter() - start:.2f}"}
 
 
 def verdict(row: Row, clean: Row | None) -> dict[str, str]:
-    """outcome, loss_db and depth_loss_mm of a row beside its clean cell's; unknown where that has failed."""
+    """outcome, loss_db and depth_loss_mm of a row beside its clean cell's.
+
+    The outcome is unknown where the clean cell failed, or was measured before warnings had codes.
+    """
     if row["error"]:
-        kinds = {"InputError": "refused", "LimitError": "refused", "TrainingDiverged": "diverged"}
-        return {"outcome": kinds.get(row["error"].partition(":")[0], "crashed"), "loss_db": "", "depth_loss_mm": ""}
-    if clean is None or clean["error"] or not (row["psnr_db"] and clean["psnr_db"]):
+        return {"outcome": row["outcome"], "loss_db": "", "depth_loss_mm": ""}
+    if clean is None or clean["error"] or (clean["warnings"] and not clean.get("codes")):
+        return {"outcome": "unknown", "loss_db": "", "depth_loss_mm": ""}
+    if not (row["psnr_db"] and clean["psnr_db"]):
         return {"outcome": "unknown", "loss_db": "", "depth_loss_mm": ""}
     loss_db = float(clean["psnr_db"]) - float(row["psnr_db"])
     depth_loss_mm = math.inf  # no depth where there was some
     if row["depth_error_mm"] and clean["depth_error_mm"]:
         depth_loss_mm = float(row["depth_error_mm"]) - float(clean["depth_error_mm"])
-    new = new_warnings(row["warnings"].split(SEPARATOR), clean["warnings"].split(SEPARATOR))
+    new = new_warnings(row, clean)
     harmed = loss_db > LARGEST_LOSS_DB or depth_loss_mm > LARGEST_DEPTH_LOSS_MM
     outcome = "held" if not harmed else "told" if new else "silent"
     return {
@@ -205,11 +207,18 @@ def verdict(row: Row, clean: Row | None) -> dict[str, str]:
     }
 
 
-def new_warnings(warnings: Sequence[str], clean: Sequence[str]) -> list[str]:
-    """The warnings of a kind that the clean cell has not; two that differ in their numbers alone are of one kind."""
-    known = {_NUMBER.sub("#", each) for each in clean}
-    telling = [each for each in warnings if each and NO_EXPLANATION not in each]
-    return [each for each in telling if _NUMBER.sub("#", each) not in known]
+def failure(error: Exception) -> str:
+    """The outcome of a cell that ended in this error."""
+    if isinstance(error, InputError):
+        return "refused"
+    return "diverged" if isinstance(error, TrainingDiverged) else "crashed"
+
+
+def new_warnings(row: Row, clean: Row) -> list[str]:
+    """Texts of the row's warnings whose code the clean row has not; notices of severity info do not count."""
+    known = set(clean["codes"].split())
+    pairs = zip(row["codes"].split(), row["warnings"].split(SEPARATOR), strict=True) if row["codes"] else ()
+    return [text for code, text in pairs if code not in known and code.partition(":")[0] == Severity.WARNING]
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,6 +261,7 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Trainin
         "reported_db": _text(report.psnr_tissue_db),
         "machine": machine(report.device),
         "warnings": SEPARATOR.join(_one_line(report)),
+        "codes": " ".join(f"{each.severity}:{each.code}" for each in report.warnings),
     }
 
 
@@ -279,7 +289,7 @@ def _shared(grid: Grid) -> tuple[int, ...]:
 
 
 def _one_line(report: Report) -> Iterator[str]:
-    return (" ".join(each.replace(SEPARATOR, " ").split()) for each in report.warnings)
+    return (" ".join(each.text.replace(SEPARATOR, " ").split()) for each in report.warnings)
 
 
 def _mean(values: Sequence[float] | NDArray[np.floating]) -> float:

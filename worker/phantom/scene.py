@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.camera import Intrinsics
 from worker.input.clip.types import DepthClip
 from worker.phantom.camera import endoscope_pose, right_eye
@@ -168,6 +169,7 @@ class Phantom:
             view = self._view(index, LEFT)
             views.append((self._recorded(view.rgb, index, LEFT), view.tissue, view.depth_mm))
         rgb, tissue, depth_mm = (np.stack(layer) for layer in zip(*views, strict=True))
+        drawn = f"synthetic tissue: {settings.motion}, seed {settings.seed}, true depth"
         return DepthClip(
             rgb=rgb,
             tissue=tissue,
@@ -176,7 +178,7 @@ class Phantom:
             intrinsics=settings.intrinsics,
             world_from_camera=np.stack([self.world_from_camera(index) for index in range(settings.frames)]),
             frame_times_s=np.arange(settings.frames) / settings.frame_rate_hz,
-            assumptions=(f"synthetic tissue: {settings.motion}, seed {settings.seed}, true depth",),
+            assumptions=(Notice.info(NoticeCode.SYNTHETIC, drawn),),
         )
 
     def _view(self, index: int, eye: int) -> _EyeView:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.camera import Intrinsics
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
@@ -46,7 +47,7 @@ class Frame:
     rgb: NDArray[np.uint8]
     depth_mm: NDArray[np.float32]
     confidence: NDArray[np.float32]
-    warnings: tuple[str, ...]
+    warnings: tuple[Notice, ...]
 
 
 class SceneRenderer:
@@ -111,7 +112,9 @@ def render_frame(
     shown = min(max(t, 0.0), last)
     warnings = []
     if not 0.0 <= t <= last + ROUNDING:
-        warnings.append(f"t = {t:g} lies outside the clip; t = {shown:.4g} is shown.")
+        warnings.append(
+            Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, f"t = {t:g} lies outside the clip; t = {shown:.4g} is shown.")
+        )
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
     image, seen = renderer_of(scene, device).layers(shown, pose, intrinsics or scene.intrinsics)
     alpha = image[4]
@@ -121,9 +124,14 @@ def render_frame(
     fall_off = float(np.exp(-0.5 * (distance / POSE_FALL_OFF) ** 2))
     confidence = np.where(solid, np.clip(seen / np.where(solid, alpha, 1) * fall_off, 0, 1), 0).astype(np.float32)
     if distance > FAR_POSE:
-        warnings.append(f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess.")
+        warnings.append(
+            Notice.warning(
+                NoticeCode.POSE_FAR,
+                f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess.",
+            )
+        )
     if (confidence < LOW_CONFIDENCE).mean() > MANY:
-        warnings.append(HARDLY_SEEN)
+        warnings.append(Notice.warning(NoticeCode.HARDLY_SEEN, HARDLY_SEEN))
     rgb = np.clip(image[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255).astype(np.uint8)
     return Frame(rgb, depth_mm, confidence, tuple(warnings))
 

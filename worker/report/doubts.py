@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.split import REPEAT_LEVELS
 from worker.input.clip.types import DepthClip
 
@@ -50,7 +51,7 @@ LARGEST_ROUGHNESS = 1.0
 """Median change of step over median step: a smooth path has far less than 1, independent errors have 1.7."""
 
 
-def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[str]:
+def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
     """Doubts about the pictures of some training frames: veiled, out of focus, smeared, of changing colour."""
     seen = [index for index in sampled if clip.tissue[index].any()]
     if not seen:
@@ -59,21 +60,27 @@ def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[str]:
     dark = [_darkest(clip, index) for index in seen]
     if sum(each > DARKEST_VEILED for each in dark) >= min(FEWEST_FRAMES_SEEN, len(seen)):
         found.append(
-            f"Even the dark tissue is pale, {max(dark):.0f} of 255 in every colour: smoke, a fogged lens or too much "
-            "light takes its contrast, and the model shows the veil as if it were tissue."
+            Notice.warning(
+                NoticeCode.VEILED,
+                f"Even the dark tissue is pale, {max(dark):.0f} of 255 in every colour: smoke, a fogged lens or too "
+                "much light takes its contrast, and the model shows the veil as if it were tissue.",
+            )
         )
     return found + _focus_doubts(clip, seen) + _colour_doubts(clip, seen)
 
 
-def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
+def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     """Doubts about how the training frames follow each other: repeated, hidden at first, masks or poses that jump."""
     found = []
     pairs = list(itertools.pairwise(train))
     repeated = sum(_repeats(clip.rgb[earlier], clip.rgb[later]) for earlier, later in pairs)
     if repeated > LARGEST_REPEATED_SHARE * len(train):
         found.append(
-            f"{repeated} of {len(train)} training frames repeat the one before: motion stands still there and then "
-            "jumps. Give the frames as recorded, without those that were filled in."
+            Notice.warning(
+                NoticeCode.REPEATED_FRAMES,
+                f"{repeated} of {len(train)} training frames repeat the one before: motion stands still there and then "
+                "jumps. Give the frames as recorded, without those that were filled in.",
+            )
         )
     hidden = np.zeros(clip.tissue.shape[1:], np.bool_)
     for index in train[1:]:
@@ -81,38 +88,57 @@ def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
     share = float((hidden & ~clip.tissue[train[0]]).mean()) if train else 0.0
     if share > LARGEST_HIDDEN_SHARE:
         found.append(
-            f"Masks hide {share:.0%} of the picture in the first frame that later ones show; there the model starts "
-            "from those."
+            Notice.warning(
+                NoticeCode.HIDDEN_AT_FIRST,
+                f"Masks hide {share:.0%} of the picture in the first frame that later ones show; there the model "
+                "starts from those.",
+            )
         )
     flickering = _flickering(np.array([1 - clip.tissue[index].mean() for index in train]))
     if flickering:
         found.append(
-            f"{flickering} frames have no mask although those before and after have: their instrument is modelled as "
-            "if it were tissue."
+            Notice.warning(
+                NoticeCode.MASK_GAPS,
+                f"{flickering} frames have no mask although those before and after have: their instrument is modelled "
+                "as if it were tissue.",
+            )
         )
     return found + _depth_doubts(clip, train) + _pose_doubts(clip, train)
 
 
-def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[str]:
+def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
     measured = [_fine_detail(clip, index) for index in frames]
     detail = np.array([each for each in measured if each is not None])
     if not detail.size:
         return []
     if np.median(detail) < LEAST_FINE_DETAIL:
-        return ["The picture has no fine detail: it is out of focus, or was enlarged; the scene is as soft."]
+        return [
+            Notice.warning(
+                NoticeCode.OUT_OF_FOCUS,
+                "The picture has no fine detail: it is out of focus, or was enlarged; the scene is as soft.",
+            )
+        ]
     smeared = int((detail < LEAST_EQUAL_DETAIL * detail.max()).sum())
     if smeared < FEWEST_FRAMES_SEEN:
         return []
-    return [f"{smeared} of {detail.size} frames looked at are blurred beside the others; motion in them is guessed."]
+    return [
+        Notice.warning(
+            NoticeCode.BLURRED_FRAMES,
+            f"{smeared} of {detail.size} frames looked at are blurred beside the others; motion in them is guessed.",
+        )
+    ]
 
 
-def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[str]:
+def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
     """Blood that comes in, or else a white balance that drifts."""
     flooded = float(np.ptp([_blood_share(clip, index) for index in frames]))
     if flooded > LARGEST_FLOODED_SHARE:
         return [
-            f"Blood covers {flooded:.0%} more of the tissue in some frames than in others: what it hides there is not "
-            "seen, and it has no texture to follow."
+            Notice.warning(
+                NoticeCode.BLOOD,
+                f"Blood covers {flooded:.0%} more of the tissue in some frames than in others: what it hides there is "
+                "not seen, and it has no texture to follow.",
+            )
         ]
     ratios = np.array([_colour_ratios(clip, index) for index in frames])
     drift = np.ptp(ratios, axis=0) / np.maximum(ratios.mean(axis=0), 1e-6)
@@ -121,12 +147,15 @@ def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[str]:
     worst = int(drift.argmax())
     low, high = ratios[:, worst].min(), ratios[:, worst].max()
     return [
-        f"The tissue's colour changes during the clip ({('red', 'blue')[worst]} over green from {low:.2f} to "
-        f"{high:.2f}): the white balance drifts, and the model shows it."
+        Notice.warning(
+            NoticeCode.COLOUR_CHANGES,
+            f"The tissue's colour changes during the clip ({('red', 'blue')[worst]} over green from {low:.2f} to "
+            f"{high:.2f}): the white balance drifts, and the model shows it.",
+        )
     ]
 
 
-def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
+def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     """No tissue comes a tenth nearer within a frame; where depth does, on much of the tissue, it is wrong."""
     wanted = set(train)
     first = [index for index in train if index + 1 in wanted]
@@ -140,12 +169,15 @@ def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
     if jumps <= LARGEST_JUMPING_SHARE * total:
         return []
     return [
-        f"Depth jumps by more than {DEPTH_JUMP:.0%} from one frame to the next on {jumps / total:.0%} of the tissue: "
-        "much of it is wrong, and so are distances in this scene."
+        Notice.warning(
+            NoticeCode.DEPTH_JUMPS,
+            f"Depth jumps by more than {DEPTH_JUMP:.0%} from one frame to the next on {jumps / total:.0%} of the "
+            "tissue: much of it is wrong, and so are distances in this scene.",
+        )
     ]
 
 
-def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
+def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     """Poses that err independently jump to and fro: the change of step is larger than the step itself.
 
     Looked at is the point on the optical axis at the tissue's median depth, which errors of place and of angle move.
@@ -166,8 +198,11 @@ def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[str]:
     if jitter_px < LARGEST_JITTER * clip.intrinsics.width or np.median(change) < LARGEST_ROUGHNESS * np.median(step):
         return []
     return [
-        f"The camera's poses jump to and fro by about {jitter_mm:.1f} mm at the tissue from frame to frame: they seem "
-        "to be inexact, and the model takes their errors for motion."
+        Notice.warning(
+            NoticeCode.POSE_JITTER,
+            f"The camera's poses jump to and fro by about {jitter_mm:.1f} mm at the tissue from frame to frame: they "
+            "seem to be inexact, and the model takes their errors for motion.",
+        )
     ]
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import TrainingDiverged
+from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import FrameScore, Report
 from worker.fusion import CLEAR_CONFIDENCE
 from worker.input.clip import FrameSplit
@@ -76,8 +77,8 @@ class Training:
     units_per_mm: float
     seconds: dict[str, float]
     versions: dict[str, str]
-    assumptions: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    assumptions: tuple[Notice, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     measurements: dict[str, float] = field(default_factory=dict)
 
 
@@ -150,31 +151,53 @@ def build_report(
     )
 
 
-def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[str]:
+def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     """What in the clip itself makes the result doubtful; held-out frames are not looked at."""
     sampled = sample_frames(train)
     found = []
     if len(train) < FEW_FRAMES:
-        found.append(f"Only {len(train)} frames were trained on; motion between them is guessed.")
+        found.append(
+            Notice.warning(
+                NoticeCode.FEW_FRAMES, f"Only {len(train)} frames were trained on; motion between them is guessed."
+            )
+        )
     tissue_share = float(np.mean([clip.tissue[index].mean() for index in train]))
     if tissue_share < LEAST_TISSUE_SHARE:
         found.append(
-            f"Only {tissue_share:.0%} of the picture counts as tissue. If the masks are inverted, set mask_polarity."
+            Notice.warning(
+                NoticeCode.LITTLE_TISSUE,
+                f"Only {tissue_share:.0%} of the picture counts as tissue. If the masks are inverted, "
+                "set mask_polarity.",
+            )
         )
     if all(clip.tissue[index].all() for index in train):
-        found.append("No instrument is masked anywhere: an instrument in the clip is modelled as if it were tissue.")
+        found.append(
+            Notice.warning(
+                NoticeCode.NO_INSTRUMENT_MASKED,
+                "No instrument is masked anywhere: an instrument in the clip is modelled as if it were tissue.",
+            )
+        )
     confident = _share_of_tissue(clip, sampled, lambda index: clip.depth_confidence[index] >= CLEAR_CONFIDENCE)
     if confident < LEAST_CONFIDENT_SHARE:
         found.append(
-            f"Stereo depth is missing or unsure on {1 - confident:.0%} of the tissue; the shape there is interpolated."
+            Notice.warning(
+                NoticeCode.STEREO_UNSURE,
+                f"Stereo depth is missing or unsure on {1 - confident:.0%} of the tissue; the shape there "
+                "is interpolated.",
+            )
         )
     smooth = _share_of_tissue(clip, sampled, lambda index: _roughness(clip.rgb[index]) < SMOOTH_LEVELS)
     if smooth > LARGEST_SMOOTH_SHARE:
-        found.append(f"{smooth:.0%} of the tissue has no texture, so stereo and motion are guessed there.")
+        found.append(
+            Notice.warning(
+                NoticeCode.NO_TEXTURE,
+                f"{smooth:.0%} of the tissue has no texture, so stereo and motion are guessed there.",
+            )
+        )
     return found + _brightness_warnings(clip, sampled) + picture_doubts(clip, sampled) + course_doubts(clip, train)
 
 
-def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) -> list[str]:
+def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) -> list[Notice]:
     """What the scores say against the model; and why a figure is missing, where one is."""
     model_db = _mean(held_out.psnr_tissue_db)
     train_db = _mean(trained.psnr_tissue_db)
@@ -182,43 +205,74 @@ def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) 
     found += _worse_than_copying(model_db, baselines)
     if train_db is not None and train_db < LEAST_TRAIN_DB:
         found.append(
-            f"Even frames it was trained on are reproduced at only {train_db:.1f} dB: do not rely on this scene. "
-            "Look for inverted masks, a wrong layout or calibration, or a clip in which everything moves."
+            Notice.warning(
+                NoticeCode.TRAINING_SCORE_LOW,
+                f"Even frames it was trained on are reproduced at only {train_db:.1f} dB: do not rely on this scene. "
+                "Look for inverted masks, a wrong layout or calibration, or a clip in which everything moves.",
+            )
         )
     elif model_db is not None and model_db < LEAST_HELD_OUT_DB:
         found.append(
-            f"Held-out frames are reproduced at only {model_db:.1f} dB: do not rely on this scene between the trained "
-            "frames. Tissue that is cut, or moves far from one frame to the next, cannot be followed."
+            Notice.warning(
+                NoticeCode.HELD_OUT_SCORE_LOW,
+                f"Held-out frames are reproduced at only {model_db:.1f} dB: do not rely on this scene between the "
+                "trained frames. Tissue that is cut, or moves far from one frame to the next, cannot be followed.",
+            )
         )
     if model_db is not None and train_db is not None and train_db - model_db > LARGEST_GAP_DB:
         found.append(
-            f"Held-out frames score {train_db - model_db:.1f} dB less than trained ones ({model_db:.1f} and "
-            f"{train_db:.1f} dB): between the trained frames the motion is not to be trusted."
+            Notice.warning(
+                NoticeCode.GENERALISATION_GAP,
+                f"Held-out frames score {train_db - model_db:.1f} dB less than trained ones ({model_db:.1f} and "
+                f"{train_db:.1f} dB): between the trained frames the motion is not to be trusted.",
+            )
         )
     found += _bad_frames(held_out, model_db)
     judged = held_out if held_out.frames else trained
     covered = _mean(judged.coverage)
     if covered is not None and covered < LEAST_COVERAGE:
-        found.append(f"The model leaves {1 - covered:.1%} of the tissue uncovered: renders have holes there.")
+        found.append(
+            Notice.warning(
+                NoticeCode.HOLES,
+                f"The model leaves {1 - covered:.1%} of the tissue uncovered: renders have holes there.",
+            )
+        )
     if judged.depth_agreement_mm > LARGEST_DEPTH_SHARE * judged.depth_mm:
         found.append(
-            f"Rendered and stereo depth differ by {judged.depth_agreement_mm:.1f} mm (median) at a depth of "
-            f"{judged.depth_mm:.0f} mm: distances in this scene are not to be trusted."
+            Notice.warning(
+                NoticeCode.DEPTH_DISAGREES,
+                f"Rendered and stereo depth differ by {judged.depth_agreement_mm:.1f} mm (median) at a depth of "
+                f"{judged.depth_mm:.0f} mm: distances in this scene are not to be trusted.",
+            )
         )
     return found
 
 
-def _missing(held_out: Scores, model_db: float | None) -> list[str]:
+def _missing(held_out: Scores, model_db: float | None) -> list[Notice]:
     if not held_out.frames:
-        return ["No frames were held out, so the quality between trained frames, where it matters, is not measured."]
+        return [
+            Notice.warning(
+                NoticeCode.NOTHING_HELD_OUT,
+                "No frames were held out, so the quality between trained frames, where it matters, is not measured.",
+            )
+        ]
     if model_db is None:
-        return ["The held-out frames show no tissue, so quality is not measured."]
+        return [
+            Notice.warning(
+                NoticeCode.HELD_OUT_WITHOUT_TISSUE, "The held-out frames show no tissue, so quality is not measured."
+            )
+        ]
     if math.isnan(held_out.depth_agreement_mm):
-        return ["No held-out tissue has both rendered and stereo depth, so depth agreement is not measured."]
+        return [
+            Notice.warning(
+                NoticeCode.DEPTH_NOT_COMPARED,
+                "No held-out tissue has both rendered and stereo depth, so depth agreement is not measured.",
+            )
+        ]
     return []
 
 
-def _worse_than_copying(model_db: float | None, baselines: CopyBaselines) -> list[str]:
+def _worse_than_copying(model_db: float | None, baselines: CopyBaselines) -> list[Notice]:
     """Says plainly that copying frames would have done better; a model earns its place only elsewhere then."""
     copies = {"blending": _mean(baselines.blend_db), "warping (optical flow)": _mean(baselines.flow_db)}
     better = {name: score for name, score in copies.items() if score is not None and model_db is not None}
@@ -227,28 +281,38 @@ def _worse_than_copying(model_db: float | None, baselines: CopyBaselines) -> lis
         return []
     named = " and ".join(f"{name} at {score:.1f} dB" for name, score in better.items())
     return [
-        f"On held-out frames the model scores {model_db:.1f} dB; copying the neighbouring frames scores more: {named}. "
-        "Seen from the endoscope itself, the recorded frames are the better picture; the model adds other views, "
-        "depth and what the instrument hides."
+        Notice.info(
+            NoticeCode.COPYING_SCORES_MORE,
+            f"On held-out frames the model scores {model_db:.1f} dB; copying the neighbouring frames scores more: "
+            f"{named}. Seen from the endoscope itself, the recorded frames are the better picture; the model adds "
+            "other views, depth and what the instrument hides.",
+        )
     ]
 
 
-def _bad_frames(held_out: Scores, model_db: float | None) -> list[str]:
+def _bad_frames(held_out: Scores, model_db: float | None) -> list[Notice]:
     if model_db is None:
         return []
     scores = zip(held_out.frames, held_out.psnr_tissue_db, strict=True)
     bad = [f"{frame} ({score:.1f} dB)" for frame, score in scores if score < model_db - OUTLIER_DB]
-    return [f"Far below the others are held-out frames {', '.join(bad)}."] if bad else []
+    return (
+        [Notice.warning(NoticeCode.OUTLIER_FRAMES, f"Far below the others are held-out frames {', '.join(bad)}.")]
+        if bad
+        else []
+    )
 
 
-def _brightness_warnings(clip: DepthClip, sampled: Iterable[int]) -> list[str]:
+def _brightness_warnings(clip: DepthClip, sampled: Iterable[int]) -> list[Notice]:
     medians = [float(np.median(clip.rgb[index][clip.tissue[index]])) for index in sampled if clip.tissue[index].any()]
     mean = float(np.mean(medians)) if medians else 0.0
     if mean == 0 or (max(medians) - min(medians)) / mean <= LARGEST_BRIGHTNESS_DRIFT:
         return []
     return [
-        f"The tissue's brightness changes from {min(medians):.0f} to {max(medians):.0f} of 255 during the clip; "
-        "the model may take changing light for motion."
+        Notice.warning(
+            NoticeCode.BRIGHTNESS_CHANGES,
+            f"The tissue's brightness changes from {min(medians):.0f} to {max(medians):.0f} of 255 during the clip; "
+            "the model may take changing light for motion.",
+        )
     ]
 
 

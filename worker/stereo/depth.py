@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import Cancelled, InputError
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip
 from worker.machine.hooks import Hooks, Progress
@@ -219,23 +220,34 @@ def _valid_share(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) -> fl
     return share
 
 
-def _warnings(shift: RowShift, valid_share: float) -> tuple[str, ...]:
+def _warnings(shift: RowShift, valid_share: float) -> tuple[Notice, ...]:
     found = []
     if shift.matches == 0:
-        found.append("too few matching features to measure the vertical misalignment of the eyes: taken as 0")
+        found.append(
+            Notice.warning(
+                NoticeCode.ALIGNMENT_UNKNOWN,
+                "too few matching features to measure the vertical misalignment of the eyes: taken as 0",
+            )
+        )
     elif abs(shift.shift_px) >= WARN_SHIFT_PX:
         found.append(
-            f"rows of left and right differed by {shift.shift_px:+.2f} px (corrected, {shift.residual_px:.2f} px "
-            "remain): the calibration does not fit this recording exactly"
+            Notice.warning(
+                NoticeCode.ROWS_MISALIGNED,
+                f"rows of left and right differed by {shift.shift_px:+.2f} px (corrected, {shift.residual_px:.2f} px "
+                "remain): the calibration does not fit this recording exactly",
+            )
         )
     if valid_share < WARN_VALID_SHARE:
-        found.append(f"only {valid_share:.0%} of tissue has stereo depth")
+        found.append(
+            Notice.warning(NoticeCode.LITTLE_STEREO_DEPTH, f"only {valid_share:.0%} of tissue has stereo depth")
+        )
     return tuple(found)
 
 
-def _scale_assumption(clip: RectifiedClip) -> str:
+def _scale_assumption(clip: RectifiedClip) -> Notice:
     """The assumption about the baseline: a wrong one scales every distance, and no picture shows it."""
-    return f"scale: the calibration's baseline of {clip.baseline_mm:.4g} mm; every distance is as right as it is"
+    text = f"scale: the calibration's baseline of {clip.baseline_mm:.4g} mm; every distance is as right as it is"
+    return Notice.info(NoticeCode.BASELINE, text)
 
 
 def _check_stop(hooks: Hooks) -> None:

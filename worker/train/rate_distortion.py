@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip import DepthClip, spread
 from worker.model.deformation import SharedBasis
 from worker.raster.backend import CPU, Device
@@ -59,13 +60,14 @@ class QuantizedScene:
     float_bytes: int
 
     @property
-    def words(self) -> tuple[str, ...]:
+    def notices(self) -> tuple[Notice, ...]:
         """What was chosen, for the report."""
-        return (
+        text = (
             f"Numbers are stored in steps that change the picture by {255 * self.step:.2g} of 255: "
             f"{self.scene.file_bytes / 1e6:.2f} MB instead of {self.float_bytes / 1e6:.1f}, for {self.loss_db:.2f} dB "
-            f"on {self.frames} training frames. All scores are of the stored scene.",
+            f"on {self.frames} training frames. All scores are of the stored scene."
         )
+        return (Notice.info(NoticeCode.STORED_PRECISION, text),)
 
     @property
     def measurements(self) -> dict[str, float]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from contract.wire.notices import Notice
 from worker.raster.backend import Device
 from worker.raster.model import Model
 from worker.train.average import RunningMean
@@ -52,7 +53,7 @@ class Run:
     iteration: int = 0
     average: RunningMean = field(default_factory=RunningMean)
     densifier: Densifier | None = None
-    chosen: tuple[str, ...] = ()
+    chosen: tuple[Notice, ...] = ()
     curve: list[CurvePoint] = field(default_factory=list)
 
     @property

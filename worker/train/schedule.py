@@ -13,6 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from contract.wire.notices import Notice, NoticeCode
+
 MIN_CYCLE_ITERATIONS, MIN_CYCLE_EPOCHS = 250, 3
 """Of a cycle, the larger of the two."""
 RESTART = 0.6
@@ -118,15 +120,16 @@ class Schedule:
         return cls(**{**settings, "scores": scores})
 
     @property
-    def words(self) -> tuple[str, ...]:
+    def notices(self) -> tuple[Notice, ...]:
         """What was decided, for the report."""
         if self.stopped_at is None:
             return ()
-        return (
+        text = (
             f"Training ended after {self.iterations} of {self.planned} iterations that the time allowed: doubling the "
             f"first {self.stopped_at // 2} gained {self.scores[-1] - self.scores[-2]:.2f} dB on validation frames, "
-            f"less than {self.min_gain_db} dB.",
+            f"less than {self.min_gain_db} dB."
         )
+        return (Notice.info(NoticeCode.EARLY_STOPPING, text),)
 
 
 def validation_frames(frames: Sequence[int]) -> tuple[int, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from contract.wire.notices import Notice, NoticeCode
 from worker.fusion import FusionSettings, PointCloud
 from worker.input.camera import Intrinsics, to_camera
 from worker.input.clip import DepthClip
@@ -42,9 +43,9 @@ def _stride_for(points: int, intrinsics: Intrinsics) -> int:
 
 def settled(
     preset: Preset, tracks: Tracks | None, clip: DepthClip, train: Sequence[int]
-) -> tuple[Preset, tuple[str, ...]]:
+) -> tuple[Preset, tuple[Notice, ...]]:
     """The preset with what it leaves to the scene settled (decisions 014, 018), and why, in words for the report."""
-    words = []
+    notices = []
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
     trials = Trials({})
     if tracks is not None and left_open:
@@ -53,7 +54,12 @@ def settled(
     if fusion.mode == "fill" and preset.points_per_image is not None:
         least = ", the least there is" if fusion.stride == MIN_STRIDE else ""
         wanted = preset.points_per_image
-        words.append(f"Gaussians start {fusion.stride} pixels apart{least}: {wanted} an image were asked for.")
+        notices.append(
+            Notice.info(
+                NoticeCode.SPACING,
+                f"Gaussians start {fusion.stride} pixels apart{least}: {wanted} an image were asked for.",
+            )
+        )
     elif fusion.mode == "fill":
         finest = _stride_for(MAX_POINTS, clip.intrinsics)
         choice = choose_stride(
@@ -61,13 +67,20 @@ def settled(
         )
         fusion = dataclasses.replace(fusion, stride=choice.count)
         preset = dataclasses.replace(preset, fusion=fusion)
-        words.append(f"Gaussians start {choice.count} pixels apart: {choice.reason}.")
+        notices.append(
+            Notice.info(NoticeCode.SPACING, f"Gaussians start {choice.count} pixels apart: {choice.reason}.")
+        )
     if preset.bases is None:
         floor = floor_error(clip, train[0], fusion.stride)
         choice = choose_bases(trials, floor, len(train), preset.max_bases)
         preset = dataclasses.replace(preset, bases=choice.count)
-        words.append(f"Motion has {choice.count} {'basis' if choice.count == 1 else 'bases'}: {choice.reason}.")
-    return preset, tuple(words)
+        notices.append(
+            Notice.info(
+                NoticeCode.BASES,
+                f"Motion has {choice.count} {'basis' if choice.count == 1 else 'bases'}: {choice.reason}.",
+            )
+        )
+    return preset, tuple(notices)
 
 
 def basis_values(bases: int, trained_times: Sequence[float], times: Sequence[float]) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from contract.access.render_keys import RenderKeys, service_keys, worker_keys
 from contract.queue.embedded import short_socket_path
 from contract.wire.errors import InputError, SceneError, UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
+from tests.reports import a_warning
 from worker.daemon.serve import LONGEST_REQUEST_BYTES, NotYetError, Reply, RequestServer
 
 SCENE = "0" * 32
@@ -31,7 +32,7 @@ def answer(request: RenderRequest | ExportRequest) -> Reply:
         raise ZeroDivisionError("patient Smith")
     if request.t == 4:
         raise NotYetError("Nothing to show yet.")
-    return Reply(b"image", "image/png", request.t, ("a warning",), iteration=12)
+    return Reply(b"image", "image/png", request.t, (a_warning("a warning"),), iteration=12)
 
 
 @contextmanager
@@ -77,7 +78,7 @@ def test_an_answer_carries_the_bytes_the_time_and_the_warnings(socket: zmq.Socke
     head, body = ask(socket, request(0.5))
     assert body == b"image"
     assert head.render_ms > 0
-    expected = WorkerReply(media_type="image/png", t=0.5, warnings=("a warning",), iteration=12)
+    expected = WorkerReply(media_type="image/png", t=0.5, warnings=(a_warning("a warning"),), iteration=12)
     assert head.model_copy(update={"render_ms": 0.0}) == expected
 
 

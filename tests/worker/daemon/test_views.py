@@ -13,6 +13,7 @@ import torch
 
 from contract.store.store import Store, new_job_id
 from contract.wire.errors import LimitError, SceneError
+from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose
 from contract.wire.rendering import ExportRequest, ImageFormat, IntrinsicsOverride, Layer, RenderRequest
 from worker.daemon.serve import NotYetError
@@ -152,7 +153,7 @@ def test_a_running_job_is_shown_by_its_snapshot_which_vouches_for_nothing(store:
     view = views.answer(request_of(running, attempt=None))
     assert view.iteration == 40
     (warning,) = view.warnings
-    assert "Training goes on" in warning
+    assert warning.code is NoticeCode.TRAINING_GOES_ON
     layer = RenderRequest(scene_id=running, t=0, layer=Layer.CONFIDENCE, format=ImageFormat.NPY)
     assert not np.load(io.BytesIO(views.answer(layer).body)).any()
     assert views.answer(request_of(scene_id)).iteration is None

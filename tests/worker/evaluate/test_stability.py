@@ -8,7 +8,9 @@ import pytest
 
 from benchmarks.pages.stability import stability_sections
 from contract.runtime.exits import ExitCode
-from contract.wire.errors import Cancelled, InputError, UnavailableError
+from contract.wire.errors import Cancelled, InputError, LimitError, TrainingDiverged, UnavailableError
+from contract.wire.notices import Notice, NoticeCode
+from tests.test_repository import REPOSITORY
 from worker.__main__ import main
 from worker.evaluate.atlas import count_outcomes, draw_map, places_of, told_table
 from worker.evaluate.conditions import CLEAN, CLEAN_STEREO, CONDITIONS, clean_clip
@@ -21,6 +23,7 @@ from worker.evaluate.stability import (
     Atlas,
     Grid,
     StabilityCell,
+    failure,
     measured,
     new_warnings,
     plan,
@@ -32,16 +35,25 @@ from worker.train.hooks import TrainingHooks
 SMALL = Grid(width=96, height=80, frames=12, iterations=15)
 
 
-def row(psnr_db: float = 30.0, depth_error_mm: float = 0.5, *warnings: str, error: str = "") -> Row:
+def row(
+    psnr_db: float = 30.0, depth_error_mm: float = 0.5, *notices: Notice, error: str = "", outcome: str = ""
+) -> Row:
     """What measuring a cell gives."""
     empty = dict.fromkeys(FIELDS, "")
     figures = {"psnr_db": f"{psnr_db:.3f}", "depth_error_mm": f"{depth_error_mm:.3f}"} if not error else {}
-    return {**empty, **figures, "warnings": SEPARATOR.join(warnings), "error": error}
+    told = {
+        "warnings": SEPARATOR.join(each.text for each in notices),
+        "codes": " ".join(f"{each.severity}:{each.code}" for each in notices),
+    }
+    return {**empty, **figures, **told, "error": error, "outcome": outcome}
 
 
-COPYING = (
-    "On held-out frames the model scores 26.0 dB; copying the neighbouring frames scores more: blending at 30.0 dB."
-)
+PALE = Notice.warning(NoticeCode.VEILED, "the tissue is pale")
+COPYING = Notice.info(NoticeCode.COPYING_SCORES_MORE, "copying scores more")
+
+
+def few_frames(count: int) -> Notice:
+    return Notice.warning(NoticeCode.FEW_FRAMES, f"only {count} frames")
 
 
 @pytest.mark.parametrize(
@@ -50,31 +62,59 @@ COPYING = (
         (row(), "held"),
         (row(27.2), "held"),
         (row(26.0), "silent"),
-        (row(26.0, 0.5, "the tissue is pale"), "told"),
-        (row(26.0, 0.5, "only 5 frames"), "silent"),
+        (row(26.0, 0.5, PALE), "told"),
+        (row(26.0, 0.5, few_frames(5)), "silent"),
         (row(26.0, 0.5, COPYING), "silent"),
         (row(30.0, 3.0), "silent"),
-        (row(30.0, 3.0, "depth differs by 3.1 mm"), "told"),
-        (row(40.0, 0.5, "the tissue is pale"), "held"),
-        (row(error="InputError: masks: they look inverted."), "refused"),
-        (row(error="LimitError: clip: too large."), "refused"),
-        (row(error="TrainingDiverged: the loss is no number"), "diverged"),
-        (row(error="ZeroDivisionError: division by zero"), "crashed"),
+        (row(30.0, 3.0, Notice.warning(NoticeCode.DEPTH_DISAGREES, "depth differs by 3.1 mm")), "told"),
+        (row(40.0, 0.5, PALE), "held"),
+        (row(error="InputError: masks: they look inverted.", outcome="refused"), "refused"),
     ],
 )
 def test_silent_is_harm_without_a_warning_that_the_clean_clip_has_not(measured_row: Row, outcome: str) -> None:
-    clean = row(30.0, 0.5, "only 28 frames")
+    clean = row(30.0, 0.5, few_frames(28))
     assert verdict(measured_row, clean)["outcome"] == outcome
+
+
+@pytest.mark.parametrize(
+    ("error", "outcome"),
+    [
+        (InputError("masks", "they look inverted.", "Turn them."), "refused"),
+        (LimitError("clip", "too large.", "Cut it."), "refused"),
+        (TrainingDiverged("the loss is no number"), "diverged"),
+        (ZeroDivisionError("division by zero"), "crashed"),
+    ],
+)
+def test_the_type_of_an_error_decides_how_a_cell_failed(error: Exception, outcome: str) -> None:
+    assert failure(error) == outcome
 
 
 def test_without_a_clean_score_nothing_is_known() -> None:
     assert verdict(row(), None)["outcome"] == "unknown"
-    assert verdict(row(), row(error="InputError: no"))["outcome"] == "unknown"
+    assert verdict(row(), row(error="InputError: no", outcome="refused"))["outcome"] == "unknown"
 
 
-def test_warnings_that_differ_in_numbers_alone_are_of_one_kind() -> None:
-    clean = ["depth is missing on 20% of the tissue"]
-    assert new_warnings(["depth is missing on 80.5% of the tissue", "all is dark", ""], clean) == ["all is dark"]
+def test_a_clean_row_whose_warnings_have_no_codes_tells_nothing() -> None:
+    before_codes = row(30.0, 0.5, few_frames(28)) | {"codes": ""}
+    assert verdict(row(26.0), before_codes)["outcome"] == "unknown"
+
+
+def test_warnings_of_one_code_are_of_one_kind() -> None:
+    assert new_warnings(row(30.0, 0.5, few_frames(5), PALE, COPYING), row(30.0, 0.5, few_frames(28))) == [PALE.text]
+
+
+def test_the_stored_rows_keep_their_outcomes() -> None:
+    stored = read_rows(REPOSITORY / "docs" / "results" / STABILITY)
+    assert stored
+    assert {each["outcome"] for each in stored} <= {
+        "held",
+        "told",
+        "silent",
+        "refused",
+        "diverged",
+        "crashed",
+        "unknown",
+    }
 
 
 def test_the_plan_puts_each_clean_clip_before_what_is_compared_with_it() -> None:

@@ -141,7 +141,7 @@ def test_the_conventions_page_shows_both_kinds_as_they_are_read(tmp_path: Path) 
 def test_a_clip_says_whether_its_calibration_rectified_it() -> None:
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     said = [
-        rectify(clip_of(image, image), each).assumptions[-1]
+        rectify(clip_of(image, image), each).assumptions[-1].text
         for each in (parse_calibration(RECTIFIED), raw_calibration())
     ]
     assert said == [
@@ -370,7 +370,7 @@ def test_a_rectification_that_cuts_the_view_away_warns_and_in_the_extreme_is_ref
 
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     assert rectify(clip_of(image, image), raw_calibration()).warnings == ()
-    assert "magnifies" in rectify(clip_of(image, image), rolled(0.2)).warnings[0]
+    assert "magnifies" in rectify(clip_of(image, image), rolled(0.2)).warnings[0].text
     with pytest.raises(InputError, match="magnifies"):
         rectify(clip_of(image, image), rolled(0.5))
 

@@ -155,9 +155,9 @@ def test_a_stopped_job_ends_the_process_and_leaves_nothing(studio: Studio, scrat
 def test_the_report_says_what_protected_the_worker(studio: Studio) -> None:
     decoded = decode_clip(studio.endonerf(), limits=ClipLimits(decoded_bytes=1 << 30))
     assert isinstance(decoded, DepthClip)
-    assert decoded.assumptions[-1].startswith("decoding: in a process of its own (limited memory of 3.0 GiB")
+    assert decoded.assumptions[-1].text.startswith("decoding: in a process of its own (limited memory of 3.0 GiB")
     for word in PROTECTIONS:
-        assert word in decoded.assumptions[-1]  # as held, or as what the kernel did not grant
+        assert word in decoded.assumptions[-1].text  # as held, or as what the kernel did not grant
 
 
 def run_stand_in(tmp_path: Path, work: str, **more: Any) -> dict[str, Any]:

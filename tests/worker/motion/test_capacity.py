@@ -247,5 +247,5 @@ def test_the_report_is_told_what_was_chosen() -> None:
     clip = phantom_clip()
     run = prepared_on(clip, split_frames(clip))
     bases = run.model.export()[1].bases
-    assert any(each.startswith(f"Motion has {bases} bas") for each in run.chosen)
+    assert any(each.text.startswith(f"Motion has {bases} bas") for each in run.chosen)
     assert prepared_on(clip, split_frames(clip)).chosen == run.chosen

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from contract.wire.notices import Notice
 from tests.worker.phantoms import phantom_clip
 from worker.evaluate.conditions import CONDITIONS, CleanClip, clean_clip
 from worker.input.clip import DepthClip, open_clip, split_frames
@@ -24,7 +25,7 @@ def clean() -> CleanClip:
     return clean_clip(PhantomSettings(width=96, height=80, frames=20))
 
 
-def doubts(clip: DepthClip) -> list[str]:
+def doubts(clip: DepthClip) -> list[Notice]:
     train = split_frames(clip).train
     return picture_doubts(clip, sample_frames(train)) + course_doubts(clip, train)
 
@@ -65,7 +66,7 @@ def test_what_harms_a_scene_is_told(clean: CleanClip, condition: str, severity: 
     given = CONDITIONS[condition].apply(clean, severity, 0)
     assert isinstance(given.clip, DepthClip)
     found = doubts(given.clip)
-    assert sum(said in each for each in found) == 1
+    assert sum(said in each.text for each in found) == 1
     assert len(found) == 1
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from contract.wire.errors import TrainingDiverged
+from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import RESEARCH_USE, Report
 from tests.worker.clips import plane_clip
 from worker.input.clip import FrameSplit, split_frames
@@ -20,6 +21,11 @@ from worker.report.baselines import CopyBaselines, copy_baselines
 from worker.report.quality import Scores, Training, build_report, clip_warnings, measure, score_warnings
 from worker.train.hooks import RenderedFrame
 from worker.train.scoring import sample_frames
+
+
+def info(text: str) -> Notice:
+    return Notice.info(NoticeCode.UNCLASSIFIED, text)
+
 
 TRAINING = Training(
     preset="fast",
@@ -33,7 +39,7 @@ TRAINING = Training(
     units_per_mm=0.8,
     seconds={"t_train_s": 12.5, "t_post_s": 20.0},
     versions={"intrasplat": "0"},
-    assumptions=("depth: of the model",),
+    assumptions=(info("depth: of the model"),),
     measurements={"steps_per_s": 40.0},
 )
 
@@ -43,7 +49,7 @@ def long_clip() -> DepthClip:
     clip = plane_clip(frames=24)
     noise = np.random.default_rng(5).integers(-15, 16, clip.rgb.shape)
     clip.rgb[:] = np.clip(clip.rgb + noise, 0, 255)
-    return dataclasses.replace(clip, assumptions=("masks: as given",), measurements={"vertical_px": 0.2})
+    return dataclasses.replace(clip, assumptions=(info("masks: as given"),), measurements={"vertical_px": 0.2})
 
 
 def views(clip: DepthClip, noise: float = 0.01) -> Callable[[int], RenderedFrame]:
@@ -87,7 +93,7 @@ def test_a_good_model_of_a_good_clip_warns_of_nothing() -> None:
     assert report.held_out == (1, 9, 17)
     assert report.train_count == 21
     assert report.notice == RESEARCH_USE
-    assert report.assumptions == ("masks: as given", "depth: of the model")
+    assert [each.text for each in report.assumptions] == ["masks: as given", "depth: of the model"]
     assert report.measurements == {"vertical_px": 0.2, "steps_per_s": 40.0}
     assert (report.width, report.height, report.frame_count) == (64, 48, 24)
     assert report.seconds == TRAINING.seconds
@@ -112,7 +118,7 @@ def test_without_held_out_frames_figures_are_null_and_the_reason_is_given() -> N
     report = report_of(long_clip(), "none")
     for name in ("psnr_tissue_db", "psnr_paper_db", "ssim", "baseline_blend_db", "depth_agreement_mm", "coverage"):
         assert getattr(report, name) is None
-    assert any("No frames were held out" in each for each in report.warnings)
+    assert any("No frames were held out" in each.text for each in report.warnings)
     assert json.loads(report.model_dump_json())["psnr_tissue_db"] is None
 
 
@@ -123,7 +129,7 @@ def test_held_out_frames_without_tissue_are_left_out_of_the_means() -> None:
     assert report.frames[1].psnr_tissue_db is None
     assert report.psnr_tissue_db == pytest.approx(40.0, abs=0.3)
     clip.tissue[[1, 17]] = False
-    assert any("show no tissue" in each for each in report_of(clip).warnings)
+    assert any("show no tissue" in each.text for each in report_of(clip).warnings)
 
 
 @pytest.mark.parametrize("broken", ["rgb", "depth_mm", "alpha"])
@@ -172,7 +178,7 @@ def test_a_view_that_is_not_finite_stops_the_scene(broken: str) -> None:
     ],
 )
 def test_every_failure_is_told(held_out: Scores, trained: Scores, baselines: CopyBaselines, said: str) -> None:
-    assert any(said in each for each in score_warnings(held_out, trained, baselines))
+    assert any(said in each.text for each in score_warnings(held_out, trained, baselines))
 
 
 def test_good_scores_are_not_complained_about() -> None:
@@ -217,11 +223,11 @@ def test_every_doubt_about_the_clip_is_told(spoil: Callable[[DepthClip], None], 
     spoil(clip)
     found = clip_warnings(clip, train)
     assert len(found) == 1
-    assert said in found[0]
+    assert said in found[0].text
 
 
 def test_few_frames_are_told() -> None:
-    assert "Only 10 frames" in clip_warnings(long_clip(), list(range(10)))[0]
+    assert "Only 10 frames" in clip_warnings(long_clip(), list(range(10)))[0].text
 
 
 def test_held_out_frames_do_not_change_what_is_said_of_the_clip() -> None:
@@ -240,8 +246,8 @@ def test_the_sample_spans_the_training_frames() -> None:
 
 
 def test_what_the_clip_and_the_split_warned_of_is_repeated_once() -> None:
-    clip = dataclasses.replace(long_clip(), warnings=("the sound is missing", "the sound is missing"))
-    split = FrameSplit([0, *range(2, 24)], [1], [], warnings=("1 frame repeats",))
+    clip = dataclasses.replace(long_clip(), warnings=(info("the sound is missing"), info("the sound is missing")))
+    split = FrameSplit([0, *range(2, 24)], [1], [], warnings=(info("1 frame repeats"),))
     held_out, trained = (measure(clip, frames, views(clip)) for frames in ([1], sample_frames(split.train)))
     report = build_report(clip, split, held_out, trained, copy_baselines(clip, split.train, [1]), TRAINING)
-    assert report.warnings == ("the sound is missing", "1 frame repeats")
+    assert [each.text for each in report.warnings] == ["the sound is missing", "1 frame repeats"]

@@ -332,7 +332,7 @@ def test_shrinking_keeps_its_tolerance_and_says_what_it_took() -> None:
     assert tiny is not None
     assert small.loss_db <= 0.1 < tiny.loss_db <= 0.5
     assert tiny.scene.file_bytes < small.scene.file_bytes < 0.25 * scene.byte_count
-    assert f"{small.scene.file_bytes / 1e6:.2f} MB" in small.words[0]
+    assert f"{small.scene.file_bytes / 1e6:.2f} MB" in small.notices[0].text
     judged = spread(run.frames.indices, SCORED_FRAMES)
     assert small.frames == len(judged)
     exact, kept = (mean_db(each, clip, run.frames, judged) for each in (scene, small.scene))

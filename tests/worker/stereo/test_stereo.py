@@ -119,7 +119,7 @@ def test_a_vertical_misalignment_is_measured_corrected_and_reported(row_shift_px
     clip = estimate_depth(clip_of([draw_pair(disparity, row_shift_px=row_shift_px)]))
     assert clip.measurements["vertical_misalignment_px"] == pytest.approx(row_shift_px, abs=0.1)
     assert clip.measurements["vertical_residual_px"] < 0.3
-    assert any("rows of left and right differed" in warning for warning in clip.warnings)
+    assert any("rows of left and right differed" in warning.text for warning in clip.warnings)
     assert np.median(np.abs(errors_px(clip, disparity))) < 0.12
 
 
@@ -131,7 +131,7 @@ def test_aligned_eyes_give_no_warning() -> None:
 
 def test_what_no_picture_can_confirm_is_named_as_an_assumption() -> None:
     clip = estimate_depth(clip_of([draw_pair(slanted())]))
-    assert any(f"baseline of {BASELINE_MM:g} mm" in each for each in clip.assumptions)
+    assert any(f"baseline of {BASELINE_MM:g} mm" in each.text for each in clip.assumptions)
 
 
 def test_a_misalignment_beyond_eight_pixels_is_refused() -> None:
@@ -165,7 +165,7 @@ def test_frames_that_are_rectified_already_are_refused_with_a_raw_calibration(lo
     calibration = raw_calibration(lower_px)
     as_recorded = estimate_depth(rectify(recorded(lower_px), calibration))
     assert abs(as_recorded.measurements["vertical_misalignment_px"]) < 0.2
-    assert "frames: as recorded, rectified by the calibration" in as_recorded.assumptions
+    assert "frames: as recorded, rectified by the calibration" in [each.text for each in as_recorded.assumptions]
     with pytest.raises(InputError, match="the frames are rectified already") as error:
         estimate_depth(rectify(recorded(0.0), calibration))
     assert (error.value.field, "model rectified" in error.value.remedy) == ("calibration", True)

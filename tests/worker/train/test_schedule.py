@@ -115,7 +115,7 @@ def test_scores_that_grow_by_enough_never_stop_a_run() -> None:
     schedule = scored_to_the_end(planned, rising)
     assert schedule.stopped_at is None
     assert schedule.ends == planned.ends
-    assert schedule.words == ()
+    assert schedule.notices == ()
 
 
 @pytest.mark.parametrize("stopping", [1, 2, 3])
@@ -214,11 +214,11 @@ def test_scores_that_are_no_numbers_stop_nothing() -> None:
 
 def test_a_stop_is_told_in_words() -> None:
     schedule = after(Schedule(4000, True, MIN_GAIN_DB), 30.0, 31.0, 31.13)
-    assert schedule.words == (
+    assert [each.text for each in schedule.notices] == [
         "Training ended after 1250 of 4000 iterations that the time allowed: doubling the first 500 gained 0.13 dB "
         f"on validation frames, less than {MIN_GAIN_DB} dB.",
-    )
-    assert after(Schedule(4000, True), 30.0, 30.0).words == ()
+    ]
+    assert after(Schedule(4000, True), 30.0, 30.0).notices == ()
 
 
 @pytest.mark.parametrize("count", range(MIN_FRAMES_FOR_VALIDATION, MIN_FRAMES_FOR_VALIDATION + 2 * VALIDATION_EVERY))

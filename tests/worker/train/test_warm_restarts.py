@@ -101,15 +101,15 @@ def test_a_run_whose_doubling_gains_too_little_ends_early_and_says_so(clip: Dept
     assert run.schedule.stopped_at == STOPPED_AT
     assert run.iteration == run.iterations == CLOSED_AT
     assert [point.iteration for point in run.curve if point.iteration in run.schedule.ends] == [24, 48, 60]
-    assert len(run.schedule.words) == 1
-    assert f"after {CLOSED_AT} of {PLANNED} iterations" in run.schedule.words[0]
+    assert len(run.schedule.notices) == 1
+    assert f"after {CLOSED_AT} of {PLANNED} iterations" in run.schedule.notices[0].text
 
 
 def test_a_run_whose_doublings_gain_enough_goes_on_as_planned(clip: DepthClip, split: FrameSplit) -> None:
     run = trained(validated(clip, split, ALWAYS_ENOUGH_DB))
     assert run.iteration == PLANNED
     assert len(run.schedule.scores) == 3
-    assert run.schedule.words == ()
+    assert run.schedule.notices == ()
 
 
 def test_a_score_is_how_near_the_finished_model_is_to_the_validation_frames(clip: DepthClip, split: FrameSplit) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.calibration.check import FIELD, check_calibration
 from worker.input.calibration.types import RawCalibration, RawEye, RectifiedCalibration, StereoCalibration
 from worker.input.camera import Intrinsics
@@ -45,8 +46,8 @@ class RectifiedClip:
     pairs: PairSource
     tissue: NDArray[np.bool_]
     frame_times_s: NDArray[np.float64]
-    assumptions: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    assumptions: tuple[Notice, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     equal_rows_px: float = 0.0
 
 
@@ -100,7 +101,7 @@ def _pass_through(clip: StereoClip, calibration: RectifiedCalibration) -> Rectif
         pairs=clip.pairs,
         tissue=_all_tissue(clip) if clip.tissue is None else clip.tissue,
         frame_times_s=clip.frame_times_s,
-        assumptions=(*clip.assumptions, *c.assumptions, "frames: rectified already, as the calibration says"),
+        assumptions=_assumptions(clip, c, "frames: rectified already, as the calibration says"),
         warnings=clip.warnings,
     )
 
@@ -131,7 +132,7 @@ def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
         pairs=_RemappedPairs(clip.pairs, left_maps, right_maps),
         tissue=_warp_tissue(clip, left_maps),
         frame_times_s=clip.frame_times_s,
-        assumptions=(*clip.assumptions, *calibration.assumptions, "frames: as recorded, rectified by the calibration"),
+        assumptions=_assumptions(clip, calibration, "frames: as recorded, rectified by the calibration"),
         warnings=clip.warnings + _zoom_warning(float(left_p[0, 0]) / calibration.left.fx_px),
         equal_rows_px=float(
             np.median(_rows(size, *cameras[1], right_r, right_p) - _rows(size, *cameras[0], left_r, left_p))
@@ -172,7 +173,12 @@ def _all_tissue(clip: StereoClip) -> NDArray[np.bool_]:
     return np.broadcast_to(np.True_, (clip.frame_count, clip.height, clip.width))
 
 
-def _zoom_warning(zoom: float) -> tuple[str, ...]:
+def _assumptions(clip: StereoClip, calibration: StereoCalibration, done: str) -> tuple[Notice, ...]:
+    own = (Notice.info(NoticeCode.CALIBRATION, text) for text in calibration.assumptions)
+    return (*clip.assumptions, *own, Notice.info(NoticeCode.RECTIFICATION, done))
+
+
+def _zoom_warning(zoom: float) -> tuple[Notice, ...]:
     """What to say of a rectification that magnifies, as it must cut away what only one eye recorded.
 
     Raises:
@@ -184,4 +190,7 @@ def _zoom_warning(zoom: float) -> tuple[str, ...]:
             f"rectifying with it magnifies {zoom:.1f} times and cuts most of the view away.",
             "Give the calibration of this recording; check R, T and the distortion's order k1 k2 p1 p2 k3.",
         )
-    return (f"rectification magnifies {zoom:.2f} times and cuts the margins away",) if zoom > WARN_ZOOM else ()
+    if zoom <= WARN_ZOOM:
+        return ()
+    text = f"rectification magnifies {zoom:.2f} times and cuts the margins away"
+    return (Notice.warning(NoticeCode.MAGNIFIED, text),)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from contract.intake.limits import MAX_IMAGE_BYTES
 from contract.intake.sniff import JPEG_MAGIC, PNG_MAGIC, png_size
 from contract.wire.errors import InputError
+from contract.wire.notices import Notice
 from worker.input.clip.files import FileTree
 from worker.input.clip.types import RgbFrame
 
@@ -34,7 +35,7 @@ class ImageSequence:
     height: int
     width: int
     frame_times_s: NDArray[np.float64] | None = None  # images carry no time
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     @property
     def frame_count(self) -> int:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from contract.intake.limits import ClipLimits
 from contract.wire.errors import InputError
 from contract.wire.names import MaskPolarity
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.files import FileTree, check_exists, open_tree
 from worker.input.clip.images import MASK_THRESHOLD, ImageSequence, as_mask, open_images
 from worker.input.clip.naming import left_eye_only
@@ -24,7 +25,6 @@ from worker.input.clip.video import VideoFile, open_video, open_video_in
 BrightClass = Literal["tool", "tissue"]  # what a white pixel means
 
 MAX_TOOL_SHARE = 0.4  # of the area: a class larger than this is not taken for the instrument unasked
-NO_MASKS = "masks: none given, every pixel is tissue"  # the assumption recorded then
 _FIELD = "masks"
 _POLARITY_REMEDY = 'Say mask_polarity "tool" if white marks instruments, "tissue" if white marks tissue.'
 
@@ -34,8 +34,8 @@ class TissueMasks:
     """tissue [T, H, W] bool, True = tissue, with what was assumed and what looks odd."""
 
     tissue: NDArray[np.bool_]
-    assumption: str
-    warnings: tuple[str, ...] = ()
+    assumption: Notice
+    warnings: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,11 @@ def mask_names(tree: FileTree) -> tuple[str, ...]:
     return left_eye_only(tuple(names))
 
 
+def no_masks() -> Notice:
+    """The assumption of a clip without masks."""
+    return Notice.info(NoticeCode.MASKS, "masks: none given, every pixel is tissue")
+
+
 def tissue_from_masks(
     masks: MaskFrames,
     shape: tuple[int, int, int],
@@ -107,11 +112,17 @@ def tissue_from_masks(
         raise InputError(_FIELD, "every pixel of every mask is tool.", _POLARITY_REMEDY)
     warnings = []
     if tissue.all():
-        warnings.append("the masks mark no instrument in any frame")
+        warnings.append(Notice.warning(NoticeCode.MASKS_MARK_NOTHING, "the masks mark no instrument in any frame"))
     covered = int((~tissue.any(axis=(1, 2))).sum())
     if covered:
-        warnings.append(f"{covered} of {len(tissue)} frames are all tool in their masks and cannot be learnt from")
-    return TissueMasks(tissue, f"masks: white is {bright} ({reason})", tuple(warnings))
+        warnings.append(
+            Notice.warning(
+                NoticeCode.FRAMES_WITHOUT_TISSUE,
+                f"{covered} of {len(tissue)} frames are all tool in their masks and cannot be learnt from",
+            )
+        )
+    assumption = Notice.info(NoticeCode.MASKS, f"masks: white is {bright} ({reason})")
+    return TissueMasks(tissue, assumption, tuple(warnings))
 
 
 def _bright_class(

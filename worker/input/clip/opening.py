@@ -9,13 +9,14 @@ from pathlib import Path, PurePosixPath
 
 from contract.intake.limits import MAX_CALIBRATION_BYTES, ClipLimits
 from contract.wire.errors import InputError
+from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import ClipOptions
 from worker.input.clip.files import FileTree, check_exists, open_tree, scratch_folder
 from worker.input.clip.images import open_images
 from worker.input.clip.layouts import ClipFiles, detect_layout, layout_named
 from worker.input.clip.layouts.layout import outside_masks
 from worker.input.clip.layouts.stereomis import CALIBRATION_FILE
-from worker.input.clip.masks import NO_MASKS, MaskFrames, mask_names, open_masks
+from worker.input.clip.masks import MaskFrames, mask_names, no_masks, open_masks
 from worker.input.clip.packing import FrameSequence
 from worker.input.clip.stereo import two_sequence_clip, with_masks
 from worker.input.clip.types import DepthClip, StereoClip
@@ -94,7 +95,7 @@ def _open_two(left: Path, right: Path, layout: str, limits: ClipLimits) -> Stere
         raise InputError("options.layout", f'layout "{layout}" does not go with a second file.', "Leave it out.")
     check_exists(right, "right")
     eyes = _open_eye(left, "clip", limits), _open_eye(right, "right", limits)
-    return two_sequence_clip(*eyes, "layout: two files, left eye first", limits)
+    return two_sequence_clip(*eyes, Notice.info(NoticeCode.LAYOUT, "layout: two files, left eye first"), limits)
 
 
 def _open_eye(path: Path, field: str, limits: ClipLimits) -> FrameSequence:
@@ -112,7 +113,7 @@ def _own_masks(tree: FileTree) -> MaskFrames | None:
 
 
 def _without_masks(clip: StereoClip) -> StereoClip:
-    return replace(clip, assumptions=(*clip.assumptions, NO_MASKS))
+    return replace(clip, assumptions=(*clip.assumptions, no_masks()))
 
 
 def _as_path(tree: FileTree, name: str, scratch: Path | None) -> Path:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from contract.wire.notices import Notice
 from worker.input.clip.types import RgbFrame
 
 Packing = Literal["sbs", "tb"]
@@ -43,7 +44,7 @@ class FrameSequence(Protocol):
     @property
     def frame_times_s(self) -> NDArray[np.float64] | None: ...
     @property
-    def warnings(self) -> tuple[str, ...]: ...
+    def warnings(self) -> tuple[Notice, ...]: ...
     def frames(self) -> Iterator[RgbFrame]: ...
 
 
@@ -55,7 +56,7 @@ class PackedPairs:
     packing: Packing
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[Notice, ...]:
         return self.sequence.warnings
 
     @property
@@ -77,7 +78,7 @@ class TwoSequences:
     right: FrameSequence
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[Notice, ...]:
         return self.left.warnings + self.right.warnings
 
     def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.types import DepthClip
 
 MIN_FRAMES = 9  # shorter clips cannot spare a frame
@@ -33,7 +34,7 @@ class FrameSplit:
     train: list[int]
     held_out: list[int]
     repeated: list[int]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
@@ -55,7 +56,8 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     repeated = find_repeats(clip.rgb, train, held_out)
     if len(repeated) == len(train):
         return _nothing_held_out(count, "every training frame repeats a held-out one: the picture does not change")
-    warnings = (f"frames that repeat a held-out frame are not used: {len(repeated)}",) if repeated else ()
+    text = f"frames that repeat a held-out frame are not used: {len(repeated)}"
+    warnings = (Notice.warning(NoticeCode.HELD_OUT_REPEATED, text),) if repeated else ()
     gone = set(repeated)
     return FrameSplit([index for index in train if index not in gone], held_out, repeated, warnings)
 
@@ -131,4 +133,5 @@ def _held_out_by_rule(holdout: str, count: int) -> set[int]:
 
 
 def _nothing_held_out(count: int, reason: str) -> FrameSplit:
-    return FrameSplit(list(range(count)), [], [], (f"no frames are held out, so quality is not measured: {reason}",))
+    text = f"no frames are held out, so quality is not measured: {reason}"
+    return FrameSplit(list(range(count)), [], [], (Notice.warning(NoticeCode.NOTHING_HELD_OUT, text),))

@@ -12,6 +12,7 @@ import numpy as np
 from contract.intake.limits import MIN_SIDE_PX, ClipLimits
 from contract.wire.errors import InputError
 from contract.wire.names import MaskPolarity
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.files import FileTree
 from worker.input.clip.images import open_images
 from worker.input.clip.masks import BrightClass, MaskFrames, tissue_from_masks
@@ -33,14 +34,17 @@ def packed_clip(
 ) -> StereoClip:
     """Both eyes in each picture of one sequence; title is the layout's, if it has one."""
     how = " (found by likeness of the halves)" if detected else ""
-    assumptions = [f"layout: {title}{', ' if title else ''}{PACKING_WORDS[packing]}{how}"]
+    words = f"layout: {title}{', ' if title else ''}{PACKING_WORDS[packing]}{how}"
+    assumptions = [Notice.info(NoticeCode.LAYOUT, words)]
     odd = sequence.width % 2 if packing == "sbs" else sequence.height % 2
     if odd:
-        assumptions.append(f"layout: the odd middle {'column' if packing == 'sbs' else 'row'} belongs to neither eye")
+        line = "column" if packing == "sbs" else "row"
+        text = f"layout: the odd middle {line} belongs to neither eye"
+        assumptions.append(Notice.info(NoticeCode.MIDDLE_LINE_UNUSED, text))
     return _stereo_clip(PackedPairs(sequence, packing), tuple(assumptions), limits)
 
 
-def two_sequence_clip(left: FrameSequence, right: FrameSequence, assumption: str, limits: ClipLimits) -> StereoClip:
+def two_sequence_clip(left: FrameSequence, right: FrameSequence, assumption: Notice, limits: ClipLimits) -> StereoClip:
     """One sequence an eye. InputError when their lengths or sizes differ."""
     return _stereo_clip(pair_sequences(left, right), (assumption,), limits)
 
@@ -56,7 +60,8 @@ def two_video_clip(tree: FileTree, videos: tuple[str, ...]) -> StereoClip:
         )
     left, right = left_eye_only(videos)[0], next(name for name in videos if name not in left_eye_only(videos))
     left_video, right_video = open_video_in(tree, left), open_video_in(tree, right)
-    return two_sequence_clip(left_video, right_video, "layout: two files, told apart by their names", tree.limits)
+    assumption = Notice.info(NoticeCode.LAYOUT, "layout: two files, told apart by their names")
+    return two_sequence_clip(left_video, right_video, assumption, tree.limits)
 
 
 def eye_images_clip(tree: FileTree, images: tuple[str, ...], title: str) -> StereoClip:
@@ -68,7 +73,7 @@ def eye_images_clip(tree: FileTree, images: tuple[str, ...], title: str) -> Ster
             f"{tree.label} holds neither a video nor frames (PNG or JPEG).",
             "Give a stereo video, left and right frames, or the EndoNeRF or StereoMIS layout.",
         )
-    assumption = f"layout: {title}, told apart by their names"
+    assumption = Notice.info(NoticeCode.LAYOUT, f"layout: {title}, told apart by their names")
     return two_sequence_clip(open_images(tree, left), open_images(tree, right), assumption, tree.limits)
 
 
@@ -85,7 +90,7 @@ def with_masks(
     )
 
 
-def _stereo_clip(pairs: PackedPairs | TwoSequences, assumptions: tuple[str, ...], limits: ClipLimits) -> StereoClip:
+def _stereo_clip(pairs: PackedPairs | TwoSequences, assumptions: tuple[Notice, ...], limits: ClipLimits) -> StereoClip:
     first = pairs.sequence if isinstance(pairs, PackedPairs) else pairs.left
     height, width = pairs.eye_size if isinstance(pairs, PackedPairs) else (first.height, first.width)
     if min(height, width) < MIN_SIDE_PX:
@@ -94,5 +99,6 @@ def _stereo_clip(pairs: PackedPairs | TwoSequences, assumptions: tuple[str, ...]
     frame_times_s = first.frame_times_s
     if frame_times_s is None:
         frame_times_s = np.arange(first.frame_count) / FALLBACK_RATE_HZ
-        assumptions = (*assumptions, f"time: {FALLBACK_RATE_HZ:g} frames a second, the clip carries none")
+        text = f"time: {FALLBACK_RATE_HZ:g} frames a second, the clip carries none"
+        assumptions = (*assumptions, Notice.info(NoticeCode.FRAME_TIMES, text))
     return StereoClip(first.frame_count, height, width, pairs, None, frame_times_s, assumptions, pairs.warnings)

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.wire.notices import Notice
 from worker.input.camera import Intrinsics
 
 RgbFrame = NDArray[np.uint8]  # [H, W, 3]
@@ -37,8 +38,8 @@ class StereoClip:
     pairs: PairSource
     tissue: NDArray[np.bool_] | None
     frame_times_s: NDArray[np.float64]
-    assumptions: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    assumptions: tuple[Notice, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,8 @@ class DepthClip:
     intrinsics: Intrinsics
     world_from_camera: NDArray[np.float64]
     frame_times_s: NDArray[np.float64]
-    assumptions: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    assumptions: tuple[Notice, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     measurements: dict[str, float] = field(default_factory=dict)  # e.g. vertical misalignment in px, for the report
 
     @property

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from contract.intake.limits import ClipLimits
 from contract.intake.video_header import CODECS, REMEDY, check_video, is_matroska
 from contract.wire.errors import InputError
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.files import FileTree, scratch_folder
 from worker.input.clip.types import RgbFrame
 
@@ -52,7 +53,7 @@ class VideoFile:
     width: int
     frame_times_s: NDArray[np.float64] | None  # None: the container has no usable times
     limits: ClipLimits
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     def frames(self) -> Iterator[RgbFrame]:
         """RGB uint8 [H, W, 3], from the first frame on. InputError when frames change size or stop early."""
@@ -125,7 +126,8 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
     whole = len(times_ms) + MISSING_FRAMES_ALLOWED >= declared
     if not times_ms or not (whole or _whole_despite_count(path, decoder, declared, times_s, rate_hz, limits)):
         raise _cut_short(field, label, len(times_ms), declared)
-    warnings = () if declared else (f"{field}: the video names no frame count, a missing end would not be noticed",)
+    unknown = f"{field}: the video names no frame count, a missing end would not be noticed"
+    warnings = () if declared else (Notice.warning(NoticeCode.FRAME_COUNT_UNKNOWN, unknown),)
     return VideoFile(path, field, label, decoder, len(times_ms), height, width, times_s, limits, warnings)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import ClipOptions
 from worker.input.calibration import check_calibration
 from worker.input.calibration.types import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
@@ -120,8 +121,8 @@ def _received(told: dict[str, Any], folder: Path, allowance: Allowance) -> Stere
     frame_times_s = map_array(folder, "frame_times_s", size).copy()
     if not np.isfinite(frame_times_s).all():
         raise ValueError("frame times that are not finite")
-    assumptions = (*(str(each) for each in told["assumptions"]), _protection(told["granted"], allowance))
-    warnings = tuple(str(each) for each in told["warnings"])
+    assumptions = (*_notices(told["assumptions"]), _protection(told["granted"], allowance))
+    warnings = _notices(told["warnings"])
     if told["kind"] == DEPTH:
         return DepthClip(
             rgb=map_array(folder, "rgb", size),
@@ -140,13 +141,18 @@ def _received(told: dict[str, Any], folder: Path, allowance: Allowance) -> Stere
     return StereoRecording(clip, _calibration(told["calibration"]))
 
 
-def _protection(granted: list[str], allowance: Allowance) -> str:
+def _notices(told: Any) -> tuple[Notice, ...]:
+    return tuple(Notice.model_validate(each) for each in told)
+
+
+def _protection(granted: list[str], allowance: Allowance) -> Notice:
     """The protections in force while the clip was decoded, and those that the kernel did not grant."""
     amounts = {LIMITED_MEMORY: f" of {allowance.memory_bytes / 2**30:.1f} GiB"}
     held = [each + amounts.get(each, "") for each in PROTECTIONS if each in granted]
     lacking = [each for each in PROTECTIONS if each not in granted]
     denied = f"; the kernel did not grant: {', '.join(lacking)}" if lacking else ""
-    return f"decoding: in a process of its own ({', '.join(held) or 'not confined'}{denied})"
+    text = f"decoding: in a process of its own ({', '.join(held) or 'not confined'}{denied})"
+    return Notice.info(NoticeCode.DECODING, text)
 
 
 def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -43,8 +43,8 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
     height, width = clip.rgb.shape[1:3] if isinstance(clip, DepthClip) else (clip.height, clip.width)
     told = {
         "size": [clip.frame_count, height, width],
-        "assumptions": clip.assumptions,
-        "warnings": clip.warnings,
+        "assumptions": [each.model_dump() for each in clip.assumptions],
+        "warnings": [each.model_dump() for each in clip.warnings],
     }
     if isinstance(clip, DepthClip):
         write_arrays(folder, _depth_arrays(clip, reports))

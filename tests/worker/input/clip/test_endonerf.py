@@ -45,7 +45,7 @@ def test_a_folder_and_its_zip_give_the_same_clip(studio, zipped: bool) -> None:
     assert clip.intrinsics.numbers() == {"width": 80, "height": 64, "fx": 100, "fy": 100, "cx": 40, "cy": 32}
     np.testing.assert_array_equal(clip.world_from_camera, np.tile(np.eye(4), (3, 1, 1)))
     np.testing.assert_allclose(clip.frame_times_s, np.arange(3) / 30)
-    assert any("white is tool" in assumption for assumption in clip.assumptions)
+    assert any("white is tool" in assumption.text for assumption in clip.assumptions)
     assert clip.warnings == ()
 
 
@@ -67,7 +67,7 @@ def test_without_a_masks_folder_every_pixel_is_tissue(studio) -> None:
         mask.unlink()
     clip = depth_clip(folder)
     assert clip.tissue.all()
-    assert any("none given" in assumption for assumption in clip.assumptions)
+    assert any("none given" in assumption.text for assumption in clip.assumptions)
 
 
 def test_given_masks_replace_the_folders_own(studio) -> None:
@@ -89,7 +89,7 @@ def test_a_moving_camera_is_expressed_in_the_camera_of_frame_0(studio, conventio
     studio.poses("endonerf", np.stack([*columns, opencv[:, :3, 3]], axis=2), 64, 80)
     clip = depth_clip(folder, pose_convention=convention)
     np.testing.assert_allclose(clip.world_from_camera, np.linalg.inv(opencv[0]) @ opencv, atol=1e-12)
-    assert any(f"{convention} camera-to-world, moving camera" in assumption for assumption in clip.assumptions)
+    assert any(f"{convention} camera-to-world, moving camera" in assumption.text for assumption in clip.assumptions)
 
 
 def test_moving_right_in_the_file_is_plus_x_and_backing_off_is_minus_z(studio) -> None:
@@ -230,7 +230,7 @@ def test_no_valid_depth_is_refused(studio) -> None:
 def test_depth_in_other_units_is_warned_about(studio, depth_mm: int, warning: str) -> None:
     folder = studio.endonerf()
     studio.images("endonerf/depth/frame-{}.depth.png", np.full((3, 64, 80), depth_mm, dtype=np.uint16))
-    assert warning in depth_clip(folder).warnings[0]
+    assert warning in depth_clip(folder).warnings[0].text
 
 
 def test_mostly_missing_depth_is_warned_about(studio) -> None:
@@ -238,7 +238,7 @@ def test_mostly_missing_depth_is_warned_about(studio) -> None:
     depth = np.zeros((3, 64, 80), dtype=np.uint8)
     depth[:, :, :20] = 60
     studio.images("endonerf/depth/frame-{}.depth.png", depth)
-    assert any("of the tissue pixels have one" in warning for warning in depth_clip(folder).warnings)
+    assert any("of the tissue pixels have one" in warning.text for warning in depth_clip(folder).warnings)
 
 
 def test_a_damaged_image_is_named(studio) -> None:

@@ -40,7 +40,7 @@ def test_left_and_right_frames_are_told_by_their_names(studio, patterns: tuple[s
         np.testing.assert_array_equal(shown_left, left[index])
         np.testing.assert_array_equal(shown_right, right[index])
     np.testing.assert_allclose(clip.frame_times_s, np.arange(3) / 30)
-    assert any("30 frames a second" in assumption for assumption in clip.assumptions)
+    assert any("30 frames a second" in assumption.text for assumption in clip.assumptions)
 
 
 def test_two_folders_are_the_two_eyes(studio) -> None:
@@ -187,7 +187,7 @@ def test_stereomis_masks_are_white_on_tissue(studio, zipped: bool) -> None:
     clip = open_clip(studio.zip(folder, prefix="P1/") if zipped else folder)
     assert isinstance(clip, StereoClip)
     np.testing.assert_array_equal(clip.tissue, ~studio.tool(3))
-    assert any("StereoMIS" in assumption for assumption in clip.assumptions)
+    assert any("StereoMIS" in assumption.text for assumption in clip.assumptions)
 
 
 def test_a_stereomis_video_is_top_bottom(studio) -> None:
@@ -197,7 +197,7 @@ def test_a_stereomis_video_is_top_bottom(studio) -> None:
     (studio.root / "P1/StereoCalibration.ini").write_text("[StereoLeft]\n")
     clip = open_clip(studio.root / "P1")
     assert (clip.height, clip.width) == (80, 96)
-    assert clip.assumptions[0].startswith("layout: StereoMIS, top-bottom, left eye on top")
+    assert clip.assumptions[0].text.startswith("layout: StereoMIS, top-bottom, left eye on top")
 
 
 def test_two_videos_in_a_folder_are_told_by_their_names(studio) -> None:
@@ -231,7 +231,7 @@ def test_what_is_said_of_a_clip_repeats_no_name_of_its_files(studio, pattern: st
     studio.masks("clip/masks/smith", studio.tool(3))
     clip = open_with(studio.zip(folder, prefix="smith/"), mask_polarity="tool")
     assert clip.assumptions
-    assert not any("smith" in said for said in clip.assumptions + clip.warnings)
+    assert not any("smith" in said.text for said in clip.assumptions + clip.warnings)
 
 
 def test_what_is_said_of_videos_repeats_no_name_of_their_files(studio) -> None:
@@ -241,7 +241,7 @@ def test_what_is_said_of_videos_repeats_no_name_of_their_files(studio) -> None:
         shutil.copy(LIVE, folder / f"smith_{eye}.webm")
     clip = open_clip(studio.zip(folder))
     assert len(clip.warnings) == 2
-    assert not any("smith" in said for said in clip.assumptions + clip.warnings)
+    assert not any("smith" in said.text for said in clip.assumptions + clip.warnings)
 
 
 def test_no_calibration_is_none_and_two_are_an_error(studio) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from contract.wire.notices import Notice
 from tests.worker.clips import open_with
 from worker.input.clip import StereoClip, open_clip
 
@@ -22,6 +24,10 @@ def frames(studio) -> Path:
     return studio.root / "clip"
 
 
+def texts(notices: Iterable[Notice]) -> list[str]:
+    return [notice.text for notice in notices]
+
+
 def tissue_of(path: Path, **options) -> NDArray[np.bool_]:
     clip = open_with(path, **options)
     assert isinstance(clip, StereoClip)
@@ -33,7 +39,7 @@ def test_without_masks_there_is_no_tissue_map_and_the_clip_says_so(frames: Path)
     clip = open_clip(frames)
     assert isinstance(clip, StereoClip)
     assert clip.tissue is None
-    assert "masks: none given, every pixel is tissue" in clip.assumptions
+    assert "masks: none given, every pixel is tissue" in texts(clip.assumptions)
 
 
 def test_folder_zip_and_video_of_masks_agree(studio, frames: Path) -> None:
@@ -56,13 +62,13 @@ def test_the_class_on_the_border_with_the_smaller_area_is_the_tool(studio, frame
     masks = studio.masks("masks", tool if white == "tool" else ~tool)
     clip = open_clip(frames, masks=masks)
     np.testing.assert_array_equal(clip.tissue, ~tool)
-    assert any(f"white is {white}" in assumption for assumption in clip.assumptions)
+    assert any(f"white is {white}" in assumption.text for assumption in clip.assumptions)
 
 
 def test_what_was_told_wins_over_the_look(studio, frames: Path) -> None:
     clip = open_with(frames, masks=studio.masks("masks", studio.tool()), mask_polarity="tissue")
     np.testing.assert_array_equal(clip.tissue, studio.tool())
-    assert "masks: white is tissue (as told)" in clip.assumptions
+    assert "masks: white is tissue (as told)" in texts(clip.assumptions)
 
 
 def test_a_small_class_that_touches_no_border_asks_for_the_polarity(studio, frames: Path) -> None:
@@ -106,7 +112,7 @@ def test_told_masks_may_mark_no_tool_but_not_everything(studio, frames: Path) ->
     clip = open_with(frames, masks=masks, mask_polarity="tool")
     assert clip.tissue is not None
     assert clip.tissue.all()
-    assert "the masks mark no instrument in any frame" in clip.warnings
+    assert "the masks mark no instrument in any frame" in texts(clip.warnings)
     with pytest.raises(InputError, match="every pixel of every mask is tool"):
         open_with(frames, masks=masks, mask_polarity="tissue")
 
@@ -115,7 +121,7 @@ def test_a_frame_that_is_all_tool_is_warned_about(studio, frames: Path) -> None:
     tool = studio.tool()
     tool[2] = True
     clip = open_clip(frames, masks=studio.masks("masks", tool))
-    assert "1 of 6 frames are all tool in their masks and cannot be learnt from" in clip.warnings
+    assert "1 of 6 frames are all tool in their masks and cannot be learnt from" in texts(clip.warnings)
 
 
 def test_grey_edges_are_cut_at_half(studio, frames: Path) -> None:

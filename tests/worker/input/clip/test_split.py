@@ -76,13 +76,13 @@ def test_short_clips_hold_out_none_and_warn(holdout: str) -> None:
     assert held_out_frames(8, holdout) == []
     assert split.train == list(range(8))
     assert split.held_out == []
-    assert "fewer than 9" in split.warnings[0]
+    assert "fewer than 9" in split.warnings[0].text
 
 
 def test_blocks8_warns_when_it_finds_no_block() -> None:
     split = split_frames(distinct(16), "blocks8")
     assert split.held_out == []
-    assert "finds no frame" in split.warnings[0]
+    assert "finds no frame" in split.warnings[0].text
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_a_training_frame_that_repeats_a_held_out_one_is_in_neither_list() -> No
     assert split.repeated == [2, 14]
     assert split.held_out == [1, 9, 17]
     assert split.train == [0, 3, 4, 5, 6, 7, 8, 10, 11, 12, 13, 15, 16]
-    assert split.warnings == ("frames that repeat a held-out frame are not used: 2",)
+    assert [each.text for each in split.warnings] == ["frames that repeat a held-out frame are not used: 2"]
 
 
 def test_the_quick_bound_never_changes_the_answer() -> None:
@@ -134,7 +134,7 @@ def test_a_still_clip_keeps_its_frames_and_warns() -> None:
     split = split_frames(clip_of(np.full((20, 8, 10, 3), 90, dtype=np.uint8)))
     assert split.train == list(range(20))
     assert split.held_out == []
-    assert "the picture does not change" in split.warnings[0]
+    assert "the picture does not change" in split.warnings[0].text
 
 
 @pytest.mark.skipif(not (REAL_DATA / "d4d_endonerf").is_dir(), reason="needs INTRASPLAT_DATA")

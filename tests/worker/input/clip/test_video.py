@@ -32,7 +32,7 @@ def stereo(path, *args, **options) -> StereoClip:
 def test_h264_and_hevc_clips_open_with_their_packing_found(path: Path, words: str) -> None:
     clip = stereo(path)
     assert (clip.frame_count, clip.height, clip.width) == (12, 80, 96)
-    assert any(words in assumption for assumption in clip.assumptions)
+    assert any(words in assumption.text for assumption in clip.assumptions)
     pairs = list(clip.pairs())
     assert len(pairs) == 12
     for left, right in pairs:
@@ -63,7 +63,7 @@ def test_frames_hidden_by_an_edit_list_are_not_missing() -> None:
 def test_a_stream_that_declares_no_length_warns() -> None:
     clip = stereo(DATA / "stereo_sbs_live.webm")
     assert clip.frame_count == 12
-    assert "a missing end would not be noticed" in clip.warnings[0]
+    assert "a missing end would not be noticed" in clip.warnings[0].text
 
 
 def test_a_cut_clip_of_varying_frames_is_refused(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ def test_an_odd_middle_column_belongs_to_neither_eye(studio) -> None:
     folder = studio.images("packed/{}.png", np.concatenate([left, middle, right], axis=2))
     clip = stereo(folder, layout="sbs")
     assert (clip.height, clip.width) == (80, 96)
-    assert any("odd middle column" in assumption for assumption in clip.assumptions)
+    assert any("odd middle column" in assumption.text for assumption in clip.assumptions)
     shown_left, shown_right = next(clip.pairs())
     np.testing.assert_array_equal(shown_left, left[0])
     np.testing.assert_array_equal(shown_right, right[0])
@@ -292,4 +292,4 @@ def test_real_stereo_clips_open_without_being_told_anything() -> None:
     assert 0.85 < clip.tissue.mean() < 0.95
     raw = stereo(REAL_DATA / "surgt_raw/video.mp4")
     assert (raw.frame_count, raw.height, raw.width) == (10, 1024, 1280)
-    assert "side by side" in raw.assumptions[0]
+    assert "side by side" in raw.assumptions[0].text

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from contract.intake.limits import MAX_POSES_BYTES
 from contract.wire.errors import InputError
 from contract.wire.names import MaskPolarity, PoseConvention
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.camera import Intrinsics
 from worker.input.clip.files import FileTree
 from worker.input.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
 from worker.input.clip.layouts.layout import ClipFiles, InputLayout
-from worker.input.clip.masks import NO_MASKS, MaskFrames, TissueMasks, tissue_from_masks
+from worker.input.clip.masks import MaskFrames, TissueMasks, no_masks, tissue_from_masks
 from worker.input.clip.naming import check_aligned
 from worker.input.clip.poses import POSES_FILE, Poses, parse_poses
 from worker.input.clip.types import DepthClip
@@ -85,15 +86,15 @@ def _open(files: ClipFiles) -> DepthClip:
     )
 
 
-def _assumptions(masks: TissueMasks, poses: Poses, convention: PoseConvention) -> tuple[str, ...]:
-    moves = not np.allclose(poses.world_from_camera, np.eye(4), atol=1e-6)
+def _assumptions(masks: TissueMasks, poses: Poses, convention: PoseConvention) -> tuple[Notice, ...]:
+    camera = "fixed" if np.allclose(poses.world_from_camera, np.eye(4), atol=1e-6) else "moving"
     return (
-        f"layout: {TITLE}",
+        Notice.info(NoticeCode.LAYOUT, f"layout: {TITLE}"),
         masks.assumption,
-        f"poses: {convention} camera-to-world, " + ("moving camera" if moves else "fixed camera"),
-        "intrinsics: principal point at the image centre",
-        "depth: millimetres",
-        f"time: {FALLBACK_RATE_HZ:g} frames a second, images carry none",
+        Notice.info(NoticeCode.POSES, f"poses: {convention} camera-to-world, {camera} camera"),
+        Notice.info(NoticeCode.INTRINSICS, "intrinsics: principal point at the image centre"),
+        Notice.info(NoticeCode.DEPTH_UNIT, "depth: millimetres"),
+        Notice.info(NoticeCode.FRAME_TIMES, f"time: {FALLBACK_RATE_HZ:g} frames a second, images carry none"),
     )
 
 
@@ -135,7 +136,7 @@ def _masks(tree: FileTree, images: ImageSequence, given: MaskFrames | None, told
     if given is None:
         names = tree.images("masks")
         if not names:
-            return TissueMasks(np.ones(shape, dtype=np.bool_), NO_MASKS)
+            return TissueMasks(np.ones(shape, dtype=np.bool_), no_masks())
         check_aligned("masks", images.names, names)
         given = MaskFrames(open_images(tree, names))
     return tissue_from_masks(given, shape, told, by_layout=(TITLE, "tool"))
@@ -156,17 +157,23 @@ def _decode_all(
     return result
 
 
-def _depth_warnings(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) -> tuple[str, ...]:
+def _depth_warnings(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) -> tuple[Notice, ...]:
     """What looks odd about depth that has some valid pixel on tissue; judged on every 4th row and column."""
     depth_mm, tissue = depth_mm[:, ::4, ::4], tissue[:, ::4, ::4]
     valid = (depth_mm > 0) & tissue
     warnings = []
     low, high = _USUAL_DEPTH_MM
     if valid.any() and not low <= (median := float(np.median(depth_mm[valid]))) <= high:
-        warnings.append(f"depth: its median is {median:.1f} mm, unusual for an endoscope; is it in millimetres?")
+        warnings.append(
+            Notice.warning(
+                NoticeCode.DEPTH_UNUSUAL,
+                f"depth: its median is {median:.1f} mm, unusual for an endoscope; is it in millimetres?",
+            )
+        )
     share = np.count_nonzero(valid) / max(1, int(np.count_nonzero(tissue)))
     if share < _MIN_DEPTH_SHARE:
-        warnings.append(f"depth: only {100 * share:.0f} % of the tissue pixels have one")
+        text = f"depth: only {100 * share:.0f} % of the tissue pixels have one"
+        warnings.append(Notice.warning(NoticeCode.LITTLE_DEPTH, text))
     return tuple(warnings)
 
 
