@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from contract.runtime.exits import LAST_WORDS_VARIABLE, ExitCode, take_last_words
 from contract.runtime.processes import die_with_parent
@@ -121,8 +122,7 @@ class Supervised:
         if self._process.stdin is None:
             self._process.terminate()
         else:
-            with contextlib.suppress(BrokenPipeError):
-                self._process.stdin.close()
+            _close(self._process.stdin)
 
     def kill(self) -> None:
         """Kill the child and wait until it is gone; watch() then tells how it ended."""
@@ -162,8 +162,10 @@ class Supervised:
     def _end_of_process(self) -> ProcessEnd | None:
         """How the process ended, if it has; sets when the next one starts."""
         status = self._process.poll() if self._process else None
-        if status is None:
+        if self._process is None or status is None:
             return None
+        if self._process.stdin is not None:
+            _close(self._process.stdin)
         self._process = None
         if self.age_s > self._healthy_after_s:
             self.mark_healthy()
@@ -189,6 +191,11 @@ class Supervised:
     def _clear_last_words(self) -> None:
         if self._last_words is not None:
             self._last_words.unlink(missing_ok=True)
+
+
+def _close(pipe: IO[bytes]) -> None:
+    with contextlib.suppress(BrokenPipeError):
+        pipe.close()
 
 
 def cause_of(status: int) -> str:

@@ -20,10 +20,10 @@ from pathlib import Path
 
 from contract.queue.promise import BEAT_PERIOD_S, LEASE_S
 from tests.chaos.campaign import CELLS, NO_MATTER, Outcome, run_kill
-from tests.chaos.deployment import Deployment, Target
+from tests.chaos.deployment import Deployment, Victim
 from tests.chaos.history import RERUN_WITHIN_S, ClipHistory, orphans
 from tests.chaos.points import Point
-from tests.chaos.scenarios import Finding, bad_wire, zombie
+from tests.chaos.scenarios import ScenarioResult, bad_wire, zombie
 from worker.evaluate.rows import commit, machine
 
 CANCEL_EVERY = 5
@@ -54,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
     return 1 if left or broken else 0
 
 
-def _plan(kills: int, seed: int) -> list[tuple[Target, Point, bool]]:
+def _plan(kills: int, seed: int) -> list[tuple[Victim, Point, bool]]:
     """As many kills of each cell, in a random order."""
     cells = itertools.islice(itertools.cycle(CELLS), kills)
     plan = [
@@ -66,11 +66,11 @@ def _plan(kills: int, seed: int) -> list[tuple[Target, Point, bool]]:
 
 
 def _run_deployments(
-    plan: list[tuple[Target, Point, bool]], folder: Path, deployments: int, first_port: int
+    plan: list[tuple[Victim, Point, bool]], folder: Path, deployments: int, first_port: int
 ) -> tuple[list[Outcome], list[Path]]:
     outcomes: list[Outcome] = []
     left: list[Path] = []
-    remaining: Iterator[tuple[Target, Point, bool]] = iter(plan)
+    remaining: Iterator[tuple[Victim, Point, bool]] = iter(plan)
     lock = threading.Lock()
 
     def live_in(number: int) -> None:
@@ -98,7 +98,7 @@ def _run_deployments(
     return outcomes, left
 
 
-def _run_scenarios(folder: Path, port: int) -> list[Finding]:
+def _run_scenarios(folder: Path, port: int) -> list[ScenarioResult]:
     findings = [
         zombie(folder / f"zombie-{point.name}", port, point)
         for point in (Point.CLAIMED, Point.TRAINING, Point.PUBLISHING, Point.PUBLISHED)
@@ -106,13 +106,13 @@ def _run_scenarios(folder: Path, port: int) -> list[Finding]:
     return [*findings, bad_wire(folder / "wire", port, seed=0)]
 
 
-def _scenario_lines(findings: list[Finding]) -> str:
+def _scenario_lines(findings: list[ScenarioResult]) -> str:
     lines = ["", "# Sleepers and bad wires", "", "| scenario | seen | broken laws |", "|---|---|---|"]
     lines += [f"| {found.name} | {found.seen} | {'; '.join(found.violations) or 'none'} |" for found in findings]
     return "\n".join(lines) + "\n"
 
 
-def _one(deployment: Deployment, target: Target, point: Point, cancels: bool) -> Outcome:
+def _one(deployment: Deployment, target: Victim, point: Point, cancels: bool) -> Outcome:
     try:
         return run_kill(deployment, target, point, cancels)
     except Exception as error:  # a deployment that does not come back is the gravest finding of all
@@ -154,7 +154,7 @@ def _table(outcomes: list[Outcome], left: list[Path], seconds: float, options: a
         "| killed | " + " | ".join(point.value for point in Point) + " |",
         "|---|" + "---|" * len(Point),
     ]
-    for target in Target:
+    for target in Victim:
         cells = [
             "no part in it" if (target, point) in NO_MATTER else _cell(by_cell[target.value, point.value])
             for point in Point

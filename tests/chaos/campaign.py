@@ -17,7 +17,7 @@ import httpx
 
 from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
-from tests.chaos.deployment import Deployment, Target
+from tests.chaos.deployment import Deployment, Victim
 from tests.chaos.history import ClipHistory, violations
 from tests.chaos.points import Point
 
@@ -34,12 +34,12 @@ RETRY_PAUSE_S = 0.2
 
 NO_MATTER = frozenset(
     (target, point)
-    for target in (Target.SUPERVISOR, Target.CHILD)
+    for target in (Victim.SUPERVISOR, Victim.CHILD)
     for point in (Point.UPLOAD, Point.SPOOLED)
 )  # fmt: skip
 """Cells without meaning: the worker has no part in the clip before it is queued."""
 
-CELLS = [(target, point) for target in Target for point in Point if (target, point) not in NO_MATTER]
+CELLS = [(target, point) for target in Victim for point in Point if (target, point) not in NO_MATTER]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Outcome:
     violations: list[str]
 
 
-class Caller:
+class ChaosClient:
     """A client that sends one clip until it is accepted, always under the same idempotency key."""
 
     def __init__(self, url: str) -> None:
@@ -92,11 +92,11 @@ class Caller:
             time.sleep(RETRY_PAUSE_S)
 
 
-def run_kill(deployment: Deployment, target: Target, point: Point, cancels: bool) -> Outcome:
+def run_kill(deployment: Deployment, target: Victim, point: Point, cancels: bool) -> Outcome:
     """Kill `target` while a clip is at `point`; with `cancels`, after asking to cancel it."""
     deployment.points.reset()
     history = ClipHistory((target.value, point.value))
-    caller = Caller(deployment.url)
+    caller = ChaosClient(deployment.url)
     half: socket.socket | None = None
     if point is Point.UPLOAD:
         half = caller.send_half()
@@ -115,7 +115,7 @@ def run_kill(deployment: Deployment, target: Target, point: Point, cancels: bool
         half.close()
         caller.start()
     deployment.wait_until_ready()
-    history.restart_s = time.time() - history.killed_at_s if target in (Target.VALKEY, Target.ALL) else 0.0
+    history.restart_s = time.time() - history.killed_at_s if target in (Victim.VALKEY, Victim.ALL) else 0.0
     caller.wait()
     history.job_id = caller.job_id
     watch(deployment, history)

@@ -28,7 +28,7 @@ KEEP_PERIOD_S = 0.05
 START_TIMEOUT_S = 60.0
 
 
-class Target(StrEnum):
+class Victim(StrEnum):
     """What is killed."""
 
     SERVICE = "service"
@@ -130,16 +130,16 @@ class Deployment:
             time.sleep(0.05)
         raise TimeoutError(f"{self.data_dir} is not ready after {timeout_s:g} s; its logs lie beside it")
 
-    def kill(self, target: Target) -> None:
+    def kill(self, target: Victim) -> None:
         """kill -9."""
         supervisors = [kept.process_id for kept in self.workers]
         children = [child for supervisor in supervisors if supervisor for child in children_of(supervisor)]
         victims = {
-            Target.SERVICE: [self.service.process_id],
-            Target.SUPERVISOR: supervisors,
-            Target.CHILD: children,
-            Target.VALKEY: [self.server.process_id],
-            Target.ALL: [self.service.process_id, *supervisors, *children, self.server.process_id],
+            Victim.SERVICE: [self.service.process_id],
+            Victim.SUPERVISOR: supervisors,
+            Victim.CHILD: children,
+            Victim.VALKEY: [self.server.process_id],
+            Victim.ALL: [self.service.process_id, *supervisors, *children, self.server.process_id],
         }[target]
         for victim in victims:
             if victim is not None:

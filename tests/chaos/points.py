@@ -17,7 +17,7 @@ from typing import Any
 
 FOLDER_VARIABLE = "INTRASPLAT_CHAOS_FOLDER"
 POLL_S = 0.005
-HELD_AT_MOST_S = 30.0
+MAX_HELD_S = 30.0
 
 
 class Point(StrEnum):
@@ -84,7 +84,7 @@ def reach(point: Point) -> None:
     arriving = folder / f"arriving.{point.name}"
     arriving.write_text(str(os.getpid()))
     arriving.rename(folder / f"at.{point.name}")
-    deadline_s = time.monotonic() + HELD_AT_MOST_S
+    deadline_s = time.monotonic() + MAX_HELD_S
     while not (folder / f"go.{point.name}").exists() and time.monotonic() < deadline_s:
         time.sleep(POLL_S)
 

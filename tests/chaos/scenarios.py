@@ -11,7 +11,7 @@ from pathlib import Path
 
 from contract.queue.promise import LEASE_S
 from contract.wire.job import TERMINAL_STATES, JobState
-from tests.chaos.campaign import Caller, wait_until_ended, watch
+from tests.chaos.campaign import ChaosClient, wait_until_ended, watch
 from tests.chaos.deployment import Deployment, children_of
 from tests.chaos.history import ClipHistory, orphans, violations
 from tests.chaos.points import Point
@@ -34,7 +34,7 @@ WIRE_JOBS = 25
 
 
 @dataclass(frozen=True)
-class Finding:
+class ScenarioResult:
     """A scenario, what was seen in it, and the laws it broke."""
 
     name: str
@@ -42,10 +42,10 @@ class Finding:
     violations: list[str]
 
 
-def zombie(folder: Path, port: int, point: Point) -> Finding:
+def zombie(folder: Path, port: int, point: Point) -> ScenarioResult:
     """SIGSTOP the worker that holds a job at `point` past its lease, let the other finish, SIGCONT the first."""
     with Deployment(folder, port, workers=2) as deployment:
-        caller = Caller(deployment.url)
+        caller = ChaosClient(deployment.url)
         deployment.points.arm(point)
         caller.start()
         held = deployment.points.wait_for(point, 40.0)
@@ -71,10 +71,10 @@ def zombie(folder: Path, port: int, point: Point) -> Finding:
         if history.events[-1].record.attempt != 2:
             broken.append(f"attempt {history.events[-1].record.attempt} won")
         seen = f"another worker was done {taken_over_s:.1f} s after the first was stopped"
-        return Finding(f"zombie, stopped {point.value}", seen, broken)
+        return ScenarioResult(f"zombie, stopped {point.value}", seen, broken)
 
 
-def bad_wire(folder: Path, port: int, seed: int) -> Finding:
+def bad_wire(folder: Path, port: int, seed: int) -> ScenarioResult:
     """Two workers behind a wire that misbehaves while jobs come in."""
     with Deployment(folder, port, workers=0) as deployment, ChaosProxy(deployment.socket, seed) as proxy:
         deployment.add_workers(2, redis_url=f"redis://127.0.0.1:{proxy.port}/0")
@@ -83,7 +83,7 @@ def bad_wire(folder: Path, port: int, seed: int) -> Finding:
         for fault, seconds in WIRE_FAULTS:
             proxy.set(fault)
             for _ in range(WIRE_JOBS // len(WIRE_FAULTS)):
-                callers.append(Caller(deployment.url))
+                callers.append(ChaosClient(deployment.url))
                 callers[-1].start()
                 time.sleep(seconds * len(WIRE_FAULTS) / WIRE_JOBS)
             proxy.set(Fault.NONE)
@@ -103,7 +103,7 @@ def bad_wire(folder: Path, port: int, seed: int) -> Finding:
         if orphans(deployment.store, {record.job_id for record in records}):
             broken.append("folders that belong to no job")
         faults = ", ".join(f"{fault.value} {seconds:g} s" for fault, seconds in WIRE_FAULTS)
-        return Finding(f"wire: {faults}", f"{WIRE_JOBS} clips, {len(records)} jobs, {attempts} attempts", broken)
+        return ScenarioResult(f"wire: {faults}", f"{WIRE_JOBS} clips, {len(records)} jobs, {attempts} attempts", broken)
 
 
 def _family_of(process_id: int, deployment: Deployment) -> list[int]:

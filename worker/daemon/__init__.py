@@ -1,4 +1,5 @@
-"""Jobs from the queue in, scenes and renders out: the long-running worker of a service.
+"""The long-running worker of a service.
 
-supervisor.py and consume.py hold the claim without torch; device.py is the child that trains and renders.
+In: jobs from the queue, render and export requests. Out: scenes in the store, replies. Verbs: supervisor.run_supervisor
+claims jobs and watches its child without torch; device.run_device is that child, which trains and renders.
 """

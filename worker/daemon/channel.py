@@ -1,4 +1,7 @@
-"""The child's end of the wire of worker/daemon/orders.py: reports go out, orders come in. Imports no torch."""
+"""The device process's end of the messages of worker/daemon/orders.py: it sends reports and reads orders.
+
+Imports no torch.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,13 @@ from typing import BinaryIO
 
 from pydantic import ValidationError
 
-from worker.daemon.orders import DeviceReport, Run, line_of, read_order
+from worker.daemon.orders import DeviceReport, RunJob, line_of, read_order
 
 logger = logging.getLogger("intrasplat.worker")
 
 
 class Channel:
-    """Where reports go; for any thread."""
+    """Sends reports; for any thread."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -28,20 +31,20 @@ class Channel:
 
     @classmethod
     def instead_of_stdout(cls) -> Channel:
-        """Takes stdout for itself: whatever else is printed from now on goes to stderr."""
+        """Take stdout for reports; anything else that is printed from now on goes to stderr."""
         sys.stdout.flush()
-        own = os.dup(sys.stdout.fileno())  # not inherited by processes that are started from here
+        own = os.dup(sys.stdout.fileno())  # child processes do not inherit it
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         return cls(os.fdopen(own, "wb"))
 
     def send(self, message: DeviceReport) -> None:
-        """Write one report. A supervisor that is gone ends this process by other means."""
+        """Write one report; if the supervisor is gone, do nothing."""
         with self._lock, contextlib.suppress(BrokenPipeError):
             self._stream.write(line_of(message))
             self._stream.flush()
 
     def send_if_new(self, message: DeviceReport) -> None:
-        """Write a report unless it says what the last of its kind said; for one thread."""
+        """Write a report unless it equals the last of its type; for one thread."""
         if self._last.get(type(message)) != message:
             self._last[type(message)] = message
             self.send(message)
@@ -49,14 +52,14 @@ class Channel:
 
 @dataclass(frozen=True)
 class Task:
-    """A job that was ordered, and whether its end was since."""
+    """A job that was ordered; `stop` is set once it shall stop."""
 
-    run: Run
+    run: RunJob
     stop: threading.Event = field(default_factory=threading.Event)
 
 
 class Orders:
-    """Reads orders in a thread of its own; at their end it ends the process, whatever else goes on in it."""
+    """Reads orders in a thread, which ends the whole process when the orders end."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -65,7 +68,7 @@ class Orders:
 
     @classmethod
     def from_stdin(cls) -> Orders:
-        """Through a file of its own: Python must not wait for this thread's lock on sys.stdin when it ends."""
+        """Orders from stdin, read through a copy: at exit Python must not wait for this thread's lock on sys.stdin."""
         return cls(os.fdopen(os.dup(sys.stdin.fileno()), "rb"))
 
     def next(self, timeout_s: float) -> Task | None:
@@ -80,12 +83,12 @@ class Orders:
         for line in self._stream:
             try:
                 order = read_order(line)
-            except ValidationError:  # of another version: a process that heard no further order would only seem to work
-                logger.error("an order cannot be read; restart the worker after its program was changed")
+            except ValidationError:  # of another version: a process that hears no orders would only seem to work
+                logger.error("an order cannot be read; restart the worker after updating the program")
                 os._exit(1)
-            if isinstance(order, Run):
+            if isinstance(order, RunJob):
                 task = Task(order)
                 self._tasks.put(task)
             elif task is not None:
                 task.stop.set()
-        os._exit(0)  # nothing here is worth keeping: what is durable is on disk already
+        os._exit(0)  # all that must be kept is on disk already

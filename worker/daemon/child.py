@@ -91,7 +91,6 @@ class DeviceChild:
         return ended
 
     def _read(self) -> None:
-        assert self.process.stdin is not None
         assert self.process.stdout is not None
         with self.process.stdout as lines:
             for line in lines:
@@ -104,8 +103,6 @@ class DeviceChild:
                     self.scenes = report.scenes
                 else:
                     self._reports.put(report)
-        with contextlib.suppress(BrokenPipeError):
-            self.process.stdin.close()
 
 
 class Keeper:

@@ -1,8 +1,8 @@
-"""The job loop: claim, let the device child reconstruct, settle. No torch in here: nothing in this process can hang.
+"""The job loop: claim a job, let the device process reconstruct it, settle. No torch here, so nothing can hang.
 
-A job ends in exactly one of done, failed and cancelled. If the child dies the job is handed back and held against it;
-if this process is told to end, or to make way, it is handed back and a later attempt goes on from there; if this
-process dies its child dies with it, the claim runs out, and any worker takes the job again (contract/queue/promise.py).
+A job ends in exactly one of done, failed and cancelled. If the child dies, the job is handed back and the death counts
+against it. If this process is told to end, or the job to make way, the job is handed back and a later attempt resumes
+it. If this process dies, its child dies too, the claim runs out, and any worker takes the job.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from contract.wire.errors import IntrasplatError, UnavailableError
 from contract.wire.job import JobProgress, JobRecord, JobState
 from worker.daemon.child import DeviceChild, Ended, Keeper
 from worker.daemon.faults import describe
+from worker.daemon.hang import HangDetector
 from worker.daemon.heartbeat import Heartbeat
-from worker.daemon.liveness import Watch
-from worker.daemon.orders import Advanced, Failed, Finished, Run, Stop, Stopped
+from worker.daemon.orders import Advanced, Failed, Finished, RunJob, StopJob, Stopped
 
 CLAIM_TIMEOUT_S = 1.0
 """How soon an idle worker notices that it should end, or that its child has."""
 
 LOOK_PERIOD_S = 0.1
-"""How soon a new order of the queue, or a hang, is acted on."""
+"""How soon this process acts on a new order of the queue, or on a hang."""
 
-STOP_LIMIT_S = 5.0
-"""A child that is told to stop has so long to keep the job's state; then it is killed."""
+MAX_STOP_S = 5.0
+"""How long a child that is told to stop may take to save the job's state before it is killed."""
 
 UNREACHABLE_PAUSE_S = 1.0
 
-STORE_PATIENCE_S = 60.0
-"""A store that fails for so long fails the job."""
+MAX_STORE_S = 60.0
+"""The job fails when the store fails for so long."""
 
 FETCHING = "fetch"
 PUBLISHING = "publish"
-"""The first and the last stage a caller sees: the clip is brought here, the scene put in its place."""
+"""The first and the last stage a caller sees: the clip is fetched, the scene is published."""
 
-WAIT_FOR_QUEUE = "the queue is away; the lease will run out"
+UNSETTLED = "the queue cannot be reached; the lease will run out"
 
 _Result = TypeVar("_Result")
 
@@ -51,14 +51,14 @@ logger = logging.getLogger("intrasplat.worker")
 
 @dataclass(frozen=True)
 class Died:
-    """The child is gone. excused: not because of the job; it had been told to stop, or had died before."""
+    """The child is gone. excused: not because of the job, as it had been told to stop or had died before."""
 
     cause: str
     excused: bool
 
 
 class Consumer:
-    """Takes jobs one after the other; job_id is that of the running one and may be read from any thread."""
+    """Takes one job after the other. job_id names the running one and may be read from any thread."""
 
     def __init__(self, queue: Queue, store: Store, keeper: Keeper, owner: str, end: threading.Event) -> None:
         self._queue = queue
@@ -69,10 +69,10 @@ class Consumer:
         self.job_id: str | None = None
 
     def run(self, claim_timeout_s: float = CLAIM_TIMEOUT_S) -> None:
-        """Until `end` is set.
+        """Take jobs until `end` is set.
 
         Raises:
-            UnavailableError: the child says that it cannot work here.
+            UnavailableError: the child cannot work here.
         """
         away = False
         while (child := self._keeper.child(self._end)) is not None:
@@ -92,7 +92,7 @@ class Consumer:
 
 
 def run_job(queue: Queue, store: Store, child: DeviceChild, record: JobRecord, end: threading.Event) -> None:
-    """Run one claimed job to its end; if `end` is set first, hand it back."""
+    """Run one claimed job to its end; hand it back if `end` is set first."""
     assert record.owner is not None
     claim = Claim(record.job_id, record.attempt, record.owner)
     log = _log_of(claim)
@@ -102,7 +102,7 @@ def run_job(queue: Queue, store: Store, child: DeviceChild, record: JobRecord, e
         job = _Job(queue, store, claim, heart, end)
         try:
             outcome = job.settle(job.work(child, record))
-        except IntrasplatError as error:  # of the store; the child is idle
+        except IntrasplatError as error:  # the store failed, and the child is idle
             outcome = job.settle(job.without_store(error))
         except Exception as error:
             child.kill()
@@ -111,12 +111,12 @@ def run_job(queue: Queue, store: Store, child: DeviceChild, record: JobRecord, e
 
 
 def _log_of(claim: Claim) -> logging.LoggerAdapter[logging.Logger]:
-    """Lines that name the job by its id."""
+    """A logger whose lines carry the job's id."""
     return logging.LoggerAdapter(logger, {"job_id": claim.job_id, "attempt": claim.attempt})
 
 
 class _Job:
-    """One attempt: watched while the child works on it, then settled."""
+    """One attempt at a job: work() watches the child, settle() tells the queue how it ended."""
 
     def __init__(self, queue: Queue, store: Store, claim: Claim, heart: Heartbeat, end: threading.Event) -> None:
         self._queue = queue
@@ -126,18 +126,16 @@ class _Job:
         self._end = end
         self._log = _log_of(claim)
 
-    # the work
-
     def work(self, child: DeviceChild, record: JobRecord) -> Finished | Stopped | Failed | Died:
-        """Let the child reconstruct, stop it if that is wanted, and kill it if it hangs."""
+        """Let the child reconstruct; stop it when the queue or `end` says so, kill it when it hangs."""
         job_id, attempt = self._claim.job_id, self._claim.attempt
         self._heart.report(JobProgress(stage=FETCHING, fraction=0.0))
-        spool = self._with_patience(lambda: self._store.fetch_clip(job_id))
-        out = self._with_patience(lambda: self._store.work_folder(job_id, attempt))
+        spool = self._retry_store(lambda: self._store.fetch_clip(job_id))
+        out = self._retry_store(lambda: self._store.work_folder(job_id, attempt))
         if child.ended is not None:
             return Died(child.ended.cause, excused=True)
-        child.send(Run(record=record, spool=spool, out=out))
-        watch, asked_s = Watch(), None
+        child.send(RunJob(record=record, spool=spool, out=out))
+        detector, asked_s = HangDetector(), None
         while True:
             report = child.next_report(LOOK_PERIOD_S)
             if isinstance(report, Finished | Stopped | Failed):
@@ -145,84 +143,82 @@ class _Job:
             if isinstance(report, Ended):
                 return Died(report.cause, excused=asked_s is not None)
             if isinstance(report, Advanced):
-                watch.hear(report.progress)
+                detector.observe(report.progress)
                 self._heart.report(report.progress)
             if asked_s is None and self._is_to_stop():
-                child.send(Stop())
+                child.send(StopJob())
                 asked_s = time.monotonic()
-            if asked_s is not None and time.monotonic() - asked_s > STOP_LIMIT_S:
+            if asked_s is not None and time.monotonic() - asked_s > MAX_STOP_S:
                 child.kill()
-                return Died(f"did not stop within {STOP_LIMIT_S:g} s and was killed", excused=True)
-            if watch.is_hung():
+                return Died(f"did not stop within {MAX_STOP_S:g} s and was killed", excused=True)
+            if detector.is_hung():
                 child.kill()
-                return Died(f"hung in stage {watch.stage!r} and was killed", excused=asked_s is not None)
+                return Died(f"hung in stage {detector.stage!r} and was killed", excused=asked_s is not None)
 
     def _is_to_stop(self) -> bool:
         return self._heart.order is not Order.GO_ON or self._end.is_set()
 
     def without_store(self, error: IntrasplatError) -> Failed | Died:
-        """What becomes of an attempt that the store fails: another is made if this one was to stop anyway."""
+        """The end of an attempt when the store fails: handed back if it was to stop anyway, else failed."""
         if self._is_to_stop():
             return Died("waited for the store", excused=True)
         return Failed(error=describe(error), fault=type(error).__name__)
 
-    # its end
-
     def settle(self, result: Finished | Stopped | Failed | Died) -> str:
-        """Tell the queue how the attempt ended, and tidy up; what came of it, for the log.
+        """Tell the queue how the attempt ended, and tidy up; returns the outcome for the log.
 
-        A queue that is away is asked again until `end` is set; after that nothing may be touched: the claim may have
-        ended as was said, or still stand.
+        Retry until the queue answers or `end` is set. After that touch nothing: whether the claim still stands is
+        unknown.
         """
         if self._heart.order in (Order.CANCEL, Order.LOST):
             return self._withdraw()
         accepted, outcome = self._tell(result)
         if accepted is None:
-            return WAIT_FOR_QUEUE
+            return UNSETTLED
         if not accepted:
             return self._withdraw()
         self._tidy(result)
         return outcome
 
     def _tell(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
-        """Whether the queue accepts how the attempt ended, None if it cannot be reached, and the end in words."""
+        """Whether the queue accepts the end (None: it cannot be reached), and the end in words for the log."""
         if isinstance(result, Finished):
             return self._publish(), "done"
         if isinstance(result, Failed):
-            return self._insist(lambda: self._queue.fail(self._claim, result.error)), f"failed ({result.fault})"
+            return self._retry_queue(lambda: self._queue.fail(self._claim, result.error)), f"failed ({result.fault})"
         died = isinstance(result, Died) and not result.excused
         if isinstance(result, Died):
             self._log.warning("the device process %s", result.cause)
         if isinstance(result, Stopped) and result.checkpointed:
             self._store.hand_over(self._claim.job_id, self._claim.attempt)
-        accepted = self._insist(lambda: self._queue.release(self._claim, died=died))
+        accepted = self._retry_queue(lambda: self._queue.release(self._claim, died=died))
         return accepted, "handed back, its worker's death held against it" if died else "handed back"
 
     def _publish(self) -> bool | None:
-        """Scene first, then the record: whoever sees the record done finds the scene."""
+        """Publish the scene, then finish the record, so that whoever sees the job done finds its scene."""
         self._heart.report(JobProgress(stage=PUBLISHING, fraction=1.0, seconds_left=0.0))
-        order = self._insist(self._heart.beat)
+        order = self._retry_queue(self._heart.beat)
         if order is None or order in (Order.CANCEL, Order.LOST):
             return None if order is None else False
-        self._with_patience(lambda: self._store.publish_scene(self._claim.job_id, self._claim.attempt))
-        return self._insist(lambda: self._queue.finish(self._claim))
+        self._retry_store(lambda: self._store.publish_scene(self._claim.job_id, self._claim.attempt))
+        return self._retry_queue(lambda: self._queue.finish(self._claim))
 
     def _withdraw(self) -> str:
-        """The job is cancelled, or not ours any more: remove all of it, or what this attempt has made."""
+        """Remove the whole job if it is cancelled, this attempt's files if another worker has taken it over."""
         order = self._heart.order
         if order not in (Order.CANCEL, Order.LOST):
-            order = self._insist(self._heart.beat) or order
+            order = self._retry_queue(self._heart.beat) or order
         if order is Order.CANCEL:
             self._remove(lambda: self._store.purge(self._claim.job_id))
-            confirmed = self._insist(lambda: self._queue.confirm_cancel(self._claim))
-            return WAIT_FOR_QUEUE if confirmed is None else "cancelled"
+            confirmed = self._retry_queue(lambda: self._queue.confirm_cancel(self._claim))
+            return UNSETTLED if confirmed is None else "cancelled"
         if order is Order.LOST:
             self._remove(lambda: self._store.remove_attempt(self._claim.job_id, self._claim.attempt))
             return "lost to another attempt"
-        return WAIT_FOR_QUEUE
+        return UNSETTLED
 
     def _tidy(self, result: Finished | Stopped | Failed | Died) -> None:
-        """Remove what nobody needs after an end that was accepted."""
+        """Remove what nobody needs once the queue has accepted the end."""
         job_id, attempt = self._claim.job_id, self._claim.attempt
         if isinstance(result, Finished):
             self._remove(lambda: self._store.remove_other_attempts(job_id, attempt))
@@ -230,34 +226,34 @@ class _Job:
             self._remove(lambda: self._store.remove_attempt(job_id, attempt))
 
     def _is_given_up(self) -> bool:
-        """Whether that was one death too many."""
-        record = self._insist(lambda: self._queue.get(self._claim.job_id))
+        """Whether the queue has failed the job after too many deaths."""
+        record = self._retry_queue(lambda: self._queue.get(self._claim.job_id))
         return record is not None and record.state is JobState.FAILED
 
-    def _insist(self, ask: Callable[[], _Result]) -> _Result | None:
-        """Ask the queue as often as it takes to reach it; None if `end` comes first."""
+    def _retry_queue(self, ask: Callable[[], _Result]) -> _Result | None:
+        """Retry until the queue answers; None if `end` is set first."""
         while True:
             try:
                 return ask()
             except UnavailableError as error:
-                self._log.warning("waits for the queue: %s", error.problem)
+                self._log.warning("waiting for the queue: %s", error.problem)
                 if self._end.wait(UNREACHABLE_PAUSE_S):
                     return None
 
-    def _with_patience(self, work: Callable[[], _Result]) -> _Result:
-        """Let the store do something, again if it fails for a while; the beats go on."""
-        deadline_s = time.monotonic() + STORE_PATIENCE_S
+    def _retry_store(self, work: Callable[[], _Result]) -> _Result:
+        """Retry while the store cannot be reached, for up to MAX_STORE_S; the beats go on."""
+        deadline_s = time.monotonic() + MAX_STORE_S
         while True:
             try:
                 return work()
             except UnavailableError as error:
                 if time.monotonic() > deadline_s or self._is_to_stop():
                     raise
-                self._log.warning("waits for the store: %s", error.problem)
+                self._log.warning("waiting for the store: %s", error.problem)
                 self._end.wait(UNREACHABLE_PAUSE_S)
 
     def _remove(self, work: Callable[[], object]) -> None:
-        """What cannot be removed now does not change how the job ended; the service sweeps."""
+        """Remove files; what cannot be removed now the service's sweep removes later."""
         try:
             work()
         except UnavailableError as error:

@@ -1,7 +1,6 @@
-"""The device child: owns torch, kernels and models, trains one job at a time, and answers renders beside it.
+"""The device process: owns torch, kernels and models, trains one job at a time, and answers renders meanwhile.
 
-It belongs to a supervisor (worker/daemon/supervisor.py), obeys worker/daemon/orders.py, and dies with it, however that
-dies.
+It belongs to a supervisor (worker/daemon/supervisor.py), obeys worker/daemon/orders.py, and dies with its supervisor.
 """
 
 from __future__ import annotations
@@ -44,16 +43,16 @@ from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
 
 REPORT_PERIOD_S = 0.1
-"""Least time between two reports from one stage."""
+"""Minimum time between two reports of one stage."""
 
-AFTERGLOW_S = 10.0
-"""The last snapshot of a finished job is shown for so long, until the service knows of the scene."""
+LAST_SNAPSHOT_S = 10.0
+"""How long the last snapshot of a finished job is still shown: until the service knows of the scene."""
 
 logger = logging.getLogger("intrasplat.worker")
 
 
 def run_device(settings: Settings) -> None:
-    """Obey the orders on stdin; never returns, for the end of the orders ends the process.
+    """Obey the orders on stdin. It never returns, because the end of the orders ends the process.
 
     What keeps it from starting (a device, data directory or endpoint that cannot be used) is left to the supervisor
     as last words (contract/runtime/exits.py), and the supervisor tells the user.
@@ -75,28 +74,28 @@ def run_device(settings: Settings) -> None:
 def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     device = choose_device(settings.device, cpu_by=CPU_BY_VARIABLE)
     store, snapshots, pace = open_store(settings), Snapshots(), Pace()
-    # What is unpacked of clips stays in the data directory, and does not outlive the next start.
+    # Clips are unpacked inside the data directory, in a folder that the next start empties.
     tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
     started_s = time.monotonic()
-    if device == CPU:  # those of a GPU are compiled for the model of a job, and kept
+    if device == CPU:  # kernels of a GPU are compiled when a job needs them
         compile_kernels()
     compile_coder()
     logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, pace, device)
 
-    def tell_what_is_held() -> None:
+    def report_held_scenes() -> None:
         views.forget_purged()
         channel.send_if_new(Holding(scenes=views.held))
 
     endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
     with RequestServer(
-        endpoint, views.answer, between=tell_what_is_held, rest_s=pace.rest_s, render_secret=settings.render_secret
+        endpoint, views.answer, between=report_held_scenes, rest_s=pace.rest_s, render_secret=settings.render_secret
     ):
         channel.send(Ready(endpoint=endpoint, device=str(device)))
         logger.info("the device process is ready on %s", device)
         shown = ""
         while True:
-            task = orders.next(AFTERGLOW_S)
+            task = orders.next(LAST_SNAPSHOT_S)
             if task is None:
                 snapshots.drop(shown)
             else:
@@ -109,7 +108,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
 def work_on(
     task: Task, device: str, limits: ClipLimits, snapshots: Snapshots, channel: Channel
 ) -> Finished | Stopped | Failed:
-    """Run one job; every error is its end and not this process's, unless it takes the GPU along."""
+    """Run one job. An error ends the job; only a lost GPU ends this process too."""
     run = task.run
     reporter = _Reporter(channel)
     hooks = TrainingHooks(
@@ -127,14 +126,14 @@ def work_on(
     except Exception as error:
         snapshots.drop(run.record.job_id)
         if gpu_is_lost():
-            logger.error("the GPU answers this process no more (%s); another takes its place", type(error).__name__)
+            logger.error("this process has lost the GPU (%s); another takes its place", type(error).__name__)
             raise SystemExit(1) from error
         return Failed(error=describe(error), fault=type(error).__name__)
     return Finished()
 
 
 class _Reporter:
-    """Passes progress on, not too often; for any thread."""
+    """Sends progress, not too often; for any thread."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
@@ -142,7 +141,7 @@ class _Reporter:
         self._next_s = 0.0
 
     def report(self, progress: Progress) -> None:
-        """Send it, if it is time for another."""
+        """Send the progress if it begins a stage or REPORT_PERIOD_S has passed."""
         now_s = time.monotonic()
         if progress.stage == self._stage and now_s < self._next_s:
             return
@@ -151,7 +150,7 @@ class _Reporter:
 
 
 def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits | None = None) -> ReconstructionRequest:
-    """The reconstruction that a job asks for, with its files where the store keeps them."""
+    """The request of a job, with its files in the folder where the store keeps them."""
     files = record.files
     return ReconstructionRequest(
         clip=spool / files.clip,
@@ -166,20 +165,20 @@ def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits |
 
 
 def run_or_start_anew(request: ReconstructionRequest, out: Path, hooks: TrainingHooks) -> None:
-    """Reconstruct; from the beginning if the state in `out` is damaged, or of an earlier version of this program."""
+    """Reconstruct, resuming the state in `out`; start anew if that state is damaged or of another version."""
     resumes = (out / RESUME_FILE).exists()
     try:
         reconstruct(request, out, hooks)
     except InputError as error:
         if error.field != "--out" or not resumes:
             raise
-        logger.warning("the stored state is of no use to this version; training starts anew")
+        logger.warning("the stored state cannot be resumed; training starts anew")
         (out / RESUME_FILE).unlink()
         reconstruct(request, out, hooks)
 
 
 def _socket_endpoint(store: Store, name: str) -> str:
-    """A unix socket in the data directory, cleared of what an earlier process of this name left."""
+    """A unix socket in the data directory; one that an earlier process of this name left is removed."""
     path = short_socket_path(store.run_dir, f"{name}.sock")
     path.unlink(missing_ok=True)
     return f"ipc://{path}"

@@ -1,6 +1,6 @@
-"""What the caller of a job is told of an error.
+"""Describe an error to the caller of a job.
 
-The text of an error that nobody foresaw may hold the names of a caller's files: neither the caller nor the log gets it.
+The text of an unforeseen error may hold the names of a caller's files, so neither the caller nor the log gets it.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ logger = logging.getLogger("intrasplat.worker")
 
 
 def describe(error: Exception) -> JobError:
-    """Problem and remedy; of an error that nobody foresaw only its kind, for its text may hold anything."""
+    """Problem and remedy of an error. An unforeseen one is told by its type alone, as its text may hold anything."""
     if isinstance(error, InputError):
         return JobError(problem=error.problem, field=error.field, remedy=error.remedy)
     if isinstance(error, UnavailableError):
         return JobError(problem=error.problem, remedy=error.remedy)
     if isinstance(error, IntrasplatError):
         return JobError(problem=str(error), remedy="The worker's log has the details.")
-    # Of this machine, or of its GPU: torch's own error, known by its name, for not everyone here has loaded torch.
+    # torch.OutOfMemoryError is known by its name, because the supervisor does not load torch
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return JobError(problem="The worker ran out of memory.", remedy="Send a shorter or smaller clip.")
     logger.error("a fault while a job ran", exc_info=error)

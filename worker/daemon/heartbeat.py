@@ -1,4 +1,4 @@
-"""The beats of one claim, in a thread of their own: neither work nor a slow disk holds them up."""
+"""Renew one claim in a thread of its own, which neither work nor a slow disk delays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contract.wire.errors import UnavailableError
 from contract.wire.job import JobProgress
 
 REPORT_PERIOD_S = 0.3
-"""Least time between two beats for progress alone: each is a write that the queue's server puts on disk."""
+"""Minimum time between two beats that only carry progress: the queue's server writes each to disk."""
 
 RETRY_PERIOD_S = 1.0
 
@@ -19,10 +19,10 @@ logger = logging.getLogger("intrasplat.worker")
 
 
 class Heartbeat:
-    """Beats while its context lasts: at least every BEAT_PERIOD_S, with the newest progress, at once in a new stage.
+    """A context manager that beats for a claim every BEAT_PERIOD_S, and at once when a new stage begins.
 
-    order is what the queue wants; CANCEL, YIELD and LOST stay once they were heard. A queue that cannot be reached
-    changes nothing: the work goes on, and the claim stands if it is back within the lease.
+    Each beat carries the newest progress and brings back the queue's order. CANCEL, YIELD and LOST are kept once heard.
+    While the queue cannot be reached the work goes on; the claim stands if the queue answers again within the lease.
     """
 
     def __init__(self, queue: Queue, claim: Claim) -> None:
@@ -39,7 +39,7 @@ class Heartbeat:
 
     @property
     def order(self) -> Order:
-        """The last word of the queue."""
+        """The queue's last order."""
         return self._order
 
     def __enter__(self) -> Heartbeat:
@@ -53,17 +53,17 @@ class Heartbeat:
         self._thread.join()
 
     def report(self, progress: JobProgress) -> None:
-        """Send this with one of the next beats."""
+        """Send this progress with the next beat that is due."""
         with self._changed:
             before = self._progress
-            if progress.psnr_db is None and before is not None:  # what training reached stays visible
+            if progress.psnr_db is None and before is not None:  # keep showing what training reached
                 progress = progress.model_copy(update={"psnr_db": before.psnr_db})
             self._urgent = self._urgent or before is None or before.stage != progress.stage
             self._progress, self._unsent = progress, True
             self._changed.notify()
 
     def beat(self) -> Order:
-        """Beat now.
+        """Beat now; returns the queue's order.
 
         Raises:
             UnavailableError: the queue cannot be reached.
@@ -78,7 +78,7 @@ class Heartbeat:
                 with self._changed:
                     self._unsent = self._unsent or progress is not None
                 raise
-            # To yield is a wish, and may be followed by either of the others, which are final.
+            # YIELD may be followed by CANCEL or LOST, which are final.
             if order is not Order.GO_ON and self._order in (Order.GO_ON, Order.YIELD):
                 self._order = order
             return self._order
@@ -90,10 +90,10 @@ class Heartbeat:
             began_s = time.monotonic()
             try:
                 self.beat()
-            except Exception as error:  # whatever it was: without beats the claim is lost, and no order is heard
+            except Exception as error:  # go on after any error: without beats the claim is lost
                 if not away:
                     reason = error.problem if isinstance(error, UnavailableError) else type(error).__name__
-                    logger.warning("no beat gets through: %s", reason, extra={"job_id": self._claim.job_id})
+                    logger.warning("the queue cannot be reached: %s", reason, extra={"job_id": self._claim.job_id})
                 away = True
                 earliest_s = latest_s = time.monotonic() + RETRY_PERIOD_S
             else:
@@ -101,7 +101,10 @@ class Heartbeat:
                 earliest_s, latest_s = began_s + REPORT_PERIOD_S, began_s + BEAT_PERIOD_S
 
     def _wait(self, earliest_s: float, latest_s: float, *, hurries: bool) -> bool:
-        """Until a beat is due: by latest_s, with progress from earliest_s on, with a new stage at once."""
+        """Wait until a beat is due; False once the context ends.
+
+        A beat is due at latest_s, with unsent progress at earliest_s, with a new stage at once.
+        """
         with self._changed:
             while not self._ended:
                 due_s = earliest_s if self._unsent else latest_s

@@ -1,10 +1,10 @@
-"""What the supervisor and its device child say to each other: one JSON document a line.
+"""The messages between the supervisor and its device process, one JSON document a line.
 
-    supervisor -> child   on the child's stdin    Run, Stop; its end means: end at once
+    supervisor -> child   on the child's stdin    RunJob, StopJob; when stdin closes, the child ends at once
     child -> supervisor   on the child's stdout   Ready once; Holding at any time;
-                                                  of a job any number of Advanced, then Finished, Stopped or Failed
+                                                  for a job any number of Advanced, then Finished, Stopped or Failed
 
-A job begins with Run and ends with one of its three reports, or with the child's death; only then may another begin.
+A job begins with RunJob and ends with Finished, Stopped, Failed or the child's death. Only then may another begin.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class _Message(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Run(_Message):
-    """Reconstruct record's clip, which lies in `spool`, into `out`: empty, or with the state to go on from."""
+class RunJob(_Message):
+    """Reconstruct the record's clip from the folder `spool` into `out`, which is empty or holds a state to resume."""
 
     kind: Literal["run"] = "run"
     record: JobRecord
@@ -32,14 +32,14 @@ class Run(_Message):
     out: Path
 
 
-class Stop(_Message):
-    """Stop the job soon, its state kept in `out`; without a job it means nothing."""
+class StopJob(_Message):
+    """Stop the running job and keep its state in `out`; ignored without a job."""
 
     kind: Literal["stop"] = "stop"
 
 
 class Ready(_Message):
-    """Kernels are compiled, renders are answered at `endpoint`."""
+    """The kernels are compiled, and renders are answered at `endpoint`."""
 
     kind: Literal["ready"] = "ready"
     endpoint: str
@@ -47,14 +47,14 @@ class Ready(_Message):
 
 
 class Holding(_Message):
-    """Scenes that are in the child's memory."""
+    """The scenes in the child's memory."""
 
     kind: Literal["holding"] = "holding"
     scenes: tuple[str, ...]
 
 
 class Advanced(_Message):
-    """The job has come further."""
+    """The progress of the job."""
 
     kind: Literal["advanced"] = "advanced"
     progress: JobProgress
@@ -67,22 +67,22 @@ class Finished(_Message):
 
 
 class Stopped(_Message):
-    """The job stopped as it was told to. checkpointed: training had begun, and its state lies in `out`."""
+    """The job stopped as ordered. checkpointed: training had begun, and its state is in `out`."""
 
     kind: Literal["stopped"] = "stopped"
     checkpointed: bool
 
 
 class Failed(_Message):
-    """The job cannot be done."""
+    """The job failed."""
 
     kind: Literal["failed"] = "failed"
     error: JobError
     fault: str
-    """The error's kind, for the log: its text may hold the names of a caller's files."""
+    """The error's type, for the log. Its text may hold the names of a caller's files."""
 
 
-DeviceOrder: TypeAlias = Run | Stop
+DeviceOrder: TypeAlias = RunJob | StopJob
 DeviceReport: TypeAlias = Ready | Holding | Advanced | Finished | Stopped | Failed
 
 _ORDERS: TypeAdapter[DeviceOrder] = TypeAdapter(Annotated[DeviceOrder, Field(discriminator="kind")])
@@ -90,7 +90,7 @@ _REPORTS: TypeAdapter[DeviceReport] = TypeAdapter(Annotated[DeviceReport, Field(
 
 
 def line_of(message: DeviceOrder | DeviceReport) -> bytes:
-    """The message as it goes over the wire."""
+    """The message as a line of JSON."""
     return message.model_dump_json().encode() + b"\n"
 
 
@@ -98,13 +98,13 @@ def read_order(line: bytes) -> DeviceOrder:
     """The order in a line.
 
     Raises:
-        ValidationError: there is none.
+        ValidationError: the line is not an order.
     """
     return _ORDERS.validate_json(line)
 
 
 def read_report(line: bytes) -> DeviceReport | None:
-    """The report in a line; None if something else has been printed."""
+    """The report in a line; None if the line is something else."""
     try:
         return _REPORTS.validate_json(line)
     except ValidationError:
@@ -112,7 +112,7 @@ def read_report(line: bytes) -> DeviceReport | None:
 
 
 def job_progress(progress: Progress) -> JobProgress:
-    """The report as the contract has it: fraction in [0, 1], no numbers that JSON cannot hold."""
+    """Progress as the contract defines it: fraction in [0, 1], and None for numbers that are not finite."""
     return JobProgress(
         stage=progress.stage,
         fraction=min(1.0, max(0.0, progress.fraction)) if math.isfinite(progress.fraction) else 0.0,

@@ -1,8 +1,8 @@
-"""The worker's ear for renders and exports: a ZeroMQ ROUTER in a thread beside training (contract/wire/rendering.py).
+"""Answer render and export requests: a ZeroMQ ROUTER in a thread beside training (contract/wire/rendering.py).
 
-One request is answered at a time, in the order they came; rendering shares the cores with training, and waits when it
-has had its share (worker/daemon/pace.py). A unix socket is
-guarded by the folder it lies in. TCP is encrypted, and only who knows the installation's secret is heard.
+The thread answers one request at a time, in order of arrival. Rendering shares the cores with training and waits when
+it has used its share (worker/daemon/pace.py). The folder of a unix socket protects it. TCP is encrypted, and only
+callers who know the installation's secret are answered.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from contract.wire.notices import Notice
 from contract.wire.rendering import ExportRequest, RenderRequest, ReplyError, WorkerReply, WorkerRequest
 
 POLL_MS = 50
-"""How soon the thread notices that it should end."""
+"""How soon the thread notices that it shall end."""
 
-LONGEST_REQUEST_BYTES = 64 * 1024
-"""Of one part of a message; a request is some hundred bytes. The connection of who sends more is closed."""
+MAX_REQUEST_BYTES = 64 * 1024
+"""Of one part of a message; a request has some hundred bytes. A caller who sends more loses the connection."""
 
 BETWEEN_PERIOD_S = 1.0
 
@@ -36,14 +36,14 @@ logger = logging.getLogger("intrasplat.worker")
 
 
 class NotYetError(IntrasplatError):
-    """The job that is asked for has nothing to show so far."""
+    """The job has nothing to show yet."""
 
 
 @dataclass(frozen=True)
 class Reply:
-    """An answered request: encoded bytes, the time they show (clamped), what the caller should know.
+    """The answer to a request: encoded bytes, the model time that they show (clamped), and warnings.
 
-    iteration is that of the snapshot that is shown, None where the scene is finished.
+    iteration: of the snapshot that is shown; None: the scene is finished.
     """
 
     body: bytes
@@ -54,11 +54,14 @@ class Reply:
 
 
 class RequestServer:
-    """Answers requests at `endpoint` by `answer`; a context manager that binds and unbinds.
+    """A context manager that answers requests at `endpoint`.
 
-    `answer` may raise InputError, SceneError or NotYetError, which the caller is told; anything else is logged and told
-    as a fault. `between` is called about once a second, in the same thread. `rest_s` says how long to answer nobody
-    for. render_secret is needed for tcp:// alone.
+    Args:
+        answer: makes the reply. The caller is told of its InputError, SceneError or NotYetError; any other error is
+            logged and told as a fault.
+        between: called about once a second, in the same thread.
+        rest_s: how long to answer nobody.
+        render_secret: needed for tcp:// alone.
     """
 
     def __init__(
@@ -84,22 +87,22 @@ class RequestServer:
         self._render_secret = render_secret
         self._end = threading.Event()
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._gate: ThreadAuthenticator | None = None
+        self._authenticator: ThreadAuthenticator | None = None
         self._thread = threading.Thread(target=self._serve, name="renders", daemon=True)
         self._socket: zmq.Socket[bytes] | None = None
 
     def __enter__(self) -> RequestServer:
         self._socket = self._context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_REQUEST_BYTES)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
         if self.endpoint.startswith("tcp:"):
             assert self._render_secret is not None
-            self._gate = _encrypt(self._socket, self._render_secret)
+            self._authenticator = _encrypt(self._socket, self._render_secret)
         try:
-            self._socket.bind(_bound(self.endpoint))
+            self._socket.bind(_bind_address(self.endpoint))
         except zmq.ZMQError as error:
             self._socket.close()
-            self._let_go()
+            self._close()
             problem = f"Renders cannot be answered at {self.endpoint} ({error.strerror})."
             raise UnavailableError(problem, "Free the address, or set another INTRASPLAT_RENDER_ENDPOINT.") from error
         self._thread.start()
@@ -108,11 +111,11 @@ class RequestServer:
     def __exit__(self, *exception: object) -> None:
         self._end.set()
         self._thread.join()
-        self._let_go()
+        self._close()
 
-    def _let_go(self) -> None:
-        if self._gate is not None:
-            self._gate.stop()
+    def _close(self) -> None:
+        if self._authenticator is not None:
+            self._authenticator.stop()
         self._context.term()
 
     def _serve(self) -> None:
@@ -138,7 +141,7 @@ class RequestServer:
             return
         try:
             self._between()
-        except Exception as error:  # a disk that fails for a moment must not end the thread
+        except Exception as error:  # a brief failure of the disk must not end the thread
             logger.error("between two requests: %s", type(error).__name__)
         self._between_at_s = time.monotonic() + BETWEEN_PERIOD_S
 
@@ -152,7 +155,7 @@ class RequestServer:
         try:
             view = self._answer(request)
         except Exception as error:
-            return WorkerReply(error=_told(error)), b""
+            return WorkerReply(error=_reply_error(error)), b""
         head = WorkerReply(
             media_type=view.media_type,
             t=view.t,
@@ -163,8 +166,8 @@ class RequestServer:
         return head, view.body
 
 
-def _told(error: Exception) -> ReplyError:
-    """What the caller is told of an error; of one that nobody foresaw only its kind, for its text may hold anything."""
+def _reply_error(error: Exception) -> ReplyError:
+    """An error as the caller is told. Of an unforeseen one only its type, because its text may hold anything."""
     if isinstance(error, InputError):
         return ReplyError(kind="input", problem=error.problem, field=error.field, remedy=error.remedy)
     if isinstance(error, SceneError):
@@ -178,19 +181,19 @@ def _told(error: Exception) -> ReplyError:
 
 
 def _encrypt(socket: zmq.Socket[bytes], render_secret: str) -> ThreadAuthenticator:
-    """Make the socket a CURVE server that lets in the services of this secret alone; the gate must be stopped."""
+    """Make the socket a CURVE server that admits only services with this secret; the caller must stop the result."""
     own = worker_keys(render_secret)
     socket.curve_server = True
     socket.curve_publickey, socket.curve_secretkey = own.public, own.secret
-    gate = ThreadAuthenticator(socket.context, log=logger)
-    gate.start()
-    gate.configure_curve_callback(credentials_provider=_OneKey(service_keys(render_secret).public))
-    return gate
+    authenticator = ThreadAuthenticator(socket.context, log=logger)
+    authenticator.start()
+    authenticator.configure_curve_callback(credentials_provider=_OneKey(service_keys(render_secret).public))
+    return authenticator
 
 
 @dataclass(frozen=True)
 class _OneKey:
-    """Whom the gate lets in; the method's name is ZeroMQ's."""
+    """Admits one public key; ZeroMQ calls callback()."""
 
     public: bytes
 
@@ -199,8 +202,8 @@ class _OneKey:
         return key == self.public
 
 
-def _bound(endpoint: str) -> str:
-    """Where to listen for callers of `endpoint`: a name is that of this machine only as others see it."""
+def _bind_address(endpoint: str) -> str:
+    """The address to listen on: every one where `endpoint` has the name by which others reach this machine."""
     parts = urlsplit(endpoint)
     if parts.scheme != "tcp" or parts.hostname in ("127.0.0.1", "::1"):
         return endpoint

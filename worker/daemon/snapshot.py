@@ -1,7 +1,7 @@
-"""The model of the job that trains, for whoever wants to see it now: handed from the training loop to the renders.
+"""Hand copies of the model that trains from the training loop to the renders.
 
-The loop copies its model at its start, and from then on only when somebody has asked since the last copy and that is
-older than PERIOD_S: a job that nobody watches pays for one copy. Training never waits here; a render waits a moment
+The loop copies its model at its start. Later it copies only if somebody has asked since the last copy and that copy is
+older than PERIOD_S, so a job that nobody watches pays for one copy. Training never waits here; a render waits a moment
 for a copy that is due.
 """
 
@@ -14,15 +14,15 @@ from dataclasses import dataclass
 from worker.scene.scene import Scene
 
 PERIOD_S = 1.0
-"""Least time between two copies of one job's model."""
+"""Minimum time between two copies of one job's model."""
 
 PATIENCE_S = 0.3
-"""How long a render waits for a copy that is due: some steps of training. Longer, it shows the one that is there."""
+"""How long a render waits for a copy that is due: some steps of training. Then it shows the copy that is there."""
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The scene that so many iterations have made, and when it was copied (monotonic)."""
+    """The scene after `iteration` iterations, and when it was copied (monotonic)."""
 
     scene: Scene
     iteration: int
@@ -30,7 +30,7 @@ class Snapshot:
 
 
 class Snapshots:
-    """Of at most one job at a time, the newest copy; for one training thread and any number of others."""
+    """Keeps the newest copy of at most one job; for one training thread and any number of others."""
 
     def __init__(self, period_s: float = PERIOD_S, patience_s: float = PATIENCE_S) -> None:
         self._period_s = period_s
@@ -42,13 +42,13 @@ class Snapshots:
         self._answers = True
 
     def begin(self, job_id: str) -> None:
-        """A job starts; what is left of the one before is dropped."""
+        """A job starts: drop the copy of the one before."""
         with self._changed:
             self._job_id, self._newest, self._asked, self._answers = job_id, None, False, True
             self._changed.notify_all()
 
     def drop(self, job_id: str) -> None:
-        """Nothing of this job is shown any more."""
+        """Show nothing of this job any more."""
         with self._changed:
             if self._job_id == job_id:
                 self._job_id = self._newest = None
@@ -70,13 +70,13 @@ class Snapshots:
                 self._changed.notify_all()
 
     def newest(self, job_id: str) -> Snapshot | None:
-        """The newest copy of the job's model, and ask for a newer one; None if there is none."""
+        """The newest copy of the job's model, or None; asks the loop for a newer one."""
         with self._changed:
             if self._job_id != job_id or self._newest is None:
                 return None
             self._asked, shown = True, self._newest
             if self._answers and self._is_due(shown):
-                # Once in vain is enough: the loop is doing something else, such as scoring, until it offers again.
+                # After one wait in vain do not wait again until the loop, which may be scoring, offers a copy.
                 self._answers = self._changed.wait_for(lambda: self._newest is not shown, self._patience_s)
             return self._newest if self._job_id == job_id else None
 

@@ -1,6 +1,6 @@
-"""The worker's process: it holds the claims, a child of its own holds the device, and either may die at any time.
+"""The worker's process: it holds the claims, its child holds the device, and either may die at any time.
 
-Nothing here imports torch or compiles anything, so this process starts at once, needs little memory and never hangs.
+Nothing here imports torch or compiles anything, so this process starts fast, needs little memory and never hangs.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from worker.daemon.child import Keeper
 from worker.daemon.consume import Consumer
 
 LOOK_PERIOD_S = 0.1
-"""How soon a change of what is announced is seen."""
+"""How soon a change is announced."""
 
 TIDY_PERIOD_S = 600.0
-"""How long a copy may outlive a scene that was purged on another machine."""
+"""How long a local copy may outlive a scene that was purged on another machine."""
 
 DEVICE_COMMAND = (sys.executable, "-m", "worker", "device")
 
@@ -36,15 +36,13 @@ logger = logging.getLogger("intrasplat.worker")
 
 
 def run_supervisor(settings: Settings, end: threading.Event, child_command: Sequence[str] | None = None) -> None:
-    """Work until `end` is set; waits for a queue that is away.
+    """Work until `end` is set; wait while the queue cannot be reached.
 
     Args:
-        child_command: what to start as the child instead of `python -m worker device`; it speaks
-            worker/daemon/orders.py.
+        child_command: the program to run instead of `python -m worker device`; it must obey worker/daemon/orders.py.
 
     Raises:
-        UnavailableError: a worker of this name works on this data directory already, or the child says that it cannot
-            work here.
+        UnavailableError: a worker of this name already works on this data directory, or the child cannot work here.
     """
     assert settings.redis_url is not None
     store = open_store(settings)
@@ -56,7 +54,7 @@ def run_supervisor(settings: Settings, end: threading.Event, child_command: Sequ
     queue = RedisQueue(settings.redis_url)
     environment = {**os.environ, **settings.to_environment()}
     keeper = Keeper(child_command or DEVICE_COMMAND, environment, store.run_dir / f"{name}.device.last-words")
-    # New at each start: what an earlier process of this name still holds is given up by its silence alone.
+    # The owner's name is new at each start, so claims of an earlier process of this name simply run out.
     consumer = Consumer(queue, store, keeper, f"{name}.{secrets.token_hex(4)}", end)
     try:
         with announced(queue, name, lambda: address_of(name, keeper, consumer)), kept_tidy(store):
@@ -68,7 +66,7 @@ def run_supervisor(settings: Settings, end: threading.Event, child_command: Sequ
 
 
 def address_of(name: str, keeper: Keeper, consumer: Consumer) -> WorkerAddress | None:
-    """What is announced of a worker now; None while its child is not ready."""
+    """The address that a worker announces now; None while its child is not ready."""
     child = keeper.live
     if child is None or child.ready is None:
         return None
@@ -80,7 +78,7 @@ def address_of(name: str, keeper: Keeper, consumer: Consumer) -> WorkerAddress |
 
 @contextlib.contextmanager
 def kept_tidy(store: Store) -> Iterator[None]:
-    """Remove what nobody needs on this machine, every TIDY_PERIOD_S for as long as the context lasts."""
+    """Tidy the store every TIDY_PERIOD_S while the context lasts."""
     end = threading.Event()
 
     def tidy() -> None:
@@ -91,7 +89,7 @@ def kept_tidy(store: Store) -> Iterator[None]:
                 logger.warning("the store was not tidied: %s", error.problem)
             end.wait(TIDY_PERIOD_S)
 
-    threading.Thread(target=tidy, name="tidy", daemon=True).start()  # not waited for: a bucket may answer slowly
+    threading.Thread(target=tidy, name="tidy", daemon=True).start()  # not joined: a bucket may answer slowly
     try:
         yield
     finally:
@@ -100,7 +98,7 @@ def kept_tidy(store: Store) -> Iterator[None]:
 
 @contextlib.contextmanager
 def announced(queue: Queue, name: str, address: Callable[[], WorkerAddress | None]) -> Iterator[None]:
-    """Say where the worker is, every ANNOUNCE_PERIOD_S and whenever that changes, for as long as the context lasts."""
+    """Announce the worker's address every ANNOUNCE_PERIOD_S and at every change while the context lasts."""
     end = threading.Event()
 
     def announce() -> None:

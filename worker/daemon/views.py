@@ -1,6 +1,6 @@
-"""Renders and exports of finished scenes, which stay loaded between requests, and renders of the job that trains.
+"""Render and export finished scenes, which stay loaded between requests, and render the job that trains.
 
-A scene whose folder is gone is forgotten at once: a deleted patient's tissue is not shown from memory, nor kept there.
+A scene whose folder is gone leaves memory at once: a deleted patient's tissue is neither shown nor kept.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS
 
 COPIES = 3
-"""A loaded scene is in memory three times: its tensors, the arrays of its renderer, and about as much of buffers
+"""A loaded scene takes memory three times: its tensors, the arrays of its renderer, and about as much in buffers
 (measured: 100 MB more for each scene of 32 MB, of 36,000 Gaussians with 17 bases, shown at 640 x 512)."""
 
-HELD_AT_MOST = 64
-"""Scenes, however small: the worker names all of them whenever it announces itself."""
+MAX_HELD_SCENES = 64
+"""However small they are: each announcement of the worker names all of them."""
 
 
 class Views:
     """Answers render and export requests from the scenes of a store and the snapshots of a job; for one thread.
 
-    `held` names the scenes that are in memory, the one used last at the end; it may be read from other threads.
+    `held` names the scenes in memory, the last used one at the end; other threads may read it.
     """
 
     def __init__(
@@ -63,9 +63,9 @@ class Views:
         """The encoded image or file.
 
         Raises:
-            SceneError: the scene is not there, or damaged.
-            NotYetError: a running job is asked for, and there is no snapshot of it here.
-            LimitError: the image would have more than request.max_pixels.
+            SceneError: the scene is missing or damaged.
+            NotYetError: the running job has no snapshot here yet.
+            LimitError: the image would exceed request.max_pixels.
             InputError: the export format does not exist.
         """
         if isinstance(request, ExportRequest):
@@ -74,14 +74,14 @@ class Views:
         if request.attempt is not None:
             with self._pace.rendering():
                 return _render(self._stored(request.scene_id, request.attempt), request, self._device)
-        snapshot = self._snapshots.newest(request.scene_id)  # may wait for training, which costs that nothing
+        snapshot = self._snapshots.newest(request.scene_id)  # may wait for training, without slowing it
         if snapshot is None:
             raise NotYetError(f"Job {request.scene_id} has nothing to show yet.")
         with self._pace.rendering():
             return _render(snapshot.scene, request, self._device, snapshot.iteration)
 
     def forget_purged(self) -> None:
-        """Let go of scenes whose folders are gone; to be called now and then."""
+        """Drop scenes whose folders are gone. Call it now and then."""
         for key in [key for key in self._scenes if not self._store.has_scene(*key)]:
             self._forget(key)
 
@@ -95,7 +95,7 @@ class Views:
         if key not in self._scenes:
             self._scenes[key] = load_scene(folder)
         self._scenes.move_to_end(key)
-        while len(self._scenes) > HELD_AT_MOST or (len(self._scenes) > 1 and self._byte_count() > self._hot_bytes):
+        while len(self._scenes) > MAX_HELD_SCENES or (len(self._scenes) > 1 and self._byte_count() > self._hot_bytes):
             self._scenes.popitem(last=False)
         self.held = tuple(name for name, _ in self._scenes)
         return self._scenes[key]
@@ -109,7 +109,7 @@ class Views:
 
 
 def _render(scene: Scene, request: RenderRequest, device: Device, iteration: int | None = None) -> Reply:
-    """One view; iteration is that of a snapshot, None of a finished scene."""
+    """One render; iteration: of a snapshot, None for a finished scene."""
     intrinsics = camera_of(scene.intrinsics, request.camera, request.max_pixels)
     frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics, device)
     body = encode_layer(frame, request.layer, request.format, request.quality)
@@ -134,7 +134,7 @@ def _export(scene: Scene, request: ExportRequest) -> Reply:
 
 
 def shown_time(scene: Scene, t: float) -> float:
-    """Model time that is shown for t: after the last frame nothing is known, so the last frame's stands."""
+    """Model time that is shown for t: after the last frame, that of the last frame."""
     return min(t, (scene.frame_count - 1) / scene.frame_count)
 
 
@@ -146,10 +146,10 @@ def pose_of(scene: Scene, pose: MatrixPose | OrbitPose | None) -> NDArray[np.flo
 
 
 def camera_of(clip: Intrinsics, wanted: IntrinsicsOverride, max_pixels: int) -> Intrinsics:
-    """The clip's camera with what the caller wants otherwise.
+    """The clip's camera with the caller's overrides.
 
     Raises:
-        LimitError: more than max_pixels.
+        LimitError: it has more than max_pixels.
     """
     width, height = wanted.width, wanted.height
     if width is None and height is None:

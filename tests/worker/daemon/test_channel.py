@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from worker.daemon.orders import Holding, Stop, line_of, read_report
+from worker.daemon.orders import Holding, StopJob, line_of, read_report
 
 DEAF = "import time; from worker.daemon.channel import Orders; Orders.from_stdin(); time.sleep(60)"
 CHATTY = """
@@ -26,7 +26,7 @@ def run(program: str, orders: bytes = b"") -> subprocess.CompletedProcess[bytes]
     return subprocess.run([sys.executable, "-c", program], input=orders, capture_output=True, timeout=30, check=False)
 
 
-@pytest.mark.parametrize(("orders", "status"), [(b"", 0), (line_of(Stop()), 0), (b'{"kind": "dance"}\n', 1)])
+@pytest.mark.parametrize(("orders", "status"), [(b"", 0), (line_of(StopJob()), 0), (b'{"kind": "dance"}\n', 1)])
 def test_a_process_ends_with_its_orders_or_at_one_that_it_cannot_read(orders: bytes, status: int) -> None:
     assert run(DEAF, orders).returncode == status
 

@@ -21,13 +21,13 @@ from contract.wire.job import JobError, JobProgress, JobRecord, JobState
 from contract.wire.names import MANIFEST, RESUME
 from contract.wire.rendering import WorkerAddress
 from tests.worker.jobs import STANDIN, Jobs, eventually
-from worker.daemon import consume, liveness
+from worker.daemon import consume, hang
 from worker.daemon.child import Keeper
 from worker.daemon.consume import Consumer
 from worker.daemon.supervisor import address_of, announced
 
 
-class Bench(Jobs):
+class JobLoop(Jobs):
     """Jobs, and a worker in a thread, with a child process."""
 
     def __init__(self, data_dir: Path, queue: MemoryQueue | None = None, *arguments: str) -> None:
@@ -66,14 +66,14 @@ class Bench(Jobs):
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(tmp_path)
+def bench(tmp_path: Path) -> Iterator[JobLoop]:
+    bench = JobLoop(tmp_path)
     yield bench
     bench.stop()
     bench.keeper.stop()
 
 
-def test_a_reconstruction_that_finishes_makes_its_job_done_and_its_scene_visible(bench: Bench) -> None:
+def test_a_reconstruction_that_finishes_makes_its_job_done_and_its_scene_visible(bench: JobLoop) -> None:
     record = bench.outcome("publish")
     bench.stop()
     assert record.state is JobState.DONE
@@ -83,7 +83,7 @@ def test_a_reconstruction_that_finishes_makes_its_job_done_and_its_scene_visible
     assert bench.files(record.job_id, "work") == []
 
 
-def test_one_child_does_many_jobs(bench: Bench) -> None:
+def test_one_child_does_many_jobs(bench: JobLoop) -> None:
     jobs = [bench.submit("publish"), bench.submit("fail"), bench.submit("publish")]
     before = None
     bench.start()
@@ -93,7 +93,7 @@ def test_one_child_does_many_jobs(bench: Bench) -> None:
     assert bench.child_id() == before
 
 
-def test_an_input_error_fails_the_job_with_its_field_and_remedy(bench: Bench) -> None:
+def test_an_input_error_fails_the_job_with_its_field_and_remedy(bench: JobLoop) -> None:
     record = bench.outcome("fail")
     bench.stop()
     assert record.state is JobState.FAILED
@@ -101,17 +101,17 @@ def test_an_input_error_fails_the_job_with_its_field_and_remedy(bench: Bench) ->
     assert bench.files(record.job_id, "work") == bench.files(record.job_id, "scenes") == []
 
 
-def test_what_a_library_prints_in_the_child_changes_nothing(bench: Bench) -> None:
+def test_what_a_library_prints_in_the_child_changes_nothing(bench: JobLoop) -> None:
     assert bench.outcome("noise").state is JobState.DONE
 
 
 @pytest.mark.parametrize("death", ["SIGSEGV", "SIGKILL", "SIGABRT", "exit"])
-def test_a_child_that_dies_is_replaced_at_once_and_its_job_runs_again(bench: Bench, death: str) -> None:
+def test_a_child_that_dies_is_replaced_at_once_and_its_job_runs_again(bench: JobLoop, death: str) -> None:
     record = bench.outcome(f"{death} publish")
     assert (record.state, record.attempt, record.released) == (JobState.DONE, 2, 0)
 
 
-def test_a_job_that_takes_every_child_down_fails_and_leaves_no_work(bench: Bench) -> None:
+def test_a_job_that_takes_every_child_down_fails_and_leaves_no_work(bench: JobLoop) -> None:
     record = bench.outcome("SIGSEGV")
     bench.stop()
     assert (record.state, record.attempt) == (JobState.FAILED, MAX_ATTEMPTS)
@@ -120,7 +120,7 @@ def test_a_job_that_takes_every_child_down_fails_and_leaves_no_work(bench: Bench
     assert bench.files(record.job_id, "work") == []
 
 
-def test_a_child_without_memory_is_named_in_the_log(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_child_without_memory_is_named_in_the_log(bench: JobLoop, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO", logger="intrasplat.worker"):
         record = bench.outcome("SIGKILL publish")
         bench.stop()
@@ -128,13 +128,13 @@ def test_a_child_without_memory_is_named_in_the_log(bench: Bench, caplog: pytest
     assert {getattr(line, "job_id", record.job_id) for line in caplog.records} == {record.job_id}
 
 
-def test_a_hung_job_is_killed_and_runs_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(liveness, "STAGE_LIMITS_S", {"train": 0.3})
+def test_a_hung_job_is_killed_and_runs_again(bench: JobLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hang, "STAGE_LIMITS_S", {"train": 0.3})
     record = bench.outcome("hang publish")
     assert (record.state, record.attempt, record.released) == (JobState.DONE, 2, 0)
 
 
-def test_a_child_that_died_idle_is_not_held_against_the_next_job(bench: Bench) -> None:
+def test_a_child_that_died_idle_is_not_held_against_the_next_job(bench: JobLoop) -> None:
     bench.start()
     os.kill(bench.child_id(), signal.SIGKILL)
     record = bench.record(bench.submit("publish"))
@@ -143,7 +143,7 @@ def test_a_child_that_died_idle_is_not_held_against_the_next_job(bench: Bench) -
     assert record.attempt == record.released + 1
 
 
-def test_cancelling_a_running_job_stops_it_and_removes_every_file_of_it(bench: Bench) -> None:
+def test_cancelling_a_running_job_stops_it_and_removes_every_file_of_it(bench: JobLoop) -> None:
     job_id = bench.submit("wait")
     bench.start()
     bench.wait_for_step(job_id)
@@ -155,8 +155,10 @@ def test_cancelling_a_running_job_stops_it_and_removes_every_file_of_it(bench: B
 
 
 @pytest.mark.parametrize("word", ["deaf", "hang"])
-def test_a_cancelled_job_that_does_not_stop_is_killed(bench: Bench, monkeypatch: pytest.MonkeyPatch, word: str) -> None:
-    monkeypatch.setattr(consume, "STOP_LIMIT_S", 0.3)
+def test_a_cancelled_job_that_does_not_stop_is_killed(
+    bench: JobLoop, monkeypatch: pytest.MonkeyPatch, word: str
+) -> None:
+    monkeypatch.setattr(consume, "MAX_STOP_S", 0.3)
     job_id, after = bench.submit(word), bench.submit("publish")
     bench.start()
     bench.wait_for_step(job_id)
@@ -199,9 +201,9 @@ class Lane(MemoryQueue):
 
 
 @pytest.fixture
-def lane(tmp_path: Path) -> Iterator[tuple[Bench, Lane]]:
+def lane(tmp_path: Path) -> Iterator[tuple[JobLoop, Lane]]:
     lane = Lane()
-    bench = Bench(tmp_path, lane)
+    bench = JobLoop(tmp_path, lane)
     yield bench, lane
     bench.stop()
     bench.keeper.stop()
@@ -211,7 +213,7 @@ def lane(tmp_path: Path) -> Iterator[tuple[Bench, Lane]]:
     ("clip", "call"), [("publish", "beat"), ("publish", "finish"), ("fail", "fail"), ("SIGSEGV", "release")]
 )
 def test_a_cancel_in_the_last_moment_ends_as_cancelled_and_leaves_nothing(
-    lane: tuple[Bench, Lane], clip: str, call: str
+    lane: tuple[JobLoop, Lane], clip: str, call: str
 ) -> None:
     bench, queue = lane
     queue.before[call] = lambda claim: queue.cancel(claim.job_id)
@@ -221,7 +223,7 @@ def test_a_cancel_in_the_last_moment_ends_as_cancelled_and_leaves_nothing(
     assert bench.files(record.job_id) == []
 
 
-def test_an_attempt_that_was_thought_dead_publishes_nothing(lane: tuple[Bench, Lane]) -> None:
+def test_an_attempt_that_was_thought_dead_publishes_nothing(lane: tuple[JobLoop, Lane]) -> None:
     bench, queue = lane
     others: list[JobRecord | None] = []
 
@@ -239,7 +241,7 @@ def test_an_attempt_that_was_thought_dead_publishes_nothing(lane: tuple[Bench, L
     assert bench.store.fetch_clip(job_id).is_dir()
 
 
-def test_a_job_that_was_taken_over_is_stopped(bench: Bench) -> None:
+def test_a_job_that_was_taken_over_is_stopped(bench: JobLoop) -> None:
     job_id = bench.submit("wait")
     bench.start()
     bench.wait_for_step(job_id)
@@ -250,7 +252,7 @@ def test_a_job_that_was_taken_over_is_stopped(bench: Bench) -> None:
     assert bench.files(job_id, "work") == []
 
 
-def test_a_worker_that_is_told_to_end_hands_its_job_back_and_any_number_of_times(bench: Bench) -> None:
+def test_a_worker_that_is_told_to_end_hands_its_job_back_and_any_number_of_times(bench: JobLoop) -> None:
     polite = 2 * MAX_ATTEMPTS
     job_id = bench.submit(" ".join(["wait"] * polite + ["publish"]))
     for attempt in range(1, polite + 1):
@@ -268,9 +270,9 @@ def test_a_worker_that_is_told_to_end_hands_its_job_back_and_any_number_of_times
 
 
 def test_a_worker_that_is_told_to_end_does_not_wait_for_a_deaf_child(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: JobLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(consume, "STOP_LIMIT_S", 0.3)
+    monkeypatch.setattr(consume, "MAX_STOP_S", 0.3)
     job_id = bench.submit("deaf")
     bench.start()
     bench.wait_for_step(job_id)
@@ -278,7 +280,7 @@ def test_a_worker_that_is_told_to_end_does_not_wait_for_a_deaf_child(
     assert (bench.record(job_id).state, bench.record(job_id).released) == (JobState.QUEUED, 1)
 
 
-def test_a_standard_job_makes_way_for_a_high_priority_one_and_goes_on_later(bench: Bench) -> None:
+def test_a_standard_job_makes_way_for_a_high_priority_one_and_goes_on_later(bench: JobLoop) -> None:
     standard = bench.submit("wait publish")
     bench.start()
     bench.wait_for_step(standard)
@@ -294,7 +296,7 @@ def test_a_standard_job_makes_way_for_a_high_priority_one_and_goes_on_later(benc
 
 
 @pytest.mark.parametrize("clip", ["wait", "SIGSEGV"])
-def test_a_worker_that_must_end_while_the_queue_is_away_touches_nothing(lane: tuple[Bench, Lane], clip: str) -> None:
+def test_a_worker_that_must_end_while_the_queue_is_away_touches_nothing(lane: tuple[JobLoop, Lane], clip: str) -> None:
     bench, queue = lane
     job_id = bench.submit(clip)
 
@@ -314,7 +316,7 @@ def test_a_worker_that_must_end_while_the_queue_is_away_touches_nothing(lane: tu
     assert [path.name for path in bench.files(job_id, "work")] == [f"{job_id}.1"]
 
 
-def test_a_result_waits_for_a_queue_that_is_away(lane: tuple[Bench, Lane]) -> None:
+def test_a_result_waits_for_a_queue_that_is_away(lane: tuple[JobLoop, Lane]) -> None:
     bench, queue = lane
 
     def cut(claim: Claim) -> None:
@@ -328,7 +330,7 @@ def test_a_result_waits_for_a_queue_that_is_away(lane: tuple[Bench, Lane]) -> No
     assert bench.store.has_scene(record.job_id, record.attempt)
 
 
-def test_beats_go_on_after_a_fault_that_nobody_foresaw(lane: tuple[Bench, Lane]) -> None:
+def test_beats_go_on_after_a_fault_that_nobody_foresaw(lane: tuple[JobLoop, Lane]) -> None:
     bench, queue = lane
     stumbled = threading.Event()
 
@@ -344,8 +346,8 @@ def test_beats_go_on_after_a_fault_that_nobody_foresaw(lane: tuple[Bench, Lane])
     assert bench.wait_for_end(job_id).state is JobState.CANCELLED
 
 
-def test_a_clip_that_is_gone_fails_its_job(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(consume, "STORE_PATIENCE_S", 0.0)
+def test_a_clip_that_is_gone_fails_its_job(bench: JobLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(consume, "MAX_STORE_S", 0.0)
     lost, sound = bench.submit("publish"), bench.submit("publish")
     bench.store.purge(lost)
     bench.start()
@@ -357,7 +359,7 @@ def test_a_child_that_dies_at_its_start_is_not_started_in_a_hurry(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(supervised, "FIRST_PAUSE_S", 0.05)
-    bench = Bench(tmp_path, None, "dies")
+    bench = JobLoop(tmp_path, None, "dies")
     bench.start()
     eventually(lambda: "starts in 0.2 s" in caplog.text)
     bench.stop()
@@ -366,13 +368,13 @@ def test_a_child_that_dies_at_its_start_is_not_started_in_a_hurry(
 
 
 def test_a_child_that_cannot_work_here_ends_the_worker_with_its_remedy(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, None, "unable")
+    bench = JobLoop(tmp_path, None, "unable")
     with pytest.raises(UnavailableError, match=r"no such device.*INTRASPLAT_DEVICE"):
         bench.consumer.run(0.0)
     bench.keeper.stop()
 
 
-def test_a_worker_is_announced_with_its_job_and_scenes_while_its_child_lives(bench: Bench) -> None:
+def test_a_worker_is_announced_with_its_job_and_scenes_while_its_child_lives(bench: JobLoop) -> None:
     job_id = bench.submit("wait")
     with announced(bench.queue, "worker-1", lambda: address_of("worker-1", bench.keeper, bench.consumer)):
         assert bench.queue.workers() == []
@@ -386,7 +388,7 @@ def test_a_worker_is_announced_with_its_job_and_scenes_while_its_child_lives(ben
         eventually(lambda: bench.queue.workers() == [])
 
 
-def test_the_state_of_an_attempt_goes_to_the_next(bench: Bench) -> None:
+def test_the_state_of_an_attempt_goes_to_the_next(bench: JobLoop) -> None:
     job_id = bench.submit("wait SIGSEGV publish")
     bench.start()
     bench.wait_for_step(job_id)

@@ -25,7 +25,7 @@ from worker.__main__ import main
 from worker.daemon.child import DeviceChild, Keeper
 from worker.daemon.device import request_of, run_or_start_anew
 from worker.daemon.faults import describe
-from worker.daemon.orders import Advanced, Failed, Finished, Run, Stop, Stopped
+from worker.daemon.orders import Advanced, Failed, Finished, RunJob, StopJob, Stopped
 from worker.scene.checkpoint import load_scene
 from worker.scene.resume_file import RESUME_FILE, load_resume
 from worker.train.hooks import TrainingHooks
@@ -93,11 +93,11 @@ def wait_until(holds: Callable[[], bool], timeout_s: float = 60.0) -> None:
         time.sleep(0.01)
 
 
-def order(clip: Path, out: Path, **options: object) -> Run:
+def order(clip: Path, out: Path, **options: object) -> RunJob:
     chosen = JobOptions.model_validate(options)
     record = JobRecord(job_id="a" * 32, files=JobFiles(clip=clip.name), options=chosen, created_at_s=time.time())
     out.mkdir(exist_ok=True)
-    return Run(record=record, spool=clip.parent, out=out)
+    return RunJob(record=record, spool=clip.parent, out=out)
 
 
 def end_of_job(child: DeviceChild, stop_after: int | None = None) -> tuple[object, list[Advanced]]:
@@ -109,7 +109,7 @@ def end_of_job(child: DeviceChild, stop_after: int | None = None) -> tuple[objec
             return report, advances
         advances.append(report)
         if stop_after is not None and report.progress.iteration > stop_after:
-            child.send(Stop())
+            child.send(StopJob())
             stop_after = None
 
 
@@ -127,7 +127,7 @@ def test_a_stopped_job_goes_on_to_the_same_bits_and_the_process_does_any_number_
     assert end_of_job(device, stop_after=1)[0] == Stopped(checkpointed=True)
     assert [path.name for path in out.iterdir()] == [RESUME_FILE]
     stopped_at = load_resume(out)[1]["iteration"]
-    device.send(Stop())  # too late for the last job, and not meant for the next
+    device.send(StopJob())  # too late for the last job, and not meant for the next
     device.send(order(clip, out, iterations=600))
     finished, advances = end_of_job(device)
     assert finished == Finished()

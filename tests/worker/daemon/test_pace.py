@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from worker.daemon.pace import SAVED_S, SHARE, Pace
+from worker.daemon.pace import MAX_SAVED_S, SHARE, Pace
 
 VIEW_S = 0.05
 ROUNDING_S = 1e-9
@@ -39,7 +39,7 @@ def test_views_without_pause_take_their_share_of_the_time_and_what_was_saved(vie
     pace, seconds = Pace(clock), 100.0
     with pace.training():
         spent_s = view_s * views_within(seconds, view_s, clock, pace)
-    assert spent_s == pytest.approx(SHARE * seconds + SAVED_S, abs=2 * view_s)
+    assert spent_s == pytest.approx(SHARE * seconds + MAX_SAVED_S, abs=2 * view_s)
 
 
 def test_a_lone_view_is_made_at_once_and_the_next_after_a_rest() -> None:
@@ -49,9 +49,9 @@ def test_a_lone_view_is_made_at_once_and_the_next_after_a_rest() -> None:
         for _ in range(3):
             assert pace.rest_s() == 0.0
             with pace.rendering():
-                clock.now_s += SAVED_S + VIEW_S
+                clock.now_s += MAX_SAVED_S + VIEW_S
             assert 0.0 < pace.rest_s() < VIEW_S / SHARE
-            clock.now_s += (SAVED_S + VIEW_S) / SHARE
+            clock.now_s += (MAX_SAVED_S + VIEW_S) / SHARE
 
 
 def test_while_nothing_trains_nobody_rests() -> None:

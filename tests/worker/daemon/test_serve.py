@@ -17,7 +17,7 @@ from contract.queue.embedded import short_socket_path
 from contract.wire.errors import InputError, SceneError, UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
 from tests.reports import a_warning
-from worker.daemon.serve import LONGEST_REQUEST_BYTES, NotYetError, Reply, RequestServer
+from worker.daemon.serve import MAX_REQUEST_BYTES, NotYetError, Reply, RequestServer
 
 SCENE = "0" * 32
 SECRET = "a secret of at least 32 characters"
@@ -114,7 +114,7 @@ def test_a_message_of_any_shape_leaves_the_thread_alive(socket: zmq.Socket[bytes
 
 def test_who_sends_too_much_is_cut_off_and_others_are_answered(endpoint: str) -> None:
     with RequestServer(endpoint, answer), connected(endpoint) as flooding, connected(endpoint) as other:
-        flooding.send_multipart([b"1", b" " * (LONGEST_REQUEST_BYTES + 1)])
+        flooding.send_multipart([b"1", b" " * (MAX_REQUEST_BYTES + 1)])
         assert ask(other, request(0))[0].error is None
 
 

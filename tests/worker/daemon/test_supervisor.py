@@ -50,7 +50,7 @@ supervisor.run_supervisor(settings, told_to_end(), [sys.executable, {str(STANDIN
 """A worker as `python -m worker consume` makes one, with shorter leases and a child that needs no torch."""
 
 
-class Bench(Jobs):
+class WorkerProcesses(Jobs):
     """Jobs, and any number of workers."""
 
     def __init__(self, data_dir: Path) -> None:
@@ -89,13 +89,13 @@ def children_of(process: subprocess.Popen[bytes]) -> list[int]:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(tmp_path)
+def bench(tmp_path: Path) -> Iterator[WorkerProcesses]:
+    bench = WorkerProcesses(tmp_path)
     yield bench
     bench.close()
 
 
-def test_a_worker_told_to_end_hands_its_job_back_and_is_gone(bench: Bench) -> None:
+def test_a_worker_told_to_end_hands_its_job_back_and_is_gone(bench: WorkerProcesses) -> None:
     job_id = bench.submit("wait publish")
     with bench.worker() as worker:
         bench.wait_for_step(job_id)
@@ -111,7 +111,7 @@ def test_a_worker_told_to_end_hands_its_job_back_and_is_gone(bench: Bench) -> No
 
 
 def test_a_real_worker_told_to_end_keeps_what_was_trained_and_the_next_comes_to_the_same_bits(
-    bench: Bench, tmp_path: Path
+    bench: WorkerProcesses, tmp_path: Path
 ) -> None:
     write_endonerf(make_phantom(PhantomSettings(width=96, height=80, frames=8)), tmp_path / "clip")
     clip = Path(shutil.make_archive(str(tmp_path / "clip"), "zip", tmp_path / "clip"))
@@ -136,7 +136,7 @@ def tensor_bits(folder: Path) -> dict[str, bytes]:
     return {name: tensor.numpy().tobytes() for name, tensor in load_scene(folder).tensors().items()}
 
 
-def test_a_worker_that_is_killed_takes_its_child_along_and_another_takes_the_job(bench: Bench) -> None:
+def test_a_worker_that_is_killed_takes_its_child_along_and_another_takes_the_job(bench: WorkerProcesses) -> None:
     job_id = bench.submit("wait publish")
     with bench.worker() as killed, bench.worker("worker-2") as other:
         bench.wait_for_step(job_id)
@@ -149,7 +149,7 @@ def test_a_worker_that_is_killed_takes_its_child_along_and_another_takes_the_job
         assert second.poll() is None
 
 
-def test_a_worker_that_slept_through_its_lease_publishes_nothing(bench: Bench) -> None:
+def test_a_worker_that_slept_through_its_lease_publishes_nothing(bench: WorkerProcesses) -> None:
     job_id = bench.submit("slow wait")
     with bench.worker() as asleep:
         bench.wait_for_step(job_id)
@@ -164,7 +164,7 @@ def test_a_worker_that_slept_through_its_lease_publishes_nothing(bench: Bench) -
             assert bench.record(job_id).state is JobState.RUNNING
 
 
-def test_a_second_worker_of_one_name_is_refused(bench: Bench) -> None:
+def test_a_second_worker_of_one_name_is_refused(bench: WorkerProcesses) -> None:
     with bench.worker():
         eventually(lambda: bool(bench.queue.workers()))
         with pytest.raises(UnavailableError, match="worker-1 already works"):
@@ -172,7 +172,7 @@ def test_a_second_worker_of_one_name_is_refused(bench: Bench) -> None:
 
 
 def test_a_worker_waits_for_a_queue_that_is_not_there_yet(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
+    bench = WorkerProcesses(tmp_path)
     bench.server.stop()
     with bench.worker() as worker:
         time.sleep(1.0)

@@ -1,4 +1,4 @@
-"""When a job that says nothing new is taken to hang: each stage has a limit for the time between two advances."""
+"""Decide when a job hangs: each stage has a limit for the time between two advances."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from contract.wire.job import JobProgress
 
 STAGE_LIMITS_S: Mapping[str, float] = MappingProxyType(
     {
-        "decode": 20.0,  # a frame has 10 s, which the decoding process's own watch (worker/decode) sees to first
+        "decode": 20.0,  # a frame has 10 s, which the decoding process enforces first
         "stereo": 10.0,  # a pair of 4096 x 2160 takes about 3 s on one slow core
-        "compile": 120.0,  # a part of the kernels takes seconds; on a machine without room, minutes
+        "compile": 120.0,  # one set of kernels takes seconds, on a crowded machine minutes
         "fusion": 60.0,  # all frames at once, about 10 ms each
         "motion": 10.0,  # a frame takes some 10 ms
-        "start": 120.0,  # least squares for every Gaussian, and the targets of all frames, without a word between
+        "start": 120.0,  # least squares for every Gaussian, and the targets of all frames, without a report between
         "calibrate": 150.0,  # CALIBRATION_STEPS are 15 iterations of training
         "train": 10.0,  # an iteration takes 10 to 500 ms
         "finish": 60.0,  # one pass over the frames to find strays
         "score": 60.0,  # a frame takes some 100 ms; afterwards flow copies of every held-out frame, and the files
     }
 )
-"""Of each stage of worker/pipeline.py. Ten seconds are ten times and more what a step took on slow machines."""
+"""Limits for the stages of worker/pipeline.py: at least ten times what a step took on slow machines."""
 
 OTHER_LIMIT_S = 60.0
-"""Of a stage that is not in the table, and of the time before the first report."""
+"""The limit of any other stage, and of the time before the first report."""
 
-LONGEST_LOOK_S = 1.0
-"""What counts of the time between two looks: while the supervisor itself was stopped or away, nobody could be heard."""
+MAX_LOOK_S = 1.0
+"""How much of the time between two calls of is_hung() counts: a supervisor that was stopped heard nothing."""
 
 
-class Watch:
-    """Judges one job by its reports; call is_hung() often."""
+class HangDetector:
+    """Watches the reports of one job. Call is_hung() often."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -42,11 +42,11 @@ class Watch:
 
     @property
     def stage(self) -> str:
-        """Where the job is."""
+        """The stage of the last report."""
         return self._place[0]
 
-    def hear(self, progress: JobProgress) -> None:
-        """A report; only one from another place than the last counts as an advance."""
+    def observe(self, progress: JobProgress) -> None:
+        """Take a report. It is an advance unless it repeats stage, fraction and iteration of the last."""
         place = (progress.stage, progress.fraction, progress.iteration)
         if place != self._place:
             self._place, self._silence_s = place, 0.0
@@ -54,6 +54,6 @@ class Watch:
     def is_hung(self) -> bool:
         """Whether the job has not advanced for longer than its stage allows."""
         now_s = self._clock()
-        self._silence_s += min(LONGEST_LOOK_S, now_s - self._looked_s)
+        self._silence_s += min(MAX_LOOK_S, now_s - self._looked_s)
         self._looked_s = now_s
         return self._silence_s > STAGE_LIMITS_S.get(self.stage, OTHER_LIMIT_S)

@@ -8,7 +8,7 @@ import pytest
 
 from contract.wire.job import JobProgress
 from contract.wire.options import ReconstructionOptions
-from worker.daemon.liveness import LONGEST_LOOK_S, OTHER_LIMIT_S, STAGE_LIMITS_S, Watch
+from worker.daemon.hang import MAX_LOOK_S, OTHER_LIMIT_S, STAGE_LIMITS_S, HangDetector
 from worker.daemon.orders import job_progress
 from worker.machine.hooks import Progress
 from worker.phantom import PhantomSettings, make_phantom, write_stereo_video
@@ -18,7 +18,7 @@ from worker.train.request import ReconstructionRequest
 
 
 class Clock:
-    """Time that passes when it is told to; the watch looks all the while."""
+    """Time that passes when it is told to; the detector is asked all the while."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -26,10 +26,10 @@ class Clock:
     def __call__(self) -> float:
         return self.now_s
 
-    def pass_by(self, watch: Watch, seconds: float) -> bool:
+    def pass_by(self, detector: HangDetector, seconds: float) -> bool:
         for _ in range(round(10 * seconds)):
             self.now_s += 0.1
-            if watch.is_hung():
+            if detector.is_hung():
                 return True
         return False
 
@@ -40,40 +40,40 @@ def trained(iteration: int) -> JobProgress:
 
 def test_a_job_that_advances_does_not_hang_however_long_it_takes() -> None:
     clock = Clock()
-    watch = Watch(clock)
+    detector = HangDetector(clock)
     for iteration in range(20):
-        watch.hear(trained(iteration))
-        assert not clock.pass_by(watch, STAGE_LIMITS_S["train"] - 1)
+        detector.observe(trained(iteration))
+        assert not clock.pass_by(detector, STAGE_LIMITS_S["train"] - 1)
 
 
 def test_repeating_oneself_is_no_advance() -> None:
     clock = Clock()
-    watch = Watch(clock)
-    watch.hear(trained(5))
-    assert not clock.pass_by(watch, STAGE_LIMITS_S["train"] / 2)
-    watch.hear(trained(5))
-    assert clock.pass_by(watch, STAGE_LIMITS_S["train"] / 2 + 1)
-    watch.hear(trained(6))
-    assert not watch.is_hung()
+    detector = HangDetector(clock)
+    detector.observe(trained(5))
+    assert not clock.pass_by(detector, STAGE_LIMITS_S["train"] / 2)
+    detector.observe(trained(5))
+    assert clock.pass_by(detector, STAGE_LIMITS_S["train"] / 2 + 1)
+    detector.observe(trained(6))
+    assert not detector.is_hung()
 
 
 @pytest.mark.parametrize("stage", [*STAGE_LIMITS_S, "of another version"])
 def test_every_stage_has_its_own_limit(stage: str) -> None:
     clock = Clock()
-    watch = Watch(clock)
-    watch.hear(JobProgress(stage=stage, fraction=0.5))
+    detector = HangDetector(clock)
+    detector.observe(JobProgress(stage=stage, fraction=0.5))
     limit_s = STAGE_LIMITS_S.get(stage, OTHER_LIMIT_S)
-    assert not clock.pass_by(watch, limit_s - 1)
-    assert clock.pass_by(watch, 2)
+    assert not clock.pass_by(detector, limit_s - 1)
+    assert clock.pass_by(detector, 2)
 
 
 def test_time_in_which_the_supervisor_itself_was_stopped_is_not_held_against_the_job() -> None:
     clock = Clock()
-    watch = Watch(clock)
-    watch.hear(trained(1))
+    detector = HangDetector(clock)
+    detector.observe(trained(1))
     clock.now_s += 3600
-    assert not watch.is_hung()
-    assert clock.pass_by(watch, STAGE_LIMITS_S["train"] - LONGEST_LOOK_S + 1)
+    assert not detector.is_hung()
+    assert clock.pass_by(detector, STAGE_LIMITS_S["train"] - MAX_LOOK_S + 1)
 
 
 def test_progress_holds_only_numbers_that_json_can() -> None:
