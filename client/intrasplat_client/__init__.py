@@ -29,7 +29,7 @@ from intrasplat_client.errors import (
     Unauthorized,
     Unreachable,
 )
-from intrasplat_client.models import JobOptions, JobState, JobView, Report
+from intrasplat_client.models import JobOptions, JobState, JobView, Notice, NoticeCode, Report
 from intrasplat_client.views import Image
 
 __all__ = [
@@ -47,6 +47,8 @@ __all__ = [
     "JobState",
     "JobView",
     "NotFound",
+    "Notice",
+    "NoticeCode",
     "RateLimited",
     "Report",
     "RequestRefused",

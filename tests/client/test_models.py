@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from client.generate_models import MODELS, generate
 from contract.wire.job import TERMINAL_STATES
+from contract.wire.notices import NoticeCode
 from contract.wire.options import JobOptions
-from intrasplat_client import InputError, JobState, JobView, models
+from intrasplat_client import InputError, JobState, JobView, Report, models
 from intrasplat_client.submission import checked_options
+from tests.reports import REPORT_OF_A_SCENE, a_warning
 
 JOB = {"id": "0" * 32, "state": "queued", "options": {}, "input_bytes": 1, "created_at_s": 0.0, "links": {}}
 
@@ -23,6 +27,16 @@ def test_a_job_of_a_later_version_is_read_and_its_new_fields_are_kept() -> None:
     assert job.options.preset == "of-tomorrow"
     assert job.model_dump()["ward"] == "3"
     assert job.options.model_dump()["bases"] == 9
+
+
+def test_a_report_of_a_later_version_is_read_with_notices_of_unknown_codes() -> None:
+    known = a_warning("Rows differ.", NoticeCode.ROWS_MISALIGNED).model_dump(mode="json")
+    unknown = {"code": "smoke", "severity": "alarm", "text": "?"}
+    document = {**REPORT_OF_A_SCENE.model_dump(mode="json"), "warnings": [known, unknown]}
+    first, second = Report.model_validate_json(json.dumps(document)).warnings
+    assert first.code is models.NoticeCode.ROWS_MISALIGNED
+    assert first.severity is models.Severity.WARNING
+    assert (second.code, second.severity, second.text) == ("smoke", "alarm", "?")
 
 
 def test_terminal_states_are_the_services() -> None:
