@@ -45,6 +45,7 @@ ROOMS = {
         "evaluate",
         "daemon",
         "doctor",
+        "commands",
         "__main__",
     ),
 }

@@ -7,14 +7,14 @@ from pathlib import Path
 from worker.evaluate.atlas import WORST_FIRST, count_outcomes, map_name, places_of, series_in
 from worker.evaluate.conditions import CONDITIONS, SEVERITIES
 from worker.evaluate.rows import read_rows
-from worker.evaluate.stability import LARGEST_DEPTH_LOSS_MM, LARGEST_LOSS_DB, STABILITY
+from worker.evaluate.stability import MAX_DEPTH_LOSS_MM, MAX_LOSS_DB, STABILITY
 
 _INTRODUCTION = f"""
 ## Where methods break, and whether they say so
 
 `intrasplat stability --out docs/results` ([{STABILITY}]({STABILITY})) spoils a synthetic clip in {len(CONDITIONS)}
 ways, {len(SEVERITIES)} severities each, reconstructs it and judges it by the truth. Harmed is what loses more than
-{LARGEST_LOSS_DB:g} dB to the clean clip, or {LARGEST_DEPTH_LOSS_MM:g} mm of depth. Silent is the defect: harmed, and
+{MAX_LOSS_DB:g} dB to the clean clip, or {MAX_DEPTH_LOSS_MM:g} mm of depth. Silent is the defect: harmed, and
 the report has no warning that the clean clip's has not. What the user is told of each stands in
 [stability.md](stability.md), how it is judged in [decision 016](../decisions/016-stability.md). Each method is compared
 with itself on the clean clip (a pull and a cut with the same motion, calm), so a map shows what a mishap costs a method

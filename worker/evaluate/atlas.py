@@ -16,7 +16,7 @@ import numpy as np
 
 from worker.evaluate.conditions import CONDITIONS, SEVERITIES
 from worker.evaluate.rows import Row
-from worker.evaluate.stability import LARGEST_DEPTH_LOSS_MM, LARGEST_LOSS_DB, SEPARATOR
+from worker.evaluate.stability import MAX_DEPTH_LOSS_MM, MAX_LOSS_DB, SEPARATOR
 from worker.evaluate.style import GREY, SETTINGS, save
 
 WORST_FIRST = ("silent", "crashed", "unknown", "diverged", "told", "refused", "held")
@@ -35,7 +35,7 @@ FULL_COLOUR_DB = 10.0
 COLOURS = "Blues"  # one hue, light to dark: read in print and by the colour-blind
 DARK_FROM = 0.6  # of the scale, from where white writing is read better
 ROW_INCHES, COLUMN_INCHES, LABEL_INCHES = 0.3, 1.0, 3.6
-LONGEST_TOLD = 150
+MAX_TOLD_CHARACTERS = 150
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,8 @@ def count_outcomes(places: Places) -> dict[str, int]:
 def _place(rows: Sequence[Row]) -> Place:
     worst = min(rows, key=lambda row: WORST_FIRST.index(row["outcome"]))
     told = worst["error"].partition(": ")[2] or worst["new_warnings"].split(SEPARATOR)[0]
-    if len(told) > LONGEST_TOLD:
-        told = told[:LONGEST_TOLD].rpartition(" ")[0] + " ..."
+    if len(told) > MAX_TOLD_CHARACTERS:
+        told = told[:MAX_TOLD_CHARACTERS].rpartition(" ")[0] + " ..."
     losses_db, depth_losses_mm = _known(rows, "loss_db"), _known(rows, "depth_loss_mm")
     return Place(
         outcome=worst["outcome"],
@@ -170,7 +170,7 @@ def _fill(outcome: str) -> Any:
 def _figures(place: Place) -> str:
     if math.isnan(place.loss_db):
         return place.outcome
-    harmed_in_depth = place.depth_loss_mm > LARGEST_DEPTH_LOSS_MM
+    harmed_in_depth = place.depth_loss_mm > MAX_DEPTH_LOSS_MM
     return f"{place.loss_db:z.1f}" + (f", {place.depth_loss_mm:.0f} mm" if harmed_in_depth else "")
 
 
@@ -184,7 +184,7 @@ def _in_words(place: Place | None) -> str:
 
 def _title(places: Places, series: str) -> str:
     counted = ", ".join(f"{number} {outcome}" for outcome, number in count_outcomes(places).items())
-    return f"{series}: {counted}\n(harmed: over {LARGEST_LOSS_DB:g} dB, or over {LARGEST_DEPTH_LOSS_MM:g} mm of depth)"
+    return f"{series}: {counted}\n(harmed: over {MAX_LOSS_DB:g} dB, or over {MAX_DEPTH_LOSS_MM:g} mm of depth)"
 
 
 def _handles(places: Places) -> list[Any]:

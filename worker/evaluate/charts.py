@@ -29,7 +29,7 @@ AREA_A_MEGABYTE, MARK_AREA = 5.0, 30.0
 LEGEND_MEGABYTES = (10, 50)
 SHOWN_BELOW_WORST_DB = 6.0
 """Curves begin far below where they end; what lies this far under the worst end is cut off."""
-MOST_FINE_TICKS = 500
+MAX_FINE_TICKS = 500
 """An axis that spans more than this factor has ticks at powers of ten alone: others would run into each other."""
 REAL_CLIP, PAPERS_HOLDOUT = "d4d-a", "every8"
 """Published figures stand beside the real clip alone, held out as the papers do."""
@@ -297,7 +297,7 @@ def _finish(axis: Any) -> None:
 
     axis.margins(x=0.09, y=0.1)
     low, high = axis.get_xlim()
-    axis.xaxis.set_major_locator(LogLocator(base=10, subs=(1, 2, 5) if high < MOST_FINE_TICKS * low else (1,)))
+    axis.xaxis.set_major_locator(LogLocator(base=10, subs=(1, 2, 5) if high < MAX_FINE_TICKS * low else (1,)))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
 

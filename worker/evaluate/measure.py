@@ -42,7 +42,7 @@ from worker.train.targets import camera_in_units
 
 UNTIMED_RENDERS, TIMED_RENDERS = 5, 40
 """Renders at different times, of which the median counts; the first fill caches."""
-LONGEST_ERROR = 300
+MAX_ERROR_CHARACTERS = 300
 
 Values = dict[str, object]
 
@@ -80,7 +80,7 @@ class Bench:
             raise
         except Exception as error:
             problem = " ".join(str(error).split())
-            return {**row, "error": f"{type(error).__name__}: {problem}"[:LONGEST_ERROR]}, []
+            return {**row, "error": f"{type(error).__name__}: {problem}"[:MAX_ERROR_CHARACTERS]}, []
         return {**row, **values}, curve
 
     def _measured(self, cell: Cell, source: Source, hooks: TrainingHooks) -> tuple[Values, list[Values]]:

@@ -2,8 +2,8 @@
 
 Symbols: T frames of the clean clip, S frames of the given one, H W pixels.
 
-A cell is harmed when it scores more than LARGEST_LOSS_DB below the clean cell of the same series and seed, or its
-depth errs by LARGEST_DEPTH_LOSS_MM more. The clean cell has severity 0: the clean clip, or the condition's own motion
+A cell is harmed when it scores more than MAX_LOSS_DB below the clean cell of the same series and seed, or its
+depth errs by MAX_DEPTH_LOSS_MM more. The clean cell has severity 0: the clean clip, or the condition's own motion
 where that is calm. A harmed cell is `told` if its report has a kind of warning that the clean cell's has not, else
 `silent`: that is the defect. The kind of a warning is its code. `refused` and `diverged` end in an error that says why,
 `crashed` in one that nobody foresaw.
@@ -60,9 +60,9 @@ FIELDS = (
 )  # fmt: skip
 """psnr_db and depth_error_mm (mean) are against the truth, reported_db is what the report says of itself; codes
 has SEVERITY:CODE of each of the warnings."""
-LARGEST_LOSS_DB = 3.0
+MAX_LOSS_DB = 3.0
 """Twice the squared error: nobody would call that the same quality."""
-LARGEST_DEPTH_LOSS_MM = 2.0
+MAX_DEPTH_LOSS_MM = 2.0
 """About the width of a grasper's jaw."""
 SEPARATOR = " | "
 
@@ -197,7 +197,7 @@ def verdict(row: Row, clean: Row | None) -> dict[str, str]:
     if row["depth_error_mm"] and clean["depth_error_mm"]:
         depth_loss_mm = float(row["depth_error_mm"]) - float(clean["depth_error_mm"])
     new = new_warnings(row, clean)
-    harmed = loss_db > LARGEST_LOSS_DB or depth_loss_mm > LARGEST_DEPTH_LOSS_MM
+    harmed = loss_db > MAX_LOSS_DB or depth_loss_mm > MAX_DEPTH_LOSS_MM
     outcome = "held" if not harmed else "told" if new else "silent"
     return {
         "outcome": outcome,

@@ -4,7 +4,6 @@ Verbs: make_phantom, write_endonerf, write_stereomis, write_stereo_video.
 """
 
 from worker.phantom.camera import orbit_pose
-from worker.phantom.command import add_cli_arguments, run_cli
 from worker.phantom.scene import Phantom, PhantomFrame, Trajectories, make_phantom
 from worker.phantom.settings import MOTIONS, Motion, PhantomSettings
 from worker.phantom.writers import write_endonerf, write_stereo_video, write_stereomis
@@ -16,10 +15,8 @@ __all__ = [
     "PhantomFrame",
     "PhantomSettings",
     "Trajectories",
-    "add_cli_arguments",
     "make_phantom",
     "orbit_pose",
-    "run_cli",
     "write_endonerf",
     "write_stereo_video",
     "write_stereomis",

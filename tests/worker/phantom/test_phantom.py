@@ -23,14 +23,13 @@ from worker.phantom import (
     Motion,
     Phantom,
     PhantomSettings,
-    add_cli_arguments,
     make_phantom,
     orbit_pose,
-    run_cli,
     write_endonerf,
     write_stereo_video,
     write_stereomis,
 )
+from worker.phantom.command import add_cli_arguments, run_cli
 
 PERIOD = 12.0
 

@@ -1,0 +1,99 @@
+"""`intrasplat reconstruct`: trains a scene from a clip."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+from contract.runtime.arguments import add_options, given_options
+from contract.runtime.exits import ExitCode
+from contract.runtime.progress_bar import ProgressBar
+from contract.wire.errors import Cancelled, InputError
+from contract.wire.options import ReconstructionOptions
+from contract.wire.report import Report
+from worker.commands.device import add_device
+
+
+def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of `reconstruct`; run_cli reads them."""
+    parser.add_argument(
+        "clip", type=Path, metavar="INPUT", help="a video, a folder or a zip: both eyes, or the left one"
+    )
+    parser.add_argument(
+        "right", type=Path, metavar="RIGHT", nargs="?", help="the right eye, if it is a file of its own"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="SCENE", help="folder for the scene: new, empty, or of a stopped run"
+    )
+    parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini; for stereo")
+    parser.add_argument("--masks", type=Path, metavar="F", help="zip or folder of PNGs, or a video: the instruments")
+    add_options(parser, ReconstructionOptions)
+    add_device(parser, "auto")
+
+
+def run_cli(options: argparse.Namespace) -> int:
+    """Reconstructs; SIGINT or SIGTERM stops the run, and the same command resumes it. Returns the exit code.
+
+    Raises:
+        InputError: --out holds something else, or as worker.pipeline.reconstruct.
+        Cancelled: a signal came.
+    """
+    from worker.daemon.orders import job_progress
+    from worker.pipeline import reconstruct
+    from worker.scene.resume_file import RESUME_FILE
+    from worker.train.hooks import TrainingHooks
+    from worker.train.request import ReconstructionRequest
+
+    out: Path = options.out
+    if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= {RESUME_FILE}):
+        problem = f"{out} is there already and is neither an empty folder nor that of a stopped run."
+        raise InputError("--out", problem, "Name a new folder.")
+    request = ReconstructionRequest(
+        clip=options.clip,
+        right=options.right,
+        calibration=options.calibration,
+        masks=options.masks,
+        options=given_options(options, ReconstructionOptions),
+        device=options.device,
+    )
+    interrupted = threading.Event()
+    is_new = not out.exists()
+    out.mkdir(parents=True, exist_ok=True)
+    before = {number: signal.signal(number, _once(interrupted)) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with ProgressBar(sys.stderr) as bar:
+            hooks = TrainingHooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
+            report = reconstruct(request, out, hooks)
+    except Cancelled as error:
+        again = " The same command goes on from there." if (out / RESUME_FILE).exists() else ""
+        raise Cancelled(f"{error}{again}") from error
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if is_new and not any(out.iterdir()):
+            out.rmdir()
+    _print_report(report, out)
+    return ExitCode.OK
+
+
+def _once(event: threading.Event) -> Callable[[int, FrameType | None], None]:
+    """A handler that sets the event at the first signal; the second raises KeyboardInterrupt."""
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        event.set()
+        signal.signal(number, signal.default_int_handler)
+
+    return handle
+
+
+def _print_report(report: Report, out: Path) -> None:
+    quality = report.psnr_tissue_db
+    shown = "not measured (no frames were held out)" if quality is None else f"{quality:.2f} dB on held-out frames"
+    print(f"scene: {out}\npsnr_tissue: {shown}")
+    for notice in report.warnings:
+        print(f"{notice.severity}: {notice.text}")
