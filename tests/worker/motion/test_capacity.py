@@ -209,10 +209,10 @@ def test_a_fixed_number_of_points_is_kept_to(points: int) -> None:
 def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: int) -> None:
     clip = phantom_clip(frames=frames)
     train = list(range(frames))
-    preset, words = settled(FAST, track(clip, train) if frames > 1 else None, clip, train)
+    preset, notices = settled(FAST, track(clip, train) if frames > 1 else None, clip, train)
     assert preset.bases is not None
     assert 1 <= preset.bases <= frames
-    assert any("too little could be followed" in each for each in words)
+    assert any("too little could be followed" in each.text for each in notices)
 
 
 @pytest.mark.parametrize(("frames", "bases"), [(1, 1), (2, 2), (12, 4), (1000, 33)])
@@ -223,11 +223,11 @@ def test_where_nothing_could_be_followed_bases_come_by_the_frames_up_to_the_most
 @pytest.mark.parametrize("most", [2, 5, 12, 1000])
 def test_a_preset_may_allow_fewer_bases_than_the_scene_would_get(most: int) -> None:
     clip, train, tracks = followed("breathing")
-    limited, words = settled(dataclasses.replace(FAST, max_bases=most), tracks, clip, train)
+    limited, notices = settled(dataclasses.replace(FAST, max_bases=most), tracks, clip, train)
     assert limited.bases is not None
     assert limited.bases <= most
     assert limited.bases == bases_for("breathing") or most < bases_for("breathing")
-    assert words[-1].startswith(f"Motion has {limited.bases} bases: ")
+    assert notices[-1].text.startswith(f"Motion has {limited.bases} bases: ")
     assert max(tried_bases(tracks, clip, train, most).tracked) <= most
 
 
