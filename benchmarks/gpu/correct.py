@@ -23,7 +23,7 @@ from benchmarks.bm_raster import BASES, GRID_STEP_PX, HEIGHT, WIDTH, grid_scene
 from benchmarks.gpu.rows import KERNELS_READY, Part
 from benchmarks.gpu.scenes import LOSS, Noise, poison, stereo_pairs, stirred_motion
 from tests.worker.raster.interpreter import hasten
-from tests.worker.raster.scenes import Scene, pixels_near_a_cut, random_scene
+from tests.worker.raster.scenes import SplatScene, pixels_near_a_cut, random_scene
 from worker.model.deformation import Deformation, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.optimize import StepRates
@@ -125,7 +125,7 @@ class Checks:
 
     # The rasteriser
 
-    def _scene(self, pixels: float = 2.0, opacities: tuple[float, ...] = (0.05, 0.4, 0.999)) -> Scene:
+    def _scene(self, pixels: float = 2.0, opacities: tuple[float, ...] = (0.05, 0.4, 0.999)) -> SplatScene:
         size = self.sizes
         made = random_scene(
             size.count, width=size.width, height=size.height, seed=self._random(), pixels=pixels, opacities=opacities
@@ -309,7 +309,7 @@ class Checks:
 
 
 def _rendered(
-    scene: Scene, render: Callable[..., object], cotangents: Sequence[NDArray[np.float64]], device: str
+    scene: SplatScene, render: Callable[..., object], cotangents: Sequence[NDArray[np.float64]], device: str
 ) -> dict[str, Tensor]:
     """Layers and gradients, on the host."""
     live = scene.differentiable()
@@ -327,7 +327,7 @@ def _rendered(
     return {name: each.cpu().double() for name, each in found.items()}
 
 
-def _arguments(scenes: Sequence[Scene], device: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _arguments(scenes: Sequence[SplatScene], device: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """camera, state, opacity_logit, colour of a rasteriser with a frame a scene; opacities are the first one's."""
     cameras = torch.from_numpy(np.stack([camera_vector(each.camera) for each in scenes]))
     states = torch.stack([torch.cat([each.mean, each.quaternion, each.scale.log()], 1).T for each in scenes]).float()

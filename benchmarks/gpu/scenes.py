@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tests.worker.raster.scenes import Scene, pixels_near_a_cut
+from tests.worker.raster.scenes import SplatScene, pixels_near_a_cut
 from worker.model.deformation import Deformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
 from worker.model.loss import LossSettings, training_loss
 from worker.raster import reference
@@ -19,7 +19,7 @@ from worker.raster.cuda.rasterizer import CudaRasterizer
 from worker.raster.step import Target, TrainingFrame
 from worker.stereo.matching import MatchPlan
 
-LOSS = LossSettings(depth_weight=20.0, colour_zone=0.05, depth_zone=1e-3)
+LOSS = LossSettings(depth_weight=20.0, colour_huber_delta=0.05, depth_huber_delta=1e-3)
 NOT_BUFFERS = frozenset({"ok", "needed", "_borders", "_camera", "_state", "_opacity_logit"})
 """Of a rasteriser's tensors: what outlives a projection, a constant, and its caller's."""
 
@@ -27,7 +27,7 @@ NOT_BUFFERS = frozenset({"ok", "needed", "_borders", "_camera", "_state", "_opac
 class Noise:
     """A frame of noise with holes in tissue and depth: for the loss in torch, for a step, and for the rasteriser."""
 
-    def __init__(self, scene: Scene, seed: int) -> None:
+    def __init__(self, scene: SplatScene, seed: int) -> None:
         random = np.random.default_rng(seed)
         shape = (scene.camera.height, scene.camera.width)
         self._rgb = random.integers(0, 256, (*shape, 3), dtype=np.uint8)
@@ -65,7 +65,7 @@ class Noise:
         frame = self.frame(0.0, np.zeros(18))
         return torch.from_numpy(frame.loss_settings(LOSS))
 
-    def gradients(self, scene: Scene) -> dict[str, Tensor]:
+    def gradients(self, scene: SplatScene) -> dict[str, Tensor]:
         """Of the loss, in float64, to what the rasteriser takes: log-scales and logits."""
         live = scene.to(torch.float64)
         log_scale, logit = live.scale.log().requires_grad_(), torch.logit(live.opacity).requires_grad_()

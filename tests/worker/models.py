@@ -38,7 +38,7 @@ RATES = StepRates(
 )
 """Motion has one rate for all its channels, as a deformation without kernels of its own needs."""
 PAPER = LossSettings(normalised_depth=False)
-NORMALISED = LossSettings(depth_weight=20.0, colour_zone=0.02, depth_zone=1e-3)
+NORMALISED = LossSettings(depth_weight=20.0, colour_huber_delta=0.02, depth_huber_delta=1e-3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ Source: Yang et al., Deform3DGS (MICCAI 2024), section "Optimization": masked L1
     L_d = 1 / |M_d|     sum_{M_d}      h(D - 1 / d),     D = 1 / Z   ("paper": the sum as blended)
                                                          D = A / Z   (normalised: inverse of the mean depth)
 
-h is |e|, or with a zone delta > 0 Huber's: e^2 / (2 delta) for |e| < delta, else |e| - delta / 2. Its slope is
-h'(e) = clip(e / delta, -1, 1), sign(e) without a zone. So the gradients that reach the blend are
+h is |e|, or Huber's loss over its delta > 0: e^2 / (2 delta) for |e| < delta, else |e| - delta / 2. Its slope is
+h'(e) = clip(e / delta, -1, 1), or sign(e) for delta = 0. So the gradients that reach the blend are
 
     dL/dC = colour_weight / (3 |M_c|) h'(C - C_true)                      on M_c, else 0
     dL/dZ = -depth_weight / |M_d| h'(D - 1 / d) D / Z                     on M_d, else 0   (both forms)
@@ -35,15 +35,15 @@ class LossSettings:
     """Weights of the two terms, the form of depth, and where the L1 becomes quadratic.
 
     normalised_depth   False: 1 / Z, as published; True: A / Z
-    colour_zone        half-width of Huber's zone in colour ([0, 1]); 0: plain L1
-    depth_zone         the same in 1 / units
+    colour_huber_delta of the colour's h, in [0, 1]; 0: plain L1
+    depth_huber_delta  of the inverse depth's h, in 1 / units
     """
 
     colour_weight: float = 1.0
     depth_weight: float = 1.0
     normalised_depth: bool = True
-    colour_zone: float = 0.0
-    depth_zone: float = 0.0
+    colour_huber_delta: float = 0.0
+    depth_huber_delta: float = 0.0
 
     def __post_init__(self) -> None:
         negative = {name: value for name, value in vars(self).items() if value < 0}
@@ -77,21 +77,21 @@ def training_loss(
         true_depth: [H, W] in units, 0 = invalid.
         tissue: [H, W] bool.
     """
-    colour = colour_loss(rgb, true_rgb, tissue, zone=settings.colour_zone)
+    colour = colour_loss(rgb, true_rgb, tissue, delta=settings.colour_huber_delta)
     inverse_depth = inverse_depth_loss(
-        depth, alpha, true_depth, tissue, normalised=settings.normalised_depth, zone=settings.depth_zone
+        depth, alpha, true_depth, tissue, normalised=settings.normalised_depth, delta=settings.depth_huber_delta
     )
     return Loss(settings.colour_weight * colour + settings.depth_weight * inverse_depth, colour, inverse_depth)
 
 
-def colour_loss(rgb: Tensor, true_rgb: Tensor, tissue: Tensor, *, zone: float = 0.0) -> Tensor:
+def colour_loss(rgb: Tensor, true_rgb: Tensor, tissue: Tensor, *, delta: float = 0.0) -> Tensor:
     """L_c: mean over tissue pixels and RGB; 0 without tissue."""
-    errors = _h(rgb - true_rgb, zone).sum(dim=-1)
+    errors = _h(rgb - true_rgb, delta).sum(dim=-1)
     return torch.where(tissue, errors, 0.0).sum() / (3 * tissue.sum()).clamp(min=1)
 
 
 def inverse_depth_loss(
-    depth: Tensor, alpha: Tensor, true_depth: Tensor, tissue: Tensor, *, normalised: bool, zone: float = 0.0
+    depth: Tensor, alpha: Tensor, true_depth: Tensor, tissue: Tensor, *, normalised: bool, delta: float = 0.0
 ) -> Tensor:
     """L_d: mean over tissue pixels with valid true depth, in 1 / units; 0 if there is none."""
     valid = tissue & (true_depth > 0)
@@ -100,13 +100,13 @@ def inverse_depth_loss(
     inverse = 1 / torch.where(usable, depth, 1.0)
     if normalised:
         inverse = inverse * alpha
-    errors = _h(inverse - 1 / torch.where(valid, true_depth, 1.0), zone)
+    errors = _h(inverse - 1 / torch.where(valid, true_depth, 1.0), delta)
     return torch.where(usable, errors, 0.0).sum() / valid.sum().clamp(min=1)
 
 
-def _h(error: Tensor, zone: float) -> Tensor:
-    """|e|, quadratic within the zone."""
+def _h(error: Tensor, delta: float) -> Tensor:
+    """|e|, or Huber's loss over its delta."""
     size = error.abs()
-    if zone == 0:
+    if delta == 0:
         return size
-    return torch.where(size < zone, error**2 / (2 * zone), size - zone / 2)
+    return torch.where(size < delta, error**2 / (2 * delta), size - delta / 2)

@@ -12,7 +12,7 @@ number and any Gaussian in view, comes with the next answer.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -121,3 +121,16 @@ class Model(Protocol):
     def export(self) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as tensors on the host (copies)."""
         ...
+
+
+def put_back(arrays: Mapping[str, Tensor], stored: Mapping[str, Tensor]) -> None:
+    """Copy the stored tensors, on any device, into a model's arrays().
+
+    Raises:
+        ValueError: one is of another shape.
+    """
+    for name, each in arrays.items():
+        if stored[name].shape != each.shape:
+            shapes = tuple(stored[name].shape), tuple(each.shape)
+            raise ValueError(f"{name} has shape {shapes[0]}, this model needs {shapes[1]}")
+        each.copy_(stored[name])

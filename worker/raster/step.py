@@ -67,8 +67,8 @@ class TrainingFrame:
             [
                 loss.colour_weight / (3 * max(self.tissue_pixels, 1)),
                 loss.depth_weight / max(self.measured_pixels, 1),
-                1 / max(loss.colour_zone, 1e-30),
-                1 / max(loss.depth_zone, 1e-30),
+                1 / max(loss.colour_huber_delta, 1e-30),
+                1 / max(loss.depth_huber_delta, 1e-30),
                 float(loss.normalised_depth),
             ],
             np.float32,

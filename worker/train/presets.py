@@ -184,7 +184,7 @@ _FAST = Preset(
     warm_restarts=True,
     min_gain_db=0.25,
     rates=_FAST_RATES,
-    loss=LossSettings(colour_zone=0.1),
+    loss=LossSettings(colour_huber_delta=0.1),
     densify=None,
     iterations=None,
     budget_s=60.0,

@@ -33,10 +33,12 @@ def frame(seed: int = 0) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("normalised", [False, True])
-@pytest.mark.parametrize("zone", [0.0, 0.02])
-def test_gradients_are_those_of_the_docstring(normalised: bool, zone: float) -> None:
+@pytest.mark.parametrize("delta", [0.0, 0.02])
+def test_gradients_are_those_of_the_docstring(normalised: bool, delta: float) -> None:
     values = frame()
-    settings = LossSettings(0.7, 1.3, normalised_depth=normalised, colour_zone=zone, depth_zone=zone / 10)
+    settings = LossSettings(
+        0.7, 1.3, normalised_depth=normalised, colour_huber_delta=delta, depth_huber_delta=delta / 10
+    )
     rendered = [values[name].requires_grad_() for name in ("rgb", "depth", "alpha")]
     loss = training_loss(**values, settings=settings)
     got = torch.autograd.grad(loss.total, rendered, allow_unused=True)
@@ -49,8 +51,8 @@ def test_gradients_are_those_of_the_docstring(normalised: bool, zone: float) -> 
     valid = tissue & (d > 0)
     usable = valid & (a >= 0.01)
     inverse = a / z if normalised else 1 / z
-    g = torch.where(usable, 1.3 / valid.sum() * slope(inverse - 1 / d, zone / 10), 0.0)
-    colour = 0.7 / (3 * tissue.sum()) * slope(rgb - values["true_rgb"], zone) * tissue[..., None]
+    g = torch.where(usable, 1.3 / valid.sum() * slope(inverse - 1 / d, delta / 10), 0.0)
+    colour = 0.7 / (3 * tissue.sum()) * slope(rgb - values["true_rgb"], delta) * tissue[..., None]
     torch.testing.assert_close(got[0], colour)
     torch.testing.assert_close(got[1], -g * inverse / z)
     torch.testing.assert_close(got[2] if got[2] is not None else torch.zeros_like(a), g / z if normalised else 0 * a)
@@ -107,10 +109,10 @@ def test_hubers_zone_is_continuous_and_tends_to_the_plain_loss() -> None:
     values = frame()
     arguments = values["rgb"], values["true_rgb"], values["tissue"]
     plain = colour_loss(*arguments)
-    torch.testing.assert_close(colour_loss(*arguments, zone=1e-9), plain)
+    torch.testing.assert_close(colour_loss(*arguments, delta=1e-9), plain)
     error = torch.full((1, 1, 3), 0.1, dtype=torch.float64)
     one = torch.ones(1, 1, dtype=torch.bool)
-    below, above = (colour_loss(error * scale, 0 * error, one, zone=0.1) for scale in (1 - 1e-9, 1 + 1e-9))
+    below, above = (colour_loss(error * scale, 0 * error, one, delta=0.1) for scale in (1 - 1e-9, 1 + 1e-9))
     assert abs(float(above - below)) < 1e-9
 
 

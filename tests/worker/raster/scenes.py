@@ -48,7 +48,7 @@ NAMES = ("mean", "quaternion", "scale", "opacity", "colour")
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class SplatScene:
     """The arguments of rasterize."""
 
     mean: Tensor
@@ -64,15 +64,15 @@ class Scene:
     def render(self, rasterize: Rasterize = reference.rasterize) -> Rendered:
         return rasterize(*self.tensors(), self.camera)
 
-    def to(self, dtype: torch.dtype) -> Scene:
+    def to(self, dtype: torch.dtype) -> SplatScene:
         """In another precision; the camera stays float64."""
         return dataclasses.replace(self, **{name: getattr(self, name).to(dtype) for name in NAMES})
 
-    def rows(self, index: Tensor) -> Scene:
+    def rows(self, index: Tensor) -> SplatScene:
         """The Gaussians index, in that order."""
         return dataclasses.replace(self, **{name: getattr(self, name)[index] for name in NAMES})
 
-    def differentiable(self) -> Scene:
+    def differentiable(self) -> SplatScene:
         """Copies that ask for gradients, the camera's pose among them."""
         leaves = {name: getattr(self, name).detach().clone().requires_grad_() for name in NAMES}
         pose = torch.tensor(np.asarray(self.camera.camera_from_world)).requires_grad_()
@@ -121,7 +121,7 @@ def random_scene(
     seed: int = 0,
     pixels: float = 2.0,
     opacities: tuple[float, ...] = (0.05, 0.4, 0.999),
-) -> Scene:
+) -> SplatScene:
     """Gaussians in and around the image at distinct depths, float64: faint and opaque, thin and wide, any orientation.
 
     Args:
@@ -134,7 +134,7 @@ def random_scene(
     column = random.uniform(-0.25 * width, 1.25 * width, count)
     row = random.uniform(-0.25 * height, 1.25 * height, count)
     scale = random.lognormal(0.0, 0.5, (count, 3)) * (pixels * depth / view.fx)[:, None]
-    return Scene(
+    return SplatScene(
         mean=torch.tensor(unproject(view, column, row, depth)),
         quaternion=torch.tensor(random.normal(size=(count, 4))),
         scale=torch.tensor(scale),
@@ -144,12 +144,12 @@ def random_scene(
     )
 
 
-def opaque_wall() -> Scene:
+def opaque_wall() -> SplatScene:
     """Every pixel is full long before its last Gaussian: most are hidden everywhere."""
     return random_scene(400, width=37, height=35, seed=40, pixels=9.0, opacities=(0.9,))
 
 
-def opacities_at_both_ends(count: int = 150, *, width: int = 41, height: int = 34) -> Scene:
+def opacities_at_both_ends(count: int = 150, *, width: int = 41, height: int = 34) -> SplatScene:
     """A third of the Gaussians at opacity 1, a third at 0: neither has a finite logit."""
     scene = random_scene(count, width=width, height=height, seed=41)
     opacity = scene.opacity.clone()
@@ -166,7 +166,7 @@ def unproject(
     return np.asarray((in_camera - pose[:3, 3]) @ pose[:3, :3])
 
 
-def pixels_near_a_cut(scene: Scene, *, alpha_margin: float = 1e-5, stop_margin: float = 1e-6) -> NDArray[np.bool_]:
+def pixels_near_a_cut(scene: SplatScene, *, alpha_margin: float = 1e-5, stop_margin: float = 1e-6) -> NDArray[np.bool_]:
     """[H, W] bool: pixels where a Gaussian comes so near a threshold that rounding decides on which side it falls.
 
     Thresholds: alpha at MIN_ALPHA and at MAX_ALPHA (within alpha_margin), transmittance at MIN_TRANSMITTANCE (within

@@ -20,7 +20,7 @@ from tests.worker.raster.scenes import (
     BACKENDS,
     INTERPRETED,
     Rasterize,
-    Scene,
+    SplatScene,
     affordable,
     opacities_at_both_ends,
     opaque_wall,
@@ -33,7 +33,7 @@ from worker.raster import Rendered, reference
 MAX_LEFT_OUT = 0.05
 """Share of an image's pixels that may lie near a cut before a comparison says too little."""
 
-SCENES: dict[str, Callable[[], Scene]] = {
+SCENES: dict[str, Callable[[], SplatScene]] = {
     "one Gaussian": lambda: random_scene(1, width=16, height=16, seed=1, pixels=4.0),
     "odd size": lambda: random_scene(400, width=47, height=38, seed=2),
     "one pixel": lambda: random_scene(30, width=1, height=1, seed=3, pixels=0.5),
@@ -46,7 +46,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "thinner than a pixel": lambda: random_scene(600, width=56, height=40, seed=8, pixels=0.15),
     "a small frame": lambda: random_scene(1500, width=96, height=80, seed=9),
 }
-SMALL_SCENES: dict[str, Callable[[], Scene]] = {
+SMALL_SCENES: dict[str, Callable[[], SplatScene]] = {
     "one Gaussian": SCENES["one Gaussian"],
     "one pixel": SCENES["one pixel"],
     "one column": lambda: random_scene(40, width=1, height=21, seed=42),
@@ -177,11 +177,11 @@ def test_the_same_scene_gives_the_same_bits(rasterize: Rasterize) -> None:
     assert all(bool((again_gradients[name] == each).all()) for name, each in first_gradients.items())
 
 
-def no_pixel(scene: Scene) -> NDArray[np.bool_]:
+def no_pixel(scene: SplatScene) -> NDArray[np.bool_]:
     return np.zeros((scene.camera.height, scene.camera.width), bool)
 
 
-def random_cotangent(scene: Scene, left_out: NDArray[np.bool_]) -> Tensor:
+def random_cotangent(scene: SplatScene, left_out: NDArray[np.bool_]) -> Tensor:
     """[H, W, 5] float64 for rgb, depth, alpha; 0 where pixels are left out; depth scaled so that no layer rules."""
     random = torch.Generator().manual_seed(17)
     cotangent = torch.randn(scene.camera.height, scene.camera.width, 5, generator=random, dtype=torch.float64)
@@ -190,7 +190,9 @@ def random_cotangent(scene: Scene, left_out: NDArray[np.bool_]) -> Tensor:
     return cotangent
 
 
-def values_and_gradients(scene: Scene, rasterize: Rasterize, cotangent: Tensor) -> tuple[Rendered, dict[str, Tensor]]:
+def values_and_gradients(
+    scene: SplatScene, rasterize: Rasterize, cotangent: Tensor
+) -> tuple[Rendered, dict[str, Tensor]]:
     """The image, and the gradients of sum(cotangent * layers) to everything that can be differentiated."""
     live = scene.differentiable()
     rendered = live.render(rasterize)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.helpers import assert_close
-from tests.worker.raster.scenes import Scene, opaque_wall, pixels_near_a_cut, random_scene
+from tests.worker.raster.scenes import SplatScene, opaque_wall, pixels_near_a_cut, random_scene
 from worker.model.deformation import (
     FlexibleDeformation,
     GaussianFdm,
@@ -35,8 +35,8 @@ from worker.raster.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion, motion
 from worker.raster.step import Target, TrainingFrame, camera_vector
 
 LOSSES = {
-    "summed depth": LossSettings(2e3, 4e4, normalised_depth=False, colour_zone=0.05, depth_zone=1e-3),
-    "normalised depth": LossSettings(2e3, 4e4, normalised_depth=True, colour_zone=0.05, depth_zone=1e-3),
+    "summed depth": LossSettings(2e3, 4e4, normalised_depth=False, colour_huber_delta=0.05, depth_huber_delta=1e-3),
+    "normalised depth": LossSettings(2e3, 4e4, normalised_depth=True, colour_huber_delta=0.05, depth_huber_delta=1e-3),
 }
 """Weights near the number of pixels, so that gradients are near 1 and the absolute tolerance plays no part."""
 NORMALISED = LOSSES["normalised depth"]
@@ -59,7 +59,7 @@ RATES = StepRates(
 
 
 @dataclass(frozen=True)
-class Frame:
+class RawFrame:
     """One training frame, unpadded: rgb [H, W, 3] uint8, tissue [H, W] bool, depth [H, W] in units, 0 = invalid."""
 
     rgb: NDArray[np.uint8]
@@ -86,8 +86,8 @@ class Frame:
             [
                 settings.colour_weight / (3 * int(self.tissue.sum())),
                 settings.depth_weight / with_depth,
-                1 / settings.colour_zone,
-                1 / settings.depth_zone,
+                1 / settings.colour_huber_delta,
+                1 / settings.depth_huber_delta,
                 settings.normalised_depth,
             ],
             np.float32,
@@ -98,7 +98,7 @@ class Frame:
         counts = int(self.tissue.sum()), int((self.tissue & (self.depth > 0)).sum())
         return TrainingFrame(camera_vector(camera), t, self.target(rasterizer), *counts)
 
-    def loss(self, scene: Scene, settings: LossSettings) -> Tensor:
+    def loss(self, scene: SplatScene, settings: LossSettings) -> Tensor:
         """worker.model.loss on the reference's render."""
         rendered = scene.render()
         true_rgb = torch.from_numpy(self.rgb).double() / 255
@@ -106,18 +106,18 @@ class Frame:
         return training_loss(rendered.rgb, rendered.depth, rendered.alpha, true_rgb, true_depth, tissue, settings).total
 
 
-def random_frame(camera: Camera, left_out: NDArray[np.bool_]) -> Frame:
+def random_frame(camera: Camera, left_out: NDArray[np.bool_]) -> RawFrame:
     random = np.random.default_rng(21)
     shape = (camera.height, camera.width)
     depth = random.uniform(40, 90, shape) * (random.uniform(size=shape) > 0.2)
-    return Frame(
+    return RawFrame(
         rgb=random.integers(0, 256, (*shape, 3), dtype=np.uint8),
         tissue=(random.uniform(size=shape) > 0.15) & ~left_out,
         depth=depth.astype(np.float32),
     )
 
 
-def project_with(rasterizer: Rasterizer, scene: Scene) -> None:
+def project_with(rasterizer: Rasterizer, scene: SplatScene) -> None:
     """The scene's Gaussians onto its camera, as rows of padded columns."""
     count = padded(len(scene.mean))
 
@@ -131,7 +131,7 @@ def project_with(rasterizer: Rasterizer, scene: Scene) -> None:
     rasterizer.project(camera_vector(scene.camera), state, logit, rows(scene.colour, 0.0))
 
 
-def outcome(rasterizer: Rasterizer, scene: Scene, frame: Frame) -> list[NDArray[np.float32]]:
+def outcome(rasterizer: Rasterizer, scene: SplatScene, frame: RawFrame) -> list[NDArray[np.float32]]:
     """Copies of everything a render and a loss leave behind for the caller."""
     project_with(rasterizer, scene)
     image = rasterizer.render().copy()
@@ -158,7 +158,7 @@ def poison(rasterizer: Rasterizer) -> None:
 @pytest.mark.parametrize(
     "make_scene", [lambda: random_scene(180, width=45, height=37, seed=30), opaque_wall], ids=["open", "opaque"]
 )
-def test_what_the_buffers_held_before_changes_nothing(make_scene: Callable[[], Scene]) -> None:
+def test_what_the_buffers_held_before_changes_nothing(make_scene: Callable[[], SplatScene]) -> None:
     scene = make_scene()
     width, height = scene.camera.width, scene.camera.height
     frame = random_frame(scene.camera, np.zeros((height, width), bool))
@@ -282,8 +282,8 @@ def test_a_fused_step_has_the_gradients_of_the_stages_one_by_one(kind: str, sh_d
             assert_close(stored["motion.first"][row, ..., :90], wanted[name].permute(1, 2, 0), name=name)
 
 
-def _scene_of(gaussians: Gaussians, camera: Camera) -> Scene:
-    return Scene(
+def _scene_of(gaussians: Gaussians, camera: Camera) -> SplatScene:
+    return SplatScene(
         mean=gaussians.mean,
         quaternion=gaussians.quaternion,
         scale=gaussians.scale,

@@ -18,9 +18,9 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
 from tests.helpers import assert_close
-from tests.worker.raster.scenes import INTERPRETED, Scene, pixels_near_a_cut, random_scene, unproject
+from tests.worker.raster.scenes import INTERPRETED, SplatScene, pixels_near_a_cut, random_scene, unproject
 from tests.worker.raster.test_backends import random_cotangent, values_and_gradients
-from tests.worker.raster.test_cpu import LOSSES, NORMALISED, Frame, random_frame
+from tests.worker.raster.test_cpu import LOSSES, NORMALISED, RawFrame, random_frame
 from worker.model.loss import LossSettings
 from worker.raster import Camera, cpu, reference
 from worker.raster.cpu import padded
@@ -34,10 +34,10 @@ WIDTH, HEIGHT = 11, 7
 
 
 @dataclasses.dataclass
-class View:
+class SceneFrames:
     """Scenes of equal size, one a frame, as the rasteriser reads them."""
 
-    scenes: list[Scene]
+    scenes: list[SplatScene]
     device: str
 
     def arguments(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -60,11 +60,11 @@ def memory(device: str) -> str:
     return device
 
 
-def scene_of(count: int = 40, seed: int = 30, **options: float) -> Scene:
+def scene_of(count: int = 40, seed: int = 30, **options: float) -> SplatScene:
     return random_scene(count, width=WIDTH, height=HEIGHT, seed=seed, **options).to(torch.float32)  # type: ignore[arg-type]
 
 
-def clip_of(frames: list[Frame], device: str) -> tuple[Tensor, Tensor, Tensor]:
+def clip_of(frames: list[RawFrame], device: str) -> tuple[Tensor, Tensor, Tensor]:
     """rgb, weight and inverse depth of frames, on the device."""
     rgb = np.stack([each.rgb.transpose(2, 0, 1) for each in frames])
     weight = np.stack([each.tissue * np.uint8(255) for each in frames])
@@ -73,7 +73,7 @@ def clip_of(frames: list[Frame], device: str) -> tuple[Tensor, Tensor, Tensor]:
     return tuple(torch.from_numpy(each).contiguous().to(device) for each in (rgb, weight, inverse))  # type: ignore[return-value]
 
 
-def loss_of(rasterizer: CudaRasterizer, frames: list[Frame], settings: LossSettings, order: list[int]) -> Gradients:
+def loss_of(rasterizer: CudaRasterizer, frames: list[RawFrame], settings: LossSettings, order: list[int]) -> Gradients:
     """loss_backward of frames, given as a clip in another order."""
     device = str(rasterizer.device)
     clip = clip_of([frames[order.index(k)] for k in range(len(frames))], device)
@@ -82,7 +82,7 @@ def loss_of(rasterizer: CudaRasterizer, frames: list[Frame], settings: LossSetti
     return rasterizer.loss_backward(*clip, rows, chosen, pose=True)
 
 
-def outcome(view: View, rasterizer: CudaRasterizer, frames: list[Frame]) -> list[Tensor]:
+def outcome(view: SceneFrames, rasterizer: CudaRasterizer, frames: list[RawFrame]) -> list[Tensor]:
     """Copies of everything a render and a loss leave behind for the caller."""
     rasterizer.project(*view.arguments())
     image = rasterizer.render().clone()
@@ -107,7 +107,7 @@ def assert_same_bits(actual: list[Tensor], expected: list[Tensor]) -> None:
 
 @pytest.mark.parametrize("options", [{}, {"pixels": 9.0, "opacities": (0.9,)}], ids=["open", "opaque"])
 def test_what_the_buffers_held_before_changes_nothing(options: dict[str, float], memory: str) -> None:
-    view = View([scene_of(**options)], memory)
+    view = SceneFrames([scene_of(**options)], memory)
     frames = [random_frame(view.scenes[0].camera, np.zeros((HEIGHT, WIDTH), bool))]
     expected = outcome(view, view.rasterizer(), frames)
     used = view.rasterizer()
@@ -117,7 +117,7 @@ def test_what_the_buffers_held_before_changes_nothing(options: dict[str, float],
 
 
 def test_a_rasterizer_that_saw_other_scenes_gives_the_same_bits(memory: str) -> None:
-    view, other = View([scene_of()], memory), View([scene_of(150, seed=31, pixels=3.0)], memory)
+    view, other = SceneFrames([scene_of()], memory), SceneFrames([scene_of(150, seed=31, pixels=3.0)], memory)
     frames = [random_frame(view.scenes[0].camera, np.zeros((HEIGHT, WIDTH), bool))]
     used = other.rasterizer()
     used.project(*other.arguments())
@@ -133,13 +133,13 @@ def test_several_frames_at_once_are_each_what_it_is_alone(memory: str) -> None:
     scenes = [first, shifted]
     frames = [random_frame(first.camera, np.zeros((HEIGHT, WIDTH), bool)) for _ in scenes]
     frames[1] = dataclasses.replace(frames[1], tissue=~frames[1].tissue)
-    together = View(scenes, memory).rasterizer()
-    together.project(*View(scenes, memory).arguments())
+    together = SceneFrames(scenes, memory).rasterizer()
+    together.project(*SceneFrames(scenes, memory).arguments())
     image = together.render().clone()
     got = loss_of(together, frames, NORMALISED, [1, 0])
     for f, scene in enumerate(scenes):
-        alone = View([scene], memory).rasterizer()
-        alone.project(*View([scene], memory).arguments())
+        alone = SceneFrames([scene], memory).rasterizer()
+        alone.project(*SceneFrames([scene], memory).arguments())
         assert torch.equal(alone.render()[0], image[f])
         wanted = loss_of(alone, [frames[f]], NORMALISED, [0])
         for name in ("state", "opacity_logit", "colour", "mean2d_norm"):
@@ -153,8 +153,8 @@ def test_several_frames_at_once_are_each_what_it_is_alone(memory: str) -> None:
 def test_the_built_in_loss_has_the_gradients_of_the_loss(settings: LossSettings, memory: str) -> None:
     scene = scene_of(90, seed=34)
     frame = random_frame(scene.camera, pixels_near_a_cut(scene))
-    rasterizer = View([scene], memory).rasterizer()
-    rasterizer.project(*View([scene], memory).arguments())
+    rasterizer = SceneFrames([scene], memory).rasterizer()
+    rasterizer.project(*SceneFrames([scene], memory).arguments())
     got = loss_of(rasterizer, [frame], settings, [0])
 
     live = scene.to(torch.float64).differentiable()
@@ -185,14 +185,14 @@ def test_a_depth_of_half_precision_is_read_as_such(memory: str) -> None:
         torch.from_numpy(frame.kernel_settings(NORMALISED))[None].to(memory),
         torch.zeros(1, dtype=torch.int32, device=memory),
     )
-    rasterizer = View([scene], memory).rasterizer()
-    rasterizer.project(*View([scene], memory).arguments())
+    rasterizer = SceneFrames([scene], memory).rasterizer()
+    rasterizer.project(*SceneFrames([scene], memory).arguments())
     wanted = rasterizer.loss_backward(rgb, weight, halved.float(), *rest).state.clone()
     assert torch.equal(rasterizer.loss_backward(rgb, weight, halved, *rest).state, wanted)
 
 
 def test_what_the_kernels_would_misread_is_refused(memory: str) -> None:
-    view = View([scene_of()], memory)
+    view = SceneFrames([scene_of()], memory)
     camera, state, logit, colour = view.arguments()
     rasterizer = view.rasterizer()
     with pytest.raises(ValueError, match=r"camera is contiguous torch.float32 \[1, 18\], not .* torch.float64"):
@@ -209,17 +209,17 @@ def test_a_value_is_blended_as_colour_is_and_leaves_the_rest_as_it_was(memory: s
     scene = scene_of()
     values = torch.rand(len(scene.mean), generator=torch.Generator().manual_seed(0))
     grey = dataclasses.replace(scene, colour=values[:, None].repeat(1, 3))
-    rasterizer = View([scene], memory).rasterizer()
-    rasterizer.project(*View([scene], memory).arguments())
+    rasterizer = SceneFrames([scene], memory).rasterizer()
+    rasterizer.project(*SceneFrames([scene], memory).arguments())
     without = rasterizer.render().clone()
     with_values = rasterizer.render(values.to(memory)).clone()
-    rasterizer.project(*View([grey], memory).arguments())
+    rasterizer.project(*SceneFrames([grey], memory).arguments())
     assert torch.equal(with_values[:, :5], without)
     assert_close(with_values[:, 5], rasterizer.render()[:, 0], relative=1e-6)
 
 
 def test_too_little_room_is_noticed_kept_in_mind_and_mended(memory: str) -> None:
-    view = View([scene_of(80, pixels=6.0)], memory)
+    view = SceneFrames([scene_of(80, pixels=6.0)], memory)
     enough = view.rasterizer()
     enough.project(*view.arguments())
     assert not enough.grown()
@@ -233,7 +233,7 @@ def test_too_little_room_is_noticed_kept_in_mind_and_mended(memory: str) -> None
     assert int(small.ok) == 0
     assert int(small.needed) == touched
     empty = dataclasses.replace(view.scenes[0], opacity=torch.full((80,), 1e-4))
-    small.project(*View([empty], memory).arguments())
+    small.project(*SceneFrames([empty], memory).arguments())
     assert int(small.ok) == 0, "a later projection that fits does not undo it"
     assert small.grown()
     assert small.capacity >= touched
@@ -243,7 +243,7 @@ def test_too_little_room_is_noticed_kept_in_mind_and_mended(memory: str) -> None
 
 
 def test_what_fits_exactly_fits(memory: str) -> None:
-    view = View([scene_of()], memory)
+    view = SceneFrames([scene_of()], memory)
     enough = view.rasterizer()
     enough.project(*view.arguments())
     exact = view.rasterizer()
@@ -253,11 +253,11 @@ def test_what_fits_exactly_fits(memory: str) -> None:
     assert torch.equal(exact.render(), enough.render())
 
 
-def needle(view: Camera, scale: tuple[float, float, float], turn: float) -> Scene:
+def needle(view: Camera, scale: tuple[float, float, float], turn: float) -> SplatScene:
     """One Gaussian in the middle of the image, turned in its plane."""
     pose = dataclasses.replace(view, camera_from_world=np.eye(4))
     middle = unproject(pose, np.array([view.width / 2]), np.array([view.height / 2]), np.array([50.0]))
-    return Scene(
+    return SplatScene(
         mean=torch.tensor(middle, dtype=torch.float32),
         quaternion=torch.tensor([[np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)]], dtype=torch.float32),
         scale=torch.tensor([scale]),
@@ -274,8 +274,8 @@ def test_every_tile_with_a_pixel_of_a_splat_has_it_and_few_others(
 ) -> None:
     view = random_scene(1, width=21, height=18).camera
     scene = needle(view, scale, turn)
-    rasterizer = View([scene], memory).rasterizer()
-    rasterizer.project(*View([scene], memory).arguments())
+    rasterizer = SceneFrames([scene], memory).rasterizer()
+    rasterizer.project(*SceneFrames([scene], memory).arguments())
     drawn = scene.to(torch.float64).render().alpha > 0
     whole = torch.zeros(24, 24, dtype=torch.bool)
     whole[: view.height, : view.width] = drawn
@@ -317,7 +317,7 @@ def test_parameters_beyond_all_training_give_what_they_give_on_the_cpu(memory: s
 
 @pytest.mark.parametrize("row", [0, 2, 4, 8, "opacity"])
 def test_a_gaussian_with_a_parameter_that_is_no_number_is_not_drawn(row: int | str, memory: str) -> None:
-    view = View([scene_of(12, pixels=3.0)], memory)
+    view = SceneFrames([scene_of(12, pixels=3.0)], memory)
     camera, state, logit, colour = view.arguments()
     without = view.rasterizer()
     without.project(camera, state, torch.where(torch.arange(12, device=memory) == 5, -30.0, logit), colour)
@@ -336,7 +336,7 @@ def test_more_tiles_than_16_bits_can_number_are_sorted_with_32(memory: str) -> N
     width, frames = 8 * 2100, MAX_FRAMES
     scene = random_scene(3, width=width, height=1, seed=3, pixels=4.0).to(torch.float32)
     rasterizer = CudaRasterizer(width, 1, memory, frames=frames)
-    rasterizer.project(*View([scene] * frames, memory).arguments())
+    rasterizer.project(*SceneFrames([scene] * frames, memory).arguments())
     of_frame = rasterizer._tile_start[:-1].reshape(frames, 2100).diff(dim=0)
     touched = int(rasterizer.count[0].sum())
     assert touched > 0
@@ -366,9 +366,9 @@ def test_no_gaussians_leave_the_tissue_a_hole(memory: str) -> None:
     full = scene_of()
     scene = full.rows(torch.zeros(0, dtype=torch.long))
     frame = random_frame(scene.camera, np.zeros((HEIGHT, WIDTH), bool))
-    rasterizer = View([full], memory).rasterizer()
-    rasterizer.project(*View([full], memory).arguments())
-    rasterizer.project(*View([scene], memory).arguments())
+    rasterizer = SceneFrames([full], memory).rasterizer()
+    rasterizer.project(*SceneFrames([full], memory).arguments())
+    rasterizer.project(*SceneFrames([scene], memory).arguments())
     gradients = loss_of(rasterizer, [frame], NORMALISED, [0])
     assert not rasterizer.render().any()
     assert gradients.state.shape == (1, 10, 0)

@@ -31,7 +31,7 @@ from worker.train.presets import MAX_FRAMES_A_STEP
 
 WIDTH, HEIGHT, COUNT = 20, 16, 32
 Fused = SharedBasis | PolynomialFourier | FlexibleDeformation
-LOSS = LossSettings(depth_weight=20.0, colour_zone=0.05, depth_zone=1e-3)
+LOSS = LossSettings(depth_weight=20.0, colour_huber_delta=0.05, depth_huber_delta=1e-3)
 RATES = dataclasses.replace(models.RATES, eps=1e-6)
 """eps is far above rounding, so that gradients that are nothing but rounding do not become whole steps."""
 SCENE = random_scene(COUNT, width=WIDTH, height=HEIGHT, seed=50, pixels=2.5)

@@ -38,7 +38,7 @@ RATED = [field.name for field in dataclasses.fields(RATES) if field.name not in 
 
 
 @dataclass
-class Bench:
+class MotionBench:
     """A motion on the device with all that its kernels read and write."""
 
     gaussians: Gaussians
@@ -77,7 +77,7 @@ class Bench:
             each.copy_(torch.from_numpy(drawn))
 
 
-def bench(kind: str, device: str, times: tuple[float, ...] = TIMES) -> Bench:
+def bench(kind: str, device: str, times: tuple[float, ...] = TIMES) -> MotionBench:
     gaussians, deformation = some_gaussians(kind, 0)
     columns, frames = padded(COUNT), len(times)
     motion = motion_of(deformation, columns, torch.device(device))
@@ -95,7 +95,7 @@ def bench(kind: str, device: str, times: tuple[float, ...] = TIMES) -> Bench:
         torch.ones(1, dtype=torch.int32, device=device), torch.zeros(SEEN + 1, dtype=torch.int32, device=device),
     )  # fmt: skip
     control = Control(adam_fields() | motion.fields(frames), 1, torch.device(device))
-    return Bench(gaussians, deformation, motion, control, trained, poisoned(frames, ROWS, columns), times)
+    return MotionBench(gaussians, deformation, motion, control, trained, poisoned(frames, ROWS, columns), times)
 
 
 def some_gaussians(kind: str, degree: int) -> tuple[Gaussians, Fused]:

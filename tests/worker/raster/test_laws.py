@@ -13,7 +13,7 @@ from tests.helpers import assert_close
 from tests.worker.raster.scenes import (
     BACKENDS,
     Rasterize,
-    Scene,
+    SplatScene,
     affordable,
     camera,
     pixels_near_a_cut,
@@ -29,11 +29,11 @@ def rasterize(request: pytest.FixtureRequest) -> Rasterize:
 
 
 @pytest.fixture
-def scene(rasterize: Rasterize) -> Scene:
+def scene(rasterize: Rasterize) -> SplatScene:
     return random_scene(**affordable(rasterize, 250, width=47, height=38), seed=11).to(torch.float32)
 
 
-def assert_same(actual: Rendered, expected: Rendered, scene: Scene) -> None:
+def assert_same(actual: Rendered, expected: Rendered, scene: SplatScene) -> None:
     """Equal but for rounding, where rounding does not choose the side of a threshold."""
     kept = ~pixels_near_a_cut(scene)
     assert kept.mean() > 0.9
@@ -41,7 +41,7 @@ def assert_same(actual: Rendered, expected: Rendered, scene: Scene) -> None:
         assert_close(getattr(actual, name), getattr(expected, name), where=kept, name=name)
 
 
-def test_permuting_the_gaussians_changes_nothing(rasterize: Rasterize, scene: Scene) -> None:
+def test_permuting_the_gaussians_changes_nothing(rasterize: Rasterize, scene: SplatScene) -> None:
     shuffled = scene.rows(torch.randperm(len(scene.mean), generator=torch.Generator().manual_seed(4)))
     expected, actual = scene.render(rasterize), shuffled.render(rasterize)
     assert bool((actual.rgb == expected.rgb).all())
@@ -49,7 +49,7 @@ def test_permuting_the_gaussians_changes_nothing(rasterize: Rasterize, scene: Sc
     assert bool((actual.alpha == expected.alpha).all())
 
 
-def test_a_gaussian_of_opacity_zero_changes_nothing(rasterize: Rasterize, scene: Scene) -> None:
+def test_a_gaussian_of_opacity_zero_changes_nothing(rasterize: Rasterize, scene: SplatScene) -> None:
     hidden = scene.opacity.clone()
     hidden[::3] = 0.0
     kept = scene.rows(torch.tensor([g for g in range(len(scene.mean)) if g % 3]))
@@ -59,19 +59,19 @@ def test_a_gaussian_of_opacity_zero_changes_nothing(rasterize: Rasterize, scene:
 
 
 @pytest.mark.parametrize("factor", [-1.0, 3.0], ids=["the other sign", "another length"])
-def test_a_quaternion_turns_alike_with(factor: float, rasterize: Rasterize, scene: Scene) -> None:
+def test_a_quaternion_turns_alike_with(factor: float, rasterize: Rasterize, scene: SplatScene) -> None:
     again = dataclasses.replace(scene, quaternion=factor * scene.quaternion)
     assert_same(again.render(rasterize), scene.render(rasterize), scene)
 
 
-def test_the_colour_is_linear_in_the_gaussians_colours(rasterize: Rasterize, scene: Scene) -> None:
+def test_the_colour_is_linear_in_the_gaussians_colours(rasterize: Rasterize, scene: SplatScene) -> None:
     swapped = dataclasses.replace(scene, colour=scene.colour.flip(0))
     both = dataclasses.replace(scene, colour=scene.colour - 2 * scene.colour.flip(0))
     expected = scene.render(rasterize).rgb - 2 * swapped.render(rasterize).rgb
     assert_close(both.render(rasterize).rgb, expected, absolute=1e-5)
 
 
-def test_colour_one_shows_alpha(rasterize: Rasterize, scene: Scene) -> None:
+def test_colour_one_shows_alpha(rasterize: Rasterize, scene: SplatScene) -> None:
     white = dataclasses.replace(scene, colour=torch.ones_like(scene.colour)).render(rasterize)
     assert_close(white.rgb, white.alpha[..., None].expand(-1, -1, 3))
     assert float(white.alpha.min()) >= 0.0
@@ -108,11 +108,11 @@ def test_moving_camera_and_world_together_changes_nothing(rasterize: Rasterize) 
     assert_same(moved.to(single).render(rasterize), scene.to(single).render(rasterize), scene)
 
 
-def test_a_camera_given_as_a_tensor_sees_the_same(rasterize: Rasterize, scene: Scene) -> None:
+def test_a_camera_given_as_a_tensor_sees_the_same(rasterize: Rasterize, scene: SplatScene) -> None:
     assert_same(scene.differentiable().render(rasterize), scene.render(rasterize), scene)
 
 
-def test_a_pose_that_cannot_be_written_sees_the_same(rasterize: Rasterize, scene: Scene) -> None:
+def test_a_pose_that_cannot_be_written_sees_the_same(rasterize: Rasterize, scene: SplatScene) -> None:
     pose = np.array(scene.camera.camera_from_world)
     pose.setflags(write=False)
     fixed = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, camera_from_world=pose))

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.helpers import assert_close
-from tests.worker.raster.scenes import Scene, camera, pixels_near_a_cut, random_scene, unproject
+from tests.worker.raster.scenes import SplatScene, camera, pixels_near_a_cut, random_scene, unproject
 from worker.model.constants import MIN_ALPHA, NEAR
 from worker.raster import Camera, Rendered, reference
 
@@ -164,10 +164,10 @@ def test_a_camera_without_an_image_is_refused(change: dict[str, Any]) -> None:
         dataclasses.replace(camera(8, 8), **change)
 
 
-def _one_gaussian(opacity: float) -> Scene:
+def _one_gaussian(opacity: float) -> SplatScene:
     """In the middle of pixel (4, 4) of a 9 x 9 image, 3 pixels wide, at depth 50."""
     view = Camera(20.0, 20.0, 4.5, 4.5, 9, 9, np.eye(4))
-    return Scene(
+    return SplatScene(
         mean=torch.tensor([[0.0, 0.0, 50.0]], dtype=torch.float64),
         quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64),
         scale=torch.full((1, 3), 7.5, dtype=torch.float64),
@@ -177,13 +177,13 @@ def _one_gaussian(opacity: float) -> Scene:
     )
 
 
-def _beyond_the_limits() -> Scene:
+def _beyond_the_limits() -> SplatScene:
     """Wide Gaussians left of, right of, above, below and in a corner outside the limits, all reaching the image."""
     view = camera(21, 18)
     column, row = np.array([-5.0, 26.5, 9.0, 12.0, -4.5]), np.array([6.0, 9.0, -4.5, 22.5, 22.0])
     depth = np.array([44.0, 50.0, 55.0, 60.0, 66.0])
     random = np.random.default_rng(5)
-    return Scene(
+    return SplatScene(
         mean=torch.tensor(unproject(view, column, row, depth)),
         quaternion=torch.tensor(random.normal(size=(5, 4))),
         scale=torch.tensor(random.uniform(8.0, 16.0, (5, 3))),
@@ -193,7 +193,7 @@ def _beyond_the_limits() -> Scene:
     )
 
 
-def _check_gradient(scene: Scene, name: str) -> None:
+def _check_gradient(scene: SplatScene, name: str) -> None:
     """Central differences of a random cotangent's product with the image, entry by entry, against autograd."""
     near = pixels_near_a_cut(scene, alpha_margin=DIFFERENCE_MARGIN, stop_margin=DIFFERENCE_MARGIN)
     assert not near.any(), "choose another seed: a difference would step over a threshold"
@@ -228,7 +228,7 @@ def _differences(function: Callable[[], Tensor], leaf: Tensor) -> NDArray[np.flo
     return slopes.reshape(leaf.shape)
 
 
-def _loop_over_pixels(scene: Scene) -> NDArray[np.float64]:
+def _loop_over_pixels(scene: SplatScene) -> NDArray[np.float64]:
     """[H, W, 5] rgb, depth, alpha by the contract's text, one pixel and one Gaussian at a time."""
     view, pose = scene.camera, np.asarray(scene.camera.camera_from_world)
     splats = []
@@ -251,7 +251,7 @@ def _loop_over_pixels(scene: Scene) -> NDArray[np.float64]:
     return image
 
 
-def _footprint(scene: Scene, g: int, x: float, y: float, z: float) -> tuple[float, float, NDArray[np.float64]]:
+def _footprint(scene: SplatScene, g: int, x: float, y: float, z: float) -> tuple[float, float, NDArray[np.float64]]:
     """Centre on the image and inverse covariance of Gaussian g."""
     view = scene.camera
     turn = Rotation.from_quat(scene.quaternion[g].numpy(), scalar_first=True).as_matrix()

@@ -85,7 +85,7 @@ def test_there_is_no_picture_of_a_held_out_frame(clip: DepthClip) -> None:
 
 def test_each_loss_is_a_mean_over_its_own_pixels(clip: DepthClip) -> None:
     frames = TrainingFrames(clip, TRAIN, 1.0)
-    loss = LossSettings(colour_weight=2.0, depth_weight=0.5, colour_zone=0.02)
+    loss = LossSettings(colour_weight=2.0, depth_weight=0.5, colour_huber_delta=0.02)
     for index in TRAIN:
         tissue = int(clip.tissue[index].sum())
         measured = int((clip.tissue[index] & (clip.depth_mm[index] > 0)).sum())

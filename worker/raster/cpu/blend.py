@@ -277,7 +277,7 @@ def _read_cotangents(planes, image, origin, stride, size, rows):  # type: ignore
 
 @kernel(inline="always")
 def _clip_unit(x):  # type: ignore[no-untyped-def]
-    """x held within [-1, 1]: the derivative of the L1 loss with a quadratic zone of half-width 1."""
+    """x held within [-1, 1]: the derivative of the Huber loss with delta 1."""
     one, minus = splat(_ONE), splat(-_ONE)
     x = where_less(x, minus, minus, x)
     return where_less(one, x, one, x)
@@ -313,7 +313,7 @@ def _loss(  # type: ignore[no-untyped-def]
     """Loss of the tile into statistics, its gradient into the planes (worker/model/loss.py: the same in torch).
 
     target [3, H, stride] uint8, weight [H, stride] uint8 (255 = tissue), inverse_depth [H, stride] float32 (0 = none),
-    flattened. loss_settings float32 [5]: colour weight a channel, depth weight, 1 / width of the quadratic zone of the
+    flattened. loss_settings float32 [5]: colour weight a channel, depth weight, 1 / Huber delta of the
     colour and of the depth loss, 1 for normalised depth else 0.
     """
     zero = splat(_ZERO)

@@ -55,17 +55,24 @@ def _terms(degree, x, y, z, value, slope):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _direction(state, centre, g):  # type: ignore[no-untyped-def]
+    """Unit vector from the camera to Gaussian g, and one over the distance."""
+    x = state[MEAN_ROW, g] - centre[0]
+    y = state[MEAN_ROW + 1, g] - centre[1]
+    z = state[MEAN_ROW + 2, g] - centre[2]
+    n = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
+    return x * n, y * n, z * n, n
+
+
+@kernel
 def colour_from_sh(thread, threads, degree, centre, state, rest, colour):  # type: ignore[no-untyped-def]
     """colour = max(0, 0.5 + sum_k c_k Y_k(direction from the camera centre to the mean))."""
     terms = (degree + 1) * (degree + 1)
     value, slope = np.empty(terms), np.empty((terms, 3))
     count = state.shape[1]
     for g in range(count * thread // threads, count * (thread + 1) // threads):
-        x = state[MEAN_ROW, g] - centre[0]
-        y = state[MEAN_ROW + 1, g] - centre[1]
-        z = state[MEAN_ROW + 2, g] - centre[2]
-        n = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
-        _terms(degree, x * n, y * n, z * n, value, slope)
+        x, y, z, _ = _direction(state, centre, g)
+        _terms(degree, x, y, z, value, slope)
         for channel in range(3):
             total = 0.5 + SH_C0 * state[COLOUR_ROW + channel, g]
             for k in range(1, terms):
@@ -82,11 +89,7 @@ def colour_from_sh_backward(  # type: ignore[no-untyped-def]
     value, slope, v_direction = np.empty(terms), np.empty((terms, 3)), np.empty(3)
     count = state.shape[1]
     for g in range(count * thread // threads, count * (thread + 1) // threads):
-        x = state[MEAN_ROW, g] - centre[0]
-        y = state[MEAN_ROW + 1, g] - centre[1]
-        z = state[MEAN_ROW + 2, g] - centre[2]
-        n = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
-        x, y, z = x * n, y * n, z * n
+        x, y, z, n = _direction(state, centre, g)
         _terms(degree, x, y, z, value, slope)
         v_direction[:] = 0.0
         for channel in range(3):

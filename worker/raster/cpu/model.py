@@ -24,6 +24,7 @@ from worker.raster.cpu import harmonics, update
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
 from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, padded
 from worker.raster.cpu.threads import run
+from worker.raster.model import put_back
 from worker.raster.step import StepSums, TrainingFrame, camera_centre, image_size
 
 PAD_LOGIT = -30.0
@@ -218,11 +219,7 @@ class CpuModel:
 
     def load_arrays(self, stored: dict[str, Tensor]) -> None:
         """Put back what arrays() gave, into a model of the same size."""
-        for name, values in self.arrays().items():
-            if stored[name].shape != values.shape:
-                shapes = tuple(stored[name].shape), tuple(values.shape)
-                raise ValueError(f"{name} has shape {shapes[0]}, this model needs {shapes[1]}")
-            values.copy_(stored[name])
+        put_back(self.arrays(), stored)
 
     def export(self) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as torch tensors (copies)."""

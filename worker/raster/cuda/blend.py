@@ -152,7 +152,7 @@ def _split_columns(red, green, blue, depth):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _clip_unit(value):  # type: ignore[no-untyped-def]
-    """value held within [-1, 1]: the derivative of the L1 loss with a quadratic zone of half-width 1."""
+    """value held within [-1, 1]: the derivative of the Huber loss with delta 1."""
     return tl.minimum(tl.maximum(value, -1.0), 1.0)
 
 
@@ -202,8 +202,8 @@ def blend(  # type: ignore[no-untyped-def]
     image [F, 5 or 6, H, W]: R G B Z A and, with VALUES, the blended value: written in RENDER; read as cotangents in
     COTANGENT. slots [M, SLOT] and, in LOSS, statistics [F tiles, STATISTICS] are written.
     target [*, 3, H, W] uint8, weight [*, H, W] uint8 (255 = tissue), inverse_depth [*, H, W] (0 = none), of which the
-    tile's frame is frame[f]; loss_settings float32 [F, 5]: colour weight a channel, depth weight, 1 / width of the
-    quadratic zone of the colour and of the depth loss, 1 for normalised depth else 0.
+    tile's frame is frame[f]; loss_settings float32 [F, 5]: colour weight a channel, depth weight, 1 / Huber delta of
+    the colour and of the depth loss, 1 for normalised depth else 0.
 
     One long function, because the pixels' sums have to stay in registers from the first chunk to the last.
     """

@@ -29,10 +29,10 @@ def exp(x):  # type: ignore[no-untyped-def]
 @triton.jit
 def rotation_of(state, n, there, N):  # type: ignore[no-untyped-def]
     """Unit quaternion wxyz, 1 / its stored length, and its rotation matrix, row by row."""
-    w = tl.load(state + _Q * N + n, mask=there, other=1.0).to(tl.float64)
-    x = tl.load(state + (_Q + 1) * N + n, mask=there, other=0.0).to(tl.float64)
-    y = tl.load(state + (_Q + 2) * N + n, mask=there, other=0.0).to(tl.float64)
-    z = tl.load(state + (_Q + 3) * N + n, mask=there, other=0.0).to(tl.float64)
+    w = tl.load(state + N * _Q + n, mask=there, other=1.0).to(tl.float64)
+    x = tl.load(state + N * (_Q + 1) + n, mask=there, other=0.0).to(tl.float64)
+    y = tl.load(state + N * (_Q + 2) + n, mask=there, other=0.0).to(tl.float64)
+    z = tl.load(state + N * (_Q + 3) + n, mask=there, other=0.0).to(tl.float64)
     inverse = 1.0 / tl.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     return (
@@ -46,17 +46,17 @@ def rotation_of(state, n, there, N):  # type: ignore[no-untyped-def]
 @triton.jit
 def variances_of(state, n, there, N):  # type: ignore[no-untyped-def]
     """Squared scales."""
-    a = exp(tl.load(state + _S * N + n, mask=there, other=0.0)).to(tl.float64)
-    b = exp(tl.load(state + (_S + 1) * N + n, mask=there, other=0.0)).to(tl.float64)
-    c = exp(tl.load(state + (_S + 2) * N + n, mask=there, other=0.0)).to(tl.float64)
+    a = exp(tl.load(state + N * _S + n, mask=there, other=0.0)).to(tl.float64)
+    b = exp(tl.load(state + N * (_S + 1) + n, mask=there, other=0.0)).to(tl.float64)
+    c = exp(tl.load(state + N * (_S + 2) + n, mask=there, other=0.0)).to(tl.float64)
     return a * a, b * b, c * c
 
 
 @triton.jit
 def mean_of(state, n, there, N):  # type: ignore[no-untyped-def]
-    a = tl.load(state + _X * N + n, mask=there, other=0.0).to(tl.float64)
-    b = tl.load(state + (_X + 1) * N + n, mask=there, other=0.0).to(tl.float64)
-    c = tl.load(state + (_X + 2) * N + n, mask=there, other=0.0).to(tl.float64)
+    a = tl.load(state + N * _X + n, mask=there, other=0.0).to(tl.float64)
+    b = tl.load(state + N * (_X + 1) + n, mask=there, other=0.0).to(tl.float64)
+    c = tl.load(state + N * (_X + 2) + n, mask=there, other=0.0).to(tl.float64)
     return a, b, c
 
 

@@ -30,12 +30,13 @@ from worker.model.layout import COLOUR, LOG_SCALE, MEAN, OPACITY_ROW, QUATERNION
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
 from worker.raster.cuda import harmonics
+from worker.raster.cuda.buffers import FrameBuffers
 from worker.raster.cuda.control import write_adam
 from worker.raster.cuda.frames import FrameStore
 from worker.raster.cuda.motion import Motion, Trained, kept_where_old, motion_of
 from worker.raster.cuda.rasterizer import Gradients
 from worker.raster.cuda.update import MADE, SEEN, SUMS, padded
-from worker.raster.cuda.view import View
+from worker.raster.model import put_back
 from worker.raster.step import StepSums, TrainingFrame, image_size
 
 Floats = NDArray[np.float32]
@@ -77,13 +78,13 @@ class CudaModel:
         self.motion: Motion = motion_of(deformation, columns, self.device)
         self._size = width, height
         self._training = self._training_view(1)
-        self._views: OrderedDict[tuple[int, int, int], View] = OrderedDict()
+        self._views: OrderedDict[tuple[int, int, int], FrameBuffers] = OrderedDict()
         self._store = FrameStore(width, height, self.device)
         self._report = torch.zeros(SEEN + CHECK_EVERY, dtype=torch.int32, device=self.device)
         self._sent: list[int] = []  # the harmonics' degree of every step that nobody has waited for
         self._learnt: StepSums | None = None
         self._gradients: Gradients | None = None
-        self._shown: View | None = None
+        self._shown: FrameBuffers | None = None
 
     # Steps
 
@@ -118,9 +119,9 @@ class CudaModel:
             self._settle()
         return self._answer()
 
-    def _training_view(self, frames: int) -> View:
+    def _training_view(self, frames: int) -> FrameBuffers:
         """What steps on so many frames need."""
-        view = View(*self._size, frames, self.motion, self.device, rows=CHECK_EVERY)
+        view = FrameBuffers(*self._size, frames, self.motion, self.device, rows=CHECK_EVERY)
         view.fit(self._values.shape[1])
         return view
 
@@ -157,7 +158,7 @@ class CudaModel:
         self.motion.update(trained, control)
         self._gradients = gradients
 
-    def _project(self, view: View, sh_degree: int) -> None:
+    def _project(self, view: FrameBuffers, sh_degree: int) -> None:
         """The Gaussians, at the times and on the images that the view's control block says."""
         control = view.control.values
         self.motion.deform(self._values, control, view.state, view.colour)
@@ -218,20 +219,20 @@ class CudaModel:
 
     # Pictures
 
-    def _view(self, width: int, height: int, frames: int) -> View:
+    def _view(self, width: int, height: int, frames: int) -> FrameBuffers:
         """The buffers for so many images of a size; those of the sizes used last are kept."""
         if (width, height) == self._size and frames == self._training.frames:
             return self._training
         size = width, height, frames
         if size not in self._views:
-            self._views[size] = View(width, height, frames, self.motion, self.device)
+            self._views[size] = FrameBuffers(width, height, frames, self.motion, self.device)
             self._views[size].fit(self._values.shape[1])
         self._views.move_to_end(size)
         while len(self._views) > SIZES_KEPT:
             self._views.popitem(last=False)[1].launches.forget()
         return self._views[size]
 
-    def _steer(self, camera: NDArray[np.float64], times: Sequence[float]) -> View:
+    def _steer(self, camera: NDArray[np.float64], times: Sequence[float]) -> FrameBuffers:
         """Settle, and have a view that sees these times through this camera."""
         self._settle()
         view = self._view(*image_size(camera), len(times))
@@ -240,7 +241,7 @@ class CudaModel:
         view.control.send(0)
         return view
 
-    def _fitted(self, view: View) -> bool:
+    def _fitted(self, view: FrameBuffers) -> bool:
         """Wait; whether the last projection had room. If not, there is room now."""
         grown = view.rasterizer.grown()
         if grown:
@@ -264,7 +265,7 @@ class CudaModel:
             if self._fitted(view):
                 return view.images[with_values]
 
-    def _draw(self, view: View, with_values: bool) -> None:
+    def _draw(self, view: FrameBuffers, with_values: bool) -> None:
         """Everything that a picture launches."""
         self._project(view, self.sh_degree)
         view.images[with_values] = view.rasterizer.render(view.values if with_values else None)
@@ -345,11 +346,7 @@ class CudaModel:
 
     def load_arrays(self, stored: dict[str, Tensor]) -> None:
         """Put back what arrays() gave, on any device, into a model of the same size; ValueError if the sizes differ."""
-        for name, each in self.arrays().items():
-            if stored[name].shape != each.shape:
-                shapes = tuple(stored[name].shape), tuple(each.shape)
-                raise ValueError(f"{name} has shape {shapes[0]}, this model needs {shapes[1]}")
-            each.copy_(stored[name])
+        put_back(self.arrays(), stored)
 
     def export(self) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as tensors on the host (copies)."""

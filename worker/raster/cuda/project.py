@@ -63,7 +63,7 @@ def project(  # type: ignore[no-untyped-def]
     f = tl.program_id(1)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = n < N
-    camera += _CAMERA * f
+    camera += f * _CAMERA
     state += (f * state_rows).to(tl.int64) * N
     a, b, c = mean_of(state, n, there, N)
     x, y, z = seen(camera, a, b, c)

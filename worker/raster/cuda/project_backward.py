@@ -147,7 +147,7 @@ def project_backward(  # type: ignore[no-untyped-def]
     there = n < N
     splat = f * N + n
     drawn = tl.load(count + splat, mask=there, other=0) > 0
-    camera += _CAMERA * f
+    camera += f * _CAMERA
     state += (f * state_rows).to(tl.int64) * N
     sums += splat
     colour = v_colour + (3 * f).to(tl.int64) * N + n
@@ -194,10 +194,10 @@ def project_backward(  # type: ignore[no-untyped-def]
     # dL/dB = 2 dL/dcov2d B S^2 =: E; dL/dlog s_k = b_k . e_k, the sum over both rows of column k.
     e00, e01, e02 = c00 * t00 + c01 * t10, c00 * t01 + c01 * t11, c00 * t02 + c01 * t12
     e10, e11, e12 = c01 * t00 + c11 * t10, c01 * t01 + c11 * t11, c01 * t02 + c11 * t12
-    out = v_state + (_ROWS * f).to(tl.int64) * N + n
-    _store(out + _S * N, b00 * e00 + b10 * e10, drawn, there)
-    _store(out + (_S + 1) * N, b01 * e01 + b11 * e11, drawn, there)
-    _store(out + (_S + 2) * N, b02 * e02 + b12 * e12, drawn, there)
+    out = v_state + (f * _ROWS).to(tl.int64) * N + n
+    _store(out + N * _S, b00 * e00 + b10 * e10, drawn, there)
+    _store(out + N * (_S + 1), b01 * e01 + b11 * e11, drawn, there)
+    _store(out + N * (_S + 2), b02 * e02 + b12 * e12, drawn, there)
 
     # dL/dR = A^T E, then through R(q / |q|).
     d0, d1, d2, d3 = _quaternion_gradient(
@@ -206,10 +206,10 @@ def project_backward(  # type: ignore[no-untyped-def]
         a01 * e00 + a11 * e10, a01 * e01 + a11 * e11, a01 * e02 + a11 * e12,
         a02 * e00 + a12 * e10, a02 * e01 + a12 * e11, a02 * e02 + a12 * e12,
     )  # fmt: skip
-    _store(out + _Q * N, d0 * length, drawn, there)
-    _store(out + (_Q + 1) * N, d1 * length, drawn, there)
-    _store(out + (_Q + 2) * N, d2 * length, drawn, there)
-    _store(out + (_Q + 3) * N, d3 * length, drawn, there)
+    _store(out + N * _Q, d0 * length, drawn, there)
+    _store(out + N * (_Q + 1), d1 * length, drawn, there)
+    _store(out + N * (_Q + 2), d2 * length, drawn, there)
+    _store(out + N * (_Q + 3), d3 * length, drawn, there)
 
     # dL/dA = E R^T =: F, then to the camera point through A = diag(j) (W_xy - (u, v) W_z).
     f00, f01 = dot(e00, e01, e02, r00, r01, r02), dot(e00, e01, e02, r10, r11, r12)

@@ -50,9 +50,9 @@ AGREEMENT_PX = 1.5
 """Of the reduced image: by more the disparities of both eyes contradict each other."""
 ROUGHNESS_PX, ROUGHNESS_PER_PX2 = 5, 0.256
 """Side of the window, and how much trust a variance of the disparity of 1 px^2 within it costs: jumps are not sharp."""
-LEAST_WEIGHT = 1e-8
+MIN_WEIGHT = 1e-8
 """Where the filter finds no start far around."""
-LEAST_LANES = 32
+MIN_LANES = 32
 VOLUME_BYTES = 1 << 30
 """Of the cost volumes at a time: some seventy frames, whose lines are enough for a large GPU."""
 PIXELS_AT_ONCE = 1 << 25
@@ -200,7 +200,7 @@ def _share() -> _Share:
 
 
 def _lanes(count: int) -> int:
-    return max(LEAST_LANES, 1 << (count - 1).bit_length())
+    return max(MIN_LANES, 1 << (count - 1).bit_length())
 
 
 def _disagreement(disparity: Tensor, opposite: Tensor) -> tuple[Tensor, Tensor]:
@@ -236,7 +236,7 @@ def filled(disparity: Tensor, trust: Tensor, guide: Tensor) -> Tensor:
                 strength, 1 / (COLOUR_SIGMA * math.log(2)), share.lines, num_warps=1,
             )  # fmt: skip
         strength *= FILTER_EASING
-    return torch.where(weight > LEAST_WEIGHT, weighted / weight.clamp_min(LEAST_WEIGHT), disparity)
+    return torch.where(weight > MIN_WEIGHT, weighted / weight.clamp_min(MIN_WEIGHT), disparity)
 
 
 def refine(disparity: Tensor, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:

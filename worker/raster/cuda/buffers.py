@@ -20,7 +20,7 @@ from worker.raster.cuda.rasterizer import CudaRasterizer
 from worker.raster.step import camera_centre
 
 
-class View:
+class FrameBuffers:
     """So many frames of one size at once: the rasteriser's buffers, and the control block that steers them.
 
     launches  those of steps and pictures; to be forgotten when a buffer moves
