@@ -88,7 +88,6 @@ class Installation:
             command,
             {**os.environ, **self.settings.to_environment(), **variables},
             last_words=self.settings.data_dir / "run" / f"{name}.last-words",
-            dies_with_parent=os.name == "posix",
             grace_s=STOP_TIMEOUT_S,
             healthy_after_s=HEALTHY_AFTER_S,
         )

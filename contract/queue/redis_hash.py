@@ -1,4 +1,4 @@
-"""A JobRecord as the queue on Redis keeps it: the document as submitted, and one field for each thing that changes."""
+"""A JobRecord as a hash on Redis: the document as submitted, and one field for each value that changes."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import TypeVar
 from contract.wire.job import JobError, JobProgress, JobRecord, JobState
 
 EVENT_FIELDS = ("state", "attempt", "released", "owner", "cancel", "progress", "error", "started", "finished")
-"""The fields that change, which with the document make the record."""
+"""The fields that change. Together with the document they make the record."""
 
 Model = TypeVar("Model", JobProgress, JobError)
 
 logger = logging.getLogger("intrasplat.queue")
 
 
-def introduced(record: JobRecord) -> tuple[str, str, str, str]:
-    """What the scripts that write a new record are told: id, hash as JSON, time of submission, idempotency hash."""
+def new_record(record: JobRecord) -> tuple[str, str, str, str]:
+    """ARGV 2 to 5 of submit.lua and restore.lua: id, hash as JSON, time of submission, idempotency hash."""
     fields = {
         "document": record.model_dump_json(),
         "state": record.state.value,
@@ -38,12 +38,12 @@ def introduced(record: JobRecord) -> tuple[str, str, str, str]:
 
 
 def table_of(answer: Sequence[str]) -> dict[str, str]:
-    """A hash as a script returns it: names and values in turn."""
+    """The fields of a hash that a script returns as alternating names and values."""
     return dict(zip(answer[::2], answer[1::2], strict=True))
 
 
 def record_of(job_id: str, fields: Mapping[str, str]) -> JobRecord | None:
-    """The record that a job's hash describes; None if there is none, or none that can be read, which is logged."""
+    """The record in a job's hash; None if the hash is empty, or if it cannot be read, which is logged."""
     if not fields:
         return None
     try:
@@ -55,7 +55,7 @@ def record_of(job_id: str, fields: Mapping[str, str]) -> JobRecord | None:
 
 
 def _changed(fields: Mapping[str, str]) -> dict[str, object]:
-    """What has changed of a record since it was submitted."""
+    """The values of a record that have changed since it was submitted."""
     return {
         "state": JobState(fields["state"]),
         "attempt": int(fields["attempt"]),

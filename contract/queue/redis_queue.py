@@ -66,7 +66,7 @@ from contract.queue.promise import (
     event_order,
 )
 from contract.queue.redis_client import connect, reachable
-from contract.queue.redis_hash import introduced, record_of, table_of
+from contract.queue.redis_hash import new_record, record_of, table_of
 from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES, Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.rendering import WorkerAddress
@@ -90,7 +90,7 @@ logger = logging.getLogger("intrasplat.queue")
 class RedisQueue:
     """A Queue on a Redis 7+ or Valkey server (`redis://`, `rediss://` or `unix://`); safe to share among threads.
 
-    lease_s and preempt_after_s are for tests that cannot wait; all clients of one queue have to agree on them.
+    lease_s and preempt_after_s are for tests that cannot wait. All clients of one queue must agree on them.
     """
 
     def __init__(self, url: str, *, lease_s: float = LEASE_S, preempt_after_s: float = PREEMPT_AFTER_S) -> None:
@@ -99,7 +99,7 @@ class RedisQueue:
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
         limits = (admission.queued, admission.queued_per_tenant) if admission else ("", "")
-        answer = self._scripts.run("submit", *introduced(record), IDEMPOTENCY_S * 1000, *limits)
+        answer = self._scripts.run("submit", *new_record(record), IDEMPOTENCY_S * 1000, *limits)
         if answer[0] == "full" and admission is not None:
             check_admission(admission, *answer[1:])
         known = record_of(answer[1], table_of(answer[2]))
@@ -112,7 +112,7 @@ class RedisQueue:
         if record.state not in TERMINAL_STATES:
             raise ValueError(f"Job {record.job_id} is {record.state}; only ended jobs are restored.")
         remaining_s = record.created_at_s + IDEMPOTENCY_S - time.time()
-        return bool(self._scripts.run("restore", *introduced(record), round(remaining_s * 1000), uuid.uuid4().hex))
+        return bool(self._scripts.run("restore", *new_record(record), round(remaining_s * 1000), uuid.uuid4().hex))
 
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
         deadline = time.monotonic() + timeout_s
@@ -202,7 +202,7 @@ class RedisQueue:
         try:
             with reachable():
                 self._client.bgrewriteaof()
-        except (UnavailableError, redis.ResponseError):  # one is under way, or this user may not
+        except (UnavailableError, redis.ResponseError):  # the server rewrites its log already, or this user may not ask
             return False
         return True
 
@@ -243,7 +243,7 @@ class RedisQueue:
         return bool(self._scripts.run("settle", claim.job_id, claim.owner, claim.attempt, target.value, error))
 
     def _usable(self, owner: str, job_id: str, answer: Sequence[str]) -> JobRecord | None:
-        """The claimed record; if it cannot be read the job fails, so that it is in nobody's way."""
+        """The claimed record. A job whose record cannot be read fails, so that it does not block the queue."""
         fields = table_of(answer)
         record = record_of(job_id, fields)
         if record is None:
@@ -253,7 +253,7 @@ class RedisQueue:
         return record
 
     def _get_all(self, job_ids: list[str]) -> dict[str, JobRecord]:
-        """The records that there are and that can be read, in the order of their ids here."""
+        """The records that exist and can be read, in the order of job_ids."""
         with reachable():
             batch = self._client.pipeline(transaction=False)
             for job_id in job_ids:
@@ -269,7 +269,7 @@ class RedisQueue:
 
 
 def _address(name: str, document: str) -> WorkerAddress | None:
-    """What a worker announced; None if it cannot be read, which is logged."""
+    """The address that a worker announced; None if it cannot be read, which is logged."""
     try:
         return WorkerAddress.model_validate_json(document)
     except ValueError as error:

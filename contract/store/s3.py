@@ -172,10 +172,11 @@ class S3Shelf:
     def put(self, folder: Path, entry: ShelfEntry) -> None:
         self._seen_s.pop(entry, None)
         try:
-            self._bucket.remove(_key(entry), first=entry.marker)
-            for path in _files_to_put(folder, entry):
-                self._bucket.put(path, _key(entry) + path.relative_to(folder).as_posix())
-            self._here.put(folder, entry)
+            with disk_errors():
+                self._bucket.remove(_key(entry), first=entry.marker)
+                for path in _files_to_put(folder, entry):
+                    self._bucket.put(path, _key(entry) + path.relative_to(folder).as_posix())
+                self._here.put(folder, entry)
         except UnavailableError:
             with contextlib.suppress(UnavailableError):  # the rest has no marker, so tidy() removes it
                 self._bucket.remove(_key(entry), first=entry.marker)
