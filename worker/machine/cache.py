@@ -23,17 +23,18 @@ import numba
 from numba.core.caching import FunctionCache
 
 
-def kernel(function: Callable[..., Any] | None = None, *, inline: str = "never") -> Any:
+def kernel(function: Callable[..., Any] | None = None, *, inline: str = "never", error_model: str = "python") -> Any:
     """Declare a function as a kernel: compiled by Numba at its first call, kept on disk, and run without the GIL.
 
     Declaring one touches no file. Numba's own `cache=True` would choose the folder while a module is imported.
 
     Args:
         inline: "always" copies the kernel into those that call it.
+        error_model: "numpy" lets a division by zero give inf or NaN instead of an exception.
     """
     if function is None:
-        return lambda declared: kernel(declared, inline=inline)
-    dispatcher = numba.njit(nogil=True, inline=inline)(function)
+        return lambda declared: kernel(declared, inline=inline, error_model=error_model)
+    dispatcher = numba.njit(nogil=True, inline=inline, error_model=error_model)(function)
     dispatcher._cache = _LateCache(function)
     return dispatcher
 

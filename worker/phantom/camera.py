@@ -1,4 +1,4 @@
-"""Where the endoscope is, and where else one may look from. Poses are world_from_camera [4, 4], mm, OpenCV axes."""
+"""Poses of the endoscope and of free viewpoints: world_from_camera [4, 4], mm, OpenCV axes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DOLLY_MM = 5.0
 
 
 def orbit_pose(yaw_deg: float, pitch_deg: float, nearer_mm: float = 0.0) -> NDArray[np.float64]:
-    """A camera turned about frame 0's axis point at mean depth, and looking at it: yaw to the right, pitch up."""
+    """A camera that orbits the point at mean depth on frame 0's axis and looks at it. Yaw is to the right, pitch up."""
     yaw, pitch = np.deg2rad(yaw_deg), np.deg2rad(pitch_deg)
     about_y = np.array([[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]])
     about_x = np.array([[1, 0, 0], [0, np.cos(pitch), np.sin(pitch)], [0, -np.sin(pitch), np.cos(pitch)]])
@@ -24,7 +24,7 @@ def orbit_pose(yaw_deg: float, pitch_deg: float, nearer_mm: float = 0.0) -> NDAr
 
 
 def endoscope_pose(frame: float, period_frames: float, moving: bool) -> NDArray[np.float64]:
-    """The left eye at a frame; the identity at frame 0, and always when it does not move."""
+    """The left eye's pose at a frame: the identity at frame 0, and in every frame of a fixed endoscope."""
     if not moving:
         return np.eye(4)
     angle = 2 * np.pi * frame / period_frames
@@ -33,7 +33,7 @@ def endoscope_pose(frame: float, period_frames: float, moving: bool) -> NDArray[
 
 
 def right_eye(world_from_left: NDArray[np.float64], baseline_mm: float) -> NDArray[np.float64]:
-    """The rectified right eye: baseline_mm along the left eye's x axis."""
+    """The rectified right eye's pose: baseline_mm along the left eye's x axis."""
     pose = world_from_left.copy()
     pose[:3, 3] += baseline_mm * pose[:3, 0]
     return pose

@@ -1,4 +1,4 @@
-"""`intrasplat phantom`: writes a synthetic clip."""
+"""`intrasplat phantom`: the command that writes a synthetic clip."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ WRITERS = {"video": write_stereo_video, "stereomis": write_stereomis, "endonerf"
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `phantom`; run_cli reads them."""
+    """Add the options of `phantom`, which run_cli reads."""
     default = PhantomSettings()
     parser.add_argument("--motion", choices=MOTIONS, default=default.motion, help="how the tissue moves (%(default)s)")
-    parser.add_argument("--frames", type=int, default=default.frames, help="length of the clip (%(default)s)")
-    parser.add_argument("--width", type=int, default=default.width, help="pixels of one eye across (%(default)s)")
-    parser.add_argument("--height", type=int, default=default.height, help="pixels of one eye down (%(default)s)")
-    parser.add_argument("--seed", type=int, default=default.seed, help="same seed, same tissue (%(default)s)")
-    parser.add_argument("--no-tools", action="store_true", help="leave the instrument out")
-    parser.add_argument("--no-noise", action="store_true", help="leave the sensor's noise out")
+    parser.add_argument("--frames", type=int, default=default.frames, help="frames of the clip (%(default)s)")
+    parser.add_argument("--width", type=int, default=default.width, help="width of one eye in pixels (%(default)s)")
+    parser.add_argument("--height", type=int, default=default.height, help="height of one eye in pixels (%(default)s)")
+    parser.add_argument("--seed", type=int, default=default.seed, help="seed of the tissue and the noise (%(default)s)")
+    parser.add_argument("--no-tools", action="store_true", help="draw no instrument")
+    parser.add_argument("--no-noise", action="store_true", help="add no sensor noise")
     parser.add_argument(
-        "--moving-camera", action="store_true", help="let the endoscope swing; only endonerf tells poses"
+        "--moving-camera", action="store_true", help="let the endoscope swing; only --format endonerf stores poses"
     )
     parser.add_argument(
         "--format",
@@ -38,10 +38,10 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_cli(args: argparse.Namespace) -> int:
-    """Writes the clip that args ask for; returns the exit code. Raises InputError for what cannot be drawn."""
+    """Write the clip and return the exit code. InputError for a bad setting or a folder that is not empty."""
     out: Path = args.out
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError("out", f"{out} is there already and is not an empty folder.", "Name a new folder.")
+        raise InputError("out", f"{out} exists and is not an empty folder.", "Name a new folder.")
     settings = PhantomSettings(
         width=args.width,
         height=args.height,

@@ -1,7 +1,7 @@
-"""Seeded random fields over a rectangle in millimetres: the raw material of shape, colour and wetness.
+"""Seeded random fields over a rectangle in millimetres, for shape, colour and wetness.
 
-Each field is drawn on a lattice that follows its wavelength and not the picture's size, so that a larger picture of the
-same seed shows the same tissue with finer detail.
+A field's lattice follows its wavelength, not the picture's size. So a larger picture of the same seed shows the same
+tissue with finer detail.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def smooth_field(
 
 
 def fine_field(rng: np.random.Generator, shape: tuple[int, int], blur_texels: float) -> Image32:
-    """Noise as fine as the texture itself: white, blurred by blur_texels, deviation 1. The detail stereo lives on."""
-    own_rng = rng.spawn(1)[0]  # how much is drawn depends on shape; what is drawn next from rng must not
+    """White noise, blurred by blur_texels, deviation 1: the fine detail that stereo matching needs."""
+    own_rng = rng.spawn(1)[0]  # the number of draws depends on shape; the next draws from rng must not
     field = cv2.GaussianBlur(own_rng.standard_normal(shape, dtype=np.float32), (0, 0), blur_texels)
     return np.asarray(field / field.std(), dtype=np.float32)
 

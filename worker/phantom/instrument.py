@@ -1,6 +1,6 @@
-"""A laparoscopic grasper: shaft, wrist and two jaws of metal, and how it moves over the tissue.
+"""A laparoscopic grasper: metal shaft, wrist and two jaws, and its motion over the tissue.
 
-The instrument's own frame has its tip at the origin and its shaft along +z.
+In the instrument's own frame the tip is at the origin and the shaft along +z.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ JAW_MM, WRIST_MM, SHAFT_MM = 11.0, 22.0, 150.0  # from the tip, where each part 
 JAW_HALF_MM = (1.7, 0.9)  # half width and half thickness at the jaw's root
 WRIST_RADIUS_MM, SHAFT_RADIUS_MM = 2.7, 4.0
 PORT_MM = np.array([70.0, 62.0, 6.0])  # the shaft points at its port in the abdominal wall, below right of the camera
-HOVER_MM = 3.0  # the tip keeps this far above the tissue it does not hold
+HOVER_MM = 3.0  # of the tip above tissue that it does not hold
 RETREAT_MM = 16.0  # after the release
 JAW_OPEN_RAD = 0.30
 STEEL = np.array([0.42, 0.43, 0.44])
@@ -42,7 +42,7 @@ class InstrumentMesh:
 
 
 def instrument_at(surface: Surface, frame: float, period_frames: float) -> InstrumentMesh:
-    """The instrument at a frame, placed on or above the tissue as the motion asks."""
+    """The instrument at a frame, on or above the tissue, depending on the motion."""
     tip, opening = _tip_and_opening(surface, frame, period_frames)
     parts = [*_jaws(opening), _wrist(), _shaft()]
     rotation = _rotation_along(PORT_MM - tip)

@@ -1,28 +1,28 @@
-"""Triangles to pixels: a z-buffer that remembers which material point each pixel shows.
+"""Triangles to pixels: a z-buffer that keeps the material point of each pixel.
 
 Symbols: V vertices, F triangles, A attributes of a vertex, H W pixels.
 
-A pixel keeps its triangle and its perspective-correct barycentric weights; depth, colour coordinates, normals and the
-point's place at any other time all follow from these by interpolation, so they agree with each other exactly.
+A pixel keeps its triangle and its perspective-correct barycentric weights. Depth, colour coordinates, normals and the
+point's position at any other time are interpolated from these, so they agree exactly.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from worker.input.camera import Intrinsics
+from worker.machine.cache import kernel
 
 NEAR_MM = 2.0  # triangles with a corner nearer than this are not drawn
-SHARED_EDGE = 1e-9  # slack of a weight, so that rounding leaves no hole between two triangles
+EDGE_TOLERANCE = 1e-9  # of a weight, so that rounding leaves no hole between two triangles
 
 
 @dataclass(frozen=True)
 class Fragments:
-    """What each pixel's centre shows.
+    """The fragment at each pixel's centre.
 
     depth_mm  [H, W]    float32, camera z, 0 where nothing is hit
     triangle  [H, W]    int32, index into triangles, -1 where nothing is hit
@@ -72,9 +72,9 @@ def grid_triangles(rows: int, columns: int, first_vertex: int = 0) -> NDArray[np
 
 
 def grid_normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit normals [rows, columns, 3] of a grid of points, facing the camera of frame 0 where it faces the grid.
+    """Unit normals [rows, columns, 3] of a grid of points, on the side of frame 0's camera.
 
-    Where the grid is folded to a line the normal is (0, 0, -1).
+    Where the grid is folded to a line, the normal is (0, 0, -1).
     """
     along_rows, along_columns = np.gradient(points, axis=(0, 1))
     normals = np.cross(along_rows, along_columns)
@@ -83,7 +83,7 @@ def grid_normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return unit
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _project(
     vertices_mm: NDArray[np.float64],
     rotation: NDArray[np.float64],
@@ -93,7 +93,7 @@ def _project(
     y: NDArray[np.float64],
     z: NDArray[np.float64],
 ) -> None:
-    """Fills x, y [V] in pixels with pixel centres at whole numbers, z [V] in mm; x, y of points behind mean nothing."""
+    """Write x, y [V] (px, pixel centres at whole numbers) and z [V] (mm); behind the camera only z is valid."""
     for v in range(vertices_mm.shape[0]):
         a, b, c = vertices_mm[v, 0] - centre[0], vertices_mm[v, 1] - centre[1], vertices_mm[v, 2] - centre[2]
         z[v] = a * rotation[0, 2] + b * rotation[1, 2] + c * rotation[2, 2]
@@ -102,7 +102,7 @@ def _project(
         y[v] = pinhole[1] * (a * rotation[0, 1] + b * rotation[1, 1] + c * rotation[2, 1]) / ahead + pinhole[3]
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _fill(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -130,7 +130,7 @@ def _fill(
                 wi = ((x[j] - column) * (y[k] - row) - (x[k] - column) * (y[j] - row)) / area
                 wj = ((x[k] - column) * (y[i] - row) - (x[i] - column) * (y[k] - row)) / area
                 wk = 1.0 - wi - wj
-                if min(wi, wj, wk) < -SHARED_EDGE:
+                if min(wi, wj, wk) < -EDGE_TOLERANCE:
                     continue
                 # 1/z is linear on the screen, so screen weights over z are the surface's weights
                 wi, wj, wk = wi / z[i], wj / z[j], wk / z[k]
@@ -144,7 +144,7 @@ def _fill(
                 weights[row, column, 2] = wk * depth
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _gather(
     triangle: NDArray[np.int32],
     weights: NDArray[np.float32],

@@ -1,7 +1,7 @@
-"""How the tissue moves: each motion takes points at rest to where they are at a frame.
+"""Tissue motions: each maps points at rest to their positions at a frame.
 
 Points are [..., 3] float64, mm, in the world (the endoscope's camera of frame 0: x right, y down, z away). A frame is a
-real number, so motion is known between frames too. P is the period in frames.
+real number: motion is defined between frames, too. P is the period in frames.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ CUT_HALF_WIDTH_MM = 6.5
 CUT_GAPE_MM = 12.0  # behind the blade the cut opens to its full width over this length
 CUT_REACH_MM = 16.0  # the sides give way over this distance
 CUT_LIP_MM, CUT_LIP_REACH_MM = 1.6, 4.0  # the lips curl up
-CUT_DEPTH_PER_WIDTH, CUT_DEEPEST_MM = 1.5, 8.0
+CUT_DEPTH_PER_WIDTH, MAX_CUT_DEPTH_MM = 1.5, 8.0
 
 
 class TissueMotion(Protocol):
     def __call__(self, rest_mm: Points, frame: float) -> Points:
-        """Where points at rest [..., 3] are at a frame, mm."""
+        """Positions at a frame, in mm, of points at rest [..., 3]."""
         ...
 
 
@@ -70,12 +70,12 @@ class Breathing:
 
 @dataclass(frozen=True)
 class Pull:
-    """A fold about GRIP_MM is lifted and dragged aside, held, and let go; then again every P frames."""
+    """A grasper lifts a fold about GRIP_MM, drags it aside, holds it and lets go; it repeats every P frames."""
 
     period_frames: float
 
     def strength(self, frame: float) -> float:
-        """How far the pull has gone: 0 at rest, 1 held; it swings once past rest after the release."""
+        """Progress of the pull: 0 at rest, 1 held. After the release it swings once past 0."""
         p = (frame / self.period_frames) % 1.0
         rise = float(smoothstep(np.array(p), 0.08, 0.5))
         if p < RELEASE:
@@ -97,20 +97,20 @@ class Pull:
 
 @dataclass(frozen=True)
 class Cut:
-    """The surface splits along a slanted line from the top down within 2 P frames, and stays open, breathing a little.
+    """The surface splits along a slanted line, from the top down within 2 P frames, stays open, and breathes a little.
 
-    side says where a point lies when it lies on the line itself: -1 left lip, +1 right lip.
+    In move(), side is -1 for points of the left lip and +1 for the right lip.
     """
 
     period_frames: float
 
     def blade_mm(self, frame: float) -> float:
-        """y at rest of the blade: -CUT_HALF_LENGTH_MM at the start, +CUT_HALF_LENGTH_MM when the cut is done."""
+        """y of the blade, at rest: -CUT_HALF_LENGTH_MM when the cut starts, +CUT_HALF_LENGTH_MM when it ends."""
         done = float(smoothstep(np.array(frame / (2 * self.period_frames)), 0.02, 1.0))
         return CUT_HALF_LENGTH_MM * (2 * done - 1)
 
     def half_width_mm(self, y_mm: NDArray[np.float64], frame: float) -> NDArray[np.float64]:
-        """Half the opening at height y (at rest); 0 where the blade has not been."""
+        """Half the opening at y (at rest); 0 where the blade has not been."""
         lens = np.sqrt(np.clip(1 - (y_mm / CUT_HALF_LENGTH_MM) ** 2, 0, 1))
         behind = smoothstep(self.blade_mm(frame) - y_mm, 0.0, CUT_GAPE_MM).astype(np.float64)
         half_width: NDArray[np.float64] = CUT_HALF_WIDTH_MM * lens * behind
@@ -136,13 +136,13 @@ class Cut:
             left_lip, right_lip: [rows, 3] at rest.
             across: [columns] from -1 at the left lip to +1 at the right lip.
 
-        Where the cut is closed the groove is folded to a line and cannot be seen.
+        Where the cut is closed, the groove is folded to a line and invisible.
         """
         left, right = self.move(left_lip, frame, -1.0), self.move(right_lip, frame, 1.0)
         share = ((across + 1) / 2)[None, :, None]
         moved = left[:, None] * (1 - share) + right[:, None] * share
         half_width = self.half_width_mm(left_lip[:, 1], frame)
-        depth = np.minimum(CUT_DEPTH_PER_WIDTH * half_width, CUT_DEEPEST_MM)
+        depth = np.minimum(CUT_DEPTH_PER_WIDTH * half_width, MAX_CUT_DEPTH_MM)
         moved[..., 2] += depth[:, None] * (1 - np.abs(across) ** 5)
         return moved
 

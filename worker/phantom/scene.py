@@ -1,8 +1,8 @@
-"""The phantom itself: frames with exact truth, free viewpoints and trajectories.
+"""The phantom: frames with exact truth, free viewpoints and trajectories.
 
 Symbols: T frames, H W pixels of one eye, M tracked material points.
 
-Truth comes from the geometry, never from the picture: depth and tracks are those of the mesh that is drawn.
+Truth comes from the geometry, never from the picture: depth and tracks are those of the drawn mesh.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from worker.phantom.shading import (
 from worker.phantom.surface import Surface, make_surface
 from worker.phantom.tissue import Paint, paint_tissue
 
-BLUR_PX = 3  # the lens spreads a pixel over its neighbours: a kernel of 3x3 with this sigma
+BLUR_PX = 3  # the lens blurs with a 3x3 Gaussian of this sigma
 BLUR_SIGMA_PX = 0.45
 FILM_DRIFT_MM = (0.05, 0.09)  # of the wet film over the tissue in one frame, so that glints crawl
 LEFT, RIGHT = 0, 1
@@ -45,9 +45,9 @@ class PhantomFrame:
     """One frame of both eyes with its truth.
 
     left, right          [H, W, 3] uint8 RGB, with noise if settings ask for it
-    tissue, tissue_right [H, W] bool: False at every pixel that the instrument's light touches
+    tissue, tissue_right [H, W] bool: False at every pixel that the instrument or its blur touches
     depth_mm             [H, W] float32, camera z of what the left eye sees, instrument included; 0 beyond the tissue
-    hidden_depth_mm      [H, W] float32, the same with the instrument taken away
+    hidden_depth_mm      [H, W] float32, the same without the instrument
     hidden_rgb           [H, W, 3] float32 in [0, 1], the left eye's picture without instrument and noise
     world_from_camera    [4, 4] float64 of the left eye
     """
@@ -64,7 +64,7 @@ class PhantomFrame:
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Material points seen in frame 0, without the instrument, and where they go.
+    """Material points of frame 0, as without the instrument, and their positions in every frame.
 
     pixels    [M, 2] int32, (row, column) in frame 0 of the left eye
     points_mm [T, M, 3] float64, world
@@ -85,7 +85,7 @@ class _EyeView:
 
 @dataclass(frozen=True)
 class Phantom:
-    """Synthetic tissue under a stereo endoscope. Frames are drawn when asked for and not kept."""
+    """Synthetic tissue under a stereo endoscope. Each call draws its frame anew."""
 
     settings: PhantomSettings
     surface: Surface
@@ -113,12 +113,12 @@ class Phantom:
         intrinsics: Intrinsics | None = None,
         eye_mm: NDArray[np.float64] | None = None,
     ) -> tuple[Image32, NDArray[np.float32]]:
-        """The tissue without instrument and noise from any viewpoint, best within 15 degrees of the endoscope's.
+        """The tissue without instrument and noise, from any viewpoint; best within 15 degrees of the endoscope's.
 
         Args:
             frame: any real number in [0, T); model time t is frame / T.
-            world_from_camera: [4, 4] mm; the endoscope's left eye when left out. The lamp stays in the endoscope.
-            eye_mm: [3] world; mirrored light is drawn as it is seen from there, from the camera itself when left out.
+            world_from_camera: [4, 4] mm; default: the endoscope's left eye. The lamp stays in the endoscope.
+            eye_mm: [3] world position from which mirrored light is seen; default: the camera's.
 
         Returns:
             rgb [H, W, 3] float32 in [0, 1] and depth_mm [H, W] float32, both 0 where no tissue is modelled.
@@ -128,8 +128,10 @@ class Phantom:
         return to_srgb(_through_lens(linear)), fragments.depth_mm
 
     def atlas_xy(self, frame: float, world_from_camera: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
-        """[H, W, 2] which material point each pixel shows, instrument aside: its place (x, y) on the atlas in texels,
-        the same in every frame and from every pose; -1 where no tissue is modelled."""
+        """[H, W, 2] material point of each pixel, as without the instrument: (x, y) on the atlas in texels.
+
+        A point has the same (x, y) in every frame and from every pose. -1 where no tissue is modelled.
+        """
         pose = self.world_from_camera(frame) if world_from_camera is None else world_from_camera
         triangles = self.surface.triangles
         fragments = rasterize_mesh(self.surface.vertices_mm(frame), triangles, pose, self.settings.intrinsics)
@@ -142,7 +144,7 @@ class Phantom:
         return endoscope_pose(frame, self.settings.period_frames, self.settings.moving_camera)
 
     def trajectories(self, stride_px: int = 8) -> Trajectories:
-        """Follows the material points that every stride_px-th pixel of frame 0 shows through all frames."""
+        """Positions, in all frames, of the material points that every stride_px-th pixel of frame 0 shows."""
         seen = rasterize_mesh(
             self.surface.vertices_mm(0),
             self.surface.triangles,
@@ -162,7 +164,7 @@ class Phantom:
         return Trajectories(np.stack([rows, columns], -1).astype(np.int32), np.stack(points))
 
     def depth_clip(self) -> DepthClip:
-        """All frames of the left eye with true depth: what training reads, without stereo matching's errors."""
+        """All frames of the left eye with true depth, for training without the errors of stereo matching."""
         settings = self.settings
         views = []
         for index in range(settings.frames):
@@ -196,7 +198,7 @@ class Phantom:
         behind_tissue = (depth_mm > 0) & (depth_mm < tool_fragments.depth_mm)
         shows_tool = (tool_fragments.triangle >= 0) & ~behind_tissue
         both = np.where(shows_tool[..., None], linear, hidden)
-        # the lens smears the instrument into its neighbours: they are no clean tissue
+        # the lens blurs the instrument into its neighbours, which are then no clean tissue
         touched = cv2.dilate(shows_tool.astype(np.uint8), np.ones((BLUR_PX, BLUR_PX), np.uint8)) > 0
         return _EyeView(
             rgb=np.where(touched[..., None], to_srgb(_through_lens(both)), hidden_rgb),
@@ -267,7 +269,7 @@ class Phantom:
 
 
 def make_phantom(settings: PhantomSettings) -> Phantom:
-    """Draws the tissue that settings ask for: shape, colours, motion. Frames follow when asked for."""
+    """A phantom with the settings' shape, colours and motion; it draws frames on demand."""
     shape_rng, paint_rng = (np.random.default_rng((settings.seed, part)) for part in (101, 102))
     surface = make_surface(settings, shape_rng)
     return Phantom(settings, surface, paint_tissue(surface, paint_rng))

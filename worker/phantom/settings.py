@@ -1,4 +1,4 @@
-"""What a phantom is made of. T frames, H W pixels of one eye."""
+"""Settings of a phantom. T frames, H W pixels of one eye."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Motion = Literal["still", "breathing", "pull", "cut"]
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
 
 FOCAL_PER_WIDTH = 0.89  # a da Vinci endoscope's field of view, about 59 degrees across
-MIN_WIDTH_PX, MIN_HEIGHT_PX = 64, 48  # px; below this vessels and instrument are a pixel wide
-MAX_SIDE_PX = 4096  # px; the tissue's texture is about twice as wide and must stay within OpenCV's 32767
-MAX_ASPECT = 4  # beyond this a pinhole sees nothing like an endoscope's view
+MIN_WIDTH_PX, MIN_HEIGHT_PX = 64, 48  # below this vessels and instrument are a pixel wide
+MAX_SIDE_PX = 4096  # the tissue's texture is about twice as wide, and OpenCV's limit is 32767
+MAX_ASPECT = 4  # of the longer side to the shorter
 MAX_FRAMES = 100_000
 
 
@@ -33,7 +33,7 @@ class PhantomSettings:
         moving_camera: whether the endoscope swings slowly about the tissue; its pose is known.
         period_frames: frames of one breath, of one pull, or of half a cut.
 
-    Raises InputError (field options.<name>) for what cannot be drawn.
+    Raises InputError (field options.<name>) for a setting out of range.
     """
 
     width: int = 640

@@ -1,8 +1,8 @@
 """Light on wet tissue and on metal. All light is linear until to_srgb. P points.
 
-The lamp sits in the endoscope, so what faces it is bright, light falls off with the squared distance and towards the
-rim of its beam (which reads as gentle vignetting), and wet places that mirror the lamp to the eye glint.
-For a free viewpoint the lamp stays in the endoscope: only glints depend on the viewer.
+The lamp sits in the endoscope: surfaces that face it are bright. Its light falls off with the squared distance and
+towards the rim of its beam, which looks like gentle vignetting. Wet places that mirror the lamp to the eye glint. For a
+free viewpoint the lamp stays in the endoscope: only glints depend on the viewer.
 """
 
 from __future__ import annotations
@@ -10,20 +10,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from worker.machine.cache import kernel
 
 Image32 = NDArray[np.float32]
 
 REFERENCE_MM = 80.0  # tissue at this distance is lit with strength 1
 EXPOSURE = 1.55
-AMBIENT = 0.07  # light that comes back from all sides of the cavity
+AMBIENT = 0.07  # light that the walls of the cavity scatter back
 BEAM_POWER = 3.0  # the beam falls off with the cosine to this power
 LAMP_IN_EYES_MM = (0.0, -3.5, 0.0)  # from the middle between the eyes
 
 GLINT, GLINT_POWER = 3.2, 240.0  # the lamp mirrored in the film
-BACKLIT = 0.15  # a normal that turns away by more than this gets no glint
+MIN_GLINT_COSINE = 0.15  # of the angle between normal and lamp, below which nothing glints
 
 TISSUE_WRAP = (0.40, 0.22, 0.20)  # light bleeds round edges inside tissue, red the farthest
 
@@ -40,10 +41,11 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Finish:
-    """How a kind of surface answers to light.
+    """How a kind of surface reflects light.
 
-    matte is the share of albedo that scatters to all sides, wrap [3] how far light bleeds round edges; sheen adds
-    (sheen + tint * albedo) * cos^power about the mirror direction.
+    matte  share of the albedo that scatters to all sides
+    wrap   [3] how far light bleeds round edges
+    sheen, tint, power  add (sheen + tint * albedo) * cos^power about the mirror direction
     """
 
     matte: float
@@ -77,7 +79,7 @@ def shade(
     lamp: Lamp,
     eye_mm: NDArray[np.float64],
 ) -> Image32:
-    """Linear light [P, 3] that P points send to an eye.
+    """Linear light [P, 3] that points send to an eye.
 
     Args:
         points_mm: [P, 3] world.
@@ -92,7 +94,7 @@ def shade(
     return light
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel(error_model="numpy")  # type: ignore[untyped-decorator]
 def _shade_points(
     points_mm: Image32,
     normals: Image32,
@@ -121,7 +123,7 @@ def _shade_points(
         half = max(half, 0.0)
         shine = half**power
         gloss = 0.0
-        if facing > BACKLIT:
+        if facing > MIN_GLINT_COSINE:
             gloss = glint[p] * (GLINT * half**GLINT_POWER + sheen * shine)
         beam = max(-(lx * axis[0] + ly * axis[1] + lz * axis[2]), 0.0) ** BEAM_POWER
         strength = EXPOSURE * beam * (REFERENCE_MM / distance) ** 2
@@ -131,7 +133,7 @@ def _shade_points(
 
 
 def to_srgb(linear: Image32) -> Image32:
-    """sRGB in [0, 1] with a shoulder, so that glints burn out softly: [..., 3] to [..., 3]."""
+    """sRGB in [0, 1] of linear light [..., 3]; a soft shoulder keeps the detail of glints."""
     rolled = linear * (1 + linear / 9) / (1 + linear * 0.45)
     return np.asarray(cv2.pow(np.clip(rolled, 0, 1), 1 / 2.2), dtype=np.float32)
 

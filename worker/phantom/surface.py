@@ -1,4 +1,4 @@
-"""The tissue's shape: grids of material points, and where they are at any frame.
+"""The tissue's shape: grids of material points, and their positions at any frame.
 
 Symbols: V vertices, F triangles. Material coordinates (u, v) are mm to the right and down on the sheet at rest; the
 atlas is the picture all colours are looked up in, the sheet above and the cut's groove below it.
@@ -19,9 +19,9 @@ from worker.phantom.settings import PhantomSettings
 
 MEAN_DEPTH_MM = 80.0
 DEPTH_RANGE_MM = (58.0, 104.0)  # of the sheet at rest
-SHEET_PER_VIEW = 1.75  # the sheet is this much larger than what is seen at mean depth: room for motion and other views
+SHEET_PER_VIEW = 1.75  # the sheet over the view at mean depth: it leaves room for motion and other views
 MIN_HALF_MM = 30.0  # of the sheet, so that a cut fits into the flattest picture
-TILT_MM_PER_MM = (0.06, -0.2)  # (right, down): the near edge is below, as the endoscope looks along the cavity
+TILT_MM_PER_MM = (0.06, -0.2)  # (right, down): the lower edge is nearer, as seen along a cavity
 LOOPS_MM = ((34.0, 11.0, 0.12), (13.0, 1.9, 0.15))  # (wavelength, height, crease) of folds and of lobes on them
 RELIEF_MM = (4.5, 0.16)  # (wavelength, height)
 
@@ -35,7 +35,7 @@ TEXEL_PX = 0.8  # a texel of the atlas in pixels at mean depth
 
 @dataclass(frozen=True)
 class Atlas:
-    """Where on the atlas the sheet and the groove lie. Sizes in texels; both start at column 0."""
+    """Position of sheet and groove on the atlas. Sizes in texels; both start at column 0."""
 
     texel_mm: float
     sheet_shape: tuple[int, int]
@@ -57,7 +57,7 @@ class Patch:
 
     rest_mm: NDArray[np.float64]
     atlas_xy: NDArray[np.float32]
-    side: float = 0.0  # of the cut, -1 left, +1 right, 0 where nothing is cut
+    side: float = 0.0  # of the cut: -1 left, +1 right, 0 without a cut
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class Surface:
 
 
 def make_surface(settings: PhantomSettings, rng: np.random.Generator) -> Surface:
-    """Draws the tissue's shape. The sheet's extent follows the field of view, its mesh and atlas the pixels."""
+    """The tissue's shape. The sheet's extent follows the field of view; its mesh and atlas follow the pixels."""
     intrinsics = settings.intrinsics
     pixel_mm = MEAN_DEPTH_MM / intrinsics.fx
     half_u, half_v = (
@@ -164,7 +164,7 @@ class _Sheet:
 def _cut_patches(
     sheet: _Sheet, v: NDArray[np.float64], step: float, groove_rows: slice, atlas: Atlas
 ) -> tuple[Patch, ...]:
-    """Left of the cut, right of it, and the groove between; their lips share material points."""
+    """The sheet left and right of the cut, and the groove between; adjoining lips share material points."""
     half_u = sheet.half_extent_mm[0]
     share = np.linspace(0, 1, int(half_u / step) + 1)
     line = CUT_SLANT * v[:, None]

@@ -1,7 +1,7 @@
-"""What the tissue is painted with: colour and wetness over the atlas.
+"""The tissue's paint: colour and wetness over the atlas.
 
-Colour is light scattered by tissue and absorbed by blood, scatter * exp(-blood * ABSORPTION) (Beer-Lambert), so thicker
-blood goes from pale pink through red to dark red as it does in the body. All colours here are linear light, not sRGB.
+Tissue scatters light and blood absorbs it: scatter * exp(-blood * ABSORPTION) (Beer-Lambert). So more blood turns pale
+pink into red and dark red, as in the body. All colours are linear light, not sRGB.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ VEIN_ABSORPTION = np.array([0.85, 1.15, 0.72], dtype=np.float32)  # by blood in 
 
 BLOOD_OCTAVES = ((48.0, 0.16), (17.0, 0.15), (6.0, 0.10), (2.2, 0.09), (0.9, 0.08))  # (wavelength mm, deviation)
 FINE_DEVIATION = 0.14  # of blood, from texel to texel
-CREASE_MM = 7.0  # light reaches a place that lies deeper than its surroundings of this size less well
+CREASE_MM = 7.0  # places deeper than their surroundings of this size get less light
 CREASE_DIMMING_PER_MM = 0.2
 ARTERY_BLOOD, VEIN_BLOOD, CAPILLARY_BLOOD = 1.0, 0.85, 0.38
 CAPILLARIES_MM = ((6.5, 0.055), (3.2, 0.07))  # (mesh size, line width as share of the field's deviation)
@@ -47,7 +47,7 @@ class Paint:
 
 
 def paint_tissue(surface: Surface, rng: np.random.Generator) -> Paint:
-    """Colours the sheet and, where it will be cut, the tissue beneath."""
+    """The paint of the sheet and, if it will be cut, of the tissue beneath."""
     atlas = surface.atlas
     albedo = np.zeros((*atlas.shape, 3), dtype=np.float32)
     film = np.zeros((*atlas.shape, 3), dtype=np.float32)
@@ -119,7 +119,7 @@ def _slopes(height: Image32, deviation: float) -> Image32:
 
 
 def _blurred(image: NDArray[np.float32], sigma: float) -> Image32:
-    """Gaussian blur with a sigma of many pixels, on a smaller picture: exact to what dimming can show."""
+    """Gaussian blur with a sigma of many pixels, computed on a smaller picture; exact enough for dimming."""
     shrink = max(1, int(sigma / 4))
     small = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), sigma / shrink, borderType=cv2.BORDER_REFLECT)

@@ -1,4 +1,4 @@
-"""Blood vessels: branching walks over the sheet, drawn as lines that thin with every fork."""
+"""Blood vessels: branching random walks over the sheet, drawn as lines that get thinner with every fork."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ CURL_RAD = 0.05  # slow bend of a whole vessel
 FORK_CHANCE = 0.5  # of a piece
 FORK_SHARE = 0.72  # of the parent's width that a branch keeps; the parent keeps the rest by Murray's law, r^3
 TAPER = 0.93  # of the width, from piece to piece
-THINNEST_MM = 0.09
+MIN_WIDTH_MM = 0.09
 MM2_PER_ARTERY, MM2_PER_VEIN = 420.0, 1100.0  # area of sheet for one trunk
 ARTERY_MM, VEIN_MM = (0.22, 0.62), (0.6, 1.3)  # width of trunks
 ARTERY_BLUR_MM, VEIN_BLUR_MM = 0.05, 0.35  # veins lie deeper
 SUBPIXEL_BITS = 4  # of OpenCV's line coordinates
-MAX_PIECES = 40_000  # guards against a forest; usual sheets need a tenth
+MAX_PIECES = 40_000  # usual sheets need a tenth
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class _Sprout:
 def draw_vessels(
     rng: np.random.Generator, extent_mm: tuple[float, float], texel_mm: float, shape: tuple[int, int]
 ) -> tuple[Image32, Image32]:
-    """(arteries, veins) [rows, columns] in [0, 1]: how much of a texel's depth the vessel fills."""
+    """(arteries, veins) [rows, columns] in [0, 1]: share of a texel's depth that the vessel fills."""
     arteries = _draw(rng, extent_mm, texel_mm, shape, MM2_PER_ARTERY, ARTERY_MM, ARTERY_BLUR_MM)
     veins = _draw(rng, extent_mm, texel_mm, shape, MM2_PER_VEIN, VEIN_MM, VEIN_BLUR_MM)
     return arteries, veins
@@ -60,7 +60,7 @@ def _draw(
             rng.uniform(0, 2 * np.pi),
             rng.uniform(*trunk_mm),
         )
-        # a trunk grows both ways from where it comes to the surface, so that none begins with a blunt end
+        # a trunk grows in both directions from where it surfaces, so that none has a blunt end
         trunks += [_Sprout(place, angle, width_mm), _Sprout(place, angle + np.pi, width_mm)]
     # thin ones first, so that a trunk covers where its branches begin
     for width_mm, line_mm in sorted(_grow(rng, trunks), key=lambda piece: piece[0]):
@@ -87,9 +87,9 @@ def _grow(rng: np.random.Generator, sprouts: list[_Sprout]) -> Iterator[tuple[fl
         if rng.random() < FORK_CHANCE:
             side = rng.choice((-1.0, 1.0)) * rng.uniform(0.45, 1.1)
             share = FORK_SHARE * rng.uniform(0.6, 1.0)
-            if share * width > THINNEST_MM:
+            if share * width > MIN_WIDTH_MM:
                 sprouts.append(_Sprout(line[-1], directions[-1] + side, share * width))
             width *= (1 - 0.5 * share**3) ** (1 / 3)
             directions[-1] -= 0.25 * side
-        if width > THINNEST_MM and rng.random() > 0.04:
+        if width > MIN_WIDTH_MM and rng.random() > 0.04:
             sprouts.append(_Sprout(line[-1], directions[-1], width))

@@ -1,7 +1,7 @@
-"""Writes a phantom the way real clips arrive: stereo video, StereoMIS layout, EndoNeRF layout with truth beside it.
+"""Writes a phantom as a stereo video, in StereoMIS layout, or in EndoNeRF layout with the truth beside it.
 
 Symbols: T frames, H W pixels of one eye, M tracked points, K novel views.
-PNG keeps every bit; the video is VP9, which is lossy on fine texture, so truth is measured on the PNG layouts.
+VP9 video loses fine texture and PNG loses nothing, so measure against truth on the PNG layouts.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from worker.machine.opencv import silent_stderr
 from worker.phantom.camera import orbit_pose
 from worker.phantom.scene import Phantom, PhantomFrame
 
-Tick = Callable[[int, int], None]  # called with (frames done, frames) after each frame
+OnFrame = Callable[[int, int], None]  # called with (frames done, frames) after each frame
 
 VIDEO, CALIBRATION, MASKS = "stereo.webm", "calibration.json", "masks.zip"
 BRIGHT = 255
-DEEPEST_8_BIT_MM = 255
+MAX_DEPTH_8_BIT_MM = 255
 NOVEL_TIMES = (0.0, 0.35, 0.7)  # model times of the novel views
 NOVEL_ANGLES_DEG = ((12.0, 0.0), (-12.0, 0.0), (0.0, 9.0), (8.0, -8.0))  # (yaw, pitch) about frame 0's axis
-BOUNDS_MARGIN = (0.9, 1.1)  # near and far bounds around the depths seen
+BOUNDS_MARGIN = (0.9, 1.1)  # factors of the near and far bounds
 
 
 def _ignore(done: int, frames: int) -> None:
     del done, frames
 
 
-def write_stereo_video(phantom: Phantom, path: Path, tick: Tick = _ignore) -> None:
+def write_stereo_video(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:
     """Folder with stereo.webm (VP9, left | right), calibration.json and masks.zip (tool = 255).
 
     Raises UnavailableError when this OpenCV cannot write VP9.
@@ -53,13 +53,13 @@ def write_stereo_video(phantom: Phantom, path: Path, tick: Tick = _ignore) -> No
                 both = np.concatenate([frame.left, frame.right], axis=1)
                 video.write(cv2.cvtColor(both, cv2.COLOR_RGB2BGR))
                 masks.writestr(f"{index:06d}.png", _png(_white(~frame.tissue)))
-                tick(index + 1, settings.frames)
+                on_frame(index + 1, settings.frames)
     finally:
         video.release()
     _write_calibration(phantom, path)
 
 
-def write_stereomis(phantom: Phantom, path: Path, tick: Tick = _ignore) -> None:
+def write_stereomis(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:
     """StereoMIS layout: NNNNNNl.png, NNNNNNr.png, StereoCalibration.ini, masks/NNNNNNl.png (tissue = 255)."""
     (path / "masks").mkdir(parents=True, exist_ok=True)
     for index in range(phantom.settings.frames):
@@ -67,11 +67,11 @@ def write_stereomis(phantom: Phantom, path: Path, tick: Tick = _ignore) -> None:
         _save(path / f"{index:06d}l.png", frame.left)
         _save(path / f"{index:06d}r.png", frame.right)
         _save(path / "masks" / f"{index:06d}l.png", _white(frame.tissue))
-        tick(index + 1, phantom.settings.frames)
+        on_frame(index + 1, phantom.settings.frames)
     (path / "StereoCalibration.ini").write_text(_stereomis_calibration(phantom))
 
 
-def write_endonerf(phantom: Phantom, path: Path, tick: Tick = _ignore) -> None:
+def write_endonerf(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:
     """EndoNeRF layout: images/ depth/ (8-bit mm) masks/ (tool = 255) poses_bounds.npy, and truth/.
 
     truth/NNNNNN.npz      depth_mm, hidden_depth_mm [H, W] float32; hidden_rgb [H, W, 3] float16 in [0, 1]; tissue
@@ -85,12 +85,12 @@ def write_endonerf(phantom: Phantom, path: Path, tick: Tick = _ignore) -> None:
     for index in range(phantom.settings.frames):
         frame, name = phantom.frame(index), f"{index:06d}"
         _save(path / "images" / f"{name}.png", frame.left)
-        _save(path / "depth" / f"{name}.png", np.clip(np.rint(frame.depth_mm), 0, DEEPEST_8_BIT_MM).astype(np.uint8))
+        _save(path / "depth" / f"{name}.png", np.clip(np.rint(frame.depth_mm), 0, MAX_DEPTH_8_BIT_MM).astype(np.uint8))
         _save(path / "masks" / f"{name}.png", _white(~frame.tissue))
         _write_truth(path / "truth" / f"{name}.npz", frame)
         seen = frame.depth_mm[frame.depth_mm > 0]
         nearest, farthest = min(nearest, float(seen.min())), max(farthest, float(seen.max()))
-        tick(index + 1, phantom.settings.frames)
+        on_frame(index + 1, phantom.settings.frames)
     bounds = (nearest * BOUNDS_MARGIN[0], farthest * BOUNDS_MARGIN[1])
     np.save(path / "poses_bounds.npy", _poses_bounds(phantom, bounds))
     tracks = phantom.trajectories()
@@ -122,12 +122,12 @@ def _write_calibration(phantom: Phantom, path: Path) -> None:
 
 
 def _stereomis_calibration(phantom: Phantom) -> str:
-    """Both eyes' intrinsics; right_from_left rotation R and translation T in mm stand with the right eye."""
+    """Both eyes' intrinsics; the right eye's section holds rotation R and translation T (mm) from left to right."""
     camera = phantom.settings.intrinsics
     lines = []
     for section, shift_mm in (("StereoLeft", 0.0), ("StereoRight", -phantom.settings.baseline_mm)):
         values: dict[str, float] = {"res_x": camera.width, "res_y": camera.height, "fc_x": camera.fx, "fc_y": camera.fy}
-        # this file's principal point counts pixel centres at whole numbers, as OpenCV does
+        # in this file pixel centres are at whole numbers, as in OpenCV
         values |= {"cc_x": camera.cx - 0.5, "cc_y": camera.cy - 0.5}
         values |= {f"kc_{i}": 0.0 for i in range(5)}
         values |= {f"R_{i}": float(i % 4 == 0) for i in range(9)}
@@ -162,7 +162,7 @@ def _write_truth(path: Path, frame: PhantomFrame) -> None:
 
 
 def _write_novel_views(phantom: Phantom, path: Path) -> None:
-    """Each novel time from each novel angle."""
+    """Write a view at each novel time from each novel angle."""
     frames = [int(t * phantom.settings.frames) for t in NOVEL_TIMES for _ in NOVEL_ANGLES_DEG]
     poses = [orbit_pose(yaw_deg, pitch_deg) for _ in NOVEL_TIMES for yaw_deg, pitch_deg in NOVEL_ANGLES_DEG]
     views = [phantom.render(frame, pose) for frame, pose in zip(frames, poses, strict=True)]
