@@ -1,7 +1,6 @@
 """A folder, a zip or a single image as one flat list of named files, read in memory.
 
-Archives come from strangers (contract/intake/zips.py says what is refused); members are never written under their own
-names.
+Archives are untrusted: contract/intake/zips.py says what is refused, and no member is written under its own name.
 """
 
 from __future__ import annotations
@@ -22,15 +21,15 @@ from contract.wire.errors import InputError, LimitError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm"})
-MAX_FOLDER_DEPTH = 6  # levels below the given folder; also what ends a loop of linked folders
+MAX_FOLDER_DEPTH = 6  # levels below the given folder; it also ends a loop of linked folders
 _CHUNK_BYTES = 1 << 20
-_LAYOUT_FOLDERS = frozenset({"images", "depth", "masks", "mask", "left", "right"})  # never stripped as mere wrapping
+_LAYOUT_FOLDERS = frozenset({"images", "depth", "masks", "mask", "left", "right"})  # never removed as a wrapping folder
 
 _Item = TypeVar("_Item")
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key by which frame9 comes before frame10."""
+    """Sort key that puts frame9 before frame10."""
     parts = re.split(r"(\d+)", name.lower())
     return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)
 
@@ -52,21 +51,21 @@ class FileTree(ABC):
         """The file for reading; may raise what zipfile and the operating system raise."""
 
     def path(self, name: str) -> Path | None:
-        """Where the file lies on disk; None inside an archive."""
+        """The file's path on disk; None inside an archive."""
         return None
 
     def read(self, name: str, max_bytes: int) -> bytes:
-        """Content of a file. InputError when it is unreadable, LimitError when it is larger than max_bytes."""
+        """Content of a file. InputError if it is unreadable, LimitError if it is larger than max_bytes."""
         return b"".join(self._chunks(name, max_bytes))
 
     def head(self, name: str, size: int) -> bytes:
-        """The first `size` bytes of a file, or all of a smaller one. InputError when it is unreadable."""
+        """The first `size` bytes of a file, or all of a smaller one. InputError if it is unreadable."""
         return next(self._chunks(name, size, size), b"")
 
     def copy_to(self, name: str, target: Path, max_bytes: int | None = None) -> None:
-        """Writes a file under a name of ours, for readers that need a path. target must not exist.
+        """Write a file to target, for readers that need a path. target must not exist.
 
-        Raises what `read` does; max_bytes is the limit for everything in an archive unless given.
+        Raises as `read`; max_bytes defaults to the limit for a whole archive.
         """
         descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
         with open(descriptor, "wb") as stream:
@@ -74,7 +73,7 @@ class FileTree(ABC):
                 stream.write(chunk)
 
     def _chunks(self, name: str, max_bytes: int, size: int = _CHUNK_BYTES) -> Iterator[bytes]:
-        """Content piece by piece, counted while it is inflated: what an archive declares may be a lie."""
+        """Content piece by piece. It is counted while it is inflated, because an archive may declare a false size."""
         total = 0
         try:
             with self.open(name) as stream:
@@ -92,7 +91,7 @@ class FileTree(ABC):
             ) from error
 
     def images(self, folder: str | None = None) -> tuple[str, ...]:
-        """Image files of the tree, or those right inside `folder`."""
+        """Image files of the tree, or only those directly in `folder`."""
         return tuple(
             name
             for name in self.names
@@ -125,7 +124,7 @@ class _Zip(FileTree):
 
 
 def open_tree(path: Path, field: str, limits: ClipLimits) -> FileTree | None:
-    """The files behind a folder, a zip (told by its content) or a single image; None when path is none of these."""
+    """The files of a folder, of a zip (detected by content) or a single image; None for any other file."""
     if path.is_dir():
         return _open_folder(path, field, limits)
     if zipfile.is_zipfile(path):
@@ -148,7 +147,7 @@ def check_exists(path: Path, field: str) -> None:
 
 
 def scratch_folder() -> Path:
-    """A new private folder for files that must have a path; the caller removes it."""
+    """A new private folder for files that need a path. The caller removes it."""
     return Path(tempfile.mkdtemp(prefix="intrasplat-"))
 
 
@@ -172,7 +171,7 @@ def _open_zip(path: Path, field: str, limits: ClipLimits) -> FileTree:
 
 
 def _without_wrapping(items: dict[str, _Item]) -> dict[str, _Item]:
-    """Drops what file managers leave behind, and folders that hold everything ("clip/images/..." -> "images/...")."""
+    """The items without files of file managers and without wrapping folders ("clip/images/..." -> "images/...")."""
     kept = {name: item for name, item in items.items() if not _is_litter(name)}
     while kept:
         first = {name.split("/", 1)[0] for name in kept}

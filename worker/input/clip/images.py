@@ -20,8 +20,8 @@ from contract.wire.notices import Notice
 from worker.input.clip.files import FileTree
 from worker.input.clip.types import RgbFrame
 
-MASK_THRESHOLD = 128  # of 255: masks are binary, but lossy video and resizing leave grey edges
-_HEADER_BYTES = 1 << 16  # a JPEG's size stands behind its metadata blocks, one of which may fill 64 kB
+MASK_THRESHOLD = 128  # of 255: masks are binary, but lossy video and resizing make grey edges
+_HEADER_BYTES = 1 << 16  # a JPEG's size comes after its metadata blocks, each of up to 64 kB
 _PNG_END = b"IEND\xaeB`\x82"
 _JPEG_NOT_SIZES = frozenset({0xC4, 0xC8, 0xCC})  # markers in the range of frame headers that are none
 
@@ -46,7 +46,7 @@ class ImageSequence:
         return self.tree.label
 
     def frames(self) -> Iterator[RgbFrame]:
-        """RGB uint8 [H, W, 3], from the first frame on. InputError when an image is damaged."""
+        """RGB uint8 [H, W, 3], from the first frame on. InputError if an image is damaged."""
         for name in self.names:
             yield as_rgb(self.decode(name), self.tree.field, name)
 
@@ -79,7 +79,7 @@ def open_images(tree: FileTree, names: tuple[str, ...]) -> ImageSequence:
 
 
 def decode_image(data: bytes, field: str, name: str) -> NDArray[Any]:
-    """Pixels of a PNG or JPEG as stored (BGR order). InputError when it is cut short or damaged."""
+    """Pixels of a PNG or JPEG as stored (BGR order). InputError if it is cut short or damaged."""
     whole = _PNG_END in data[-64:] if data.startswith(PNG_MAGIC) else b"\xff\xd9" in data[-64:]
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
     if image is None:
@@ -109,7 +109,7 @@ def as_mask(image: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def as_depth_mm(image: NDArray[Any], field: str, name: str) -> NDArray[np.float32]:
-    """Depth [H, W] float32 in mm of a decoded depth image; 0 = invalid. InputError when it is a colour picture."""
+    """Depth [H, W] float32 in mm of a decoded depth image; 0 = invalid. InputError if it is a colour picture."""
     if image.ndim == 3:
         if not (image[:, :, 0] == image[:, :, 1]).all() or not (image[:, :, 0] == image[:, :, 2]).all():
             raise InputError(

@@ -1,4 +1,4 @@
-"""Instrument masks: which pixels are tissue, and how that was known.
+"""Instrument masks: which pixels are tissue, and what decided it.
 
 Symbols: T frames, H W pixels of the left eye.
 """
@@ -24,14 +24,14 @@ from worker.input.clip.video import VideoFile, open_video, open_video_in
 
 BrightClass = Literal["tool", "tissue"]  # what a white pixel means
 
-MAX_TOOL_SHARE = 0.4  # of the area: a class larger than this is not taken for the instrument unasked
+MAX_TOOL_SHARE = 0.4  # of the area: a larger class is never taken for the instrument by its look
 _FIELD = "masks"
 _POLARITY_REMEDY = 'Say mask_polarity "tool" if white marks instruments, "tissue" if white marks tissue.'
 
 
 @dataclass(frozen=True)
 class TissueMasks:
-    """tissue [T, H, W] bool, True = tissue, with what was assumed and what looks odd."""
+    """tissue [T, H, W] bool, True = tissue, with the assumption behind it and warnings."""
 
     tissue: NDArray[np.bool_]
     assumption: Notice
@@ -40,7 +40,7 @@ class TissueMasks:
 
 @dataclass(frozen=True)
 class MaskFrames:
-    """Masks whose number and size are known, but not yet their pixels: a small file may decode to gigabytes."""
+    """Masks of known number and size that are not decoded yet, because a small file may decode to gigabytes."""
 
     frames: ImageSequence | VideoFile
 
@@ -50,7 +50,7 @@ class MaskFrames:
         return self.frames.frame_count, self.frames.height, self.frames.width
 
     def white(self) -> NDArray[np.bool_]:
-        """White pixels [T, H, W]. InputError when images have values, but none that is white."""
+        """White pixels [T, H, W]. InputError if the images have values but none is white."""
         decoded: Iterator[NDArray[Any]]
         if isinstance(self.frames, ImageSequence):
             decoded = map(self.frames.decode, self.frames.names)
@@ -69,7 +69,7 @@ class MaskFrames:
 
 
 def open_masks(path: Path, limits: ClipLimits) -> MaskFrames:
-    """Masks given as a zip or folder of images, or as a video. InputError, LimitError."""
+    """The masks in a zip or folder of images, or in a video. InputError, LimitError."""
     check_exists(path, _FIELD)
     tree = open_tree(path, _FIELD, limits)
     if tree is None:
@@ -81,7 +81,7 @@ def open_masks(path: Path, limits: ClipLimits) -> MaskFrames:
 
 
 def mask_names(tree: FileTree) -> tuple[str, ...]:
-    """Images that lie in a folder called masks or mask; of both eyes only the left."""
+    """Images in a folder called masks or mask; of two eyes only the left."""
     names = (name for name in tree.images() if {"masks", "mask"} & {p.lower() for p in PurePosixPath(name).parts[:-1]})
     return left_eye_only(tuple(names))
 
@@ -97,12 +97,12 @@ def tissue_from_masks(
     told: MaskPolarity,
     by_layout: tuple[str, BrightClass] | None = None,
 ) -> TissueMasks:
-    """Tissue pixels of a clip's masks, which are decoded only when their number and size fit its `shape` (T, H, W).
+    """Tissue pixels of masks. The masks are decoded only if their number and size fit `shape` (T, H, W).
 
-    What the user told wins; then the layout (its name, what white means there), unless the masks' own look contradicts
-    it; then the look: the class that touches the border in most frames with less than 40 % of the area is the tool.
-    InputError when they do not fit, when the tool's class cannot be told, when the masks mark nothing, and when they
-    leave no tissue.
+    What white means is decided by the caller (`told`), else by the layout (its name and what white means there), else
+    by look: the tool is the class that touches the border in most frames and covers less than 40 % of the area.
+    InputError if the masks do not fit, contradict the layout, mark nothing, leave no tissue, or if their look does not
+    decide.
     """
     _check_shape(masks.shape, shape)
     white = masks.white()
@@ -128,7 +128,7 @@ def tissue_from_masks(
 def _bright_class(
     white: NDArray[np.bool_], told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
 ) -> tuple[BrightClass, str]:
-    """What white means, and why we think so."""
+    """What white means, and the reason in words."""
     if told != "auto":
         return told, "as told"
     if white.all() or not white.any():
@@ -155,7 +155,7 @@ def _bright_class(
 
 
 def _bright_class_by_look(white: NDArray[np.bool_]) -> BrightClass | None:
-    """The class that reaches the border in most of the frames it appears in, with little enough area to be the tool."""
+    """What white means if one class covers little area and touches the border in most frames it is in; else None."""
     border = np.concatenate([white[:, 0], white[:, -1], white[:, :, 0], white[:, :, -1]], axis=1)
     if white.mean() < MAX_TOOL_SHARE:
         touches = 2 * border.any(axis=1).sum() > white.any(axis=(1, 2)).sum()

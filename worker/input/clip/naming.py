@@ -1,4 +1,4 @@
-"""What file names say: which eye a frame belongs to, and whether two lists of files line up."""
+"""The eye and the frame that file names name, and whether two lists of files match."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def eye_of(name: str) -> tuple[Side, str] | None:
     for depth, part in enumerate(path.parts[:-1]):
         if _FOLDER.fullmatch(part):
             others = path.parts[:depth] + path.parts[depth + 1 : -1]
-            # a side in the file name repeats the folder's and is no part of the frame's key
+            # an eye in the file name repeats the folder's; it is not part of the frame's key
             stem = _by_stem(path.stem)
             return _SIDES[part.lower()], "/".join((*others, stem[1] if stem else path.stem))
     found = _by_stem(path.stem)
@@ -34,7 +34,7 @@ def eye_of(name: str) -> tuple[Side, str] | None:
 
 
 def left_eye_only(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Drops the right eye's files where names tell both eyes apart; otherwise all names."""
+    """The names without the right eye's, if they name both eyes; else all names."""
     eyes = {name: found[0] for name in names if (found := eye_of(name))}
     if set(eyes.values()) != {"left", "right"}:
         return names
@@ -44,7 +44,7 @@ def left_eye_only(names: tuple[str, ...]) -> tuple[str, ...]:
 def pair_names(names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """(left, right) file names, frame by frame in natural order.
 
-    InputError when a frame lacks an eye, or a name says none.
+    InputError if a frame lacks an eye, or a name names none.
     """
     frames: dict[str, dict[Side, str]] = {}
     for name in names:
@@ -71,7 +71,7 @@ def pair_names(names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]
 
 
 def check_aligned(field: str, names: tuple[str, ...], others: tuple[str, ...]) -> None:
-    """InputError when two lists differ in length, or when their frame numbers run differently."""
+    """InputError if two lists differ in length, or in the steps between their frame numbers."""
     if len(names) != len(others):
         raise InputError(
             field,
@@ -96,7 +96,7 @@ def _by_stem(stem: str) -> tuple[Side, str] | None:
 
 
 def _frame_numbers(names: tuple[str, ...]) -> list[int] | None:
-    """The last number in each name, when they rise from file to file; None when they are no frame numbers."""
+    """The last number in each name, if these rise from file to file; else None."""
     found = [re.findall(r"\d+", PurePosixPath(name).stem) for name in names]
     if not all(found):
         return None

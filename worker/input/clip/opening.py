@@ -1,4 +1,4 @@
-"""The front of the pipeline: what the user gave becomes a StereoClip or a DepthClip, or an error that says why not."""
+"""The front of the pipeline: files become a StereoClip or a DepthClip, or an error says why they cannot."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def open_clip(
     options: ClipOptions | None = None,
     limits: ClipLimits | None = None,
 ) -> StereoClip | DepthClip:
-    """Opens and validates a clip; every assumption made on the way is in the clip's `assumptions`.
+    """The clip in these files, validated. Its `assumptions` list every assumption that was made.
 
     path     a stereo video, a folder or a zip; or the left eye's video or frames when `right` is given
-    masks    zip or folder of PNG, or a video; without it the clip's own masks/ folder is used, if there is one
-    options  layout: one of clip/layouts/ by its name; "auto" tells it by names, shape and content.
-             mask_polarity: "auto" asks layout and look (masks.tissue_from_masks)
+    masks    zip or folder of PNG, or a video; default: the clip's own masks/ folder, if it has one
+    options  layout: one of clip/layouts/ by its name; "auto" detects it by names, shape and content.
+             mask_polarity: "auto" decides by layout and look (masks.tissue_from_masks)
 
-    Raises InputError, naming field and remedy, for everything that is wrong, and LimitError when it is too large.
+    Raises InputError for everything that is wrong, with field and remedy, and LimitError for a clip that is too large.
     """
     options, limits = options or ClipOptions(), limits or ClipLimits()
     layout, mask_polarity = options.layout, options.mask_polarity
@@ -65,11 +65,11 @@ def open_clip(
 
 
 def find_calibration(path: Path | str, scratch: Path | None = None, limits: ClipLimits | None = None) -> Path | None:
-    """The calibration file that lies in a clip's folder or zip; None when there is none, or path is a single file.
+    """The calibration file in a clip's folder or zip; None if there is none, or if path is a single file.
 
-    StereoMIS's own name goes first, then files called calibration.*, then any whose name contains "calib".
-    From a zip it is copied into `scratch`, or into a temporary folder that lasts until the process ends.
-    Raises InputError when several files are equally likely.
+    StereoMIS's own name has priority, then files called calibration.*, then names that contain "calib". From a zip it
+    is copied into `scratch`, or into a temporary folder that lasts until the process ends.
+    Raises InputError if several files are equally likely.
     """
     path = Path(path)
     check_exists(path, "clip")

@@ -1,4 +1,4 @@
-"""Two eyes out of one picture, or out of two sequences.
+"""Pairs of left and right frames, from one sequence of pictures or two.
 
 Symbols: T frames, H W pixels of one eye.
 """
@@ -22,16 +22,16 @@ Packing = Literal["sbs", "tb"]
 
 PACKING_WORDS: dict[Packing, str] = {"sbs": "side by side, left eye left", "tb": "top-bottom, left eye on top"}
 
-_EYE_ASPECTS = (0.8, 2.4)  # width / height an endoscope's eye plausibly has, 5:4 and 16:9 well inside
-_CLEAR_MARGIN = 0.15  # of correlation, by which content alone decides
+_EYE_ASPECTS = (0.8, 2.4)  # plausible width / height of an endoscope's eye; 5:4 and 16:9 are well inside
+_CLEAR_MARGIN = 0.15  # of correlation; beyond it the content decides against the shape
 _MIN_LIKENESS = 0.35  # two eyes on the same tissue correlate above this, different parts of one picture below
-_LIKENESS_WIDTH_PX = 160  # halves are compared at this width: disparities become few pixels, and it costs a millisecond
-_FLAT_STD = 1.0  # grey levels of detail below which a frame says nothing
-_FRAMES_ASKED = 30  # clips may open black
+_LIKENESS_WIDTH_PX = 160  # halves are compared at this width: disparities are a few pixels, and it takes 1 ms
+_MIN_DETAIL_STD = 1.0  # grey levels; a frame with less detail decides nothing
+_MAX_FRAMES_COMPARED = 30  # clips may start black
 
 
 class FrameSequence(Protocol):
-    """T RGB frames of one size that can be read again from the start (a video or images)."""
+    """T RGB frames of one size, a video or images. Each call of frames() starts again from frame 0."""
 
     @property
     def frame_count(self) -> int: ...
@@ -50,7 +50,7 @@ class FrameSequence(Protocol):
 
 @dataclass(frozen=True)
 class PackedPairs:
-    """Left and right halves of each picture; an odd middle row or column is left out."""
+    """Left and right halves of each picture, without an odd middle row or column."""
 
     sequence: FrameSequence
     packing: Packing
@@ -86,7 +86,7 @@ class TwoSequences:
 
 
 def pair_sequences(left: FrameSequence, right: FrameSequence) -> TwoSequences:
-    """Joins two eyes. InputError when their lengths or sizes differ."""
+    """The pairs of two eyes' sequences. InputError if their lengths or sizes differ."""
     if left.frame_count != right.frame_count:
         raise InputError(
             "right",
@@ -113,9 +113,9 @@ def halves(frame: RgbFrame, packing: Packing) -> tuple[RgbFrame, RgbFrame]:
 
 
 def detect_packing(sequence: FrameSequence) -> Packing:
-    """Side by side or top-bottom: by which halves look alike, and by which eye has a plausible shape.
+    """Side by side or top-bottom, decided by which halves look alike and which shape of an eye is plausible.
 
-    InputError when neither pair of halves looks alike, or when content and shape point to different answers.
+    InputError if neither pair of halves looks alike, or if content and shape disagree.
     """
     by_shape = _packing_by_shape(sequence)
     likeness = _likeness_in(sequence)
@@ -144,8 +144,8 @@ def _packing_by_shape(sequence: FrameSequence) -> Packing | None:
 
 
 def _likeness_in(sequence: FrameSequence) -> dict[Packing, float] | None:
-    """Likeness of the halves for both packings, from the first frame with detail; None when there is none."""
-    for frame in itertools.islice(sequence.frames(), _FRAMES_ASKED):
+    """Likeness of the halves for both packings, in the first frame with detail; None without such a frame."""
+    for frame in itertools.islice(sequence.frames(), _MAX_FRAMES_COMPARED):
         sbs, tb = _likeness(*halves(frame, "sbs")), _likeness(*halves(frame, "tb"))
         if sbs is not None and tb is not None:
             return {"sbs": sbs, "tb": tb}
@@ -153,9 +153,9 @@ def _likeness_in(sequence: FrameSequence) -> dict[Packing, float] | None:
 
 
 def _likeness(first: RgbFrame, second: RgbFrame) -> float | None:
-    """Best normalised correlation of detail over small shifts, in [-1, 1]; None where one half is flat."""
+    """Best normalised correlation of detail over small shifts, in [-1, 1]; None if a half is flat."""
     detail = [_detail(first), _detail(second)]
-    if min(float(image.std()) for image in detail) < _FLAT_STD:
+    if min(float(image.std()) for image in detail) < _MIN_DETAIL_STD:
         return None
     height, width = detail[0].shape
     rows, columns = max(1, height // 12), width // 5  # search range: vertical misalignment, disparity
@@ -164,7 +164,7 @@ def _likeness(first: RgbFrame, second: RgbFrame) -> float | None:
 
 
 def _detail(eye: RgbFrame) -> NDArray[np.float32]:
-    """Small grey picture without its slow shading, which any two halves share."""
+    """A small grey picture without slow shading, which any two halves have in common."""
     height, width = eye.shape[:2]
     small_width = min(width, _LIKENESS_WIDTH_PX)
     small_height = max(4, round(height * small_width / width))

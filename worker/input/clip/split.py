@@ -1,4 +1,4 @@
-"""Which frames teach and which are held out to measure.
+"""The split of a clip into training frames and held-out frames (the test split).
 
 Symbols: T frames, H W pixels.
 """
@@ -17,8 +17,8 @@ from contract.wire.errors import InputError
 from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.types import DepthClip
 
-MIN_FRAMES = 9  # shorter clips cannot spare a frame
-REPEAT_LEVELS = 0.2  # mean |difference| in 8-bit levels below which two frames are the same picture
+MIN_FRAMES = 9  # shorter clips hold out no frame
+REPEAT_LEVELS = 0.2  # mean |difference| in 8-bit levels; two frames below it are the same picture
 RULES = ("every8", "blocks8", "none")
 _FIELD = "options.holdout"
 _REMEDY = 'Say "every8", "blocks8", "none", or frame numbers like "1,9,17".'
@@ -26,9 +26,9 @@ _REMEDY = 'Say "every8", "blocks8", "none", or frame numbers like "1,9,17".'
 
 @dataclass(frozen=True)
 class FrameSplit:
-    """Frame indices, each list rising. Held-out frames touch nothing in training.
+    """Frame indices, each list rising. No part of training reads held-out frames.
 
-    repeated are frames in neither list: they would teach, but repeat a held-out frame.
+    repeated lists frames that are in neither set, because they repeat a held-out frame.
     """
 
     train: list[int]
@@ -38,10 +38,10 @@ class FrameSplit:
 
 
 def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
-    """Splits the clip's T frames.
+    """The split of the clip's T frames.
 
     holdout  "every8": frames i with (i - 1) % 8 == 0, as in the papers; "blocks8": i in [8, T - 8) with
-             (i // 8) % 3 == 1, what a fixed camera needs to be measured honestly; "none"; or a list, "1,9,17"
+             (i // 8) % 3 == 1, the honest rule for a fixed camera; "none"; or a list, "1,9,17"
     Clips under 9 frames hold out none, with a warning. InputError for an unknown rule and for frames that do not exist.
     """
     count = clip.frame_count
@@ -63,16 +63,16 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
 
 
 def held_out_frames(frame_count: int, holdout: str) -> list[int]:
-    """The frames that the rule of split_frames holds out of a clip, rising; it needs no picture.
+    """The frames that split_frames would hold out, rising. It reads no picture.
 
-    So stages before the split can leave them alone. InputError as in split_frames.
+    Stages before the split use it to avoid these frames. InputError as in split_frames.
     """
     wanted = _held_out_by_rule(holdout, frame_count)
     return sorted(wanted) if frame_count >= MIN_FRAMES else []
 
 
 def check_holdout(holdout: str) -> None:
-    """Refuse what is neither a rule of split_frames nor a list of frames; whether a clip has those, it cannot know.
+    """Refuse what is neither a rule of split_frames nor a list of frames. It does not know the clip's frames.
 
     Raises:
         InputError: names the field.
@@ -82,7 +82,7 @@ def check_holdout(holdout: str) -> None:
 
 
 def spread(indices: Sequence[int], count: int) -> list[int]:
-    """At most count of the indices, evenly spread, the first and the last among them."""
+    """At most count of the indices, evenly spread, with the first and the last."""
     places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
     return [indices[place] for place in places]
 
@@ -90,25 +90,25 @@ def spread(indices: Sequence[int], count: int) -> list[int]:
 def find_repeats(rgb: NDArray[np.uint8], train: list[int], held_out: list[int]) -> list[int]:
     """Training frames of rgb [T, H, W, 3] whose mean |difference| to some held-out frame is below REPEAT_LEVELS of 255.
 
-    The differences of column sums bound the mean difference from below (triangle inequality), so whole frames are
-    compared only where that bound does not already rule a repeat out.
+    Differences of column sums are a lower bound of the mean difference (triangle inequality). Whole frames are compared
+    only if the bound does not rule a repeat out.
     """
     values_per_frame = float(np.prod(rgb.shape[1:]))
-    most = REPEAT_LEVELS * values_per_frame
+    limit = REPEAT_LEVELS * values_per_frame
     column_sums = {index: _column_sums(rgb[index]) for index in (*train, *held_out)}
     held_sums = np.stack([column_sums[index] for index in held_out])
     repeats = []
     for index in train:
         bounds = np.abs(held_sums - column_sums[index]).sum(axis=1)
-        candidates = [held_out[k] for k in np.flatnonzero(bounds < most)]
-        if any(_closer_than(most, rgb[index], rgb[other]) for other in candidates):
+        candidates = [held_out[k] for k in np.flatnonzero(bounds < limit)]
+        if any(_closer_than(limit, rgb[index], rgb[other]) for other in candidates):
             repeats.append(index)
     return repeats
 
 
-def _closer_than(most: float, frame: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
-    """Whether the sum of |differences| is below `most`; every 8th row alone often shows that it is not."""
-    return all(cv2.norm(frame[::step], other[::step], cv2.NORM_L1) < most for step in (8, 1))
+def _closer_than(limit: float, frame: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+    """Whether the sum of |differences| is below the limit. Every 8th row is tried first: it often decides."""
+    return all(cv2.norm(frame[::step], other[::step], cv2.NORM_L1) < limit for step in (8, 1))
 
 
 def _column_sums(frame: NDArray[np.uint8]) -> NDArray[np.int64]:

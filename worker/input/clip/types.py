@@ -1,4 +1,4 @@
-"""What comes out of the front of the pipeline.
+"""The two kinds of clip that the front of the pipeline gives.
 
 Symbols of the whole worker: T frames, H W pixels (rows, columns), N Gaussians, B bases, C = 10 deformed channels.
 """
@@ -19,17 +19,17 @@ RgbFrame = NDArray[np.uint8]  # [H, W, 3]
 
 
 class PairSource(Protocol):
-    """Left and right frames, decoded as they are asked for. Each call starts again from frame 0."""
+    """Left and right frames, decoded on demand. Each call starts again from frame 0."""
 
     def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]: ...
 
 
 @dataclass(frozen=True)
 class StereoClip:
-    """A stereo clip as it was recorded, not yet rectified. Frames are decoded lazily, RGB uint8.
+    """A stereo clip as recorded, not yet rectified. Frames are decoded lazily, RGB uint8.
 
-    tissue is [T, H, W] bool (True = tissue) in the pixels of the recorded left eye, or None when no masks were given.
-    frame_times_s is [T] float64, from the container or i / 30 when it has none.
+    tissue is [T, H, W] bool (True = tissue) in the pixels of the recorded left eye, or None without masks.
+    frame_times_s is [T] float64, from the container, or i / 30 if it has none.
     """
 
     frame_count: int
@@ -44,7 +44,7 @@ class StereoClip:
 
 @dataclass(frozen=True)
 class DepthClip:
-    """Rectified left frames with metric depth, tissue mask and camera: all that training reads.
+    """Rectified left frames with metric depth, tissue mask and camera. Training reads nothing else.
 
     rgb              [T, H, W, 3] uint8
     tissue           [T, H, W]    bool, True = tissue (tools, labels and borders are False)

@@ -1,7 +1,7 @@
 """Video files through one of three decoders and nothing else.
 
-The decoders bundled with OpenCV are many and some had holes; a whitelist of codecs reaches only FFmpeg's probe. What
-does hold is to force the decoder by name, so each allowed one is tried in turn.
+OpenCV bundles many decoders, and some had security holes. A whitelist of codecs only affects FFmpeg's probe. So each
+allowed decoder is forced by name, in turn.
 
 Symbols: T frames, H W pixels.
 """
@@ -29,15 +29,15 @@ from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.files import FileTree, scratch_folder
 from worker.input.clip.types import RgbFrame
 
-MISSING_FRAMES_ALLOWED = 1  # containers that store a duration instead of a count round it
+MAX_MISSING_FRAMES = 1  # containers that store a duration instead of a count round it
 FALLBACK_RATE_HZ = 30.0
 
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm"
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _SILENT = 0  # OpenCV's own messages
-_QUIET = "-8"  # AV_LOG_QUIET: what a refused decoder says is not for the user
-_environment_lock = threading.Lock()  # OpenCV takes these options from the environment only, which the process shares
+_QUIET = "-8"  # AV_LOG_QUIET: hides the messages of decoders that refuse a file
+_environment_lock = threading.Lock()  # OpenCV reads these options only from the environment, which all threads share
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class VideoFile:
     warnings: tuple[Notice, ...] = ()
 
     def frames(self) -> Iterator[RgbFrame]:
-        """RGB uint8 [H, W, 3], from the first frame on. InputError when frames change size or stop early."""
+        """RGB uint8 [H, W, 3], from the first frame on. InputError if frames change size or stop early."""
         with _capture(self.path, self.decoder) as capture:
             for index in range(self.frame_count):
                 good, frame = capture.read() if capture is not None else (False, None)
@@ -74,13 +74,13 @@ class VideoFile:
 
 
 def open_video(path: Path, field: str, limits: ClipLimits, label: str | None = None) -> VideoFile:
-    """Opens, counts and times a video; frames are decoded later.
+    """The video, with its frames counted and timed. They are decoded later.
 
-    Raises InputError when it is no video, its codec is not allowed, or it ends early; LimitError when it is too large.
+    Raises InputError if it is no video, its codec is not allowed, or it ends early; LimitError if it is too large.
     """
     label = label or path.name
     codec = check_video(path, field, label, limits).codec
-    # the order only saves failed attempts: what a file says of itself does not choose the decoder
+    # the file's declared codec only sets the order: it saves failed attempts
     for decoder in sorted(CODECS, key=lambda decoder: codec not in CODECS[decoder]):
         with _capture(path, decoder) as capture:
             if capture is not None:
@@ -90,7 +90,7 @@ def open_video(path: Path, field: str, limits: ClipLimits, label: str | None = N
 
 
 def open_video_in(tree: FileTree, name: str) -> VideoFile:
-    """Opens a video inside a folder or zip; what is copied out of a zip goes when the VideoFile does."""
+    """A video in a folder or zip. A copy from a zip is removed with the VideoFile."""
     path = tree.path(name)
     if path is not None:
         return open_video(path, tree.field, tree.limits, label=name)
@@ -107,7 +107,7 @@ def open_video_in(tree: FileTree, name: str) -> VideoFile:
 
 
 def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str, decoder: str) -> VideoFile:
-    """Checks the header, then walks all frames once: only that gives their number and times for certain."""
+    """Check the header, then walk all frames once: only that gives their exact number and times."""
     width, height = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     declared = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))  # negative when the container has no duration
     rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
@@ -118,12 +118,12 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
         times_ms.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)))
         limits.on_picture()
         if len(times_ms) == 1:
-            good, frame = capture.retrieve()  # turned clips have another size than their header
+            good, frame = capture.retrieve()  # a rotated clip has another size than its header says
             height, width = frame.shape[:2] if good else (height, width)
         limits.check_clip(field, label, len(times_ms), width, height)
     times_s = _times_s(times_ms, rate_hz)
     limits.check_duration(field, label, 0.0 if times_s is None or len(times_s) == 0 else float(times_s[-1]))
-    whole = len(times_ms) + MISSING_FRAMES_ALLOWED >= declared
+    whole = len(times_ms) + MAX_MISSING_FRAMES >= declared
     if not times_ms or not (whole or _whole_despite_count(path, decoder, declared, times_s, rate_hz, limits)):
         raise _cut_short(field, label, len(times_ms), declared)
     unknown = f"{field}: the video names no frame count, a missing end would not be noticed"
@@ -134,25 +134,25 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
 def _whole_despite_count(
     path: Path, decoder: str, declared: int, times_s: NDArray[np.float64] | None, rate_hz: float, limits: ClipLimits
 ) -> bool:
-    """Whether a video that shows fewer frames than `declared` is whole all the same.
+    """Whether a video with fewer frames than `declared` is complete.
 
-    Matroska stores a duration, and declared is that times the nominal rate: frames of varying length may be fewer, as
-    long as they last to the end. An mp4 cut without re-encoding keeps frames that its edit list hides: these count.
+    For Matroska, `declared` is the duration times the nominal rate. Frames of varying length may be fewer, if they last
+    to the end. An mp4 that was cut without re-encoding keeps hidden frames outside its edit list; they count, too.
     """
     if is_matroska(path):
         if times_s is None or len(times_s) < 2:
             return False
-        return bool(declared / rate_hz - times_s[-1] <= (1 + MISSING_FRAMES_ALLOWED) * np.diff(times_s).max())
+        return bool(declared / rate_hz - times_s[-1] <= (1 + MAX_MISSING_FRAMES) * np.diff(times_s).max())
     with _capture(path, decoder, "|advanced_editlist;0") as capture:
         found = 0
         while capture is not None and found < declared and capture.grab():
             found += 1
             limits.on_picture()
-    return found + MISSING_FRAMES_ALLOWED >= declared
+    return found + MAX_MISSING_FRAMES >= declared
 
 
 def _times_s(times_ms: list[float], rate_hz: float) -> NDArray[np.float64] | None:
-    """Seconds from frame 0: the container's time stamps when they rise, else its frame rate, else None."""
+    """Seconds from frame 0: by the container's time stamps if they rise, else by its frame rate, else None."""
     times_s = (np.asarray(times_ms, dtype=np.float64) - (times_ms[0] if times_ms else 0.0)) / 1000.0
     if len(times_s) > 1 and np.isfinite(times_s).all() and (np.diff(times_s) > 0).all():
         return times_s
