@@ -1,4 +1,4 @@
-"""`make chaos`: kill everything at every point of a clip's way, many times, and check what became of every clip.
+"""`make chaos`: kill every process at every point of a clip's way, many times, and check what became of every clip.
 
 python -m tests.chaos --kills 310 --deployments 6 --out docs/results/chaos.md
 """
@@ -115,7 +115,7 @@ def _scenario_lines(findings: list[ScenarioResult]) -> str:
 def _one(deployment: Deployment, target: Victim, point: Point, cancels: bool) -> Outcome:
     try:
         return run_kill(deployment, target, point, cancels)
-    except Exception as error:  # a deployment that does not come back is the gravest finding of all
+    except Exception as error:  # a deployment that does not come back is the gravest violation
         deployment.points.let_go()
         deployment.wait_until_ready()
         return Outcome(ClipHistory((target.value, point.value)), [f"{type(error).__name__}: {error}"])

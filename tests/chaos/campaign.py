@@ -1,4 +1,4 @@
-"""One kill: send a clip, hold a process at a point, kill, let all come back, and see what became of the clip."""
+"""One kill: send a clip, hold a process at a point, kill, let everything restart, and check what became of the clip."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ ACCEPTED_WITHIN_S = 60.0
 ENDED_WITHIN_S = 90.0
 POINT_WITHIN_S = 40.0
 SECOND_ENDING_S = 0.3
-"""A job that has ended is looked at once more after this."""
+"""How long to wait before looking again at a job that has ended."""
 TIDIED_WITHIN_S = 5.0
-"""What is left of a job that was cancelled, and whose worker died, is removed by the service's sweep."""
+"""How soon the service's sweep removes the files of a cancelled job whose worker died."""
 RETRY_PAUSE_S = 0.2
 
 NO_MATTER = frozenset(
@@ -37,14 +37,14 @@ NO_MATTER = frozenset(
     for target in (Victim.SUPERVISOR, Victim.CHILD)
     for point in (Point.UPLOAD, Point.SPOOLED)
 )  # fmt: skip
-"""Cells without meaning: the worker has no part in the clip before it is queued."""
+"""Cells without meaning: before the clip is queued, the worker has no part in it."""
 
 CELLS = [(target, point) for target in Victim for point in Point if (target, point) not in NO_MATTER]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one kill came to."""
+    """The outcome of one kill."""
 
     history: ClipHistory
     violations: list[str]
@@ -65,7 +65,7 @@ class ChaosClient:
         self._thread.start()
 
     def wait(self) -> None:
-        """Until it was accepted or given up."""
+        """Wait until the clip was accepted or given up."""
         self._thread.join()
 
     def send_half(self) -> socket.socket:
@@ -134,7 +134,7 @@ def _cancel(deployment: Deployment, job_id: str | None) -> bool:
 
 
 def watch(deployment: Deployment, history: ClipHistory) -> None:
-    """Until the job has ended, and a moment longer, so that a second ending would be seen."""
+    """Watch until the job has ended, and a moment longer to see a second ending."""
     if history.job_id is None:
         return
     record = wait_until_ended(deployment, history.job_id, ENDED_WITHIN_S)
@@ -143,7 +143,7 @@ def watch(deployment: Deployment, history: ClipHistory) -> None:
 
 
 def wait_until_ended(deployment: Deployment, job_id: str, timeout_s: float) -> JobRecord | None:
-    """The record of the job that has ended, or after timeout_s as it was last seen; None if it never was."""
+    """The record of the ended job, or the last one seen before timeout_s; None if none was seen."""
     deadline_s = time.monotonic() + timeout_s
     record: JobRecord | None = None
     while time.monotonic() < deadline_s:
@@ -156,7 +156,7 @@ def wait_until_ended(deployment: Deployment, job_id: str, timeout_s: float) -> J
 
 
 def _clip_of_its_own(name: str) -> bytes:
-    """A video like no other: with a box at its end that players skip."""
+    """The clip with a unique box at its end, which players skip."""
     padding = name.encode() * (PADDING_BYTES // len(name))
     return CLIP.read_bytes() + struct.pack(">I4s", 8 + len(padding), b"free") + padding
 

@@ -29,7 +29,7 @@ START_TIMEOUT_S = 60.0
 
 
 class Victim(StrEnum):
-    """What is killed."""
+    """Which processes are killed."""
 
     SERVICE = "service"
     SUPERVISOR = "supervisor"
@@ -49,11 +49,11 @@ class Kept:
 
     @property
     def process_id(self) -> int | None:
-        """Of the live process."""
+        """Process id, None unless it runs."""
         return self._process.pid if self._process is not None and self._process.poll() is None else None
 
     def keep(self) -> None:
-        """Start it if it is not there."""
+        """Start it unless it runs."""
         if self.process_id is None:
             with self._log.open("ab") as log:
                 self._process = subprocess.Popen(
@@ -62,7 +62,7 @@ class Kept:
                 )  # fmt: skip
 
     def end(self) -> None:
-        """For good."""
+        """Kill it for good."""
         if self._process is not None:
             with suppress(ProcessLookupError):
                 os.kill(self._process.pid, signal.SIGKILL)
@@ -104,18 +104,18 @@ class Deployment:
 
     @property
     def socket(self) -> Path:
-        """Of the queue's server."""
+        """The socket of the queue's server."""
         return Path(self.server.url.removeprefix("unix://"))
 
     def add_workers(self, count: int, **settings: str) -> None:
-        """Workers that are kept from now on, with settings of their own."""
+        """Add workers, with settings of their own, that are kept running."""
         for number in range(len(self.workers) + 1, len(self.workers) + count + 1):
             environment = self._environment({"worker_name": f"worker-{number}", **settings})
             log = self._folder / f"worker-{number}.log"
             self.workers.append(Kept("tests.chaos.worker_process", environment, log))
 
     def wait_until_ready(self, timeout_s: float = START_TIMEOUT_S) -> None:
-        """Until service, queue and all workers answer.
+        """Wait until service, queue and all workers answer.
 
         Raises:
             TimeoutError: they do not.
@@ -131,7 +131,7 @@ class Deployment:
         raise TimeoutError(f"{self.data_dir} is not ready after {timeout_s:g} s; its logs lie beside it")
 
     def kill(self, target: Victim) -> None:
-        """kill -9."""
+        """kill -9 the victim."""
         supervisors = [kept.process_id for kept in self.workers]
         children = [child for supervisor in supervisors if supervisor for child in children_of(supervisor)]
         victims = {

@@ -33,12 +33,12 @@ class ClipHistory:
 
     @property
     def final(self) -> JobState | None:
-        """The last state that was seen."""
+        """The last state seen."""
         return self.events[-1].record.state if self.events else None
 
     @property
     def rerun_s(self) -> float | None:
-        """From the kill to the start of the next attempt, if the job had to be run again."""
+        """Seconds from the kill to the start of the next attempt; None if there was none."""
         killed_at_s = self.killed_at_s
         if killed_at_s is None:
             return None
@@ -76,7 +76,7 @@ def violations(history: ClipHistory, store: Store) -> list[str]:
 
 
 def orphans(store: Store, known: set[str]) -> list[Path]:
-    """Folders of work and scenes that belong to no known job: nothing may be left lying about."""
+    """Folders of work and scenes that belong to no known job."""
     return [
         folder
         for area in ("spool", "scenes")

@@ -1,4 +1,4 @@
-"""Places in the processes under test at which they hold still, so that they can be killed there and nowhere else.
+"""Points in the processes under test at which they stop, so that they can be killed exactly there.
 
 A process reaches a point by reach(). If that point is armed it says so and waits, for the harness to kill something or
 to let it go on; a point is armed for one arrival. The processes are the real ones: install_service_points() and
@@ -21,7 +21,7 @@ MAX_HELD_S = 30.0
 
 
 class Point(StrEnum):
-    """Where a job can be when something dies, in the order in which a job comes through."""
+    """Where a job can be when something dies, in a job's order."""
 
     UPLOAD = "during upload"
     SPOOLED = "after fsync, before enqueue"
@@ -40,11 +40,11 @@ class Points:
         folder.mkdir(parents=True, exist_ok=True)
 
     def arm(self, point: Point) -> None:
-        """Hold whoever reaches the point next."""
+        """Stop the next process that reaches the point."""
         self._file("arm", point).touch()
 
     def wait_for(self, point: Point, timeout_s: float) -> int:
-        """The process id of whoever has arrived.
+        """The process id of the process that has arrived.
 
         Raises:
             TimeoutError: nobody came.
@@ -58,7 +58,7 @@ class Points:
         return int(arrived.read_text())
 
     def let_go(self) -> None:
-        """Disarm everything and let everybody go on."""
+        """Disarm all points and let all processes go on."""
         for path in self.folder.iterdir():
             if path.name.startswith("arm."):
                 path.unlink(missing_ok=True)
@@ -66,7 +66,7 @@ class Points:
                 path.rename(path.with_name("go." + path.name.removeprefix("at.")))
 
     def reset(self) -> None:
-        """Forget all that was."""
+        """Forget all arrivals."""
         for path in self.folder.iterdir():
             path.unlink(missing_ok=True)
 
@@ -75,7 +75,7 @@ class Points:
 
 
 def reach(point: Point) -> None:
-    """Hold still here, if the point is armed."""
+    """Stop here if the point is armed."""
     folder = Path(os.environ[FOLDER_VARIABLE])
     try:
         (folder / f"arm.{point.name}").unlink()

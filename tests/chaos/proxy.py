@@ -1,4 +1,4 @@
-"""A wire that misbehaves: a TCP port in front of the queue's socket that delays, drops, swallows or cuts."""
+"""A faulty network: a TCP port in front of the queue's socket that delays, drops, swallows or cuts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DROPPED_SHARE = 0.3
 
 
 class Fault(StrEnum):
-    """What the wire does."""
+    """What the network does."""
 
     NONE = "none"
     DELAY = "delayed replies"
@@ -56,7 +56,7 @@ class ChaosProxy:
         self._loop.close()
 
     def set(self, fault: Fault) -> None:
-        """From now on."""
+        """Set the fault from now on."""
         self._fault = fault
         if fault in (Fault.PARTITION, Fault.NONE):  # after half-open, too, whoever waits must learn of it
             asyncio.run_coroutine_threadsafe(self._cut_all(), self._loop).result()

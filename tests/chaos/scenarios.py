@@ -1,4 +1,4 @@
-"""Failures that are not deaths: a worker that sleeps past its lease and wakes, and a wire that misbehaves."""
+"""Failures other than deaths: a worker that sleeps past its lease and wakes, and a faulty network."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ WIRE_FAULTS = (
     (Fault.PARTITION, 12.0),
     (Fault.DROP_REPLY, 8.0),
 )
-"""What the wire does, and for how many seconds; it is sound for a second between two of them. The partition outlasts
-the lease."""
+"""What the network does, and for how many seconds. It works for a second in between. PARTITION outlasts the lease."""
 WIRE_PAUSE_S = 1.0
 WIRE_JOBS = 25
 
@@ -75,7 +74,7 @@ def zombie(folder: Path, port: int, point: Point) -> ScenarioResult:
 
 
 def bad_wire(folder: Path, port: int, seed: int) -> ScenarioResult:
-    """Two workers behind a wire that misbehaves while jobs come in."""
+    """Two workers behind a faulty network while jobs come in."""
     with Deployment(folder, port, workers=0) as deployment, ChaosProxy(deployment.socket, seed) as proxy:
         deployment.add_workers(2, redis_url=f"redis://127.0.0.1:{proxy.port}/0")
         deployment.wait_until_ready()

@@ -1,4 +1,4 @@
-"""The child's end of the wire: when it ends, the process does, and nothing but reports goes over it."""
+"""The device process's channel: it carries only reports, and the process ends with its orders."""
 
 from __future__ import annotations
 

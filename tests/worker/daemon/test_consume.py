@@ -1,4 +1,4 @@
-"""The job loop on a real queue, a real store and a child process that does what a clip tells it (standin.py)."""
+"""The job loop with a real queue, a real store and a child process that obeys the text of the clip (standin.py)."""
 
 from __future__ import annotations
 
@@ -330,7 +330,7 @@ def test_a_result_waits_for_a_queue_that_is_away(lane: tuple[JobLoop, Lane]) -> 
     assert bench.store.has_scene(record.job_id, record.attempt)
 
 
-def test_beats_go_on_after_a_fault_that_nobody_foresaw(lane: tuple[JobLoop, Lane]) -> None:
+def test_beats_go_on_after_an_unforeseen_fault(lane: tuple[JobLoop, Lane]) -> None:
     bench, queue = lane
     stumbled = threading.Event()
 

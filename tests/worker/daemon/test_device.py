@@ -1,4 +1,4 @@
-"""The device child: what a job asks for reaches the reconstruction whole, and no order, error or death upsets it."""
+"""The device process: all options of a job reach the reconstruction, and orders, errors and deaths are handled."""
 
 from __future__ import annotations
 
@@ -185,9 +185,7 @@ def test_a_state_of_another_version_is_left_behind_and_training_starts_anew(tmp_
         (ValueError("smith.mp4"), "A fault in the worker (ValueError)"),
     ],
 )
-def test_every_error_is_told_with_a_remedy_and_without_what_nobody_wrote_for_the_caller(
-    error: Exception, says: str
-) -> None:
+def test_every_error_has_a_remedy_and_no_unforeseen_text_reaches_the_caller(error: Exception, says: str) -> None:
     told = describe(error)
     assert says in told.problem
     assert told.remedy

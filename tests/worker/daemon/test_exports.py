@@ -1,4 +1,4 @@
-"""An export format from outside: registered in one line, it is answered like those that come with the program."""
+"""An export format from outside needs one line to register, and is then served like the program's own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What counts as an advance, what as a hang, and that no stage of a reconstruction is silent for too long."""
+"""What counts as an advance, what as a hang, and that every stage of a reconstruction reports in time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pace: a lone view at once, a share of the time for those who ask without pause, and no limit while nothing trains."""
+"""Pace: a single render at once, a share of the time for those who ask without pause, no limit while nothing trains."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_lone_view_is_made_at_once_and_the_next_after_a_rest() -> None:
             clock.now_s += (MAX_SAVED_S + VIEW_S) / SHARE
 
 
-def test_while_nothing_trains_nobody_rests() -> None:
+def test_renders_are_not_rationed_while_nothing_trains() -> None:
     clock = Clock()
     pace = Pace(clock)
     with pace.training():
@@ -70,7 +70,7 @@ def test_what_was_rendered_before_a_job_is_not_held_against_those_who_watch_it()
         assert pace.rest_s() == 0.0
 
 
-def test_a_job_that_fails_rations_nobody_any_more() -> None:
+def test_rations_end_with_a_job_that_fails() -> None:
     clock = Clock()
     pace = Pace(clock)
 

@@ -1,4 +1,4 @@
-"""The worker's ear: whatever arrives, each request gets one answer and the thread lives on."""
+"""The request server: whatever arrives, each request gets one answer and the thread lives on."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_an_answer_carries_the_bytes_the_time_and_the_warnings(socket: zmq.Socke
 @pytest.mark.parametrize(
     ("t", "kind", "field"), [(1, "input", "t"), (2, "scene", "scene"), (3, "internal", None), (4, "not-yet", "scene")]
 )
-def test_an_error_is_told_and_the_next_request_is_answered(
+def test_an_error_is_reported_and_the_next_request_is_answered(
     socket: zmq.Socket[bytes], t: float, kind: str, field: str | None
 ) -> None:
     head, body = ask(socket, request(t))
@@ -96,7 +96,7 @@ def test_an_error_is_told_and_the_next_request_is_answered(
 
 
 @pytest.mark.parametrize("document", [b"", b"{}", b'{"request": {"kind": "shutdown"}}', b"\xff\xfe"])
-def test_a_request_that_does_not_fit_is_told_so(socket: zmq.Socket[bytes], document: bytes) -> None:
+def test_a_request_that_does_not_fit_gets_an_error(socket: zmq.Socket[bytes], document: bytes) -> None:
     head, _ = ask(socket, document)
     assert head.error is not None
     assert head.error.kind == "internal"
@@ -160,7 +160,7 @@ def test_over_tcp_the_services_of_the_same_secret_are_answered(tcp_endpoint: str
         (service_keys(SECRET), worker_keys("another secret of 32 characters.").public),
     ],
 )
-def test_over_tcp_nobody_else_is(tcp_endpoint: str, keys: RenderKeys | None, server: bytes) -> None:
+def test_over_tcp_no_other_caller_is_answered(tcp_endpoint: str, keys: RenderKeys | None, server: bytes) -> None:
     asked: list[RenderRequest | ExportRequest] = []
 
     def note(request: RenderRequest | ExportRequest) -> Reply:

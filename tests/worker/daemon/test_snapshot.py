@@ -1,4 +1,4 @@
-"""Snapshots: the newest for who asks, nothing for who does not, and no bit of training changed by being watched."""
+"""Snapshots: callers get the newest, no copy is made without a caller, and watching changes no bit of training."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_a_snapshot_shows_what_the_model_shows_and_training_does_not_move_it() -
     assert not np.array_equal(view(run, 3).rgb, before.rgb)
 
 
-def test_the_first_copy_is_wanted_at_once_and_the_next_when_somebody_has_asked() -> None:
+def test_the_first_copy_is_wanted_at_once_and_the_next_after_a_request() -> None:
     snapshots = Snapshots(period_s=ALWAYS, patience_s=0.0)
     assert not snapshots.wanted()
     snapshots.begin(JOB)

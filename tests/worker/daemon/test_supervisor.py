@@ -1,4 +1,4 @@
-"""The worker's process with an embedded queue: however it ends, its job goes on elsewhere and only one scene stands."""
+"""The worker's process with an embedded queue: however it ends, its job goes on elsewhere and makes one scene."""
 
 from __future__ import annotations
 

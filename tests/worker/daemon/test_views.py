@@ -1,4 +1,4 @@
-"""Views of stored scenes: the camera a caller means, and no picture of a scene that is gone."""
+"""Renders of stored scenes: the requested camera, and no picture of a scene that is gone."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_deleted_scene_is_not_shown_from_memory(store: Store, scene_id: str) -
     assert views.held == ()
 
 
-def test_a_deleted_scene_is_let_go_of_although_nobody_asks(store: Store, scene_id: str) -> None:
+def test_a_deleted_scene_leaves_memory_without_a_request(store: Store, scene_id: str) -> None:
     views, other = Views(store), new_job_id()
     publish(store, other)
     views.answer(request_of(scene_id))

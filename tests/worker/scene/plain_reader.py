@@ -1,6 +1,6 @@
-"""Another reader of compact scenes: plain Python, written from docs/scene-file.md and from nothing else of ours.
+"""Another reader of compact scenes in plain Python, written from docs/scene-file.md alone.
 
-Slow, and for the tests alone: where it and worker/scene/compact.py part, one of them or the page is wrong.
+It is slow and for tests only. Where it and worker/scene/compact.py differ, one of them or the page is wrong.
 """
 
 from __future__ import annotations

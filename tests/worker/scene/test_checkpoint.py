@@ -1,4 +1,4 @@
-"""What is stored comes back bit for bit, and what is damaged does not come back at all."""
+"""What is stored is loaded bit for bit, and what is damaged is refused."""
 
 from __future__ import annotations
 

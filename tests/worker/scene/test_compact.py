@@ -1,4 +1,4 @@
-"""A scene in whole numbers: how far it may be off, that it costs little, and that no file makes it do harm."""
+"""A compact scene: its error, its size, and that no hostile file does harm."""
 
 from __future__ import annotations
 

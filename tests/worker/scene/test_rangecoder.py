@@ -1,4 +1,4 @@
-"""Whole numbers come back as they were, from few bytes, and nothing else comes back."""
+"""Tables are decoded as they were encoded, from few bytes; any other code is refused."""
 
 from __future__ import annotations
 
