@@ -21,16 +21,15 @@ from torch import Tensor
 from worker.model.deformation import SharedBasis
 from worker.model.deformation.shared import CHANNELS_WITH_COLOUR
 from worker.model.gaussians import Gaussians
-from worker.model.layout import CHANNELS
+from worker.model.layout import CHANNELS, COLOUR, LOG_SCALE, MEAN, OPACITY_ROW, QUATERNION, VALUES
 from worker.scene.differences import MAX_POWER, MAX_STORED, add_differences, coding_order, take_differences
 from worker.scene.rangecoder import PARTS, decode, encode
 
 Whole = NDArray[np.int64]
 Floats = NDArray[np.float32]
 
-STATE = 14
-"""Numbers of a Gaussian at rest: mean 0:3, quaternion 3:7, log-scale 7:10, colour 10:13, opacity logit."""
-PLACE, ROTATION, LOG_SCALE, COLOUR, OPACITY = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13), 13
+STATE = VALUES
+"""Numbers of a Gaussian at rest, in the order of worker/model/layout.py."""
 GROUP_OF = np.array([0] * 3 + [1] * 7 + [2] * 4)
 """Which power belongs to each number of the state: of place, shape or colour."""
 PLAIN = 3
@@ -187,7 +186,7 @@ def check_size(rows: int, columns: int) -> None:
 def _check_numbers(table: NDArray[np.int32], step: Floats) -> None:
     if table.max() > MAX_STORED or table.min() < -MAX_STORED:
         raise ValueError(f"a number exceeds {MAX_STORED}")
-    if not (step > 0).all() or not table[:, ROTATION].any(axis=1).all():
+    if not (step > 0).all() or not table[:, QUATERNION].any(axis=1).all():
         raise ValueError("a step or a quaternion is 0")
 
 
@@ -222,9 +221,9 @@ def _gaussians_of(state: Floats) -> Gaussians:
     """The Gaussians whose numbers at rest are state [N, STATE]."""
     held = torch.from_numpy(state)
     return Gaussians(
-        mean=held[:, PLACE].contiguous(),
-        quaternion=held[:, ROTATION].contiguous(),
+        mean=held[:, MEAN].contiguous(),
+        quaternion=held[:, QUATERNION].contiguous(),
         log_scale=held[:, LOG_SCALE].contiguous(),
-        opacity_logit=held[:, OPACITY].contiguous(),
+        opacity_logit=held[:, OPACITY_ROW].contiguous(),
         sh=held[:, None, COLOUR].contiguous(),
     )

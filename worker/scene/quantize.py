@@ -28,24 +28,13 @@ from torch import Tensor
 from worker.model.deformation import SharedBasis
 from worker.model.deformation.shared import CHANNELS_WITH_COLOUR
 from worker.model.gaussians import Gaussians
-from worker.scene.compact import (
-    COLOUR,
-    GROUP_OF,
-    MIN_POWER,
-    OPPONENT,
-    PLACE,
-    ROTATION,
-    SEEN_LEVELS,
-    STATE,
-    Compact,
-    Whole,
-    check_size,
-)
+from worker.model.layout import COLOUR, COLOUR_ROW, MEAN, QUATERNION, QUATERNION_ROW
+from worker.scene.compact import GROUP_OF, MIN_POWER, OPPONENT, SEEN_LEVELS, STATE, Compact, Whole, check_size
 from worker.scene.differences import MAX_POWER, MAX_STORED
 
 Reals = NDArray[np.float64]
 
-SHAPE = slice(3, 10)
+SHAPE = slice(QUATERNION_ROW, COLOUR_ROW)
 """Quaternion and log-scale, whose precision is one power."""
 MAX_ROTATION_STEP = 2.0**MIN_POWER / 2
 """Of a quaternion at power 0. One of length 1 has a number of at least 1/2, which is one step at the lowest power, so
@@ -100,17 +89,17 @@ def prepare(
     mean = weight @ values.mean(0).astype(np.float32)
     state[:, :channels] += mean
     weight -= mean[:, :, None]  # the bases sum to 1
-    length = np.linalg.norm(state[:, ROTATION], axis=1)
-    state[length == 0, ROTATION.start], length[length == 0] = 1, 1  # zeros are no rotation
-    state[:, ROTATION] /= length[:, None]
-    weight[:, ROTATION] /= length[:, None, None].astype(np.float32)
-    effect[ROTATION] *= length**2
+    length = np.linalg.norm(state[:, QUATERNION], axis=1)
+    state[length == 0, QUATERNION_ROW], length[length == 0] = 1, 1  # zeros are no rotation
+    state[:, QUATERNION] /= length[:, None]
+    weight[:, QUATERNION] /= length[:, None, None].astype(np.float32)
+    effect[QUATERNION] *= length**2
     state[:, COLOUR] = state[:, COLOUR] @ OPPONENT.T
     effect[COLOUR] = effect[COLOUR].mean(0)
     if channels == CHANNELS_WITH_COLOUR:
         weight[:, COLOUR] = OPPONENT.astype(np.float32) @ weight[:, COLOUR]
 
-    power = np.stack([_power(effect[group]) for group in (PLACE, SHAPE, COLOUR)], axis=1)
+    power = np.stack([_power(effect[group]) for group in (MEAN, SHAPE, COLOUR)], axis=1)
     scale = np.exp2(power)[:, GROUP_OF]
     root = np.maximum(np.sqrt(effect.sum(1) / (scale**2).sum(0)), MIN_EFFECT)
     motion, pattern = _patterns(weight, values, scale)
@@ -131,7 +120,7 @@ def round_to(prepared: Prepared, step: float) -> Compact:
     columns = STATE + channels * patterns + 4
     check_size(count, columns)
     steps = step / prepared.effect
-    steps[ROTATION] = np.minimum(steps[ROTATION], MAX_ROTATION_STEP)
+    steps[QUATERNION] = np.minimum(steps[QUATERNION], MAX_ROTATION_STEP)
     table: NDArray[np.int32] = np.empty((count, columns), np.int32)
 
     def fill(first: int, numbers: NDArray[np.floating]) -> None:
