@@ -1,4 +1,5 @@
-"""The canonical Gaussians, their deformation in time, what is minimised and how it is scored.
+"""Points come in; Gaussians go out, with their motion, the loss that trains them and the scores that judge them.
 
-Verbs: gaussians.initial_gaussians, deformation (fdm.py holds the FDM equation), loss, optimize, metrics.
+Verbs: gaussians.initial_gaussians, deformation.motion_named and restore (fdm.py holds the FDM equation),
+loss.training_loss, optimize.adam_step, metrics. constants.py and layout.py hold the numbers that kernels compile in.
 """

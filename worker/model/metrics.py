@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.floating] | NDArray[np.uint8]
 
 BEST_PSNR_DB = 100.0
-"""Stands for equality, whose PSNR is infinite and which no mean over frames and no JSON survives."""
+"""The PSNR of equal images. The true value is infinite, which neither a mean over frames nor JSON can hold."""
 SSIM_SIGMA_PX = 1.5
 SSIM_WINDOW_PX = 11
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2

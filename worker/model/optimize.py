@@ -1,7 +1,7 @@
 """Adam's rates and their schedules. The arithmetic itself is fused into the backends' steps.
 
-Rates are stated in optimiser units (median depth 60). Progress in (0, 1] is how far they have fallen: 1 at the end of
-every cycle of the schedule (worker/train/schedule.py), and of a run without cycles.
+Rates are in optimiser units (median depth 60). Progress in (0, 1] says how far they have fallen. It reaches 1 before
+every warm restart (worker/train/schedule.py) and at the end of a run.
 """
 
 from __future__ import annotations

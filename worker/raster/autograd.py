@@ -1,4 +1,4 @@
-"""What a backend's rasterize() shares with the others': between torch's arguments and cotangents and the kernels'."""
+"""What every backend's rasterize() needs to pass torch's arguments and cotangents to its kernels and back."""
 
 from __future__ import annotations
 

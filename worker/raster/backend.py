@@ -83,7 +83,7 @@ def gpu_is_lost() -> bool:
     if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
         return False
     try:
-        # Not the whole device: another thread may be capturing a graph, which nobody may wait for.
+        # Only this stream: waiting for the whole device would break the graph that another thread may be capturing.
         torch.cuda.current_stream().synchronize()
     except RuntimeError:
         return True

@@ -5,9 +5,9 @@ Implementations: CpuModel (worker/raster/cpu/model.py) and CudaModel (worker/ras
 which evaluates and trains the deformation: by kernels, or on the CPU by torch (worker/raster/cpu/unfused.py).
 worker/raster/backend.py makes the one for a device.
 
-A device may lag behind: step() returns before its step is made. Every other method waits for the steps before it, so
-none ever sees a model between two steps. What has to be known of steps that nobody waited for, whether their loss is a
-number and any Gaussian in view, comes with the next answer.
+A device may lag behind: step() may return before its step is made. Every other method waits for all steps first, so
+none sees a model between two steps. The sums of a step that lags come with a later answer. They tell whether its loss
+is a number and whether any Gaussian was in view.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Model(Protocol):
         """One iteration (counted from 1): one step of Adam down the sum of the frames' losses.
 
         Args:
-            frames: F of one size, a frame among them more than once if it likes. Buffers are for the F of the last
-                step; another F makes new ones.
+            frames: F of one size; a frame may occur more than once. The buffers fit the F of the last step; another F
+                allocates new ones.
             sh_degree: the harmonics in use at this iteration.
 
         Returns:

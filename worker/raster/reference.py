@@ -1,4 +1,4 @@
-"""The contract of worker.raster in plain torch: any float dtype, autograd, meant to be read and to be right.
+"""The contract of worker.raster in plain torch: any float dtype, autograd, written to be read.
 
 Symbols: N Gaussians, H W pixels, M (Gaussian, tile) instances, P pixels of a tile, Q Gaussians of a chunk.
 The other backends are tested against this one in float64.

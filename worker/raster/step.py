@@ -1,4 +1,4 @@
-"""What a training step is given and what it answers, on every device.
+"""What a training step takes and returns, on every device.
 
 Symbols: H W pixels; stride = W rounded up to whole vectors of the CPU's kernels.
 """

@@ -31,9 +31,9 @@ class Motion(Protocol):
         """state [13, N] = canonical + psi(t). Where trains, update follows."""
 
     def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
-        """One Adam step of the weights that reach any of F times, those deformed to last, given dL/dstate at each.
+        """One Adam step, iteration counted from 1, given dL/dstate [F, 13, N] at the F times of the last deform calls.
 
-        Turns v_state [F, 13, N] into dL/dcanonical, frame by frame. iteration counts from 1.
+        Turns v_state into dL/dcanonical, frame by frame. A motion may train only the weights that reach these times.
         """
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
@@ -50,7 +50,7 @@ class Motion(Protocol):
 
 
 def kept_where_old(moments: Floats, columns: np.ndarray, fresh: np.ndarray) -> Floats:
-    """These columns of Adam's moments, 0 where fresh. A copy by rows: indexing the last axis alone turns it about."""
+    """These columns of Adam's moments, 0 where fresh. Contiguous by rows, which indexing alone is not."""
     return np.ascontiguousarray(np.where(fresh, np.float32(0), moments[..., columns]))
 
 
@@ -60,9 +60,9 @@ def _channel_rates(rates: StepRates) -> Floats:
 
 
 class LinearMotion:
-    """Bases of t common to all Gaussians; only the weights of those alive at a step's times are read or written in it.
+    """Bases of t that all Gaussians share. A step reads and writes only the weights of bases alive at its times.
 
-    Adam's moments of a weight advance only in steps that use it, with its own count of them.
+    Adam's moments of a weight advance only in those steps, and each basis counts its own.
     """
 
     def __init__(self, deformation: LinearDeformation, columns: int) -> None:

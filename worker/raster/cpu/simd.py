@@ -280,7 +280,7 @@ def all_less(typing: Any, a: Any, b: Any) -> Any:
 def exp2(typing: Any, x: Any) -> Any:
     """2**x: round, degree-5 polynomial on the remainder, exponent added as an integer.
 
-    x is raised to at least -120: further down the integer would wrap round. Above 127.5 it does: nobody comes there.
+    x is raised to at least -120: below, the integer would wrap round. Above 127.5 it does wrap; no caller gets there.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:

@@ -29,7 +29,7 @@ class AutogradMotion:
     """
 
     def __init__(self, deformation: Deformation, count: int, columns: int) -> None:
-        padding = torch.zeros(columns - count, dtype=torch.int64)  # whose motion it is does not matter: never drawn
+        padding = torch.zeros(columns - count, dtype=torch.int64)  # copies of the first Gaussian; never drawn
         self._adopt(deformation.select(torch.cat([torch.arange(count), padding])))
         self._moments = {name: torch.zeros(2, *each.shape) for name, each in self._parameters.items()}
         self._graphs: list[tuple[Tensor, Tensor]] = []  # a step's canonical states, and what became of each

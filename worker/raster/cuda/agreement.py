@@ -1,6 +1,6 @@
-"""Whether the device splats as the reference does: asked once a process, before a job computes on it.
+"""Check once a process, before the first job, that the device splats as the reference does.
 
-No GPU, driver or version of Triton is believed unseen. A small fixed scene is rendered and differentiated on the device
+Any GPU, driver or version of Triton may be wrong. So a small fixed scene is rendered and differentiated on the device,
 and by worker/raster/reference.py in float64.
 
 Symbols: N Gaussians, H W pixels.
@@ -31,7 +31,7 @@ def check(memory: str, name: str) -> None:
     """Compare both once; memory: the device as torch calls it, name: the GPU's own.
 
     Raises:
-        UnavailableError: they differ by more than LIMIT; nothing that this device computes is to be believed.
+        UnavailableError: they differ by more than LIMIT, so nothing that this device computes can be trusted.
     """
     with one_at_a_time:  # the first scene may be rendered while the first job begins
         worst, part = disagreement(torch.device(memory))

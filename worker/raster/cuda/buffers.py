@@ -1,4 +1,4 @@
-"""What the model keeps for an image size: the rasteriser's buffers, the Gaussians at the frames' times, the steering.
+"""Buffers of one image size: the rasteriser's, the Gaussians at the frames' times, and the control block.
 
 N Gaussians (padded), F frames at once.
 """
@@ -21,11 +21,11 @@ from worker.raster.step import camera_centre
 
 
 class FrameBuffers:
-    """So many frames of one size at once: the rasteriser's buffers, and the control block that steers them.
+    """What a step or a render of so many frames of one size needs; it is kept from one to the next.
 
-    launches  those of steps and pictures; to be forgotten when a buffer moves
-    values    [N], the caller's, to be blended as colour is
-    images    the last picture, by whether values were blended in it
+    launches  captured steps and renders; to be forgotten when a buffer moves
+    values    [N], a number a Gaussian, blended as colour is
+    images    the last render, by whether values were blended in it
     """
 
     def __init__(

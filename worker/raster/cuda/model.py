@@ -5,9 +5,10 @@ N Gaussians (padded to COLUMNS), rows of N floats; F frames a step; values [14, 
 step() returns before its step is made. What changes from step to step goes to the device as one row of the control
 block (control.py); everything else lies there already, so a step is a copy of some hundred floats and a replay.
 
-Room. The rasteriser's buffers hold so many instances. A step that needs more changes nothing, nor do those after it;
-every CHECK_EVERY steps, and before anything else is done with the model, the host looks, makes room, and sends again
-the steps that were not made, from the rows that it kept. So a model with little room ends as one with ample room does.
+Room. The rasteriser's buffers hold so many instances. A step that needs more changes nothing, nor do those after it.
+Every CHECK_EVERY steps, and before anything else is done with the model, the host reads the report. It makes room and
+sends the steps that were not made once more, from the rows that it kept. So a model with little room ends as one with
+ample room does.
 
 Where the host waits for the device: every CHECK_EVERY-th step; wait, and every method and property but step; a render,
 for its picture; the first use of a frame, for its copy; when buffers grow.
@@ -43,8 +44,8 @@ Floats = NDArray[np.float32]
 PAD_LOGIT = -30.0
 """Opacity logit of the columns that only fill the rows: never drawn."""
 CHECK_EVERY = 32
-"""Steps from one look at the device to the next. The device idles while the host looks, and a step that found no room
-costs at most so many again."""
+"""Steps from one read of the device's report to the next. The device idles during a read; after a step without room, at
+most so many are made again."""
 SIZES_KEPT = 3
 """Image sizes, of those rendered last, whose buffers are kept."""
 
@@ -81,7 +82,7 @@ class CudaModel:
         self._views: OrderedDict[tuple[int, int, int], FrameBuffers] = OrderedDict()
         self._store = FrameStore(width, height, self.device)
         self._report = torch.zeros(SEEN + CHECK_EVERY, dtype=torch.int32, device=self.device)
-        self._sent: list[int] = []  # the harmonics' degree of every step that nobody has waited for
+        self._sent: list[int] = []  # the harmonics' degree of every step since the last wait
         self._learnt: StepSums | None = None
         self._gradients: Gradients | None = None
         self._shown: FrameBuffers | None = None
@@ -94,7 +95,7 @@ class CudaModel:
         """One iteration (counted from 1) on the sum of the frames' losses; sh_degree: the harmonics in use at it.
 
         Returns:
-            What the steps since the last answer add up to, where the host has looked.
+            The sums of the steps since the last answer, where the host has read the report.
 
         Raises:
             ValueError: no frame, or more than the rasteriser draws at once (bins.MAX_FRAMES).

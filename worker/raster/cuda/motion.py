@@ -91,7 +91,7 @@ class Motion(Protocol):
 
 
 TIMES_KEPT = 4096
-"""Times whose bases are remembered: more than frames of a clip, and a bound for a scene that is watched for days."""
+"""Times whose bases are cached: more than a clip has frames, yet bounded for a scene that is rendered for days."""
 
 
 def kept_where_old(moments: Tensor, columns: Tensor, fresh: Tensor) -> Tensor:
@@ -130,9 +130,9 @@ class Moments:
 
 
 class LinearMotion:
-    """Bases of t common to all Gaussians; only the weights of those alive at a step's times are read or written in it.
+    """Bases of t that all Gaussians share. A step reads and writes only the weights of bases alive at its times.
 
-    Adam's moments of a weight advance only in steps that use it, with its own count of them.
+    Adam's moments of a weight advance only in those steps, and each basis counts its own.
     """
 
     def __init__(self, deformation: LinearDeformation, columns: int, device: torch.device) -> None:

@@ -10,8 +10,8 @@ device, float32 where nothing is said.
 
 Once the buffers are there nothing here asks the device anything or allocates, but for torch.sort's own scratch: so all
 of it can be captured in a CUDA graph. The buffers have room for ``capacity`` slots. A projection that needs more leaves
-ok at 0 and draws only what fits; ok stays 0, and needed the most that was needed, until reset(). Who changes
-parameters reads ok on the device and does nothing where it is 0; the host looks when it likes, with grown().
+ok at 0 and draws only what fits; ok stays 0, and needed the most that was needed, until reset(). A kernel that changes
+parameters reads ok on the device and does nothing where it is 0. The host reads it with grown().
 """
 
 from __future__ import annotations
