@@ -15,6 +15,26 @@ class Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="allow")
 
 
+class ErrorCode(StrEnum):
+    """The kind of an error, for programs; docs/codes.md explains each."""
+
+    ATTEMPTS_EXHAUSTED = "attempts_exhausted"
+    CANCELLED = "cancelled"
+    FAULT = "fault"
+    INPUT = "input"
+    LIMIT = "limit"
+    NOT_YET = "not_yet"
+    OUT_OF_MEMORY = "out_of_memory"
+    QUEUE_FULL = "queue_full"
+    RECORD_UNREADABLE = "record_unreadable"
+    RESUME_MISMATCH = "resume_mismatch"
+    SCENE = "scene"
+    STORE_FULL = "store_full"
+    TRAINING_DIVERGED = "training_diverged"
+    UNAVAILABLE = "unavailable"
+    UNCLASSIFIED = "unclassified"
+
+
 class JobState(StrEnum):
     """Where a job stands."""
 
@@ -109,8 +129,9 @@ class FrameScore(Model):
 
 
 class JobError(Model):
-    """Why a job failed: one sentence, the field at fault if it was the input, and what to do about it."""
+    """Why a job failed: its kind, one sentence, the field at fault if it was the input, and what to do about it."""
 
+    code: Annotated[ErrorCode | str, Field(union_mode="left_to_right")] = ErrorCode.UNCLASSIFIED
     problem: str
     field: str | None = None
     remedy: str | None = None

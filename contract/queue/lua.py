@@ -14,11 +14,16 @@ from typing import Any
 from contract.queue.promise import MAX_ATTEMPTS, MAX_DURATIONS, MAX_EVENTS, YIELD_S, worker_died
 from contract.queue.redis_client import reachable
 from contract.queue.redis_hash import EVENT_FIELDS
+from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError, JobState, sources_of
 
 NAMES = ("submit", "restore", "claim", "beat", "settle", "release", "cancel", "retry", "forget", "announce")
 
-UNREADABLE = JobError(problem="The queue's record of this job cannot be read.", remedy="Submit the clip again.")
+UNREADABLE = JobError(
+    code=ErrorCode.RECORD_UNREADABLE,
+    problem="The queue's record of this job cannot be read.",
+    remedy="Submit the clip again.",
+)
 
 
 class Scripts:

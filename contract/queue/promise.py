@@ -16,7 +16,7 @@ from enum import StrEnum
 from statistics import median
 from typing import Protocol
 
-from contract.wire.errors import UnavailableError
+from contract.wire.errors import ErrorCode, UnavailableError
 from contract.wire.job import Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.rendering import WorkerAddress
 
@@ -103,6 +103,8 @@ class QueueFigures:
 
 class QueueFullError(UnavailableError):
     """Too many jobs wait. tenant: the caller's own share is used up (HTTP 429), not the whole queue (503)."""
+
+    code = ErrorCode.QUEUE_FULL
 
     def __init__(self, problem: str, remedy: str, *, tenant: bool) -> None:
         super().__init__(problem, remedy)
@@ -223,7 +225,11 @@ class Queue(Protocol):
 def worker_died() -> JobError:
     """The error of a job whose workers have died MAX_ATTEMPTS times."""
     problem = f"The worker died {MAX_ATTEMPTS} times while it ran this job."
-    return JobError(problem=problem, remedy="Try a shorter or smaller clip, and look at the worker's log.")
+    return JobError(
+        code=ErrorCode.ATTEMPTS_EXHAUSTED,
+        problem=problem,
+        remedy="Try a shorter or smaller clip, and look at the worker's log.",
+    )
 
 
 def check_admission(admission: Admission, queued: int, queued_of_tenant: int) -> None:

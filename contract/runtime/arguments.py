@@ -8,7 +8,7 @@ from collections.abc import Callable
 from types import NoneType
 from typing import Any, Literal, TypeAlias, get_args, get_origin
 
-from contract.runtime.exits import EXIT_CODES_HELP
+from contract.runtime.exits import EXIT_CODES_HELP, flag_of
 from contract.wire.options import ClipOptions, Options, parse_options
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -56,11 +56,6 @@ def given_options(namespace: argparse.Namespace, model: type[Options]) -> Option
     """
     values = {name: getattr(namespace, name) for name in model.model_fields}
     return parse_options(model, {name: value for name, value in values.items() if value is not None})
-
-
-def flag_of(name: str) -> str:
-    """budget_s is --budget-s."""
-    return f"--{name.replace('_', '-')}"
 
 
 def finite(text: str) -> float:

@@ -9,6 +9,7 @@ from enum import IntEnum
 from pathlib import Path
 
 from contract.wire.errors import Cancelled, InputError, IntrasplatError, UnavailableError
+from contract.wire.options import FIELD_PREFIX
 
 
 class ExitCode(IntEnum):
@@ -45,7 +46,7 @@ LAST_WORDS_VARIABLE = "INTRASPLAT_LAST_WORDS"
 
 def end_by(error: IntrasplatError) -> ExitCode:
     """Say on stderr why this process ends, leave an UnavailableError as last words, and return the exit code."""
-    print(f"intrasplat: {error}", file=sys.stderr)
+    print(f"intrasplat: {_in_flags(error)}", file=sys.stderr)
     if isinstance(error, UnavailableError):
         leave_last_words(error)
     return exit_code_of(error)
@@ -62,6 +63,19 @@ def leave_last_words(error: UnavailableError) -> bool:
     except OSError:  # the disk may be full
         return False
     return True
+
+
+def flag_of(name: str) -> str:
+    """The command-line option of a name: budget_s is --budget-s."""
+    return f"--{name.replace('_', '-')}"
+
+
+def _in_flags(error: IntrasplatError) -> str:
+    """The error's sentences; an option is named as the command line names it."""
+    prefix = f"{FIELD_PREFIX}."
+    if not isinstance(error, InputError) or not error.field.startswith(prefix):
+        return str(error)
+    return f"{flag_of(error.field.removeprefix(prefix))}: {error.problem} {error.remedy}"
 
 
 def take_last_words(path: Path) -> UnavailableError | None:

@@ -7,7 +7,7 @@ import errno
 import os
 from collections.abc import Iterator
 
-from contract.wire.errors import UnavailableError
+from contract.wire.errors import ErrorCode, UnavailableError
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
@@ -16,6 +16,8 @@ NOT_THERE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.ESTALE})
 
 class StoreFullError(UnavailableError):
     """The data directory's disk, quota or file size limit is used up. What was stored before is not harmed."""
+
+    code = ErrorCode.STORE_FULL
 
 
 @contextlib.contextmanager

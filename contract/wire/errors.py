@@ -2,20 +2,47 @@
 
     IntrasplatError
     ├── InputError            what the user gave cannot be used: names the field and the remedy
-    │   └── LimitError        it is larger than this machine accepts
+    │   ├── LimitError        it is larger than this machine accepts
+    │   └── ResumeMismatch    the folder holds a stopped run that this request does not continue
     ├── TrainingDiverged      the optimiser left the finite numbers, or the model collapsed
     ├── SceneError            a stored scene is missing, damaged or of another version
     ├── Cancelled             the caller asked to stop
     └── UnavailableError      a queue, device or binary that is needed is not there
 
-All carry one sentence that says what is wrong; InputError and UnavailableError also say what to do about it.
+Each has a code for programs (docs/codes.md) and one sentence for people. InputError and UnavailableError also say what
+to do.
 """
 
 from __future__ import annotations
 
+from enum import StrEnum
+from typing import ClassVar
+
+
+class ErrorCode(StrEnum):
+    """The kind of an error, for programs; docs/codes.md explains each."""
+
+    ATTEMPTS_EXHAUSTED = "attempts_exhausted"
+    CANCELLED = "cancelled"
+    FAULT = "fault"
+    INPUT = "input"
+    LIMIT = "limit"
+    NOT_YET = "not_yet"
+    OUT_OF_MEMORY = "out_of_memory"
+    QUEUE_FULL = "queue_full"
+    RECORD_UNREADABLE = "record_unreadable"
+    RESUME_MISMATCH = "resume_mismatch"
+    SCENE = "scene"
+    STORE_FULL = "store_full"
+    TRAINING_DIVERGED = "training_diverged"
+    UNAVAILABLE = "unavailable"
+    UNCLASSIFIED = "unclassified"
+
 
 class IntrasplatError(Exception):
     """Base of all errors raised on purpose."""
+
+    code: ClassVar[ErrorCode] = ErrorCode.UNCLASSIFIED
 
 
 class InputError(IntrasplatError):
@@ -27,6 +54,8 @@ class InputError(IntrasplatError):
         remedy: what to do about it, one sentence.
     """
 
+    code = ErrorCode.INPUT
+
     def __init__(self, field: str, problem: str, remedy: str) -> None:
         super().__init__(f"{field}: {problem} {remedy}")
         self.field = field
@@ -37,17 +66,31 @@ class InputError(IntrasplatError):
 class LimitError(InputError):
     """The input is larger than this machine accepts (frames, pixels, bytes, seconds)."""
 
+    code = ErrorCode.LIMIT
+
+
+class ResumeMismatch(InputError):
+    """The folder holds a stopped run that is damaged, of another version, or of another request."""
+
+    code = ErrorCode.RESUME_MISMATCH
+
 
 class TrainingDiverged(IntrasplatError):
     """Training reached a NaN or lost its Gaussians; nothing is published."""
+
+    code = ErrorCode.TRAINING_DIVERGED
 
 
 class SceneError(IntrasplatError):
     """A stored scene is missing, damaged (hash mismatch) or written by another version."""
 
+    code = ErrorCode.SCENE
+
 
 class Cancelled(IntrasplatError):
     """The caller asked to stop; nothing is published."""
+
+    code = ErrorCode.CANCELLED
 
 
 class UnavailableError(IntrasplatError):
@@ -57,6 +100,8 @@ class UnavailableError(IntrasplatError):
         remedy: one line that mends it.
         may_return: it may be there again without anything done here, like a queue on another machine that starts later.
     """
+
+    code = ErrorCode.UNAVAILABLE
 
     def __init__(self, problem: str, remedy: str, *, may_return: bool = False) -> None:
         super().__init__(f"{problem} {remedy}")

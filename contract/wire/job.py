@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from contract.wire.errors import ErrorCode
 from contract.wire.options import JobOptions
 
 JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
@@ -76,10 +77,11 @@ class JobProgress(BaseModel):
 
 
 class JobError(BaseModel):
-    """Why a job failed: one sentence, the field at fault if it was the input, and what to do about it."""
+    """Why a job failed: its kind, one sentence, the field at fault if it was the input, and what to do about it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    code: ErrorCode = ErrorCode.UNCLASSIFIED
     problem: str
     field: str | None = None
     remedy: str | None = None

@@ -98,5 +98,4 @@ def parse_options(model: type[Options], given: str | Mapping[str, object]) -> Op
         first = error.errors()[0]
         field = ".".join([FIELD_PREFIX, *(str(part) for part in first["loc"])])
         problem = f"{first['msg']} (given: {str(first['input'])[:80]!r})."
-        known = ", ".join(model.model_fields)
-        raise InputError(field, problem, f"The options are {known}; /openapi.json describes them.") from error
+        raise InputError(field, problem, f"The options are {', '.join(model.model_fields)}.") from error

@@ -128,7 +128,7 @@ def test_an_option_that_cannot_be_meant_is_a_bad_input(
 ) -> None:
     out = tmp_path / "scene"
     assert main(["reconstruct", str(clip), "--out", str(out), *wrong]) == ExitCode.BAD_INPUT
-    assert "options." in capsys.readouterr().err
+    assert f"intrasplat: {wrong[0]}: " in capsys.readouterr().err
     assert not out.exists()
 
 

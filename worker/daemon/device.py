@@ -16,7 +16,7 @@ from contract.runtime.exits import ExitCode, leave_last_words
 from contract.runtime.processes import die_with_parent
 from contract.runtime.settings import Settings
 from contract.store.store import Store, open_store
-from contract.wire.errors import Cancelled, InputError, UnavailableError
+from contract.wire.errors import Cancelled, InputError, ResumeMismatch, UnavailableError
 from contract.wire.job import JobRecord
 from worker.daemon.channel import Channel, Orders, Task
 from worker.daemon.faults import describe
@@ -166,12 +166,9 @@ def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits |
 
 def run_or_start_anew(request: ReconstructionRequest, out: Path, hooks: TrainingHooks) -> None:
     """Reconstruct, resuming the state in `out`; start anew if that state is damaged or of another version."""
-    resumes = (out / RESUME_FILE).exists()
     try:
         reconstruct(request, out, hooks)
-    except InputError as error:
-        if error.field != "--out" or not resumes:
-            raise
+    except ResumeMismatch:
         logger.warning("the stored state cannot be resumed; training starts anew")
         (out / RESUME_FILE).unlink()
         reconstruct(request, out, hooks)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 
-from contract.wire.errors import InputError, IntrasplatError, UnavailableError
+from contract.wire.errors import ErrorCode, InputError, IntrasplatError, UnavailableError
 from contract.wire.job import JobError
 
 FAULT_REMEDY = "This is a fault of intrasplat: please report it with the worker's log."
@@ -18,13 +18,15 @@ logger = logging.getLogger("intrasplat.worker")
 def describe(error: Exception) -> JobError:
     """Problem and remedy of an error. An unforeseen one is told by its type alone, as its text may hold anything."""
     if isinstance(error, InputError):
-        return JobError(problem=error.problem, field=error.field, remedy=error.remedy)
+        return JobError(code=error.code, problem=error.problem, field=error.field, remedy=error.remedy)
     if isinstance(error, UnavailableError):
-        return JobError(problem=error.problem, remedy=error.remedy)
+        return JobError(code=error.code, problem=error.problem, remedy=error.remedy)
     if isinstance(error, IntrasplatError):
-        return JobError(problem=str(error), remedy="The worker's log has the details.")
+        return JobError(code=error.code, problem=str(error), remedy="The worker's log has the details.")
     # torch.OutOfMemoryError is known by its name, because the supervisor does not load torch
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
-        return JobError(problem="The worker ran out of memory.", remedy="Send a shorter or smaller clip.")
+        remedy = "Send a shorter or smaller clip."
+        return JobError(code=ErrorCode.OUT_OF_MEMORY, problem="The worker ran out of memory.", remedy=remedy)
     logger.error("a fault while a job ran", exc_info=error)
-    return JobError(problem=f"A fault in the worker ({type(error).__name__}).", remedy=FAULT_REMEDY)
+    problem = f"A fault in the worker ({type(error).__name__})."
+    return JobError(code=ErrorCode.FAULT, problem=problem, remedy=FAULT_REMEDY)

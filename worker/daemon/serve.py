@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from zmq.auth.thread import ThreadAuthenticator
 
 from contract.access.render_keys import service_keys, worker_keys
-from contract.wire.errors import InputError, IntrasplatError, SceneError, UnavailableError
+from contract.wire.errors import ErrorCode, InputError, IntrasplatError, SceneError, UnavailableError
 from contract.wire.notices import Notice
 from contract.wire.rendering import ExportRequest, RenderRequest, ReplyError, WorkerReply, WorkerRequest
 
@@ -37,6 +37,8 @@ logger = logging.getLogger("intrasplat.worker")
 
 class NotYetError(IntrasplatError):
     """The job has nothing to show yet."""
+
+    code = ErrorCode.NOT_YET
 
 
 @dataclass(frozen=True)

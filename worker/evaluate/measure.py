@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.runtime.arguments import flag_of
+from contract.runtime.exits import flag_of
 from contract.wire.names import CURVE, REPORT, DeviceName
 from contract.wire.report import Report
 from worker.evaluate.cells import Cell, options_of, preset_of

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from contract.wire.errors import InputError, SceneError
+from contract.wire.errors import ResumeMismatch, SceneError
 from worker.scene.resume_file import RESUME_FILE, load_resume, save_resume
 from worker.train.run import CurvePoint, Run
 from worker.train.schedule import Schedule
@@ -21,7 +21,7 @@ def resume(out_dir: Path, run: Run) -> float | None:
     """Resume the run stored in out_dir, if there is one; returns its t_train_s.
 
     Raises:
-        InputError: it was started with another preset, seed, length or clip, or cannot be read.
+        ResumeMismatch: it was started with another preset, seed, length or clip, or cannot be read.
     """
     if not (out_dir / RESUME_FILE).exists():
         return None
@@ -29,7 +29,7 @@ def resume(out_dir: Path, run: Run) -> float | None:
         return load_run(out_dir, run)
     except (ValueError, KeyError, SceneError) as error:
         problem = f"{out_dir / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
-        raise InputError("--out", problem, "Give the options it was started with, or name a new folder.") from error
+        raise ResumeMismatch("--out", problem, "Give the options it was started with, or name a new folder.") from error
 
 
 def save_run(directory: Path, run: Run, t_train_s: float) -> None:

@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from contract.runtime.arguments import add_options, finite, flag_of, given_options, positive
+from contract.runtime.arguments import add_options, finite, given_options, positive
+from contract.runtime.exits import flag_of
 from contract.wire.errors import InputError
 from contract.wire.options import JobOptions, ReconstructionOptions
 

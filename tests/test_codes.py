@@ -1,0 +1,48 @@
+"""docs/codes.md lists every code of a notice and of an error, and no other; each class of error has a code."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import contract.queue.promise
+import contract.store.disk_errors  # noqa: F401
+import worker.daemon.serve  # noqa: F401
+from contract.wire.errors import ErrorCode, IntrasplatError
+from contract.wire.notices import NoticeCode
+from tests.test_repository import REPOSITORY
+
+NOTICES, ERRORS = (REPOSITORY / "docs" / "codes.md").read_text(encoding="utf-8").split("## Errors")
+SOURCES = [path for room in ("contract", "worker", "service") for path in (REPOSITORY / room).rglob("*.py")]
+
+
+def listed(page: str) -> list[str]:
+    return re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)
+
+
+def classes_below(parent: type[IntrasplatError]) -> Iterator[type[IntrasplatError]]:
+    for each in parent.__subclasses__():
+        yield each
+        yield from classes_below(each)
+
+
+def test_every_code_of_a_notice_is_explained_once_and_no_other() -> None:
+    assert sorted(listed(NOTICES)) == sorted(NoticeCode)
+
+
+def test_every_code_of_an_error_is_explained_once_and_no_other() -> None:
+    assert sorted(listed(ERRORS)) == sorted(ErrorCode)
+
+
+def test_every_class_of_error_has_a_code_of_its_own() -> None:
+    ours = [each for each in classes_below(IntrasplatError) if not each.__module__.startswith("tests")]
+    without = [each.__name__ for each in ours if "code" not in vars(each)]
+    assert without == []
+    assert len({each.code for each in ours}) == len(ours)
+
+
+def test_every_notice_is_raised_with_the_severity_that_the_page_names() -> None:
+    text = "\n".join(path.read_text(encoding="utf-8") for path in SOURCES)
+    raised = set(re.findall(r"Notice\.(info|warning)\(\s*NoticeCode\.(\w+)", text))
+    explained = re.findall(r"^\| `(\w+)` \| (info|warning) \|", NOTICES, re.MULTILINE)
+    assert raised == {(severity, code.upper()) for code, severity in explained}
