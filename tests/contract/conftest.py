@@ -80,7 +80,7 @@ def queue(queues: MakeQueue) -> Queue:
 
 
 @pytest.fixture
-def hasty(queues: MakeQueue) -> Queue:
+def short_lease(queues: MakeQueue) -> Queue:
     """A queue whose leases run out at once unless they are renewed."""
     return queues(lease_s=0.02, preempt_after_s=0.0)
 

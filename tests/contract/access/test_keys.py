@@ -84,7 +84,7 @@ def test_a_file_that_is_gone_holds_no_keys(tmp_path: Path) -> None:
         ("a", {KeyScope.VIEW}, "x" * 61, "label"),
     ],
 )
-def test_a_key_that_cannot_be_meant_is_named(
+def test_a_tenant_or_scope_that_is_not_accepted_is_named(
     tmp_path: Path, tenant: str, scopes: set[KeyScope], label: str | None, field: str
 ) -> None:
     with pytest.raises(InputError) as caught:
@@ -101,7 +101,7 @@ def test_a_write_that_was_cut_off_leaves_the_old_keys_and_does_not_block_new_one
     assert [each.tenant for each in KeyFile(tmp_path).list()] == ["a", "b"]
 
 
-def test_others_are_let_in_only_once_there_is_a_key(tmp_path: Path) -> None:
+def test_a_service_that_others_reach_needs_a_key(tmp_path: Path) -> None:
     check_keys(Settings(data_dir=tmp_path))
     abroad = Settings(data_dir=tmp_path, host="0.0.0.0")
     with pytest.raises(UnavailableError, match="intrasplat keys create"):

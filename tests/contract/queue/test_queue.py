@@ -40,7 +40,7 @@ def test_a_job_goes_from_queued_through_running_to_done_and_keeps_what_was_submi
     assert finished.finished_at_s >= finished.started_at_s
 
 
-def test_submitting_the_same_job_twice_queues_it_once_and_answers_how_it_stands(queue: Queue) -> None:
+def test_submitting_the_same_job_twice_queues_it_once_and_answers_with_its_record(queue: Queue) -> None:
     submitted = job()
     queue.submit(submitted)
     assert queue.submit(submitted) == submitted
@@ -276,7 +276,7 @@ def test_the_last_events_of_a_job_are_kept(queue: Queue) -> None:
     assert events[-1].record.progress.iteration == MAX_EVENTS + 4
 
 
-def test_a_job_stands_behind_those_that_will_be_claimed_before_it(queue: Queue) -> None:
+def test_the_position_counts_the_jobs_that_will_be_claimed_before(queue: Queue) -> None:
     first, second = queue.submit(job()), queue.submit(job())
     urgent = queue.submit(job(priority="high"))
     positions = {record.job_id: queue.forecast(record.job_id).position for record in (first, second, urgent)}

@@ -14,7 +14,7 @@ from tests.contract.queues import ERROR, TRAINING, claimed, job, known, state_of
 
 
 def outlast_lease() -> None:
-    """Sleep for longer than the leases of a hasty queue."""
+    """Sleep for longer than the leases of a short_lease queue."""
     time.sleep(0.04)
 
 
@@ -44,27 +44,27 @@ def test_nobody_else_reports_on_a_running_job_or_takes_it(queue: Queue) -> None:
     assert queue.finish(claim)
 
 
-def test_a_job_whose_lease_has_run_out_is_anybodys_and_its_old_worker_changes_nothing(hasty: Queue) -> None:
-    hasty.submit(job())
-    first, stale = claimed(hasty)
+def test_a_job_whose_lease_has_run_out_is_anybodys_and_its_old_worker_changes_nothing(short_lease: Queue) -> None:
+    short_lease.submit(job())
+    first, stale = claimed(short_lease)
     outlast_lease()
-    second, current = claimed(hasty, "worker-2")
+    second, current = claimed(short_lease, "worker-2")
     assert (second.job_id, second.attempt, second.released) == (first.job_id, 2, 0)
-    assert hasty.beat(stale, TRAINING) is Order.LOST
-    assert not hasty.finish(stale)
-    assert not hasty.release(stale)
-    assert hasty.claim("worker-2", 0.0) == second
-    assert hasty.finish(current)
-    assert known(hasty, first.job_id).owner == "worker-2"
+    assert short_lease.beat(stale, TRAINING) is Order.LOST
+    assert not short_lease.finish(stale)
+    assert not short_lease.release(stale)
+    assert short_lease.claim("worker-2", 0.0) == second
+    assert short_lease.finish(current)
+    assert known(short_lease, first.job_id).owner == "worker-2"
 
 
-def test_a_late_beat_keeps_the_job_if_nobody_has_taken_it(hasty: Queue) -> None:
-    hasty.submit(job())
-    record, claim = claimed(hasty)
+def test_a_late_beat_keeps_the_job_if_nobody_has_taken_it(short_lease: Queue) -> None:
+    short_lease.submit(job())
+    record, claim = claimed(short_lease)
     outlast_lease()
-    assert hasty.beat(claim) is Order.GO_ON
-    assert hasty.claim("worker-1", 0.0) == record
-    assert hasty.finish(claim)
+    assert short_lease.beat(claim) is Order.GO_ON
+    assert short_lease.claim("worker-1", 0.0) == record
+    assert short_lease.finish(claim)
 
 
 def test_beats_keep_a_job_for_longer_than_its_lease(queues: MakeQueue) -> None:
@@ -87,12 +87,12 @@ def test_beats_keep_a_job_for_longer_than_its_lease(queues: MakeQueue) -> None:
     assert queue.finish(claim)
 
 
-def test_a_waiting_claim_hears_of_a_new_job_and_of_a_lease_that_runs_out(hasty: Queue) -> None:
-    submitting = threading.Timer(0.1, lambda: hasty.submit(job()))
+def test_a_waiting_claim_hears_of_a_new_job_and_of_a_lease_that_runs_out(short_lease: Queue) -> None:
+    submitting = threading.Timer(0.1, lambda: short_lease.submit(job()))
     submitting.start()
-    first = hasty.claim("worker-1", 10.0)
+    first = short_lease.claim("worker-1", 10.0)
     submitting.join()
-    second = hasty.claim("worker-2", 10.0)
+    second = short_lease.claim("worker-2", 10.0)
     assert first is not None
     assert second is not None
     assert (second.job_id, second.attempt) == (first.job_id, 2)
@@ -124,22 +124,22 @@ def test_a_release_that_is_repeated_counts_once(queue: Queue) -> None:
 
 
 @pytest.mark.parametrize("death", ["reported", "noticed"])
-def test_a_job_whose_workers_all_die_fails_after_the_last_attempt(hasty: Queue, death: str) -> None:
-    hasty.submit(job())
+def test_a_job_whose_workers_all_die_fails_after_the_last_attempt(short_lease: Queue, death: str) -> None:
+    short_lease.submit(job())
     for attempt in range(1, MAX_ATTEMPTS + 1):
-        record, claim = claimed(hasty, f"worker-{attempt}")
+        record, claim = claimed(short_lease, f"worker-{attempt}")
         assert record.attempt == attempt
         if death == "reported":
-            assert hasty.release(claim, died=True)
-            assert hasty.release(claim, died=True)
+            assert short_lease.release(claim, died=True)
+            assert short_lease.release(claim, died=True)
         else:
             outlast_lease()
-    assert hasty.claim("worker-9", 0.0) is None
-    failed = known(hasty, record.job_id)
+    assert short_lease.claim("worker-9", 0.0) is None
+    failed = known(short_lease, record.job_id)
     assert (failed.state, failed.error, failed.attempt) == (JobState.FAILED, worker_died(), MAX_ATTEMPTS)
 
 
-def test_polite_ends_are_not_held_against_a_job_and_deaths_are(queue: Queue) -> None:
+def test_releases_are_not_counted_as_deaths_of_a_job_and_deaths_are(queue: Queue) -> None:
     queue.submit(job())
     for _ in range(2 * MAX_ATTEMPTS):
         record, claim = claimed(queue)
@@ -150,14 +150,14 @@ def test_polite_ends_are_not_held_against_a_job_and_deaths_are(queue: Queue) -> 
     assert state_of(queue, record.job_id) is JobState.FAILED
 
 
-def test_a_cancelled_job_whose_worker_died_ends_as_cancelled_with_the_next_claim(hasty: Queue) -> None:
-    hasty.submit(job())
-    record, claim = claimed(hasty)
-    hasty.cancel(record.job_id)
+def test_a_cancelled_job_whose_worker_died_ends_as_cancelled_with_the_next_claim(short_lease: Queue) -> None:
+    short_lease.submit(job())
+    record, claim = claimed(short_lease)
+    short_lease.cancel(record.job_id)
     outlast_lease()
-    assert hasty.claim("worker-2", 0.0) is None
-    assert state_of(hasty, record.job_id) is JobState.CANCELLED
-    assert hasty.beat(claim) is Order.LOST
+    assert short_lease.claim("worker-2", 0.0) is None
+    assert state_of(short_lease, record.job_id) is JobState.CANCELLED
+    assert short_lease.beat(claim) is Order.LOST
 
 
 # Making way

@@ -327,10 +327,10 @@ def test_the_queue_is_reached_over_tls_by_who_trusts_its_certificate(certificate
     trusting = RedisQueue(f"{address}?ssl_ca_certs={certificates}/cert.pem", preempt_after_s=0.0)
     full_course(trusting)
     trusting.close()
-    doubting = RedisQueue(address)
+    distrusting = RedisQueue(address)
     with pytest.raises(UnavailableError):
-        doubting.ping()
-    doubting.close()
+        distrusting.ping()
+    distrusting.close()
     server.stop()
 
 
