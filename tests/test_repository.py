@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 import pytest
 
-from worker.machine.gpu import NEWEST_TRITON, OLDEST_TRITON, triton_range
+from worker.machine.gpu import MAX_TRITON, MIN_TRITON, triton_range
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("docker/*.md")])
@@ -137,8 +137,8 @@ def test_the_constraint_on_torch_is_the_projects_range() -> None:
 
 
 def test_triton_is_asked_for_in_the_range_that_a_gpu_is_held_to() -> None:
-    after = f"{NEWEST_TRITON[0]}.{NEWEST_TRITON[1] + 1}"
-    wanted = f"triton>={OLDEST_TRITON[0]}.{OLDEST_TRITON[1]},<{after}"
+    after = f"{MAX_TRITON[0]}.{MAX_TRITON[1] + 1}"
+    wanted = f"triton>={MIN_TRITON[0]}.{MIN_TRITON[1]},<{after}"
     extras = project()["optional-dependencies"]
     lines = (REPOSITORY / "constraints.txt").read_text(encoding="utf-8").splitlines()
     asked = [each.split(";")[0] for each in [*extras["gpu"], *extras["dev"], *lines] if each.startswith("triton")]

@@ -18,6 +18,7 @@ from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import GIB, Settings
 from contract.wire.errors import IntrasplatError, UnavailableError
 from contract.wire.names import DeviceName
+from worker.machine.cores import cores
 from worker.machine.gpu import Gpu, find_gpu, triton_range
 
 PACKAGES = (
@@ -92,13 +93,9 @@ def format_findings(findings: list[Finding]) -> str:
 
 
 def _python() -> list[Finding]:
-    found = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {_cores()} cores"
+    found = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {cores()} cores"
     remedy = None if sys.version_info >= MIN_PYTHON else "install Python 3.11 or newer"
     return [Finding("python", found, remedy, blocks=remedy is not None)]
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _packages() -> list[Finding]:
@@ -132,7 +129,7 @@ def device_finding(asked: DeviceName, gpu: Gpu) -> Finding:
         return Finding("device", error.problem, error.remedy, blocks=True)
     if device.kind == "cuda":
         return Finding("device", str(device))
-    found = f"cpu, {_cores()} threads"
+    found = f"cpu, {cores()} threads"
     if asked == "auto" and gpu.name is not None:
         return Finding("device", f"{found} (the {gpu.name} is not used: {gpu.missing})", f"{gpu.remedy}.")
     return Finding("device", f"{found} ({gpu.missing or 'the GPU is not asked for'})")

@@ -39,7 +39,7 @@ MAX_TOLD_CHARACTERS = 150
 
 
 @dataclass(frozen=True)
-class Place:
+class MapCell:
     """All seeds of a condition at a severity by one method; depth_loss_mm and loss_db are means, NaN if unknown.
 
     spread_db is the largest loss less the smallest; 0 for one seed.
@@ -52,10 +52,10 @@ class Place:
     told: str
 
 
-Places = Mapping[tuple[str, int], Place]
+MapCells = Mapping[tuple[str, int], MapCell]
 
 
-def places_of(rows: Sequence[Row], series: str) -> dict[tuple[str, int], Place]:
+def places_of(rows: Sequence[Row], series: str) -> dict[tuple[str, int], MapCell]:
     """The places of a method that have rows, by condition and severity; the clean clips are among them."""
     gathered: dict[tuple[str, int], list[Row]] = {}
     for row in rows:
@@ -69,7 +69,7 @@ def series_in(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(row["series"] for row in rows))
 
 
-def draw_map(places: Places, series: str, folder: Path) -> str:
+def draw_map(places: MapCells, series: str, folder: Path) -> str:
     """stability-SERIES.png and .svg in folder; returns the name without its ending."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -101,7 +101,7 @@ def map_name(series: str) -> str:
     return "stability-" + "".join(each if each.isalnum() or each in "-_" else "-" for each in series)
 
 
-def told_table(places: Places, series: str) -> str:
+def told_table(places: MapCells, series: str) -> str:
     """Markdown: of each condition, how each severity ended, and what the user is told at the highest one measured."""
     lines = [
         f"| {series} | severity 1 | 2 | 3 | 4 | 5 | what the user is told at the highest |",
@@ -116,19 +116,19 @@ def told_table(places: Places, series: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def count_outcomes(places: Places) -> dict[str, int]:
+def count_outcomes(places: MapCells) -> dict[str, int]:
     """How many places ended in each way, the worst first; ways that none ended in are left out."""
     spoilt = [place.outcome for (_, severity), place in places.items() if severity in SEVERITIES]
     return {outcome: spoilt.count(outcome) for outcome in WORST_FIRST if outcome in spoilt}
 
 
-def _place(rows: Sequence[Row]) -> Place:
+def _place(rows: Sequence[Row]) -> MapCell:
     worst = min(rows, key=lambda row: WORST_FIRST.index(row["outcome"]))
     told = worst["error"].partition(": ")[2] or worst["new_warnings"].split(SEPARATOR)[0]
     if len(told) > MAX_TOLD_CHARACTERS:
         told = told[:MAX_TOLD_CHARACTERS].rpartition(" ")[0] + " ..."
     losses_db, depth_losses_mm = _known(rows, "loss_db"), _known(rows, "depth_loss_mm")
-    return Place(
+    return MapCell(
         outcome=worst["outcome"],
         loss_db=float(np.mean(losses_db)) if losses_db else math.nan,
         spread_db=max(losses_db) - min(losses_db) if losses_db else 0.0,
@@ -141,11 +141,11 @@ def _known(rows: Sequence[Row], name: str) -> list[float]:
     return [float(row[name]) for row in rows if row[name]]
 
 
-def _loss(place: Place | None) -> float:
+def _loss(place: MapCell | None) -> float:
     return math.nan if place is None else place.loss_db
 
 
-def _write(axis: Any, column: int, row: int, place: Place | None, level: float) -> None:
+def _write(axis: Any, column: int, row: int, place: MapCell | None, level: float) -> None:
     """A place's figures and mark; hatching where it was not measured. The level stands small in its corner."""
     from matplotlib.patches import Rectangle
 
@@ -167,14 +167,14 @@ def _fill(outcome: str) -> Any:
     return "full" if outcome in ("silent", "crashed") else "none"
 
 
-def _figures(place: Place) -> str:
+def _figures(place: MapCell) -> str:
     if math.isnan(place.loss_db):
         return place.outcome
     harmed_in_depth = place.depth_loss_mm > MAX_DEPTH_LOSS_MM
     return f"{place.loss_db:z.1f}" + (f", {place.depth_loss_mm:.0f} mm" if harmed_in_depth else "")
 
 
-def _in_words(place: Place | None) -> str:
+def _in_words(place: MapCell | None) -> str:
     if place is None:
         return ""
     spread = f" (spread {place.spread_db:.1f})" if place.spread_db else ""
@@ -182,12 +182,12 @@ def _in_words(place: Place | None) -> str:
     return (f"**{place.outcome}**" if place.outcome in ("silent", "crashed") else place.outcome) + figures
 
 
-def _title(places: Places, series: str) -> str:
+def _title(places: MapCells, series: str) -> str:
     counted = ", ".join(f"{number} {outcome}" for outcome, number in count_outcomes(places).items())
     return f"{series}: {counted}\n(harmed: over {MAX_LOSS_DB:g} dB, or over {MAX_DEPTH_LOSS_MM:g} mm of depth)"
 
 
-def _handles(places: Places) -> list[Any]:
+def _handles(places: MapCells) -> list[Any]:
     """The legend: the marks in use."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

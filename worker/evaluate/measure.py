@@ -26,7 +26,7 @@ from contract.wire.report import Report
 from worker.evaluate.cells import Cell, options_of, preset_of
 from worker.evaluate.rows import KEY, NO_RESULT, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
-from worker.evaluate.truth import ShownScene, Truth
+from worker.evaluate.truth import SceneCandidate, Truth
 from worker.input.clip import DepthClip
 from worker.model.metrics import depth_agreement_mm, depth_errors_mm, psnr_tissue, ssim
 from worker.pipeline import reconstruct
@@ -127,7 +127,7 @@ class Bench:
             unused = {*report.held_out, *report.repeated}
             train = [frame for frame in range(report.frame_count) if frame not in unused]
             self._truth[place] = Truth(opened.phantom, opened.clip, train, report.held_out)
-        return dataclasses.asdict(self._truth[place].score(ShownScene(scene)))
+        return dataclasses.asdict(self._truth[place].score(SceneCandidate(scene)))
 
 
 class _OnTheWay:

@@ -118,7 +118,7 @@ def plan(
 
 
 @dataclass
-class Atlas:
+class StabilityBench:
     """The rows of a folder, each kept as soon as its cell is measured."""
 
     folder: Path
@@ -160,7 +160,7 @@ def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: TrainingH
     """The row of a cell, without its verdict and origin; a failure's row says why in `error`.
 
     Raises:
-        Cancelled, UnavailableError: as Atlas.measure.
+        Cancelled, UnavailableError: as StabilityBench.measure.
     """
     condition = CONDITIONS.get(cell.condition)
     row = dict(zip(KEY, cell.key(grid), strict=True)) | {name: "" for name in FIELDS if name not in KEY}

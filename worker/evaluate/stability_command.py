@@ -16,7 +16,7 @@ from contract.wire.job import JobProgress
 from worker.evaluate.atlas import count_outcomes, draw_map, places_of, series_in, told_table
 from worker.evaluate.conditions import CONDITIONS, SEVERITIES
 from worker.evaluate.rows import Row, adding_alone, read_rows
-from worker.evaluate.stability import STABILITY, Atlas, Grid, StabilityCell, plan
+from worker.evaluate.stability import STABILITY, Grid, StabilityBench, StabilityCell, plan
 from worker.train.hooks import TrainingHooks
 
 DEFAULT_SERIES = ("fast", "paper", "pfs", "hexplane", "without_mapf")
@@ -62,7 +62,7 @@ def run_cli(options: argparse.Namespace) -> int:
         width, height = options.size
         cells = plan(options.conditions, options.severities, options.series, range(options.seeds))
         with adding_alone(out):
-            atlas = Atlas(out, Grid(width, height, options.frames, options.iterations))
+            atlas = StabilityBench(out, Grid(width, height, options.frames, options.iterations))
             waiting = atlas.missing(cells)
             print(f"{len(cells)} cells, {len(cells) - len(waiting)} of them have their rows already")
             measure_all(atlas, waiting)
@@ -73,8 +73,8 @@ def run_cli(options: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
-def measure_all(atlas: Atlas, cells: Sequence[StabilityCell]) -> None:
-    """Measure each cell and keep its row at once. Raises Cancelled after SIGINT or SIGTERM, and as Atlas.measure."""
+def measure_all(atlas: StabilityBench, cells: Sequence[StabilityCell]) -> None:
+    """Measure each cell and keep its row at once. Raises Cancelled after a signal, and as measure."""
     with heeding_signals() as end:
         for place, cell in enumerate(cells):
             with ProgressBar(sys.stderr) as bar:

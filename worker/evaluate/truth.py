@@ -2,7 +2,7 @@
 
 Symbols: T frames, H W pixels, M material points of frame 0.
 
-Whatever is judged is a Shown: a scene, or the phantom itself, which scores as well as anything can.
+Whatever is judged is a Candidate: a scene, or the phantom itself, which scores as well as anything can.
 
 view   a held-out frame's moment from a pose 10 or 15 degrees off, to the right, up, left or down, about the point at
        median depth on frame 0's axis (contract/wire/pose.py). Judged are the pixels whose material point some training
@@ -57,7 +57,7 @@ SEEN_CELL_TEXELS = 4
 three pixels wide, and in all squares about it."""
 
 
-class Shown(Protocol):
+class Candidate(Protocol):
     """What can be judged against the truth."""
 
     def view(self, frame: int, pose: Pose) -> RenderedFrame:
@@ -112,12 +112,14 @@ class Truth:
         self._hidden = [self._behind_instrument(frame) for frame in self._judged_frames]
         self._bounds_db = [_mean_psnr([each.baked for each in views], views) for views in self._views.values()]
 
-    def score(self, shown: Shown) -> TruthScores:
-        """How near the shown is to the truth."""
-        views = {angle: [shown.view(each.frame, each.pose).rgb for each in self._views[angle]] for angle in ANGLES_DEG}
-        hidden = [shown.view(each.frame, each.pose).rgb for each in self._hidden]
+    def score(self, candidate: Candidate) -> TruthScores:
+        """How near the candidate is to the truth."""
+        views = {
+            angle: [candidate.view(each.frame, each.pose).rgb for each in self._views[angle]] for angle in ANGLES_DEG
+        }
+        hidden = [candidate.view(each.frame, each.pose).rgb for each in self._hidden]
         at10, at15 = ((views[angle], self._views[angle]) for angle in ANGLES_DEG)
-        error_mm, moving_error_mm, moving_mm = self._motion(shown)
+        error_mm, moving_error_mm, moving_mm = self._motion(candidate)
         return TruthScores(
             psnr_view10_db=_mean_psnr(*at10),
             psnr_view15_db=_mean_psnr(*at15),
@@ -126,7 +128,7 @@ class Truth:
             bound10_db=self._bounds_db[0],
             bound15_db=self._bounds_db[1],
             psnr_hidden_db=_mean_psnr(hidden, self._hidden),
-            depth_error_mm=self._depth(shown),
+            depth_error_mm=self._depth(candidate),
             motion_error_mm=error_mm,
             moving_error_mm=moving_error_mm,
             moving_mm=moving_mm,
@@ -151,14 +153,14 @@ class Truth:
         row, column, shows = _cells(self._phantom.atlas_xy(frame, pose))
         return shows & self._seen[row, column]
 
-    def _depth(self, shown: Shown) -> float:
+    def _depth(self, candidate: Candidate) -> float:
         errors = []
         for frame in self._judged_frames:
-            view = shown.view(frame, self._phantom.world_from_camera(frame))
+            view = candidate.view(frame, self._phantom.world_from_camera(frame))
             errors.append(depth_errors_mm(view.depth_mm, self._clip.depth_mm[frame], self._clip.tissue[frame]))
         return depth_agreement_mm(errors)
 
-    def _motion(self, shown: Shown) -> tuple[float, float, float]:
+    def _motion(self, candidate: Candidate) -> tuple[float, float, float]:
         """Medians in mm: end-point error of all, of what moves, and how far that has moved."""
         row, column = self._tracks.pixels.T
         tissue = self._clip.tissue[0][row, column]
@@ -166,7 +168,7 @@ class Truth:
         errors, moves = [np.empty(0)], [np.empty(0)]
         for frame in self._judged_frames:
             truth_mm = points_mm[frame] - points_mm[0]
-            distance = np.linalg.norm(shown.motion_mm(frame)[row, column] - truth_mm, axis=1)
+            distance = np.linalg.norm(candidate.motion_mm(frame)[row, column] - truth_mm, axis=1)
             shows = np.isfinite(distance)
             errors.append(distance[shows])
             moves.append(np.linalg.norm(truth_mm[shows], axis=1))
@@ -175,7 +177,7 @@ class Truth:
         return _median(error_mm), _median(error_mm[moving]), _median(moved_mm[moving])
 
 
-class ShownScene:
+class SceneCandidate:
     """A stored scene as it is rendered."""
 
     def __init__(self, scene: Scene) -> None:

@@ -1,1 +1,4 @@
-"""What this machine offers: its GPU, its cores, the cache of compiled kernels; and how a stage reports its progress."""
+"""What this machine offers (GPU, cores, OpenCV, the cache of compiled kernels), clocks, and the hooks of a stage.
+
+Verbs: gpu.find_gpu, Hooks.report_stage, Timings.measure.
+"""

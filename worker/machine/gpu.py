@@ -11,8 +11,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from shutil import which
 
-OLDEST_TRITON, NEWEST_TRITON = (3, 6), (3, 9)
-"""Major and minor numbers between which the kernels were tried; pyproject.toml asks for the same."""
+MIN_TRITON, MAX_TRITON = (3, 6), (3, 9)
+"""Major and minor numbers of the versions that the kernels were tested with; pyproject.toml asks for the same."""
 
 TRITON_PACKAGES = ("triton", "pytorch-triton")
 """Names under which Triton is installed; the second comes with builds of torch that are no release."""
@@ -56,7 +56,7 @@ class Gpu:
             yield "torch sees no NVIDIA GPU", f"See whether `nvidia-smi` lists the GPU, and {driver}"
         if self.triton is None:
             yield "Triton is not installed", "Install Triton (in a checkout: `.venv/bin/pip install '.[gpu]'`)"
-        elif not OLDEST_TRITON <= _numbers(self.triton) <= NEWEST_TRITON:
+        elif not MIN_TRITON <= _numbers(self.triton) <= MAX_TRITON:
             remedy = "Install a torch that brings one of those, and do not change Triton alone"
             remedy += f" (`make clean`, then {CUDA_SETUP})"
             yield f"Triton is {self.triton}, where {triton_range()} are supported", remedy
@@ -69,7 +69,7 @@ class Gpu:
 
 def triton_range() -> str:
     """The supported versions of Triton, in words."""
-    oldest, newest = (".".join(map(str, numbers)) for numbers in (OLDEST_TRITON, NEWEST_TRITON))
+    oldest, newest = (".".join(map(str, numbers)) for numbers in (MIN_TRITON, MAX_TRITON))
     return f"{oldest} to {newest}"
 
 

@@ -13,11 +13,6 @@ STDERR = 2
 """Its file descriptor, to which libraries write."""
 
 
-def cores() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-
-
 @contextmanager
 def one_opencv_thread() -> Iterator[None]:
     """Within it OpenCV does not split its loops; the former setting, which is the whole process's, comes back after.

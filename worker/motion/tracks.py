@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from worker.input.camera import unproject
 from worker.input.clip import DepthClip
-from worker.machine.opencv import cores, one_opencv_thread
+from worker.machine.cores import cores
+from worker.machine.opencv import one_opencv_thread
 
 Floats = NDArray[np.float32]
 Moved = Callable[[int, NDArray[np.intp]], Floats]

@@ -6,6 +6,7 @@ N Gaussians, H W pixels. Scenes keep their kernels' buffers between frames, so t
 from __future__ import annotations
 
 import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass
 from threading import Lock
 
@@ -25,12 +26,12 @@ from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_dept
 POSE_FALL_OFF = 0.25
 """Distance from the nearest trained pose, in median depths, at which confidence has fallen to exp(-1/2): 14 degrees."""
 FAR_POSE = 0.35
-"""In the same unit: from here on the frame carries a warning, for it shows sides the clip never saw."""
-LOW_CONFIDENCE, MANY = 0.3, 0.1
-"""A frame warns when this share of its pixels lies below this confidence."""
+"""In the same unit: beyond it the frame carries a warning, because it shows sides that the clip never saw."""
+LOW_CONFIDENCE, MAX_LOW_SHARE = 0.3, 0.1
+"""A frame warns when more than this share of its pixels lies below this confidence."""
 HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
 ROUNDING = 1e-6
-"""Model time by which t may exceed the last frame's without a warning: i / T need not survive a decimal fraction."""
+"""Model time by which t may exceed the last frame's without a warning: a decimal fraction may round i / T."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +111,6 @@ def render_frame(
     """The scene at model time t (held within the clip) from a pose (mm; None: the endoscope's) through a camera."""
     last = (scene.frame_count - 1) / scene.frame_count
     shown = min(max(t, 0.0), last)
-    warnings = []
-    if not 0.0 <= t <= last + ROUNDING:
-        warnings.append(
-            Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, f"t = {t:g} lies outside the clip; t = {shown:.4g} is shown.")
-        )
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
     image, seen = renderer_of(scene, device).layers(shown, pose, intrinsics or scene.intrinsics)
     alpha = image[4]
@@ -123,17 +119,23 @@ def render_frame(
     distance = _distance_from_trained(scene, pose)
     fall_off = float(np.exp(-0.5 * (distance / POSE_FALL_OFF) ** 2))
     confidence = np.where(solid, np.clip(seen / np.where(solid, alpha, 1) * fall_off, 0, 1), 0).astype(np.float32)
-    if distance > FAR_POSE:
-        warnings.append(
-            Notice.warning(
-                NoticeCode.POSE_FAR,
-                f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess.",
-            )
-        )
-    if (confidence < LOW_CONFIDENCE).mean() > MANY:
-        warnings.append(Notice.warning(NoticeCode.HARDLY_SEEN, HARDLY_SEEN))
     rgb = np.clip(image[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255).astype(np.uint8)
-    return Frame(rgb, depth_mm, confidence, tuple(warnings))
+    in_clip = 0.0 <= t <= last + ROUNDING
+    warnings = () if in_clip else (_warning_of_time(t, shown),)
+    return Frame(rgb, depth_mm, confidence, (*warnings, *_warnings_of_pose(distance, confidence)))
+
+
+def _warning_of_time(t: float, shown: float) -> Notice:
+    text = f"t = {t:g} lies outside the clip; t = {shown:.4g} is shown."
+    return Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, text)
+
+
+def _warnings_of_pose(distance: float, confidence: NDArray[np.float32]) -> Iterator[Notice]:
+    if distance > FAR_POSE:
+        text = f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess."
+        yield Notice.warning(NoticeCode.POSE_FAR, text)
+    if (confidence < LOW_CONFIDENCE).mean() > MAX_LOW_SHARE:
+        yield Notice.warning(NoticeCode.HARDLY_SEEN, HARDLY_SEEN)
 
 
 def _distance_from_trained(scene: Scene, pose: NDArray[np.float64]) -> float:

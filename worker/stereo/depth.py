@@ -17,8 +17,9 @@ from contract.wire.errors import Cancelled, InputError
 from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip
+from worker.machine.cores import cores
 from worker.machine.hooks import Hooks, Progress
-from worker.machine.opencv import cores, one_opencv_thread
+from worker.machine.opencv import one_opencv_thread
 from worker.stereo.alignment import (
     RowShift,
     agreed_disparities,

@@ -1,4 +1,5 @@
-"""A clip with depth in, a trained run out.
+"""A clip with depth in; a trained run out, and its scene in whole numbers.
 
-Verbs: prepare.prepare builds a run, loop.train is the only training loop, resume.resume continues a stopped run.
+Verbs: prepare.prepare builds a run from a Setup, loop.train is the only training loop, resume.resume continues a
+stopped run, rate_distortion.quantize_scene chooses how coarse a scene may be stored.
 """

@@ -20,8 +20,8 @@ from worker.evaluate.stability import (
     KEY,
     SEPARATOR,
     STABILITY,
-    Atlas,
     Grid,
+    StabilityBench,
     StabilityCell,
     failure,
     measured,
@@ -133,7 +133,7 @@ def test_the_plan_puts_each_clean_clip_before_what_is_compared_with_it() -> None
 
 def test_a_few_cells_are_measured_judged_kept_and_not_measured_again(tmp_path: Path) -> None:
     cells = plan(["smoke", "few_frames"], [5], ["fast"], [0])
-    atlas = Atlas(tmp_path, SMALL)
+    atlas = StabilityBench(tmp_path, SMALL)
     assert atlas.missing(cells) == cells
     found = {cell.condition: atlas.measure(cell, TrainingHooks()) for cell in cells[:2]}
     assert found[CLEAN]["outcome"] == "held"
@@ -141,7 +141,7 @@ def test_a_few_cells_are_measured_judged_kept_and_not_measured_again(tmp_path: P
     assert found["smoke"]["outcome"] == "told"
     assert float(found["smoke"]["loss_db"]) > 3
     assert "smoke" in found["smoke"]["new_warnings"]
-    again = Atlas(tmp_path, SMALL)
+    again = StabilityBench(tmp_path, SMALL)
     assert again.missing(cells) == cells[2:]
     few = again.measure(cells[2], TrainingHooks())
     assert few["outcome"] in ("held", "told")
@@ -149,7 +149,7 @@ def test_a_few_cells_are_measured_judged_kept_and_not_measured_again(tmp_path: P
     assert "Only 1 frames" in few["warnings"]
     kept = read_rows(tmp_path / STABILITY)
     assert [tuple(each[name] for name in KEY) for each in kept] == [cell.key(SMALL) for cell in cells]
-    assert Atlas(tmp_path, Grid(96, 80, 12, 16)).missing(cells) == cells
+    assert StabilityBench(tmp_path, Grid(96, 80, 12, 16)).missing(cells) == cells
 
 
 def test_a_recording_is_read_as_any_other_and_its_checks_speak() -> None:
@@ -161,7 +161,7 @@ def test_a_recording_is_read_as_any_other_and_its_checks_speak() -> None:
 
 
 def test_a_cell_that_is_interrupted_leaves_no_row(tmp_path: Path) -> None:
-    atlas = Atlas(tmp_path, SMALL)
+    atlas = StabilityBench(tmp_path, SMALL)
     with pytest.raises(Cancelled):
         atlas.measure(StabilityCell(CLEAN, 0, "fast", 0), TrainingHooks(should_stop=lambda: True))
     assert not (tmp_path / STABILITY).exists()
@@ -171,7 +171,7 @@ def test_what_this_machine_lacks_ends_measuring_and_is_no_row(tmp_path: Path) ->
     def fail(_: Progress) -> None:
         raise UnavailableError("The disk is full.", "Make room.")
 
-    atlas = Atlas(tmp_path, SMALL)
+    atlas = StabilityBench(tmp_path, SMALL)
     with pytest.raises(UnavailableError, match="The disk is full"):
         atlas.measure(StabilityCell(CLEAN, 0, "fast", 0), TrainingHooks(on_progress=fail))
     assert not (tmp_path / STABILITY).exists()

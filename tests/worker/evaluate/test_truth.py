@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from worker.evaluate.truth import MOVING_MM, ShownScene, Truth
+from worker.evaluate.truth import MOVING_MM, SceneCandidate, Truth
 from worker.input.clip import DepthClip
 from worker.model.deformation import SharedBasis
 from worker.model.gaussians import initial_gaussians
@@ -99,7 +99,7 @@ def test_highlights_alone_keep_a_perfect_shape_below_perfection() -> None:
 
 def test_a_model_that_follows_the_truth_has_hardly_an_error_of_motion() -> None:
     phantom, clip, truth = made()
-    scores = truth.score(ShownScene(painted_scene(phantom, clip, follows=True)))
+    scores = truth.score(SceneCandidate(painted_scene(phantom, clip, follows=True)))
     assert scores.moving_error_mm < 0.1 * scores.moving_mm
     assert scores.motion_error_mm < 0.1
     assert scores.depth_error_mm < 1.0, "a pixel is as wide"
@@ -107,7 +107,7 @@ def test_a_model_that_follows_the_truth_has_hardly_an_error_of_motion() -> None:
 
 def test_a_model_that_stays_errs_by_the_motion_itself() -> None:
     phantom, clip, truth = made()
-    scores = truth.score(ShownScene(painted_scene(phantom, clip, follows=False)))
+    scores = truth.score(SceneCandidate(painted_scene(phantom, clip, follows=False)))
     assert scores.moving_error_mm == pytest.approx(scores.moving_mm)
     assert scores.psnr_view10_db < BEST_PSNR_DB
 
