@@ -16,9 +16,9 @@ from tests.worker.input.clip import toy_layout
 from worker.input.clip import DepthClip, layouts, open_clip
 from worker.input.clip.layouts import LAYOUTS, register_layout, registered_files
 from worker.input.decode import decode_clip
-from worker.machine.hooks import Hooks
 from worker.pipeline import reconstruct
 from worker.scene.checkpoint import load_scene
+from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
 
 TOY = Path(toy_layout.__file__)
@@ -60,7 +60,7 @@ def test_the_decoding_process_knows_layouts_from_outside(toy: Path) -> None:
 
 def test_a_clip_in_a_layout_from_outside_becomes_a_scene(toy: Path, tmp_path: Path) -> None:
     request = ReconstructionRequest(toy, in_layout(ReconstructionOptions(iterations=3), "toy"))
-    report = reconstruct(request, tmp_path / "scene", Hooks())
+    report = reconstruct(request, tmp_path / "scene", TrainingHooks())
     assert load_scene(tmp_path / "scene").intrinsics == plane_clip().intrinsics
     assert report.iterations == 3
 
