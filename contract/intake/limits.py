@@ -1,4 +1,4 @@
-"""How large a clip may be, to the service that takes it in and the worker that reads it.
+"""How large a clip may be: the service checks it at upload, the worker while decoding.
 
 A 166 kB file can decode to 18 GB, so sizes are checked in the header and again while decoding.
 """
@@ -15,48 +15,48 @@ from contract.wire.errors import LimitError
 if TYPE_CHECKING:
     from contract.runtime.settings import Settings
 
-MIN_SIDE_PX = 16  # below this neither stereo matching nor a tile of the rasteriser has anything to work on
+MIN_SIDE_PX = 16  # stereo matching and the rasteriser's tiles need as much
 
 HELD_BYTES_PER_PIXEL = 18
-"""Memory that a pixel of one eye takes in every frame while a clip is reconstructed.
+"""Memory of a pixel of one eye in every frame while a clip is reconstructed.
 
 9 in the DepthClip (rgb 3, depth_mm 4, depth_confidence 1, tissue 1), 8 in the training frames made from it (rgb 3,
 weight 1, inverse depth 4), and 1 for their padding; before these exist, masks and the grey right eye take less.
 """
 
-MAX_MEMORY_BYTES = 8 * 1024**3  # a clip may take, however much there is: more frames than this train for too long
-MEMORY_SHARE = 2  # a clip may take one part in this many of the machine's memory; the model and its gradients need room
+MAX_MEMORY_BYTES = 8 * 1024**3  # of a clip, on any machine: more frames would train for too long
+MEMORY_PARTS = 2  # a clip gets one of this many parts of the machine's memory; the rest is for the model
 
 EYES = 2  # of a stereo clip; the largest picture accepted holds both
 
-MAX_POSES_BYTES = 1 << 16, 1024  # of poses_bounds.npy: its header, and a frame's 17 numbers with ample room
-MAX_CALIBRATION_BYTES = 1_000_000  # a calibration has a few kB; anything larger is another file
-MAX_IMAGE_BYTES = 1 << 20, 8  # of a PNG or JPEG: its metadata, and a pixel of 16-bit RGBA stored uncompressed
+MAX_POSES_BYTES = 1 << 16, 1024  # of poses_bounds.npy: its header, and each frame's 17 numbers
+MAX_CALIBRATION_BYTES = 1_000_000  # a calibration has a few kB
+MAX_IMAGE_BYTES = 1 << 20, 8  # of a PNG or JPEG: its metadata, and each pixel as uncompressed 16-bit RGBA
 
 
 def memory_for_clip_bytes() -> int:
-    """What a clip may take of this machine's memory: half of it, at most 8 GiB."""
+    """Memory that a clip may take on this machine: half of its memory, at most 8 GiB."""
     try:
         memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):  # not every system tells
         return MAX_MEMORY_BYTES
-    return min(MAX_MEMORY_BYTES, memory_bytes // MEMORY_SHARE) if memory_bytes > 0 else MAX_MEMORY_BYTES
+    return min(MAX_MEMORY_BYTES, memory_bytes // MEMORY_PARTS) if memory_bytes > 0 else MAX_MEMORY_BYTES
 
 
 def _ignore() -> None:
-    """What is done after each picture by default."""
+    """Do nothing."""
 
 
 @dataclass(frozen=True)
 class ClipLimits:
-    """What this machine accepts.
+    """Limits of the clips that this machine accepts.
 
     frames            frames of a clip
-    duration_s        seconds that a clip lasts, by its frame times
+    duration_s        duration by the frame times
     pixels_per_frame  pixels of one recorded picture (both eyes when they share it); default: two eyes of 3840x2160
     decoded_bytes     memory of the whole clip while it is reconstructed (HELD_BYTES_PER_PIXEL), and bytes of everything
                       in an archive once inflated; default: half of this machine's memory, at most 8 GiB
-    on_picture        called after each picture that is decoded, from any thread: whoever waits knows that it goes on
+    on_picture        called after each decoded picture, from any thread, as a sign of progress
     """
 
     frames: int = 1000
@@ -67,22 +67,22 @@ class ClipLimits:
 
     @classmethod
     def of(cls, settings: Settings) -> ClipLimits:
-        """Those of an installation; its limit on one eye's pixels allows a picture of two."""
+        """The limits of an installation. A picture may hold two eyes of max_frame_pixels."""
         return cls(settings.max_frames, settings.max_clip_s, EYES * settings.max_frame_pixels)
 
     def numbers(self) -> dict[str, float]:
-        """The limits by their names, as another process may be told them."""
+        """The limits by their names, for another process."""
         return {name: getattr(self, name) for name in ("frames", "duration_s", "pixels_per_frame", "decoded_bytes")}
 
     def check_duration(self, field: str, label: str, duration_s: float) -> None:
-        """LimitError unless a clip may last so long."""
+        """LimitError if a clip lasts too long."""
         if duration_s > self.duration_s:
             raise LimitError(
                 field, f"{label} lasts {duration_s:.1f} s; the limit is {self.duration_s:g} s.", "Cut a shorter clip."
             )
 
     def check_frame(self, field: str, label: str, width: int, height: int) -> None:
-        """LimitError unless a picture of width x height pixels is acceptable."""
+        """LimitError if a picture of width x height pixels is too small or too large."""
         if width < MIN_SIDE_PX or height < MIN_SIDE_PX:
             raise LimitError(
                 field,
@@ -97,9 +97,9 @@ class ClipLimits:
             )
 
     def check_clip(self, field: str, label: str, frames: int, width: int, height: int, eyes: int = 2) -> None:
-        """LimitError unless `frames` pictures of width x height pixels are acceptable.
+        """LimitError if `frames` pictures of width x height pixels are too many or too large.
 
-        eyes is how many share a picture, of which one is held; 2 where that is not known yet.
+        eyes: number of eyes in a picture, of which one is kept in memory; 2 if it is not known yet.
         """
         if frames > self.frames:
             raise LimitError(

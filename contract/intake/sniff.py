@@ -1,6 +1,6 @@
-"""A first look at files from outside, without any decoder: what cannot be a clip is refused where it arrives.
+"""A first check of uploaded files, without a decoder: what cannot be a clip is refused on arrival.
 
-Everything here reads a few bytes by rules of its own. What passes is still read by a process that has nothing else.
+It reads only a few bytes. The files that pass are decoded in a confined process (worker/input/decode/).
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ _NPY_MAGIC = b"\x93NUMPY"
 _MATROSKA_SUFFIXES = frozenset({".mkv", ".webm"})
 _IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 _HEAD_BYTES = 32  # holds a PNG's size
-_NPY_HEAD_BYTES = 4096  # NumPy writes 128; larger headers are only good for attacks on what parses them
+_NPY_HEAD_BYTES = 4096  # NumPy writes 128; larger headers may attack their parser
 _PLAIN_TEXT_REMEDY = "Give numbers only: our JSON, OpenCV YAML or XML, or StereoMIS ini."
 _ACTIVE_TEXT = {"<!entity": "declares XML entities", "<!doctype": "has an XML document type", "!!python": "names code"}
 
 
 def check_file(path: Path, part: str, limits: ClipLimits) -> None:
-    """Look at one part of an upload; its name's ending is what the sender says it is.
+    """Check one part of an upload. The sender declares its kind by the ending of its name.
 
     Raises:
-        InputError: it is something else, damaged, or holds what no clip needs; its field is the part.
-        LimitError: it says of itself that it is larger than accepted.
+        InputError: it is of another kind, damaged, or holds what no clip needs; its field is the part.
+        LimitError: its header declares more than is accepted.
     """
     if path.stat().st_size == 0:
         raise InputError(part, f"{path.name} is empty (0 bytes).", "Send the file again.")
@@ -44,14 +44,14 @@ def check_file(path: Path, part: str, limits: ClipLimits) -> None:
 
 
 def png_size(head: bytes) -> tuple[int, int] | None:
-    """(width, height) that a PNG's first 24 bytes tell; None when it is no PNG."""
+    """(width, height) in a PNG's first 24 bytes; None if it is no PNG."""
     if not head.startswith(PNG_MAGIC) or len(head) < 24:
         return None
     return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
 
 
 def check_calibration_text(text: str, field: str, label: str) -> None:
-    """InputError for text that wants more of its reader than to be read: entities, document types, code."""
+    """InputError for text with active content: XML entities, document types, code."""
     small = text.lower()
     for sign, problem in _ACTIVE_TEXT.items():
         if sign in small:
@@ -73,7 +73,7 @@ def _text_of(path: Path, part: str) -> str:
 
 
 def _check_ending(path: Path, part: str) -> None:
-    """InputError when a file of one kind bears the ending of another."""
+    """InputError if the file's content and its ending disagree."""
     with path.open("rb") as file:
         head = file.read(12)
     found = "a zip" if head.startswith(b"PK") else "a Matroska or WebM file" if head.startswith(EBML) else None
@@ -85,7 +85,7 @@ def _check_ending(path: Path, part: str) -> None:
 
 
 def _check_zip(path: Path, part: str, limits: ClipLimits) -> None:
-    """Every member by its name, its sizes, and its first bytes."""
+    """Check every member by its name, its sizes and its first bytes."""
     if not zipfile.is_zipfile(path):
         raise InputError(part, f"{path.name} is not a zip, or was cut short.", "Zip the files again.")
     archive, members = open_zip(path, part, path.name, limits)
@@ -117,12 +117,12 @@ def _check_image(head: bytes, name: str, part: str, limits: ClipLimits) -> None:
 
 
 def _is_litter(name: str) -> bool:
-    """Whether file managers left it; the worker leaves such files out."""
+    """Whether it is a file manager's own file, which the worker ignores."""
     return "__MACOSX" in name or PurePosixPath(name).name.startswith(".")
 
 
 def _check_npy(head: bytes, name: str, part: str) -> None:
-    """InputError for an array of pickled objects, which run code when they are loaded, or with an odd header."""
+    """InputError for an array with an odd header or of pickled objects, which run code when they are loaded."""
     if _is_litter(name):
         return
     header_bytes = int.from_bytes(head[8:10] if head[6:7] == b"\1" else head[8:12], "little")

@@ -1,7 +1,7 @@
-"""What a video says of itself, read without a decoder: which codec, how large, how long.
+"""Codec, size and duration in a video's header, read without a decoder.
 
-ISO base media (mp4, mov; ISO/IEC 14496-12) is a tree of boxes, Matroska and WebM (RFC 9559) a tree of elements. What is
-not found here is not refused: a decoder that is forced by name, in a process of its own, has the last word.
+ISO base media (mp4, mov; ISO/IEC 14496-12) is a tree of boxes, Matroska and WebM (RFC 9559) a tree of elements. A video
+whose header does not tell is not refused here: the decoder in its confined process decides.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import BinaryIO
 from contract.intake.limits import ClipLimits
 from contract.wire.errors import InputError
 
-CODECS: dict[str, tuple[bytes, ...]] = {  # that are accepted: how containers name them
+CODECS: dict[str, tuple[bytes, ...]] = {  # accepted codecs, as containers name them
     "h264": (b"avc1", b"avc2", b"avc3", b"avc4", b"h264", b"H264", b"dva1", b"dvav", b"V_MPEG4/ISO/AVC"),
     "hevc": (b"hvc1", b"hvc2", b"hev1", b"dvh1", b"dvhe", b"V_MPEGH/ISO/HEVC"),
     "vp9": (b"vp09", b"VP90", b"V_VP9"),
 }
-OTHER_CODECS = {  # that people are likely to bring, by their names
+OTHER_CODECS = {  # codecs that users are likely to bring, with names for errors
     b"av01": "AV1",
     b"V_AV1": "AV1",
     b"V_VP8": "VP8",
@@ -39,8 +39,8 @@ REMEDY = "Give H.264, HEVC or VP9 video in mp4, mov, mkv or webm."
 
 EBML = b"\x1aE\xdf\xa3"  # first bytes of Matroska and WebM
 _FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
-_MAX_HEADER_BYTES = 32 << 20  # of moov, or of what stands before Matroska's first pictures; 1000 frames take some kB
-_MAX_PARTS = 10_000  # boxes or elements looked at
+_MAX_HEADER_BYTES = 32 << 20  # of moov, or before Matroska's first pictures; 1000 frames take some kB
+_MAX_PARTS = 10_000  # boxes or elements read
 _ACCEPTED = frozenset(name for names in CODECS.values() for name in names)
 
 _SEGMENT, _INFO, _TRACKS, _CLUSTER = 0x18538067, 0x1549A966, 0x1654AE6B, 0x1F43B675
@@ -51,7 +51,7 @@ _VIDEO_TYPE = 1
 
 @dataclass(frozen=True)
 class VideoTrack:
-    """A video track; numbers are 0 where the header does not say. shown is the size that it asks players for."""
+    """A video track. Numbers are 0 if the header has none; `shown` is the display size."""
 
     codec: bytes
     width: int = 0
@@ -62,22 +62,22 @@ class VideoTrack:
 
 
 def is_video(head: bytes) -> bool:
-    """Whether a file that begins so is ISO base media, whose first box is named at byte 4, or Matroska."""
+    """Whether a file with these first bytes is ISO base media (its first box is named at byte 4) or Matroska."""
     return head[4:8] in _FIRST_BOXES or head.startswith(EBML)
 
 
 def is_matroska(path: Path) -> bool:
-    """Whether it is Matroska or WebM."""
+    """Whether the file is Matroska or WebM."""
     with path.open("rb") as file:
         return file.read(4) == EBML
 
 
 def check_video(path: Path, field: str, label: str, limits: ClipLimits) -> VideoTrack:
-    """The track to decode; a file that no decoder needs to see is refused.
+    """The track to decode. Files that need no decoder to be refused are refused here.
 
     Raises:
-        InputError: it is no video, has no header, or its codec is none that is accepted.
-        LimitError: it says that it is too large, has too many frames, or lasts too long.
+        InputError: it is no video, has no header, or its codec is not accepted.
+        LimitError: by its header it is too large, too long, or has too many frames.
     """
     with path.open("rb") as file:
         if not is_video(file.read(12)):
@@ -195,7 +195,7 @@ def _shown(trak: bytes) -> tuple[int, int]:
 
 
 def _samples(trak: bytes) -> int:
-    """Frames, as the table of their sizes counts them; 0 in fragmented files, whose fragments hold the tables."""
+    """Frames in the table of sample sizes; 0 in fragmented files, whose fragments hold the tables."""
     table = _inside(trak, b"mdia", b"minf", b"stbl", b"stsz") or _inside(trak, b"mdia", b"minf", b"stbl", b"stz2")
     return 0 if table is None else int(struct.unpack_from(">I", table, 8)[0])
 
@@ -211,7 +211,7 @@ def _duration_s(trak: bytes) -> float:
 
 
 def _matroska_tracks(file: BinaryIO, file_bytes: int) -> list[VideoTrack]:
-    """Up to the first pictures: a file whose tracks come later is one for the decoder to judge."""
+    """The tracks described before the first pictures. ValueError if there are none."""
     data = file.read(min(file_bytes, _MAX_HEADER_BYTES))
     tracks: list[VideoTrack] = []
     duration_s = 0.0
@@ -267,9 +267,9 @@ def _elements(data: bytes) -> Iterator[tuple[int, bytes]]:
     raise ValueError(f"it has more than {_MAX_PARTS} elements in one")
 
 
-def _length_of_number(first: int, most: int) -> int:
-    """Bytes of a number, told by the leading zeros of its first byte."""
+def _length_of_number(first: int, max_length: int) -> int:
+    """Bytes of a number, by the leading zeros of its first byte."""
     length = 9 - first.bit_length()
-    if length > most:
+    if length > max_length:
         raise ValueError("an element's size or name is none")
     return length

@@ -1,7 +1,7 @@
-"""Zips from strangers: what their directory says is judged before anything in them is inflated.
+"""Untrusted zips: their directory is checked before any member is inflated.
 
-Refused is what could reach outside (absolute paths, "..", links), hide its content (encryption, nested archives,
-duplicates, overlaps), or outgrow the limits. The judges are the service, when a zip arrives, and the worker.
+Members are refused that could reach outside (absolute paths, "..", links), hide their content (encryption, nested
+archives, duplicates, overlaps), or exceed the limits. The service checks a zip at upload, and the worker once more.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from contract.wire.errors import InputError, LimitError
 
 ARCHIVE_SUFFIXES = frozenset({".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar", ".jar"})
 MAX_MEMBERS = 20_000  # images, depth, masks and right frames of 1000 frames are 4000
-MAX_DIRECTORY_BYTES = 16 << 20  # ample for as many: a record of 46 bytes and a path each
-MAX_RATIO = 200  # inflated to compressed; pictures hardly shrink, text some ten times, zeros a thousand times
-SMALL_BYTES = 1 << 20  # a member that inflates to no more than this may shrink as it likes
+MAX_DIRECTORY_BYTES = 16 << 20  # each member has a record of 46 bytes and a path
+MAX_RATIO = 200  # inflated to compressed: about 1 for pictures, 10 for text, 1000 for zeros
+MAX_BYTES_OF_ANY_RATIO = 1 << 20  # smaller members may have any ratio
 
 UNREADABLE = (OSError, EOFError, NotImplementedError, RuntimeError, ValueError, zipfile.BadZipFile, zlib.error)
-"""What zipfile raises while a damaged member is read; a name that is no UTF-8 is a ValueError."""
+"""Exceptions of zipfile for a damaged member; ValueError is for a name that is no UTF-8."""
 
 _END = struct.Struct("<4s4H2LH")  # end of central directory (APPNOTE 4.3.16)
 _END_64 = struct.Struct("<4sQ2H2L4Q")  # (4.3.14)
@@ -35,10 +35,10 @@ _AGAIN = "Zip the files again."
 
 
 def open_zip(path: Path, field: str, label: str, limits: ClipLimits) -> tuple[zipfile.ZipFile, list[zipfile.ZipInfo]]:
-    """The zip, open for reading, and its files; folders are left out.
+    """The zip, open for reading, and its files without folders.
 
     Raises:
-        InputError: it is damaged, or a member is nothing to accept; with `field`, and `label` for its name.
+        InputError: it is damaged, or a member is refused. The error names `field` and `label`.
         LimitError: it holds too many members, or they inflate to too much.
     """
     try:
@@ -71,14 +71,14 @@ def _checked(
 
 
 def check_member_count(count: int, field: str, label: str) -> None:
-    """LimitError for more members, or files of a folder, than any clip has."""
+    """LimitError for more members of a zip, or files of a folder, than MAX_MEMBERS."""
     if count > MAX_MEMBERS:
         problem = f"{label} holds {count} files or more; the limit is {MAX_MEMBERS}."
         raise LimitError(field, problem, "Keep the clip's own.")
 
 
 def _check_directory(path: Path, field: str, label: str) -> None:
-    """LimitError for a directory too large to be read; zipfile would hold all of it in memory."""
+    """LimitError for a directory that is too large; zipfile would read all of it into memory."""
     with path.open("rb") as file:
         size, count = _directory_size(file, path.stat().st_size)
     check_member_count(count, field, label)
@@ -88,7 +88,7 @@ def _check_directory(path: Path, field: str, label: str) -> None:
 
 
 def _directory_size(file: BinaryIO, file_bytes: int) -> tuple[int, int]:
-    """(bytes, members) of the central directory, found where zipfile finds it."""
+    """(bytes, members) of the central directory, found by the same rules as in zipfile."""
     tail_bytes = min(file_bytes, _END.size + _MAX_COMMENT_BYTES)
     file.seek(file_bytes - tail_bytes)
     tail = file.read(tail_bytes)
@@ -111,7 +111,7 @@ def _check_member(entry: zipfile.ZipInfo, field: str, label: str) -> None:
     name = entry.filename
     problem = None
     kind = stat.S_IFMT(entry.external_attr >> 16)
-    # zipfile cuts names at NUL, so the name as stored is asked too
+    # zipfile cuts names at NUL, so the stored name is checked, too
     if any(ord(letter) < 32 for letter in entry.orig_filename) or "\\" in entry.orig_filename:
         problem = "has a name with a backslash or a control character"
     elif name.startswith("/") or re.match(r"[A-Za-z]:", name):
@@ -131,19 +131,19 @@ def _check_member(entry: zipfile.ZipInfo, field: str, label: str) -> None:
 
 
 def _check_inflated(entries: list[zipfile.ZipInfo], field: str, label: str, limits: ClipLimits) -> None:
-    """LimitError when the declared sizes are too much; zipfile reads no more of a member than it declares."""
+    """LimitError if the declared sizes are too large. zipfile reads no more of a member than it declares."""
     total = sum(entry.file_size for entry in entries)
     if total > limits.decoded_bytes:
         problem = f"{label} inflates to {total} bytes; the limit is {limits.decoded_bytes}."
         raise LimitError(field, problem, "Give a shorter clip.")
     for entry in entries:
-        if entry.file_size > SMALL_BYTES and entry.file_size > MAX_RATIO * entry.compress_size:
+        if entry.file_size > MAX_BYTES_OF_ANY_RATIO and entry.file_size > MAX_RATIO * entry.compress_size:
             problem = f"{entry.filename!r} in {label} inflates from {entry.compress_size} to {entry.file_size} bytes."
             raise LimitError(field, problem, f"Zip pictures and text only, which shrink less than {MAX_RATIO} times.")
 
 
 def _check_overlap(entries: list[zipfile.ZipInfo], path: Path, field: str, label: str) -> None:
-    """InputError when members share compressed bytes, by which a small file would inflate to any size."""
+    """InputError if members share compressed bytes: a small file could then inflate to any size."""
     ordered = sorted(entries, key=lambda entry: entry.header_offset)
     ends = [entry.header_offset + _LOCAL_HEADER_BYTES + entry.compress_size for entry in ordered]
     starts = [entry.header_offset for entry in ordered] + [path.stat().st_size]
