@@ -209,9 +209,9 @@ def _timed(model: CpuModel, call: Callable[[], object], repeats: int) -> tuple[f
     spent: dict[str, float] = {}
 
     def wrapped(part: str, method: Callable[..., Any]) -> Callable[..., Any]:
-        def timed(*arguments: Any) -> Any:
+        def timed(*arguments: Any, **named: Any) -> Any:
             start = time.perf_counter()
-            result = method(*arguments)
+            result = method(*arguments, **named)
             spent[part] = spent.get(part, 0.0) + time.perf_counter() - start
             return result
 
