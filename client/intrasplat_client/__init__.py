@@ -29,13 +29,14 @@ from intrasplat_client.errors import (
     Unauthorized,
     Unreachable,
 )
-from intrasplat_client.models import JobOptions, JobState, JobView, Notice, NoticeCode, Report
+from intrasplat_client.models import ErrorCode, JobOptions, JobState, JobView, Notice, NoticeCode, Report
 from intrasplat_client.views import Image
 
 __all__ = [
     "AsyncClient",
     "Client",
     "Conflict",
+    "ErrorCode",
     "Forbidden",
     "Image",
     "InputError",
