@@ -39,7 +39,7 @@ from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.names import MANIFEST
 
 SEEN_FOR_S = 2.0
-"""An entry that was there counts as there for so long. A purge on another machine takes effect with this delay."""
+"""How long an entry that was found counts as there. A purge on another machine takes effect with this delay."""
 
 FOLDERS = {Area.SPOOL: "spool", Area.WORK: "resume", Area.SCENES: "scenes"}
 """The areas that a bucket keeps, and what their keys begin with. Of WORK it keeps the marker alone."""
