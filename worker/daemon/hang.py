@@ -16,7 +16,7 @@ STAGE_LIMITS_S: Mapping[str, float] = MappingProxyType(
         "fusion": 60.0,  # all frames at once, about 10 ms each
         "motion": 10.0,  # a frame takes some 10 ms
         "start": 120.0,  # least squares for every Gaussian, and the targets of all frames, without a report between
-        "calibrate": 150.0,  # CALIBRATION_STEPS are 15 iterations of training
+        "calibrate": 150.0,  # UNTIMED_STEPS and TIMED_STEPS are 15 iterations of training
         "train": 10.0,  # an iteration takes 10 to 500 ms
         "finish": 60.0,  # one pass over the frames to find strays
         "score": 60.0,  # a frame takes some 100 ms; afterwards flow copies of every held-out frame, and the files

@@ -59,7 +59,7 @@ def plan(
 ) -> list[Cell]:
     """Every combination, clip by clip so that each is opened once; without budgets and iterations as the presets say.
 
-    Cells bear the series' names as _read writes them, so that one series is one row however it was spelt.
+    Cells have the series' canonical names: one series is one row, however it was spelt.
 
     Args:
         series: also "ours" and "rivals".
@@ -117,7 +117,7 @@ def capacity_grid(preset: str) -> list[str]:
 
 
 def _read(series: str) -> tuple[str, Preset]:
-    """The one name of a series, its changes in the order of the alphabet, and its preset. Raises as preset_of."""
+    """A series' canonical name, with its changes in alphabetical order, and its preset. Raises as preset_of."""
     name, _, changes = series.partition(":")
     preset = preset_named(name)
     values: dict[str, Any] = {}
@@ -144,9 +144,11 @@ def _read(series: str) -> tuple[str, Preset]:
 
 
 def _plain_fields() -> list[str]:
-    """The fields of a preset that are numbers, words or switches in every preset, but for those that a name stands for:
-    the name itself, and whether a budget chooses the points, which nothing does of a changed preset. How long a cell
-    trains is its limit and not its series."""
+    """The fields of a preset that a series can change: numbers, words and switches.
+
+    Not the name, not points_by_budget, which has no effect in a changed preset, and not the length, which is the cell's
+    limit.
+    """
     others = ("name", "points_by_budget", "iterations", "budget_s")
     names = [each.name for each in dataclasses.fields(Preset) if each.name not in others]
     return [name for name in names if not any(dataclasses.is_dataclass(getattr(x, name)) for x in PRESETS.values())]

@@ -31,13 +31,13 @@ RECORDINGS: Mapping[str, tuple[str, str, Mapping[str, Any]]] = {
     "d4d_endonerf": ("d4d-a", "d4d_endonerf", {}),
     "d4d_stereo": ("d4d-a-stereo", "d4d_stereo/stereo_sbs.mp4", _STEREO),
 }
-"""By name: what rows call it, its file, and the files beside it that `reconstruct` needs. A patient's recording is not
-named by its own name anywhere."""
+"""By argument: the name in rows, the file, and the files beside it that `reconstruct` needs. Rows never give a
+patient's recording its own name."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A clip that can be opened. argument is what the command line says, name what rows say.
+    """A clip that can be opened. The command line calls it `argument`, rows call it `name`.
 
     phantom  how to draw it; None for a recording
     clip     the recording's file or folder

@@ -1,4 +1,4 @@
-"""The mean of a model over some of its steps: the noise of single steps cancels, what they agree on stays."""
+"""The mean of a model over some of its steps, in which the noise of single steps cancels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class RunningMean:
         self._total: dict[str, Tensor] = {}
 
     def add(self, parameters: Mapping[str, Tensor]) -> None:
-        """One more of what is averaged."""
+        """Add one model to the mean."""
         self.count += 1
         if self.count == 1:
             self._total = {name: values.clone() for name, values in parameters.items()}
@@ -27,16 +27,16 @@ class RunningMean:
             self._total[name] = self._total[name].to(values.device).add_(values)  # stored ones come from the host
 
     def put(self, parameters: Mapping[str, Tensor]) -> None:
-        """Write the mean into these tensors and begin anew."""
+        """Write the mean into these tensors, and start a new mean."""
         for name, values in parameters.items():
             torch.div(self._total[name].to(values.device), self.count, out=values)
         self.count, self._total = 0, {}
 
     def arrays(self) -> dict[str, Tensor]:
-        """What a resumed run needs beside the count."""
+        """The sums by name, which a resumed run needs beside the count."""
         return {PREFIX + name: values for name, values in self._total.items()}
 
     def load_arrays(self, arrays: Mapping[str, Tensor], count: int) -> None:
-        """Put back what arrays() gave, out of more."""
+        """Take back what arrays() gave; other names are ignored."""
         self.count = count
         self._total = {name.removeprefix(PREFIX): a.clone() for name, a in arrays.items() if name.startswith(PREFIX)}

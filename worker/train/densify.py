@@ -31,8 +31,8 @@ SPLIT_SHRINK = 0.8
 class DensifySettings:
     """When and what to split and prune.
 
-    from_iteration      the first iteration after which it happens; statistics gather from the first step on
-    every               iterations from one time to the next
+    from_iteration      the first iteration after which it happens; statistics are gathered from the first step on
+    every               iterations between two densifications
     gradient_threshold  NDC; a Gaussian whose mean gradient is above it is split
     split_into          children of one Gaussian
     min_opacity         a Gaussian below it is dropped
@@ -64,7 +64,7 @@ class DensifyResult:
 
     split     Gaussians replaced by their children
     pruned    Gaussians dropped
-    withheld  Gaussians that asked to be split, but max_count was reached
+    withheld  Gaussians above the threshold that were not split, because max_count was reached
     count     N afterwards
     """
 
@@ -138,7 +138,7 @@ class Densifier:
         return {"densify.gradient_sum": self._gradient_sum, "densify.steps_seen": self._steps_seen}
 
     def load_arrays(self, stored: dict[str, Tensor]) -> None:
-        """Put back what arrays() gave; the number of Gaussians becomes that of then.
+        """Take back what arrays() gave; the number of Gaussians becomes the stored one.
 
         Raises:
             ValueError: the two arrays differ in length.

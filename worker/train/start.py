@@ -1,4 +1,4 @@
-"""The model before its first step: points become Gaussians; motion starts as the tracks have it, or at rest."""
+"""The model before its first step: points become Gaussians; motion starts from the tracks, or at rest."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from worker.raster.model import Model
 from worker.train.presets import Preset
 
 SHARE_PX = 4
-"""Points within such a square start with one motion: tracks are smooth over more, and fewer systems are solved."""
+"""Points within such a square start with one motion. Tracks are smooth over more, and there is less to solve."""
 MIN_STRIDE = 2
-"""Pixels between the points of a grid at the least: a Gaussian a pixel is noise, not surface."""
+"""Pixels between the points of a grid. A Gaussian for every pixel would fit noise, not surface."""
 
 
 def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
@@ -103,8 +103,10 @@ def start_model(
     seed: int,
     device: Device = CPU,
 ) -> Model:
-    """Gaussians at the cloud's points (mm, scaled to optimiser units) with the preset's motion: as the tracks have it
-    where the motion is "shared" and there are tracks, else at rest. The preset must be settled."""
+    """Gaussians at the cloud's points, scaled from mm to optimiser units, with the motion of the (settled) preset.
+
+    A "shared" motion starts from the tracks if there are any. Every other motion starts at rest.
+    """
     gaussians = initial_gaussians(
         cloud.reference_mm * np.float32(scale),  # widths are by neighbours of one time
         cloud.rgb,

@@ -83,7 +83,7 @@ class TrainingFrames:
             self._frames[index] = TrainingFrame(self.cameras[index], float(clip.t[index]), target, *counts)
 
     def frame(self, index: int) -> TrainingFrame:
-        """Frame `index` as a step takes it: views, and the same object every time."""
+        """Frame `index` as a training step needs it: views of the arrays, the same object every time."""
         return self._frames[index]
 
     def picture(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -96,7 +96,7 @@ class TrainingFrames:
         return psnr_tissue(image[:3].transpose(1, 2, 0), *self.picture(index))
 
     def digest(self) -> str:
-        """SHA-256 over all that training reads of the clip: two runs on the same frames have the same."""
+        """SHA-256 of everything that training reads of the clip; equal for two runs on the same frames."""
         found = hashlib.sha256(f"{self.indices} {self.scale!r} {self._rgb.shape}".encode())
         cameras = np.stack([self.cameras[index] for index in self.indices])
         for values in (self._rgb, self._weight, self._inverse_depth, cameras):
