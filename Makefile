@@ -44,7 +44,7 @@ HAS_CUDA := import sys, torch; sys.exit(torch.version.cuda is None)
 PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do \
 	"$$each" -c '$(NEW_ENOUGH)' 2>/dev/null && { echo "$$each"; break; }; done)
 
-# What `make evaluate` measures, hours of it: rows are kept as they finish, and the same command goes on
+# What `make evaluate` measures. It takes hours, keeps each row as it finishes, and resumes
 CLIPS ?= d4d_endonerf phantom:still phantom:breathing phantom:pull phantom:cut
 GRID_CLIPS ?= phantom:still:640x512 phantom:breathing:640x512 phantom:pull:640x512 phantom:cut:640x512
 EVALUATE := $(BIN)/intrasplat evaluate
@@ -98,7 +98,7 @@ bench: setup ## every benchmarks/bm_*.py, one after the other
 		[ -e "$$each" ] || { echo "bench: benchmarks/ holds no bm_*.py" >&2; exit 1; }; \
 		echo "== $$each"; $(BIN)/python "$$each"; done
 
-gpu-check: ## with an NVIDIA GPU: are its kernels right, how fast are they; 7 minutes at most, docs/gpu.md
+gpu-check: ## with an NVIDIA GPU: check its kernels and time them; at most 7 minutes, docs/gpu.md
 	@# nothing is installed and no .venv is made; a PYTHON that is named is used whatever it has
 	@python="$(PYTHON)"; \
 	if [ "$(origin PYTHON)" = file ] && [ -x $(BIN)/python ] && ! "$$python" -c '$(HAS_CUDA)' 2>/dev/null; then \
@@ -107,14 +107,14 @@ gpu-check: ## with an NVIDIA GPU: are its kernels right, how fast are they; 7 mi
 		echo "gpu-check: '$$python' is no Python of 3.11 or newer; name one: make gpu-check PYTHON=/path/to/python3" >&2; exit 1; fi; \
 	"$$python" benchmarks/gpu/check.py $(ARGS)
 
-evaluate: setup ## every preset on every clip, and the charts; hours, and it goes on where it was (CLIPS="phantom:pull ...")
+evaluate: setup ## every preset on every clip, and the charts; takes hours, and resumes (CLIPS="phantom:pull ...")
 	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out docs/results
 	@$(EVALUATE) $(CLIPS) --series fast --budget-s 15 --seeds 0 1 2 --out docs/results
 	@$(if $(filter d4d_%,$(CLIPS)),$(EVALUATE) d4d_stereo --series instant fast --holdout every8 --out docs/results)
 	@$(EVALUATE) $(CLIPS) --series rivals --out docs/results
 	@$(BIN)/python -m benchmarks.pages
 
-capacity: setup ## a grid of fixed capacities beside the automatic choice; hours, and it goes on where it was
+capacity: setup ## a grid of fixed capacities beside the automatic choice; takes hours, and resumes
 	@$(EVALUATE) $(GRID_CLIPS) --series fast --grid --holdout every8 --iterations 600 --seeds 0 1 2 3 4 --out docs/results/capacity
 	@$(BIN)/python -m benchmarks.pages
 

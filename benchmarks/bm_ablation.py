@@ -1,10 +1,10 @@
-"""What each part of `fast` is worth: the same fixed number of iterations with one part changed at a time.
+"""Measure what each part of `fast` is worth: train with one part changed at a time.
 
     python benchmarks/bm_ablation.py [--iterations 400] [--seeds 1] [--csv docs/results/ablation.csv] [--only NAME ...]
 
-Iterations are fixed, so the decibels do not depend on how busy the machine is. Clips: the real recording (named
-`d4d-a`, left out where it is absent) and two synthetic motions with true depth, 320 x 256, 64 frames. Both ways of
-holding out. Below 500 iterations a run is one cycle, and `rates fall once, nothing averaged` lacks the average alone.
+The number of iterations is fixed, so the decibels do not depend on how busy the machine is. Clips: the real recording
+(named `d4d-a`, if it is there) and two synthetic motions with true depth, 320 x 256, 64 frames. Both splits.
+Below 500 iterations a run is one cycle, and `rates fall once, nothing averaged` lacks only the average.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a stored scene costs and what it loses: bytes against decibels, on frames that training saw and on others.
+"""Measure what quantising a scene saves and costs: bytes against decibels, on training and on held-out frames.
 
     python benchmarks/bm_compact.py [CLIP ...] [--iterations 1200] [--tolerances 0.05 0.1 0.14 0.2 0.4 0.8] [--csv FILE]
 

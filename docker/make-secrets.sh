@@ -1,7 +1,7 @@
 #!/bin/sh
-# Makes the secrets that compose.yml mounts, in docker/secrets or the folder given; those that are there stay.
-#   queue.acl  who may do what at the queue: ours the project's own keys, anyone else nothing but `ping`
-#   redis_url  the queue's address with the password that belongs to it
+# Make the secrets that compose.yml mounts, in docker/secrets or the given folder; existing ones stay.
+#   queue.acl  the queue's access list: our user may use the project's keys, everybody else only `ping`
+#   redis_url  the queue's address with our user's password
 set -eu
 folder=${1:-$(dirname "$0")/secrets}
 if [ -e "$folder/redis_url" ]; then

@@ -1,8 +1,8 @@
 """`python docker/sbom.py build/sbom.json`: every component of this environment, as CycloneDX JSON.
 
-What pip knows comes from cyclonedx-py. The libraries that OpenCV's wheel carries are no packages of pip's, and they
-are what reads untrusted video (FFmpeg above all), so they are added: each with its hash, and FFmpeg with the release
-it says it is, by which advisories can be looked up.
+cyclonedx-py lists what pip knows. pip does not know the libraries inside OpenCV's wheel, which read untrusted video
+(FFmpeg above all). So this program adds each of them with its hash, and FFmpeg with its release, by which one finds
+advisories.
 """
 
 from __future__ import annotations

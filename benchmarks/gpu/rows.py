@@ -1,7 +1,7 @@
-"""What every part of check.py shares: its place, its time, its rows, and a clock of the device.
+"""What all parts of check.py share: folders, deadline, rows, and a clock of the device.
 
-A part is a process of its own: what breaks one, be it the memory of the device, breaks no other. Rows are written as
-they are measured, each with what it was measured on.
+Each part is a process, so that an error in one, even of the device's memory, does not break another. A part writes each
+row when it is measured, with the machine, the versions and the commit.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Part:
     """A part of the check.
 
     out, work    folders of its CSV file, and of what the parts hand on
-    deadline     Unix time at which it is ended; it begins nothing that it cannot end by then
-    doubt        why its figures are not to be believed; empty: nothing is known against them
+    deadline     Unix time at which check.py ends it; it starts nothing that it cannot finish by then
+    doubt        why nobody should believe its figures; empty if nothing speaks against them
     interpret    on tiny sizes in Triton's interpreter, where no duration means anything
     seed         of all that is random
     """
@@ -71,10 +71,10 @@ class Part:
         return self.deadline - time.time()
 
     def has(self, seconds: float, what: str) -> bool:
-        """Whether there is time for what takes so long; says so if not."""
+        """Whether so many seconds are left for this work; prints a line if not."""
         if self.left_s >= seconds:
             return True
-        print(f"  {what}: left out, {max(self.left_s, 0):.0f} s are left of this part", flush=True)
+        print(f"  {what}: skipped, only {max(self.left_s, 0):.0f} s are left", flush=True)
         return False
 
     @property
@@ -107,10 +107,10 @@ class Part:
         self._begun = True
 
     def wait_for(self, name: str) -> dict[str, object]:
-        """What prepare.py says under this name, waited for; what it failed with is raised.
+        """Wait for what prepare.py writes under this name, and return it.
 
         Raises:
-            RuntimeError: it failed, or is not done in time.
+            RuntimeError: prepare.py failed, or is not done in time.
         """
         path = self.work / name
         while not path.exists():

@@ -1,9 +1,9 @@
 """Part of check.py: how long a step and a picture take, and what they spend it on.
 
 The standard scene is that of bm_raster.py: 640x512, a Gaussian every 2.86 pixels each way (40,096), with 17 shared
-bases and moving colour, and with the paper's FDM of 17 bases. Durations are medians: of the device's own events, or,
-where a row says so, of the host's clock, with everything that training waits for. Parts of a step are timed inside
-steps whose launches were queued before the first of them began.
+bases and moving colour, and with the paper's FDM of 17 bases. Durations are medians of the device's own events. Rows
+with `clock` host use the host's clock, and contain everything that training waits for. Parts of a step are timed inside
+whole steps, whose launches are all queued before the first one starts.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FIELDS = ("what", "scene", "frames", "value", "unit", "clock", "note")
 SMALL = 8, 8, 4.0
 """Width, height and distance of Gaussians in the interpreter."""
 QUEUED_TICKS = 6_000_000
-"""The device sleeps so long, some 3 ms, while the launches of a step are queued."""
+"""The device sleeps so many ticks, about 3 ms, while the host queues the launches of a step."""
 CAMERAS, PROFILED = 8, 8
 """Frames to choose from; steps the profiler sees."""
 TIME = 0.4

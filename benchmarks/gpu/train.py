@@ -1,13 +1,13 @@
 """Part of check.py: how soon training on the device is how good, against `paper` to its end and the CPU's `fast`.
 
-A run is what `reconstruct` makes of a clip with depth, without what follows training: points, tracks, a model, steps.
-Seconds are t_train_s as docs/conventions.md defines it, so they have what is done on the processor before the first
-step, and neither compilation nor scoring. Held-out frames are scored at many moments of it; a threshold counts as
-reached at the first of them that is above it, so a figure is late by at most the distance to the moment before.
+A run does what `reconstruct` does with a clip that has depth, until training ends: points, tracks, a model, steps.
+Seconds are t_train_s as docs/conventions.md defines it: they contain the work of the processor before the first step,
+and neither compilation nor scoring. The run scores held-out frames at many moments. A threshold is reached at the first
+moment with a score above it, so a figure is late by at most the distance to the moment before.
 
-How many dB can be reached depends on the clip, so thresholds are what `paper` ends with there, and so many dB from it.
-`fast` is trained on one frame a step, on two and on four, which fill the device better: the seconds tell what that is
-worth. A second seed comes last, where time is left.
+How many dB a run can reach depends on the clip. So thresholds count from the score that `paper` ends with on that clip.
+`fast` trains on one, two and four frames a step; more frames fill the device better, and the seconds say what that is
+worth. A second seed runs last if time is left.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ CURVE_FIELDS = ("clip", "preset", "frames_a_step", "device", "seed", "t_train_s"
 MOMENTS_S = (*np.arange(0.1, 2.0, 0.1), *np.arange(2.0, 6.0, 0.25), *np.arange(6.0, 60.0, 2.0))
 """Of t_train_s, at which held-out frames are scored: closer than those of a report, for a run is over in seconds."""
 FAST_BUDGET_S, CPU_BUDGET_S = 15.0, 45.0
-LEAST_S = {"paper": 45.0, "fast": 24.0, "cpu": 35.0}
-"""Seconds that have to be left of the part to begin a run: of its time, and for scoring."""
+MIN_LEFT_S = {"paper": 45.0, "fast": 24.0, "cpu": 35.0}
+"""A run starts only if so many seconds are left of the part, for its training and its scoring."""
 
 
 def main() -> None:
@@ -63,15 +63,15 @@ def main() -> None:
         for frames_a_step in FRAMES_A_STEP[:2]:
             trials.run(on_several(_tiny("fast"), frames_a_step), device, 0, iterations=2)
         return
-    if part.has(LEAST_S["paper"], "paper"):
+    if part.has(MIN_LEFT_S["paper"], "paper"):
         trials.run(PRESETS["paper"], device, 0, iterations=PRESETS["paper"].iterations)
     for frames_a_step in FRAMES_A_STEP:
-        if part.has(LEAST_S["fast"], f"fast, {frames_a_step} frames a step"):
+        if part.has(MIN_LEFT_S["fast"], f"fast, {frames_a_step} frames a step"):
             trials.run(on_several(PRESETS["fast"], frames_a_step), device, 0, budget_s=FAST_BUDGET_S)
-    if part.has(LEAST_S["cpu"], "the CPU's fast"):
+    if part.has(MIN_LEFT_S["cpu"], "the CPU's fast"):
         part.wait_for(KERNELS_READY)
         trials.run(PRESETS["fast"], CPU, 0, budget_s=min(CPU_BUDGET_S, part.left_s - 15))
-    if part.has(LEAST_S["fast"], "fast, seed 1"):
+    if part.has(MIN_LEFT_S["fast"], "fast, seed 1"):
         trials.run(PRESETS["fast"], device, 1, budget_s=FAST_BUDGET_S)
 
 
