@@ -88,12 +88,15 @@ async def render(
     """An image of the scene at time t from a pose, without the instruments; while the job runs, of what there is."""
     start = time.perf_counter()
     shown = await find_shown(services, caller, query.scene)
-    tag = tag_of(request_of(query, shown, services.settings))
+    request = request_of(query, shown, services.settings)
+    tag = tag_of(request)
     if shown.attempt is not None and matches(if_none_match, tag):
         return Response(status_code=304, headers=cache_headers(shown, tag))
-    shown, answer = await answer_to(services, caller, query, shown)
+    shown, answer = await answer_to(services, caller, request, shown)
+    if shown.attempt != request.attempt:  # the job has ended meanwhile
+        tag = tag_of(request.model_copy(update={"attempt": shown.attempt}))
     response = image_response(shown.scene_id, answer)
-    response.headers.update(cache_headers(shown, tag_of(request_of(query, shown, services.settings))))
+    response.headers.update(cache_headers(shown, tag))
     total_ms = (time.perf_counter() - start) * 1e3
     response.headers["Server-Timing"] = f"render;dur={answer.head.render_ms:.1f}, total;dur={total_ms:.1f}"
     return response
@@ -134,13 +137,13 @@ def _only(services: Deps, caller: Caller) -> Shown:
     return Shown(there[0].job_id, there[0].attempt)
 
 
-async def answer_to(services: Deps, caller: Caller, query: RenderQuery, shown: Shown) -> tuple[Shown, Answer]:
-    """The worker's answer, and what it shows: a job that ends just now is shown as the scene that it came to."""
-    answer = await services.renderer.ask(request_of(query, shown, services.settings))
+async def answer_to(services: Deps, caller: Caller, request: RenderRequest, shown: Shown) -> tuple[Shown, Answer]:
+    """The worker's answer, and what it shows: the finished scene if the job has just ended."""
+    answer = await services.renderer.ask(request)
     if answer.head.error is not None and answer.head.error.kind == "not-yet":
         shown = await find_shown(services, caller, shown.scene_id)
         if shown.attempt is not None:
-            answer = await services.renderer.ask(request_of(query, shown, services.settings))
+            answer = await services.renderer.ask(request.model_copy(update={"attempt": shown.attempt}))
     if answer.head.error is None:
         services.metrics.rendered(shown.state.value, answer.head.render_ms)
     return shown, answer

@@ -32,7 +32,7 @@ from service.access import Caller, Refusal, key_missing
 from service.connection import Answer
 from service.deps import Deps, EarlyCaller, Services, address_of
 from service.problems import API_REMEDY, Problem, fault, problem_of
-from service.renders import RenderQuery, Shown, answer_to, find_shown, problem_of_reply
+from service.renders import RenderQuery, Shown, answer_to, find_shown, problem_of_reply, request_of
 
 router = APIRouter()
 
@@ -176,7 +176,8 @@ class _Viewer:
         caller = self._known_caller()
         self._services.limiter.admit(caller.key_id or caller.address)
         shown = await find_shown(self._services, caller, message.scene)
-        shown, answer = await answer_to(self._services, caller, message, shown)
+        request = request_of(message, shown, self._services.settings)
+        shown, answer = await answer_to(self._services, caller, request, shown)
         if answer.head.error is not None:
             raise problem_of_reply(answer.head.error)
         return packed(message, shown, answer, (time.perf_counter() - start) * 1e3)

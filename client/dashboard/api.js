@@ -3,12 +3,7 @@
 import { askForKey, currentKey, keyHeaders } from "./key.js";
 import { connectionLost, Problem, problemOf } from "./problem.js";
 
-/**
- * A job as the service shows it (JobView).
- * @typedef {{id: string, state: "queued"|"running"|"done"|"failed"|"cancelled", stage?: string, fraction?: number,
- *   iteration?: number, psnr_db?: number, seconds_left?: number, position?: number, eta_s?: number,
- *   error?: {problem: string, field?: string, remedy?: string}, cancel_requested: boolean, created_at_s: number}} Job
- */
+/** @typedef {import("./wire.js").JobView} Job */
 /**
  * What a purge removed.
  * @typedef {{job_id: string, purged_at: string, files: Record<string, number>, bytes: Record<string, number>,

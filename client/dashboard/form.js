@@ -3,9 +3,22 @@
 import { reconstruct } from "./api.js";
 import { insist } from "./pause.js";
 import { Upload } from "./upload.js";
+import { LIMITS } from "./wire.js";
 
 const PARTS = ["clip", "right", "calibration", "masks"];
 const OPTIONS = ["budget_s", "layout", "priority", "mask_polarity"];
+const LABELS = {
+  mask_polarity: { auto: "to be found out", tool: "the instrument", tissue: "the tissue" },
+  layout: {
+    auto: "to be found out",
+    sbs: "side by side",
+    tb: "top and bottom",
+    frames: "frames",
+    endonerf: "EndoNeRF",
+    stereomis: "StereoMIS",
+  },
+  priority: { standard: "standard", high: "high: before all others" },
+};
 const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;
 
 /**
@@ -35,6 +48,18 @@ function optionsOf(form) {
   return options;
 }
 
+/** Give the form's fields the choices and limits of the service's options. @param {HTMLFormElement} form */
+function limit(form) {
+  for (const name of OPTIONS) {
+    const { choices, max, default: chosen } = LIMITS[name];
+    const field = form.elements[name];
+    if (max !== undefined) field.max = max;
+    for (const choice of choices ?? []) {
+      field.append(new Option(LABELS[name][choice] ?? choice, choice, choice === chosen, choice === chosen));
+    }
+  }
+}
+
 export class ClipForm {
   /**
    * @param {{form: HTMLFormElement, message: HTMLElement, progress: HTMLElement, stop: HTMLElement}} parts
@@ -43,6 +68,7 @@ export class ClipForm {
   constructor(parts, onJob) {
     Object.assign(this, parts);
     this.onJob = onJob;
+    limit(this.form);
     this.submit = this.form.querySelector("[type=submit]");
     this.form.addEventListener("submit", (event) => {
       event.preventDefault();

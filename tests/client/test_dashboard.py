@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from client.generate_page import PAGE_TYPES, generate
 from client.up import DASHBOARD
+from contract.wire.options import JobOptions
 
 SCRIPTS = sorted(DASHBOARD.glob("*.js"))
 
@@ -74,3 +77,16 @@ def test_every_element_that_a_script_asks_for_is_on_the_page() -> None:
 def test_nothing_is_fetched_from_elsewhere() -> None:
     for path in (*SCRIPTS, DASHBOARD / "style.css", DASHBOARD / "index.html"):
         assert not re.search(r"(https?:)?//[a-z0-9.-]+\.[a-z]{2,}/", path.read_text()), path.name
+
+
+def test_the_types_and_limits_are_what_contract_wire_generates() -> None:
+    assert PAGE_TYPES.read_text(encoding="utf-8") == generate(), "run: python -m client.generate_page"
+
+
+def test_the_form_has_a_label_for_each_choice_and_a_field_for_options_alone() -> None:
+    page, script = (DASHBOARD / "index.html").read_text(), (DASHBOARD / "form.js").read_text()
+    (listed,) = re.findall(r"const OPTIONS = \[(.*)\]", script)
+    for name in re.findall(r'"(\w+)"', listed):
+        assert f'name="{name}"' in page
+        choices = get_args(JobOptions.model_fields[name].annotation)
+        assert [each for each in choices if isinstance(each, str) and not re.search(rf"\b{each}:", script)] == []
