@@ -17,7 +17,7 @@ from service.partial import promised_bytes
 from service.problems import LENGTH_REMEDY, Problem, no_room
 from service.upload import LIMIT_REMEDY
 
-LEAST_BYTES = 4096
+MIN_BYTES = 4096
 """What a body must bring in upload_silence_s, or end: whoever drips holds a place that another could use."""
 
 
@@ -80,7 +80,7 @@ class Intake:
         pieces, silence_s = request.stream(), self._settings.upload_silence_s
         while True:
             new_bytes, left_s = 0, silence_s
-            while new_bytes < LEAST_BYTES:
+            while new_bytes < MIN_BYTES:
                 asked_at_s = time.monotonic()
                 try:
                     async with asyncio.timeout(left_s):
@@ -97,7 +97,7 @@ class Intake:
 
 
 def _silence(silence_s: float) -> Problem:
-    detail = f"Fewer than {LEAST_BYTES} bytes came in {silence_s:g} s."
+    detail = f"Fewer than {MIN_BYTES} bytes came in {silence_s:g} s."
     return Problem(408, detail, remedy="Send it again.", headers={"Connection": "close"})
 
 

@@ -37,7 +37,7 @@ from service.renders import RenderQuery, Shown, answer_to, find_shown, problem_o
 router = APIRouter()
 
 LENGTH_BYTES = 4
-LONGEST_MESSAGE = 16 * 1024
+MAX_MESSAGE = 16 * 1024
 """Characters; a request is some hundred."""
 AUTHORIZE_TIMEOUT_S = 5.0
 """Who has connected without a key sends it at once."""
@@ -136,8 +136,8 @@ class _Viewer:
             text = message.get("text")
             if text is None:
                 raise _HangUp(NOT_TEXT, Problem(422, "A binary message is no request.", remedy=API_REMEDY))
-            if len(text) > LONGEST_MESSAGE:
-                detail = f"The message has {len(text)} characters, more than {LONGEST_MESSAGE}."
+            if len(text) > MAX_MESSAGE:
+                detail = f"The message has {len(text)} characters, more than {MAX_MESSAGE}."
                 raise _HangUp(TOO_LARGE, Problem(413, detail, remedy=API_REMEDY))
             document = document_of(text)
             if self._caller is None or (isinstance(document, dict) and AUTHORIZE in document):

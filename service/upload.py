@@ -33,7 +33,7 @@ PARTS = tuple(SUFFIXES)
 
 OPTIONS = "options"
 MAX_OPTIONS_BYTES = 64 * 1024
-MOST_BYTES = {OPTIONS: MAX_OPTIONS_BYTES, "calibration": MAX_CALIBRATION_BYTES}
+MAX_BYTES = {OPTIONS: MAX_OPTIONS_BYTES, "calibration": MAX_CALIBRATION_BYTES}
 """Of the parts that are small by their nature."""
 LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
 MAX_HEADER_BYTES = 8 * 1024
@@ -103,8 +103,8 @@ def checked_suffix(part: str, suffix: str) -> str:
 
 def check_part_size(part: str, part_bytes: int) -> None:
     """LimitError for a part of more bytes than one of its kind can have."""
-    if part_bytes > MOST_BYTES.get(part, part_bytes):
-        raise LimitError(part, f"it is larger than {MOST_BYTES[part]} bytes.", "Send a smaller one.")
+    if part_bytes > MAX_BYTES.get(part, part_bytes):
+        raise LimitError(part, f"it is larger than {MAX_BYTES[part]} bytes.", "Send a smaller one.")
 
 
 async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: Path, limits: UploadLimits) -> Received:

@@ -7,7 +7,7 @@ const RIGHT = 6;
 const TOP = 8;
 const BOTTOM = 18;
 /** The axis spans at least so much, so that noise does not look like progress. */
-const LEAST_SPAN_DB = 4;
+const MIN_SPAN_DB = 4;
 
 /** @typedef {{iteration: number, db: number}} Point */
 
@@ -43,7 +43,7 @@ export function drawCurve(svg, points, baselines) {
   if (points.length === 0) return;
   const values = [...points, ...baselines].map((each) => each.db);
   const middle = (Math.min(...values) + Math.max(...values)) / 2;
-  const half = Math.max(LEAST_SPAN_DB, Math.max(...values) - Math.min(...values)) / 2 + 0.5;
+  const half = Math.max(MIN_SPAN_DB, Math.max(...values) - Math.min(...values)) / 2 + 0.5;
   const last = Math.max(1, points.at(-1).iteration);
   const x = (iteration) => LEFT + (iteration / last) * (WIDTH - LEFT - RIGHT);
   const y = (db) => TOP + ((middle + half - db) / (2 * half)) * (HEIGHT - TOP - BOTTOM);

@@ -8,7 +8,7 @@ import { keyEvents } from "./key.js";
 
 const POLL_MS = 2000;
 /** Browsers open six connections to a place, and uploads and pictures need some. */
-const MOST_FOLLOWED = 3;
+const MAX_FOLLOWED = 3;
 const isActive = (job) => job.state === "queued" || job.state === "running";
 
 /** A job's scores while it trains, by iteration. */
@@ -104,7 +104,7 @@ export class Jobs {
 
   #follow() {
     const active = [...this.byId.values()].filter(isActive).reverse();
-    const chosen = active.sort((a, b) => (b.state === "running") - (a.state === "running")).slice(0, MOST_FOLLOWED);
+    const chosen = active.sort((a, b) => (b.state === "running") - (a.state === "running")).slice(0, MAX_FOLLOWED);
     const wanted = new Set(chosen.map((job) => job.id));
     for (const [id, events] of this.followed) {
       if (wanted.has(id)) continue;

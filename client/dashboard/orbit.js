@@ -1,9 +1,9 @@
 // Where the viewer stands: at the endoscope, or turned about what it looks at.
 
 const DEGREES_A_PIXEL = 0.15;
-const MOST_DEGREES = 60;
-const LEAST_ZOOM = 0.3;
-const MOST_ZOOM = 4;
+const MAX_DEGREES = 60;
+const MIN_ZOOM = 0.3;
+const MAX_ZOOM = 4;
 
 const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
 
@@ -23,14 +23,14 @@ export class Orbit {
   /** @param {number} dx pixels to the right @param {number} dy pixels down */
   turn(dx, dy) {
     this.isHome = false;
-    this.yaw = clamp(this.yaw - dx * DEGREES_A_PIXEL, -MOST_DEGREES, MOST_DEGREES);
-    this.pitch = clamp(this.pitch + dy * DEGREES_A_PIXEL, -MOST_DEGREES, MOST_DEGREES);
+    this.yaw = clamp(this.yaw - dx * DEGREES_A_PIXEL, -MAX_DEGREES, MAX_DEGREES);
+    this.pitch = clamp(this.pitch + dy * DEGREES_A_PIXEL, -MAX_DEGREES, MAX_DEGREES);
   }
 
   /** @param {number} factor above 1: nearer */
   approach(factor) {
     this.isHome = false;
-    this.zoom = clamp(this.zoom * factor, LEAST_ZOOM, MOST_ZOOM);
+    this.zoom = clamp(this.zoom * factor, MIN_ZOOM, MAX_ZOOM);
   }
 
   /** @returns {string | null} as the service spells a pose; null is the endoscope's own */

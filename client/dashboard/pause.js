@@ -3,7 +3,7 @@
 import { Problem } from "./problem.js";
 
 const FIRST_PAUSE_MS = 500;
-const LONGEST_PAUSE_MS = 8000;
+const MAX_PAUSE_MS = 8000;
 
 /**
  * @param {number} ms
@@ -31,7 +31,7 @@ export function pause(ms, signal) {
  * @returns {Promise<T>}
  */
 export async function insist(work, onTrouble, signal) {
-  for (let pauseMs = FIRST_PAUSE_MS; ; pauseMs = Math.min(LONGEST_PAUSE_MS, pauseMs * 2)) {
+  for (let pauseMs = FIRST_PAUSE_MS; ; pauseMs = Math.min(MAX_PAUSE_MS, pauseMs * 2)) {
     try {
       return await work();
     } catch (error) {

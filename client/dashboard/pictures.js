@@ -10,7 +10,7 @@ import { Stream } from "./stream.js";
 
 const ANSWER_MS = 15000;
 const FIRST_RETRY_MS = 1000;
-const LONGEST_RETRY_MS = 15000;
+const MAX_RETRY_MS = 15000;
 
 /** @param {View} view @param {AbortSignal} signal @returns {Promise<Picture>} */
 async function renderOnce(view, signal) {
@@ -63,7 +63,7 @@ export class Pictures {
     if (this.stream.isOpen) this.retryMs = FIRST_RETRY_MS;
     if (this.stream.isOpen || this.stream.isConnecting || performance.now() < this.retryAt) return;
     this.retryAt = performance.now() + this.retryMs;
-    this.retryMs = Math.min(LONGEST_RETRY_MS, this.retryMs * 2);
+    this.retryMs = Math.min(MAX_RETRY_MS, this.retryMs * 2);
     this.stream.connect();
   }
 

@@ -5,8 +5,8 @@ import { insist } from "./pause.js";
 
 const TUS = { "Tus-Resumable": "1.0.0" };
 const PIECES = 50;
-const SMALLEST_PIECE = 256 * 1024;
-const LARGEST_PIECE = 8 * 1024 * 1024;
+const MIN_PIECE = 256 * 1024;
+const MAX_PIECE = 8 * 1024 * 1024;
 
 /** Of a file's name only the ending is sent: the rest may name somebody. */
 const suffixOf = (name) => /\.[a-z0-9]+$/.exec(name.toLowerCase())?.[0] ?? "";
@@ -68,7 +68,7 @@ export class Upload {
   }
 
   async #append() {
-    const length = Math.min(LARGEST_PIECE, Math.max(SMALLEST_PIECE, Math.ceil(this.file.size / PIECES)));
+    const length = Math.min(MAX_PIECE, Math.max(MIN_PIECE, Math.ceil(this.file.size / PIECES)));
     const response = await request(this.location, {
       method: "PATCH",
       headers: { ...TUS, "Upload-Offset": String(this.offset), "Content-Type": "application/offset+octet-stream" },

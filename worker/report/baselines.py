@@ -18,7 +18,7 @@ from worker.model.metrics import psnr_tissue
 
 Flow = NDArray[np.float32]  # [H, W, 2] px
 
-SMALLEST_FLOW_PX = 16
+MIN_FLOW_PX = 16
 """The optical flow's finest patches do not fit into a smaller image; there the flow counts as 0."""
 
 
@@ -89,7 +89,7 @@ def _blend(frames: list[NDArray[np.float32]], tissue: list[NDArray[np.float32]],
 
 def _flows(earlier: NDArray[np.uint8], later: NDArray[np.uint8]) -> tuple[Flow, Flow]:
     """Forward and backward flow: earlier's pixel x shows what later shows at x + forward(x), and the reverse."""
-    if min(earlier.shape[:2]) < SMALLEST_FLOW_PX:
+    if min(earlier.shape[:2]) < MIN_FLOW_PX:
         still = np.zeros((*earlier.shape[:2], 2), np.float32)
         return still, still
     grey = [cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in (earlier, later)]

@@ -19,35 +19,35 @@ from worker.input.clip.types import DepthClip
 
 ANALYSED_WIDTH = 640
 """Larger pictures are shrunk to it first: 4K endoscopes are soft from pixel to pixel, and in focus all the same."""
-DARK_PERCENTILE, DARKEST_VEILED = 5.0, 85.0
+DARK_PERCENTILE, MAX_DARK_LEVEL = 5.0, 85.0
 """Of each pixel's weakest colour: at most 68 of 255 in clean clips, and 90 behind a veil that takes a quarter."""
 FOCUS_SIGMAS_PX = (1.0, 2.0)
-LEAST_FINE_DETAIL = 0.62
+MIN_FINE_DETAIL = 0.62
 """Detail below 1 px over that of 1 to 2 px: 0.71 to 1.7 in clean clips, 0.58 where all is blurred by 1.5 px."""
-LEAST_DETAIL_LEVELS = 0.4
+MIN_DETAIL_LEVELS = 0.4
 """Of 255; below it there is nothing to be sharp: that is said of the texture."""
-LEAST_EQUAL_DETAIL = 0.75
+MIN_EQUAL_DETAIL = 0.75
 """Of a frame's fine detail beside that of the clip's sharpest: 0.93 and more in clean clips."""
-FEWEST_FRAMES_SEEN = 2
+MIN_DOUBTFUL_FRAMES = 2
 """Of the frames looked at: one alone may be an accident."""
-LARGEST_COLOUR_DRIFT = 0.25
+MAX_COLOUR_DRIFT = 0.25
 """Range of the median red over green, or blue over green, over its mean."""
-BLOOD_RATIO, LARGEST_FLOODED_SHARE = 3.0, 0.1
+BLOOD_RATIO, MAX_FLOODED_SHARE = 3.0, 0.1
 """Red over green of blood, and by how much its share of the tissue may change: by 0.005 in clean clips."""
-LARGEST_REPEATED_SHARE = 0.1
-LARGEST_HIDDEN_SHARE = 0.4
-LONGEST_FLICKER = 3
+MAX_REPEATED_SHARE = 0.1
+MAX_HIDDEN_SHARE = 0.4
+MAX_FLICKER = 3
 """Frames: no instrument leaves the picture and is back so soon."""
-LEAST_INSTRUMENT = 0.02
+MIN_INSTRUMENT = 0.02
 """Share of the picture; less may be an instrument's tip that comes and goes."""
 SURE = 128
 """Of depth_confidence's 255: what stereo itself doubts is told of elsewhere."""
-DEPTH_JUMP, LARGEST_JUMPING_SHARE = 0.1, 0.03
+DEPTH_JUMP, MAX_JUMPING_SHARE = 0.1, 0.03
 """Of the depth from frame to frame, and of the tissue: 0.012 at most in clean clips, 0.05 with gross errors on 0.05."""
-MOST_PAIRS = 8
-LARGEST_JITTER = 0.003
+MAX_PAIRS = 8
+MAX_JITTER = 0.003
 """Of the picture's width: how far poses that jump to and fro move the tissue in it, 2 px of 640."""
-LARGEST_ROUGHNESS = 1.0
+MAX_ROUGHNESS = 1.0
 """Median change of step over median step: a smooth path has far less than 1, independent errors have 1.7."""
 
 
@@ -58,7 +58,7 @@ def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
         return []
     found = []
     dark = [_darkest(clip, index) for index in seen]
-    if sum(each > DARKEST_VEILED for each in dark) >= min(FEWEST_FRAMES_SEEN, len(seen)):
+    if sum(each > MAX_DARK_LEVEL for each in dark) >= min(MIN_DOUBTFUL_FRAMES, len(seen)):
         found.append(
             Notice.warning(
                 NoticeCode.VEILED,
@@ -74,7 +74,7 @@ def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     found = []
     pairs = list(itertools.pairwise(train))
     repeated = sum(_repeats(clip.rgb[earlier], clip.rgb[later]) for earlier, later in pairs)
-    if repeated > LARGEST_REPEATED_SHARE * len(train):
+    if repeated > MAX_REPEATED_SHARE * len(train):
         found.append(
             Notice.warning(
                 NoticeCode.REPEATED_FRAMES,
@@ -86,7 +86,7 @@ def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     for index in train[1:]:
         hidden |= clip.tissue[index]
     share = float((hidden & ~clip.tissue[train[0]]).mean()) if train else 0.0
-    if share > LARGEST_HIDDEN_SHARE:
+    if share > MAX_HIDDEN_SHARE:
         found.append(
             Notice.warning(
                 NoticeCode.HIDDEN_AT_FIRST,
@@ -111,15 +111,15 @@ def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
     detail = np.array([each for each in measured if each is not None])
     if not detail.size:
         return []
-    if np.median(detail) < LEAST_FINE_DETAIL:
+    if np.median(detail) < MIN_FINE_DETAIL:
         return [
             Notice.warning(
                 NoticeCode.OUT_OF_FOCUS,
                 "The picture has no fine detail: it is out of focus, or was enlarged; the scene is as soft.",
             )
         ]
-    smeared = int((detail < LEAST_EQUAL_DETAIL * detail.max()).sum())
-    if smeared < FEWEST_FRAMES_SEEN:
+    smeared = int((detail < MIN_EQUAL_DETAIL * detail.max()).sum())
+    if smeared < MIN_DOUBTFUL_FRAMES:
         return []
     return [
         Notice.warning(
@@ -132,7 +132,7 @@ def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
 def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
     """Blood that comes in, or else a white balance that drifts."""
     flooded = float(np.ptp([_blood_share(clip, index) for index in frames]))
-    if flooded > LARGEST_FLOODED_SHARE:
+    if flooded > MAX_FLOODED_SHARE:
         return [
             Notice.warning(
                 NoticeCode.BLOOD,
@@ -142,7 +142,7 @@ def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
         ]
     ratios = np.array([_colour_ratios(clip, index) for index in frames])
     drift = np.ptp(ratios, axis=0) / np.maximum(ratios.mean(axis=0), 1e-6)
-    if drift.max() <= LARGEST_COLOUR_DRIFT:
+    if drift.max() <= MAX_COLOUR_DRIFT:
         return []
     worst = int(drift.argmax())
     low, high = ratios[:, worst].min(), ratios[:, worst].max()
@@ -160,13 +160,13 @@ def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     wanted = set(train)
     first = [index for index in train if index + 1 in wanted]
     jumps, total = 0, 0
-    for index in first[:: -(-len(first) // MOST_PAIRS) or 1]:
+    for index in first[:: -(-len(first) // MAX_PAIRS) or 1]:
         pair = slice(index, index + 2)
         sure = (clip.tissue[pair] & (clip.depth_confidence[pair] >= SURE)).all(axis=0)
         before, after = clip.depth_mm[index][sure], clip.depth_mm[index + 1][sure]
         jumps += int((np.abs(after - before) > DEPTH_JUMP * before).sum())
         total += before.size
-    if jumps <= LARGEST_JUMPING_SHARE * total:
+    if jumps <= MAX_JUMPING_SHARE * total:
         return []
     return [
         Notice.warning(
@@ -186,7 +186,7 @@ def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     runs = [index for index in train if {index - 1, index + 1} <= wanted]
     depths = [clip.depth_mm[index][clip.tissue[index] & (clip.depth_mm[index] > 0)] for index in runs]
     known = [float(np.median(each)) for each in depths if each.size]
-    if len(runs) < FEWEST_FRAMES_SEEN or not known:
+    if len(runs) < MIN_DOUBTFUL_FRAMES or not known:
         return []
     depth_mm = float(np.median(known))
     pose = clip.world_from_camera
@@ -195,7 +195,7 @@ def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     change = np.array([np.linalg.norm(looked_at[i + 1] - 2 * looked_at[i] + looked_at[i - 1]) for i in runs])
     jitter_mm = float(np.median(change)) / np.sqrt(6)  # of independent errors: the deviation of each, over its axes
     jitter_px = clip.intrinsics.fx * jitter_mm / depth_mm
-    if jitter_px < LARGEST_JITTER * clip.intrinsics.width or np.median(change) < LARGEST_ROUGHNESS * np.median(step):
+    if jitter_px < MAX_JITTER * clip.intrinsics.width or np.median(change) < MAX_ROUGHNESS * np.median(step):
         return []
     return [
         Notice.warning(
@@ -242,7 +242,7 @@ def _fine_detail(clip: DepthClip, index: int) -> float | None:
         inside = tissue > 0
     fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in FOCUS_SIGMAS_PX)
     coarser_levels = float((fine - coarse)[inside].std())
-    return float((grey - fine)[inside].std()) / coarser_levels if coarser_levels > LEAST_DETAIL_LEVELS else None
+    return float((grey - fine)[inside].std()) / coarser_levels if coarser_levels > MIN_DETAIL_LEVELS else None
 
 
 def _repeats(earlier: NDArray[np.uint8], later: NDArray[np.uint8]) -> bool:
@@ -253,11 +253,11 @@ def _repeats(earlier: NDArray[np.uint8], later: NDArray[np.uint8]) -> bool:
 
 
 def _flickering(instrument: NDArray[np.floating]) -> int:
-    """Frames without instrument in gaps of at most LONGEST_FLICKER between frames that have one; shares in, [T]."""
-    masked = np.flatnonzero(instrument >= LEAST_INSTRUMENT)
+    """Frames without instrument in gaps of at most MAX_FLICKER between frames that have one; shares in, [T]."""
+    masked = np.flatnonzero(instrument >= MIN_INSTRUMENT)
     gaps = [
         range(before + 1, after)
         for before, after in itertools.pairwise(masked)
-        if 1 < after - before <= LONGEST_FLICKER + 1
+        if 1 < after - before <= MAX_FLICKER + 1
     ]
     return sum(1 for gap in gaps for index in gap if instrument[index] == 0)

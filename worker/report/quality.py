@@ -25,24 +25,24 @@ from worker.report.baselines import CopyBaselines
 from worker.report.doubts import course_doubts, picture_doubts
 from worker.train.scoring import FrameRenderer, sample_frames
 
-LEAST_COVERAGE = 0.98
-LEAST_TRAIN_DB = 25.0
+MIN_COVERAGE = 0.98
+MIN_TRAIN_DB = 25.0
 """A model that does not even reproduce its own frames this well has not learnt them; good ones reach 30 to 38."""
-LEAST_HELD_OUT_DB = 24.0
+MIN_HELD_OUT_DB = 24.0
 """An error of 6 % of white: clean clips come to 25 within a hundred iterations, what cuts or jumps stays below."""
-LARGEST_GAP_DB = 3.0
+MAX_GAP_DB = 3.0
 """Between training and held-out frames: more means frames were memorised, or the gap between frames is not bridged."""
 OUTLIER_DB = 6.0
 """A held-out frame this far below the mean is named."""
-LARGEST_DEPTH_SHARE = 0.03
+MAX_DEPTH_SHARE = 0.03
 """Of the depth: beyond it model and stereo disagree by more than the stereo's own noise."""
-FEW_FRAMES = 16
-LEAST_CONFIDENT_SHARE = 0.8
+MIN_FRAMES = 16
+MIN_CONFIDENT_SHARE = 0.8
 SMOOTH_LEVELS = 2.0
 """Standard deviation in 9 x 9 pixels, of 255: below it there is only noise to match."""
-LARGEST_SMOOTH_SHARE = 0.4
-LEAST_TISSUE_SHARE = 0.3
-LARGEST_BRIGHTNESS_DRIFT = 0.25
+MAX_SMOOTH_SHARE = 0.4
+MIN_TISSUE_SHARE = 0.3
+MAX_BRIGHTNESS_DRIFT = 0.25
 """Range of the median brightness over its mean; beyond it, changing light and moving tissue are hard to tell apart."""
 
 
@@ -155,14 +155,14 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     """What in the clip itself makes the result doubtful; held-out frames are not looked at."""
     sampled = sample_frames(train)
     found = []
-    if len(train) < FEW_FRAMES:
+    if len(train) < MIN_FRAMES:
         found.append(
             Notice.warning(
                 NoticeCode.FEW_FRAMES, f"Only {len(train)} frames were trained on; motion between them is guessed."
             )
         )
     tissue_share = float(np.mean([clip.tissue[index].mean() for index in train]))
-    if tissue_share < LEAST_TISSUE_SHARE:
+    if tissue_share < MIN_TISSUE_SHARE:
         found.append(
             Notice.warning(
                 NoticeCode.LITTLE_TISSUE,
@@ -178,7 +178,7 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
             )
         )
     confident = _share_of_tissue(clip, sampled, lambda index: clip.depth_confidence[index] >= CLEAR_CONFIDENCE)
-    if confident < LEAST_CONFIDENT_SHARE:
+    if confident < MIN_CONFIDENT_SHARE:
         found.append(
             Notice.warning(
                 NoticeCode.STEREO_UNSURE,
@@ -187,7 +187,7 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
             )
         )
     smooth = _share_of_tissue(clip, sampled, lambda index: _roughness(clip.rgb[index]) < SMOOTH_LEVELS)
-    if smooth > LARGEST_SMOOTH_SHARE:
+    if smooth > MAX_SMOOTH_SHARE:
         found.append(
             Notice.warning(
                 NoticeCode.NO_TEXTURE,
@@ -203,7 +203,7 @@ def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) 
     train_db = _mean(trained.psnr_tissue_db)
     found = _missing(held_out, model_db)
     found += _worse_than_copying(model_db, baselines)
-    if train_db is not None and train_db < LEAST_TRAIN_DB:
+    if train_db is not None and train_db < MIN_TRAIN_DB:
         found.append(
             Notice.warning(
                 NoticeCode.TRAINING_SCORE_LOW,
@@ -211,7 +211,7 @@ def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) 
                 "Look for inverted masks, a wrong layout or calibration, or a clip in which everything moves.",
             )
         )
-    elif model_db is not None and model_db < LEAST_HELD_OUT_DB:
+    elif model_db is not None and model_db < MIN_HELD_OUT_DB:
         found.append(
             Notice.warning(
                 NoticeCode.HELD_OUT_SCORE_LOW,
@@ -219,7 +219,7 @@ def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) 
                 "trained frames. Tissue that is cut, or moves far from one frame to the next, cannot be followed.",
             )
         )
-    if model_db is not None and train_db is not None and train_db - model_db > LARGEST_GAP_DB:
+    if model_db is not None and train_db is not None and train_db - model_db > MAX_GAP_DB:
         found.append(
             Notice.warning(
                 NoticeCode.GENERALISATION_GAP,
@@ -230,14 +230,14 @@ def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) 
     found += _bad_frames(held_out, model_db)
     judged = held_out if held_out.frames else trained
     covered = _mean(judged.coverage)
-    if covered is not None and covered < LEAST_COVERAGE:
+    if covered is not None and covered < MIN_COVERAGE:
         found.append(
             Notice.warning(
                 NoticeCode.HOLES,
                 f"The model leaves {1 - covered:.1%} of the tissue uncovered: renders have holes there.",
             )
         )
-    if judged.depth_agreement_mm > LARGEST_DEPTH_SHARE * judged.depth_mm:
+    if judged.depth_agreement_mm > MAX_DEPTH_SHARE * judged.depth_mm:
         found.append(
             Notice.warning(
                 NoticeCode.DEPTH_DISAGREES,
@@ -305,7 +305,7 @@ def _bad_frames(held_out: Scores, model_db: float | None) -> list[Notice]:
 def _brightness_warnings(clip: DepthClip, sampled: Iterable[int]) -> list[Notice]:
     medians = [float(np.median(clip.rgb[index][clip.tissue[index]])) for index in sampled if clip.tissue[index].any()]
     mean = float(np.mean(medians)) if medians else 0.0
-    if mean == 0 or (max(medians) - min(medians)) / mean <= LARGEST_BRIGHTNESS_DRIFT:
+    if mean == 0 or (max(medians) - min(medians)) / mean <= MAX_BRIGHTNESS_DRIFT:
         return []
     return [
         Notice.warning(
