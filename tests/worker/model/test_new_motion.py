@@ -13,7 +13,6 @@ from torch import Tensor
 
 from contract.wire.options import ReconstructionOptions
 from tests.worker.phantoms import phantom_clip
-from worker.machine.hooks import Hooks
 from worker.model.deformation import MOTIONS, AtRest, Deformation, LinearDeformation, add_offsets
 from worker.model.gaussians import Gaussians
 from worker.model.layout import CHANNELS
@@ -21,6 +20,7 @@ from worker.pipeline import reconstruct
 from worker.render.view import render_frame
 from worker.scene.checkpoint import load_scene
 from worker.train.densify import DensifySettings
+from worker.train.hooks import TrainingHooks
 from worker.train.presets import PRESETS
 from worker.train.request import ReconstructionRequest
 
@@ -85,7 +85,7 @@ def test_a_motion_from_outside_is_trained_stored_loaded_and_rendered(
         densify=DensifySettings(from_iteration=5, every=5),
     )
     request = ReconstructionRequest(clip, ReconstructionOptions(iterations=12), own_preset=preset, device="cpu")
-    report = reconstruct(request, tmp_path, Hooks())
+    report = reconstruct(request, tmp_path, TrainingHooks())
     scene = load_scene(tmp_path)
     assert type(scene.deformation) is motion
     assert scene.preset == report.preset == motion.kind
