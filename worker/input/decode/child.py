@@ -30,6 +30,8 @@ def serve(work_of: Callable[[], Work]) -> None:
         reports = Reports(stream)
         folder = Path.cwd()
         granted = lock_in(Allowance(**request["allowance"]), [Path(each) for each in request["readable"]], folder)
+        if os.getppid() != request["parent"]:  # it ended before lock_in could ask the kernel to watch it
+            return
         try:
             reports.end({"result": work_of()(request, folder, reports) | {"granted": granted}})
         except Exception as error:

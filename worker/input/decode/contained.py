@@ -91,7 +91,7 @@ def run_contained(
     watch = _Watch(process, on_report, should_stop, patience)
     try:
         with process.stdin as stdin:
-            stdin.write(json.dumps(request | {"allowance": asdict(allowance)}).encode() + b"\n")
+            stdin.write(json.dumps(request | {"allowance": asdict(allowance), "parent": os.getpid()}).encode() + b"\n")
         answer = watch.answer()
     except BrokenPipeError:
         answer = None
