@@ -9,7 +9,7 @@ from pathlib import Path
 
 from contract.store.disk_errors import disk_errors
 from contract.store.durable import flush, move_folder
-from contract.store.shelf import MARKERS, Area, Removed, ShelfEntry, checked, entry_of, is_job_id
+from contract.store.shelf import MARKERS, Area, Removed, ShelfEntry, checked, entry_of
 
 
 class LocalShelf:
@@ -21,7 +21,6 @@ class LocalShelf:
         self.data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         for area in Area:
             (self.data_dir / area).mkdir(mode=0o700, exist_ok=True)
-        self._number_old_scenes()
 
     def path(self, entry: ShelfEntry) -> Path:
         """Where the entry's folder lies, or would lie."""
@@ -85,13 +84,6 @@ class LocalShelf:
             for folder in (self.data_dir / area).iterdir():
                 if not (folder / MARKERS[area]).is_file():  # of a removal that was cut off
                     remove_tree(folder)
-
-    def _number_old_scenes(self) -> None:
-        """Version 0.1 kept one scene a job, in a folder without a number: it counts as made by the first attempt."""
-        for folder in list((self.data_dir / Area.SCENES).iterdir()):
-            if is_job_id(folder.name):
-                with contextlib.suppress(FileNotFoundError):  # another process does the same
-                    folder.rename(folder.with_name(f"{folder.name}.1"))
 
 
 def remove_tree(path: Path) -> None:
