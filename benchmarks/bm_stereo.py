@@ -111,7 +111,7 @@ def _timed(name: str, clip: RectifiedClip, matched: Callable[[RectifiedClip], De
     print(f"  {cpu_s / clip.frame_count:.4f} CPU seconds a frame, the figure to compare on a busy machine")
     print("  " + ", ".join(f"{key} {value:.3f}" for key, value in depth.measurements.items()))
     for warning in depth.warnings:
-        print(f"  warning: {warning}")
+        print(f"  warning: {warning.text}")
     return depth
 
 
