@@ -34,13 +34,6 @@ def test_a_damaged_submission_hides_no_other(store: Store) -> None:
     assert store.submission(new_job_id()) is None
 
 
-def test_scenes_of_the_version_before_count_as_the_first_attempts(store: Store) -> None:
-    job_id = new_job_id()
-    (store.data_dir / "scenes" / job_id).mkdir()
-    (store.data_dir / "scenes" / job_id / MANIFEST).write_text("{}")
-    assert Store(store.data_dir).scene_attempts(job_id) == [1]
-
-
 def test_a_purge_leaves_no_file_of_a_job_and_says_what_it_took(store: Store) -> None:
     job_id, other = accepted(store).job_id, accepted(store).job_id
     publish(store, job_id, 1)
