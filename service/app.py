@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 
-from contract.queue.promise import Queue
+from contract.queue.interface import Queue
 from contract.runtime.settings import LOOPBACK_NAMES, Settings
 from contract.store.store import Store
 from service import jobs, reconstruct, renders, scenes, stream, system, tus
@@ -21,7 +21,7 @@ from service.metrics import Measure
 from service.openapi import DescribedApp
 from service.problems import install_handlers
 from service.renderer import Renderer
-from service.surface import Surface
+from service.request_log import RequestLog
 from service.version import version
 
 DESCRIPTION = (
@@ -59,7 +59,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     )
     app.state.deps = deps
     app.add_middleware(Guard, hosts=LOOPBACK_NAMES | {settings.host, *settings.hosts}, origins=settings.cors_origins)
-    app.add_middleware(Surface)
+    app.add_middleware(RequestLog)
     app.add_middleware(Measure, metrics=deps.metrics)
     install_handlers(app)
     install_refusal_handler(app, deps.audit)

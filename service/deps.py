@@ -15,9 +15,10 @@ from fastapi import Depends, Query
 from starlette.requests import HTTPConnection
 
 from contract.access.audit import AuditLog
-from contract.queue.promise import MAX_LISTED, Queue
+from contract.queue.interface import MAX_LISTED, Queue
 from contract.runtime.settings import Settings
-from contract.store.store import Store, is_job_id
+from contract.store.shelf import is_job_id
+from contract.store.store import Store
 from contract.wire.job import JobRecord
 from service.access import Access, Caller, Refusal, key_missing
 from service.audit import Audit

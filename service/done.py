@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from contract.queue.promise import Queue
+from contract.queue.interface import Queue
 from contract.store.store import Store
 from contract.wire.job import JobRecord, JobState
 

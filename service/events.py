@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from fastapi.sse import format_sse_event
 from starlette.concurrency import run_in_threadpool
 
-from contract.queue.promise import MAX_EVENTS, Queue, event_order
+from contract.queue.interface import MAX_EVENTS, Queue, event_order
 from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES, Forecast, JobRecord, JobState, JobView
 

@@ -10,7 +10,7 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.queue.promise import MAX_LISTED, event_order
+from contract.queue.interface import MAX_LISTED, event_order
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState, JobView
 from service.deps import AnyCaller, Deps, ListingLimit, Services, owned_job
 from service.events import NOTHING_SEEN

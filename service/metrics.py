@@ -12,7 +12,7 @@ from prometheus_client.exposition import generate_latest
 from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from contract.queue.promise import Queue
+from contract.queue.interface import Queue
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from service.version import version

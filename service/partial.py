@@ -19,7 +19,8 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.store.durable import flush, replace_file
-from contract.store.store import Store, is_job_id, new_job_id
+from contract.store.shelf import is_job_id, new_job_id
+from contract.store.store import Store
 from contract.wire.job import JOB_ID_PATTERN
 
 DECLARATION = "upload.json"

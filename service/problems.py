@@ -11,7 +11,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocketState
 
-from contract.queue.promise import QueueFullError
+from contract.queue.interface import QueueFullError
 from contract.store.disk_errors import NO_ROOM, StoreFullError
 from contract.wire.errors import InputError, LimitError, SceneError, UnavailableError
 

@@ -15,9 +15,11 @@ from pathlib import Path
 from pydantic import BaseModel, Field
 
 from contract.access.audit import AuditAction, utc_now
-from contract.queue.promise import Queue
+from contract.queue.interface import Queue
+from contract.store.disk_errors import StoreFullError, disk_errors
 from contract.store.durable import flush
-from contract.store.store import Removed, Store, StoreFullError, disk_errors, is_job_id
+from contract.store.shelf import Removed, is_job_id
+from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES
 from service.access import Caller

@@ -20,8 +20,8 @@ from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
 from contract.intake.limits import MAX_MEMORY_BYTES, ClipLimits
 from contract.intake.sniff import check_file
-from contract.queue.promise import Admission, QueueFullError
-from contract.store.store import new_job_id
+from contract.queue.interface import Admission, QueueFullError
+from contract.store.shelf import new_job_id
 from contract.wire.errors import InputError, LimitError, UnavailableError
 from contract.wire.job import JOB_ID_PATTERN, Forecast, JobRecord, JobView
 from contract.wire.options import JobOptions, parse_options

@@ -13,7 +13,7 @@ from typing import Protocol
 import zmq.asyncio
 from starlette.concurrency import run_in_threadpool
 
-from contract.queue.promise import WORKER_TTL_S, Queue
+from contract.queue.interface import WORKER_TTL_S, Queue
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, ReplyError, WorkerAddress, WorkerReply
 from service.connection import Answer, Connection, Reached, WorkerGoneError

@@ -9,7 +9,7 @@ import time
 from starlette.concurrency import run_in_threadpool
 
 from contract.access.audit import AuditLog
-from contract.queue.promise import Queue
+from contract.queue.interface import Queue
 from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
 from contract.store.store import Store

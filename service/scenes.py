@@ -11,8 +11,8 @@ from starlette.responses import FileResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.queue.promise import MAX_LISTED
-from contract.store.store import is_job_id
+from contract.queue.interface import MAX_LISTED
+from contract.store.shelf import is_job_id
 from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.names import CURVE, REPORT

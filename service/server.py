@@ -25,7 +25,7 @@ It is looked at this often, so that it may take twice as long."""
 MAX_HEAD_BYTES = 32 * 1024
 """Of a request's line and headers together."""
 MAX_CONNECTIONS = 1024
-"""Open ones, whether or not something is asked on them; service/surface.py counts requests."""
+"""Open ones, whether or not something is asked on them; service/request_log.py counts requests."""
 BACKLOG = 128
 """Connections that wait to be accepted, all of which asyncio takes at once; as many are let in to be told to come back.
 Those that come in excess are closed: it logs each one that it has no file descriptor for, and forgets none of them."""

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 
 from starlette.concurrency import run_in_threadpool
 
-from contract.queue.promise import Queue
+from contract.queue.interface import Queue
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord, JobState

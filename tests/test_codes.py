@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-import contract.queue.promise
+import contract.queue.interface
 import contract.store.disk_errors  # noqa: F401
 import worker.daemon.serve  # noqa: F401
 from contract.wire.errors import ErrorCode, IntrasplatError

@@ -20,10 +20,10 @@ import redis
 import yaml  # type: ignore[import-untyped]
 
 from contract.queue.embedded import find_server
-from contract.queue.promise import Claim, Order
+from contract.queue.interface import Claim, Order
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import Settings
-from contract.store.store import new_job_id
+from contract.store.shelf import new_job_id
 from contract.wire.job import JobFiles, JobProgress, JobRecord, JobState
 from contract.wire.rendering import WorkerAddress
 from tests.test_layers import imports_of

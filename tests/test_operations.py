@@ -8,7 +8,7 @@ from typing import get_args
 import yaml  # type: ignore[import-untyped]
 
 from contract.queue import redis_queue as queue_redis
-from contract.queue.promise import LEASE_S, MAX_ATTEMPTS
+from contract.queue.interface import LEASE_S, MAX_ATTEMPTS
 from contract.queue.redis_queue import PREFIX
 from contract.runtime.settings import ENVIRONMENT_PREFIX, Settings, default_data_dir
 from contract.store.s3 import SEEN_FOR_S

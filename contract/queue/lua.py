@@ -11,7 +11,7 @@ import json
 from importlib.resources import files
 from typing import Any
 
-from contract.queue.promise import MAX_ATTEMPTS, MAX_DURATIONS, MAX_EVENTS, YIELD_S, worker_died
+from contract.queue.interface import MAX_ATTEMPTS, MAX_DURATIONS, MAX_EVENTS, YIELD_S, worker_died
 from contract.queue.redis_client import reachable
 from contract.queue.redis_hash import EVENT_FIELDS
 from contract.wire.errors import ErrorCode
@@ -31,7 +31,7 @@ class Scripts:
 
     Args:
         prefix: of the queue's keys.
-        lease_s, preempt_after_s: as in contract/queue/promise.py.
+        lease_s, preempt_after_s: as in contract/queue/interface.py.
     """
 
     def __init__(self, client: Any, prefix: str, lease_s: float, preempt_after_s: float) -> None:
@@ -53,7 +53,7 @@ def load_script(name: str) -> str:
 
 
 def _rules(lease_s: float, preempt_after_s: float) -> str:
-    """The numbers of promise.py and the table of transitions, as the scripts read them (ARGV 1)."""
+    """The numbers of interface.py and the table of transitions, as the scripts read them (ARGV 1)."""
     rules = {
         "sources": {state: dict.fromkeys(sorted(sources_of(state)), True) for state in JobState},
         "lease_ms": round(lease_s * 1000),

@@ -1,4 +1,4 @@
-"""The queue inside one process: the plainest statement of what contract/queue/promise.py promises."""
+"""The queue inside one process: the plainest statement of contract/queue/interface.py, for tests."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import threading
 import time
 from collections import Counter, deque
 
-from contract.queue.promise import (
+from contract.queue.interface import (
     IDEMPOTENCY_S,
     LEASE_S,
     MAX_ATTEMPTS,

@@ -49,8 +49,7 @@ from typing import Any
 
 import redis
 
-from contract.queue.lua import UNREADABLE, Scripts
-from contract.queue.promise import (
+from contract.queue.interface import (
     IDEMPOTENCY_S,
     LEASE_S,
     MAX_LISTED,
@@ -65,6 +64,7 @@ from contract.queue.promise import (
     estimate_forecast,
     event_order,
 )
+from contract.queue.lua import UNREADABLE, Scripts
 from contract.queue.redis_client import connect, reachable
 from contract.queue.redis_hash import new_record, record_of, table_of
 from contract.wire.errors import UnavailableError

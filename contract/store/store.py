@@ -27,24 +27,13 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from contract.runtime.settings import Settings
-from contract.store.disk_errors import StoreFullError, disk_errors
+from contract.store.disk_errors import disk_errors
 from contract.store.local import LocalShelf, remove_tree
 from contract.store.s3 import S3Shelf
-from contract.store.shelf import ABANDONED_AFTER_S, Area, Removed, Shelf, ShelfEntry, is_job_id, new_job_id
+from contract.store.shelf import ABANDONED_AFTER_S, Area, Removed, Shelf, ShelfEntry, is_job_id
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.names import RESUME, SUBMISSION
-
-__all__ = [
-    "ABANDONED_AFTER_S",
-    "Removed",
-    "Store",
-    "StoreFullError",
-    "disk_errors",
-    "is_job_id",
-    "new_job_id",
-    "open_store",
-]
 
 
 def open_store(settings: Settings) -> Store:

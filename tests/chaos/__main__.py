@@ -18,7 +18,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from contract.queue.promise import BEAT_PERIOD_S, LEASE_S
+from contract.queue.interface import BEAT_PERIOD_S, LEASE_S
 from tests.chaos.campaign import CELLS, NO_MATTER, Outcome, run_kill
 from tests.chaos.deployment import Deployment, Victim
 from tests.chaos.history import RERUN_WITHIN_S, ClipHistory, orphans

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from contract.queue.promise import BEAT_PERIOD_S, LEASE_S, Event
+from contract.queue.interface import BEAT_PERIOD_S, LEASE_S, Event
 from contract.store.store import Store
 from contract.wire.job import TERMINAL_STATES, JobState
 

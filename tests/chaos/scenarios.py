@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from contract.queue.promise import LEASE_S
+from contract.queue.interface import LEASE_S
 from contract.wire.job import TERMINAL_STATES, JobState
 from tests.chaos.campaign import ChaosClient, wait_until_ended, watch
 from tests.chaos.deployment import Deployment, children_of

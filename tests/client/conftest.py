@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from contract.queue.promise import Claim
+from contract.queue.interface import Claim
 from intrasplat_client import Client
 from tests.client.local_service import CLIP, LocalService, local_service
 

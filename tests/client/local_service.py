@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from contract.queue.embedded import short_socket_path
+from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue
-from contract.queue.promise import Claim
 from contract.runtime.settings import Settings
 from contract.store.store import Store
 from contract.wire.job import JobError

@@ -24,10 +24,11 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from client.up import DASHBOARD
 from contract.queue.embedded import short_socket_path
+from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue
-from contract.queue.promise import Claim
 from contract.runtime.settings import Settings
-from contract.store.store import Store, new_job_id
+from contract.store.shelf import new_job_id
+from contract.store.store import Store
 from contract.wire.job import JobFiles, JobProgress, JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode

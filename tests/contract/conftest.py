@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import redis
 
+from contract.queue.interface import LEASE_S, Queue
 from contract.queue.memory import MemoryQueue
-from contract.queue.promise import LEASE_S, Queue
 from contract.queue.redis_queue import PREFIX, RedisQueue
 from tests.contract.queues import RunningServer, redis_binary, valkey_binary
 

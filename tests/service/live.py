@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from contract.queue.embedded import short_socket_path
+from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue
-from contract.queue.promise import Claim
 from contract.runtime.settings import Settings
-from contract.store.store import Store, new_job_id
+from contract.store.shelf import new_job_id
+from contract.store.store import Store
 from contract.wire.errors import SceneError
 from contract.wire.job import JobFiles, JobRecord
 from contract.wire.names import MANIFEST

@@ -11,9 +11,9 @@ from typing import Any
 import httpx
 import pytest
 
+from contract.queue.interface import Event
 from contract.queue.memory import MemoryQueue
-from contract.queue.promise import Event
-from contract.store.store import new_job_id
+from contract.store.shelf import new_job_id
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobError, JobFiles, JobProgress, JobRecord
 from service.events import NOTHING_SEEN, Feeds

@@ -16,10 +16,11 @@ import redis
 
 from contract.access.audit import AUDIT_FILE, RESERVE_FILE, AuditAction, AuditLog
 from contract.queue.embedded import EmbeddedServer
-from contract.queue.promise import Claim
+from contract.queue.interface import Claim
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import Settings
-from contract.store.store import Store, new_job_id
+from contract.store.shelf import new_job_id
+from contract.store.store import Store
 from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobError, JobFiles, JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT

@@ -12,8 +12,8 @@ import zmq
 
 from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
 from contract.queue.embedded import short_socket_path
+from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue
-from contract.queue.promise import Claim
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.names import MANIFEST, REPORT

@@ -123,7 +123,7 @@ def test_a_stream_of_events_ends_when_the_service_is_asked_to(live: LiveService)
 
 
 def test_what_is_too_much_at_once_is_told_to_come_back(live: LiveService, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.surface.MAX_OPEN", 2)
+    monkeypatch.setattr("service.request_log.MAX_OPEN", 2)
     events = f"{live.url}/jobs/{submitted(live)}/events"
     with httpx.stream("GET", events) as first, httpx.stream("GET", events) as second:
         streams = [first.iter_lines(), second.iter_lines()]  # kept: one that is dropped closes its connection

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from contract.queue.interface import Admission
 from contract.queue.memory import MemoryQueue
-from contract.queue.promise import Admission
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord, JobState

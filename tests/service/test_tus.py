@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from contract.store.store import is_job_id
+from contract.store.shelf import is_job_id
 from service.partial import promised_bytes
 from tests.service.under_test import CLIP, EMPTY_ZIP, ServiceUnderTest, another_clip, assert_problem, running_service
 

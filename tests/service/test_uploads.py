@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from fastapi import FastAPI
 
-from contract.store.store import ABANDONED_AFTER_S, Store, new_job_id
+from contract.store.shelf import ABANDONED_AFTER_S, new_job_id
+from contract.store.store import Store
 from contract.wire.job import JobRecord
 from contract.wire.names import SUBMISSION
 from service.problems import Problem, install_handlers

@@ -10,8 +10,8 @@ from typing import Any
 import httpx
 
 from contract.queue.embedded import short_socket_path
+from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue
-from contract.queue.promise import Claim
 from contract.runtime.settings import Settings
 from contract.store.store import Store
 from contract.wire.errors import InputError, SceneError

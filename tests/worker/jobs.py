@@ -6,8 +6,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from contract.queue.promise import Queue
-from contract.store.store import Store, new_job_id
+from contract.queue.interface import Queue
+from contract.store.shelf import new_job_id
+from contract.store.store import Store
 from contract.wire.job import TERMINAL_STATES, JobFiles, JobRecord, JobState
 from contract.wire.options import JobOptions
 

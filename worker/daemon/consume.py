@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
-from contract.queue.promise import Claim, Order, Queue
+from contract.queue.interface import Claim, Order, Queue
 from contract.store.store import Store
 from contract.wire.errors import IntrasplatError, UnavailableError
 from contract.wire.job import JobProgress, JobRecord, JobState

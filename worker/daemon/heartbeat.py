@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 
-from contract.queue.promise import BEAT_PERIOD_S, Claim, Order, Queue
+from contract.queue.interface import BEAT_PERIOD_S, Claim, Order, Queue
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobProgress
 

@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-from contract.queue.promise import ANNOUNCE_PERIOD_S, Queue
+from contract.queue.interface import ANNOUNCE_PERIOD_S, Queue
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings

@@ -1,5 +1,5 @@
 #!lua flags=allow-oom
--- BEAT: renew the lease of a claim, write progress, and say what the worker is to do.
+-- BEAT: renew the lease of a claim (common.lua: renew), write progress, and say what the worker is to do.
 -- ARGV   2 id, 3 owner, 4 attempt, 5 progress or ''
 -- Keys   job:<id>, jobs:<priority>, waiting:high, queued, yield:<id>, events:<id>
 -- Answer an Order: go-on, cancel, yield or lost.

@@ -1,6 +1,6 @@
 #!lua flags=allow-oom
 -- CLAIM: give a worker the next job and a lease on it. The lease is the idle time of the job's stream entry: claiming
--- and beating (beat.lua) set it to 0, and an entry that has been idle for lease_ms is anybody's.
+-- and beating (beat.lua) set it to 0 (common.lua: renew). Any worker may claim an entry that was idle for lease_ms.
 -- ARGV   2 owner
 -- Keys   held, jobs:high|standard, job:<id>, the indexes of its state, yield:<id>, ended, events:<id>
 -- Answer {1, id, hash}: the owner's now. {0, last id of jobs:high, of jobs:standard, how many entries are pending}: none.

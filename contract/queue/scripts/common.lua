@@ -1,6 +1,6 @@
 -- What all scripts share; the loader puts it between a script's first line and the rest of it.
 -- KEYS 1: the prefix of all keys, which names the cluster's slot.
--- ARGV 1: the numbers of contract/queue/promise.py and the table of transitions, as JSON. Each script names the others.
+-- ARGV 1: the numbers of contract/queue/interface.py and the table of transitions, as JSON. Each script names the others.
 
 local P, RULES = KEYS[1], cjson.decode(ARGV[1])
 local PRIORITIES = {'high', 'standard'}

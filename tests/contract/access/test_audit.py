@@ -19,7 +19,7 @@ from contract.access.audit import (
     AuditLog,
     utc_now,
 )
-from contract.store.store import StoreFullError
+from contract.store.disk_errors import StoreFullError
 from contract.wire.errors import UnavailableError
 from tests.contract.stores import files_no_larger_than
 

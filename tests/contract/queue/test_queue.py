@@ -7,14 +7,14 @@ import time
 
 import pytest
 
-from contract.queue.promise import (
+from contract.queue.interface import (
     MAX_ATTEMPTS,
     MAX_EVENTS,
     Claim,
     Order,
     Queue,
 )
-from contract.store.store import new_job_id
+from contract.store.shelf import new_job_id
 from contract.wire.job import JobState
 from contract.wire.options import JobOptions
 from contract.wire.rendering import WorkerAddress

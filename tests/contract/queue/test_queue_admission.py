@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from contract.queue.promise import Admission, Queue, QueueFullError
+from contract.queue.interface import Admission, Queue, QueueFullError
 from contract.wire.job import JobState
 from tests.contract.queues import claimed, job
 

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from contract.queue.promise import LEASE_S, MAX_ATTEMPTS, Claim, Order, Queue, worker_died
+from contract.queue.interface import LEASE_S, MAX_ATTEMPTS, Claim, Order, Queue, worker_died
 from contract.wire.job import JobState
 from tests.contract.conftest import MakeQueue
 from tests.contract.queues import ERROR, TRAINING, claimed, job, known, state_of

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import redis
 
-from contract.queue.promise import Admission, Claim, Order, Queue
+from contract.queue.interface import Admission, Claim, Order, Queue
 from contract.queue.redis_queue import PREFIX, RedisQueue
 from contract.wire.job import JobRecord, JobState
 from tests.contract.queues import ERROR, TRAINING, LossyProxy, RunningServer, claimed, job, known, state_of

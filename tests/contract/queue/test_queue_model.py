@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
+from contract.queue.interface import Admission, Claim, Event, QueueFullError
 from contract.queue.memory import MemoryQueue
-from contract.queue.promise import Admission, Claim, Event, QueueFullError
 from contract.queue.redis_queue import HELD, PREFIX, QUEUED, RedisQueue
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, JobRecord, JobState
 from tests.contract.conftest import emptied

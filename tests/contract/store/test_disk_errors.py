@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from contract.store.store import Store, StoreFullError, disk_errors, new_job_id
+from contract.store.disk_errors import StoreFullError, disk_errors
+from contract.store.shelf import new_job_id
+from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.names import MANIFEST, SUBMISSION
 from tests.contract.stores import files_no_larger_than, received

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from contract.runtime.settings import Settings
-from contract.store.store import ABANDONED_AFTER_S, Store, new_job_id, open_store
+from contract.store.shelf import ABANDONED_AFTER_S, new_job_id
+from contract.store.store import Store, open_store
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.names import MANIFEST, RESUME, SUBMISSION
 from tests.contract.stores import BUCKET_URL, accepted, lead_to, published, received

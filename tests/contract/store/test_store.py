@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from contract.store.store import ABANDONED_AFTER_S, Store, is_job_id, new_job_id
+from contract.store.shelf import ABANDONED_AFTER_S, is_job_id, new_job_id
+from contract.store.store import Store
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.names import MANIFEST, RESUME, SUBMISSION

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from contract.runtime.exits import LAST_WORDS_VARIABLE, ExitCode, end_by, exit_code_of, take_last_words
 from contract.runtime.progress_bar import ProgressBar, format_progress
 from contract.runtime.settings import Settings
-from contract.store.store import new_job_id
+from contract.store.shelf import new_job_id
 from contract.wire.errors import Cancelled, InputError, LimitError, SceneError, UnavailableError
 from contract.wire.job import (
     TERMINAL_STATES,

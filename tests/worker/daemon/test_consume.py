@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from contract.queue.interface import MAX_ATTEMPTS, Claim, Order
 from contract.queue.memory import MemoryQueue
-from contract.queue.promise import MAX_ATTEMPTS, Claim, Order
 from contract.runtime import supervised
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError

@@ -16,7 +16,7 @@ import torch
 
 from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
-from contract.store.store import new_job_id
+from contract.store.shelf import new_job_id
 from contract.wire.errors import InputError, TrainingDiverged, UnavailableError
 from contract.wire.job import JobFiles, JobRecord
 from contract.wire.names import REPORT

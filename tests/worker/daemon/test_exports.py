@@ -9,7 +9,8 @@ import pytest
 import zmq
 
 from contract.queue.embedded import short_socket_path
-from contract.store.store import Store, new_job_id
+from contract.store.shelf import new_job_id
+from contract.store.store import Store
 from contract.wire.rendering import ExportRequest, WorkerRequest
 from tests.worker.daemon.test_serve import ask, connected
 from tests.worker.scenes import random_scene

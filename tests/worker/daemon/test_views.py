@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from contract.store.store import Store, new_job_id
+from contract.store.shelf import new_job_id
+from contract.store.store import Store
 from contract.wire.errors import LimitError, SceneError
 from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose

@@ -1,4 +1,4 @@
-"""What every request passes first and every answer last: its id, its line in the log, and the answer to a fault.
+"""Middleware around all routes: request ids, a line in the log for each request, and the answer to a fault.
 
 The line tells the route's template, not the path, and nothing of query, headers or body: callers put anything there.
 """
@@ -42,7 +42,7 @@ class _Answered:
     status: int | None = None
 
 
-class Surface:
+class RequestLog:
     """ASGI middleware; only counting is further out."""
 
     def __init__(self, app: ASGIApp) -> None:

@@ -1,7 +1,7 @@
-"""The queue, as everyone sees it: the service submits, cancels and retries, a worker claims, beats and settles.
+"""The interface of the queue (`Queue`, a Protocol), and what every implementation guarantees.
 
-Two implementations obey this file and pass the same tests: contract/queue/redis_queue.py, which deployments use, and
-contract/queue/memory.py, for tests and for a worker inside one process.
+Two implementations pass the same tests: contract/queue/redis_queue.py, which deployments use, and
+contract/queue/memory.py, the plainest statement of the interface, which the tests use.
 
 A claim is a lease: it holds as long as its worker beats. After LEASE_S without a beat any worker may claim the job, as
 a new attempt. Every report carries the attempt's number and changes nothing if a later attempt has begun: the number
@@ -21,7 +21,7 @@ from contract.wire.job import Forecast, JobError, JobProgress, JobRecord, JobSta
 from contract.wire.rendering import WorkerAddress
 
 MAX_ATTEMPTS = 3
-"""A job whose worker has died this often fails: the job is taken for the cause."""
+"""A job whose worker has died this often fails: the job is assumed to be the cause."""
 
 BEAT_PERIOD_S = 2.0
 LEASE_S = 8.0
@@ -61,7 +61,7 @@ class Order(StrEnum):
     CANCEL = "cancel"
     """Stop, remove, confirm_cancel."""
     YIELD = "yield"
-    """Stop, keep the state, release: a high-priority job waits and nobody is free."""
+    """Stop, save the state and release the job: a high-priority job waits and no worker is free."""
     LOST = "lost"
     """The claim no longer holds: stop, and touch nothing but this attempt's own folder."""
 
@@ -286,6 +286,6 @@ def _estimate_s(
 
 
 def event_order(number: str) -> tuple[int, int]:
-    """The key by which event numbers are compared; text that is no event number comes first."""
+    """The key by which event numbers are compared; text that is not an event number comes first."""
     parts = EVENT_NUMBER.fullmatch(number)
     return (int(parts[1]), int(parts[2] or 0)) if parts else (0, 0)
