@@ -31,8 +31,8 @@ from bm_service import PhantomClip, make_clip
 
 from client.demo import started_service
 from contract.wire.errors import IntrasplatError
-from contract.wire.job import JobState
 from intrasplat_client import Client, Conflict
+from intrasplat_client.models import JobState
 from worker.evaluate.rows import commit, machine
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 16
