@@ -19,9 +19,9 @@ from contract.store.store import Store
 from contract.wire.errors import IntrasplatError, UnavailableError
 from contract.wire.job import JobProgress, JobRecord, JobState
 from worker.daemon.child import DeviceChild, Ended, Keeper
-from worker.daemon.faults import describe
 from worker.daemon.hang import HangDetector
 from worker.daemon.heartbeat import Heartbeat
+from worker.daemon.job_errors import describe
 from worker.daemon.orders import Advanced, Failed, Finished, RunJob, StopJob, Stopped
 
 CLAIM_TIMEOUT_S = 1.0

@@ -19,7 +19,7 @@ from contract.store.store import Store, open_store
 from contract.wire.errors import Cancelled, InputError, ResumeMismatch, UnavailableError
 from contract.wire.job import JobRecord
 from worker.daemon.channel import Channel, Orders, Task
-from worker.daemon.faults import describe
+from worker.daemon.job_errors import describe
 from worker.daemon.orders import (
     Advanced,
     Failed,

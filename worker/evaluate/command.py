@@ -140,13 +140,13 @@ def conclude(results: Results, out: Path) -> None:
 
 def in_words(found: Sooner) -> str:
     """The headline of one place."""
-    theirs = f"{found.theirs}'s final {found.target_db:.2f} dB ({found.their_s:.0f} s)"
-    where = f"{found.clip}, {found.holdout}: {found.ours} ({found.our_limit})"
+    theirs = f"paper's final {found.target_db:.2f} dB ({found.their_s:.0f} s)"
+    where = f"{found.clip}, {found.holdout}: fast ({found.our_limit})"
     if found.our_s is None:
         return f"{where} does not reach {theirs}"
     return (
         f"{where} first reaches {theirs} after {found.our_s:.1f} s, {found.times_in_seconds:.1f} times sooner, and in "
-        f"{found.times_in_iterations:.1f} times fewer iterations; {found.theirs} itself first after "
+        f"{found.times_in_iterations:.1f} times fewer iterations; paper itself first after "
         f"{found.their_first_s:.1f} s"
     )
 

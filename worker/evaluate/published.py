@@ -1,6 +1,6 @@
 """Figures that papers print, for comparison by eye: other hardware, other data, and psnr_paper, not psnr_tissue.
 
-All from Yang et al., "Deform3DGS", MICCAI 2024 (arXiv 2405.17835), tables 1 to 3; one NVIDIA RTX A5000. The clips are
+All from Yang et al., "Deform3DGS", MICCAI 2024 (arXiv 2405.17835), tables 1 and 3; one NVIDIA RTX A5000. The clips are
 those of the EndoNeRF and StereoMIS data sets, which are not part of this project.
 """
 
@@ -33,11 +33,5 @@ RESULTS = (
     Published("Deform3DGS", "StereoMIS", 30.48, 66, 330.37),
 )
 """Table 1."""
-ONE_MINUTE = (
-    Published("LerPlane", "EndoNeRF", 22.75, 60, None),
-    Published("EndoGaussian", "EndoNeRF", 35.81, 60, None),
-    Published("Deform3DGS", "EndoNeRF", 37.90, 60, None),
-)
-"""Table 2: about one minute of training each."""
 ABLATION = {"paper": 37.90, "without_mapf": 37.47, "hexplane": 37.13, "pfs": 37.08}
 """Table 3, psnr_paper in dB by our names of the series; "paper" is FDM with MAPF."""

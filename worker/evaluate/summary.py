@@ -68,17 +68,14 @@ def groups_of(runs: Sequence[Row]) -> list[Group]:
 
 @dataclass(frozen=True)
 class Sooner:
-    """How soon `ours`, in runs of our_limit, first reaches the final psnr_tissue of `theirs` at a place; None where it
-    does not.
+    """How soon preset fast, in runs of our_limit, first reaches the final psnr_tissue of preset paper at a place.
 
-    All figures are medians over seeds; theirs of the longest runs they were given. their_first_s is when theirs first
-    is as good as it ends: a run that over-fits is so long before its end.
+    All figures are medians over seeds: "our" ones of fast, None if it does not get there; "their" ones of the longest
+    runs of paper. their_first_s is when paper is first as good as at its end: early in a run that over-fits.
     """
 
     clip: str
     holdout: str
-    ours: str
-    theirs: str
     target_db: float
     their_s: float
     their_iterations: float
@@ -104,13 +101,12 @@ Point = tuple[float, float, float]
 """t_train_s, iteration, psnr_tissue_db."""
 
 
-def sooner(curves: Sequence[Row], ours: str = "fast", theirs: str = "paper") -> list[Sooner]:
-    """The headline: for each place where both were run and each length of ours, how soon ours is as good as theirs
-    ends."""
+def sooner(curves: Sequence[Row]) -> list[Sooner]:
+    """The headline: for each place where both ran and each limit of fast, how soon fast is as good as paper's end."""
     runs = _curves_by_run(curves)
     found = []
     for place in dict.fromkeys((clip, holdout) for clip, holdout, *_ in runs):
-        of_theirs, of_ours = (_by_limit(runs, (*place, series)) for series in (theirs, ours))
+        of_theirs, of_ours = (_by_limit(runs, (*place, series)) for series in ("paper", "fast"))
         if not of_theirs:
             continue
         their_s, their_iterations, target_db, longest = max(
@@ -121,7 +117,7 @@ def sooner(curves: Sequence[Row], ours: str = "fast", theirs: str = "paper") -> 
             our_s, our_iterations = (
                 median(values) for values in zip(*(reach(p, target_db) for p in alike), strict=True)
             )
-            row = Sooner(*place, ours, theirs, target_db, their_s, their_iterations, first_s, limit)
+            row = Sooner(*place, target_db, their_s, their_iterations, first_s, limit)
             there = math.isfinite(our_s)
             found.append(replace(row, our_s=our_s, our_iterations=our_iterations) if there else row)
     return found

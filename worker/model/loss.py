@@ -69,7 +69,7 @@ def training_loss(
     tissue: Tensor,
     settings: LossSettings,
 ) -> Loss:
-    """The loss of one frame.
+    """The loss of one frame: a reference for tests and benchmarks. Training uses the kernels.
 
     Args:
         rgb, depth, alpha: [H, W, 3], [H, W], [H, W] as rendered; depth is sum(w z) in units, not divided by alpha.

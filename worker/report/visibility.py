@@ -24,7 +24,7 @@ SAMPLED_FRAMES = 24
 BEHIND = 0.03
 """A Gaussian farther than the rendered surface by this share of its depth is hidden there."""
 
-WIDEST_UNSEEN = 3.0
+MAX_UNSEEN_WIDTH = 3.0
 """Units, a twentieth of the median depth: a Gaussian that nothing saw may be no wider at any time of the clip."""
 MISSED_IN_FRAMES, MISSED_DB = 8, 0.02
 """Training frames, evenly spread, of which none may lose more of its psnr_tissue with a Gaussian that is taken out."""
@@ -42,7 +42,7 @@ def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
     """
     unseen = np.flatnonzero(~_ever_on_tissue(model, clip, frames))
     widest = _widest(model, unseen, [float(frames.t[index]) for index in spread(frames.indices, SAMPLED_FRAMES)])
-    strays = _not_missed(model, frames, unseen[widest > WIDEST_UNSEEN])
+    strays = _not_missed(model, frames, unseen[widest > MAX_UNSEEN_WIDTH])
     if not 0 < len(strays) < model.count:
         return 0
     kept = np.setdiff1d(np.arange(model.count), strays)

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from worker.model.deformation import SharedBasis
-from worker.model.deformation.shared import CHANNELS_WITH_COLOUR
 from worker.model.gaussians import Gaussians
-from worker.model.layout import CHANNELS, COLOUR, LOG_SCALE, MEAN, OPACITY_ROW, QUATERNION, VALUES
+from worker.model.layout import CHANNELS, COLOUR, LOG_SCALE, MEAN, OPACITY_ROW, QUATERNION, ROWS, VALUES
 from worker.scene.differences import MAX_POWER, MAX_STORED, add_differences, coding_order, take_differences
 from worker.scene.rangecoder import PARTS, decode, encode
 
@@ -102,7 +101,7 @@ class Compact:
 
         for channel in range(CHANNELS):
             motion[:, channel] = coefficients(channel, channel + 1) @ pattern[channel]
-        if channels == CHANNELS_WITH_COLOUR:
+        if channels == ROWS:
             mixed = np.einsum("or,opx->oprx", OPPONENT.astype(np.float32), pattern[COLOUR])
             colour = coefficients(CHANNELS, channels) @ mixed.reshape(3 * patterns, 3 * columns)
             motion[:, COLOUR] = colour.reshape(-1, 3, columns)
@@ -145,7 +144,7 @@ def unpack(tensors: Mapping[str, Tensor]) -> Compact:
     columns = STATE + channels * patterns + 4
     if count.shape != (1,) or step.shape != (STATE,) or shared.shape != (columns,):
         raise ValueError(f"count, step and shared do not fit {channels} channels of {patterns} patterns")
-    if patterns != bases - 1 or channels not in (CHANNELS, CHANNELS_WITH_COLOUR):
+    if patterns != bases - 1 or channels not in (CHANNELS, ROWS):
         raise ValueError(f"{patterns} patterns in {channels} channels do not fit {bases} bases")
     rows = int(count[0])
     check_size(rows, columns)

@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from worker.model.deformation import SharedBasis
-from worker.model.deformation.shared import CHANNELS_WITH_COLOUR
 from worker.model.gaussians import Gaussians
-from worker.model.layout import COLOUR, COLOUR_ROW, MEAN, QUATERNION, QUATERNION_ROW
+from worker.model.layout import COLOUR, COLOUR_ROW, MEAN, QUATERNION, QUATERNION_ROW, ROWS
 from worker.scene.compact import GROUP_OF, MIN_POWER, OPPONENT, SEEN_LEVELS, STATE, Compact, Whole, check_size
 from worker.scene.differences import MAX_POWER, MAX_STORED
 
@@ -96,7 +95,7 @@ def prepare(
     effect[QUATERNION] *= length**2
     state[:, COLOUR] = state[:, COLOUR] @ OPPONENT.T
     effect[COLOUR] = effect[COLOUR].mean(0)
-    if channels == CHANNELS_WITH_COLOUR:
+    if channels == ROWS:
         weight[:, COLOUR] = OPPONENT.astype(np.float32) @ weight[:, COLOUR]
 
     power = np.stack([_power(effect[group]) for group in (MEAN, SHAPE, COLOUR)], axis=1)

@@ -58,22 +58,6 @@ class DensifySettings:
         return iteration >= self.from_iteration and iteration % self.every == 0
 
 
-@dataclass(frozen=True)
-class DensifyResult:
-    """What one densification did.
-
-    split     Gaussians replaced by their children
-    pruned    Gaussians dropped
-    withheld  Gaussians above the threshold that were not split, because max_count was reached
-    count     N afterwards
-    """
-
-    split: int
-    pruned: int
-    withheld: int
-    count: int
-
-
 class Densifier:
     """Gathers every Gaussian's gradients on the model's device, and edits the model when the time has come."""
 
@@ -106,14 +90,14 @@ class Densifier:
         self._gradient_sum += torch.where(visible, model.gradient_norm, 0.0)
         self._steps_seen += visible
 
-    def apply(self, model: Model, iteration: int, random: np.random.Generator) -> DensifyResult | None:
-        """Split and prune if that is due after this iteration, else None. The statistics start anew.
+    def apply(self, model: Model, iteration: int, random: np.random.Generator) -> None:
+        """Split and prune if that is due after this iteration, and reset the statistics.
 
         Raises:
             TrainingDiverged: a gradient is not finite, or no Gaussian would be left.
         """
         if not self.settings.due(iteration):
-            return None
+            return
         gradient = self.mean_gradient
         if not np.isfinite(gradient).all():
             broken = int((~np.isfinite(gradient)).sum())
@@ -127,7 +111,6 @@ class Densifier:
         split = _hardest_pulled(asked, gradient, self._room(model.count - int(pruned.sum())))
         _replace(model, pruned, split, self.settings.split_into, random)
         self._forget(model.count)
-        return DensifyResult(len(split), int(pruned.sum()), len(asked) - len(split), model.count)
 
     def _room(self, count: int) -> int:
         """How many of count Gaussians may be split."""

@@ -24,7 +24,7 @@ from contract.wire.options import JobOptions, ReconstructionOptions
 from worker.__main__ import main
 from worker.daemon.child import DeviceChild, Keeper
 from worker.daemon.device import request_of, run_or_start_anew
-from worker.daemon.faults import describe
+from worker.daemon.job_errors import describe
 from worker.daemon.orders import Advanced, Failed, Finished, RunJob, StopJob, Stopped
 from worker.scene.checkpoint import load_scene
 from worker.scene.resume_file import RESUME_FILE, load_resume

@@ -41,10 +41,6 @@ class ConstantVelocity(Deformation):
     def at_rest(cls, gaussians: Gaussians, start: AtRest) -> ConstantVelocity:
         return cls(torch.zeros_like(gaussians.mean))
 
-    @property
-    def floats_per_gaussian(self) -> int:
-        return 3
-
     def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
         still = self.velocity.new_zeros(len(gaussians), CHANNELS - 3)
         return add_offsets(gaussians, torch.cat([self.velocity * t, still], dim=1))

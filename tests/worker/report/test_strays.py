@@ -10,7 +10,7 @@ import pytest
 from tests.worker.clips import plane_clip
 from tests.worker.phantoms import prepared
 from worker.input.clip import DepthClip
-from worker.report.visibility import WIDEST_UNSEEN, drop_strays, seen_share
+from worker.report.visibility import MAX_UNSEEN_WIDTH, drop_strays, seen_share
 from worker.train.run import Run
 
 LOG_SCALE = slice(7, 10)
@@ -35,7 +35,7 @@ def start(clip: DepthClip, preset: str) -> Run:
 def test_a_wide_gaussian_that_nothing_saw_is_taken_out(preset: str, clip: DepthClip) -> None:
     run = start(clip, preset)
     count = run.model.count
-    run.model.canonical[LOG_SCALE, 0] = np.log(2 * WIDEST_UNSEEN)
+    run.model.canonical[LOG_SCALE, 0] = np.log(2 * MAX_UNSEEN_WIDTH)
     kept = run.model.canonical[:3, 1:count].copy()
     assert drop_strays(run.model, clip, run.frames) == 1
     np.testing.assert_array_equal(run.model.canonical[:3, : run.model.count], kept)
@@ -46,7 +46,7 @@ def test_what_was_seen_may_be_wide_and_what_is_narrow_may_be_unseen(clip: DepthC
     count = run.model.count
     seen = seen_share(run.model, clip, run.frames)
     assert seen[:2].tolist() == [0, 0]
-    run.model.canonical[LOG_SCALE, int(seen.argmax())] = np.log(2 * WIDEST_UNSEEN)
+    run.model.canonical[LOG_SCALE, int(seen.argmax())] = np.log(2 * MAX_UNSEEN_WIDTH)
     assert drop_strays(run.model, clip, run.frames) == 0
     assert run.model.count == count
 
@@ -59,7 +59,7 @@ def test_a_wide_gaussian_that_alone_shows_the_tissue_around_it_stays(clip: Depth
     middle = int(off_centre_px.argmin())
     elsewhere = np.flatnonzero(off_centre_px > 20)
     run.model.take(np.array([middle, *elsewhere], np.int64), np.zeros(1 + len(elsewhere), np.bool_))
-    run.model.canonical[LOG_SCALE, 0] = np.log(2 * WIDEST_UNSEEN)
+    run.model.canonical[LOG_SCALE, 0] = np.log(2 * MAX_UNSEEN_WIDTH)
     height, width = clip.tissue.shape[1:]
     rows, columns = np.mgrid[:height, :width]
     hidden = np.hypot(columns + 0.5 - camera[2], rows + 0.5 - camera[3]) < 5

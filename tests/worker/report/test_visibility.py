@@ -13,7 +13,7 @@ from tests.worker.clips import WIDTH, plane_clip
 from tests.worker.phantoms import prepared
 from worker.fusion import COMPLETED_CONFIDENCE
 from worker.input.clip import DepthClip
-from worker.report.visibility import SAMPLED_FRAMES, WIDEST_UNSEEN, drop_strays, seen_share
+from worker.report.visibility import MAX_UNSEEN_WIDTH, SAMPLED_FRAMES, drop_strays, seen_share
 from worker.train.run import Run
 
 
@@ -66,7 +66,7 @@ def test_behind_the_surface_behind_the_camera_and_outside_the_image_nothing_is_s
 
 def test_a_wide_gaussian_on_tissue_without_depth_is_no_stray(clip: DepthClip) -> None:
     run = start(clip)
-    run.model.canonical[7:10] = np.log(2 * WIDEST_UNSEEN)
+    run.model.canonical[7:10] = np.log(2 * MAX_UNSEEN_WIDTH)
     unsure = dataclasses.replace(clip, depth_confidence=np.zeros_like(clip.depth_confidence))
     seen = seen_share(run.model, unsure, run.frames)
     assert seen.any()

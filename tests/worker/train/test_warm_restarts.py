@@ -28,7 +28,7 @@ from worker.train.schedule import AVERAGED, Schedule, validation_frames
 from worker.train.setup import Setup
 from worker.train.targets import TrainingFrames
 
-SHORTEST, PLANNED = 24, 192
+MIN_CYCLE, PLANNED = 24, 192
 """Cycles that end at 24, 48, 96 and 192."""
 NEVER_ENOUGH_DB, ALWAYS_ENOUGH_DB = 1000.0, -1000.0
 STOPPED_AT, CLOSED_AT = 48, 60
@@ -37,7 +37,7 @@ STOPPED_AT, CLOSED_AT = 48, 60
 @pytest.fixture(scope="module", autouse=True)
 def short_cycles() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("worker.train.schedule.MIN_CYCLE_ITERATIONS", SHORTEST)
+        patched.setattr("worker.train.schedule.MIN_CYCLE_ITERATIONS", MIN_CYCLE)
         yield
 
 
@@ -113,7 +113,7 @@ def test_a_run_whose_doublings_gain_enough_goes_on_as_planned(clip: DepthClip, s
 
 
 def test_a_score_is_how_near_the_finished_model_is_to_the_validation_frames(clip: DepthClip, split: FrameSplit) -> None:
-    run = until(SHORTEST, validated(clip, split))
+    run = until(MIN_CYCLE, validated(clip, split))
     scores = []
     for index in validation_frames(split.train):
         image = run.model.render(run.frames.cameras[index], float(clip.t[index]))[:3].transpose(1, 2, 0)
@@ -182,9 +182,9 @@ def test_held_out_frames_do_not_decide_when_a_run_ends(
     "stopped_after",
     [
         7,  # in the first cycle
-        SHORTEST - AVERAGED + 2,  # some of the models averaged are made
-        SHORTEST,  # averaged and scored
-        SHORTEST + 9,
+        MIN_CYCLE - AVERAGED + 2,  # some of the models averaged are made
+        MIN_CYCLE,  # averaged and scored
+        MIN_CYCLE + 9,
         STOPPED_AT - 1,  # one model is missing
         STOPPED_AT,  # decided
         STOPPED_AT + 4,  # closing
@@ -204,13 +204,13 @@ def test_a_validated_run_goes_on_to_the_bits_of_an_unstopped_one(
 
 def test_a_cycle_ends_with_the_mean_of_its_last_models(clip: DepthClip, split: FrameSplit) -> None:
     run, models = validated(clip, split, None), []
-    for iteration in range(SHORTEST - AVERAGED + 1, SHORTEST):
+    for iteration in range(MIN_CYCLE - AVERAGED + 1, MIN_CYCLE):
         models.append(copied(until(iteration, run).model))
     alone = prepared_on(
-        clip, split, dataclasses.replace(PRESETS["fast"], warm_restarts=False, min_gain_db=None), iterations=SHORTEST
+        clip, split, dataclasses.replace(PRESETS["fast"], warm_restarts=False, min_gain_db=None), iterations=MIN_CYCLE
     )
     models.append(copied(trained(alone).model))  # the same steps, and nothing averaged
-    averaged = copied(until(SHORTEST, run).model)
+    averaged = copied(until(MIN_CYCLE, run).model)
     for name, values in averaged.items():
         expected = np.mean([model[name] for model in models], axis=0, dtype=np.float64)
         np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-5, err_msg=name)

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
 from contract.wire.names import PoseConvention
-
-POSE_CONVENTIONS: tuple[str, ...] = get_args(PoseConvention)
 
 POSES_FILE = "poses_bounds.npy"
 RIGID_TOLERANCE = 1e-3  # on the entries of R^T R: float32 files and rounding pass, scaled or sheared matrices do not

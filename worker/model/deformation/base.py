@@ -66,16 +66,6 @@ class Deformation(ABC):
         """B of every channel; 0 where there is no such number."""
         return 0
 
-    @property
-    @abstractmethod
-    def floats_per_gaussian(self) -> int:
-        """Trained numbers that each Gaussian adds."""
-
-    @property
-    def shared_floats(self) -> int:
-        """Numbers, trained or fixed, that all Gaussians share."""
-        return 0
-
     @abstractmethod
     def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
         """The Gaussians at time t: pure, differentiable in every parameter and in the canonical state."""
@@ -113,10 +103,6 @@ class LinearDeformation(Deformation):
     @property
     def bases(self) -> int:
         return int(self.weight.shape[2])
-
-    @property
-    def floats_per_gaussian(self) -> int:
-        return int(self.weight.shape[1]) * self.bases
 
     def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
         """The Gaussians at time t."""

@@ -64,10 +64,6 @@ class FlexibleDeformation(Deformation):
     def bases(self) -> int:
         return int(self.weight.shape[2])
 
-    @property
-    def floats_per_gaussian(self) -> int:
-        return 3 * CHANNELS * self.bases
-
     @abstractmethod
     def basis(self, t: float) -> Tensor:
         """Value of every b_j at t: [N, 10, B] in [0, 1]."""

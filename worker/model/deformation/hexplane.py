@@ -88,14 +88,6 @@ class HexPlane(Deformation):
             bounds=tensors["bounds"],
         )
 
-    @property
-    def floats_per_gaussian(self) -> int:
-        return 0
-
-    @property
-    def shared_floats(self) -> int:
-        return sum(each.numel() for each in self.parameters().values()) + self.bounds.numel()
-
     def features(self, position: Tensor, t: float) -> Tensor:
         """[N, 3] canonical positions -> [N, R * 3 * F] features at time t."""
         low, high = self.bounds

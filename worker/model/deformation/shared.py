@@ -15,9 +15,8 @@ from torch import Tensor
 from worker.model.constants import MIN_WIDTH
 from worker.model.deformation.base import AtRest, LinearDeformation
 from worker.model.gaussians import Gaussians
-from worker.model.layout import CHANNELS
+from worker.model.layout import CHANNELS, ROWS
 
-CHANNELS_WITH_COLOUR = CHANNELS + 3
 DEFAULT_BASES = 9
 WIDTH_IN_SPACINGS = 0.6
 """Neighbouring bases of this width cross at 0.7, so that no time is left without one."""
@@ -43,11 +42,11 @@ class SharedBasis(LinearDeformation):
     kind = "shared"
 
     def __post_init__(self) -> None:
-        bases, channels = self.centre.shape[0], (CHANNELS, CHANNELS_WITH_COLOUR)
+        bases, channels = self.centre.shape[0], (CHANNELS, ROWS)
         shape = tuple(self.weight.shape)
         if len(shape) != 3 or shape[1] not in channels or shape[2] != bases or self.width.shape != (bases,):
             raise ValueError(
-                f"weight must be [N, {CHANNELS} or {CHANNELS_WITH_COLOUR}, B] with centre and width [B], not {shape}, "
+                f"weight must be [N, {CHANNELS} or {ROWS}, B] with centre and width [B], not {shape}, "
                 f"{tuple(self.centre.shape)} and {tuple(self.width.shape)}"
             )
         if not bool((self.width > 0).all()):
@@ -73,7 +72,7 @@ class SharedBasis(LinearDeformation):
         gaps = np.diff(centre) if bases > 1 else np.ones(1)
         width = WIDTH_IN_SPACINGS * np.maximum(np.r_[gaps[:1], gaps], np.r_[gaps, gaps[-1:]])[:bases]
         return cls(
-            weight=torch.zeros(count, CHANNELS_WITH_COLOUR if colour else CHANNELS, bases),
+            weight=torch.zeros(count, ROWS if colour else CHANNELS, bases),
             centre=torch.from_numpy(centre).float(),
             width=torch.from_numpy(np.maximum(width, MIN_WIDTH)).float(),  # repeated quantiles of few frames: 0
         )
@@ -83,10 +82,6 @@ class SharedBasis(LinearDeformation):
         """Initial with moving colour, and with no more bases than training frames."""
         bases = DEFAULT_BASES if start.bases is None else start.bases
         return cls.initial(len(gaussians), bases=min(len(start.times), bases), colour=True, times=start.times)
-
-    @property
-    def shared_floats(self) -> int:
-        return 2 * self.bases
 
     def basis(self, t: float) -> Tensor:
         """phi at t: [B] in [0, 1], summing to 1."""
