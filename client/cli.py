@@ -19,19 +19,10 @@ from pydantic import ValidationError
 
 from client.keys import add_keys
 from client.remote import add_remote
-from contract.runtime.arguments import Commands, add_command, count
+from contract.runtime.arguments import LOCAL_COMMANDS, Commands, add_command, count
 from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
 from contract.runtime.settings import Settings, default_data_dir
 from contract.wire.errors import InputError, IntrasplatError
-
-LOCAL_COMMANDS = {
-    "reconstruct": "train a scene from a clip, on this machine",
-    "render": "render images of a scene that is on this machine",
-    "phantom": "make a synthetic stereo clip of tissue",
-    "evaluate": "measure presets on clips, and draw speed against accuracy",
-    "stability": "spoil synthetic clips, and draw where presets break and whether they say so",
-    "doctor": "say what is installed, what would be used, what is missing",
-}
 
 EXAMPLES = """\
 a clip on this machine:
@@ -95,7 +86,7 @@ def _add_up(commands: Commands) -> None:
     parser.add_argument("--port", type=int, help="where the service answers (default: 8765)")
     parser.add_argument(
         "--host",
-        help="address to answer at (default: 127.0.0.1, for this machine alone; others need `intrasplat keys`)",
+        help="address to listen on (default: 127.0.0.1, for this machine alone; others need `intrasplat keys`)",
     )
     parser.add_argument(
         "--data-dir", type=Path, metavar="DIR", help=f"where clips and scenes are kept (default: {default_data_dir()})"

@@ -169,5 +169,5 @@ def check_port(host: str, port: int) -> None:
         try:
             probe.bind((host, port))
         except OSError as error:
-            problem = f"Port {port} of {host} cannot be had ({error.strerror})."
+            problem = f"Cannot listen on {host}:{port} ({error.strerror})."
             raise UnavailableError(problem, f"Choose another: --port {port + 1}.") from error

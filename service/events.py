@@ -97,11 +97,6 @@ class Feeds:
         self._pollers: dict[str, asyncio.Task[None]] = {}
         self._is_ending = False
 
-    @property
-    def listener_count(self) -> int:
-        """How many listen, to whatever job."""
-        return sum(feed.listeners for feed in self._feeds.values())
-
     def end(self) -> None:
         """All streams end within a poll's period; may be called from a signal's handler."""
         self._is_ending = True

@@ -11,24 +11,21 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
-from contract.runtime.arguments import add_command
+from contract.runtime.arguments import LOCAL_COMMANDS, add_command
 from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, end_by
 from contract.runtime.logs import configure
 from contract.runtime.processes import told_to_end
 from contract.runtime.settings import Settings
 from contract.wire.errors import IntrasplatError, UnavailableError
 
-COMMANDS = {
-    "reconstruct": ("train a scene from a clip", "worker.commands.reconstruct"),
-    "render": ("render images of a scene", "worker.commands.render"),
-    "phantom": ("make a synthetic stereo clip of tissue, with its truth", "worker.phantom.command"),
-    "evaluate": ("measure presets on clips, and draw speed against accuracy", "worker.evaluate.command"),
-    "stability": (
-        "spoil synthetic clips in many ways, and draw where presets break and whether they say so",
-        "worker.evaluate.stability_command",
-    ),
+MODULES = {
+    "reconstruct": "worker.commands.reconstruct",
+    "render": "worker.commands.render",
+    "phantom": "worker.phantom.command",
+    "evaluate": "worker.evaluate.command",
+    "stability": "worker.evaluate.stability_command",
 }
-"""By name: a summary, and the module with its add_cli_arguments and run_cli."""
+"""By command: the module with its add_cli_arguments and run_cli."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,15 +48,15 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="intrasplat", epilog=EXIT_CODES_HELP)
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     chosen = next((each for each in argv if not each.startswith("-")), None)
-    for name, (summary, module_name) in COMMANDS.items():
+    for name, module_name in MODULES.items():
         if name == chosen:
             module = import_module(module_name)
-            module.add_cli_arguments(add_command(commands, name, summary, module.run_cli))
+            module.add_cli_arguments(add_command(commands, name, LOCAL_COMMANDS[name], module.run_cli))
         else:
-            add_command(commands, name, summary, _not_chosen)
+            add_command(commands, name, LOCAL_COMMANDS[name], _not_chosen)
     add_command(commands, "consume", "claim jobs from the queue and serve renders, until a signal ends it", _consume)
     add_command(commands, "device", "what consume starts for itself: train and render as it is told on stdin", _device)
-    add_command(commands, "doctor", "say what is installed, what would be used, what is missing", _doctor)
+    add_command(commands, "doctor", LOCAL_COMMANDS["doctor"], _doctor)
     return parser
 
 

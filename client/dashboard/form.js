@@ -26,7 +26,7 @@ const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;
  * @param {File[]} files
  * @returns {Map<string, File>}
  */
-export function partsOf(files) {
+function partsOf(files) {
   const parts = new Map();
   for (const file of files) {
     if (CALIBRATION.test(file.name)) parts.set("calibration", file);

@@ -24,7 +24,7 @@ const STAGES = {
 const seconds = (value) => (value < 90 ? `${Math.max(1, Math.round(value))} s` : `${Math.round(value / 60)} min`);
 
 /** @param {Job} job @returns {string} what it is doing, in one line */
-export function describe(job) {
+function describe(job) {
   if (job.state === "queued") {
     const before = job.position == null ? null : job.position === 0 ? "next" : `${job.position} before it`;
     return ["queued", before, job.eta_s != null && `done in about ${seconds(job.eta_s)}`].filter(Boolean).join(" · ");
@@ -36,7 +36,7 @@ export function describe(job) {
 }
 
 /** @param {import("./api.js").Receipt} receipt @returns {string} */
-export function describeReceipt(receipt) {
+function describeReceipt(receipt) {
   const sum = (counts) => Object.values(counts).reduce((total, count) => total + count, 0);
   const megabytes = (sum(receipt.bytes) / 1e6).toFixed(1);
   const proof = receipt.verified ? "It was checked that nothing is left." : "";

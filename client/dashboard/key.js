@@ -9,12 +9,12 @@ export const keyEvents = new EventTarget();
 export const currentKey = () => sessionStorage.getItem(NAME);
 
 /** @param {string} text */
-export function keepKey(text) {
+function keepKey(text) {
   sessionStorage.setItem(NAME, text);
   keyEvents.dispatchEvent(new Event("changed"));
 }
 
-export function forgetKey() {
+function forgetKey() {
   sessionStorage.removeItem(NAME);
   keyEvents.dispatchEvent(new Event("changed"));
 }

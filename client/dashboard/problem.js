@@ -16,7 +16,7 @@ const WORDS = {
 };
 
 /** In place of a status: no answer came, or only part of one. */
-export const LOST = 0;
+const LOST = 0;
 
 export class Problem extends Error {
   /**

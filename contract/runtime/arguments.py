@@ -11,6 +11,16 @@ from typing import Any, Literal, TypeAlias, get_args, get_origin
 from contract.runtime.exits import EXIT_CODES_HELP, flag_of
 from contract.wire.options import ClipOptions, Options, parse_options
 
+LOCAL_COMMANDS = {
+    "reconstruct": "train a scene from a clip, on this machine",
+    "render": "render images of a scene that is on this machine",
+    "phantom": "make a synthetic stereo clip of tissue, with its truth",
+    "evaluate": "measure presets on clips, and draw speed against accuracy",
+    "stability": "spoil synthetic clips in many ways, and draw where presets break and whether they say so",
+    "doctor": "say what is installed, what would be used, what is missing",
+}
+"""What `intrasplat` and `python -m worker` do without a service: summaries by command."""
+
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """What ArgumentParser.add_subparsers returns."""
 
@@ -28,10 +38,13 @@ def add_command(
 def add_options(parser: argparse.ArgumentParser, model: type[ClipOptions], *names: str, **overrides: Any) -> None:
     """Add one command-line option for each named field of `model` (default: all): flag, type, choices and help.
 
-    The namespace holds None for an option that was not given. `overrides` go to every add_argument, such as nargs="+".
+    The namespace holds None for an option that was not given. The parser refuses more than one of `model.exclusive`. In
+    the help, the last word of an option's name stands for its value (--budget-s S), unless it lists choices.
+    `overrides` go to every add_argument, such as nargs="+".
     """
     chosen = names or tuple(model.model_fields)
-    exclusive = parser.add_mutually_exclusive_group() if {*chosen} & {*model.exclusive} else parser
+    has_exclusive = any(name in model.exclusive for name in chosen)
+    exclusive = parser.add_mutually_exclusive_group() if has_exclusive else parser  # an empty group breaks --help
     for name in chosen:
         field = model.model_fields[name]
         kinds = [kind for kind in get_args(field.annotation) or (field.annotation,) if kind is not NoneType]
@@ -80,5 +93,5 @@ def positive(text: str) -> float:
 def count(text: str) -> int:
     """An argument's whole number of at least 1; ArgumentTypeError for any other."""
     if not (text.isascii() and text.isdigit() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of at least 1.")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1.")
     return int(text)

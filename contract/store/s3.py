@@ -59,7 +59,6 @@ class Stored:
     """An object of the bucket. Its key is without the prefix."""
 
     key: str
-    size_bytes: int
     written_at_s: float
 
 
@@ -109,7 +108,7 @@ class Bucket:
         for page in self._pages("list_objects_v2", {"ContinuationToken": "NextContinuationToken"}, start):
             for each in page.get("Contents", ()):
                 key = each["Key"].removeprefix(self._prefix)
-                found.append(Stored(key, each["Size"], each["LastModified"].timestamp()))
+                found.append(Stored(key, each["LastModified"].timestamp()))
         return found
 
     def remove(self, start: str, first: str | None = None) -> Removed:

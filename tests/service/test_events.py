@@ -153,7 +153,7 @@ def test_many_listeners_share_one_poller_and_a_silent_queue_costs_them_nothing(m
 
     heard = asyncio.run(limited(all_of_them()))
     assert all(each.count(b"cancelled") == heard[0].count(b"cancelled") > 0 for each in heard)
-    assert feeds.listener_count == 0
+    assert feeds._feeds == {}
 
 
 def test_the_end_of_the_service_ends_every_stream(monkeypatch: pytest.MonkeyPatch) -> None:
