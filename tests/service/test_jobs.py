@@ -20,13 +20,14 @@ def test_a_running_job_shows_stage_decibels_and_seconds_left(service: ServiceUnd
     assert [each["id"] for each in service.http.get("/jobs").json()] == [job_id]
 
 
-def test_a_failed_job_tells_field_and_remedy(service: ServiceUnderTest) -> None:
+def test_a_failed_job_tells_code_field_and_remedy(service: ServiceUnderTest) -> None:
     job_id = service.upload().json()["id"]
     _, claim = service.claimed()
-    service.queue.fail(claim, JobError(problem="no depth.", field="calibration", remedy="Check the baseline."))
+    error = {"code": "input", "problem": "no depth.", "field": "calibration", "remedy": "Check the baseline."}
+    service.queue.fail(claim, JobError.model_validate(error))
     job = service.http.get(f"/jobs/{job_id}").json()
     assert job["state"] == "failed"
-    assert job["error"] == {"problem": "no depth.", "field": "calibration", "remedy": "Check the baseline."}
+    assert job["error"] == error
     assert_problem(service.http.get("/render", params={"scene": job_id}), 409, "scene")
     assert_problem(service.http.delete(f"/jobs/{job_id}"), 409, "job_id")
     assert service.http.delete(f"/scenes/{job_id}").status_code == 200
