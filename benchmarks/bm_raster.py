@@ -5,7 +5,7 @@
 The standard scene is 640x512 with a Gaussian every 2.86 pixels each way (40,096), 0.6 of the grid's step wide,
 opacity 0.88, on a curved surface at depth 60: every pixel is covered, as after fusion. A step is deformation,
 projection, binning, sorting, blend with loss and gradients, their way back to the parameters, and Adam; with shared
-bases (17, colour moving) and with the paper's FDM (17 bases a Gaussian and channel). Then the same against the number
+bases (17, colour moving) and with the paper's FDM (17 bases per Gaussian and channel). Then the same against the number
 of pixels, Gaussians held, and against the number of Gaussians, pixels held. Figures are medians in ms, the least beside
 them for busy machines (--cpu-time for very busy ones); parts are timed inside whole runs. --scene measures a stored
 scene instead.
@@ -173,7 +173,7 @@ def measure(
     }
     blended = blended_per_pixel(model, view)
     rows = []
-    print(f"{name}: {len(gaussians)} Gaussians, {camera.width}x{camera.height}, {blended:.1f} blended a pixel")
+    print(f"{name}: {len(gaussians)} Gaussians, {camera.width}x{camera.height}, {blended:.1f} blended per pixel")
     for work, call in works.items():
         call()
         total_ms, least_ms, part_ms = _timed(model, call, repeats)

@@ -1,4 +1,4 @@
-"""Depth from stereo: error on synthetic tissue; on real clips agreement with a reference, rows, seconds a frame.
+"""Depth from stereo: error on synthetic tissue; on real clips agreement with a reference, rows, seconds per frame.
 
     python benchmarks/bm_stereo.py [--data FOLDER] [--repeats 3] [--device cuda] [--every 8]
 
@@ -99,7 +99,7 @@ def thinned(clip: RectifiedClip, every: int) -> RectifiedClip:
 
 
 def _timed(name: str, clip: RectifiedClip, matched: Callable[[RectifiedClip], DepthClip], repeats: int) -> DepthClip:
-    """Estimate depth and print the fastest run's seconds a frame, decoding and rectification included."""
+    """Estimate depth and print the fastest run's seconds per frame, decoding and rectification included."""
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter(), time.process_time()
@@ -107,8 +107,8 @@ def _timed(name: str, clip: RectifiedClip, matched: Callable[[RectifiedClip], De
         seconds.append((time.perf_counter() - start[0], time.process_time() - start[1]))
     size = f"{clip.intrinsics.width}x{clip.intrinsics.height}"
     wall_s, cpu_s = min(seconds)
-    print(f"{name}: {clip.frame_count} frames of {size} in {wall_s:.2f} s, {wall_s / clip.frame_count:.4f} s a frame")
-    print(f"  {cpu_s / clip.frame_count:.4f} CPU seconds a frame, the figure to compare on a busy machine")
+    print(f"{name}: {clip.frame_count} frames of {size} in {wall_s:.2f} s, {wall_s / clip.frame_count:.4f} s per frame")
+    print(f"  {cpu_s / clip.frame_count:.4f} CPU seconds per frame, the figure to compare on a busy machine")
     print("  " + ", ".join(f"{key} {value:.3f}" for key, value in depth.measurements.items()))
     for warning in depth.warnings:
         print(f"  warning: {warning.text}")

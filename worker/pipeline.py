@@ -1,4 +1,4 @@
-"""The table of contents: a clip becomes a scene, one stage a line. Read the modules in the order of the calls."""
+"""The table of contents: a clip becomes a scene, one stage per line. Read the modules in the order of the calls."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ def _warnings(run: Run) -> tuple[Notice, ...]:
     """The warnings of the run itself."""
     found = []
     if run.setup.fixed_iterations is None and run.schedule.planned == run.schedule.epoch:
-        text = "The time given allowed less than one step a training frame; one a frame was made all the same."
+        text = "The time given allowed less than one step per training frame; one per frame was made all the same."
         found.append(Notice.warning(NoticeCode.TIME_TOO_SHORT, text))
     if run.setup.gpu_is_idle:
         text = f"The motion of preset {run.preset.name} trains on the CPU only, so the GPU was left idle."

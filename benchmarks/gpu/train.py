@@ -6,7 +6,7 @@ and neither compilation nor scoring. The run scores held-out frames at many mome
 moment with a score above it, so a figure is late by at most the distance to the moment before.
 
 How many dB a run can reach depends on the clip. So thresholds count from the score that `paper` ends with on that clip.
-`fast` trains on one, two and four frames a step; more frames fill the device better, and the seconds say what that is
+`fast` trains on one, two and four frames per step; more frames fill the device better, and the seconds say what that is
 worth. A second seed runs last if time is left.
 """
 
@@ -66,7 +66,7 @@ def main() -> None:
     if part.has(MIN_LEFT_S["paper"], "paper"):
         trials.run(PRESETS["paper"], device, 0, iterations=PRESETS["paper"].iterations)
     for frames_a_step in FRAMES_A_STEP:
-        if part.has(MIN_LEFT_S["fast"], f"fast, {frames_a_step} frames a step"):
+        if part.has(MIN_LEFT_S["fast"], f"fast, {frames_a_step} frames per step"):
             trials.run(on_several(PRESETS["fast"], frames_a_step), device, 0, budget_s=FAST_BUDGET_S)
     if part.has(MIN_LEFT_S["cpu"], "the CPU's fast"):
         part.wait_for(KERNELS_READY)
@@ -76,7 +76,7 @@ def main() -> None:
 
 
 def on_several(preset: Preset, frames_a_step: int) -> Preset:
-    """The preset, with so many frames a step."""
+    """The preset, with so many frames per step."""
     return dataclasses.replace(preset, frames_a_step=frames_a_step)
 
 

@@ -21,7 +21,7 @@ PoseConvention = Literal["opengl", "llff"]
 """Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
 
 DeviceName = Literal["auto", "cpu", "cuda"]
-"""Where to compute; auto: on an NVIDIA GPU where there is one and what it takes, else on the CPU."""
+"""Where to compute; auto chooses the GPU if all of its requirements are met, otherwise the CPU."""
 
 SUBMISSION = "submission.json"
 MANIFEST = "manifest.json"

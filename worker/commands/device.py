@@ -10,5 +10,5 @@ from contract.wire.names import DeviceName
 
 def add_device(parser: argparse.ArgumentParser, default: str) -> None:
     """Adds --device."""
-    what = "auto: an NVIDIA GPU where there is one and Triton, else the CPU"
+    what = "auto: an NVIDIA GPU if all of its requirements are met, else the CPU"
     parser.add_argument("--device", choices=get_args(DeviceName), default=default, help=f"{what} (default: {default})")

@@ -1,4 +1,4 @@
-"""The messages between the supervisor and its device process, one JSON document a line.
+"""The messages between the supervisor and its device process, one JSON document per line.
 
     supervisor -> child   on the child's stdin    RunJob, StopJob; when stdin closes, the child ends at once
     child -> supervisor   on the child's stdout   Ready once; Holding at any time;

@@ -24,7 +24,7 @@ SHORTHANDS = {"ours": OURS, "rivals": RIVALS}
 DEFAULT_HOLDOUTS = ("every8", "blocks8")
 GRID_BASES = (3, 5, 9, 17, 33)
 GRID_POINTS = (10_000, 20_000, 40_000, 80_000)
-"""Bases and Gaussians an image of the grid that the automatic choice is compared with."""
+"""Bases and Gaussians per image of the grid that the automatic choice is compared with."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The charts, drawn from rows alone: a row of panels a clip, a column a way of holding out.
+"""The charts, drawn from rows alone: a row of panels per clip, a column per way of holding out.
 
 curves  held-out psnr_tissue against seconds of training; curves-ssim, curves-depth: SSIM, median depth error
 pareto  its end against the seconds it took; the front joins what nothing is both sooner and better than
@@ -75,7 +75,7 @@ def clip_alone(groups: Sequence[Group]) -> str:
 
 
 def _draw(groups: Sequence[Group], draw_panel: Callable[[Any, Sequence[Group]], None], folder: Path, name: str) -> None:
-    """One panel a place, the legend of all series below."""
+    """One panel per place, the legend of all series below."""
     places = _places(groups)
     figure, axes = figure_of(len(places), _columns(places), _handles(groups, name))
     for place, axis in zip(places, axes, strict=True):
@@ -198,7 +198,7 @@ def _missing(groups: Sequence[Group]) -> str:
 
 
 def _draw_knee(groups: Sequence[Group], choices: Sequence[Group], folder: Path) -> None:
-    """A line a number of bases over the numbers of Gaussians; a star where the automatic choice lies."""
+    """A line per number of bases over the numbers of Gaussians; a star where the automatic choice lies."""
     bases = {each.series: preset_of(each.series).bases or 0 for each in groups if each.series != base_of(each.series)}
     looks = dict(zip(sorted(set(bases.values())), itertools.cycle(BASES_LOOKS), strict=False))
     places = _places(choices)

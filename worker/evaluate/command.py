@@ -58,9 +58,9 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "--device",
         choices=get_args(DeviceName),
         default="auto",
-        help="rows of another device belong into a folder of their own (default: auto)",
+        help="rows of another device belong in a folder of their own (default: auto)",
     )
-    parser.add_argument("--again", action="store_true", help="measure anew what failed, which has its rows otherwise")
+    parser.add_argument("--again", action="store_true", help="repeat runs that failed (default: keep their error rows)")
     parser.add_argument("--redraw", action="store_true", help="measure nothing; sum up and draw the rows in DIR")
     for name in FILES:
         parser.add_argument(f"--{name}", type=Path, metavar="F", help="of the clips that are paths")
@@ -93,7 +93,7 @@ def run_cli(options: argparse.Namespace) -> int:
     failed = results.failed(cell.key for cell in cells)
     if failed:
         print(f"{len(failed)} of {len(cells)} cells failed, the first because of {failed[0]['error']}")
-        print("The same command with --again measures them anew.")
+        print("The same command with --again repeats them.")
     return ExitCode.FAILED if failed and len(failed) == len(cells) else ExitCode.OK
 
 

@@ -1,4 +1,4 @@
-"""runs.csv and curves.csv: a row a run, kept as soon as the run has ended, and which commit and machine it is of.
+"""runs.csv and curves.csv: a row per run, kept as soon as the run has ended, and which commit and machine it is of.
 
 Who adds rows to a folder writes its files whole, so one process at a time may: adding_alone().
 

@@ -149,7 +149,7 @@ class Truth:
         return _Expected(frame, pose, rgb, rgb, self._was_seen(frame, pose) & ~self._clip.tissue[frame])
 
     def _was_seen(self, frame: int, pose: Pose) -> NDArray[np.bool_]:
-        """[H, W] whether the material point a pixel shows was tissue in some training frame."""
+        """[H, W] whether the material point that a pixel shows was tissue in some training frame."""
         row, column, shows = _cells(self._phantom.atlas_xy(frame, pose))
         return shows & self._seen[row, column]
 

@@ -27,7 +27,7 @@ class Rate:
 class Rates:
     """One rate a parameter group. motion_* are those of the deformation's weights for its four kinds of channel.
 
-    beta1, beta2  decay of Adam's two moments a step; as published unless a preset says otherwise
+    beta1, beta2  decay of Adam's two moments per step; as published unless a preset says otherwise
     """
 
     mean: Rate

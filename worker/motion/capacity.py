@@ -24,7 +24,7 @@ BASES = (3, 5, 9, 13, 17, 25, 33)
 REST = 1
 """One basis is a constant: the scene neither moves nor changes its light."""
 FRAMES_A_BASIS = 3
-"""Training frames a basis where too few tracks can be trusted to try numbers of bases."""
+"""Training frames per basis where too few tracks can be trusted to try numbers of bases."""
 MIN_FRAMES_A_BASIS = 2
 """Each basis has more training frames than this. With fewer, training frames gain what held-out frames lose."""
 MAX_MOTION_LEFT = 0.5
@@ -34,7 +34,7 @@ MIN_GAIN_DB = 0.25
 MAX_COARSENING = 4
 """Points are at most this many times as far apart as in the finest grid: light may reveal detail later."""
 MAX_POINTS = 80_000
-"""Points an image in the finest grid that was measured."""
+"""Points per image in the finest grid that was measured."""
 TRAINED_SHARE = 0.1
 """Trained Gaussians leave about this share of the squared error of a grid of colours as fine as they start. Measured on
 a still clip at 2 to 4 pixels, where 0.04 to 0.14 were left."""

@@ -30,7 +30,7 @@ MIN_TRACK_CONFIDENCE = 0.3
 
 @dataclass(frozen=True)
 class FitError:
-    """Mean squared error of a number of bases in validation frames, in squared grey levels a channel.
+    """Mean squared error of a number of bases in validation frames, in squared grey levels per channel.
 
     motion  error of the displacement, times the picture's slope where the track starts
     light   error of the change of colour along the track
@@ -106,7 +106,7 @@ class Trial:
         return FitError(self._mean_square(motion), self._mean_square(light))
 
     def picture_error(self, bases: int) -> float:
-        """Mean squared difference a channel, in grey levels, between pictures and prediction in the validation frames.
+        """Mean squared difference per channel, in grey levels, of pictures and prediction in the validation frames.
 
         The picture is read where so many bases place the tracks. The prediction is the colour where the tracks start
         plus the predicted change.
@@ -155,7 +155,7 @@ class Trial:
 
 
 def _slopes(rgb: NDArray[np.uint8], step: int) -> Reals:
-    """[h, w, 3, 2] grey levels a clip pixel to the right and down, on the tracks' grid of h w cells."""
+    """[h, w, 3, 2] grey levels per clip pixel to the right and down, on the tracks' grid of h w cells."""
     small = cell_means(rgb, step).astype(np.float32)
     slopes = [cv2.Scharr(small, cv2.CV_32F, int(axis == 0), int(axis == 1)) / (32 * step) for axis in range(2)]
     return np.stack(slopes, axis=-1).astype(np.float64)

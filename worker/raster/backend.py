@@ -41,7 +41,7 @@ CPU = Device("cpu")
 
 
 def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OPTION) -> Device:
-    """The device for auto, cpu or cuda; auto takes the GPU where everything is there that it takes.
+    """The device for auto, cpu or cuda; auto chooses the GPU if all of its requirements are met, otherwise the CPU.
 
     Args:
         gpu: what there is; None looks.
@@ -49,7 +49,7 @@ def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OP
 
     Raises:
         InputError: there is no device of that name.
-        UnavailableError: cuda is asked for, and something is missing.
+        UnavailableError: cuda is asked for, and one of its requirements is not met.
     """
     if asked not in get_args(DeviceName):
         raise InputError("options.device", f"there is no device {asked!r}.", "Use auto, cpu or cuda.")
@@ -65,10 +65,10 @@ def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OP
 
 
 def examine(device: Device) -> float:
-    """See once a process that a GPU splats as the reference does; seconds it took, nearly all of them for compilation.
+    """Check, once per process, that the GPU's renders and gradients match the reference; returns the seconds it took.
 
     Raises:
-        UnavailableError: it does not.
+        UnavailableError: they do not match, or the check failed.
     """
     start = time.perf_counter()
     if device.kind == "cuda":

@@ -1,6 +1,6 @@
 """What training needs of a model, whatever computes its steps: Gaussians, their deformation and Adam's moments.
 
-Symbols: N Gaussians; H W pixels, as many as the camera says; F frames a step.
+Symbols: N Gaussians; H W pixels, as many as the camera says; F frames per step.
 Implementations: CpuModel (worker/raster/cpu/model.py) and CudaModel (worker/raster/cuda/model.py). Each holds a Motion,
 which evaluates and trains the deformation: by kernels, or on the CPU by torch (worker/raster/cpu/unfused.py).
 worker/raster/backend.py makes the one for a device.
@@ -29,7 +29,7 @@ Floats = NDArray[np.float32]
 
 
 class Model(Protocol):
-    """A scene that can be trained, on one frame a step or several, rendered, and edited between two steps.
+    """A scene that can be trained, on one frame per step or several, rendered, and edited between two steps.
 
     Tensors lie on the model's device; NumPy arrays on the host.
     """
@@ -78,7 +78,7 @@ class Model(Protocol):
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
         """R G B Z A, [5, H, W], Z = sum(w z) in units; a view that the next render overwrites.
 
-        With values [N], a number a Gaussian, they are blended as colour is, and [6, H, W] ends with them.
+        With values [N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them.
         """
         ...
 

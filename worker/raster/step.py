@@ -62,7 +62,7 @@ class TrainingFrame:
     measured_pixels: int
 
     def loss_settings(self, loss: LossSettings) -> NDArray[np.float32]:
-        """[5] as the blend applies them a pixel (cpu/blend.py): each loss is a mean over its valid pixels."""
+        """[5] as the blend applies them per pixel (cpu/blend.py): each loss is a mean over its valid pixels."""
         return np.array(
             [
                 loss.colour_weight / (3 * max(self.tissue_pixels, 1)),

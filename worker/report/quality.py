@@ -48,7 +48,7 @@ MAX_BRIGHTNESS_DRIFT = 0.25
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of some frames; a list holds one number a frame, NaN where there was no tissue.
+    """Scores of some frames; a list holds one number per frame, NaN where there was no tissue.
 
     depth_mm is the stereo's median depth where it was compared, to judge depth_agreement_mm by; both NaN without any.
     """

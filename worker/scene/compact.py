@@ -1,6 +1,6 @@
 """The compact form of a scene: a table of whole numbers, which the range coder packs, and back to Gaussians.
 
-Symbols: N Gaussians, C channels (10, or 13 with colour), B bases, R = B - 1 patterns of motion a channel, K columns.
+Symbols: N Gaussians, C channels (10, or 13 with colour), B bases, R = B - 1 patterns of motion per channel, K columns.
 
 A decoder undoes four steps (worker/scene/quantize.py does them): motion is coefficients of patterns, numbers are
 multiples of a step, columns may hold differences between neighbours, and the table is range coded. docs/scene-file.md
@@ -48,7 +48,7 @@ OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6
 class Compact:
     """A scene in whole numbers.
 
-    table    [N, K] int32     columns: STATE, then R motion coefficients a channel, then the 3 powers, then seen
+    table    [N, K] int32     columns: STATE, then R motion coefficients per channel, then the 3 powers, then seen
     step     [STATE] float32  of the state at power 0
     pattern  [C, R, B] float32  weights of one unit of a motion coefficient at power 0
     centre, width  [B] float32  of the bases

@@ -1,12 +1,12 @@
 """Turn a scene into whole numbers: each as coarse as the picture allows.
 
-Symbols: N Gaussians, C channels (10, or 13 with colour), B bases, R = B - 1 patterns of motion a channel.
+Symbols: N Gaussians, C channels (10, or 13 with colour), B bases, R = B - 1 patterns of motion per channel.
 
 `effect` decides what is lost: the mean squared change of the picture that a change of 1 in a number makes.
 
 1. Three changes of coordinates lose nothing. A channel's mean over the trained times moves from the motion into the
    canonical state. Quaternions get length 1. Red, green and blue become a brightness and two differences.
-2. Motion becomes coefficients of R patterns a channel: the principal components of all Gaussians' motions at the
+2. Motion becomes coefficients of R patterns per channel: the principal components of all Gaussians' motions at the
    trained times. Errors of equal size in any coefficient then weigh the same in time.
 3. Gaussians are sorted along a curve through the view from the world's origin, so that neighbours are alike.
 4. Every number is divided by its step and rounded. The step is the channel's own, so that all channels' errors weigh

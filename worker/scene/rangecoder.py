@@ -26,7 +26,7 @@ PARTS = 4
 MAX_MAGNITUDE = 2**30 - 1
 """Magnitudes have at most 30 digits."""
 BUCKETS = 10
-"""Sets of probabilities a row, by activity."""
+"""Sets of probabilities per row, by activity."""
 MODELS = 33 + 31 + 2 * 31
 """Probabilities of a set: of the digit count, of the second digit by that count, of the third by count and second."""
 SECOND, THIRD = 33, 33 + 31

@@ -107,7 +107,7 @@ def check_finite(tensors: dict[str, Tensor]) -> None:
 
 
 def _check_counts(scene: Scene) -> None:
-    """Raise SceneError unless every tensor is float32 and has one row a Gaussian."""
+    """Raise SceneError unless every tensor is float32 and has one row per Gaussian."""
     mean, harmonics = scene.gaussians.mean, scene.gaussians.sh
     count = mean.shape[0] if mean.ndim else 0
     degree = scene.gaussians.sh_degree if harmonics.ndim == 3 else 0

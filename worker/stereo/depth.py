@@ -262,5 +262,5 @@ def _grey(rgb: NDArray[np.uint8]) -> Grey:
 
 
 def _pool() -> ThreadPoolExecutor:
-    """One thread a core, one pair a thread: OpenCV releases the GIL, and one pair in two threads measured slower."""
+    """One thread per core, one pair per thread: OpenCV releases the GIL, and two threads for one pair are slower."""
     return ThreadPoolExecutor(cores(), thread_name_prefix=STAGE)

@@ -11,7 +11,7 @@ PREFIX = "average."
 
 
 class RunningMean:
-    """Sums of a model's parameters, by the names and on the device of the model's own."""
+    """Sums of a model's parameters, under their names and on their device."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -27,16 +27,16 @@ class RunningMean:
             self._total[name] = self._total[name].to(values.device).add_(values)  # stored ones come from the host
 
     def put(self, parameters: Mapping[str, Tensor]) -> None:
-        """Write the mean into these tensors, and start a new mean."""
+        """Write the mean into these tensors, and reset the sums to zero."""
         for name, values in parameters.items():
             torch.div(self._total[name].to(values.device), self.count, out=values)
         self.count, self._total = 0, {}
 
     def arrays(self) -> dict[str, Tensor]:
-        """The sums by name, which a resumed run needs beside the count."""
+        """The running sums under "average." names, for a resume file."""
         return {PREFIX + name: values for name, values in self._total.items()}
 
     def load_arrays(self, arrays: Mapping[str, Tensor], count: int) -> None:
-        """Take back what arrays() gave; other names are ignored."""
+        """Load what arrays() gave from a dict that may also hold other arrays."""
         self.count = count
         self._total = {name.removeprefix(PREFIX): a.clone() for name, a in arrays.items() if name.startswith(PREFIX)}

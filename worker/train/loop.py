@@ -31,8 +31,8 @@ def step(run: Run, iteration: int) -> None:
     """One iteration of the model.
 
     Raises:
-        TrainingDiverged: the loss is not finite, or no Gaussian is in view. A model that does not answer at every step
-            raises it some steps later.
+        TrainingDiverged: the loss is not finite, or no Gaussian is visible. A GPU model reports its losses some steps
+            late, so the error may come some steps later.
     """
     preset, frames = run.preset, [run.frames.frame(index) for index in frames_at(run, iteration)]
     sh_degree = min(preset.sh_degree, iteration // preset.sh_every) if preset.sh_degree else 0
@@ -44,14 +44,14 @@ def check_sums(sums: StepSums | None, iteration: int) -> None:
     """Check the losses of the steps that the model has answered for, if any.
 
     Raises:
-        TrainingDiverged: one is not finite, or no Gaussian is in view.
+        TrainingDiverged: one is not finite, or no Gaussian is visible.
     """
     if sums is None:
         return
     if not math.isfinite(sums.colour_l1 + sums.depth_l1):
         raise TrainingDiverged(f"The loss is no longer a number by iteration {iteration}.")
     if sums.visible == 0:
-        raise TrainingDiverged(f"No Gaussian is left in view by iteration {iteration}.")
+        raise TrainingDiverged(f"No Gaussian is visible by iteration {iteration}.")
 
 
 def train(
@@ -70,7 +70,7 @@ def train(
 
     Raises:
         Cancelled: hooks.should_stop said so; run is as it was after its last full iteration and can be resumed.
-        TrainingDiverged: the loss or a parameter is not finite, or no Gaussian is left.
+        TrainingDiverged: the loss or a parameter is not finite, or no Gaussian is visible.
     """
     marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s]
     scored: float | None = run.curve[-1].psnr_tissue_db if run.curve else None

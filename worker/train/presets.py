@@ -25,7 +25,7 @@ class Preset:
     """One way of training.
 
     fusion           which points become Gaussians
-    points_per_image "fill" fusion takes the grid stride that comes nearest to this many points a frame; None: as far
+    points_per_image "fill" fusion takes the grid stride that comes nearest to this many points per frame; None: as far
                      apart as the scene's detail allows
     points_by_budget whether budget_s decides points_per_image instead (preset_named)
     deformation      name of a motion in the registry (worker/model/deformation)

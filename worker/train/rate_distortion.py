@@ -159,7 +159,7 @@ def _sensitivity(
     """[STATE, N]: an error e in a number adds sensitivity * e**2 / N to the mean squared error of the tissue's pixels.
 
     The square of a pixel's derivative, summed over the pixels, is the mean square of the gradient of their sum with
-    random signs: one gradient a frame gives all of them (Hutchinson 1990).
+    random signs: one gradient per frame gives all of them (Hutchinson 1990).
 
     A depth also decides which of two Gaussians hides the other, and that has no derivative. Its sensitivity is
     therefore measured once for all Gaussians, with noise of the size that rounding makes.

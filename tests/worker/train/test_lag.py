@@ -84,7 +84,7 @@ def test_a_step_that_saw_nothing_is_noticed_though_later_ones_see_again() -> Non
         model.canonical[:3] = -place if run.iteration == 1 else place
         return False
 
-    with pytest.raises(TrainingDiverged, match="No Gaussian is left in view"):
+    with pytest.raises(TrainingDiverged, match="No Gaussian is visible"):
         trained(run, TrainingHooks(should_stop=turn_away_for_a_step))
     assert run.iteration < LAG
 

@@ -18,7 +18,7 @@ from worker.evaluate.conditions.clean import CleanClip, Given, given
 
 HIGHLIGHT_PX, HIGHLIGHT_STEP_PX = 10.0, 8.0  # radius, and deviation of the way it goes in a frame
 SMOKE_GREY = 205.0
-CLOUD_PX, CLOUD_DRIFT_PX, CLOUD_DEPTH = 160.0, 12.0, 0.35  # size, drift a frame, share by which its density varies
+CLOUD_PX, CLOUD_DRIFT_PX, CLOUD_DEPTH = 160.0, 12.0, 0.35  # size, drift per frame, share by which its density varies
 BLOOD = (104.0, 14.0, 12.0)
 BLOOD_OPACITY, BLOOD_FROM = 0.92, 0.25  # it comes in after this share of the clip
 BLURRED_SHARE = 0.5  # of the frames, where blur comes and goes
@@ -26,7 +26,7 @@ DRIFT_PERIODS = 1.5
 
 
 def highlights(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """`level` white spots, 10 px in radius, wander over the tissue by about 8 px a frame."""
+    """`level` white spots, 10 px in radius, wander over the tissue by about 8 px per frame."""
     height, width = clean.clip.tissue.shape[1:]
     places = random.uniform(0, 1, (round(level), 2)) * (width, height)
     rgb = clean.clip.rgb.copy()

@@ -69,7 +69,7 @@ def moving_camera(clean: CleanClip, level: float, random: np.random.Generator) -
 
 
 def noisy_poses(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """The endoscope swings by 5 degrees; poses err by `level` mm (one sigma an axis), and their angles by as much
+    """The endoscope swings by 5 degrees; poses err by `level` mm (one sigma per axis), and their angles by as much
     again at the tissue. Frame 0, which defines the world, is right.
     """
     swinging = clean_of(_swinging(clean.phantom, POSE_SWING_DEG))

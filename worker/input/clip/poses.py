@@ -18,7 +18,7 @@ from contract.wire.names import PoseConvention
 POSES_FILE = "poses_bounds.npy"
 RIGID_TOLERANCE = 1e-3  # on the entries of R^T R: float32 files and rounding pass, scaled or sheared matrices do not
 _ROW_LENGTH = 17
-_REMEDY = "Write it as [T, 17] floating-point numbers, 3x5 [R | t | (H, W, f)] and two bounds a row."
+_REMEDY = "Write it as [T, 17] floating-point numbers, 3x5 [R | t | (H, W, f)] and two bounds per row."
 
 # Columns of the stored rotation that are OpenCV's x (right), y (down), z (forward), and their signs.
 _OPENCV_COLUMNS: dict[str, tuple[list[int], list[float]]] = {

@@ -1,11 +1,11 @@
 """How the canonical Gaussians move: FDM and its rivals, one promise for all (base.Deformation).
 
-| kind                       | numbers a Gaussian | bases                                                     |
-|----------------------------|--------------------|-----------------------------------------------------------|
-| fdm-gaussian, fdm-quartic  | 30 B               | own centres and widths a Gaussian and channel, trained    |
-| shared                     | 10 B               | one fixed set for all                                     |
-| pfs                        | 10 B               | polynomials and harmonics                                 |
-| hexplane                   | 0                  | six shared feature planes at two resolutions and a network |
+| kind                       | numbers per Gaussian | bases                                                      |
+|----------------------------|----------------------|------------------------------------------------------------|
+| fdm-gaussian, fdm-quartic  | 30 B                 | own centres and widths per Gaussian and channel, trained   |
+| shared                     | 10 B                 | one fixed set for all                                      |
+| pfs                        | 10 B                 | polynomials and harmonics                                  |
+| hexplane                   | 0                    | six shared feature planes at two resolutions and a network |
 
 MOTIONS is the registry. A new motion is a file here and a line there (docs/extending.md).
 """

@@ -1,6 +1,6 @@
 """What all motions share: the channels they move and the promises they keep.
 
-Symbols: N Gaussians, B bases or weights a channel, C = 10 channels, t model time in [0, 1).
+Symbols: N Gaussians, B bases or weights per channel, C = 10 channels, t model time in [0, 1).
 The channels are the rows of a state (worker/model/layout.py). Opacity never deforms; colour does where a motion has
 channels 10:13 for it.
 """

@@ -1,6 +1,6 @@
 """`pfs`: polynomial plus Fourier series, the rival without local bases (Deform3DGS's ablation; Gaussian-Flow's form).
 
-Symbols: N Gaussians, C = 10 channels, B weights a channel, P of them polynomial, 2 H of H harmonics.
+Symbols: N Gaussians, C = 10 channels, B weights per channel, P of them polynomial, 2 H of H harmonics.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from worker.model.gaussians import Gaussians
 from worker.model.layout import CHANNELS
 
 DEFAULT_WEIGHTS = 17
-"""As many weights a channel as the paper's FDM has bases."""
+"""As many weights per channel as the paper's FDM has bases."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,9 @@ Down a column of pixels power2 is quadratic, so alpha goes from row to row by a 
 products instead of an exponential. Derivations: docs/rasterizer.md.
 
 A tile is done in four steps. Its entries (bins.py) are gathered as records, one after the other in memory; they are
-blended; the loss is taken; and they are walked back. A record is RECORD floats: alpha and ratio of its first row, one
-a lane, then BEND (the ratio's own), COLOUR (r, g, b, z), PLACE (dx of the first lane, dy of the first row) and VALUE.
+blended; the loss is taken; and they are walked back. A record is RECORD floats: alpha and ratio of its first row (one
+per lane), then BEND (the ratio's change per row), COLOUR (r, g, b, z), PLACE (dx of the first lane, dy of the first
+row) and VALUE.
 Its rows [top, end) and the home of its splat are in ``spans``. The planes lie in ``planes``, PLANE floats apart: T
 (later B - g_A), R G B Z (later g_R g_G g_B g_Z) and the value, blended only where no gradient is asked for.
 """
@@ -45,16 +46,17 @@ from worker.raster.cpu.simd import (
 from worker.raster.cpu.vectors import LANES
 
 PLANE = TILE_ROWS * LANES + 16
-"""Not a power of two, lest the same pixel of two planes have addresses that a processor takes for each other."""
+"""Not a power of two: otherwise the same pixel of two planes falls into the same cache set (4K aliasing)."""
 PLANES = 6
 BEND, COLOUR, PLACE, VALUE = 2 * LANES, 2 * LANES + 1, 2 * LANES + 5, 2 * LANES + 7
 RECORD = 2 * LANES + 8
 MAX_ROWS = 16
 """Rows of a record: the products' rounding grows with their square, to 1e-5 of alpha after sixteen."""
 RENDER, LOSS, COTANGENT = 0, 1, 2
-"""Modes: images only; images never, gradients of the built-in loss; gradients of given image cotangents."""
+"""Modes. RENDER writes images. LOSS computes gradients of the built-in loss and writes no image. COTANGENT computes
+gradients from given image gradients."""
 STATISTICS = 4
-"""Sums a tile reports: colour loss, depth loss, squared colour error (of channels), |1 - A| over tissue."""
+"""Sums that a tile reports: colour loss, depth loss, squared colour error (of channels), |1 - A| over tissue."""
 
 _CUT = np.float32(MIN_ALPHA)
 _CAP = np.float32(MAX_ALPHA)
@@ -72,7 +74,7 @@ def blend(  # type: ignore[no-untyped-def]
     thread, threads, next_block, mode, width, height, tiles_x, splats, tile_start, entries, homes,
     records, spans, trail, planes, sums, statistics, target, weight, inverse_depth, loss_settings, image,
 ):  # fmt: skip
-    """Composite every tile. Threads take blocks as they come: what a block gives does not depend on who computes it.
+    """Composite every tile. Threads take blocks as they come: a block's result is the same whichever thread takes it.
 
     next_block int64 [1]: 0 at the start. records, spans, trail, planes [threads, ...]: scratch (see above).
     sums [homes * GRADIENT] (bins.py): added to in modes LOSS and COTANGENT. statistics [tiles, STATISTICS]: LOSS.
@@ -313,7 +315,7 @@ def _loss(  # type: ignore[no-untyped-def]
     """Loss of the tile into statistics, its gradient into the planes (worker/model/loss.py: the same in torch).
 
     target [3, H, stride] uint8, weight [H, stride] uint8 (255 = tissue), inverse_depth [H, stride] float32 (0 = none),
-    flattened. loss_settings float32 [5]: colour weight a channel, depth weight, 1 / Huber delta of the
+    flattened. loss_settings float32 [5]: colour weight per channel, depth weight, 1 / Huber delta of the
     colour and of the depth loss, 1 for normalised depth else 0.
     """
     zero = splat(_ZERO)

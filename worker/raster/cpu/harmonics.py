@@ -1,6 +1,6 @@
 """Spherical harmonics to colour and back, for scenes whose camera moves (worker/model/gaussians.py: the same in torch).
 
-N Gaussians, K = (degree + 1)^2 coefficients a channel: the constant one in state[COLOUR], the others in
+N Gaussians, K = (degree + 1)^2 coefficients per channel: the constant one in state[COLOUR], the others in
 rest [K - 1, 3, N]; colour [3, N], mean in state[MEAN].
 """
 

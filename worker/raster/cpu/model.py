@@ -1,6 +1,6 @@
 """The fused training step: deform, project, bin, blend with loss and gradients, then Adam on every parameter.
 
-N Gaussians (padded to whole vectors), rows of N floats, F frames a step; canonical and state [ROWS, N].
+N Gaussians (padded to whole vectors), rows of N floats, F frames per step; canonical and state [ROWS, N].
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class CpuModel:
         return {"canonical": self.canonical, "opacity_logit": self.opacity_logit, "sh_rest": self.sh_rest}
 
     def _allocate(self, frames: int = 1) -> None:
-        """Room for the Gaussians at one time, and for their gradients in so many frames a step."""
+        """Room for the Gaussians at one time, and for their gradients in so many frames per step."""
         columns = self.canonical.shape[1]
         self.state = np.zeros((ROWS, columns), np.float32)
         self.colour = np.zeros((3, columns), np.float32)

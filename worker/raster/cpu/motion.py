@@ -1,6 +1,6 @@
-"""The deformation in a training step, with Adam's moments beside its weights: linear, FDM, or any (unfused.py).
+"""The motion in a training step, with Adam's moments: linear, FDM, or any other through autograd (unfused.py).
 
-N Gaussians (padded), F frames a step, B bases, C channels (10, or 13 where colour moves too), rows of N floats.
+N Gaussians (padded), F frames per step, B bases, C channels (10, or 13 where colour moves too), rows of N floats.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class LinearMotion:
 
 
 class FdmMotion:
-    """The paper's FDM: weight, centre and width of every basis learnable a Gaussian and channel; dense Adam."""
+    """The paper's FDM: weight, centre and width of every basis learnable per Gaussian and channel; dense Adam."""
 
     def __init__(self, deformation: FlexibleDeformation, columns: int) -> None:
         self._form = type(deformation)

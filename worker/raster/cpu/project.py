@@ -40,7 +40,7 @@ from worker.raster.cpu.simd import (
 from worker.raster.cpu.vectors import LANES
 
 SPLAT = 12
-"""Floats a splat record holds."""
+"""Floats in a splat record."""
 
 
 @kernel

@@ -85,7 +85,7 @@ class Rasterizer:
         self.gradients = Gradients.room(np.zeros((ROWS, count), np.float32))
 
     def _allocate_slots(self, slots: int, homes: int) -> None:
-        """Room for so many a thread."""
+        """Room for so many per thread."""
         self._slot_info, self._entries = np.zeros((2, self.threads * slots), np.uint32)
         self._sums = np.zeros(self.threads * homes * bins.GRADIENT, np.float32)
 
@@ -168,7 +168,7 @@ class Rasterizer:
     def render(self, values: Floats | None = None) -> Floats:
         """R G B Z A of the projected splats, [5, H, W]; a view of a buffer the next render overwrites.
 
-        With values [<= N], a number a Gaussian, they are blended as colour is, and [6, H, W] ends with them.
+        With values [<= N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them.
         """
         if values is not None:
             self.splats[: len(values), 11] = values
@@ -177,7 +177,7 @@ class Rasterizer:
         return self.image.reshape(6, self.height, self.stride)[:planes, :, : self.width]
 
     def loss_backward(self, target: Target, loss_settings: Floats, out: Gradients | None = None) -> Gradients:
-        """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums a tile.
+        """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums per tile.
 
         out: where they are written; None: where the next ones will be, too.
         """

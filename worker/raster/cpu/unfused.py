@@ -3,7 +3,7 @@
 The rest of a step is that of every motion, so two deformations compared with each other differ in nothing else. Only
 the time of a step is not comparable: tables of speed must say so.
 
-Symbols: N Gaussians (padded to whole vectors), rows of N floats, F frames a step; canonical and state [ROWS, N].
+Symbols: N Gaussians (padded to whole vectors), rows of N floats, F frames per step; canonical and state [ROWS, N].
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import lower_builtin, models, register_model
 
 LANES = 8
-"""Numbers a vector holds. Eight beats sixteen on Zen 4: a tile strip this narrow wastes fewer pixels beside a splat."""
+"""Numbers in a vector. Eight beats sixteen on Zen 4: a tile strip this narrow wastes fewer pixels beside a splat."""
 
 
 class VectorType(types.Type):

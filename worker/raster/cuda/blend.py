@@ -1,4 +1,4 @@
-"""The blend on the device: compositing, the loss, and the gradients of every splat, a tile a program.
+"""The blend on the device: compositing, the loss, and the gradients of every splat, a tile per program.
 
 Symbols: K splats of a chunk (axis 0), P pixels of a tile (axis 1); for one pixel and its splats i, nearest first,
     alpha_i = min(MAX_ALPHA, 2**power2_i), 0 below MIN_ALPHA or once T < MIN_TRANSMITTANCE
@@ -11,7 +11,7 @@ a chunk's alphas again. Derivations: docs/rasterizer.md; the loss: worker/model/
 
 Layout. Pixels lie along the lanes and all K splats of a pixel in one thread: products, sums and steps from splat to
 splat need no shuffle. A program is one warp, so its barriers cost nothing; what keeps the processor busy is the
-K P / 32 independent numbers a thread works on. Sums over pixels are matrix products on the tensor cores: dL/dpower
+K P / 32 independent numbers that a thread works on. Sums over pixels are matrix products on the tensor cores: dL/dpower
 times the monomials 1 x y xx xy yy of the pixel (relative to the tile's middle), and w times g. One operand is split
 into two parts of 11 bits, hence exact to 2^-22; the monomials have few enough bits to be exact, and g is split too,
 into 8 columns.
@@ -29,10 +29,10 @@ from worker.raster.cuda.bins import SLOT
 from worker.raster.cuda.project import RECORD
 
 CHUNK = 16
-"""Splats a chunk: the least a matrix product takes, and K P / 32 = 32 registers an intermediate."""
+"""Splats per chunk: the least a matrix product takes, and K P / 32 = 32 registers per intermediate."""
 WARPS = 1
 STATISTICS = 4
-"""Sums a tile reports: colour loss, depth loss, squared colour error (of channels), |1 - A| over tissue."""
+"""Sums that a tile reports: colour loss, depth loss, squared colour error (of channels), |1 - A| over tissue."""
 RENDER, LOSS, COTANGENT = 0, 1, 2
 """Modes: images only; images never, gradients of the built-in loss; gradients of given image cotangents."""
 
@@ -83,8 +83,8 @@ def _four(records, row, part: tl.constexpr):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _row(values, k, which: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Row which of values [K, P]: [P]. A name for registers, no instruction: the compiler knows each thread's k, and in
-    integers that x + 0 is x.
+    """Row which of values [K, P]: [P]. Compiles to no instructions: each thread's k is known, so the integer sum
+    reduces to a register.
     """
     return tl.sum(tl.where(k == which, values.to(tl.int32, bitcast=True), 0), 0).to(tl.float32, bitcast=True)
 
@@ -128,7 +128,7 @@ def _blended(alpha, before, k, K: tl.constexpr, P: tl.constexpr):  # type: ignor
 
 @triton.jit
 def _upper(value):  # type: ignore[no-untyped-def]
-    """value cut to the bits that a TF32 product keeps; what is left has as few."""
+    """value truncated to TF32 precision; the remainder fits in TF32 too."""
     return (value.to(tl.int32, bitcast=True) & _UPPER_BITS).to(tl.float32, bitcast=True)
 
 
@@ -142,7 +142,7 @@ def _sum_split(values, columns):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _split_columns(red, green, blue, depth):  # type: ignore[no-untyped-def]
-    """[P, 8]: the upper bits of four numbers a pixel, then what is left of them."""
+    """[P, 8]: the upper bits of four numbers per pixel, then what is left of them."""
     column = tl.arange(0, 8)[None, :]
     which = column % 4
     value = tl.where(which < 2, tl.where(which == 0, red[:, None], green[:, None]), blue[:, None])
@@ -202,7 +202,7 @@ def blend(  # type: ignore[no-untyped-def]
     image [F, 5 or 6, H, W]: R G B Z A and, with VALUES, the blended value: written in RENDER; read as cotangents in
     COTANGENT. slots [M, SLOT] and, in LOSS, statistics [F tiles, STATISTICS] are written.
     target [*, 3, H, W] uint8, weight [*, H, W] uint8 (255 = tissue), inverse_depth [*, H, W] (0 = none), of which the
-    tile's frame is frame[f]; loss_settings float32 [F, 5]: colour weight a channel, depth weight, 1 / Huber delta of
+    tile's frame is frame[f]; loss_settings float32 [F, 5]: colour weight per channel, depth weight, 1 / Huber delta of
     the colour and of the depth loss, 1 for normalised depth else 0.
 
     One long function, because the pixels' sums have to stay in registers from the first chunk to the last.

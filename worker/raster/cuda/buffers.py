@@ -24,7 +24,7 @@ class FrameBuffers:
     """What a step or a render of so many frames of one size needs; it is kept from one to the next.
 
     launches  captured steps and renders; to be forgotten when a buffer moves
-    values    [N], a number a Gaussian, blended as colour is
+    values    [N], a number per Gaussian, blended as colour is
     images    the last render, by whether values were blended in it
     """
 

@@ -1,6 +1,6 @@
 """Spherical harmonics to colour and back on the device, and Adam on all of them but the constant one.
 
-N Gaussians in rows of `columns` floats, F frames, K = (degree + 1)^2 coefficients a channel: the constant one in rows
+N Gaussians in rows of `columns` floats, F frames, K = (degree + 1)^2 coefficients per channel: the constant one in rows
 10:13 of the state, the others in rest [K - 1, 3, columns]; colour [F, 3, columns], mean in rows 0:3 of the state
 [F, 13, columns]; centre [F, 3] of the cameras. The equations are those of raster/cpu/harmonics.py.
 """
@@ -17,7 +17,7 @@ from worker.model.constants import SH_C1, SH_C2, SH_C3
 from worker.raster.cuda.update import COLOUR_ROW, CONSTANT_HARMONIC, STATE_ROWS, adam, load_trained, store_trained
 
 BLOCK = 128
-"""Gaussians a program, one a thread: a direction and its slopes stay in registers."""
+"""Gaussians per program, one per thread: a direction and its slopes stay in registers."""
 
 C1 = tl.constexpr(SH_C1)
 C2_XY, C2_ZZ, C2_XX = (tl.constexpr(each) for each in SH_C2)

@@ -1,6 +1,6 @@
 """The training step on the device: deform, project, bin, blend with loss and gradients, Adam; captured in a CUDA graph.
 
-N Gaussians (padded to COLUMNS), rows of N floats; F frames a step; values [14, N] as in update.py; H W pixels.
+N Gaussians (padded to COLUMNS), rows of N floats; F frames per step; values [14, N] as in update.py; H W pixels.
 
 step() returns before its step is made. What changes from step to step goes to the device as one row of the control
 block (control.py); everything else lies there already, so a step is a copy of some hundred floats and a replay.
@@ -252,7 +252,7 @@ class CudaModel:
     def render_times(self, camera: NDArray[np.float64], times: Sequence[float], values: Floats | None = None) -> Tensor:
         """R G B Z A at several times at once, [F, 5, H, W] on the device; a view that the next render overwrites.
 
-        With values [N], a number a Gaussian, they are blended as colour is, and [F, 6, H, W] ends with them.
+        With values [N], a number per Gaussian, they are blended as colour is, and [F, 6, H, W] ends with them.
 
         Raises:
             ValueError: more times than the rasteriser draws at once (bins.MAX_FRAMES).

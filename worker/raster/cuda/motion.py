@@ -1,7 +1,7 @@
-"""The deformation on the device, linear in bases common to all Gaussians or FDM; Adam's moments beside the weights.
+"""The motion on the device, with Adam's moments. Two kinds: linear in bases common to all Gaussians, and FDM.
 
-N Gaussians (padded), F frames a step, B bases, C channels (10, or 13 where colour moves too); rows of N floats. What is
-alive, negligible and counted is as in raster/cpu/motion.py.
+N Gaussians (padded), F frames per step, B bases, C channels (10, or 13 where colour moves too); rows of N floats.
+What is alive, negligible and counted is as in raster/cpu/motion.py.
 """
 
 from __future__ import annotations
@@ -215,7 +215,7 @@ class LinearMotion:
 
 
 class FdmMotion:
-    """The paper's FDM: weight, centre and width of every basis learnable a Gaussian and channel; dense Adam."""
+    """The paper's FDM: weight, centre and width of every basis learnable per Gaussian and channel; dense Adam."""
 
     def __init__(self, deformation: FlexibleDeformation, columns: int, device: torch.device) -> None:
         self._form = type(deformation)

@@ -1,8 +1,8 @@
 """How Gaussians move on the device: deformation to the frames' times, and Adam on everything but the other harmonics.
 
-N Gaussians in rows of `columns` floats, F frames a step, B bases, C channels (10, or 13 where colour moves too); state
-[F, 13, columns], the rest and a program's share as in update.py. The equations are those of raster/cpu/update.py. A
-loop whose length only the device knows is a while loop: with a recent NumPy, Triton's interpreter runs no other kind.
+N Gaussians in rows of `columns` floats, F frames per step, B bases, C channels (10, or 13 where colour moves too);
+state [F, 13, columns], the rest and a program's share as in update.py. The equations are those of raster/cpu/update.py.
+A loop whose length only the device knows is a while loop: with a recent NumPy, Triton's interpreter runs no other kind.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from worker.raster.cuda.bins import DEPTH_BITS, EXTENT, count_tiles
 from worker.raster.cuda.geometry import dot, exp, image_row, mean_of, rotation_of, seen, variances_of
 
 RECORD = 12
-"""Floats a splat record holds: 48 bytes, three loads of 16."""
+"""Floats in a splat record: 48 bytes, three loads of 16."""
 PROJECT_BLOCK = 128
 
 _RECORD, _EXTENT = tl.constexpr(RECORD), tl.constexpr(EXTENT)
@@ -43,7 +43,7 @@ _LOW_WORD = tl.constexpr(0xFFFFFFFF)
 
 @triton.jit
 def _store_pair(at, first, second, there):  # type: ignore[no-untyped-def]
-    """Two neighbouring float32 as one int64: half as many stores, each of which meets another 32 bytes a lane."""
+    """Two neighbouring float32 as one int64: half as many stores, each of which meets another 32 bytes per lane."""
     low = first.to(tl.int32, bitcast=True).to(tl.int64) & _LOW_WORD
     tl.store(at, (second.to(tl.int32, bitcast=True).to(tl.int64) << 32) | low, mask=there)
 

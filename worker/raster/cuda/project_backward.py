@@ -17,7 +17,7 @@ from worker.raster.cuda.geometry import dot, exp, image_row, limits, mean_of, ro
 SUMS = 10
 """What a splat's slots add up to: the moments 1, x, y, xx, xy, yy of dL/dpower about mean2d, dL/d(r, g, b, z)."""
 SPLATS_BLOCK, LANES, SUM_WARPS = 16, 8, 1
-"""sum_slots: splats a program, slots of each that are added at once, warps. A splat has some five to ten slots; one
+"""sum_slots: splats per program, slots of each that are added at once, warps. A splat has some five to ten slots; one
 with hundreds keeps only its own program waiting."""
 BACKWARD_BLOCK = 128
 POSE_SHARE = 12

@@ -38,8 +38,8 @@ from worker.raster.cuda.project_backward import (
 )
 
 _FIRST_GUESS = 8
-"""Slots a Gaussian and frame for which there is room at first: sorting takes as long for empty ones. At least one a
-tile, for a few Gaussians that cover the image."""
+"""Slots per Gaussian and frame for which there is room at first: sorting takes as long for empty ones. At least one
+per tile, for a few Gaussians that cover the image."""
 _SPARE = 1.25
 """Room beyond what was needed, so that a scene that grows slowly seldom needs more."""
 _MAX_NUMBERS = 2**31 - 1
@@ -223,7 +223,7 @@ class CudaRasterizer:
     def render(self, values: Tensor | None = None) -> Tensor:
         """R G B Z A of the projected splats, [F, 5, H, W]: a buffer that the next render overwrites.
 
-        With values [F, N] or [N], a number a Gaussian, they are blended as colour is, and [F, 6, H, W] ends with them.
+        With values [F, N] or [N], one per Gaussian, they are blended as colour is, and [F, 6, H, W] ends with them.
         """
         planes = 5 if values is None else 6
         if values is not None:
@@ -242,7 +242,7 @@ class CudaRasterizer:
         *,
         pose: bool = False,
     ) -> Gradients:
-        """Gradients of the built-in loss (blend.py) against frames of a clip; statistics holds its sums a tile.
+        """Gradients of the built-in loss (blend.py) against frames of a clip; statistics holds its sums per tile.
 
         rgb uint8 [T, 3, H, W], weight uint8 [T, H, W] (255 = tissue), inverse_depth float16 or float32 [T, H, W]
         (1 / units, 0 = none), loss_settings [F, 5], frame int32 [F]: which of the T each frame is.

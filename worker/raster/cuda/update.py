@@ -1,6 +1,6 @@
 """Adam on the device: what all parameters share; the canonical state and the opacity; and what a step reports.
 
-N Gaussians in rows of `columns` floats, a multiple of COLUMNS; F frames a step. values [VALUES, columns] are the rows
+N Gaussians in rows of `columns` floats, a multiple of COLUMNS; F frames per step. values [VALUES, columns] are the rows
 of the canonical state, as in raster/cpu/update.py, and the opacity's logit. A program has COLUMNS Gaussians and all
 of their rows, so tensors in it are [TILE_ROWS, COLUMNS]. A gradient is a sum over the frames.
 
@@ -104,7 +104,7 @@ def report_step(  # type: ignore[no-untyped-def]
     touched, statistics, report, slot, at, columns, tiles, FRAMES: tl.constexpr
 ):
     """Count the program's Gaussians in view, at the step's place slot [1]; the first program adds the step to those
-    made, and its sums to the report. touched int32 [F, columns]: tiles a Gaussian touches; statistics [tiles, 4]."""
+    made, and its sums to the report. touched int32 [F, columns]: tiles of a Gaussian; statistics [tiles, 4]."""
     most = tl.load(touched + at)
     for frame in tl.static_range(1, FRAMES):
         most = tl.maximum(most, tl.load(touched + frame * columns + at))

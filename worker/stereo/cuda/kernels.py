@@ -10,8 +10,8 @@ All volumes together have fewer than 2^31 entries (matching.VOLUME_BYTES), so pl
 
 Layout. A disparity is a lane, so that a step along a path is elementwise but for one minimum and the look at both
 neighbours, which are shuffles within a warp. A program is one warp and its steps wait for each other: what keeps the
-processor busy is the number of lines, some hundred a frame, so many frames are matched at once. The line solver has a
-line a lane. Images at the margin repeat their last pixel.
+processor busy is the number of lines, some hundred per frame, so many frames are matched at once. The line solver has a
+line per lane. Images at the margin repeat their last pixel.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def _follow(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """L from the pixels at cost_at and sum_at on, written to the sums or added; returns where the last was.
 
-    What the next step reads is loaded a step early: the steps wait for each other, and for nothing else.
+    What the next step reads is loaded one step early: the steps wait for each other, and for nothing else.
     """
     path = tl.zeros(there.shape, tl.int32)  # in front of the first pixel: there L is the cost
     to_nearer = tl.broadcast_to(tl.maximum(lane - 1, 0), there.shape)

@@ -43,7 +43,7 @@ from worker.stereo.matching import (
 Greys = NDArray[np.uint8]  # [F, H, W]
 
 SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 12, 100
-"""P1 and P2 against costs of up to 24 bits a pixel of the block: a half and four bits a pixel."""
+"""P1 and P2 against costs of up to 24 bits per pixel of the block: a half and four bits per pixel."""
 FILTER_PASSES, FILTER_EASING = 3, 0.25
 """The filter alternates rows and columns so often, each time with this share of the strength before."""
 AGREEMENT_PX = 1.5

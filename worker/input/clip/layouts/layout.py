@@ -47,12 +47,12 @@ class ClipFiles:
 
     @cached_property
     def videos(self) -> tuple[str, ...]:
-        """Names of the tree's videos that are no masks."""
+        """Names of the tree's videos that are not masks."""
         return outside_masks(self.tree.videos()) if self.tree is not None else ()
 
     @cached_property
     def images(self) -> tuple[str, ...]:
-        """Names of the tree's images that are no masks."""
+        """Names of the tree's images that are not masks."""
         return outside_masks(self.tree.images()) if self.tree is not None else ()
 
     @cached_property
