@@ -26,7 +26,7 @@ REMEDIES: Remedies = MappingProxyType(
         intrasplat_client.NotFound: "`intrasplat jobs` lists what there is.",
     }
 )
-"""Of every command; a command may have its own."""
+"""Remedies by error, for every command; a command may have its own."""
 
 
 @contextmanager

@@ -250,7 +250,7 @@ def save_curve(curve_csv: str, report: Report, out: Path) -> dict[Path, str]:
     table.write_text(curve_csv)
     title = f"{len(report.frames)} of {FRAMES} frames held out, eight at a time; synthetic tissue, two eyes in"
     draw_curve(curve_csv, baselines_of(report), title, chart)
-    return {chart: "accuracy over seconds of training, beside plain copying", table: "the same as numbers"}
+    return {chart: "accuracy over seconds of training, compared with plain copying", table: "the same as numbers"}
 
 
 def baselines_of(report: Report) -> dict[str, float]:

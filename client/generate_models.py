@@ -79,7 +79,7 @@ def generate() -> str:
         *("".join(_enum(name, schema)) for name, schema in enums.items()),
         *("".join(_model(name, schema, open_enums)) for name, schema in definitions.items() if name not in enums),
         f'TERMINAL_STATES = frozenset({{{states}}})\n"""States that a job does not leave by itself."""\n',
-        f'EXCLUSIVE_OPTIONS = {EXCLUSIVE_OPTIONS!r}\n"""Of each group at most one may be given."""\n',
+        f'EXCLUSIVE_OPTIONS = {EXCLUSIVE_OPTIONS!r}\n"""At most one option of each group may be given."""\n',
         "".join(_given(definitions[JobOptions.__name__])),
     ]
     command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", MODELS.name, "--line-length", "120", "-"]

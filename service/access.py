@@ -88,8 +88,8 @@ class Access:
         """Whose request has these headers (names in lower case); None if it has no key and needs one.
 
         Raises:
-            Problem: 401, the key is not one of ours; 429, too many from this address were not. Keys that are known
-                pass all the same, so that nobody behind a common proxy can lock out the others.
+            Problem: 401: the key is wrong. 429: too many wrong keys came from this address. Right keys still pass, so
+                that nobody behind a common proxy can lock out the others.
             UnavailableError: the file of keys is damaged.
         """
         text = _key_text(headers)

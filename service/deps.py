@@ -92,14 +92,14 @@ async def _caller(connection: HTTPConnection, caller: Annotated[Caller | None, D
 
 
 AnyCaller = Annotated[Caller, Depends(_caller)]
-"""Of a request or a WebSocket; without a known key where one is needed it is answered 401, before any handshake."""
+"""The caller of a request or WebSocket. Without a valid key where one is needed: 401, before any handshake."""
 
 EarlyCaller = Annotated[Caller | None, Depends(_caller_if_known)]
 """For a WebSocket whose key may come in its first message, since browsers send no header: None means that it must.
 services.access.caller_of_key(text, address) then says whose it is."""
 
 
-ListingLimit = Annotated[int, Query(ge=1, le=MAX_LISTED, description="at most so many")]
+ListingLimit = Annotated[int, Query(ge=1, le=MAX_LISTED, description="maximum number of entries")]
 
 
 def owned_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:

@@ -1,7 +1,7 @@
 """What happens to a job, as it happens: server-sent events from the queue's own record of changes.
 
-One poller a watched job asks the queue, whatever number of callers listen; each of them goes through the same list of
-the last MAX_EVENTS changes at its own pace, so a slow one costs no memory and holds nobody up.
+One poller per watched job asks the queue, however many callers listen. Each caller reads the same list of the last
+MAX_EVENTS changes at its own pace, so a slow one costs no memory and delays nobody.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NOTHING_SEEN: EventOrder = (0, 0)
 
 @dataclass(frozen=True)
 class Entry:
-    """One thing to tell the listeners; number is None for what is no change of the record."""
+    """One thing to tell the listeners. number None: it is not an event of the queue, such as a new forecast."""
 
     number: str | None
     state: JobState
@@ -44,7 +44,7 @@ class Entry:
 
 
 class Feed:
-    """The last changes of one job; `count` of them there have been, and `changed` is set at the next."""
+    """The last changes of one job. count: how many there have been; changed: set at the next one."""
 
     def __init__(self, job_id: str) -> None:
         self.job_id = job_id
@@ -81,7 +81,7 @@ class Feed:
         return list(self._entries)[len(self._entries) - new :]
 
     def seen_at(self, order: EventOrder) -> int:
-        """How many of all entries somebody has seen who was told of the event there."""
+        """How many of all entries a listener has seen whose last event was `order`."""
         for unseen, entry in enumerate(reversed(self._entries)):
             if entry.number is not None and event_order(entry.number) <= order:
                 return self.count - unseen

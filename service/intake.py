@@ -41,7 +41,7 @@ class Intake:
         """A place among the uploads that are received at once, with room for so many bytes.
 
         Raises:
-            Problem: 503, all places are taken; 507, the disk has no room for it.
+            Problem: 503: all places are taken. 507: the disk has no room for it.
             LimitError: it is larger than any upload may be.
         """
         if len(self._places) >= self._settings.max_uploads:
@@ -74,7 +74,7 @@ class Intake:
         """The pieces of a request's body as they come.
 
         Raises:
-            Problem: 408, hardly anything came for upload_silence_s.
+            Problem: 408: fewer than MIN_BYTES came in upload_silence_s.
             ClientDisconnect: the caller has gone.
         """
         pieces, silence_s = request.stream(), self._settings.upload_silence_s
@@ -105,7 +105,7 @@ def declared_length(request: Request) -> int:
     """Content-Length of a request; 0 if it does not say.
 
     Raises:
-        Problem: 400, it is not a number.
+        Problem: 400: it is not a length.
     """
     text = request.headers.get("content-length", "0")
     if not (text.isascii() and text.isdigit() and len(text) < 20):

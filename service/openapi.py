@@ -51,7 +51,7 @@ class ProblemDocument(BaseModel):
     title: str
     status: int = Field(ge=400, le=599)
     detail: str = Field(description="what is wrong, with the value at fault")
-    field: str | None = Field(default=None, description="of the request; absent if no part of it is at fault")
+    field: str | None = Field(default=None, description="the part of the request at fault; absent if there is none")
     remedy: str | None = Field(default=None, description="what to do about it")
     job_id: str | None = Field(default=None, description="the job that stands for the clip all the same")
 

@@ -83,7 +83,7 @@ class Partial:
         return file
 
     def sha256(self) -> str:
-        """Of the file."""
+        """The SHA-256 of the file."""
         digest = hashlib.sha256()
         with self.path.open("rb") as file:
             while piece := file.read(HASHED_AT_ONCE_BYTES):

@@ -84,13 +84,13 @@ class Problem(Exception):
 
 
 def install_handlers(app: FastAPI) -> None:
-    """Answer every exception that leaves a route as a problem document; what is no error of ours stays one (500)."""
+    """Answer every exception that leaves a route with a problem document; an unforeseen one stays a fault (500)."""
     for kind in (Problem, InputError, SceneError, UnavailableError, RequestValidationError, HTTPException, OSError):
         app.add_exception_handler(kind, _answer)
 
 
 async def _answer(connection: Any, error: Exception) -> Any:
-    """Of a Request: the problem's answer. Of a WebSocket: its handshake refused, or its end after a last message."""
+    """For a Request, the problem as a response. A WebSocket is refused, or closed after a last message."""
     problem = problem_of(error)
     if problem is None:
         raise error

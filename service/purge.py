@@ -62,7 +62,7 @@ class Purger:
         """Remove a job that has ended, recorded in the audit before it begins and before it is reported.
 
         Raises:
-            Problem: 409, the job is queued or running, or became so meanwhile.
+            Problem: 409: the job is queued or running.
             UnavailableError: queue, store or audit cannot do their part; the removal is finished later, or by asking
                 again.
         """
@@ -100,7 +100,7 @@ class Purger:
             raise Problem(409, f"The job is still {record.state}.", field="scene_id", remedy=remedy)
 
     def _write_note(self, job_id: str) -> Path:
-        """Say on disk that the job is being removed. A full disk is no hindrance: it is why one removes."""
+        """Say on disk that the job is being removed. A full disk does not stop a removal, which makes room."""
         note = self._notes / job_id
         with contextlib.suppress(StoreFullError), disk_errors():
             self._notes.mkdir(mode=0o700, exist_ok=True)

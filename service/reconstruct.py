@@ -37,7 +37,7 @@ from service.upload import LIMIT_REMEDY, PARTS, Received, UploadLimits, receive_
 router = APIRouter(tags=["jobs"])
 
 MAX_SUBMISSION_BYTES = 128 * 1024
-"""Of a JSON body."""
+"""The limit of a JSON body."""
 JSON_REMEDY = 'Send ids of finished uploads by part, and options: {"clip": ID, "options": {"budget_s": 20}}.'
 UPLOAD_ID = {"type": "string", "pattern": JOB_ID_PATTERN, "description": "a finished upload (POST /uploads)"}
 FILE = {"type": "string", "format": "binary"}
@@ -137,8 +137,8 @@ async def _read_submission(request: Request, services: Deps) -> Submission:
     """The JSON body.
 
     Raises:
-        Problem: 400, it is no JSON, or larger than such a body can be.
-        InputError: it names something that there is not.
+        Problem: 400: the body is not JSON. 413: it is larger than MAX_SUBMISSION_BYTES.
+        InputError: a field is unknown or of the wrong type.
     """
     body = b""
     async for piece in services.intake.body(request):
@@ -221,7 +221,7 @@ def _finished(services: Deps, caller: Caller, part: str, upload_id: str) -> Part
 
 
 def _taken_before(services: Deps, job_ids: set[str | None], options: JobOptions) -> JobRecord:
-    """The job that has the uploads, if they all went into one and nothing else is wanted of it now."""
+    """The job that has the uploads, if all of them went into this one job and it has the same options."""
     job_id = next(job_id for job_id in job_ids if job_id is not None)
     known = services.queue.get(job_id)
     record = known or services.store.submission(job_id)
@@ -269,8 +269,8 @@ def _enqueue(services: Deps, record: JobRecord) -> JobRecord:
 
     Raises:
         QueueFullError: there is no room in the queue; the clip is removed.
-        Problem: 503, the queue is away; the clip stays, and is queued as soon as the queue is back.
-        InputError: the idempotency key stands for something else; the clip is removed.
+        Problem: 503: the queue is away. The clip stays, and is queued as soon as the queue is back.
+        InputError: the idempotency key was used for another clip or other options; the clip is removed.
     """
     settings = services.settings
     try:
@@ -287,6 +287,6 @@ def _enqueue(services: Deps, record: JobRecord) -> JobRecord:
         return standing
     services.store.purge(record.job_id)
     if (standing.input_sha256, standing.options) != (record.input_sha256, record.options):
-        problem = f"it stands for the job {standing.job_id}, with another clip or other options."
+        problem = f"it was used for the job {standing.job_id} with another clip or other options."
         raise InputError("Idempotency-Key", problem, "Use a new key for every new job.")
     return standing

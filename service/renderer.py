@@ -22,7 +22,7 @@ WORKER_REMEDY = (
     "Ask again in some seconds; if it stays so, start one with `intrasplat up` or `python -m worker consume`."
 )
 ADDRESSES_VALID_S = 1.0
-"""How long the list of live workers is used before the queue is asked again, beside the renders that go on."""
+"""How long the list of live workers is used before the queue is asked again, while renders go on."""
 
 logger = logging.getLogger("intrasplat.service")
 
@@ -101,7 +101,7 @@ class ZmqRenderer:
         if request.attempt is not None:
             return sorted(addresses, key=lambda address: self._preference(address, request.scene_id), reverse=True)
         running = [address for address in addresses if address.job_id == request.scene_id]
-        return running or [each for each in await self._live(anew=True) if each.job_id == request.scene_id]
+        return running or [each for each in await self._live(reread=True) if each.job_id == request.scene_id]
 
     def _preference(self, address: WorkerAddress, scene_id: str) -> tuple[bool, bool, bytes]:
         """Rather one that answers, and holds the scene; of several always the same (rendezvous hashing)."""
@@ -119,13 +119,13 @@ class ZmqRenderer:
             self._connections[endpoint] = Connection(self._context, endpoint, self._render_secret)
         return self._connections[endpoint]
 
-    async def _live(self, *, anew: bool = False) -> list[WorkerAddress]:
-        """The live workers. The queue is asked beside, unless what is known is too old: renders do not wait for it."""
+    async def _live(self, *, reread: bool = False) -> list[WorkerAddress]:
+        """The live workers. Renders wait for the queue only if the list is too old or must be read again."""
         age_s = time.monotonic() - self._read_s
-        if age_s > ADDRESSES_VALID_S or anew or not self._addresses:
+        if age_s > ADDRESSES_VALID_S or reread or not self._addresses:
             if self._reading is None or self._reading.done():
                 self._reading = asyncio.create_task(self._read_addresses())
-            if age_s > WORKER_TTL_S or anew or not self._addresses:
+            if age_s > WORKER_TTL_S or reread or not self._addresses:
                 await asyncio.shield(self._reading)
         if not self._addresses:
             raise UnavailableError("No worker is ready.", WORKER_REMEDY)

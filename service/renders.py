@@ -32,7 +32,7 @@ STATUS_OF_REPLY = {"input": 422, "scene": 404, "not-yet": 503, "internal": 500}
 NOT_YET_RETRY_S = "1"
 
 ModelTime = Annotated[
-    float, Query(ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip")
+    float, Field(ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip")
 ]
 Pixels = Annotated[int | None, Field(ge=8, le=8192)]
 FocalLength = Annotated[float | None, Field(gt=0, le=1e5, allow_inf_nan=False)]
@@ -45,9 +45,7 @@ class RenderQuery(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     scene: str | None = Field(default=None, description="may be left out only while there is exactly one scene")
-    t: float = Field(
-        default=0.0, ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip"
-    )
+    t: ModelTime = 0.0
     pose: str | None = Field(
         default=None,
         max_length=1000,
@@ -63,12 +61,12 @@ class RenderQuery(BaseModel):
     cy: Centre = None
     layer: Layer = Layer.RGB
     format: ImageFormat = ImageFormat.PNG
-    quality: int = Field(default=90, ge=1, le=100, description="of jpeg and webp")
+    quality: int = Field(default=90, ge=1, le=100, description="quality of a jpeg or webp image")
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a caller is shown: the scene that an attempt has finished, or, attempt None, the job while it runs."""
+    """What a caller is shown: the scene that `attempt` finished; None: the running job's newest snapshot."""
 
     scene_id: str
     attempt: int | None
@@ -85,7 +83,7 @@ async def render(
     query: Annotated[RenderQuery, Query()],
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """An image of the scene at time t from a pose, without the instruments; while the job runs, of what there is."""
+    """An image at time t from a pose, without the instruments; while the job runs, from its newest snapshot."""
     start = time.perf_counter()
     shown = await find_shown(services, caller, query.scene)
     request = request_of(query, shown, services.settings)
@@ -106,8 +104,8 @@ async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown
     """What the caller may be shown of the scene named, or of the only one there is; the audit records that it sees it.
 
     Raises:
-        Problem: 400, none is named and the tenant has not exactly one: never show another patient by accident;
-            403, the key may not; 404, there is no such scene for this tenant; 409, there is nothing to show of the job.
+        Problem: 400: no scene is named and the tenant has not exactly one (never show another patient by accident).
+            403: the key lacks the scope. 404: the tenant has no such scene. 409: the job has nothing to show.
     """
     caller.require(KeyScope.VIEW)
     shown = await run_in_threadpool(_find, services, caller, scene)
@@ -153,7 +151,7 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
     """What the worker is asked.
 
     Raises:
-        InputError: the pose is none.
+        InputError: the pose is not valid.
     """
     return RenderRequest(
         scene_id=shown.scene_id,
@@ -204,7 +202,7 @@ def matches(if_none_match: str | None, tag: str) -> bool:
 
 
 def cache_headers(shown: Shown, tag: str) -> dict[str, str]:
-    """A finished scene may be kept and must be asked for each time, so that its removal is noticed; a snapshot not."""
+    """A finished scene may be cached but must be revalidated, so that its removal is noticed. A snapshot must not."""
     if shown.attempt is None:
         return {"Cache-Control": "no-store"}
     return {"Cache-Control": "private, no-cache", "ETag": tag}

@@ -101,7 +101,7 @@ def finished_job(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
     """The record of a done job of the caller's tenant, whose scene is there.
 
     Raises:
-        Problem: 404, there is none of that id, or it is another's; 409, the job has not come to a scene.
+        Problem: 404: there is no such scene, or it is another tenant's. 409: the job has no finished scene.
     """
     record = owned_scene(services, caller, scene_id)
     if record.state is not JobState.DONE:
@@ -111,7 +111,7 @@ def finished_job(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
 
 
 def _known(services: Deps, scene_id: str) -> JobRecord | None:
-    """The job's record; if the queue has lost it, as it was when the clip was accepted."""
+    """The job's record. If the queue has lost it, the record made at submission."""
     if not is_job_id(scene_id):
         return None
     return services.queue.get(scene_id) or services.store.submission(scene_id)

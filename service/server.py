@@ -23,21 +23,21 @@ HEAD_S = 20.0
 """A connection that is waited on for the head of a request for longer is closed: the first, or one after an answer.
 It is looked at this often, so that it may take twice as long."""
 MAX_HEAD_BYTES = 32 * 1024
-"""Of a request's line and headers together."""
+"""The limit of a request's line and headers together."""
 MAX_CONNECTIONS = 1024
 """Open ones, whether or not something is asked on them; service/request_log.py counts requests."""
 BACKLOG = 128
 """Connections that wait to be accepted, all of which asyncio takes at once; as many are let in to be told to come back.
 Those that come in excess are closed: it logs each one that it has no file descriptor for, and forgets none of them."""
 SPARE_FILES = 512
-"""Descriptors beside those of connections: files, queue, workers, and twice the backlog."""
+"""Descriptors for all that is not a connection: files, queue, workers, and twice the backlog."""
 GRACE_S = 10
-"""What is being answered when the service is asked to end has so long; an upload can be gone on with afterwards."""
+"""How long requests in progress may take when the service ends; callers can resume an upload later."""
 
 PING_PERIOD_S = 20.0
 PING_TIMEOUT_S = 20.0
 MAX_MESSAGE_BYTES = 64 * 1024
-"""Of a WebSocket's client, who sends times and poses."""
+"""The limit of a message from a WebSocket's client, which sends times and poses."""
 MAX_WAITING_MESSAGES = 16
 
 UNREADABLE = Problem(400, "This is not a sound HTTP request.", remedy="See that its lengths and headers are right.")

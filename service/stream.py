@@ -1,10 +1,10 @@
 """WS /stream: one view after the other over one connection, each the newest that was asked for.
 
 The client sends JSON texts: the query of /render, and an `id` of its choice that comes back with the answer. An answer
-is one binary message: the length of its head (4 bytes, big-endian), the head (JSON, StreamHead), the image. What went
-wrong comes as a JSON text, the problem document of HTTP with the `id`; the connection stays open unless it says who
-may not come in (1008) or was sent what is no request (1003, 1009). With keys, the first message of a browser, which
-cannot send headers, is {"authorize": KEY}.
+is one binary message: the length of its head (4 bytes, big-endian), the head (JSON, StreamHead), the image. An error
+is a JSON text, the problem document of HTTP with the `id`. The connection then stays open, unless the caller may not
+come in (1008) or a message was not a request (1003, 1009). With keys, the first message of a browser, which cannot send
+headers, is {"authorize": KEY}.
 
 While a view is made and sent only the newest of the messages that arrive is kept, so a viewer that asks faster than it
 is served skips views, and one that does not read is sent one and then none.
@@ -135,7 +135,7 @@ class _Viewer:
                 return
             text = message.get("text")
             if text is None:
-                raise _HangUp(NOT_TEXT, Problem(422, "A binary message is no request.", remedy=API_REMEDY))
+                raise _HangUp(NOT_TEXT, Problem(422, "A binary message is not a request.", remedy=API_REMEDY))
             if len(text) > MAX_MESSAGE:
                 detail = f"The message has {len(text)} characters, more than {MAX_MESSAGE}."
                 raise _HangUp(TOO_LARGE, Problem(413, detail, remedy=API_REMEDY))
@@ -249,7 +249,7 @@ def message_of(document: dict[str, Any]) -> StreamMessage:
     """The request that the document is.
 
     Raises:
-        Problem: 422, it is none; names the field.
+        Problem: 422: the document is not a valid request; names the field.
     """
     try:
         return StreamMessage.model_validate(document)

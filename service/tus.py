@@ -31,7 +31,7 @@ VERSION = "1.0.0"
 RESUMABLE = {"Tus-Resumable": VERSION}
 CONTENT_TYPE = "application/offset+octet-stream"
 MAX_OPEN_UPLOADS = 100
-"""Of one tenant, unfinished or not used yet."""
+"""Maximum uploads of one tenant that are unfinished or not used yet."""
 
 REST_REMEDY = "Ask how far it came (HEAD) and send what follows."
 METADATA_REMEDY = "Send `part` (clip, left, right, calibration or masks) and `suffix` (.mp4), each value in base64."
@@ -235,5 +235,5 @@ def _part_and_suffix(metadata: str) -> tuple[str, str]:
             ) from None
     part = values.get("part", "")
     if part not in PARTS:
-        raise Problem(422, f"{part[:40]!r} is no part.", field="Upload-Metadata", remedy=METADATA_REMEDY)
+        raise Problem(422, f"{part[:40]!r} is not a part of a clip.", field="Upload-Metadata", remedy=METADATA_REMEDY)
     return part, checked_suffix(part, values.get("suffix") or PurePosixPath(values.get("filename", "")).suffix)

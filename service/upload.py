@@ -34,7 +34,7 @@ PARTS = tuple(SUFFIXES)
 OPTIONS = "options"
 MAX_OPTIONS_BYTES = 64 * 1024
 MAX_BYTES = {OPTIONS: MAX_OPTIONS_BYTES, "calibration": MAX_CALIBRATION_BYTES}
-"""Of the parts that are small by their nature."""
+"""Maximum bytes of the parts that are small by their nature."""
 LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
 MAX_HEADER_BYTES = 8 * 1024
 FORM_REMEDY = (
@@ -82,7 +82,7 @@ class Received:
         )
 
     def sha256(self) -> str:
-        """Of the only file; of several, of a line `part digest` for each, in the order of the parts' names."""
+        """The digest of the only file, or of one line `part digest` per file, sorted by part."""
         if len(self.digests) == 1:
             return next(iter(self.digests.values()))
         lines = "".join(f"{part} {digest}\n" for part, digest in sorted(self.digests.items()))
@@ -111,7 +111,7 @@ async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: 
     """Write the parts of a multipart body into folder.
 
     Raises:
-        Problem: 400, the body is not the multipart form it should be; 507, the disk has no room for it.
+        Problem: 400: the body is not a valid multipart form. 507: the disk has no room for it.
         InputError: an unknown, repeated or empty part, or an ending that is not accepted.
         LimitError: more than limits.upload_bytes, counted as they come.
     """

@@ -9,7 +9,7 @@ from importlib.metadata import version as installed_version
 
 @cache
 def version() -> str:
-    """Of the installed distribution; "0+unknown" in a tree that was not installed."""
+    """The version of the installed distribution; "0+unknown" in a tree that was not installed."""
     try:
         return installed_version("intrasplat")
     except PackageNotFoundError:

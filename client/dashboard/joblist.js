@@ -75,7 +75,7 @@ export class JobList {
     });
   }
 
-  /** The job's row: made anew only if other things may be done about it, so that focus and half-made clicks stay. */
+  /** The job's row, made again only if its actions change, so that focus and half-made clicks stay. */
   #row(job, chosen) {
     const key = JSON.stringify([job.state, job.cancel_requested, job.error]);
     let row = this.rows.get(job.id);

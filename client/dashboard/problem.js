@@ -42,7 +42,7 @@ export class Problem extends Error {
 export const connectionLost = () => new Problem(LOST, { detail: "The connection is lost." });
 
 /**
- * @param {Response} response that is no success
+ * @param {Response} response that is not a success
  * @returns {Promise<Problem>}
  */
 export async function problemOf(response) {

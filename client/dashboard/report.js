@@ -31,8 +31,8 @@ function quality(report) {
 /** The one sentence to read first. */
 function verdict(report) {
   const best = Math.max(...baselinesOf(report).map(({ db }) => db));
-  if (!Number.isFinite(report.psnr_tissue_db)) return "Its likeness is not known: trust nothing but its looks.";
-  if (report.psnr_tissue_db <= best) return "Between the frames it is no better than copying them.";
+  if (!Number.isFinite(report.psnr_tissue_db)) return "Its quality could not be measured: do not rely on it.";
+  if (report.psnr_tissue_db <= best) return "Between the frames it is not better than copying them.";
   const count = report.warnings.filter(isWarning).length;
   if (count === 0) return "Measured; nothing to distrust was found.";
   return `Measured, with ${count === 1 ? "a warning" : `${count} warnings`}; read on.`;

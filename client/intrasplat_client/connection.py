@@ -175,7 +175,7 @@ def http_settings(url: str, api_key: str | None) -> dict[str, Any]:
     try:
         base_url = httpx.URL(url)
     except httpx.InvalidURL as error:
-        raise InputError("url", f"{url[:80]!r} is no address ({error}).", UNREACHABLE_REMEDY) from error
+        raise InputError("url", f"{url[:80]!r} is not an address ({error}).", UNREACHABLE_REMEDY) from error
     timeout = httpx.Timeout(ANSWER_TIMEOUT_S, connect=CONNECT_TIMEOUT_S)
     return {"base_url": base_url, "timeout": timeout, "headers": authorization(api_key)}
 

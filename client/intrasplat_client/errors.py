@@ -180,7 +180,7 @@ def error_of_document(
     """The exception for a problem document (RFC 9457).
 
     Raises:
-        KeyError, TypeError, ValueError: it is no problem document.
+        KeyError, TypeError, ValueError: it is not a problem document.
     """
     refusal = Refusal(
         status=int(document["status"]),

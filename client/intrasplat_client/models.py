@@ -117,7 +117,7 @@ class Severity(StrEnum):
 
 
 class FrameScore(Model):
-    """One held-out frame: the model's scores beside those of copying its neighbours. None: no tissue to judge."""
+    """One held-out frame: the model's scores and those of copying its neighbours. None: no tissue to judge."""
 
     frame: int
     psnr_tissue_db: float | None
@@ -155,11 +155,11 @@ class JobOptions(Model):
     budget_s: float | None = None
     """about how many seconds to train, often less; not with iterations"""
     seed: int = 0
-    """of all random numbers"""
+    """seed of all random numbers"""
     priority: str = "standard"
-    """high: before, and in place of, standard jobs"""
+    """high: before standard jobs, and in place of a running one"""
     retention_hours: float | None = None
-    """clip, scene and record are purged so long after the job ended"""
+    """hours after its end until the job is purged: clip, scene and record"""
 
 
 class JobView(Model):
@@ -207,7 +207,7 @@ class Report(Model):
     report_version: int = 2
     notice: str = "Research use only. Not a medical device; it must not guide treatment."
     versions: dict[str, str] = Field(default={})
-    """of intrasplat and what it computes with"""
+    """versions of intrasplat and of what it computes with"""
     psnr_tissue_db: float | None
     psnr_paper_db: float | None
     ssim: float | None
@@ -227,18 +227,18 @@ class Report(Model):
     assumptions: tuple[Notice, ...]
     """what was taken for granted about the input"""
     measurements: dict[str, float] = Field(default={})
-    """of the input, such as its misalignment in px"""
+    """measured on the input, such as misalignment in px"""
     preset: str
     seed: int
     device: str
     iterations: int
     frames_seen: int | None = None
-    """by training, each as often as it was in a step"""
+    """training frames in all steps, repeats counted"""
     seconds: dict[str, float]
-    """by stage; t_train_s and t_post_s as docs/conventions.md has them"""
+    """by stage; docs/conventions.md defines t_train_s and t_post_s"""
     gaussians: int
     bases: int
-    """of a channel's motion; 0 if the model has no such number"""
+    """bases per channel of motion; 0 if the model has none"""
     scene_bytes: int
     units_per_mm: float
     width: int
@@ -256,7 +256,7 @@ TERMINAL_STATES = frozenset({JobState.CANCELLED, JobState.DONE, JobState.FAILED}
 
 
 EXCLUSIVE_OPTIONS = (("iterations", "budget_s"),)
-"""Of each group at most one may be given."""
+"""At most one option of each group may be given."""
 
 
 @with_config(ConfigDict(extra="forbid"))
@@ -289,8 +289,8 @@ class GivenOptions(TypedDict, total=False):
     budget_s: Annotated[float, Field(gt=0, le=7200)] | None
     """about how many seconds to train, often less; not with iterations"""
     seed: Annotated[int, Field(lt=2147483648, ge=0)]
-    """of all random numbers"""
+    """seed of all random numbers"""
     priority: Literal["standard", "high"]
-    """high: before, and in place of, standard jobs"""
+    """high: before standard jobs, and in place of a running one"""
     retention_hours: Annotated[float, Field(gt=0, le=87600)] | None
-    """clip, scene and record are purged so long after the job ended"""
+    """hours after its end until the job is purged: clip, scene and record"""

@@ -130,7 +130,7 @@ class Session:
 
 
 def error_of(response: httpx.Response) -> IntrasplatError:
-    """The exception for a response that is no success."""
+    """The exception for a response that is not a success."""
     return error_of_answer(response.status_code, response.headers, response.content)
 
 
@@ -143,5 +143,5 @@ def parsed(response: httpx.Response, parse: Callable[[Content], Parsed], content
     try:
         return parse(content)
     except (ValueError, KeyError, TypeError) as error:
-        problem = "What answers there is no intrasplat service, or one of another version."
+        problem = "What answers there is not an intrasplat service, or is one of another version."
         raise ServiceFault(Refusal(response.status_code, problem, remedy="Correct the address.")) from error

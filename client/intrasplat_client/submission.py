@@ -26,7 +26,7 @@ from intrasplat_client.session import Patience, Session, error_of, parsed
 IN_PIECES_FROM_BYTES = 64 * 2**20
 """Losing a smaller upload costs seconds; a larger one resumes."""
 PIECE_BYTES = 32 * 2**20
-"""Of one request: small enough for proxies, and all that a lost connection can cost."""
+"""The size of one request: small enough for proxies, and all that a lost connection can cost."""
 READ_BYTES = 2**18
 
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -52,7 +52,7 @@ class Submission:
 
     @property
     def total_bytes(self) -> int:
-        """Of all files."""
+        """The size of all files."""
         return sum(self.sizes.values())
 
     def report(self, sent_bytes: int) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 NPY = "application/x-npy"
 LENGTH_BYTES = 4
-"""Of the number that opens a message of the stream: its head's length."""
+"""A message of the stream begins with the length of its head, a number of this size."""
 
 
 @dataclass(frozen=True)
@@ -124,4 +124,4 @@ def image_of_message(message: bytes | str) -> tuple[object, Image | IntrasplatEr
         )
         return head["id"], image
     except (ValueError, KeyError, TypeError, AttributeError):
-        return None, ServiceFault(Refusal(200, "The service sent a message that is no view."))
+        return None, ServiceFault(Refusal(200, "The service sent a message that is not a view."))

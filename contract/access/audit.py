@@ -65,7 +65,7 @@ def utc_now() -> str:
 class AuditLog:
     """The audit log of one data directory. Any number of processes may append to it.
 
-    It is opened anew for each line, so it may be moved away at any time, as logrotate does.
+    It is opened for each line, so it may be moved away at any time, as logrotate does.
     """
 
     def __init__(self, data_dir: Path) -> None:

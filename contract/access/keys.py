@@ -128,7 +128,7 @@ class KeyFile:
         return revoked
 
     def find(self, text: str) -> ApiKey | None:
-        """The key of that text; None if there is none. Cheap enough for each request: one stat and one hash.
+        """The key that this text belongs to; None if there is none. Costs one stat and one hash.
 
         Raises:
             UnavailableError: the file is damaged; no key is accepted.

@@ -76,7 +76,7 @@ def check_video(path: Path, field: str, label: str, limits: ClipLimits) -> Video
     """The track to decode. Files that need no decoder to be refused are refused here.
 
     Raises:
-        InputError: it is no video, has no header, or its codec is not accepted.
+        InputError: it is not a video, has no header, or its codec is not accepted.
         LimitError: by its header it is too large, too long, or has too many frames.
     """
     with path.open("rb") as file:

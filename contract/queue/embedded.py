@@ -24,7 +24,7 @@ from contract.runtime.supervised import Supervised
 from contract.wire.errors import UnavailableError
 
 MAX_SOCKET_PATH_BYTES = 107
-"""Of a unix socket on Linux: sun_path without the final zero."""
+"""The longest path of a unix socket on Linux: sun_path without the final zero."""
 
 START_TIMEOUT_S = 20.0
 """Includes replaying the log of a long-used queue."""
@@ -100,7 +100,7 @@ class EmbeddedServer:
 
     @property
     def process_id(self) -> int | None:
-        """Of the server, if this object has started it."""
+        """The id of the server's process, if this object has started it."""
         return self._server.process_id if self._server else None
 
     def start(self) -> None:
@@ -195,7 +195,7 @@ class EmbeddedServer:
         return [part for name, value in options.items() for part in (f"--{name}", value)]
 
     def _binary(self) -> ServerBinary:
-        """The program that wrote the log, if it is still there; else find_server(), noted beside the log."""
+        """The program that wrote the log, if it is still there; else find_server(), noted next to the log."""
         note = self._folder / WRITER
         written_by = Path(note.read_text()) if note.is_file() else None
         if written_by is not None and os.access(written_by, os.X_OK):
@@ -209,7 +209,7 @@ class EmbeddedServer:
         last = self._last_log_line()
         if "file format" in last:
             problem = f"The queue's log in {self._folder} was written by another server, which this one cannot read."
-            remedy = "Install that server again, or empty the folder; the service then queues all clips anew."
+            remedy = "Install that server again, or empty the folder; the service then queues all clips again."
             return UnavailableError(problem, remedy)
         problem = f"The queue's server ended with status {status}: {last}"
         return UnavailableError(problem, f"See {self._folder / 'server.log'}.")

@@ -59,7 +59,7 @@ def reachable() -> Iterator[None]:
         code = _code_of(error)
         if code not in REFUSALS:
             raise
-        remedy = "Look at the server's log. REDIS_URL must name a server that is no replica and whose disk has room."
+        remedy = "Look at the server's log. REDIS_URL must name a primary server whose disk has room."
         raise UnavailableError(f"The queue's server refuses ({code}).", remedy) from error
 
 

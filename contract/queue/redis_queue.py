@@ -263,7 +263,7 @@ class RedisQueue:
                 if isinstance(answer, redis.RedisError):
                     if not str(answer).startswith("WRONGTYPE"):
                         raise answer
-                    answers[i] = {"document": "something that is no hash"}
+                    answers[i] = {"document": "something that is not a hash"}
         found = {job_id: record_of(job_id, answer) for job_id, answer in zip(job_ids, answers, strict=True)}
         return {job_id: record for job_id, record in found.items() if record is not None}
 

@@ -63,18 +63,18 @@ class Settings(BaseModel):
     max_upload_bytes: int = Field(default=4 * GIB, gt=0)
     max_frames: int = Field(default=1000, gt=0)
     max_frame_pixels: int = Field(default=4096 * 2160, gt=0)
-    """Of one eye."""
+    """Maximum pixels of one eye's frame."""
     max_clip_s: float = Field(default=600.0, gt=0)
     min_free_bytes: int = Field(default=2 * GIB, ge=0)
     """The service refuses uploads while the data directory's disk has less room than this."""
     max_uploads: int = Field(default=8, gt=0)
-    """At the same time, from all callers."""
+    """Maximum uploads received at the same time, from all callers."""
     upload_silence_s: float = Field(default=60.0, gt=0)
-    """The service drops a request whose body brings nothing for so long."""
+    """The service drops a request whose body brings nothing for this long."""
     max_queued: int = Field(default=200, gt=0)
     max_queued_per_tenant: int = Field(default=50, gt=0)
     requests_per_s: float = Field(default=400.0, gt=0)
-    """Of one key, or of one address where no key is asked for; each process of the service counts for itself."""
+    """Maximum rate of one key, or of one address without a key; each process of the service counts for itself."""
 
     # who may come in
     hosts: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
@@ -95,7 +95,7 @@ class Settings(BaseModel):
     render_secret: str | None = Field(default=None, min_length=32)
     """Shared by services and workers, which make the keys of their encrypted connection from it."""
     hot_bytes: int = Field(default=2 * GIB, gt=0)
-    """Of all scenes together that a worker keeps in memory."""
+    """Maximum bytes of all scenes that a worker keeps in memory."""
 
     # many machines
     store_url: str | None = Field(default=None, pattern=r"^s3://[^\s]+$")

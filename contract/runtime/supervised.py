@@ -90,7 +90,7 @@ class Supervised:
 
     @property
     def process_id(self) -> int | None:
-        """Of the process; None where there is none."""
+        """The id of the process; None if it does not run."""
         return self._process.pid if self._process else None
 
     @property

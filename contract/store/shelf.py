@@ -63,7 +63,7 @@ class ShelfEntry:
 
     @property
     def name(self) -> str:
-        """Of the folder in its area."""
+        """The name of the folder in its area."""
         return self.job_id if self.attempt is None else f"{self.job_id}.{self.attempt:d}"
 
     @property

@@ -100,7 +100,7 @@ class JobRecord(BaseModel):
     """Whose it is; nobody else learns that it exists."""
     input_bytes: int = Field(default=0, ge=0)
     input_sha256: str = ""
-    """Of all files in the order of their parts' names."""
+    """The digest of all files, sorted by part."""
     idempotency_key: str | None = None
     """SHA-256 of the caller's Idempotency-Key: a second submission under it yields this job."""
     created_at_s: float

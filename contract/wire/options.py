@@ -58,7 +58,7 @@ class ReconstructionOptions(ClipOptions):
     budget_s: float | None = Field(
         default=None, gt=0, le=7200, description="about how many seconds to train, often less; not with iterations"
     )
-    seed: int = Field(default=0, ge=0, lt=2**31, description="of all random numbers")
+    seed: int = Field(default=0, ge=0, lt=2**31, description="seed of all random numbers")
 
     @field_validator("holdout", mode="before")
     @classmethod
@@ -77,9 +77,11 @@ class ReconstructionOptions(ClipOptions):
 class JobOptions(ReconstructionOptions):
     """How a service reconstructs a clip; the `options` field of POST /reconstruct."""
 
-    priority: Priority = Field(default="standard", description="high: before, and in place of, standard jobs")
+    priority: Priority = Field(
+        default="standard", description="high: before standard jobs, and in place of a running one"
+    )
     retention_hours: float | None = Field(
-        default=None, gt=0, le=87_600, description="clip, scene and record are purged so long after the job ended"
+        default=None, gt=0, le=87_600, description="hours after its end until the job is purged: clip, scene and record"
     )
 
 

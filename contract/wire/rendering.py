@@ -79,7 +79,7 @@ class RenderRequest(BaseModel):
     layer: Layer = Layer.RGB
     format: ImageFormat = ImageFormat.PNG
     quality: int = Field(default=90, ge=1, le=100)
-    """Of jpeg and webp."""
+    """The quality of a jpeg or webp image."""
     max_pixels: int = Field(default=4096 * 2160, gt=0)
 
 
@@ -119,7 +119,7 @@ class WorkerReply(BaseModel):
     t: float = 0.0
     warnings: tuple[Notice, ...] = ()
     iteration: int | None = None
-    """Of the snapshot that is shown; None: the scene is finished."""
+    """The iteration of the snapshot that is shown; None: the scene is finished."""
     render_ms: float = 0.0
 
 

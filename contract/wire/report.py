@@ -14,7 +14,7 @@ RESEARCH_USE = "Research use only. Not a medical device; it must not guide treat
 
 
 class FrameScore(BaseModel):
-    """One held-out frame: the model's scores beside those of copying its neighbours. None: no tissue to judge."""
+    """One held-out frame: the model's scores and those of copying its neighbours. None: no tissue to judge."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -39,7 +39,7 @@ class Report(BaseModel):
 
     report_version: int = REPORT_VERSION
     notice: str = RESEARCH_USE
-    versions: dict[str, str] = Field(default={}, description="of intrasplat and what it computes with")
+    versions: dict[str, str] = Field(default={}, description="versions of intrasplat and of what it computes with")
 
     psnr_tissue_db: float | None
     psnr_paper_db: float | None
@@ -53,16 +53,16 @@ class Report(BaseModel):
 
     warnings: tuple[Notice, ...] = Field(description="what to distrust; empty if nothing was found")
     assumptions: tuple[Notice, ...] = Field(description="what was taken for granted about the input")
-    measurements: dict[str, float] = Field(default={}, description="of the input, such as its misalignment in px")
+    measurements: dict[str, float] = Field(default={}, description="measured on the input, such as misalignment in px")
 
     preset: str
     seed: int
     device: str
     iterations: int = Field(ge=0)
-    frames_seen: int | None = Field(default=None, ge=0, description="by training, each as often as it was in a step")
-    seconds: dict[str, float] = Field(description="by stage; t_train_s and t_post_s as docs/conventions.md has them")
+    frames_seen: int | None = Field(default=None, ge=0, description="training frames in all steps, repeats counted")
+    seconds: dict[str, float] = Field(description="by stage; docs/conventions.md defines t_train_s and t_post_s")
     gaussians: int = Field(ge=0)
-    bases: int = Field(ge=0, description="of a channel's motion; 0 if the model has no such number")
+    bases: int = Field(ge=0, description="bases per channel of motion; 0 if the model has none")
     scene_bytes: int = Field(ge=0)
     units_per_mm: float = Field(gt=0)
 
