@@ -88,7 +88,7 @@ def test_another_server_at_the_address_is_a_fault_and_not_a_crash(clip: Path) ->
             lambda: client.reconstruct(clip),
             lambda: client.reconstruct(clip, in_pieces=True),
         ):
-            with pytest.raises(ServiceFault, match="no intrasplat service"):
+            with pytest.raises(ServiceFault, match="not an intrasplat service"):
                 ask()
 
 
