@@ -1,4 +1,4 @@
-"""What the decoding process costs: seconds and memory beside decoding in this process, for the same clips.
+"""What the decoding process costs: seconds and memory, compared with decoding in this process, for the same clips.
 
 Seconds of the processor, parent and child together, are given too: on a machine that does other things they tell more.
 

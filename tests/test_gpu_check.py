@@ -61,7 +61,7 @@ def test_figures_of_the_interpreter_do_not_pass_for_results() -> None:
 
 @pytest.mark.parametrize(
     ("name", "problem"),
-    [("nowhere", "does not exist"), ("file", "is no folder"), ("clip", "has no depth, no poses_bounds.npy")],
+    [("nowhere", "does not exist"), ("file", "is not a folder"), ("clip", "has no depth, no poses_bounds.npy")],
 )
 def test_a_clip_that_is_none_is_refused_before_anything_is_done(tmp_path: Path, name: str, problem: str) -> None:
     (tmp_path / "file").write_text("")

@@ -167,7 +167,7 @@ def snapshot_of(run: Run) -> Scene:
 
 
 def assess(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Report:
-    """Score the held-out frames beside the copy baselines, and say what to distrust.
+    """Score the held-out frames and the copy baselines, and say what to distrust.
 
     The curve's last point becomes the score over all held-out frames of the scene as it is kept; the points before it
     are over at most sixteen of them.

@@ -103,7 +103,7 @@ def clip_problem(path: Path) -> str:
     if not lacking:
         return ""
     problem = "does not exist" if not path.exists() else f"has no {', no '.join(lacking)}"
-    problem = "is no folder" if path.is_file() else problem
+    problem = "is not a folder" if path.is_file() else problem
     return (
         f"--clip: {path.resolve()} {problem}. Name the folder that holds {', '.join(CLIP_HAS)} of a recording "
         "in the EndoNeRF layout, or leave --clip out to train on synthetic tissue."

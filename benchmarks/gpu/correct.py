@@ -202,7 +202,7 @@ class Checks:
         ]
 
     def deformed(self, kinds: Sequence[str]) -> Differences:
-        """Where the Gaussians are at some time, beside the same in float64."""
+        """Where the Gaussians are at some time, against the same in float64."""
         worst = {}
         for kind in kinds:
             gaussians, deformation = self._parts(kind)

@@ -96,7 +96,7 @@ class DeviceChild:
             for line in lines:
                 report = read_report(line)
                 if report is None:
-                    logger.warning("the device process printed a line of %d bytes that is no report", len(line))
+                    logger.warning("the device process printed a line of %d bytes that is not a report", len(line))
                 elif isinstance(report, Ready):
                     self.ready = report
                 elif isinstance(report, Holding):

@@ -165,11 +165,11 @@ def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits |
 
 
 def run_or_start_anew(request: ReconstructionRequest, out: Path, hooks: TrainingHooks) -> None:
-    """Reconstruct, resuming the state in `out`; start anew if that state is damaged or of another version."""
+    """Reconstruct, resuming the state in `out`; start again if that state is damaged or of another version."""
     try:
         reconstruct(request, out, hooks)
     except ResumeMismatch:
-        logger.warning("the stored state cannot be resumed; training starts anew")
+        logger.warning("the stored state cannot be resumed; training starts again")
         (out / RESUME_FILE).unlink()
         reconstruct(request, out, hooks)
 

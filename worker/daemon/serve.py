@@ -1,4 +1,4 @@
-"""Answer render and export requests: a ZeroMQ ROUTER in a thread beside training (contract/wire/rendering.py).
+"""Answer render and export requests: a ZeroMQ ROUTER in a thread during training (contract/wire/rendering.py).
 
 The thread answers one request at a time, in order of arrival. Rendering shares the cores with training and waits when
 it has used its share (worker/daemon/pace.py). The folder of a unix socket protects it. TCP is encrypted, and only

@@ -170,6 +170,6 @@ def _value(series: str, field: str, text: str, current: object) -> object:
             raise ValueError(text)
         return value
     except (KeyError, ValueError, OverflowError):
-        problem = f"{text!r} in {series!r} is no value in place of {current!r}."
+        problem = f"{text!r} in {series!r} is not a value in place of {current!r}."
         known = ", ".join(words) or "a number, true, false or, where there need not be any, none"
         raise InputError("--series", problem, f"Give {known}.") from None

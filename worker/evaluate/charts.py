@@ -32,7 +32,7 @@ SHOWN_BELOW_WORST_DB = 6.0
 MAX_FINE_TICKS = 500
 """An axis that spans more than this factor has ticks at powers of ten alone: others would run into each other."""
 REAL_CLIP, PAPERS_HOLDOUT = "d4d-a", "every8"
-"""Published figures stand beside the real clip alone, held out as the papers do."""
+"""Published figures are drawn for the real clip alone, held out as the papers do."""
 DECIBEL = "held-out psnr_tissue, dB"
 OVER_TIME = {
     "curves": ("psnr_tissue_db", DECIBEL),

@@ -52,7 +52,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N", help="(default: 0)")
     add_options(parser, ReconstructionOptions, "budget_s", "iterations", nargs="+", default=[])
     parser.add_argument(
-        "--grid", action="store_true", help="of each series, the grid of fixed capacities beside its own choice"
+        "--grid", action="store_true", help="of each series, the grid of fixed capacities in addition to its own choice"
     )
     parser.add_argument(
         "--device",

@@ -66,7 +66,7 @@ def source_of(argument: str, files: Mapping[str, Path] | None = None, options: C
     """The source that an argument names; files (calibration, masks) and options are of a clip that is a path.
 
     Raises:
-        InputError: there is no such motion or file, or a recording is asked for and INTRASPLAT_DATA is not set.
+        InputError: there is no such motion or file, or a recording is asked for, and INTRASPLAT_DATA is not set.
     """
     if argument.startswith("phantom:"):
         settings = _phantom_settings(argument)
@@ -123,7 +123,7 @@ def _phantom_settings(argument: str) -> PhantomSettings:
         else:
             problem = f"{part!r} in {argument!r} is not known."
             raise InputError("CLIP", problem, "Write phantom:MOTION[:WxH][:FRAMESframes][:seedN].")
-    return PhantomSettings(motion=motion, **values)  # type: ignore[arg-type]  # it refuses what is no motion
+    return PhantomSettings(motion=motion, **values)  # type: ignore[arg-type]  # it refuses what is not a motion
 
 
 def _phantom_name(settings: PhantomSettings) -> str:

@@ -182,7 +182,7 @@ def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: TrainingH
 
 
 def verdict(row: Row, clean: Row | None) -> dict[str, str]:
-    """outcome, loss_db and depth_loss_mm of a row beside its clean cell's.
+    """outcome, loss_db and depth_loss_mm of a row, compared with its clean cell's.
 
     The outcome is unknown where the clean cell failed, or was measured before warnings had codes.
     """

@@ -105,5 +105,5 @@ def _line(row: Row) -> str:
 def _size(text: str) -> tuple[int, int]:
     width, cross, height = text.partition("x")
     if not (cross and width.isdigit() and height.isdigit()):
-        raise argparse.ArgumentTypeError(f"{text!r} is no size such as 160x128")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 160x128")
     return int(width), int(height)

@@ -170,7 +170,7 @@ def _median_end(alike: Sequence[Sequence[Point]]) -> Point:
 
 @dataclass(frozen=True)
 class Capacity:
-    """The automatic choice beside the best of the grid at a place.
+    """The automatic choice compared with the best of the grid at a place.
 
     difference_db is the mean over seeds of chosen - best, each seed with itself; deviation_db the standard deviation of
     these differences, estimated from the seeds there are; NaN of one.

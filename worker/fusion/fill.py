@@ -213,6 +213,6 @@ class _Coverage:
         cells, _ = cells_of(points_mm, self._intrinsics, world_from_camera, self._stride)
         covered = np.zeros(self._shape, dtype=np.uint8)
         covered.reshape(-1)[cells] = 1
-        # Seen from another pose the grid is uneven: a gap of one cell between points is no hole.
+        # Seen from another pose the grid is uneven: a gap of one cell between points is not a hole.
         closed = cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         self._covered = np.asarray(closed, dtype=np.bool_).reshape(-1)

@@ -20,7 +20,7 @@ class Intrinsics:
     A plain dataclass, so that training needs no pydantic.
 
     Raises:
-        ValueError: a size or focal length is not above 0, a size is no whole number, or something is not finite.
+        ValueError: a size or focal length is not above 0, a size is not a whole number, or something is not finite.
     """
 
     width: int
@@ -33,9 +33,9 @@ class Intrinsics:
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             if isinstance(value, bool | str) or not math.isfinite(value):
-                raise ValueError(f"{name} of a camera is {value!r}, which is no finite number")
+                raise ValueError(f"{name} of a camera is {value!r}, which is not a finite number")
             if name in ("width", "height") and value != int(value):
-                raise ValueError(f"{name} of a camera is {value!r} pixels, which is no whole number")
+                raise ValueError(f"{name} of a camera is {value!r} pixels, which is not a whole number")
             if name not in ("cx", "cy") and value <= 0:
                 raise ValueError(f"{name} of a camera is {value!r}, not above 0")
             kind = int if name in ("width", "height") else float  # NumPy's numbers are not written as JSON
@@ -46,7 +46,7 @@ class Intrinsics:
         """The camera whose numbers() were stored as JSON.
 
         Raises:
-            ValueError: the value is no camera.
+            ValueError: the value is not a camera.
         """
         names = {each.name for each in fields(cls)}
         if not isinstance(value, dict) or value.keys() != names:

@@ -15,7 +15,7 @@ MIN_TRITON, MAX_TRITON = (3, 6), (3, 9)
 """Major and minor numbers of the versions that the kernels were tested with; pyproject.toml asks for the same."""
 
 TRITON_PACKAGES = ("triton", "pytorch-triton")
-"""Names under which Triton is installed; the second comes with builds of torch that are no release."""
+"""Names under which Triton is installed; the second comes with builds of torch that are not releases."""
 
 CUDA_SETUP = "`make setup TORCH_INDEX=https://download.pytorch.org/whl/cu128`"
 

@@ -2,7 +2,7 @@
 
 Symbols: H W pixels. Colours are RGB: float in [0, 1], or uint8; tissue [H, W] bool, True = tissue.
 Each function judges one frame, except depth_agreement_mm; what has no pixel to be judged on is NaN, and so is the
-score of a picture that is no number where it is judged.
+score of a picture that is not finite where it is judged.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ class _EyeView:
 
 @dataclass(frozen=True)
 class Phantom:
-    """Synthetic tissue under a stereo endoscope. Each call draws its frame anew."""
+    """Synthetic tissue under a stereo endoscope. Each call draws its frame again."""
 
     settings: PhantomSettings
     surface: Surface
@@ -198,7 +198,7 @@ class Phantom:
         behind_tissue = (depth_mm > 0) & (depth_mm < tool_fragments.depth_mm)
         shows_tool = (tool_fragments.triangle >= 0) & ~behind_tissue
         both = np.where(shows_tool[..., None], linear, hidden)
-        # the lens blurs the instrument into its neighbours, which are then no clean tissue
+        # the lens blurs the instrument into its neighbours, which are then not clean tissue
         touched = cv2.dilate(shows_tool.astype(np.uint8), np.ones((BLUR_PX, BLUR_PX), np.uint8)) > 0
         return _EyeView(
             rgb=np.where(touched[..., None], to_srgb(_through_lens(both)), hidden_rgb),

@@ -63,7 +63,7 @@ class PhantomSettings:
                 "Give a less extreme shape.",
             )
         if self.motion not in MOTIONS:
-            raise InputError("options.motion", f'"{self.motion}" is no motion.', f"Give one of {', '.join(MOTIONS)}.")
+            raise InputError("options.motion", f'"{self.motion}" is unknown.', f"Give one of {', '.join(MOTIONS)}.")
 
     @property
     def intrinsics(self) -> Intrinsics:

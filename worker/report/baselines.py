@@ -1,7 +1,7 @@
 """What copying scores: held-out frames made from their neighbours in time, with no model at all.
 
 Symbols: H W pixels; a, b the nearest earlier and later training frames of held-out frame i, s = (i - a) / (b - a).
-A fixed camera and slow tissue make copying strong, so every quality figure stands beside these two.
+A fixed camera and slow tissue make copying strong, so every quality figure is compared with these two.
 """
 
 from __future__ import annotations

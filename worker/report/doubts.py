@@ -27,7 +27,7 @@ MIN_FINE_DETAIL = 0.62
 MIN_DETAIL_LEVELS = 0.4
 """Of 255; below it there is nothing to be sharp: that is said of the texture."""
 MIN_EQUAL_DETAIL = 0.75
-"""Of a frame's fine detail beside that of the clip's sharpest: 0.93 and more in clean clips."""
+"""Of a frame's fine detail, relative to that of the clip's sharpest: 0.93 and more in clean clips."""
 MIN_DOUBTFUL_FRAMES = 2
 """Of the frames looked at: one alone may be an accident."""
 MAX_COLOUR_DRIFT = 0.25

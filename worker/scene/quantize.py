@@ -37,7 +37,7 @@ SHAPE = slice(QUATERNION_ROW, COLOUR_ROW)
 """Quaternion and log-scale, whose precision is one power."""
 MAX_ROTATION_STEP = 2.0**MIN_POWER / 2
 """Of a quaternion at power 0. One of length 1 has a number of at least 1/2, which is one step at the lowest power, so
-no quaternion is rounded to 0, which would be no rotation."""
+no quaternion is rounded to 0, which is not a rotation."""
 MIN_EFFECT = 1e-3
 """A channel that the frames do not show at all is stored as if they showed it so much. Rotations have 0.02, places
 0.3."""
@@ -89,7 +89,7 @@ def prepare(
     state[:, :channels] += mean
     weight -= mean[:, :, None]  # the bases sum to 1
     length = np.linalg.norm(state[:, QUATERNION], axis=1)
-    state[length == 0, QUATERNION_ROW], length[length == 0] = 1, 1  # zeros are no rotation
+    state[length == 0, QUATERNION_ROW], length[length == 0] = 1, 1  # zeros are not a rotation
     state[:, QUATERNION] /= length[:, None]
     weight[:, QUATERNION] /= length[:, None, None].astype(np.float32)
     effect[QUATERNION] *= length**2

@@ -132,7 +132,7 @@ def _check_counts(scene: Scene) -> None:
 
 
 def _check_values(scene: Scene) -> None:
-    """Raise SceneError unless all numbers beside the tensors are finite and in their ranges."""
+    """Raise SceneError unless all numbers other than the tensors are finite and in their ranges."""
     if not 0 < scene.units_per_mm < math.inf:
         raise SceneError(f"The scene's units_per_mm is {scene.units_per_mm}, it must be above 0 and finite.")
     for name, numbers in (("world_from_camera", scene.world_from_camera), ("frame_times_s", scene.frame_times_s)):

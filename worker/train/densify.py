@@ -101,9 +101,7 @@ class Densifier:
         gradient = self.mean_gradient
         if not np.isfinite(gradient).all():
             broken = int((~np.isfinite(gradient)).sum())
-            raise TrainingDiverged(
-                f"The gradients of {broken} Gaussians are no longer numbers at iteration {iteration}."
-            )
+            raise TrainingDiverged(f"The gradients of {broken} Gaussians are not finite at iteration {iteration}.")
         pruned = model.parameters()["opacity_logit"].cpu().numpy() < _logit(self.settings.min_opacity)
         if pruned.all():
             raise TrainingDiverged(f"All {model.count} Gaussians have become transparent by iteration {iteration}.")

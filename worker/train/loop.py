@@ -49,7 +49,7 @@ def check_sums(sums: StepSums | None, iteration: int) -> None:
     if sums is None:
         return
     if not math.isfinite(sums.colour_l1 + sums.depth_l1):
-        raise TrainingDiverged(f"The loss is no longer a number by iteration {iteration}.")
+        raise TrainingDiverged(f"The loss is not finite by iteration {iteration}.")
     if sums.visible == 0:
         raise TrainingDiverged(f"No Gaussian is visible by iteration {iteration}.")
 
@@ -134,11 +134,11 @@ def _check_finite(run: Run) -> None:
     """Check the parameters themselves: a Gaussian that is not a number is not drawn, so the loss does not show it."""
     broken = [name for name, values in run.model.arrays().items() if not bool(torch.isfinite(values).all())]
     if broken:
-        raise TrainingDiverged(f"After {run.iteration} iterations {', '.join(broken)} hold values that are no numbers.")
+        raise TrainingDiverged(f"After {run.iteration} iterations {', '.join(broken)} hold values that are not finite.")
 
 
 def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], float]) -> float | None:
-    check_sums(run.model.wait(), run.iteration)  # steps that still run are no part of scoring
+    check_sums(run.model.wait(), run.iteration)  # steps that still run do not count as scoring
     t_train_s = clock.elapsed_s
     with clock.paused():
         psnr = evaluate()

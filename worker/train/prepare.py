@@ -18,7 +18,7 @@ from worker.train.targets import TrainingFrames, units_per_mm
 
 
 def prepare(setup: Setup) -> Run:
-    """The run before its first step. Compiling a GPU's kernels is no part of training: the clock is paused meanwhile.
+    """The run before its first step. Compiling a GPU's kernels does not count as training: the clock is paused.
 
     Raises:
         InputError: no training frame has valid depth.

@@ -92,7 +92,7 @@ class TrainingFrames:
         return self._rgb[row, :, :, :width].transpose(1, 2, 0), self._weight[row, :, :width] > 0
 
     def psnr_tissue_db(self, index: int, image: NDArray[np.float32]) -> float:
-        """Of a model's render [5, H, W] beside frame `index`; NaN without tissue."""
+        """Of a model's render [5, H, W] against frame `index`; NaN without tissue."""
         return psnr_tissue(image[:3].transpose(1, 2, 0), *self.picture(index))
 
     def digest(self) -> str:

@@ -71,7 +71,7 @@ def test_a_loss_that_is_no_number_is_noticed_with_the_next_answer_or_at_the_end(
 ) -> None:
     run, model = lagging(iterations)
     model.canonical[10, 5] = math.nan
-    with pytest.raises(TrainingDiverged, match=f"loss is no longer a number by iteration {noticed_by}"):
+    with pytest.raises(TrainingDiverged, match=f"loss is not finite by iteration {noticed_by}"):
         trained(run)
     assert model.steps_made == noticed_by
 

@@ -20,7 +20,7 @@ GROSS_FACTOR = (0.4, 2.0)  # by which gross errors are too near or too far
 
 
 def depth_noise(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """Depth errs by `level` of itself (one sigma), in patches of 8 px, anew in every frame."""
+    """Depth errs by `level` of itself (one sigma), in patches of 8 px, drawn again for every frame."""
     noise = _patches(clean, random, NOISE_PX)
     depth_mm = (clean.clip.depth_mm * np.maximum(1 + level * noise, 0.05)).astype(np.float32)
     return given(clean, dataclasses.replace(clean.clip, depth_mm=depth_mm))

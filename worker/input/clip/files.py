@@ -141,7 +141,7 @@ def check_exists(path: Path, field: str) -> None:
     if path.is_dir():
         return
     if not path.is_file() or not os.access(path, os.R_OK):
-        raise InputError(field, f"{path.name} is no readable file or folder.", "Check its kind and permissions.")
+        raise InputError(field, f"{path.name} is not a readable file or folder.", "Check its kind and permissions.")
     if path.stat().st_size == 0:
         raise InputError(field, f"{path.name} is empty (0 bytes).", "Copy or upload the file again.")
 

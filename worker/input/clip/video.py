@@ -76,7 +76,7 @@ class VideoFile:
 def open_video(path: Path, field: str, limits: ClipLimits, label: str | None = None) -> VideoFile:
     """The video, with its frames counted and timed. They are decoded later.
 
-    Raises InputError if it is no video, its codec is not allowed, or it ends early; LimitError if it is too large.
+    Raises InputError if it is not a video, its codec is not allowed, or it ends early; LimitError if it is too large.
     """
     label = label or path.name
     codec = check_video(path, field, label, limits).codec

@@ -57,7 +57,7 @@ def map_array(folder: Path, name: str, size: tuple[int, int, int]) -> NDArray[An
     The file may be removed at once; the mapping lives as long as the array.
 
     Raises:
-        ValueError: it is no regular file, or its size is not the array's.
+        ValueError: it is not a regular file, or its size is not the array's.
         OSError: there is no such file.
     """
     shape, dtype = _SHAPES[name](*size), np.dtype(_TYPES[name])

@@ -56,7 +56,7 @@ class SharedBasis(LinearDeformation):
     def initial(
         cls, count: int, *, bases: int = DEFAULT_BASES, colour: bool = False, times: Sequence[float] | None = None
     ) -> SharedBasis:
-        """No motion yet: weights 0. Each basis is as wide as 0.6 of the larger gap beside it.
+        """No motion yet: weights 0. Each basis is 0.6 times as wide as the larger gap next to it.
 
         Args:
             colour: whether the colour's constant harmonic moves too: 13 channels instead of 10.

@@ -11,7 +11,7 @@ from torch import Tensor
 from worker.raster.step import TrainingFrame, image_size
 
 FIRST_ROOM = 32
-"""Frames there is room for from the first on; when it is used up it doubles: all that holds addresses begins anew."""
+"""Room in frames at first. When it is used up it doubles, and everything that holds addresses is made again."""
 
 
 class FrameStore:

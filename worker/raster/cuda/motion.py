@@ -26,7 +26,7 @@ from worker.raster.cuda.update import COLUMNS
 
 @dataclass(frozen=True)
 class Trained:
-    """What a step's last kernel changes beside the motion, and the gradients it reads; update.py has the shapes."""
+    """What a step's last kernel changes apart from the motion, and the gradients it reads; update.py has the shapes."""
 
     values: Tensor
     moments: Tensor
@@ -69,7 +69,7 @@ class Motion(Protocol):
         """Fill what deform reads."""
 
     def write_rates(self, row: Mapping[str, np.ndarray], times: Sequence[float], rates: StepRates, step: int) -> None:
-        """Fill what update reads beside, and count the step; it is counted from 1."""
+        """Fill what else update reads, and count the step from 1."""
 
     def deform(self, values: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
         """state [F, 13, N] = values [14, N] + psi(t) at the times, colour [F, 3, N] without other harmonics."""

@@ -86,7 +86,7 @@ def project(  # type: ignore[no-untyped-def]
 
     extent2 = (log2_opacity - _LOG2_MIN_ALPHA) * (2.0 * _LN2) + _EXTENT_SLACK
     drawn = in_front & (extent2 >= 0.0) & (det > 0.0) & (det < _MAX_DETERMINANT)
-    # What is not drawn has numbers all the same, lest a NaN become a tile.
+    # What is not drawn has numbers all the same, so that a NaN does not become a tile.
     cxx, cxy, cyy = tl.where(drawn, cxx, 1.0), tl.where(drawn, cxy, 0.0), tl.where(drawn, cyy, 1.0)
     x, y, det = tl.where(drawn, x, 0.0), tl.where(drawn, y, 0.0), tl.where(drawn, det, 1.0)
     inverse_det = 1.0 / det

@@ -1,4 +1,4 @@
-"""The parts of matching that are no plain tensor operations: census words, costs, paths, winners, the line solver.
+"""The parts of matching that are not plain tensor operations: census words, costs, paths, winners, the line solver.
 
 Symbols: F frames of h w pixels; D disparities, low <= d < low + D, of which index i is low + i; a point at x in the
 left eye is at x - d in the right one. Volumes are [F, h, w, D], D fastest. LANES is the power of two from D up.

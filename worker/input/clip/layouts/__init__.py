@@ -43,7 +43,7 @@ def register_layout(file: Path) -> InputLayout:
     file = file.resolve()
     spec = importlib.util.spec_from_file_location(f"intrasplat_layout_{file.stem}", file)
     if spec is None or spec.loader is None:
-        raise ValueError(f"{file} is no Python file")
+        raise ValueError(f"{file} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     layout = getattr(module, "LAYOUT", None)

@@ -25,7 +25,7 @@ class ClipFiles:
 
     tree             files of a folder or zip, or one image; None where path is a single other file, such as a video
     detected         the caller left the layout open
-    masks            those that the caller gave beside the clip
+    masks            those that the caller gave in addition to the clip
     mask_polarity    what white means in masks, as the caller said
     pose_convention  axes of poses_bounds.npy, as the caller said
     """
