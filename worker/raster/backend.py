@@ -68,7 +68,7 @@ def examine(device: Device) -> float:
     """Check, once per process, that the GPU's renders and gradients match the reference; returns the seconds it took.
 
     Raises:
-        UnavailableError: they do not match, or the check failed.
+        UnavailableError: they differ by more than agreement.LIMIT.
     """
     start = time.perf_counter()
     if device.kind == "cuda":

@@ -127,7 +127,7 @@ def put_back(arrays: Mapping[str, Tensor], stored: Mapping[str, Tensor]) -> None
     """Copy the stored tensors, on any device, into a model's arrays().
 
     Raises:
-        ValueError: one is of another shape.
+        ValueError: a stored tensor has another shape than the array of its name.
     """
     for name, each in arrays.items():
         if stored[name].shape != each.shape:

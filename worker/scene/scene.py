@@ -91,7 +91,7 @@ def check(scene: Scene) -> None:
     """Check that the parts of a scene belong together and its numbers are in their ranges.
 
     Raises:
-        SceneError: they are not; the message names the part.
+        SceneError: two parts do not belong together, or a number is out of its range; the message names the part.
     """
     check_finite(scene.tensors())
     _check_counts(scene)

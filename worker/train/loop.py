@@ -44,7 +44,7 @@ def check_sums(sums: StepSums | None, iteration: int) -> None:
     """Check the losses of the steps that the model has answered for, if any.
 
     Raises:
-        TrainingDiverged: one is not finite, or no Gaussian is visible.
+        TrainingDiverged: a loss is not finite, or no Gaussian is visible.
     """
     if sums is None:
         return

@@ -172,7 +172,7 @@ class CudaRasterizer:
         colour [F, 3, N].
 
         Raises:
-            ValueError: anything else, or more than 32 bits can number.
+            ValueError: a tensor has another shape or type, or there are more slots than 32 bits can number.
         """
         gaussians = state.shape[-1]
         _check(camera, "camera", (self.frames, CAMERA), torch.float64)
@@ -248,7 +248,7 @@ class CudaRasterizer:
         (1 / units, 0 = none), loss_settings [F, 5], frame int32 [F]: which of the T each frame is.
 
         Raises:
-            ValueError: anything else.
+            ValueError: a tensor has another shape or type.
         """
         size = (self.height, self.width)
         _check(rgb, "rgb", (None, 3, *size), torch.uint8)
@@ -263,7 +263,7 @@ class CudaRasterizer:
         """Gradients of sum(cotangents * image), cotangents [F, 5, H, W].
 
         Raises:
-            ValueError: anything else.
+            ValueError: a tensor has another shape or type.
         """
         _check(cotangents, "cotangents", (self.frames, 5, self.height, self.width))
         self._blend(COTANGENT, cotangents, False)

@@ -229,7 +229,7 @@ def test_an_empty_file_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         open_clip(tmp_path / "nowhere.mp4")
     os.mkfifo(tmp_path / "pipe.mp4")
-    with pytest.raises(InputError, match="no readable file"):
+    with pytest.raises(InputError, match="not a readable file"):
         open_clip(tmp_path / "pipe.mp4")
 
 
