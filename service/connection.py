@@ -110,7 +110,7 @@ class Connection:
         return not self._waiting
 
     async def close(self) -> None:
-        """End the connection; who still waits is told that the worker is gone."""
+        """End the connection. Callers that still wait get the error that the worker is gone."""
         for task in self._tasks:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):

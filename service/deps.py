@@ -50,7 +50,7 @@ class Deps:
         self.limiter = Limiter(settings.requests_per_s)
         self.audit = Audit(AuditLog(settings.data_dir))
         self.metrics = Metrics(queue, store)
-        # how a clip comes in, what is told of its job, and how all of it goes again
+        # how a clip comes in, how callers follow its job, and how all of it is removed
         self.intake = Intake(settings, store)
         self.sweep = Sweep(queue, store)
         self.feeds = Feeds(queue)

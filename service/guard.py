@@ -85,7 +85,7 @@ class Guard:
             return Problem(403, f"Pages from {origin[:80]!r} may not use this service.", field="Origin", remedy=remedy)
         if "transfer-encoding" in headers and "content-length" in headers:  # RFC 9112, 6.1: how requests are smuggled
             close = {"Connection": "close"}
-            detail = "The body's length is told in two ways."
+            detail = "The request gives its body's length in two ways."
             return Problem(400, detail, field="Content-Length", remedy=LENGTH_REMEDY, headers=close)
         return None
 

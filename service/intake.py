@@ -38,7 +38,7 @@ class Intake:
 
     @contextmanager
     def place(self, declared_bytes: int = 0) -> Iterator[Place]:
-        """A place among the uploads that are received at once, with room for so many bytes.
+        """A place among the uploads that are received at once, with room for `declared_bytes`.
 
         Raises:
             Problem: 503: all places are taken. 507: the disk has no room for it.
@@ -57,7 +57,7 @@ class Intake:
             self._places.discard(place)
 
     def check(self, declared_bytes: int) -> None:
-        """Return if an upload of so many bytes may come and has room; raises as place()."""
+        """Return if an upload of this size is allowed and has room; raises as place()."""
         if declared_bytes > self._settings.max_upload_bytes:
             problem = f"{declared_bytes} bytes are more than the {self._settings.max_upload_bytes} of an upload."
             raise LimitError("clip", problem, LIMIT_REMEDY)

@@ -86,7 +86,7 @@ async def watch_job(
 ) -> Response:
     """Every change of the job as a server-sent event `job` whose data is the job, until it has ended.
 
-    Whoever was cut off sends Last-Event-ID and is told what it missed.
+    A caller that was cut off sends Last-Event-ID and receives what it missed.
     """
     caller.require(KeyScope.VIEW)
     record = await run_in_threadpool(owned_job, services, caller, job_id)

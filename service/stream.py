@@ -42,7 +42,7 @@ MAX_MESSAGE = 16 * 1024
 AUTHORIZE_TIMEOUT_S = 5.0
 """Who has connected without a key sends it at once."""
 SEND_TIMEOUT_S = 30.0
-"""A viewer that takes so long for one view is not there any more."""
+"""A viewer that takes this long to receive one view counts as gone."""
 
 NOT_TEXT, NOT_ALLOWED, TOO_LARGE = 1003, 1008, 1009
 """Codes of RFC 6455, 7.4.1."""
@@ -77,7 +77,7 @@ class StreamHead(BaseModel):
 
 
 class _HangUp(Exception):
-    """The connection is to be closed with this code, after what there is to say."""
+    """Close the connection with this code, after a last message."""
 
     def __init__(self, code: int, problem: Problem) -> None:
         super().__init__(problem.detail)

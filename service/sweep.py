@@ -58,7 +58,7 @@ class Sweep:
         self._unsettled = True
 
     async def run(self) -> None:
-        """Settle what there is whenever something may be unsettled, until cancelled."""
+        """Settle all clips whenever one may be unsettled, until cancelled."""
         abandoned_at_s = time.monotonic()
         while True:
             if self._unsettled or await run_in_threadpool(self._more_were_cancelled):

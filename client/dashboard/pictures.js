@@ -73,7 +73,7 @@ export class Pictures {
   }
 
   async #fromStream(view) {
-    const timer = setTimeout(() => this.stream.close(), ANSWER_MS); // a line that is silent for so long is dead
+    const timer = setTimeout(() => this.stream.close(), ANSWER_MS); // a connection that is silent for this long is dead
     try {
       return await this.stream.ask(view);
     } finally {

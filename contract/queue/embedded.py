@@ -49,7 +49,7 @@ def find_server() -> ServerBinary:
     """The server this machine would use.
 
     Raises:
-        UnavailableError: there is none.
+        UnavailableError: no server program is installed.
     """
     for name in ("valkey-server", "redis-server"):
         found = shutil.which(name)

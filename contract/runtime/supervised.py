@@ -48,7 +48,7 @@ class Supervised:
         pipes: connect stdin and stdout to this process. The child is asked to end by closing its stdin, not by SIGTERM.
         dies_with_parent: kill the child when the thread that started it ends (Linux only).
         grace_s: how long the child may take to end before it is killed.
-        healthy_after_s: a child that has run for so long is healthy; mark_healthy() says so earlier.
+        healthy_after_s: a child that has run for this long is healthy; mark_healthy() says so earlier.
     """
 
     def __init__(

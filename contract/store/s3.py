@@ -245,7 +245,7 @@ class S3Shelf:
             for each in self._bucket.objects(_key(entry)):
                 path = aside / each.key.removeprefix(_key(entry))
                 if not path.resolve().is_relative_to(aside):
-                    raise SceneError(f"The bucket holds an object under {_key(entry)} whose name is none of ours.")
+                    raise SceneError(f"The bucket holds a foreign object under {_key(entry)}: its name is not ours.")
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                 self._bucket.get(each.key, path)
             _check(aside)

@@ -2,7 +2,7 @@
 
     data_dir/
     ├── incoming/<id>/      an upload, whole or resumable, before it is a job; removed when it is refused or given up
-    ├── spool/<job>/        an accepted clip: clip.mp4, calibration.json, ..., submission.json (the JobRecord of then)
+    ├── spool/<job>/        an accepted clip: clip.mp4, calibration.json, ..., submission.json (the first JobRecord)
     ├── work/<job>.<n>/     what attempt n has written so far
     ├── work/tmp-<name>/    what worker <name> has unpacked; emptied whenever it starts
     ├── scenes/<job>.<n>/   what attempt n has finished: manifest.json, scene.safetensors, report.json, curve.csv
@@ -164,7 +164,7 @@ class Store:
         """The folder of the attempt's finished scene, which is downloaded if need be.
 
         Raises:
-            SceneError: there is none, or the bucket's is damaged.
+            SceneError: the scene does not exist, or the bucket's copy is damaged.
         """
         folder = self._shelf.get(ShelfEntry(Area.SCENES, job_id, attempt)) if is_job_id(job_id) else None
         if folder is None:
