@@ -15,10 +15,10 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
-from tests.service.test_surface import OPERATIONS
 
 from contract.wire.rendering import WorkerAddress
 from tests.service.live import WORKER, LiveService, live_service
+from tests.service.test_app import OPERATIONS
 
 EXAMPLES = 24
 
