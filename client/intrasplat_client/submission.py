@@ -92,7 +92,7 @@ def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         InputError: an option does not exist, is out of range, or excludes another.
     """
-    remedy = f"The options are {', '.join(GivenOptions.__annotations__)} (models.GivenOptions)."
+    remedy = f"The options are {', '.join(GivenOptions.__annotations__)}."
     try:
         document = dict(TypeAdapter(GivenOptions).validate_python(options))
     except ValidationError as error:

@@ -62,4 +62,5 @@ def test_a_format_from_outside_is_exported(
 def test_a_format_that_is_not_registered_is_refused(worker: zmq.Socket[bytes], scene_id: str) -> None:
     head, body = ask(worker, wire(scene_id, "xyz"))
     assert head.error is not None
-    assert (head.error.kind, head.error.field, head.error.remedy, body) == ("input", "format", "Use one of: ply.", b"")
+    remedy = f"Use one of: {', '.join(EXPORTS)}."
+    assert (head.error.kind, head.error.field, head.error.remedy, body) == ("input", "format", remedy, b"")
