@@ -67,20 +67,26 @@ def main() -> int:
     return 0
 
 
+def definitions() -> dict[str, Any]:
+    """The JSON schema of each type that the service answers with, by its name."""
+    _, document = models_json_schema([(each, "validation") for each in READ])
+    schemas: dict[str, Any] = document["$defs"]
+    return schemas
+
+
 def generate() -> str:
     """The whole file, formatted."""
-    _, document = models_json_schema([(each, "validation") for each in READ])
-    definitions: dict[str, Any] = document["$defs"]
-    enums = {name: schema for name, schema in definitions.items() if "enum" in schema}
+    schemas = definitions()
+    enums = {name: schema for name, schema in schemas.items() if "enum" in schema}
     open_enums = {*enums} - {*CLOSED}
     states = ", ".join(f"JobState.{state.name}" for state in sorted(TERMINAL_STATES))
     parts = [
         HEAD,
         *("".join(_enum(name, schema)) for name, schema in enums.items()),
-        *("".join(_model(name, schema, open_enums)) for name, schema in definitions.items() if name not in enums),
+        *("".join(_model(name, schema, open_enums)) for name, schema in schemas.items() if name not in enums),
         f'TERMINAL_STATES = frozenset({{{states}}})\n"""States that a job does not leave by itself."""\n',
         f'EXCLUSIVE_OPTIONS = {EXCLUSIVE_OPTIONS!r}\n"""At most one option of each group may be given."""\n',
-        "".join(_given(definitions[JobOptions.__name__])),
+        "".join(_given(schemas[JobOptions.__name__])),
     ]
     command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", MODELS.name, "--line-length", "120", "-"]
     return subprocess.run(command, input="\n\n".join(parts), capture_output=True, text=True, check=True).stdout
