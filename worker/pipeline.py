@@ -18,7 +18,8 @@ from contract.wire.names import CURVE, REPORT
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import Report
 from worker.input.calibration import rectify
-from worker.input.clip import DepthClip, held_out_frames, split_frames
+from worker.input.calibration.types import StereoCalibration
+from worker.input.clip import DepthClip, StereoClip, held_out_frames, split_frames
 from worker.input.decode import decode_clip
 from worker.machine.hooks import Hooks, Progress
 from worker.machine.timing import Timings
@@ -107,10 +108,26 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
         )
     if isinstance(decoded, DepthClip):
         return decoded
-    rectified = rectify(decoded.clip, decoded.calibration)
-    frame_count = decoded.clip.frame_count
-    held_out = set(held_out_frames(frame_count, request.options.holdout))
-    measured = [i for i in range(frame_count) if i not in held_out]
+    return match_eyes(decoded.clip, decoded.calibration, request.options.holdout, hooks, timings, device)
+
+
+def match_eyes(
+    clip: StereoClip,
+    calibration: StereoCalibration,
+    holdout: str,
+    hooks: Hooks,
+    timings: Timings,
+    device: Device = CPU,
+) -> DepthClip:
+    """Rectify a stereo clip and match its eyes: the left frames with depth.
+
+    Raises:
+        InputError: the clip, its calibration or the holdout cannot be used.
+        Cancelled: hooks.should_stop said so.
+    """
+    rectified = rectify(clip, calibration)
+    held_out = set(held_out_frames(clip.frame_count, holdout))
+    measured = [i for i in range(clip.frame_count) if i not in held_out]
     if device != CPU:  # before it matches anything
         hooks.report_stage("compile", 0.0)
         timings.add("compile_s", examine(device))

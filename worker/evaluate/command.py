@@ -37,7 +37,8 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "clips",
         nargs="*",
         metavar="CLIP",
-        help="a path, phantom:MOTION[:WxH][:FRAMESframes][:seedN], or d4d_endonerf or d4d_stereo of INTRASPLAT_DATA",
+        help="a path, phantom:MOTION[:WxH][:FRAMESframes][:seedN][:stereo], or d4d_endonerf or d4d_stereo of "
+        "INTRASPLAT_DATA",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="rows, summary and charts; goes on there"

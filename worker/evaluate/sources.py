@@ -2,6 +2,8 @@
 
 PATH                                        anything `reconstruct` reads
 phantom:MOTION[:WxH][:FRAMESframes][:seedN] synthetic tissue with true depth, 320x256, 64 frames, seed 0
+phantom:MOTION[:...]:stereo                 the same tissue as a stereo clip: both eyes without loss, their calibration
+                                            and the left eye's masks, rectified and matched as a user's clip is
 d4d_endonerf, d4d_stereo                    the recordings in the folder INTRASPLAT_DATA names; rows call them d4d-a
 """
 
@@ -14,18 +16,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from contract.wire.errors import InputError
 from contract.wire.options import ClipOptions, ReconstructionOptions
 from worker.input.clip import DepthClip
 from worker.machine.hooks import Hooks
 from worker.machine.timing import Timings
 from worker.phantom import MOTIONS, Phantom, PhantomSettings, make_phantom
-from worker.pipeline import open_with_depth
+from worker.pipeline import match_eyes, open_with_depth
 from worker.raster.backend import CPU, Device
 from worker.train.request import ReconstructionRequest
 
 DATA_VARIABLE = "INTRASPLAT_DATA"
 PHANTOM_WIDTH, PHANTOM_HEIGHT = 320, 256
+STEREO = ":stereo"
 _STEREO: Mapping[str, Any] = {"calibration": "calibration.json", "masks": "tool_masks.zip"}
 RECORDINGS: Mapping[str, tuple[str, str, Mapping[str, Any]]] = {
     "d4d_endonerf": ("d4d-a", "d4d_endonerf", {}),
@@ -40,6 +46,7 @@ class Source:
     """A clip that can be opened. The command line calls it `argument`, rows call it `name`.
 
     phantom  how to draw it; None for a recording
+    stereo   whether it is drawn for both eyes, and its depth is stereo's
     clip     the recording's file or folder
     files    beside it: calibration, masks
     options  how the files are to be read
@@ -48,6 +55,7 @@ class Source:
     name: str
     argument: str
     phantom: PhantomSettings | None = None
+    stereo: bool = False
     clip: Path = Path()
     files: Mapping[str, Path] = field(default_factory=dict)
     options: ClipOptions = field(default_factory=ClipOptions)
@@ -55,11 +63,15 @@ class Source:
 
 @dataclass(frozen=True, eq=False)
 class OpenClip:
-    """A clip with depth; phantom knows its truth, seconds what decoding and stereo took."""
+    """A clip with depth; phantom knows its truth, seconds what decoding and stereo took.
+
+    tissue_right is [T, H, W] bool, the exact tissue of a phantom's right eye; None where there is no such eye.
+    """
 
     clip: DepthClip
     phantom: Phantom | None
     seconds: Mapping[str, float]
+    tissue_right: NDArray[np.bool_] | None = None
 
 
 def source_of(argument: str, files: Mapping[str, Path] | None = None, options: ClipOptions | None = None) -> Source:
@@ -69,15 +81,16 @@ def source_of(argument: str, files: Mapping[str, Path] | None = None, options: C
         InputError: there is no such motion or file, or a recording is asked for, and INTRASPLAT_DATA is not set.
     """
     if argument.startswith("phantom:"):
-        settings = _phantom_settings(argument)
-        return Source(_phantom_name(settings), argument, settings)
+        drawn, stereo = (argument[: -len(STEREO)], True) if argument.endswith(STEREO) else (argument, False)
+        settings = _phantom_settings(drawn)
+        return Source(_phantom_name(settings) + "-stereo" * stereo, argument, settings, stereo)
     if argument in RECORDINGS and not Path(argument).exists():
         return _recording(argument)
     if not Path(argument).exists():
         remedy = f"Give a path, phantom:MOTION ({', '.join(MOTIONS)}), or one of {', '.join(RECORDINGS)}."
         raise InputError("CLIP", f"there is no {argument!r}.", remedy)
     path = Path(argument)
-    return Source(path.stem, argument, None, path, files or {}, options or ClipOptions())
+    return Source(path.stem, argument, clip=path, files=files or {}, options=options or ClipOptions())
 
 
 def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU) -> OpenClip:
@@ -86,10 +99,14 @@ def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU
     Raises:
         InputError: the clip or its calibration cannot be used.
     """
+    timings = Timings()
     if source.phantom is not None:
         phantom = make_phantom(source.phantom)
-        return OpenClip(phantom.depth_clip(), phantom, {})
-    timings = Timings()
+        if not source.stereo:
+            return OpenClip(phantom.depth_clip(), phantom, {})
+        drawn = phantom.stereo_recording()
+        clip = match_eyes(drawn.clip, drawn.calibration, holdout, hooks, timings, device)
+        return OpenClip(clip, phantom, timings.seconds, drawn.tissue_right)
     options, files = ReconstructionOptions(holdout=holdout, **source.options.model_dump()), source.files
     request = ReconstructionRequest(
         source.clip, options, calibration=files.get("calibration"), masks=files.get("masks")
@@ -107,7 +124,7 @@ def _recording(argument: str) -> Source:
     path = Path(folder) / file
     if not path.exists():
         raise InputError("CLIP", f"{argument} is not under {folder}.", remedy)
-    return Source(name, argument, None, path, {key: path.parent / each for key, each in beside.items()})
+    return Source(name, argument, clip=path, files={key: path.parent / each for key, each in beside.items()})
 
 
 def _phantom_settings(argument: str) -> PhantomSettings:
@@ -122,7 +139,7 @@ def _phantom_settings(argument: str) -> PhantomSettings:
             values["seed"] = int(match[1])
         else:
             problem = f"{part!r} in {argument!r} is not known."
-            raise InputError("CLIP", problem, "Write phantom:MOTION[:WxH][:FRAMESframes][:seedN].")
+            raise InputError("CLIP", problem, "Write phantom:MOTION[:WxH][:FRAMESframes][:seedN][:stereo].")
     return PhantomSettings(motion=motion, **values)  # type: ignore[arg-type]  # it refuses what is not a motion
 
 

@@ -10,8 +10,16 @@ view   a held-out frame's moment from a pose 10 or 15 degrees off, to the right,
        where. So three figures: the view as it is; `baked`, the view with its highlights where the endoscope sees them;
        and the bound, what that baked view itself scores as the view. No model whose colours do not depend on the
        viewpoint passes the bound but by chance.
+        A stereo clip has two eyes that show tissue, whichever of them is trained on.
 hidden the endoscope's own picture of a held-out frame behind the instrument, on the same condition.
 depth  median |z - truth| over tissue of held-out frames.
+empty_ok  share of all pixels of those views in which nothing solid is drawn where truth is empty: nothing nearer than
+       the nearest true surface within one pixel by more than FREE_SPACE of its depth, and nothing at all where no pixel
+       within one shows tissue. A pixel that the render marks as unseen is not solid.
+seen_ok   share of the judged pixels of those views in which something solid is drawn.
+rank   Spearman's rank correlation of the confidence layer with the smallness of a pixel's error (ranking.py), over all
+       pixels that show tissue, seen or not, in those views: rank_colour, rank_depth; and in the right eye's own
+       views of the same frames: rank_right_colour, rank_right_depth.
 motion of what a pixel of frame 0 shows: the displacements of the Gaussians it is blended of, each from its own centre
        at frame 0 to that at frame i, blended with the same weights. Gaussians a pixel hardly shows hardly count, and
        none has to be declared the nearest. The end-point error is its distance to the true displacement of the
@@ -24,7 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import cv2
@@ -32,15 +40,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.pose import OrbitPose, world_from_camera
+from worker.evaluate.ranking import PixelErrors, pixel_errors, rank_correlation, together
 from worker.input.clip import DepthClip
 from worker.model.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
 from worker.phantom import Phantom
 from worker.raster.step import camera_vector
+from worker.render.view import render_frame
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
-from worker.train.hooks import RenderedFrame
 from worker.train.scoring import sample_frames
-from worker.train.targets import camera_in_units, solid_depth_mm
+from worker.train.targets import camera_in_units
 
 Pose = NDArray[np.float64]
 
@@ -55,12 +64,25 @@ MOVING_MM = 1.0
 SEEN_CELL_TEXELS = 4
 """A material point counts as seen if training frames showed some in the same square of the tissue's texture, about
 three pixels wide, and in all squares about it."""
+FREE_SPACE = 0.03
+"""What is drawn nearer than the true surface by more than this share of its depth hangs in free space."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShownView:
+    """What a candidate shows: rgb [H, W, 3] float in [0, 1], depth_mm [H, W], 0 where it draws nothing solid, and
+    confidence [H, W] in [0, 1].
+    """
+
+    rgb: NDArray[np.float32]
+    depth_mm: NDArray[np.float32]
+    confidence: NDArray[np.float32]
 
 
 class Candidate(Protocol):
     """What can be judged against the truth."""
 
-    def view(self, frame: int, pose: Pose) -> RenderedFrame:
+    def view(self, frame: int, pose: Pose) -> ShownView:
         """The tissue at a frame from world_from_camera [4, 4] in mm, with the clip's intrinsics."""
         ...
 
@@ -71,7 +93,8 @@ class Candidate(Protocol):
 
 @dataclass(frozen=True)
 class TruthScores:
-    """NaN where there was nothing to judge; dB are means over the judged frames, mm medians (see above)."""
+    """NaN where there was nothing to judge; dB are means over the judged frames, mm medians, the rest shares and rank
+    correlations over all pixels of all judged frames (see above)."""
 
     psnr_view10_db: float
     psnr_view15_db: float
@@ -84,80 +107,106 @@ class TruthScores:
     motion_error_mm: float
     moving_error_mm: float
     moving_mm: float
+    empty_ok: float
+    seen_ok: float
+    rank_colour: float
+    rank_depth: float
+    rank_right_colour: float
+    rank_right_depth: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Expected:
-    """A picture, the same with mirrored light as the endoscope sees it, and the pixels both are judged on."""
+    """A picture, the same with mirrored light as the endoscope sees it, the pixels both are judged on, and depth."""
 
     frame: int
     pose: Pose
     rgb: NDArray[np.float32]
     baked: NDArray[np.float32]
     judged: NDArray[np.bool_]
+    depth_mm: NDArray[np.float32]
 
 
 class Truth:
     """The truth of a phantom for one split of its frames, drawn once and compared with many scenes."""
 
-    def __init__(self, phantom: Phantom, clip: DepthClip, train: Sequence[int], held_out: Sequence[int]) -> None:
+    def __init__(
+        self,
+        phantom: Phantom,
+        clip: DepthClip,
+        train: Sequence[int],
+        held_out: Sequence[int],
+        tissue_right: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """tissue_right [T, H, W]: of a stereo clip, whose right eye shows tissue too."""
         self._phantom, self._clip = phantom, clip
         self._judged_frames = sample_frames(held_out, JUDGED_FRAMES)
-        self._seen = _seen_cells(phantom, clip, train)
+        self._seen, pivot_mm = _seen_by(phantom, train, clip.tissue, tissue_right)
         self._tracks = phantom.trajectories(TRACK_STRIDE_PX)
-        pivot_mm = float(
-            np.median([np.median(clip.depth_mm[i][clip.tissue[i] & (clip.depth_mm[i] > 0)]) for i in train])
-        )
         self._views = {angle: list(self._off_axis(angle, pivot_mm)) for angle in ANGLES_DEG}
-        self._hidden = [self._behind_instrument(frame) for frame in self._judged_frames]
+        self._own = [self._expected(frame, phantom.world_from_camera(frame)) for frame in self._judged_frames]
+        self._right = [self._expected(frame, phantom.world_from_right(frame)) for frame in self._judged_frames]
         self._bounds_db = [_mean_psnr([each.baked for each in views], views) for views in self._views.values()]
 
     def score(self, candidate: Candidate) -> TruthScores:
         """How near the candidate is to the truth."""
-        views = {
-            angle: [candidate.view(each.frame, each.pose).rgb for each in self._views[angle]] for angle in ANGLES_DEG
-        }
-        hidden = [candidate.view(each.frame, each.pose).rgb for each in self._hidden]
-        at10, at15 = ((views[angle], self._views[angle]) for angle in ANGLES_DEG)
+        at10, at15 = (self._shown(candidate, views) for views in self._views.values())
+        views10, views15 = self._views.values()
+        shown, expected = at10 + at15, views10 + views15
+        own = self._shown(candidate, self._own)
+        hidden = [self._behind_instrument(each) for each in self._own]
         error_mm, moving_error_mm, moving_mm = self._motion(candidate)
         return TruthScores(
-            psnr_view10_db=_mean_psnr(*at10),
-            psnr_view15_db=_mean_psnr(*at15),
-            psnr_baked10_db=_mean_psnr(*at10, "baked"),
-            psnr_baked15_db=_mean_psnr(*at15, "baked"),
+            psnr_view10_db=_mean_psnr(_pictures(at10), views10),
+            psnr_view15_db=_mean_psnr(_pictures(at15), views15),
+            psnr_baked10_db=_mean_psnr(_pictures(at10), views10, "baked"),
+            psnr_baked15_db=_mean_psnr(_pictures(at15), views15, "baked"),
             bound10_db=self._bounds_db[0],
             bound15_db=self._bounds_db[1],
-            psnr_hidden_db=_mean_psnr(hidden, self._hidden),
-            depth_error_mm=self._depth(candidate),
+            psnr_hidden_db=_mean_psnr(_pictures(own), hidden),
+            depth_error_mm=self._depth(own),
             motion_error_mm=error_mm,
             moving_error_mm=moving_error_mm,
             moving_mm=moving_mm,
+            empty_ok=float(np.mean([_is_clear(*pair) for pair in zip(shown, expected, strict=True)])),
+            seen_ok=_share_solid(shown, expected),
+            **_ranks(_errors(shown, expected), self._right_errors(candidate)),
         )
+
+    def errors(self, candidate: Candidate) -> dict[str, PixelErrors]:
+        """The confidence and the errors of every pixel that shows tissue, of the `off-axis` and `right` views."""
+        expected = [each for views in self._views.values() for each in views]
+        off_axis = _errors(self._shown(candidate, expected), expected)
+        return {"off-axis": off_axis, "right": self._right_errors(candidate)}
+
+    def _right_errors(self, candidate: Candidate) -> PixelErrors:
+        return _errors(self._shown(candidate, self._right), self._right)
+
+    def _shown(self, candidate: Candidate, expected: Sequence[_Expected]) -> list[ShownView]:
+        return [candidate.view(each.frame, each.pose) for each in expected]
 
     def _off_axis(self, angle_deg: float, pivot_mm: float) -> Iterable[_Expected]:
         for place, frame in enumerate(self._judged_frames):
             yaw, pitch = DIRECTIONS[place % len(DIRECTIONS)]
             orbit = OrbitPose(yaw_deg=yaw * angle_deg, pitch_deg=pitch * angle_deg, zoom=1.0)
             pose = np.array(world_from_camera(orbit, pivot_mm), np.float64)
-            rgb, _ = self._phantom.render(frame, pose)
-            baked, _ = self._phantom.render(frame, pose, eye_mm=self._phantom.world_from_camera(frame)[:3, 3])
-            yield _Expected(frame, pose, rgb, baked, self._was_seen(frame, pose))
+            yield self._expected(frame, pose)
 
-    def _behind_instrument(self, frame: int) -> _Expected:
-        pose = self._phantom.world_from_camera(frame)
-        rgb, _ = self._phantom.render(frame, pose)
-        return _Expected(frame, pose, rgb, rgb, self._was_seen(frame, pose) & ~self._clip.tissue[frame])
+    def _expected(self, frame: int, pose: Pose) -> _Expected:
+        rgb, depth_mm = self._phantom.render(frame, pose)
+        eye_mm = self._phantom.world_from_camera(frame)[:3, 3]
+        baked = rgb if np.array_equal(pose[:3, 3], eye_mm) else self._phantom.render(frame, pose, eye_mm=eye_mm)[0]
+        row, column, shows = _cells(self._phantom.surface_pixels(frame, pose).atlas_xy)
+        return _Expected(frame, pose, rgb, baked, shows & self._seen[row, column], depth_mm)
 
-    def _was_seen(self, frame: int, pose: Pose) -> NDArray[np.bool_]:
-        """[H, W] whether the material point that a pixel shows was tissue in some training frame."""
-        row, column, shows = _cells(self._phantom.atlas_xy(frame, pose))
-        return shows & self._seen[row, column]
+    def _behind_instrument(self, own: _Expected) -> _Expected:
+        return replace(own, judged=own.judged & ~self._clip.tissue[own.frame])
 
-    def _depth(self, candidate: Candidate) -> float:
-        errors = []
-        for frame in self._judged_frames:
-            view = candidate.view(frame, self._phantom.world_from_camera(frame))
-            errors.append(depth_errors_mm(view.depth_mm, self._clip.depth_mm[frame], self._clip.tissue[frame]))
+    def _depth(self, own: Sequence[ShownView]) -> float:
+        errors = [
+            depth_errors_mm(view.depth_mm, each.depth_mm, self._clip.tissue[each.frame])
+            for view, each in zip(own, self._own, strict=True)
+        ]
         return depth_agreement_mm(errors)
 
     def _motion(self, candidate: Candidate) -> tuple[float, float, float]:
@@ -183,10 +232,9 @@ class SceneCandidate:
     def __init__(self, scene: Scene) -> None:
         self._scene, self._model = scene, model_of(scene)
 
-    def view(self, frame: int, pose: Pose) -> RenderedFrame:
-        image = self._image(frame, pose)
-        depth_mm = solid_depth_mm(image[3], image[4], self._scene.units_per_mm)
-        return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
+    def view(self, frame: int, pose: Pose) -> ShownView:
+        shown = render_frame(self._scene, frame / self._scene.frame_count, pose)
+        return ShownView(self._image(frame, pose)[:3].transpose(1, 2, 0), shown.depth_mm, shown.confidence)
 
     def motion_mm(self, frame: int) -> NDArray[np.floating]:
         start, end = (self._model.deformed_mean(each / self._scene.frame_count) for each in (0, frame))
@@ -203,18 +251,67 @@ class SceneCandidate:
         return self._model.render(camera, frame / scene.frame_count).copy()
 
 
-def _seen_cells(phantom: Phantom, clip: DepthClip, train: Sequence[int]) -> NDArray[np.bool_]:
-    """Which squares of the tissue's texture some training frame shows as tissue."""
+def _seen_by(
+    phantom: Phantom,
+    train: Sequence[int],
+    tissue: NDArray[np.bool_],
+    tissue_right: NDArray[np.bool_] | None,
+) -> tuple[NDArray[np.bool_], float]:
+    """Which squares of the tissue's texture some training frame of an eye shows as tissue, and the left eye's median
+    over training frames of the median depth of tissue, mm."""
     rows, columns = (size // SEEN_CELL_TEXELS + 1 for size in phantom.surface.atlas.shape)
     seen = np.zeros((rows, columns), np.bool_)
+    medians_mm = []
     for frame in train:
-        row, column, shows = _cells(phantom.atlas_xy(frame))
-        visible = shows & clip.tissue[frame]
-        seen[row[visible], column[visible]] = True
+        left = phantom.surface_pixels(frame)
+        medians_mm.append(np.median(left.depth_mm[tissue[frame] & (left.depth_mm > 0)]))
+        eyes = [(left, tissue)]
+        if tissue_right is not None:
+            eyes.append((phantom.surface_pixels(frame, phantom.world_from_right(frame)), tissue_right))
+        for surface, shown in eyes:
+            row, column, shows = _cells(surface.atlas_xy)
+            visible = shows & shown[frame]
+            seen[row[visible], column[visible]] = True
     # Where the tissue lies obliquely, neighbouring pixels are more than a square apart: first such gaps are closed.
     closed = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     inner = cv2.erode(closed, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(inner, np.bool_)
+    return np.asarray(inner, np.bool_), float(np.median(medians_mm))
+
+
+def _is_clear(shown: ShownView, expected: _Expected) -> NDArray[np.bool_]:
+    """[H, W] whether nothing solid is drawn in front of the nearest true surface within one pixel."""
+    true_mm = np.where(expected.depth_mm > 0, expected.depth_mm, np.inf).astype(np.float32)
+    nearest_mm = cv2.erode(true_mm, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray((shown.depth_mm <= 0) | (shown.depth_mm >= nearest_mm * (1 - FREE_SPACE)), np.bool_)
+
+
+def _share_solid(shown: Sequence[ShownView], expected: Sequence[_Expected]) -> float:
+    """Share of the judged pixels in which something solid is drawn."""
+    solid = [view.depth_mm[each.judged] > 0 for view, each in zip(shown, expected, strict=True)]
+    judged = np.concatenate(solid)
+    return float(judged.mean()) if judged.size else math.nan
+
+
+def _errors(shown: Sequence[ShownView], expected: Sequence[_Expected]) -> PixelErrors:
+    """The errors of every pixel that shows tissue in truth."""
+    return together(
+        [
+            pixel_errors(view.confidence, (view.rgb, each.rgb), (view.depth_mm, each.depth_mm), each.depth_mm > 0)
+            for view, each in zip(shown, expected, strict=True)
+        ]
+    )
+
+
+def _ranks(off_axis: PixelErrors, right: PixelErrors) -> dict[str, float]:
+    found = {}
+    for name, errors in (("rank", off_axis), ("rank_right", right)):
+        found[f"{name}_colour"] = rank_correlation(errors.confidence, errors.colour)
+        found[f"{name}_depth"] = rank_correlation(errors.confidence, errors.depth)
+    return found
+
+
+def _pictures(shown: Sequence[ShownView]) -> list[NDArray[np.float32]]:
+    return [each.rgb for each in shown]
 
 
 def _cells(atlas_xy: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:

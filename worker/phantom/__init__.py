@@ -4,12 +4,13 @@ Verbs: make_phantom, write_endonerf, write_stereomis, write_stereo_video.
 """
 
 from worker.phantom.camera import orbit_pose
-from worker.phantom.scene import Phantom, PhantomFrame, Trajectories, make_phantom
+from worker.phantom.scene import DrawnStereo, Phantom, PhantomFrame, Trajectories, make_phantom
 from worker.phantom.settings import MOTIONS, Motion, PhantomSettings
 from worker.phantom.writers import write_endonerf, write_stereo_video, write_stereomis
 
 __all__ = [
     "MOTIONS",
+    "DrawnStereo",
     "Motion",
     "Phantom",
     "PhantomFrame",

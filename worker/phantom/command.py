@@ -32,7 +32,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         choices=sorted(WRITERS),
         default="video",
         help="video: VP9 side by side, calibration, masks; stereomis: frames as PNG; "
-        "endonerf: frames, depth, poses and the exact truth (%(default)s)",
+        "endonerf: frames, depth, poses. Each has the exact truth in the folder truth (%(default)s)",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder to write into; new or empty")
 

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.notices import Notice, NoticeCode
+from worker.input.calibration.types import RectifiedCalibration
 from worker.input.camera import Intrinsics
-from worker.input.clip.types import DepthClip
+from worker.input.clip.types import DepthClip, StereoClip
 from worker.phantom.camera import endoscope_pose, right_eye
 from worker.phantom.fields import Image32
 from worker.phantom.instrument import InstrumentMesh, instrument_at
@@ -74,6 +75,31 @@ class Trajectories:
     points_mm: NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
+class DrawnStereo:
+    """A stereo clip as a user gives it, with the left eye's masks alone, and what only the phantom knows beside it.
+
+    tissue_right  [T, H, W] bool, exact
+    """
+
+    clip: StereoClip
+    calibration: RectifiedCalibration
+    tissue_right: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePixels:
+    """The tissue that each pixel shows, as without the instrument.
+
+    depth_mm  [H, W] float32, camera z; 0 where no tissue is modelled
+    atlas_xy  [H, W, 2] float32, the material point: (x, y) on the atlas in texels; -1 where no tissue is modelled.
+              A point has the same (x, y) in every frame and from every pose.
+    """
+
+    depth_mm: NDArray[np.float32]
+    atlas_xy: NDArray[np.float32]
+
+
 @dataclass(frozen=True)
 class _EyeView:
     rgb: Image32  # noise-free, instrument included
@@ -127,21 +153,22 @@ class Phantom:
         linear, fragments = self._draw_tissue(frame, pose, intrinsics or self.settings.intrinsics, eye_mm)
         return to_srgb(_through_lens(linear)), fragments.depth_mm
 
-    def atlas_xy(self, frame: float, world_from_camera: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
-        """[H, W, 2] material point of each pixel, as without the instrument: (x, y) on the atlas in texels.
-
-        A point has the same (x, y) in every frame and from every pose. -1 where no tissue is modelled.
-        """
+    def surface_pixels(self, frame: float, world_from_camera: NDArray[np.float64] | None = None) -> SurfacePixels:
+        """What the pixels show at a frame from a pose [4, 4] mm (default: the left eye's), without its colours."""
         pose = self.world_from_camera(frame) if world_from_camera is None else world_from_camera
         triangles = self.surface.triangles
         fragments = rasterize_mesh(self.surface.vertices_mm(frame), triangles, pose, self.settings.intrinsics)
         places = interpolate(fragments, triangles, self.surface.atlas_xy)
         places[fragments.triangle < 0] = -1
-        return places
+        return SurfacePixels(fragments.depth_mm, places)
 
     def world_from_camera(self, frame: float) -> NDArray[np.float64]:
         """Pose [4, 4] of the endoscope's left eye, mm; the identity at frame 0."""
         return endoscope_pose(frame, self.settings.period_frames, self.settings.moving_camera)
+
+    def world_from_right(self, frame: float) -> NDArray[np.float64]:
+        """Pose [4, 4] of the endoscope's right eye, mm."""
+        return right_eye(self.world_from_camera(frame), self.settings.baseline_mm)
 
     def trajectories(self, stride_px: int = 8) -> Trajectories:
         """Positions, in all frames, of the material points that every stride_px-th pixel of frame 0 shows."""
@@ -183,11 +210,25 @@ class Phantom:
             assumptions=(Notice.info(NoticeCode.SYNTHETIC, drawn),),
         )
 
+    def stereo_recording(self) -> DrawnStereo:
+        """All frames of both eyes as a rectified stereo clip in memory, without any loss."""
+        settings = self.settings
+        frames = [self.frame(index) for index in range(settings.frames)]
+        drawn = f"synthetic tissue: {settings.motion}, seed {settings.seed}, depth by stereo"
+        clip = StereoClip(
+            frame_count=settings.frames,
+            height=settings.height,
+            width=settings.width,
+            pairs=lambda: ((frame.left, frame.right) for frame in frames),
+            tissue=np.stack([frame.tissue for frame in frames]),
+            frame_times_s=np.arange(settings.frames) / settings.frame_rate_hz,
+            assumptions=(Notice.info(NoticeCode.SYNTHETIC, drawn),),
+        )
+        return DrawnStereo(clip, settings.calibration, np.stack([frame.tissue_right for frame in frames]))
+
     def _view(self, index: int, eye: int) -> _EyeView:
         """One eye at a frame, with and without instrument."""
-        pose = self.world_from_camera(index)
-        if eye == RIGHT:
-            pose = right_eye(pose, self.settings.baseline_mm)
+        pose = self.world_from_camera(index) if eye == LEFT else self.world_from_right(index)
         hidden, fragments = self._draw_tissue(index, pose, self.settings.intrinsics)
         hidden_rgb = to_srgb(_through_lens(hidden))
         depth_mm = fragments.depth_mm

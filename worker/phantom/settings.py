@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from contract.wire.errors import InputError
+from worker.input.calibration.types import RectifiedCalibration
 from worker.input.camera import Intrinsics
 
 Motion = Literal["still", "breathing", "pull", "cut"]
@@ -71,6 +72,21 @@ class PhantomSettings:
         focal = FOCAL_PER_WIDTH * self.width
         return Intrinsics(
             width=self.width, height=self.height, fx=focal, fy=focal, cx=self.width / 2, cy=self.height / 2
+        )
+
+    @property
+    def calibration(self) -> RectifiedCalibration:
+        """Of both eyes."""
+        camera = self.intrinsics
+        return RectifiedCalibration(
+            model="rectified",
+            width=camera.width,
+            height=camera.height,
+            fx_px=camera.fx,
+            fy_px=camera.fy,
+            cx_px=camera.cx,
+            cy_px=camera.cy,
+            baseline_mm=self.baseline_mm,
         )
 
 

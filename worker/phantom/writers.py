@@ -1,6 +1,12 @@
-"""Writes a phantom as a stereo video, in StereoMIS layout, or in EndoNeRF layout with the truth beside it.
+"""Writes a phantom as a stereo video, in StereoMIS layout, or in EndoNeRF layout; beside each the truth, in truth/:
 
-Symbols: T frames, H W pixels of one eye, M tracked points, K novel views.
+NNNNNN.npz        depth_mm, hidden_depth_mm [H, W] float32; hidden_rgb [H, W, 3] float16 in [0, 1]; tissue, and
+                  tissue_right of the right eye [H, W] bool
+trajectories.npz  pixels [M, 2] (row, column) in frame 0, points_mm [T, M, 3] float32 world
+novel_views.npz   frame [K], world_from_camera [K, 4, 4], rgb [K, H, W, 3] float16, depth_mm [K, H, W] float32
+camera.json       the exact intrinsics, every frame's world_from_camera of the left eye and of the right
+
+Symbols: T frames, H W pixels of one eye, M tracked points, K novel views. `hidden` is without the instrument.
 VP9 video loses fine texture and PNG loses nothing, so measure against truth on the PNG layouts.
 """
 
@@ -22,7 +28,7 @@ from worker.phantom.scene import Phantom, PhantomFrame
 
 OnFrame = Callable[[int, int], None]  # called with (frames done, frames) after each frame
 
-VIDEO, CALIBRATION, MASKS = "stereo.webm", "calibration.json", "masks.zip"
+VIDEO, CALIBRATION, MASKS, TRUTH = "stereo.webm", "calibration.json", "masks.zip", "truth"
 BRIGHT = 255
 MAX_DEPTH_8_BIT_MM = 255
 NOVEL_TIMES = (0.0, 0.35, 0.7)  # model times of the novel views
@@ -35,7 +41,7 @@ def _ignore(done: int, frames: int) -> None:
 
 
 def write_stereo_video(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:
-    """Folder with stereo.webm (VP9, left | right), calibration.json and masks.zip (tool = 255).
+    """Folder with stereo.webm (VP9, left | right), calibration.json, masks.zip (tool = 255) and truth/.
 
     Raises UnavailableError when this OpenCV cannot write VP9.
     """
@@ -53,33 +59,32 @@ def write_stereo_video(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore
                 both = np.concatenate([frame.left, frame.right], axis=1)
                 video.write(cv2.cvtColor(both, cv2.COLOR_RGB2BGR))
                 masks.writestr(f"{index:06d}.png", _png(_white(~frame.tissue)))
+                _write_frame_truth(path, index, frame)
                 on_frame(index + 1, settings.frames)
     finally:
         video.release()
-    _write_calibration(phantom, path)
+    calibration = phantom.settings.calibration.model_dump(exclude={"assumptions"})
+    (path / CALIBRATION).write_text(json.dumps(calibration, indent=1))
+    _write_clip_truth(phantom, path)
 
 
 def write_stereomis(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:
-    """StereoMIS layout: NNNNNNl.png, NNNNNNr.png, StereoCalibration.ini, masks/NNNNNNl.png (tissue = 255)."""
+    """StereoMIS layout: NNNNNNl.png, NNNNNNr.png, StereoCalibration.ini, masks/NNNNNNl.png (tissue = 255); truth/."""
     (path / "masks").mkdir(parents=True, exist_ok=True)
     for index in range(phantom.settings.frames):
         frame = phantom.frame(index)
         _save(path / f"{index:06d}l.png", frame.left)
         _save(path / f"{index:06d}r.png", frame.right)
         _save(path / "masks" / f"{index:06d}l.png", _white(frame.tissue))
+        _write_frame_truth(path, index, frame)
         on_frame(index + 1, phantom.settings.frames)
     (path / "StereoCalibration.ini").write_text(_stereomis_calibration(phantom))
+    _write_clip_truth(phantom, path)
 
 
 def write_endonerf(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:
-    """EndoNeRF layout: images/ depth/ (8-bit mm) masks/ (tool = 255) poses_bounds.npy, and truth/.
-
-    truth/NNNNNN.npz      depth_mm, hidden_depth_mm [H, W] float32; hidden_rgb [H, W, 3] float16 in [0, 1]; tissue
-    truth/trajectories.npz  pixels [M, 2] (row, column) in frame 0, points_mm [T, M, 3] float32 world
-    truth/novel_views.npz   frame [K], world_from_camera [K, 4, 4], rgb [K, H, W, 3] float16, depth_mm [K, H, W] float32
-    truth/camera.json       the exact intrinsics and every frame's world_from_camera
-    """
-    for folder in ("images", "depth", "masks", "truth"):
+    """EndoNeRF layout: images/ depth/ (8-bit mm) masks/ (tool = 255) poses_bounds.npy; truth/."""
+    for folder in ("images", "depth", "masks"):
         (path / folder).mkdir(parents=True, exist_ok=True)
     nearest, farthest = np.inf, 0.0
     for index in range(phantom.settings.frames):
@@ -87,38 +92,13 @@ def write_endonerf(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) ->
         _save(path / "images" / f"{name}.png", frame.left)
         _save(path / "depth" / f"{name}.png", np.clip(np.rint(frame.depth_mm), 0, MAX_DEPTH_8_BIT_MM).astype(np.uint8))
         _save(path / "masks" / f"{name}.png", _white(~frame.tissue))
-        _write_truth(path / "truth" / f"{name}.npz", frame)
+        _write_frame_truth(path, index, frame)
         seen = frame.depth_mm[frame.depth_mm > 0]
         nearest, farthest = min(nearest, float(seen.min())), max(farthest, float(seen.max()))
         on_frame(index + 1, phantom.settings.frames)
     bounds = (nearest * BOUNDS_MARGIN[0], farthest * BOUNDS_MARGIN[1])
     np.save(path / "poses_bounds.npy", _poses_bounds(phantom, bounds))
-    tracks = phantom.trajectories()
-    np.savez_compressed(
-        path / "truth" / "trajectories.npz", pixels=tracks.pixels, points_mm=tracks.points_mm.astype(np.float32)
-    )
-    _write_novel_views(phantom, path / "truth" / "novel_views.npz")
-    camera = {
-        "intrinsics": phantom.settings.intrinsics.numbers(),
-        "world_from_camera": _poses(phantom).tolist(),
-    }
-    (path / "truth" / "camera.json").write_text(json.dumps(camera, indent=1))
-
-
-def _write_calibration(phantom: Phantom, path: Path) -> None:
-    camera = phantom.settings.intrinsics
-    calibration = {
-        "model": "rectified",
-        "width": camera.width,
-        "height": camera.height,
-        "fx_px": camera.fx,
-        "fy_px": camera.fy,
-        "cx_px": camera.cx,
-        "cy_px": camera.cy,
-        "baseline_mm": phantom.settings.baseline_mm,
-        "disparity_offset_px": 0.0,
-    }
-    (path / CALIBRATION).write_text(json.dumps(calibration, indent=1))
+    _write_clip_truth(phantom, path)
 
 
 def _stereomis_calibration(phantom: Phantom) -> str:
@@ -151,14 +131,32 @@ def _poses(phantom: Phantom) -> NDArray[np.float64]:
     return np.stack([phantom.world_from_camera(index) for index in range(phantom.settings.frames)])
 
 
-def _write_truth(path: Path, frame: PhantomFrame) -> None:
+def _write_frame_truth(path: Path, index: int, frame: PhantomFrame) -> None:
+    (path / TRUTH).mkdir(exist_ok=True)
     np.savez_compressed(
-        path,
+        path / TRUTH / f"{index:06d}.npz",
         depth_mm=frame.depth_mm,
         hidden_depth_mm=frame.hidden_depth_mm,
         hidden_rgb=frame.hidden_rgb.astype(np.float16),
         tissue=frame.tissue,
+        tissue_right=frame.tissue_right,
     )
+
+
+def _write_clip_truth(phantom: Phantom, path: Path) -> None:
+    """Write what belongs to no single frame."""
+    tracks = phantom.trajectories()
+    np.savez_compressed(
+        path / TRUTH / "trajectories.npz", pixels=tracks.pixels, points_mm=tracks.points_mm.astype(np.float32)
+    )
+    _write_novel_views(phantom, path / TRUTH / "novel_views.npz")
+    frames = range(phantom.settings.frames)
+    camera = {
+        "intrinsics": phantom.settings.intrinsics.numbers(),
+        "world_from_camera": _poses(phantom).tolist(),
+        "world_from_right_camera": [phantom.world_from_right(index).tolist() for index in frames],
+    }
+    (path / TRUTH / "camera.json").write_text(json.dumps(camera, indent=1))
 
 
 def _write_novel_views(phantom: Phantom, path: Path) -> None:

@@ -60,6 +60,18 @@ def test_a_run_becomes_a_row_with_every_figure(measured: Path) -> None:
     assert fast["command"] == again
 
 
+def test_a_phantom_is_also_a_stereo_clip_with_its_truth_beside_it(tmp_path: Path) -> None:
+    asked = ["evaluate", f"{CLIP}:stereo", "--series", "fast", "--iterations", "12", "--holdout", "every8"]
+    assert main([*asked, "--out", str(tmp_path)]) == ExitCode.OK
+    (row,) = read_rows(tmp_path / RUNS)
+    assert (row["clip"], row["error"]) == (f"{NAME}-stereo", "")
+    assert "stereo_s" in json.loads(row["seconds"]), "its depth was matched"
+    assert 0 < float(row["depth_error_mm"]) < 20
+    for share in ("empty_ok", "seen_ok"):
+        assert 0 < float(row[share]) <= 1
+    assert f"{CLIP}:stereo" in row["command"]
+
+
 def test_the_command_of_a_file_has_what_it_was_read_with(tmp_path: Path) -> None:
     clip = tmp_path / "my clip.mp4"
     clip.touch()

@@ -10,14 +10,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from worker.evaluate.truth import MOVING_MM, SceneCandidate, Truth
+from worker.evaluate.truth import MOVING_MM, SceneCandidate, ShownView, Truth
 from worker.input.clip import DepthClip
 from worker.model.deformation import SharedBasis
 from worker.model.gaussians import initial_gaussians
 from worker.model.metrics import BEST_PSNR_DB
 from worker.phantom import Phantom, PhantomSettings, make_phantom
 from worker.scene.scene import Scene
-from worker.train.hooks import RenderedFrame
 from worker.train.targets import MEDIAN_DEPTH_UNITS
 
 FRAMES = 12
@@ -31,9 +30,9 @@ class PhantomShown:
     def __init__(self, phantom: Phantom) -> None:
         self._phantom = phantom
 
-    def view(self, frame: int, pose: NDArray[np.float64]) -> RenderedFrame:
+    def view(self, frame: int, pose: NDArray[np.float64]) -> ShownView:
         rgb, depth_mm = self._phantom.render(frame, pose)
-        return RenderedFrame(rgb, depth_mm, (depth_mm > 0).astype(np.float32))
+        return ShownView(rgb, depth_mm, (depth_mm > 0).astype(np.float32))
 
     def motion_mm(self, frame: int) -> NDArray[np.floating]:
         tracks = self._phantom.trajectories(stride_px=1)
@@ -46,10 +45,10 @@ class PhantomShown:
 class BakedPhantom(PhantomShown):
     """The phantom with its highlights where the endoscope sees them, whoever looks."""
 
-    def view(self, frame: int, pose: NDArray[np.float64]) -> RenderedFrame:
+    def view(self, frame: int, pose: NDArray[np.float64]) -> ShownView:
         eye_mm = self._phantom.world_from_camera(frame)[:3, 3]
         rgb, depth_mm = self._phantom.render(frame, pose, eye_mm=eye_mm)
-        return RenderedFrame(rgb, depth_mm, (depth_mm > 0).astype(np.float32))
+        return ShownView(rgb, depth_mm, (depth_mm > 0).astype(np.float32))
 
 
 @cache
@@ -87,6 +86,48 @@ def test_the_truth_scores_itself_as_perfect() -> None:
     assert (scores.psnr_baked10_db, scores.psnr_baked15_db) == (scores.bound10_db, scores.bound15_db)
     assert scores.motion_error_mm == scores.moving_error_mm == pytest.approx(0, abs=1e-9)
     assert scores.moving_mm > MOVING_MM
+    assert (scores.empty_ok, scores.seen_ok) == (1.0, 1.0)
+
+
+class FinnedPhantom(PhantomShown):
+    """The phantom with a fin before the left half, a hole in the lower half, and a confidence that knows of both."""
+
+    def view(self, frame: int, pose: NDArray[np.float64]) -> ShownView:
+        shown = super().view(frame, pose)
+        rgb, depth_mm, confidence = shown.rgb.copy(), shown.depth_mm.copy(), shown.confidence.copy()
+        height, width = depth_mm.shape
+        depth_mm[:, : width // 2] *= 0.9
+        depth_mm[height // 2 :] = 0
+        rgb[:, : width // 2] = 0
+        confidence[:, : width // 2] = 0.4
+        confidence[height // 2 :] = 0.1
+        return ShownView(rgb, depth_mm, confidence)
+
+
+def test_a_fin_hangs_in_empty_space_and_a_hole_misses_what_was_seen() -> None:
+    phantom, _, truth = made()
+    scores = truth.score(FinnedPhantom(phantom))
+    assert scores.empty_ok == pytest.approx(0.75, abs=0.01), "a hole is empty: the upper left quarter alone hangs"
+    assert scores.seen_ok == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_confidence_that_knows_where_the_model_errs_ranks_the_errors() -> None:
+    phantom, _, truth = made()
+    scores = truth.score(FinnedPhantom(phantom))
+    assert min(scores.rank_depth, scores.rank_right_depth) > 0.98
+    assert 0.2 < scores.rank_colour < 0.9, "the hole's right half shows the right colours"
+    perfect = truth.score(PhantomShown(phantom))
+    assert np.isnan(perfect.rank_depth), "there is nothing to rank"
+
+
+def test_the_right_eye_of_a_stereo_clip_shows_what_the_left_eye_does_not() -> None:
+    phantom, clip, _ = made()
+    blind = dataclasses.replace(clip, tissue=np.zeros_like(clip.tissue))
+    blind.tissue[0, :, :48] = True
+    nothing = np.zeros_like(clip.tissue)
+    one, both = (Truth(phantom, blind, [0], HELD_OUT, right) for right in (nothing, ~nothing))
+    judged = [sum(int(view.judged.sum()) for view in truth._views[10.0]) for truth in (one, both)]
+    assert judged[1] > 1.5 * judged[0] > 0
 
 
 def test_highlights_alone_keep_a_perfect_shape_below_perfection() -> None:
@@ -130,12 +171,12 @@ def test_only_what_a_training_frame_showed_is_judged() -> None:
 def test_the_same_material_point_has_the_same_place_on_the_atlas_wherever_it_is_seen_from() -> None:
     phantom, _, _ = made()
     tracks = phantom.trajectories(stride_px=8)
-    first = phantom.atlas_xy(0)[tuple(tracks.pixels.T)]
+    first = phantom.surface_pixels(0).atlas_xy[tuple(tracks.pixels.T)]
     camera, frame = phantom.settings.intrinsics, 5
     x, y, z = tracks.points_mm[frame].T
     column = np.floor(camera.fx * x / z + camera.cx).astype(int)
     row = np.floor(camera.fy * y / z + camera.cy).astype(int)
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    later = phantom.atlas_xy(frame)[row[inside], column[inside]]
+    later = phantom.surface_pixels(frame).atlas_xy[row[inside], column[inside]]
     apart = np.linalg.norm(later - first[inside], axis=1)
     assert np.median(apart) < 1.5, "texels; a pixel is about one and a quarter"
