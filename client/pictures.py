@@ -97,7 +97,8 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
     if panel.image is not None:
         from PIL import Image
 
-        axis.imshow(Image.open(io.BytesIO(panel.image)), interpolation="antialiased")
+        # Without alpha the hatch under unseen pixels shows.
+        axis.imshow(Image.open(io.BytesIO(panel.image)).convert("RGB"), interpolation="antialiased")
     else:
         axis.imshow(panel.values, cmap=panel.colours, vmin=panel.limits[0], vmax=panel.limits[1])
 

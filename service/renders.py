@@ -15,7 +15,15 @@ from contract.access.keys import KeyScope
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
 from contract.wire.pose import parse_pose
-from contract.wire.rendering import MEDIA_TYPES, ImageFormat, IntrinsicsOverride, Layer, RenderRequest, ReplyError
+from contract.wire.rendering import (
+    MEDIA_TYPES,
+    ImageFormat,
+    IntrinsicsOverride,
+    Layer,
+    RenderRequest,
+    ReplyError,
+    Unseen,
+)
 from service.access import Caller
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services, owned_scene
@@ -25,7 +33,17 @@ from service.version import version
 router = APIRouter(tags=["renders"])
 
 IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
-    200: {"description": "the image", "content": {media_type: {} for media_type in MEDIA_TYPES.values()}},
+    200: {
+        "description": "the image",
+        "content": {media_type: {} for media_type in MEDIA_TYPES.values()},
+        "headers": {
+            "X-Intrasplat-Unseen": {
+                "description": "share of the view that no training frame saw, hatched unless unseen=guess",
+                "required": True,
+                "schema": {"type": "number", "minimum": 0, "maximum": 1},
+            }
+        },
+    },
     304: {"description": "it is the one that the caller has"},
 }
 STATUS_OF_REPLY = {"input": 422, "scene": 404, "not-yet": 503, "internal": 500}
@@ -62,6 +80,11 @@ class RenderQuery(BaseModel):
     layer: Layer = Layer.RGB
     format: ImageFormat = ImageFormat.PNG
     quality: int = Field(default=90, ge=1, le=100, description="quality of a jpeg or webp image")
+    unseen: Unseen = Field(
+        default=Unseen.MARK,
+        description="what to show where no training frame saw anything: mark, a hatch, alpha 0 in png and webp, depth "
+        "and confidence 0; guess, what the model draws there",
+    )
 
 
 @dataclass(frozen=True)
@@ -95,6 +118,7 @@ async def render(
         tag = tag_of(request.model_copy(update={"attempt": shown.attempt}))
     response = image_response(shown.scene_id, answer)
     response.headers.update(cache_headers(shown, tag))
+    response.headers["X-Intrasplat-Unseen"] = f"{answer.head.unseen:.3f}"
     total_ms = (time.perf_counter() - start) * 1e3
     response.headers["Server-Timing"] = f"render;dur={answer.head.render_ms:.1f}, total;dur={total_ms:.1f}"
     return response
@@ -162,6 +186,7 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
         layer=query.layer,
         format=query.format,
         quality=query.quality,
+        unseen=query.unseen,
         max_pixels=settings.max_render_pixels,
     )
 

@@ -70,6 +70,7 @@ class StreamHead(BaseModel):
     state: JobState
     t: float
     iteration: int | None
+    unseen: float
     warnings: tuple[Notice, ...]
     media_type: str
     render_ms: float
@@ -267,6 +268,7 @@ def packed(message: StreamMessage, shown: Shown, answer: Answer, total_ms: float
         state=shown.state,
         t=answer.head.t,
         iteration=answer.head.iteration,
+        unseen=round(answer.head.unseen, 3),
         warnings=answer.head.warnings,
         media_type=answer.head.media_type,
         render_ms=answer.head.render_ms,

@@ -23,6 +23,7 @@ const viewer = new Viewer({
   time: get("time"),
   timeValue: get("time-value"),
   layer: get("layer"),
+  guess: get("guess"),
   home: get("home"),
   play: get("play"),
 });

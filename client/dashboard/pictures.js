@@ -23,7 +23,9 @@ async function renderOnce(view, signal) {
     state: header("State"),
     t: Number(header("T")),
     iteration: header("Iteration") === null ? null : Number(header("Iteration")),
+    unseen: Number(header("Unseen")),
     warning: header("Warning") ?? "",
+    codes: header("Warning-Codes")?.split(", ") ?? [],
     totalMs: total ? Number(total[1]) : NaN,
     way: "single pictures",
   };
@@ -56,6 +58,8 @@ export class Pictures {
     this.#keepOpen();
     const picture = this.stream.isOpen ? await this.#fromStream(view) : await this.#fromRender(view);
     if (picture.scene !== view.scene) throw new Error("The service sent another scene's picture; it is not shown.");
+    // What is hatched is no guess: the rest of the picture is as good as ever.
+    picture.isExtrapolated = picture.codes.some((code) => code !== "unseen" || view.unseen === "guess");
     return picture;
   }
 

@@ -78,7 +78,7 @@ export class Screen {
       return ["stale", "STALE", `Last picture ${clockTime(this.shownAt)}. ${reason} Reconnecting.`];
     }
     if (this.shown.state === "running") return ["training", `TRAINING, iteration ${this.shown.iteration}`, ""];
-    return this.shown.warning !== "" ? ["extrapolated", "EXTRAPOLATED", ""] : ["live", "CURRENT", ""];
+    return this.shown.isExtrapolated ? ["extrapolated", "EXTRAPOLATED", ""] : ["live", "CURRENT", ""];
   }
 }
 

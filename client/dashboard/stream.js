@@ -5,12 +5,13 @@ import { connectionLost, Problem } from "./problem.js";
 
 /**
  * What is asked for; the query of GET /render.
- * @typedef {{scene: string, t: number, pose?: string, layer: string, format: string}} View
+ * @typedef {{scene: string, t: number, pose?: string, layer: string, unseen: string, format: string}} View
  */
 /**
- * What came.
+ * What came. isExtrapolated: it shows a guess, or a pose or time far from the clip's (set by Pictures.ask).
  * @typedef {{blob: Blob, scene: string, state: "running"|"done", t: number, iteration: number | null,
- *   warning: string, totalMs: number, way: string}} Picture
+ *   unseen: number, warning: string, codes: string[], totalMs: number, way: string,
+ *   isExtrapolated?: boolean}} Picture
  */
 
 const LENGTH_BYTES = 4;
@@ -81,9 +82,10 @@ export class Stream {
     if (head.id !== this.pending?.id) return; // of a view that nobody waits for any more
     const { resolve } = this.pending;
     this.pending = null;
-    const { scene, state, t, iteration, warnings, total_ms: totalMs } = head;
+    const { scene, state, t, iteration, unseen, warnings, total_ms: totalMs } = head;
     const warning = warnings.map(({ text }) => text).join(" ");
-    resolve({ blob, scene, state, t, iteration, warning, totalMs, way: "stream" });
+    const codes = warnings.map(({ code }) => code);
+    resolve({ blob, scene, state, t, iteration, unseen, warning, codes, totalMs, way: "stream" });
   }
 
   #fail(problem) {

@@ -69,7 +69,8 @@ export class Viewer {
 
   async #showOnce(scene, visit) {
     const began = (this.askedAt = performance.now());
-    const name = `${this.parts.layer.selectedOptions[0].text}, ${this.orbit.words}`;
+    const guesses = this.parts.guess.checked ? ", guesses shown" : "";
+    const name = `${this.parts.layer.selectedOptions[0].text}, ${this.orbit.words}${guesses}`;
     try {
       const picture = await this.pictures.ask(this.#view(scene));
       const bitmap = await createImageBitmap(picture.blob);
@@ -85,7 +86,13 @@ export class Viewer {
   }
 
   #view(scene) {
-    const view = { scene, t: Number(this.timeline.t.toFixed(4)), layer: this.parts.layer.value, format: "jpeg" };
+    const view = {
+      scene,
+      t: Number(this.timeline.t.toFixed(4)),
+      layer: this.parts.layer.value,
+      unseen: this.parts.guess.checked ? "guess" : "mark",
+      format: "jpeg",
+    };
     if (this.orbit.pose) view.pose = this.orbit.pose;
     return view;
   }
@@ -93,7 +100,8 @@ export class Viewer {
   #tell(name, picture, tookMs) {
     const server = Number.isFinite(picture.totalMs) ? ` (service ${picture.totalMs.toFixed(0)} ms)` : "";
     const rate = this.pace.rate >= 1 ? ` · ${this.pace.rate.toFixed(0)} pictures/s` : "";
-    this.parts.readout.textContent = `${name} · ${tookMs.toFixed(0)} ms${server}${rate} · ${picture.way}`;
+    const unseen = picture.unseen >= 0.005 ? ` · ${(picture.unseen * 100).toFixed(0)} % unseen` : "";
+    this.parts.readout.textContent = `${name}${unseen} · ${tookMs.toFixed(0)} ms${server}${rate} · ${picture.way}`;
   }
 
   #fail(error) {
@@ -103,7 +111,7 @@ export class Viewer {
   }
 
   #listen() {
-    const { stage, layer, home } = this.parts;
+    const { stage, layer, guess, home } = this.parts;
     const change = (work) => (...given) => {
       if (!this.scene) return;
       work(...given);
@@ -117,6 +125,7 @@ export class Viewer {
       play: () => this.timeline.play(!this.timeline.isPlaying),
     });
     layer.addEventListener("change", () => this.refresh());
+    guess.addEventListener("change", () => this.refresh());
     home.addEventListener("click", goHome);
   }
 }

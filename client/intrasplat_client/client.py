@@ -116,25 +116,43 @@ class Client:
         layer: str = "rgb",
         format: str = "png",
         quality: int | None = None,
+        unseen: str | None = None,
         known: Image | None = None,
         **camera: float,
     ) -> Image:
         """One view of a finished scene, or of a job that trains; arguments as Core.render has them."""
         return run(
             self._core.render(
-                t, scene=scene, pose=pose, layer=layer, format=format, quality=quality, known=known, **camera
+                t,
+                scene=scene,
+                pose=pose,
+                layer=layer,
+                format=format,
+                quality=quality,
+                unseen=unseen,
+                known=known,
+                **camera,
             )
         )
 
     def render_array(
-        self, t: float = 0.0, *, scene: str | None = None, pose: str | None = None, layer: str = "rgb", **camera: float
+        self,
+        t: float = 0.0,
+        *,
+        scene: str | None = None,
+        pose: str | None = None,
+        layer: str = "rgb",
+        unseen: str | None = None,
+        **camera: float,
     ) -> NDArray[Any]:
         """One view's exact values: uint8 [H, W, 3] of rgb, float32 [H, W] of depth (mm, 0 invalid) and confidence.
+
+        unseen as render has it: marked, rgb shows the hatch, and depth and confidence are 0.
 
         Raises:
             ImportError: numpy is not installed.
         """
-        return run(self._core.render_array(t, scene=scene, pose=pose, layer=layer, **camera))
+        return run(self._core.render_array(t, scene=scene, pose=pose, layer=layer, unseen=unseen, **camera))
 
     def stream(self, scene: str) -> Viewer:
         """A connection for many views: `with client.stream(scene) as viewer: viewer.render(t, pose)`."""

@@ -99,6 +99,7 @@ class Core:
         layer: str = "rgb",
         format: str = "png",
         quality: int | None = None,
+        unseen: str | None = None,
         known: Image | None = None,
         **camera: float,
     ) -> Image:
@@ -108,21 +109,32 @@ class Core:
         scene: the job's id; needed unless the service holds one scene only.
         pose: orbit:YAW,PITCH,ZOOM in degrees, or world_from_camera as 12 or 16 numbers in mm, row-major.
         layer: rgb, depth or confidence. format: png, jpeg, webp or npy. quality: of jpeg and webp, 1 to 100.
+        unseen: mark (the default) hatches what no training frame saw, and makes it transparent in png and webp; guess
+            shows what the model draws there.
         known: an earlier view; it is returned if it is still what the service would send.
         camera: width, height, fx, fy, cx, cy in pixels.
         """
-        query = view_query(t, scene, pose, layer, format, quality, camera)
+        query = view_query(t, scene, pose, layer, format, quality, unseen, camera)
         return await views.render(self._session, query, known)
 
     async def render_array(
-        self, t: float = 0.0, *, scene: str | None = None, pose: str | None = None, layer: str = "rgb", **camera: float
+        self,
+        t: float = 0.0,
+        *,
+        scene: str | None = None,
+        pose: str | None = None,
+        layer: str = "rgb",
+        unseen: str | None = None,
+        **camera: float,
     ) -> NDArray[Any]:
         """One view's exact values: uint8 [H, W, 3] of rgb, float32 [H, W] of depth (mm, 0 invalid) and confidence.
+
+        unseen as render has it: marked, rgb shows the hatch, and depth and confidence are 0.
 
         Raises:
             ImportError: numpy is not installed.
         """
-        query = view_query(t, scene, pose, layer, "npy", None, camera)
+        query = view_query(t, scene, pose, layer, "npy", None, unseen, camera)
         return (await views.render(self._session, query, None)).array()
 
     async def scenes(self, limit: int | None = None) -> list[dict[str, Any]]:

@@ -34,11 +34,19 @@ class StreamMessages:
         self._last_id = 0
 
     def request(
-        self, t: float, pose: str | None, layer: str, format: str, quality: int | None, camera: dict[str, float]
+        self,
+        t: float,
+        pose: str | None,
+        layer: str,
+        format: str,
+        quality: int | None,
+        unseen: str | None,
+        camera: dict[str, float],
     ) -> str:
         """The message that asks for a view."""
         self._last_id += 1
-        return json.dumps({"id": self._last_id, **view_query(t, self._scene, pose, layer, format, quality, camera)})
+        query = view_query(t, self._scene, pose, layer, format, quality, unseen, camera)
+        return json.dumps({"id": self._last_id, **query})
 
     def answer(self, message: str | bytes) -> Image | None:
         """The view that was asked for last; None for the answer to an earlier request.
@@ -87,11 +95,12 @@ class Viewer:
         layer: str = "rgb",
         format: str = "jpeg",
         quality: int | None = None,
+        unseen: str | None = None,
         **camera: float,
     ) -> Image:
         """One view; arguments as Client.render has them."""
         try:
-            self._socket.send(self._messages.request(t, pose, layer, format, quality, camera))
+            self._socket.send(self._messages.request(t, pose, layer, format, quality, unseen, camera))
             while True:
                 image = self._messages.answer(self._socket.recv(ANSWER_TIMEOUT_S))
                 if image is not None:
@@ -127,13 +136,14 @@ class AsyncViewer:
         layer: str = "rgb",
         format: str = "jpeg",
         quality: int | None = None,
+        unseen: str | None = None,
         **camera: float,
     ) -> Image:
         """One view; arguments as Client.render has them."""
         import asyncio
 
         try:
-            await self._socket.send(self._messages.request(t, pose, layer, format, quality, camera))
+            await self._socket.send(self._messages.request(t, pose, layer, format, quality, unseen, camera))
             async with asyncio.timeout(ANSWER_TIMEOUT_S):
                 while True:
                     image = self._messages.answer(await self._socket.recv())

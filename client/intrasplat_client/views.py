@@ -26,7 +26,8 @@ LENGTH_BYTES = 4
 class Image:
     """A rendered view: the encoded file, and what it shows.
 
-    state is "running" for a view of a job that still trains; iteration is then the step that is shown.
+    state is "running" for a view of a job that still trains; iteration is then the step that is shown. unseen is the
+    share of the view that no training frame saw; None: the service is too old to say.
     """
 
     content: bytes
@@ -35,6 +36,7 @@ class Image:
     t: float
     state: str = "done"
     iteration: int | None = None
+    unseen: float | None = None
     warning: str | None = None
     etag: str | None = None
     render_ms: float | None = None
@@ -64,11 +66,12 @@ def view_query(
     layer: str,
     format: str,
     quality: int | None,
+    unseen: str | None,
     camera: Mapping[str, float],
 ) -> dict[str, Any]:
     """The parameters of a view, as GET /render and the messages of the stream have them."""
-    values = {"t": t, "scene": scene, "pose": pose, "layer": layer, "format": format, "quality": quality, **camera}
-    return {name: value for name, value in values.items() if value is not None}
+    values = {"t": t, "scene": scene, "pose": pose, "layer": layer, "format": format, "quality": quality}
+    return {name: value for name, value in (values | {"unseen": unseen} | camera).items() if value is not None}
 
 
 async def render(session: Session, query: Mapping[str, Any], known: Image | None) -> Image:
@@ -89,6 +92,7 @@ def _image_of(response: httpx.Response) -> Image:
         t=float(about["t"]),
         state=about["state"],
         iteration=int(about["iteration"]) if "iteration" in about else None,
+        unseen=float(about["unseen"]) if "unseen" in about else None,
         warning=about.get("warning"),
         etag=about.get("etag"),
         render_ms=_duration_ms(about.get("server-timing", ""), "render"),
@@ -119,6 +123,7 @@ def image_of_message(message: bytes | str) -> tuple[object, Image | IntrasplatEr
             t=head["t"],
             state=head["state"],
             iteration=head["iteration"],
+            unseen=head.get("unseen"),
             warning="; ".join(each["text"] for each in head["warnings"]) or None,
             render_ms=head["render_ms"],
         )

@@ -84,6 +84,7 @@ class NoticeCode(StrEnum):
     POSE_FAR = "pose_far"
     TIME_OUTSIDE_CLIP = "time_outside_clip"
     TRAINING_GOES_ON = "training_goes_on"
+    UNSEEN = "unseen"
     # a report written before notices had codes
     UNCLASSIFIED = "unclassified"
 

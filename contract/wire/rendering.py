@@ -34,6 +34,13 @@ class ImageFormat(StrEnum):
     NPY = "npy"
 
 
+class Unseen(StrEnum):
+    """What a render shows where no training frame saw anything: a hatch, or the model's guess."""
+
+    MARK = "mark"
+    GUESS = "guess"
+
+
 MEDIA_TYPES = {
     ImageFormat.PNG: "image/png",
     ImageFormat.JPEG: "image/jpeg",
@@ -80,6 +87,7 @@ class RenderRequest(BaseModel):
     format: ImageFormat = ImageFormat.PNG
     quality: int = Field(default=90, ge=1, le=100)
     """The quality of a jpeg or webp image."""
+    unseen: Unseen = Unseen.MARK
     max_pixels: int = Field(default=4096 * 2160, gt=0)
 
 
@@ -120,6 +128,8 @@ class WorkerReply(BaseModel):
     warnings: tuple[Notice, ...] = ()
     iteration: int | None = None
     """The iteration of the snapshot that is shown; None: the scene is finished."""
+    unseen: float = 0.0
+    """Share of a render's pixels that no training frame saw, in [0, 1]."""
     render_ms: float = 0.0
 
 

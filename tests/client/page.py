@@ -33,7 +33,7 @@ from contract.wire.job import JobFiles, JobProgress, JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import OrbitPose
-from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, WorkerAddress
+from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, Unseen, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
@@ -46,6 +46,8 @@ LOOK_S = 0.05
 WORKER = "worker-1"
 SNAPSHOT_ITERATION = 40
 FAR_DEG = 25.0
+FAR_OUT_ZOOM = 0.9
+UNSEEN = "No frame saw 12% of this view."
 FAR = "This pose is far from the endoscope's: most of it is a guess."
 REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
     update={
@@ -68,25 +70,32 @@ def grey_of(job_id: str) -> int:
 
 
 class Painter:
-    """Paints each scene in a shade of its own, and warns of what lies far off."""
+    """Paints each scene in a shade of its own, and warns of what lies far off, or beyond the picture's borders."""
 
     def __init__(self) -> None:
         self.pause_s = 0.0
+        self.shown_unseen: Unseen | None = None
 
     def answer(self, request: RenderRequest | ExportRequest) -> Reply:
         if isinstance(request, ExportRequest):
             return Reply(b"ply\n", "application/octet-stream", request.t)
         time.sleep(self.pause_s)
+        self.shown_unseen = request.unseen
         picture = np.full((48, 60, 3), grey_of(request.scene_id), np.uint8)
-        is_far = isinstance(request.pose, OrbitPose) and abs(request.pose.yaw_deg) > FAR_DEG
+        warnings = []
+        if isinstance(request.pose, OrbitPose) and abs(request.pose.yaw_deg) > FAR_DEG:
+            warnings.append(a_warning(FAR, NoticeCode.POSE_FAR))
+        if isinstance(request.pose, OrbitPose) and request.pose.zoom < FAR_OUT_ZOOM:
+            warnings.append(a_warning(UNSEEN, NoticeCode.UNSEEN))
         image = cv2.imencode(f".{request.format.value}", picture)[1].tobytes()
         iteration = SNAPSHOT_ITERATION if request.attempt is None else None
         return Reply(
             image,
             MEDIA_TYPES[request.format],
             request.t,
-            (a_warning(FAR, NoticeCode.POSE_FAR),) if is_far else (),
+            tuple(warnings),
             iteration,
+            0.12 if NoticeCode.UNSEEN in [each.code for each in warnings] else 0.0,
         )
 
 

@@ -63,6 +63,7 @@ def test_a_render_comes_as_a_file_as_an_array_or_as_what_is_known(
     np.testing.assert_array_equal(image.array(), np.full((4, 6), 0.5, np.float32))
     np.testing.assert_array_equal(client.render_array(t=0.25, scene=job.id), np.full((4, 6), 0.25, np.float32))
     assert (image.scene, image.t, image.state, image.warning) == (job.id, 0.5, "done", "seen from afar")
+    assert (image.unseen, client.render(t=0.5, scene=job.id, unseen="guess").unseen) == (0.25, 0.0)
     assert client.render(t=0.5, scene=job.id, layer="depth", format="npy", width=64, known=image) is image
     assert client.render(t=0.5, scene=job.id, layer="rgb", known=image) is not image
     with pytest.raises(InputError, match="npy"):
@@ -92,6 +93,7 @@ def test_many_views_come_over_one_connection(service: LocalService, client: Clie
             viewer.render(0.0, "orbit:999,0,1")
         assert caught.value.field == "pose"
         assert viewer.render(0.0).media_type == "image/jpeg"
+        assert [viewer.render(0.0, unseen=each).unseen for each in (None, "mark", "guess")] == [0.25, 0.25, 0.0]
     with client.stream("nosuch") as viewer, pytest.raises(NotFound):
         viewer.render()
 

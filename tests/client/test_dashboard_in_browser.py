@@ -12,8 +12,9 @@ from selenium.webdriver.common.keys import Keys
 
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobError, JobState
+from contract.wire.rendering import Unseen
 from tests.client.local_service import CLIP
-from tests.client.page import FAR, Page, Site, browser, grey_of, site_at
+from tests.client.page import FAR, UNSEEN, Page, Site, browser, grey_of, site_at
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +137,25 @@ def test_the_view_turns_by_mouse_and_keys_and_goes_back_to_the_endoscope(site: S
     page.click("#home")
     page.until_state("live")
     assert "endoscope's view" in page.view
+
+
+@pytest.mark.parametrize("way", ["stream", "single pictures"])
+def test_what_was_never_seen_is_hatched_or_guessed_and_the_badge_knows(site: Site, page: Page, way: str) -> None:
+    if way != "stream":
+        page.script("window.WebSocket = class { static OPEN = 1; readyState = 3; addEventListener() {} close() {} };")
+    page.press(site.scene(), "View")
+    page.until_text("#readout", way)
+    assert "unseen" not in page.text("#readout")
+    page.find("#stage").send_keys("-", "-")
+    page.until_text("#readout", "12 % unseen")
+    assert (site.painter.shown_unseen, page.state) == (Unseen.MARK, "live")
+    assert page.text("#picture-warning") == UNSEEN
+    page.click("#guess")
+    page.until_state("extrapolated")
+    assert site.painter.shown_unseen is Unseen.GUESS
+    assert "guesses shown" in page.view
+    page.click("#guess")
+    page.until_state("live")
 
 
 def test_a_picture_is_stale_while_the_service_is_away_and_live_when_it_is_back(site: Site, page: Page) -> None:

@@ -115,6 +115,23 @@ def test_format_and_quality_reach_the_worker(service: ServiceUnderTest) -> None:
     assert_problem(service.http.get("/render", params={"scene": scene, "quality": "0"}), 422, "quality")
 
 
+def test_a_render_says_how_much_of_it_nothing_saw_and_the_caller_chooses_what_is_shown_there(
+    service: ServiceUnderTest,
+) -> None:
+    query = {"scene": service.finished_scene()}
+    marked = service.http.get("/render", params=query)
+    assert marked.headers["x-intrasplat-unseen"] == "0.063"
+    guessed = service.http.get("/render", params=query | {"unseen": "guess"})
+    assert guessed.headers["etag"] != marked.headers["etag"]
+    assert [each.unseen for each in service.painter.requests if isinstance(each, RenderRequest)] == ["mark", "guess"]
+    assert_problem(service.http.get("/render", params=query | {"unseen": "hide"}), 422, "unseen")
+    answer = service.http.get("/openapi.json").json()["paths"]["/render"]["get"]["responses"]["200"]
+    assert answer["headers"]["X-Intrasplat-Unseen"]["schema"] == {"type": "number", "minimum": 0, "maximum": 1}
+    export = service.http.get(f"/scenes/{query['scene']}/export")
+    assert export.status_code == 200
+    assert "x-intrasplat-unseen" not in export.headers
+
+
 def test_an_answer_says_how_long_it_took(service: ServiceUnderTest) -> None:
     timing = service.http.get("/render", params={"scene": service.finished_scene()}).headers["server-timing"]
     figures = re.fullmatch(r"render;dur=(\d+\.\d), total;dur=(\d+\.\d)", timing)

@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
-from contract.wire.rendering import ExportRequest, RenderRequest
+from contract.wire.rendering import ExportRequest, RenderRequest, Unseen
 from tests.reports import a_warning
 from tests.service.live import LiveService, live_service
 from worker.daemon.serve import NotYetError, Reply
@@ -43,7 +43,8 @@ class Painter:
         if request.t == 600:
             raise RuntimeError("patient Smith")
         iteration = 7 if request.attempt is None else None
-        return Reply(b"\xff" * self.bytes, "image/jpeg", request.t, (LOOK_OUT,), iteration)
+        unseen = 0.0 if isinstance(request, ExportRequest) or request.unseen is Unseen.GUESS else 0.12345
+        return Reply(b"\xff" * self.bytes, "image/jpeg", request.t, (LOOK_OUT,), iteration, unseen)
 
 
 LOOK_OUT = a_warning("look out")
@@ -100,9 +101,12 @@ def test_one_connection_shows_a_finished_scene_and_a_running_job(service: LiveSe
             "state": "done",
             "t": 0.5,
             "iteration": None,
+            "unseen": 0.123,
             "warnings": [LOOK_OUT.model_dump()],
             "media_type": "image/jpeg",
         }
+        ask(viewer, scene=scene, unseen="guess")
+        assert view(viewer)[0]["unseen"] == 0
         ask(viewer, scene=job_id, id=2)
         head, _ = view(viewer)
         assert (head["id"], head["scene"], head["state"], head["iteration"]) == (2, job_id, "running", 7)

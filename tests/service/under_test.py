@@ -30,6 +30,7 @@ EMPTY_ZIP = b"PK\x05\x06" + bytes(18)
 IDENTITY = "1,0,0,0,0,1,0,0,0,0,1,0"
 
 
+UNSEEN_SHARE = 0.06251
 AFTER_THE_END = a_warning("t is after the last frame", NoticeCode.TIME_OUTSIDE_CLIP)
 
 
@@ -57,7 +58,7 @@ class Painter:
         warnings = (AFTER_THE_END, a_warning("ansicht – geschätzt")) if request.t > 1 else ()
         iteration = 7 if request.attempt is None else None
         media_type, shown_t = f"image/{request.format.value}", min(request.t, 1.0)
-        return Reply(request.format.value.encode(), media_type, shown_t, warnings, iteration)
+        return Reply(request.format.value.encode(), media_type, shown_t, warnings, iteration, UNSEEN_SHARE)
 
 
 @dataclass

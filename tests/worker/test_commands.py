@@ -72,6 +72,22 @@ def test_render_writes_any_layer_from_any_pose(scene: Path, tmp_path: Path) -> N
     assert np.load(out).shape == (HEIGHT // 2, WIDTH // 2)
 
 
+def test_render_marks_what_was_not_seen_or_guesses(scene: Path, tmp_path: Path) -> None:
+    pictures = []
+    for unseen in ("mark", "guess"):
+        out = tmp_path / f"{unseen}.png"
+        view = ["--t", "0", "--pose", "orbit:30,0,1", "--unseen", unseen, "--out", str(out)]
+        assert main(["render", str(scene), *view]) == ExitCode.OK
+        pictures.append(cv2.imread(str(out), cv2.IMREAD_UNCHANGED))
+    marked, guessed = pictures
+    assert marked is not None
+    assert guessed is not None
+    assert (marked.shape[2], guessed.shape[2]) == (4, 3)
+    hidden = marked[..., 3] == 0
+    assert 0.05 < hidden.mean() < 0.9
+    np.testing.assert_array_equal(marked[~hidden][:, :3], guessed[~hidden])
+
+
 @pytest.mark.parametrize(
     "view",
     [

@@ -12,7 +12,7 @@ from contract.runtime.arguments import finite
 from contract.runtime.exits import ExitCode
 from contract.wire.errors import InputError
 from contract.wire.names import MANIFEST
-from contract.wire.rendering import ImageFormat, IntrinsicsOverride, Layer
+from contract.wire.rendering import ImageFormat, IntrinsicsOverride, Layer, Unseen
 from worker.commands.device import add_device
 
 SUFFIX_FORMATS = {
@@ -45,6 +45,13 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         choices=[layer.value for layer in Layer],
         default=Layer.RGB.value,
         help="depth: 16-bit PNG in 0.01 mm, or NPY in mm, 0 where there is none; confidence: 0 to 1 (default: rgb)",
+    )
+    parser.add_argument(
+        "--unseen",
+        choices=[each.value for each in Unseen],
+        default=Unseen.MARK.value,
+        help="what to show where no frame of the clip saw anything: mark, a hatch, transparent in PNG and WebP, depth "
+        "and confidence 0; guess, what the model draws there (default: mark)",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="PATH", help="a .png, .jpg or .npy file; with --frames a folder"
@@ -89,7 +96,7 @@ def run_cli(options: argparse.Namespace) -> int:
             raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
         frame = render_frame(scene, t, pose, camera, device)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encode_layer(frame, Layer(options.layer), image_format))
+        path.write_bytes(encode_layer(frame, Layer(options.layer), image_format, unseen=Unseen(options.unseen)))
         print(path)
         for notice in frame.warnings:
             print(f"{notice.severity}: {notice.text}", file=sys.stderr)

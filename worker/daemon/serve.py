@@ -46,6 +46,7 @@ class Reply:
     """The answer to a request: encoded bytes, the model time that they show (clamped), and warnings.
 
     iteration: of the snapshot that is shown; None: the scene is finished.
+    unseen: share of a render's pixels that no training frame saw.
     """
 
     body: bytes
@@ -53,6 +54,7 @@ class Reply:
     t: float
     warnings: tuple[Notice, ...] = ()
     iteration: int | None = None
+    unseen: float = 0.0
 
 
 class RequestServer:
@@ -163,6 +165,7 @@ class RequestServer:
             t=view.t,
             warnings=view.warnings,
             iteration=view.iteration,
+            unseen=view.unseen,
             render_ms=(time.perf_counter() - start) * 1e3,
         )
         return head, view.body

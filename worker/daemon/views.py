@@ -112,14 +112,15 @@ def _render(scene: Scene, request: RenderRequest, device: Device, iteration: int
     """One render; iteration: of a snapshot, None for a finished scene."""
     intrinsics = camera_of(scene.intrinsics, request.camera, request.max_pixels)
     frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics, device)
-    body = encode_layer(frame, request.layer, request.format, request.quality)
+    body = encode_layer(frame, request.layer, request.format, request.quality, request.unseen)
     warnings = frame.warnings
     if iteration is not None:
         # What the clip shows of each place is counted when training has ended: until then nothing is vouched for.
         text = f"Training goes on: this is iteration {iteration}, and how far to trust it is not known yet."
         goes_on = Notice.warning(NoticeCode.TRAINING_GOES_ON, text)
         warnings = (goes_on, *(each for each in warnings if each.code is not NoticeCode.HARDLY_SEEN))
-    return Reply(body, MEDIA_TYPES[request.format], shown_time(scene, request.t), warnings, iteration)
+    shown = shown_time(scene, request.t)
+    return Reply(body, MEDIA_TYPES[request.format], shown, warnings, iteration, frame.unseen_share)
 
 
 def _export(scene: Scene, request: ExportRequest) -> Reply:

@@ -4,6 +4,9 @@
 rgb         8 bit                       uint8 [H, W, 3]       8 bit
 depth       16 bit, 0.01 mm, 0 invalid  float32 mm [H, W]     false colour, near bright, invalid black
 confidence  8 bit, 255 = 1              float32 [H, W]        false colour
+
+Where unseen pixels are marked, depth and confidence are 0 there, and rgb shows a hatch; png and webp of rgb then have
+an alpha channel, 0 there and 255 elsewhere. A lossy webp flattens the hatch that its alpha hides; png keeps it.
 """
 
 from __future__ import annotations
@@ -15,11 +18,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.wire.rendering import ImageFormat, Layer
+from contract.wire.rendering import ImageFormat, Layer, Unseen
+from worker.render.unseen import hatched
 
 DEPTH_PNG_PER_MM = 100.0
 DEFAULT_QUALITY = 90
 FOR_EYES = frozenset({ImageFormat.JPEG, ImageFormat.WEBP})
+WITH_ALPHA = frozenset({ImageFormat.PNG, ImageFormat.WEBP})
 PNG_COMPRESSION = 1
 """Fast rather than small: renders travel over the loopback or a hospital's own network."""
 
@@ -39,20 +44,47 @@ class Layers(Protocol):
     @property
     def confidence(self) -> NDArray[np.float32]: ...
 
+    @property
+    def unseen(self) -> NDArray[np.bool_]: ...
 
-def encode_layer(frame: Layers, layer: Layer, image_format: ImageFormat, quality: int = DEFAULT_QUALITY) -> bytes:
+
+def encode_layer(
+    frame: Layers,
+    layer: Layer,
+    image_format: ImageFormat,
+    quality: int = DEFAULT_QUALITY,
+    unseen: Unseen = Unseen.MARK,
+) -> bytes:
     """The file's bytes; quality, 1 to 100, is that of jpeg and webp."""
-    if image_format is ImageFormat.NPY:
-        return _npy(frame, layer)
+    marked = frame.unseen if unseen is Unseen.MARK else None
     if layer is Layer.RGB:
-        return _image(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), image_format, quality)
+        return _encode_colour(frame.rgb, marked, image_format, quality)
+    values = frame.depth_mm if layer is Layer.DEPTH else frame.confidence
+    if marked is not None:
+        values = np.where(marked, np.float32(0), values)
+    if image_format is ImageFormat.NPY:
+        return _npy(values)
     if image_format in FOR_EYES:
-        false_colour = view_depth(frame.depth_mm) if layer is Layer.DEPTH else view_confidence(frame.confidence)
-        return _image(false_colour, image_format, quality)
+        return _image(view_depth(values) if layer is Layer.DEPTH else view_confidence(values), image_format, quality)
     if layer is Layer.DEPTH:
-        steps = np.clip(np.rint(frame.depth_mm * DEPTH_PNG_PER_MM), 0, np.iinfo(np.uint16).max)
+        steps = np.clip(np.rint(values * DEPTH_PNG_PER_MM), 0, np.iinfo(np.uint16).max)
         return _image(steps.astype(np.uint16), image_format, quality)
-    return _image(np.rint(np.clip(frame.confidence, 0, 1) * 255).astype(np.uint8), image_format, quality)
+    return _image(np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8), image_format, quality)
+
+
+def _encode_colour(
+    rgb: NDArray[np.uint8], marked: NDArray[np.bool_] | None, image_format: ImageFormat, quality: int
+) -> bytes:
+    """marked: pixels to hatch, and to make transparent where the format can; None: neither."""
+    if marked is not None:
+        rgb = hatched(rgb, marked)
+    if image_format is ImageFormat.NPY:
+        return _npy(rgb)
+    if marked is None or image_format not in WITH_ALPHA:
+        return _image(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), np.uint8), image_format, quality)
+    pixels = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGRA), np.uint8)
+    pixels[..., 3] = np.where(marked, np.uint8(0), np.uint8(255))
+    return _image(pixels, image_format, quality)
 
 
 def view_depth(depth_mm: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -85,10 +117,7 @@ def _image(pixels: NDArray[np.uint8] | NDArray[np.uint16], image_format: ImageFo
     return bytes(encoded.tobytes())
 
 
-def _npy(frame: Layers, layer: Layer) -> bytes:
+def _npy(values: NDArray[np.uint8] | NDArray[np.float32]) -> bytes:
     buffer = io.BytesIO()
-    if layer is Layer.RGB:
-        np.save(buffer, frame.rgb, allow_pickle=False)
-    else:
-        np.save(buffer, frame.depth_mm if layer is Layer.DEPTH else frame.confidence, allow_pickle=False)
+    np.save(buffer, values, allow_pickle=False)
     return buffer.getvalue()

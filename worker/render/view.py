@@ -19,6 +19,7 @@ from worker.input.camera import Intrinsics
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
 from worker.raster.step import camera_vector
+from worker.render.unseen import blended_values, unseen_pixels
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
@@ -30,6 +31,8 @@ FAR_POSE = 0.35
 LOW_CONFIDENCE, MAX_LOW_SHARE = 0.3, 0.1
 """A frame warns when more than this share of its pixels lies below this confidence."""
 HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
+MAX_UNSEEN_SHARE = 0.05
+"""A frame warns when more than this share of its pixels is unseen."""
 ROUNDING = 1e-6
 """Model time by which t may exceed the last frame's without a warning: a decimal fraction may round i / T."""
 
@@ -42,13 +45,20 @@ class Frame:
     depth_mm   [H, W] float32, camera z, 0 where nothing solid is
     confidence [H, W] float32 in [0, 1]: share of training frames that saw the blended Gaussians, times their stereo
                confidence, times a fall-off with the distance from the trained poses
+    unseen     [H, W] bool: no training frame saw what is shown here; the other layers hold the model's guess
     warnings   what to distrust about this frame
     """
 
     rgb: NDArray[np.uint8]
     depth_mm: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    unseen: NDArray[np.bool_]
     warnings: tuple[Notice, ...]
+
+    @property
+    def unseen_share(self) -> float:
+        """Share of the pixels that are unseen, in [0, 1]."""
+        return float(self.unseen.mean())
 
 
 class SceneRenderer:
@@ -57,21 +67,19 @@ class SceneRenderer:
     def __init__(self, scene: Scene, device: Device = CPU) -> None:
         self._scene = weakref.ref(scene)
         self._model = model_of(scene, device)
-        self._is_vouched = bool(scene.seen.any())
+        self._values = blended_values(scene.seen.numpy())
         self._lock = Lock()
 
     def layers(
         self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """R G B Z A [5, H, W], Z unnormalised in units, and the blended `seen` of the Gaussians [H, W], as copies."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """R G B Z A [5, H, W], Z unnormalised in units, and blended_values as they are blended [H, W], as copies."""
         scene = self._scene()
         assert scene is not None
         camera = camera_vector(camera_in_units(intrinsics, world_from_camera, scene.units_per_mm))
         with self._lock:
-            # Of a snapshot nothing is known yet: nothing is blended, and 0 is shown.
-            image = self._model.render(camera, t, scene.seen.numpy() if self._is_vouched else None).copy()
-        seen = image[5] if self._is_vouched else np.zeros_like(image[0])
-        return image[:5], seen
+            image = self._model.render(camera, t, self._values).copy()
+        return image[:5], None if self._values is None else image[5]
 
 
 _renderers: weakref.WeakKeyDictionary[Scene, dict[Device, SceneRenderer]] = weakref.WeakKeyDictionary()
@@ -112,17 +120,25 @@ def render_frame(
     last = (scene.frame_count - 1) / scene.frame_count
     shown = min(max(t, 0.0), last)
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
-    image, seen = renderer_of(scene, device).layers(shown, pose, intrinsics or scene.intrinsics)
+    image, blended = renderer_of(scene, device).layers(shown, pose, intrinsics or scene.intrinsics)
     alpha = image[4]
     solid = alpha >= COVERED_ALPHA
-    depth_mm = solid_depth_mm(image[3], alpha, scene.units_per_mm)
+    unseen = unseen_pixels(solid, blended)
     distance = _distance_from_trained(scene, pose)
-    fall_off = float(np.exp(-0.5 * (distance / POSE_FALL_OFF) ** 2))
-    confidence = np.where(solid, np.clip(seen / np.where(solid, alpha, 1) * fall_off, 0, 1), 0).astype(np.float32)
+    # Of a snapshot nothing is known yet: nothing is blended, and 0 is shown.
+    confidence = np.zeros_like(alpha) if blended is None else _confidence(blended, alpha, distance)
     rgb = np.clip(image[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255).astype(np.uint8)
     in_clip = 0.0 <= t <= last + ROUNDING
     warnings = () if in_clip else (_warning_of_time(t, shown),)
-    return Frame(rgb, depth_mm, confidence, (*warnings, *_warnings_of_pose(distance, confidence)))
+    warnings = (*warnings, *_warnings_of_pose(distance, confidence, unseen))
+    return Frame(rgb, solid_depth_mm(image[3], alpha, scene.units_per_mm), confidence, unseen, warnings)
+
+
+def _confidence(blended: NDArray[np.float32], alpha: NDArray[np.float32], distance: float) -> NDArray[np.float32]:
+    """[H, W] in [0, 1], 0 where nothing solid is; distance as of _distance_from_trained."""
+    solid = alpha >= COVERED_ALPHA
+    fall_off = np.float32(np.exp(-0.5 * (distance / POSE_FALL_OFF) ** 2))
+    return np.where(solid, np.clip(blended / np.where(solid, alpha, 1) * fall_off, 0, 1), 0).astype(np.float32)
 
 
 def _warning_of_time(t: float, shown: float) -> Notice:
@@ -130,11 +146,14 @@ def _warning_of_time(t: float, shown: float) -> Notice:
     return Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, text)
 
 
-def _warnings_of_pose(distance: float, confidence: NDArray[np.float32]) -> Iterator[Notice]:
+def _warnings_of_pose(distance: float, confidence: NDArray[np.float32], unseen: NDArray[np.bool_]) -> Iterator[Notice]:
     if distance > FAR_POSE:
         text = f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess."
         yield Notice.warning(NoticeCode.POSE_FAR, text)
-    if (confidence < LOW_CONFIDENCE).mean() > MAX_LOW_SHARE:
+    if (share := float(unseen.mean())) > MAX_UNSEEN_SHARE:
+        text = f"No frame saw {share:.0%} of this view. unseen=mark hatches it, unseen=guess shows a guess."
+        yield Notice.warning(NoticeCode.UNSEEN, text)
+    if ((confidence < LOW_CONFIDENCE) & ~unseen).mean() > MAX_LOW_SHARE:
         yield Notice.warning(NoticeCode.HARDLY_SEEN, HARDLY_SEEN)
 
 

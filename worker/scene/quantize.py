@@ -133,7 +133,9 @@ def round_to(prepared: Prepared, step: float) -> Compact:
     for channel, motion in enumerate(prepared.motion):
         fill(STATE + channel * patterns, motion * units[:, channel, None].astype(np.float32))
     table[:, -4:-1] = prepared.power
-    fill(columns - 1, prepared.seen[:, None] * SEEN_LEVELS)
+    # What was seen at all stays so: a render marks what was not.
+    levels = np.maximum(np.rint(prepared.seen * SEEN_LEVELS), prepared.seen > 0)
+    fill(columns - 1, levels[:, None])
     pattern = np.ascontiguousarray(prepared.pattern * steps[:channels, None, None], np.float32)
     basis = prepared.basis
     return Compact(table, steps.astype(np.float32), pattern, basis.centre, basis.width)

@@ -16,7 +16,7 @@ from contract.store.store import Store
 from contract.wire.errors import LimitError, SceneError
 from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose
-from contract.wire.rendering import ExportRequest, ImageFormat, IntrinsicsOverride, Layer, RenderRequest
+from contract.wire.rendering import ExportRequest, ImageFormat, IntrinsicsOverride, Layer, RenderRequest, Unseen
 from worker.daemon.serve import NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import COPIES, Views, camera_of, pose_of, shown_time
@@ -99,6 +99,15 @@ def test_a_time_after_the_clip_shows_its_last_frame_and_warns(store: Store, scen
     assert view.warnings
 
 
+def test_a_render_marks_what_no_frame_saw_unless_it_is_asked_to_guess(store: Store, scene_id: str) -> None:
+    aside = request_of(scene_id).model_copy(update={"pose": parse_pose("orbit:30,0,1")})
+    marked, guessed = (Views(store).answer(aside.model_copy(update={"unseen": each})) for each in Unseen)
+    assert marked.unseen == guessed.unseen > 0.05
+    assert NoticeCode.UNSEEN in [each.code for each in marked.warnings]
+    differs = (np.load(io.BytesIO(marked.body)) != np.load(io.BytesIO(guessed.body))).any(-1)
+    assert 0.9 * marked.unseen < differs.mean() <= marked.unseen
+
+
 def test_a_deleted_scene_is_not_shown_from_memory(store: Store, scene_id: str) -> None:
     views = Views(store)
     views.answer(request_of(scene_id))
@@ -153,8 +162,7 @@ def test_a_running_job_is_shown_by_its_snapshot_which_vouches_for_nothing(store:
     snapshots.offer(dataclasses.replace(scene(), seen=torch.zeros(120)), 40)
     view = views.answer(request_of(running, attempt=None))
     assert view.iteration == 40
-    (warning,) = view.warnings
-    assert warning.code is NoticeCode.TRAINING_GOES_ON
+    assert [each.code for each in view.warnings] == [NoticeCode.TRAINING_GOES_ON, NoticeCode.UNSEEN]  # bare borders
     layer = RenderRequest(scene_id=running, t=0, layer=Layer.CONFIDENCE, format=ImageFormat.NPY)
     assert not np.load(io.BytesIO(views.answer(layer).body)).any()
     assert views.answer(request_of(scene_id)).iteration is None

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from contract.wire.notices import NoticeCode
 from tests.helpers import assert_close
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared, trained, view
 from tests.worker.scenes import random_scene
@@ -112,7 +113,8 @@ def test_a_view_of_nothing_is_empty_and_says_so(scene: Scene) -> None:
     frame = render_frame(scene, 0.5, away)
     assert not frame.depth_mm.any()
     assert not frame.confidence.any()
-    assert any("hardly seen" in warning.text for warning in frame.warnings)
+    assert frame.unseen.all()
+    assert NoticeCode.UNSEEN in [warning.code for warning in frame.warnings]
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -99,6 +99,12 @@ def test_at_the_trained_times_the_scene_is_off_by_about_a_step(scene: Scene) -> 
         assert error[:, -1].max() <= 0.5 / 63 + 1e-6
 
 
+def test_what_was_seen_at_all_stays_seen_and_nothing_else_becomes_so() -> None:
+    scene = told_apart(random_scene(count=64))
+    scene.seen[:3] = torch.tensor([0.0, 1e-4, 0.004])
+    assert int((compacted(scene).seen > 0).sum()) == 63
+
+
 def test_a_finer_step_means_a_smaller_error() -> None:
     scene = colourful(200)
     errors = [
