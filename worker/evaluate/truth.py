@@ -234,7 +234,8 @@ class SceneCandidate:
 
     def view(self, frame: int, pose: Pose) -> ShownView:
         shown = render_frame(self._scene, frame / self._scene.frame_count, pose)
-        return ShownView(self._image(frame, pose)[:3].transpose(1, 2, 0), shown.depth_mm, shown.confidence)
+        rgb, is_shown = self._image(frame, pose)[:3].transpose(1, 2, 0), ~shown.unseen
+        return ShownView(rgb, shown.depth_mm * is_shown, shown.confidence * is_shown)
 
     def motion_mm(self, frame: int) -> NDArray[np.floating]:
         start, end = (self._model.deformed_mean(each / self._scene.frame_count) for each in (0, frame))

@@ -111,6 +111,15 @@ def test_a_fin_hangs_in_empty_space_and_a_hole_misses_what_was_seen() -> None:
     assert scores.seen_ok == pytest.approx(0.5, abs=0.05)
 
 
+def test_what_a_render_marks_as_unseen_is_not_solid() -> None:
+    phantom, clip, truth = made()
+    scene = painted_scene(phantom, clip, follows=True)
+    left = torch.from_numpy(phantom.trajectories(stride_px=1).pixels[:, 1] < 48)
+    half_seen = dataclasses.replace(scene, seen=left.float())
+    assert truth.score(SceneCandidate(scene)).seen_ok > 0.9
+    assert truth.score(SceneCandidate(half_seen)).seen_ok == pytest.approx(0.5, abs=0.1)
+
+
 def test_a_confidence_that_knows_where_the_model_errs_ranks_the_errors() -> None:
     phantom, _, truth = made()
     scores = truth.score(FinnedPhantom(phantom))
