@@ -20,6 +20,9 @@ MaskPolarity = Literal["auto", "tool", "tissue"]
 PoseConvention = Literal["opengl", "llff"]
 """Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
 
+Eyes = Literal["left", "both"]
+"""The eyes of a stereo clip that a model is trained on."""
+
 DeviceName = Literal["auto", "cpu", "cuda"]
 """Where to compute; auto chooses the GPU if all of its requirements are met, otherwise the CPU."""
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from pydantic_core.core_schema import ValidationInfo
 
 from contract.wire.errors import InputError
-from contract.wire.names import Layout, MaskPolarity, PoseConvention, PresetName
+from contract.wire.names import Eyes, Layout, MaskPolarity, PoseConvention, PresetName
 
 Priority = Literal["standard", "high"]
 """high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
@@ -51,6 +51,9 @@ class ReconstructionOptions(ClipOptions):
     )
     preset: PresetName = Field(
         default="fast", description="instant, fast, quality and small are ours; paper is the method as published"
+    )
+    eyes: Eyes = Field(
+        default="both", description="the eyes of a stereo clip to train on; with left, the right eye only judges"
     )
     iterations: int | None = Field(
         default=None, ge=1, le=1_000_000, description="exactly how many steps to train; not with budget_s"

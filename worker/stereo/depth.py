@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import cv2
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import Cancelled, InputError
 from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.split import spread
-from worker.input.clip.types import DepthClip
+from worker.input.clip.types import DepthClip, Eye
 from worker.machine.cores import cores
 from worker.machine.hooks import Hooks, Progress
 from worker.machine.opencv import one_opencv_thread
@@ -29,6 +30,7 @@ from worker.stereo.alignment import (
     measure_row_shift,
 )
 from worker.stereo.matching import MAX_DEPTH_MM, MIN_CONFIDENCE, Grey, MatchPlan, match
+from worker.stereo.right_eye import moved_depth, moved_tissue, painted_over
 
 if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
     from worker.input.calibration import RectifiedClip
@@ -70,15 +72,16 @@ def estimate_depth(
     measured = sorted(set(range(clip.frame_count) if measured_frames is None else measured_frames))
     if not measured or measured[0] < 0 or measured[-1] >= clip.frame_count:
         raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
-    rgb, right = _decode(clip, hooks)
+    rgb, right_rgb = _decode(clip, hooks)
     if device == "cuda":
         hooks.on_progress(Progress(COMPILATION, 0.0))
     with one_opencv_thread(), _pool() as pool:
-        shift, plan = _plan(clip, rgb, right, measured, pool, device)
+        shift, plan = _plan(clip, rgb, right_rgb, measured, pool, device)
         if device == "cuda":
-            depth_mm, confidence = _match_on_device(clip, rgb, right, plan, hooks)
+            depth_mm, confidence = _match_on_device(clip, rgb, right_rgb, plan, hooks)
         else:
-            depth_mm, confidence = _match_all(clip, rgb, right, plan, pool, hooks)
+            depth_mm, confidence = _match_all(clip, rgb, right_rgb, plan, pool, hooks)
+        right = _right_eye(clip, rgb, right_rgb, depth_mm, confidence, plan)
     valid_share = _valid_share(depth_mm, clip.tissue)
     return DepthClip(
         rgb=rgb,
@@ -88,6 +91,7 @@ def estimate_depth(
         intrinsics=clip.intrinsics,
         world_from_camera=np.tile(np.eye(4), (clip.frame_count, 1, 1)),
         frame_times_s=clip.frame_times_s,
+        right=right,
         assumptions=(*clip.assumptions, _scale_assumption(clip)),
         warnings=clip.warnings + _warnings(shift, valid_share),
         measurements={
@@ -102,16 +106,15 @@ def estimate_depth(
 
 
 def _decode(clip: RectifiedClip, hooks: Hooks) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Left frames [T, H, W, 3] and right frames in grey [T, H, W], from one pass over the source."""
-    shape = (clip.frame_count, clip.intrinsics.height, clip.intrinsics.width)
-    rgb = np.empty((*shape, 3), np.uint8)
-    right = np.empty(shape, np.uint8)
+    """Left and right frames [T, H, W, 3], from one pass over the source."""
+    shape = (clip.frame_count, clip.intrinsics.height, clip.intrinsics.width, 3)
+    rgb, right = (np.empty(shape, np.uint8) for _ in range(2))
     decoded = 0
     for i, (left_frame, right_frame) in enumerate(clip.pairs()):
         if i >= clip.frame_count:
             break
         _check_stop(hooks)
-        rgb[i], right[i] = left_frame, _grey(right_frame)
+        rgb[i], right[i] = left_frame, right_frame
         decoded = i + 1
         hooks.on_progress(Progress(STAGE, DECODING_SHARE * decoded / clip.frame_count))
     if decoded < clip.frame_count:
@@ -130,7 +133,7 @@ def _plan(
     """Row shift and disparity range, from a few pairs spread over the measured frames."""
 
     def some_pairs(count: int) -> list[tuple[Grey, Grey]]:
-        return [(_grey(rgb[index]), right[index]) for index in spread(measured, count)]
+        return [(_grey(rgb[index]), _grey(right[index])) for index in spread(measured, count)]
 
     features = list(pool.map(find_features, [eye for pair in some_pairs(ALIGNMENT_PAIRS) for eye in pair]))
     matches = np.concatenate(list(pool.map(match_features, features[::2], features[1::2])))
@@ -154,11 +157,11 @@ def _match_all(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Depth in mm and confidence [T, H, W] of all pairs, matched in parallel."""
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
-    depth_mm = np.zeros(right.shape, np.float32)
-    confidence = np.zeros(right.shape, np.uint8)
+    depth_mm = np.zeros(right.shape[:3], np.float32)
+    confidence = np.zeros(right.shape[:3], np.uint8)
 
     def work(i: int) -> None:
-        disparity, trust = match(_grey(rgb[i]), right[i], plan)
+        disparity, trust = match(_grey(rgb[i]), _grey(right[i]), plan)
         depth_mm[i], confidence[i] = _to_depth(disparity, trust, focal_baseline, clip.disparity_offset_px)
 
     share = 1 - DECODING_SHARE - MEASURING_SHARE
@@ -179,19 +182,54 @@ def _match_on_device(
     """As _match_all, with as many pairs at once as their cost volumes fit into memory."""
     from worker.stereo.cuda import depth_of, frames_at_once
 
-    depth_mm = np.empty(right.shape, np.float32)
-    confidence = np.empty(right.shape, np.uint8)
+    depth_mm = np.empty(right.shape[:3], np.float32)
+    confidence = np.empty(right.shape[:3], np.uint8)
     at_once = frames_at_once(clip.intrinsics.height, clip.intrinsics.width, plan)
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
     hooks.on_progress(Progress(COMPILATION, 0.5))
     for first in range(0, len(right), at_once):
         _check_stop(hooks)
         some = slice(first, first + at_once)
-        left = np.stack([_grey(frame) for frame in rgb[some]])
-        depth_mm[some], confidence[some] = depth_of(left, right[some], plan, focal_baseline, clip.disparity_offset_px)
+        pairs = (np.stack([_grey(frame) for frame in eye[some]]) for eye in (rgb, right))
+        depth_mm[some], confidence[some] = depth_of(*pairs, plan, focal_baseline, clip.disparity_offset_px)
         left_over = max(len(right) - first - at_once, 0) / len(right)
         hooks.on_progress(Progress(STAGE, 1 - (1 - DECODING_SHARE - MEASURING_SHARE) * left_over))
     return depth_mm, confidence
+
+
+def _right_eye(
+    clip: RectifiedClip,
+    rgb: NDArray[np.uint8],
+    right_rgb: NDArray[np.uint8],
+    depth_mm: NDArray[np.float32],
+    confidence: NDArray[np.uint8],
+    plan: MatchPlan,
+) -> Eye:
+    """The right eye with the left one's depth. Its camera lies on the calibrated baseline, lowered by the row shift."""
+    focal_baseline, offset_px = clip.intrinsics.fx * clip.baseline_mm, clip.disparity_offset_px
+    there_mm, trust = np.empty_like(depth_mm), np.empty_like(confidence)
+    tissue = np.ones(depth_mm.shape, np.bool_) if clip.tissue_right is None else clip.tissue_right
+    middle = clip.frame_count // 2
+    label = painted_over(rgb[middle], right_rgb[middle], ~clip.tissue.any(axis=0))
+
+    def work(i: int) -> None:
+        there_mm[i], trust[i] = moved_depth(depth_mm[i], confidence[i], focal_baseline, offset_px)
+        if clip.tissue_right is None:
+            tissue[i] = moved_tissue(clip.tissue[i] | label, depth_mm[i], focal_baseline, offset_px) & ~label
+
+    with _pool() as pool:
+        list(pool.map(work, range(clip.frame_count)))
+    k = clip.intrinsics
+    pose = np.eye(4)
+    pose[0, 3] = clip.baseline_mm
+    return Eye(
+        rgb=right_rgb,
+        tissue=tissue,
+        depth_mm=there_mm,
+        depth_confidence=trust,
+        intrinsics=replace(k, cx=k.cx - offset_px, cy=k.cy + plan.row_shift_px),
+        world_from_camera=np.tile(pose, (clip.frame_count, 1, 1)),
+    )
 
 
 def _to_depth(

@@ -34,7 +34,7 @@ def step(run: Run, iteration: int) -> None:
         TrainingDiverged: the loss is not finite, or no Gaussian is visible. A GPU model reports its losses some steps
             late, so the error may come some steps later.
     """
-    preset, frames = run.preset, [run.frames.frame(index) for index in frames_at(run, iteration)]
+    preset, frames = run.preset, [eye.frame(index) for index in frames_at(run, iteration) for eye in run.eyes]
     sh_degree = min(preset.sh_degree, iteration // preset.sh_every) if preset.sh_degree else 0
     rates = rates_at(preset.rates, run.schedule.progress(iteration))
     check_sums(run.model.step(frames, preset.loss, rates, iteration, sh_degree), iteration)
@@ -121,11 +121,11 @@ def _end_cycle(run: Run, iteration: int) -> None:
 
 def _validation_psnr(run: Run) -> float:
     """Mean psnr_tissue in dB of the validation frames that show tissue; NaN if none does."""
-    frames = run.frames
     scores = [
-        frames.psnr_tissue_db(index, run.model.render(frames.cameras[index], float(frames.t[index])))
-        for index in validation_frames(frames.indices)
-        if frames.picture(index)[1].any()
+        eye.psnr_tissue_db(index, run.model.render(eye.cameras[index], float(eye.t[index])))
+        for index in validation_frames(run.frames.indices)
+        for eye in run.eyes
+        if eye.picture(index)[1].any()
     ]
     return float(np.mean(scores)) if scores else math.nan
 

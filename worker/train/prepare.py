@@ -41,9 +41,10 @@ def prepare(setup: Setup) -> Run:
     with timings.measure("start_s"):
         model = start_model(cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device)
     with timings.measure("targets_s"):
-        frames = TrainingFrames(clip, train, scale)
+        frames = [TrainingFrames(eye, train, scale) for eye in setup.teaching_eyes]
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
-    run = Run(setup, model, frames, preset, Schedule(planned=0), densifier=densifier, chosen=chosen)
+    run = Run(setup, model, frames[0], preset, Schedule(planned=0), densifier=densifier, chosen=chosen)
+    run.right = frames[1] if len(frames) > 1 else None
     if setup.device != CPU:
         with setup.clock.paused():
             timings.add("compile_s", warm_up(run, partial(setup.hooks.report_stage, "compile")))

@@ -37,6 +37,7 @@ class Preset:
     sh_degree        of the colour; from 1 on, a degree is added every sh_every iterations
     order            "epochs": every training frame once, shuffled, again and again; "random": drawn each iteration
     frames_a_step    training frames of one iteration, which descends the sum of their losses
+    both_eyes        whether a step takes both eyes of its frames, where the clip has two and options.eyes allows it
     warm_restarts    whether rates rise again when the iterations have doubled, if there are enough for two cycles, and
                      the last models of each are averaged (schedule.py); else rates fall once and nothing is averaged
     min_gain_db      a run with budget_s stops early where doubling its iterations gains less; None: no early stopping
@@ -62,6 +63,7 @@ class Preset:
     sh_every: int
     order: Literal["epochs", "random"]
     frames_a_step: int
+    both_eyes: bool
     warm_restarts: bool
     min_gain_db: float | None
     rates: Rates
@@ -135,6 +137,7 @@ _PAPER = Preset(
     sh_every=500,
     order="random",
     frames_a_step=1,
+    both_eyes=False,
     warm_restarts=False,
     min_gain_db=None,
     rates=_PAPER_RATES,
@@ -181,6 +184,7 @@ _FAST = Preset(
     sh_every=0,
     order="epochs",
     frames_a_step=1,
+    both_eyes=True,
     warm_restarts=True,
     min_gain_db=0.25,
     rates=_FAST_RATES,

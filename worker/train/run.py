@@ -34,7 +34,8 @@ class Run:
 
     setup        clip, split, request, device, hooks, clocks
     model        Gaussians, deformation, Adam's moments
-    frames       targets and cameras
+    frames       targets and cameras of the left eye
+    right        those of the right eye; None where the left eye alone teaches
     preset       rates, loss, order, densification; nothing is left to the scene any more
     schedule     how many iterations, and how the rates fall; iteration: those done
     asked        the length that was asked for, in words; a stored run is resumed only with its own
@@ -51,6 +52,7 @@ class Run:
     schedule: Schedule
     asked: str = ""
     iteration: int = 0
+    right: TrainingFrames | None = None
     average: RunningMean = field(default_factory=RunningMean)
     densifier: Densifier | None = None
     chosen: tuple[Notice, ...] = ()
@@ -65,6 +67,11 @@ class Run:
     def device(self) -> Device:
         """Where the model lies."""
         return self.setup.device
+
+    @property
+    def eyes(self) -> tuple[TrainingFrames, ...]:
+        """The eyes that teach, left first."""
+        return (self.frames,) if self.right is None else (self.frames, self.right)
 
     @property
     def iterations(self) -> int:

@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, field
 
 from contract.wire.options import ReconstructionOptions
-from worker.input.clip import DepthClip, FrameSplit
+from worker.input.clip import DepthClip, Eye, FrameSplit
 from worker.machine.timing import Stopwatch, Timings
 from worker.raster.backend import CPU, Device
 from worker.train.hooks import TrainingHooks
@@ -36,6 +36,12 @@ class Setup:
     clock: Stopwatch = field(default_factory=Stopwatch)
     accepted_at_s: float = field(default_factory=time.time)
     gpu_is_idle: bool = False
+
+    @property
+    def teaching_eyes(self) -> tuple[Eye, ...]:
+        """The eyes to train on, left first."""
+        both = self.options.eyes == "both" and self.preset.both_eyes
+        return self.clip.eyes if both else self.clip.eyes[:1]
 
     @property
     def fixed_iterations(self) -> int | None:

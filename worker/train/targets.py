@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
 from worker.input.camera import Intrinsics
-from worker.input.clip import DepthClip
+from worker.input.clip import DepthClip, Eye
 from worker.model.metrics import COVERED_ALPHA, psnr_tissue
 from worker.raster import Camera
 from worker.raster.cpu import padded
@@ -54,33 +54,33 @@ def solid_depth_mm(depth: NDArray[np.float32], alpha: NDArray[np.float32], scale
 
 
 class TrainingFrames:
-    """Colour, tissue, inverse depth and camera of every training frame."""
+    """Colour, tissue, inverse depth and camera of every training frame of one eye."""
 
-    def __init__(self, clip: DepthClip, train: Sequence[int], scale: float) -> None:
+    def __init__(self, eye: Eye, train: Sequence[int], scale: float) -> None:
         self.indices = list(train)
         self.scale = scale
         self._row = {index: row for row, index in enumerate(self.indices)}
-        height, width = clip.rgb.shape[1:3]
+        height, width = eye.rgb.shape[1:3]
         self._width, stride = width, padded(width)
         count = len(self.indices)
         self._rgb = np.zeros((count, 3, height, stride), np.uint8)
         self._weight = np.zeros((count, height, stride), np.uint8)
         self._inverse_depth = np.zeros((count, height, stride), np.float32)
-        self.t = clip.t
+        self.t = eye.t
         self.cameras = {
-            index: camera_vector(camera_in_units(clip.intrinsics, clip.world_from_camera[index], scale))
-            for index in range(clip.frame_count)
+            index: camera_vector(camera_in_units(eye.intrinsics, eye.world_from_camera[index], scale))
+            for index in range(eye.frame_count)
         }
         self._frames: dict[int, TrainingFrame] = {}
         for row, index in enumerate(self.indices):
-            tissue, depth_mm = clip.tissue[index], clip.depth_mm[index]
+            tissue, depth_mm = eye.tissue[index], eye.depth_mm[index]
             measured = tissue & (depth_mm > 0)
-            self._rgb[row, :, :, :width] = clip.rgb[index].transpose(2, 0, 1)
+            self._rgb[row, :, :, :width] = eye.rgb[index].transpose(2, 0, 1)
             self._weight[row, :, :width] = np.where(tissue, np.uint8(255), np.uint8(0))
             np.divide(1 / scale, depth_mm, out=self._inverse_depth[row, :, :width], where=measured)
             target = Target(self._rgb[row].ravel(), self._weight[row].ravel(), self._inverse_depth[row].ravel())
             counts = int(tissue.sum()), int(measured.sum())
-            self._frames[index] = TrainingFrame(self.cameras[index], float(clip.t[index]), target, *counts)
+            self._frames[index] = TrainingFrame(self.cameras[index], float(self.t[index]), target, *counts)
 
     def frame(self, index: int) -> TrainingFrame:
         """Frame `index` as a training step needs it: views of the arrays, the same object every time."""
@@ -96,7 +96,7 @@ class TrainingFrames:
         return psnr_tissue(image[:3].transpose(1, 2, 0), *self.picture(index))
 
     def digest(self) -> str:
-        """SHA-256 of everything that training reads of the clip; equal for two runs on the same frames."""
+        """SHA-256 of everything that training reads of the eye; equal for two runs on the same frames."""
         found = hashlib.sha256(f"{self.indices} {self.scale!r} {self._rgb.shape}".encode())
         cameras = np.stack([self.cameras[index] for index in self.indices])
         for values in (self._rgb, self._weight, self._inverse_depth, cameras):

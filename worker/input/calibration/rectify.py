@@ -33,7 +33,8 @@ class RectifiedClip:
 
     pairs yields rectified (left, right) RGB uint8 frames, remapped as they are asked for. tissue is [T, H, W] bool in
     the pixels of the rectified left eye (a read-only view when no masks were given), False where the rectified image
-    reaches beyond the recorded one. intrinsics are the left eye's.
+    reaches beyond the recorded one. tissue_right is the same of the right eye, None if no masks show it. intrinsics are
+    the left eye's.
 
     equal_rows_px is y_right - y_left in these frames of points that lay on one row in the recorded ones: about what is
     measured here when frames that had been rectified were rectified again.
@@ -49,6 +50,7 @@ class RectifiedClip:
     assumptions: tuple[Notice, ...] = ()
     warnings: tuple[Notice, ...] = ()
     equal_rows_px: float = 0.0
+    tissue_right: NDArray[np.bool_] | None = None
 
 
 def rectify(clip: StereoClip, calibration: StereoCalibration) -> RectifiedClip:
@@ -103,6 +105,7 @@ def _pass_through(clip: StereoClip, calibration: RectifiedCalibration) -> Rectif
         frame_times_s=clip.frame_times_s,
         assumptions=_assumptions(clip, c, "frames: rectified already, as the calibration says"),
         warnings=clip.warnings,
+        tissue_right=clip.tissue_right,
     )
 
 
@@ -130,13 +133,14 @@ def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
         baseline_mm=float(-right_p[0, 3] / right_p[0, 0]),
         disparity_offset_px=float(left_p[0, 2] - right_p[0, 2]),
         pairs=_RemappedPairs(clip.pairs, left_maps, right_maps),
-        tissue=_warp_tissue(clip, left_maps),
+        tissue=_all_tissue(clip) if clip.tissue is None else _warp_tissue(clip.tissue, left_maps),
         frame_times_s=clip.frame_times_s,
         assumptions=_assumptions(clip, calibration, "frames: as recorded, rectified by the calibration"),
         warnings=clip.warnings + _zoom_warning(float(left_p[0, 0]) / calibration.left.fx_px),
         equal_rows_px=float(
             np.median(_rows(size, *cameras[1], right_r, right_p) - _rows(size, *cameras[0], left_r, left_p))
         ),
+        tissue_right=None if clip.tissue_right is None else _warp_tissue(clip.tissue_right, right_maps),
     )
 
 
@@ -158,12 +162,10 @@ def _matrix(eye: RawEye) -> NDArray[np.float64]:
     return np.array([[eye.fx_px, 0.0, eye.cx_px], [0.0, eye.fy_px, eye.cy_px], [0.0, 0.0, 1.0]])
 
 
-def _warp_tissue(clip: StereoClip, maps: Maps) -> NDArray[np.bool_]:
+def _warp_tissue(tissue: NDArray[np.bool_], maps: Maps) -> NDArray[np.bool_]:
     """Tissue in rectified pixels, nearest neighbour; beyond the recorded image there is none."""
-    if clip.tissue is None:
-        return _all_tissue(clip)
-    warped = np.empty(clip.tissue.shape, dtype=np.bool_)
-    for i, mask in enumerate(clip.tissue):
+    warped = np.empty(tissue.shape, dtype=np.bool_)
+    for i, mask in enumerate(tissue):
         warped[i] = cv2.remap(mask.astype(np.uint8), *maps, cv2.INTER_NEAREST, borderValue=0) > 0
     return warped
 

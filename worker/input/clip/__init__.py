@@ -3,11 +3,12 @@
 from contract.intake.limits import ClipLimits
 from worker.input.clip.opening import find_calibration, open_clip
 from worker.input.clip.split import FrameSplit, held_out_frames, split_frames, spread
-from worker.input.clip.types import DepthClip, StereoClip
+from worker.input.clip.types import DepthClip, Eye, StereoClip
 
 __all__ = [
     "ClipLimits",
     "DepthClip",
+    "Eye",
     "FrameSplit",
     "StereoClip",
     "find_calibration",

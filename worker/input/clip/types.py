@@ -1,4 +1,4 @@
-"""The two kinds of clip that the front of the pipeline gives.
+"""The two kinds of clip that the front of the pipeline gives, and an eye of a clip with depth.
 
 Symbols of the whole worker: T frames, H W pixels (rows, columns), N Gaussians, B bases, C = 10 deformed channels.
 """
@@ -29,6 +29,7 @@ class StereoClip:
     """A stereo clip as recorded, not yet rectified. Frames are decoded lazily, RGB uint8.
 
     tissue is [T, H, W] bool (True = tissue) in the pixels of the recorded left eye, or None without masks.
+    tissue_right is the same of the right eye, or None if the masks show the left eye alone.
     frame_times_s is [T] float64, from the container, or i / 30 if it has none.
     """
 
@@ -40,18 +41,18 @@ class StereoClip:
     frame_times_s: NDArray[np.float64]
     assumptions: tuple[Notice, ...] = ()
     warnings: tuple[Notice, ...] = ()
+    tissue_right: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
-class DepthClip:
-    """Rectified left frames with metric depth, tissue mask and camera. Training reads nothing else.
+class Eye:
+    """The frames of one rectified eye with metric depth, tissue mask and camera.
 
     rgb              [T, H, W, 3] uint8
     tissue           [T, H, W]    bool, True = tissue (tools, labels and borders are False)
     depth_mm         [T, H, W]    float32, camera z in mm, 0 = invalid
     depth_confidence [T, H, W]    uint8, 255 = left-right consistent and textured, 0 where depth is invalid
-    world_from_camera [T, 4, 4]   float64, mm, OpenCV axes; the world is the camera of frame 0
-    frame_times_s    [T]          float64, seconds from frame 0
+    world_from_camera [T, 4, 4]   float64, mm, OpenCV axes; the world is the left camera of frame 0
     """
 
     rgb: NDArray[np.uint8]
@@ -60,10 +61,6 @@ class DepthClip:
     depth_confidence: NDArray[np.uint8]
     intrinsics: Intrinsics
     world_from_camera: NDArray[np.float64]
-    frame_times_s: NDArray[np.float64]
-    assumptions: tuple[Notice, ...] = ()
-    warnings: tuple[Notice, ...] = ()
-    measurements: dict[str, float] = field(default_factory=dict)  # e.g. vertical misalignment in px, for the report
 
     @property
     def frame_count(self) -> int:
@@ -73,3 +70,23 @@ class DepthClip:
     def t(self) -> NDArray[np.float64]:
         """Model time of each frame, t_i = i / T, in [0, 1)."""
         return np.arange(self.frame_count) / self.frame_count
+
+
+@dataclass(frozen=True)
+class DepthClip(Eye):
+    """The left eye, when its frames were taken, and the right eye if there is one. Training reads nothing else.
+
+    frame_times_s    [T]          float64, seconds from frame 0
+    right            the same moments and size; None for a clip of one eye
+    """
+
+    frame_times_s: NDArray[np.float64]
+    right: Eye | None = None
+    assumptions: tuple[Notice, ...] = ()
+    warnings: tuple[Notice, ...] = ()
+    measurements: dict[str, float] = field(default_factory=dict)  # e.g. vertical misalignment in px, for the report
+
+    @property
+    def eyes(self) -> tuple[Eye, ...]:
+        """Left, and right if there is one."""
+        return (self,) if self.right is None else (self, self.right)

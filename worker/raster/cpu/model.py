@@ -97,10 +97,14 @@ class CpuModel:
         """[N] whether any of the last step's frames could see each Gaussian."""
         return torch.from_numpy(self._seen[: self.count].copy())
 
-    def project(self, camera: NDArray[np.float64], t: float, sh_degree: int, *, trains: bool = False) -> None:
-        """The Gaussians at time t on this camera's image. Where trains, a step of Adam follows."""
+    def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
+        """The Gaussians at time t on this camera's image."""
+        self.motion.deform(self.canonical, t, self.state)
+        self._project_state(camera, sh_degree)
+
+    def _project_state(self, camera: NDArray[np.float64], sh_degree: int) -> None:
+        """The Gaussians of the state on this camera's image."""
         self.rasterizer = self._rasterizer(*image_size(camera))
-        self.motion.deform(self.canonical, t, self.state, trains=trains)
         if sh_degree == 0:
             np.multiply(self.state[COLOUR], np.float32(SH_C0), out=self.colour)
             self.colour += np.float32(0.5)
@@ -138,17 +142,28 @@ class CpuModel:
         if len(frames) != len(self._gradients):
             self._allocate(len(frames))
         self._seen[:] = False
-        sums = [self._backward(place, frame, loss, sh_degree) for place, frame in enumerate(frames)]
-        self.motion.update(self._v_state, [frame.t for frame in frames], rates, iteration)
-        self._add_frames()
+        sums = [
+            self._backward(place, frame, loss, sh_degree, moved=place > 0 and frames[place - 1].t == frame.t)
+            for place, frame in enumerate(frames)
+        ]
+        times = self._add_moments([frame.t for frame in frames])
+        self.motion.update(self._v_state[: len(times)], times, rates, iteration)
+        self._add_frames(len(times))
         self.update_canonical(self._gradients[0], rates, iteration, sh_degree)
         colour_l1, depth_l1, squared_error, holes = np.sum(sums, axis=0).tolist()
         return StepSums(colour_l1, depth_l1, squared_error, holes, int(np.count_nonzero(self._seen[: self.count])))
 
-    def _backward(self, place: int, frame: TrainingFrame, loss: LossSettings, sh_degree: int) -> NDArray[np.float64]:
-        """The gradients of a frame's loss, to its place among those of the step; the loss's sums (StepSums)."""
+    def _backward(
+        self, place: int, frame: TrainingFrame, loss: LossSettings, sh_degree: int, *, moved: bool
+    ) -> NDArray[np.float64]:
+        """The gradients of a frame's loss, to its place among those of the step; the loss's sums (StepSums).
+
+        moved: the frame before was of the same moment, so that the state is that of this one already.
+        """
         gradients = self._gradients[place]
-        self.project(frame.camera, frame.t, sh_degree, trains=True)
+        if not moved:
+            self.motion.deform(self.canonical, frame.t, self.state, trains=True)
+        self._project_state(frame.camera, sh_degree)
         self.rasterizer.loss_backward(frame.target, frame.loss_settings(loss), gradients)
         if sh_degree == 0:
             np.multiply(gradients.colour, np.float32(SH_C0), out=gradients.state[COLOUR])
@@ -162,11 +177,27 @@ class CpuModel:
         sums: NDArray[np.float64] = self.rasterizer.statistics.sum(0, dtype=np.float64)
         return sums
 
-    def _add_frames(self) -> None:
-        """Make the first frame's gradients those of all, frame by frame in order, and its norms the largest."""
+    def _add_moments(self, times: Sequence[float]) -> list[float]:
+        """Add up the states' gradients of neighbouring frames of one moment, for they share its state.
+
+        Returns the moments. Their gradients are the first of _v_state.
+        """
+        moments: list[float] = []
+        for place, t in enumerate(times):
+            if moments and moments[-1] == t:
+                self._v_state[len(moments) - 1] += self._v_state[place]
+                continue
+            if place > len(moments):
+                self._v_state[len(moments)] = self._v_state[place]
+            moments.append(t)
+        return moments
+
+    def _add_frames(self, moments: int) -> None:
+        """Make the first frame's gradients those of all, in order, and its norms the largest."""
         total = self._gradients[0]
+        for v_state in self._v_state[1:moments]:
+            total.state += v_state
         for place, each in enumerate(self._gradients[1:], start=1):
-            total.state += each.state
             total.opacity_logit += each.opacity_logit
             np.maximum(total.mean2d_norm, each.mean2d_norm, out=total.mean2d_norm)
             self._v_rest[0] += self._v_rest[place]
