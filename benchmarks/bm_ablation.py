@@ -28,7 +28,7 @@ from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS, Preset
-from worker.train.scoring import frame_renderer, held_out_psnr, sample_frames
+from worker.train.scoring import frame_renderer, held_out_score, sample_frames
 from worker.train.setup import Setup
 
 FIELDS = (
@@ -106,8 +106,8 @@ def measure(
     options = ReconstructionOptions(iterations=iterations, seed=seed)
     run = prepare(Setup(clip, split, CHANGES[change], options))
     render = frame_renderer(run)
-    start = held_out_psnr(run, render)
-    train(run, run.setup.clock, lambda: held_out_psnr(run, render), TrainingHooks())
+    start = held_out_score(run).left_db
+    train(run, run.setup.clock, lambda: held_out_score(run), TrainingHooks())
     trained = [psnr_tissue(render(i).rgb, clip.rgb[i], clip.tissue[i]) for i in sample_frames(split.train)]
     _, deformation = run.model.export()
     row: dict[str, object] = {

@@ -10,6 +10,7 @@ lost on the judged training frames and on all held-out ones, and the seconds to 
 from __future__ import annotations
 
 import argparse
+import math
 import tempfile
 import time
 from pathlib import Path
@@ -27,7 +28,7 @@ from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
 from worker.train.rate_distortion import quantize_scene
-from worker.train.scoring import frame_renderer, held_out_psnr
+from worker.train.scoring import HeldOutScore, held_out_score
 from worker.train.setup import Setup
 
 FIELDS = (
@@ -60,13 +61,13 @@ def rows_of(path: Path | None, iterations: int, tolerances_db: list[float]) -> l
         raise SystemExit(f"{path} has no depth; give a folder in the EndoNeRF layout.")
     split = split_frames(clip)
     run = prepare(Setup(clip, split, PRESETS["fast"], ReconstructionOptions(iterations=iterations)))
-    train(run, Stopwatch(), lambda: float("nan"), TrainingHooks())
+    train(run, Stopwatch(), lambda: HeldOutScore(math.nan, math.nan), TrainingHooks())
     scene = scene_of(run)
-    exact_db = held_out_psnr(run, frame_renderer(run))
+    exact_db = held_out_score(run).left_db
     rows: list[dict[str, object]] = []
     for tolerance_db in tolerances_db:
         start = time.perf_counter()
-        quantized = quantize_scene(scene, clip, run.frames, tolerance_db)
+        quantized = quantize_scene(scene, [run.frames], tolerance_db)
         shrink_s = time.perf_counter() - start
         if quantized is None:
             continue
@@ -76,7 +77,7 @@ def rows_of(path: Path | None, iterations: int, tolerances_db: list[float]) -> l
             loaded = load_scene(Path(folder))
             load_s = time.perf_counter() - start
             scene_bytes, manifest_bytes = ((Path(folder) / name).stat().st_size for name in (SCENE_FILE, MANIFEST_FILE))
-        stored_db = held_out_psnr(run, frame_renderer(run, model_of(loaded)))
+        stored_db = held_out_score(run, model_of(loaded)).left_db
         rows.append(
             {
                 "clip": path.name if path else "phantom", "iterations": iterations, "gaussians": len(loaded.gaussians),

@@ -12,6 +12,7 @@ before.
 from __future__ import annotations
 
 import argparse
+import math
 import tempfile
 import threading
 import time
@@ -38,6 +39,7 @@ from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
+from worker.train.scoring import HeldOutScore
 from worker.train.setup import Setup
 
 CLIP = PhantomSettings(width=640, height=512, frames=24)
@@ -116,7 +118,7 @@ def trained(clip: DepthClip, iterations: int, pace: Pace | None) -> Figures:
             viewer.start()
             beside.callback(viewer.join)
             beside.callback(end.set)
-        train(run, Stopwatch(), lambda: float("nan"), hooks, copy)
+        train(run, Stopwatch(), lambda: HeldOutScore(math.nan, math.nan), hooks, copy)
         figures.train_s = time.perf_counter() - start
     return figures
 

@@ -27,6 +27,7 @@ from worker.raster.backend import CPU, Device, choose_device, device_for, examin
 from worker.raster.cpu import compile_kernels
 from worker.report.baselines import copy_baselines
 from worker.report.quality import Training, build_report, measure
+from worker.report.right_eye import measure_right
 from worker.report.visibility import drop_strays, seen_share
 from worker.scene.checkpoint import save_scene
 from worker.scene.compact import compile_coder
@@ -42,7 +43,7 @@ from worker.train.rate_distortion import QuantizedScene, quantize_scene
 from worker.train.request import ReconstructionRequest
 from worker.train.resume import resume, save_run
 from worker.train.run import Run, write_curve
-from worker.train.scoring import FrameRenderer, frame_renderer, held_out_psnr, sample_frames
+from worker.train.scoring import FrameRenderer, frame_renderer, held_out_score, sample_frames
 from worker.train.setup import Setup
 
 VERSIONED = ("intrasplat", "torch", "numba")
@@ -138,8 +139,7 @@ def match_eyes(
 def optimise(run: Run) -> None:
     """Train run to its last iteration; score held-out frames and offer snapshots on the way."""
     clock, started_s = run.setup.clock, run.setup.clock.elapsed_s
-    render = frame_renderer(run)
-    train(run, clock, lambda: held_out_psnr(run, render), run.setup.hooks, copy_scene=lambda: snapshot_of(run))
+    train(run, clock, lambda: held_out_score(run), run.setup.hooks, copy_scene=lambda: snapshot_of(run))
     run.setup.timings.seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
 
 
@@ -149,15 +149,14 @@ def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
     with run.setup.timings.measure("finish_s"):
         scene = scene_of(run)
     with run.setup.timings.measure("shrink_s"):
-        quantized = quantize_scene(scene, run.setup.clip, run.frames, device=run.device)
+        quantized = quantize_scene(scene, run.eyes, device=run.device)
     return (quantized.scene if quantized else scene), quantized
 
 
 def scene_of(run: Run) -> Scene:
     """The scene of a trained run; strays are removed from its model first."""
-    drop_strays(run.model, run.setup.clip, run.frames)
-    seen = torch.from_numpy(seen_share(run.model, run.setup.clip, run.frames))
-    return dataclasses.replace(snapshot_of(run), seen=seen)
+    drop_strays(run.model, run.eyes)
+    return dataclasses.replace(snapshot_of(run), seen=torch.from_numpy(seen_share(run.model, run.eyes)))
 
 
 def snapshot_of(run: Run) -> Scene:
@@ -190,15 +189,18 @@ def assess(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Report:
     are over at most sixteen of them.
     """
     clip, split, timings = run.setup.clip, run.setup.split, run.setup.timings
-    render = _reporting(run, frame_renderer(run, model_of(scene, run.setup.device) if quantized else None))
+    model = model_of(scene, run.setup.device) if quantized else run.model
+    render = _reporting(run, frame_renderer(run, model))
     with timings.measure("score_s"):
         held_out = measure(clip, split.held_out, render)
+        right = measure_right(clip, split.held_out, frame_renderer(run, model, clip.right))
         trained = measure(clip, sample_frames(split.train), render)
         baselines = copy_baselines(clip, split.train, split.held_out)
     timings.seconds["t_post_s"] = time.time() - run.setup.accepted_at_s
-    report = build_report(clip, split, held_out, trained, baselines, _training(run, scene, quantized))
+    report = build_report(clip, split, held_out, right, trained, baselines, _training(run, scene, quantized))
     if report.psnr_tissue_db is not None and run.curve:
-        run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=report.psnr_tissue_db)
+        left_db, right_db = report.psnr_tissue_db, report.psnr_right_db
+        run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=left_db, psnr_right_db=right_db)
     run.setup.hooks.on_progress(Progress("score", 1.0, run.iteration, run.iterations, report.psnr_tissue_db))
     return report
 

@@ -30,7 +30,7 @@ from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS, Preset
 from worker.train.run import CurvePoint, Run
-from worker.train.scoring import frame_renderer, held_out_psnr
+from worker.train.scoring import held_out_score
 from worker.train.setup import Setup
 
 STAGES = ("motion_s", "capacity_s", "fusion_s", "start_s", "targets_s", "optimise_s", "compile_s")
@@ -126,9 +126,9 @@ class Trials:
         hooks = TrainingHooks(should_stop=lambda: self._part.left_s < 4)
         run = prepare(Setup(self._clip, split, preset, options, device, hooks))
         clock, seconds = run.setup.clock, run.setup.timings.seconds
-        render, begun_s, note = frame_renderer(run), clock.elapsed_s, ""
+        begun_s, note = clock.elapsed_s, ""
         try:
-            train(run, clock, lambda: held_out_psnr(run, render), hooks)
+            train(run, clock, lambda: held_out_score(run), hooks)
         except Cancelled:
             run.model.wait()
             note = f"cut short after {run.iteration} of {run.iterations} iterations"

@@ -93,6 +93,7 @@ class NoticeCode(StrEnum):
     DEPTH_DISAGREES = "depth_disagrees"
     DEPTH_NOT_COMPARED = "depth_not_compared"
     GENERALISATION_GAP = "generalisation_gap"
+    RIGHT_EYE_LOW = "right_eye_low"
     GPU_IDLE = "gpu_idle"
     HELD_OUT_REPEATED = "held_out_repeated"
     HELD_OUT_SCORE_LOW = "held_out_score_low"
@@ -127,6 +128,8 @@ class FrameScore(Model):
     coverage: float | None
     baseline_blend_db: float | None
     baseline_flow_db: float | None
+    psnr_right_db: float | None = None
+    """None for a clip of one eye, too"""
 
 
 class JobError(Model):
@@ -151,6 +154,8 @@ class JobOptions(Model):
     """frames to measure quality on, never to train on: every8, blocks8, none, or frame numbers such as 1,9,17"""
     preset: str = "fast"
     """instant, fast, quality and small are ours; paper is the method as published"""
+    eyes: str = "both"
+    """the eyes of a stereo clip to train on; with left, the right eye only judges"""
     iterations: int | None = None
     """exactly how many steps to train; not with budget_s"""
     budget_s: float | None = None
@@ -211,6 +216,16 @@ class Report(Model):
     """versions of intrasplat and of what it computes with"""
     psnr_tissue_db: float | None
     psnr_paper_db: float | None
+    psnr_clear_db: float | None = None
+    """psnr_tissue_db without highlights"""
+    psnr_right_db: float | None = None
+    """psnr_tissue_db of the right eye's frames, over what the left eye sees, too; None for one eye"""
+    psnr_right_clear_db: float | None = None
+    """the same without highlights"""
+    baseline_warp_db: float | None = None
+    """psnr_right_db of the left eye's picture warped by stereo depth"""
+    baseline_warp_clear_db: float | None = None
+    """the same without highlights"""
     ssim: float | None
     baseline_blend_db: float | None
     """psnr_tissue_db of blending the nearest training frames"""
@@ -285,6 +300,8 @@ class GivenOptions(TypedDict, total=False):
         "without_mapf",
     ]
     """instant, fast, quality and small are ours; paper is the method as published"""
+    eyes: Literal["left", "both"]
+    """the eyes of a stereo clip to train on; with left, the right eye only judges"""
     iterations: Annotated[int, Field(le=1000000, ge=1)] | None
     """exactly how many steps to train; not with budget_s"""
     budget_s: Annotated[float, Field(gt=0, le=7200)] | None

@@ -70,6 +70,7 @@ class NoticeCode(StrEnum):
     DEPTH_DISAGREES = "depth_disagrees"
     DEPTH_NOT_COMPARED = "depth_not_compared"
     GENERALISATION_GAP = "generalisation_gap"
+    RIGHT_EYE_LOW = "right_eye_low"
     GPU_IDLE = "gpu_idle"
     HELD_OUT_REPEATED = "held_out_repeated"
     HELD_OUT_SCORE_LOW = "held_out_score_low"

@@ -25,6 +25,7 @@ class FrameScore(BaseModel):
     coverage: float | None
     baseline_blend_db: float | None
     baseline_flow_db: float | None
+    psnr_right_db: float | None = Field(default=None, description="None for a clip of one eye, too")
 
 
 class Report(BaseModel):
@@ -43,6 +44,16 @@ class Report(BaseModel):
 
     psnr_tissue_db: float | None
     psnr_paper_db: float | None
+    psnr_clear_db: float | None = Field(default=None, description="psnr_tissue_db without highlights")
+    psnr_right_db: float | None = Field(
+        default=None,
+        description="psnr_tissue_db of the right eye's frames, over what the left eye sees, too; None for one eye",
+    )
+    psnr_right_clear_db: float | None = Field(default=None, description="the same without highlights")
+    baseline_warp_db: float | None = Field(
+        default=None, description="psnr_right_db of the left eye's picture warped by stereo depth"
+    )
+    baseline_warp_clear_db: float | None = Field(default=None, description="the same without highlights")
     ssim: float | None
     baseline_blend_db: float | None = Field(description="psnr_tissue_db of blending the nearest training frames")
     baseline_flow_db: float | None = Field(description="the same, each warped half-way by optical flow first")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
@@ -16,7 +17,7 @@ from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS, Preset
 from worker.train.run import Run
-from worker.train.scoring import frame_renderer
+from worker.train.scoring import HeldOutScore, frame_renderer
 from worker.train.setup import Setup
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 12
@@ -66,7 +67,7 @@ def prepared_on(
 
 def trained(run: Run, hooks: TrainingHooks | None = None) -> Run:
     """The run after its last step, nothing scored."""
-    train(run, Stopwatch(), lambda: float("nan"), hooks or TrainingHooks())
+    train(run, Stopwatch(), lambda: HeldOutScore(math.nan, math.nan), hooks or TrainingHooks())
     return run
 
 

@@ -375,7 +375,7 @@ def test_the_pipeline_and_the_loop_make_the_same_model(clip: Path, whole: Whole)
     assert isinstance(opened, DepthClip)
     split = split_frames(opened)
     loop = trained(prepared_on(opened, split, "fast", iterations=ITERATIONS))
-    quantized = quantize_scene(scene_of(loop), opened, loop.frames)
+    quantized = quantize_scene(scene_of(loop), loop.eyes)
     assert quantized is not None
     assert tensor_bits(whole("fast")[1]) == {
         name: each.numpy().tobytes() for name, each in quantized.scene.tensors().items()

@@ -28,7 +28,7 @@ from worker.fusion.points import (
     taken,
 )
 from worker.fusion.published import motion_mask, published_fusion
-from worker.input.clip.types import DepthClip
+from worker.input.clip.types import DepthClip, Eye
 from worker.motion.tracks import Moved
 
 __all__ = [
@@ -71,12 +71,19 @@ class FusionSettings:
 
 
 def fuse(
-    clip: DepthClip, train: Sequence[int], settings: FusionSettings, *, seed: int, moved: Moved | None = None
+    clip: DepthClip,
+    train: Sequence[int],
+    settings: FusionSettings,
+    *,
+    seed: int,
+    moved: Moved | None = None,
+    right: Eye | None = None,
 ) -> PointCloud:
     """The starting cloud of the training frames `train` (clip indices, rising). Same arguments, same bits.
 
     Args:
         moved: for "fill", the tissue's displacement since the first training frame; None: it rests.
+        right: for "fill", the right eye, where it teaches too.
 
     Raises:
         InputError: no training frame has valid depth on tissue.
@@ -90,7 +97,7 @@ def fuse(
     # If the first frame has no depth, the first frame with depth takes its place.
     frames = [first, *(index for index in train if index != first)]
     if settings.mode == "fill":
-        return fill(clip, frames, settings.stride, moved)
+        return fill(clip, frames, settings.stride, moved, right)
     random = np.random.default_rng(seed)
     parts = [points_at(clip, first, measured_pixels(clip, first))]
     if settings.mode == "paper":

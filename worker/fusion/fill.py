@@ -28,7 +28,7 @@ from worker.fusion.points import (
 )
 from worker.input.camera import Intrinsics, unproject_at
 from worker.input.clip.split import spread
-from worker.input.clip.types import DepthClip
+from worker.input.clip.types import DepthClip, Eye
 from worker.motion.tracks import Moved
 
 EDGE_PX = 5
@@ -41,11 +41,14 @@ HIDDEN, COMPLETED, MEASURED, CLEAR = range(4)
 """How well a frame shows a cell, rising: not; depth completed; depth measured; depth confident, far from masks."""
 
 
-def fill(clip: DepthClip, frames: Sequence[int], stride: int, moved: Moved | None) -> PointCloud:
+def fill(
+    clip: DepthClip, frames: Sequence[int], stride: int, moved: Moved | None, right: Eye | None = None
+) -> PointCloud:
     """A grid on the first frame's tissue; then each cell that it does not show, from the frame that shows it best.
 
     Of frames that show a cell equally well, the earliest is taken. A cell is k x k pixels. Its point comes from the
-    middle pixel, or from the pixel to which the tissue in the middle has moved.
+    middle pixel, or from the pixel to which the tissue in the middle has moved. What only the right eye sees comes
+    from its frames.
     """
     first, later = frames[0], frames[1:]
     coverage = _Coverage(clip.intrinsics, stride)
@@ -54,17 +57,20 @@ def fill(clip: DepthClip, frames: Sequence[int], stride: int, moved: Moved | Non
         parts += _along_tracks(clip, first, later, stride, moved)
         coverage.add_points(parts[1:])
         later = [index for index in later if not same_pose(clip, index, first)]
+    views: list[tuple[Eye, int]] = [(clip, index) for index in later]
+    if right is not None:
+        views += [(right, index) for index in frames]
     for least in (CLEAR, MEASURED, COMPLETED):
-        for index in later:
-            pixels = coverage.open_pixels(clip.world_from_camera[index])
+        for eye, index in views:
+            pixels = coverage.open_pixels(eye, index)
             if pixels.size:
-                pixels = pixels[_shown(clip, index, pixels) >= least]
+                pixels = pixels[_shown(eye, index, pixels) >= least]
             if pixels.size:
-                parts.append(coverage.add(clip, index, pixels))
+                parts.append(coverage.add(eye, index, pixels))
     return concatenated(parts)
 
 
-def _shown(clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> NDArray[np.uint8]:
+def _shown(clip: Eye, index: int, pixels: NDArray[np.intp]) -> NDArray[np.uint8]:
     """[M] how well a frame shows its pixels (flat, [M]). A frame without any depth shows none."""
     depth_mm, tissue = clip.depth_mm[index], clip.tissue[index]
     on_tissue = tissue.reshape(-1)[pixels]
@@ -176,25 +182,26 @@ class _Coverage:
     """Which cells of a view the points taken so far already cover."""
 
     def __init__(self, intrinsics: Intrinsics, stride: int) -> None:
-        self._intrinsics, self._stride = intrinsics, stride
+        """intrinsics: of any eye; all have one size."""
+        self._width, self._stride = intrinsics.width, stride
         middle_row, middle_column = (_middles(size, 0, stride) for size in (intrinsics.height, intrinsics.width))
         self._shape = (middle_row.size, middle_column.size)
         self.pixels: NDArray[np.intp] = (middle_row[:, None] * intrinsics.width + middle_column).reshape(-1)
         """Flat index of each cell's middle pixel."""
         self._covered = np.zeros(self.pixels.size, dtype=np.bool_)
-        self._pose: NDArray[np.float64] | None = None
+        self._view: tuple[Intrinsics, NDArray[np.float64]] | None = None
         self._points_mm: list[NDArray[np.float32]] = []
 
-    def open_pixels(self, world_from_camera: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Middle pixels of the cells that no point covers as seen from this pose."""
-        self._look_from(world_from_camera)
+    def open_pixels(self, eye: Eye, index: int) -> NDArray[np.intp]:
+        """Middle pixels of the cells that no point covers as seen by this eye in this frame."""
+        self._look_from(eye, index)
         return self.pixels[~self._covered]
 
-    def add(self, clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> PointCloud:
+    def add(self, eye: Eye, index: int, pixels: NDArray[np.intp]) -> PointCloud:
         """The points of these middle pixels of one frame; from now on they cover their cells."""
-        self._look_from(clip.world_from_camera[index])
-        cloud = points_at(clip, index, pixels)
-        rows, columns = np.divmod(pixels, self._intrinsics.width)
+        self._look_from(eye, index)
+        cloud = points_at(eye, index, pixels)
+        rows, columns = np.divmod(pixels, self._width)
         self._covered[rows // self._stride * self._shape[1] + columns // self._stride] = True
         self._points_mm.append(cloud.points_mm)
         return cloud
@@ -203,14 +210,15 @@ class _Coverage:
         """Count these points as covering the cells that they project into, from any pose."""
         self._points_mm += [cloud.reference_mm for cloud in clouds]
 
-    def _look_from(self, world_from_camera: NDArray[np.float64]) -> None:
-        if self._pose is not None and np.array_equal(self._pose, world_from_camera):
+    def _look_from(self, eye: Eye, index: int) -> None:
+        view = eye.intrinsics, eye.world_from_camera[index]
+        if self._view is not None and self._view[0] == view[0] and np.array_equal(self._view[1], view[1]):
             return
-        self._pose = world_from_camera
+        self._view = view
         if not self._points_mm:
             return
         points_mm = np.concatenate(self._points_mm)
-        cells, _ = cells_of(points_mm, self._intrinsics, world_from_camera, self._stride)
+        cells, _ = cells_of(points_mm, *view, self._stride)
         covered = np.zeros(self._shape, dtype=np.uint8)
         covered.reshape(-1)[cells] = 1
         # Seen from another pose the grid is uneven: a gap of one cell between points is not a hole.

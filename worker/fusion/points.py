@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from worker.fusion.complete import complete_depth
 from worker.input.camera import Intrinsics, to_camera, unproject
-from worker.input.clip.types import DepthClip
+from worker.input.clip.types import Eye
 
 COMPLETED_CONFIDENCE = 0.1
 """Confidence of a point with completed depth: above 0, because its position in the image is known."""
@@ -43,12 +43,12 @@ class PointCloud:
         return len(self.points_mm)
 
 
-def is_measured(clip: DepthClip, index: int) -> NDArray[np.bool_]:
+def is_measured(clip: Eye, index: int) -> NDArray[np.bool_]:
     """[H, W] tissue with valid depth."""
     return np.asarray(clip.tissue[index] & (clip.depth_mm[index] > 0))
 
 
-def same_pose(clip: DepthClip, index: int, other: int) -> bool:
+def same_pose(clip: Eye, index: int, other: int) -> bool:
     """Whether both frames have the same camera pose."""
     return np.array_equal(clip.world_from_camera[index], clip.world_from_camera[other])
 
@@ -68,12 +68,12 @@ def cells_of(
     return cells, in_front[visible]
 
 
-def measured_pixels(clip: DepthClip, index: int) -> NDArray[np.intp]:
+def measured_pixels(clip: Eye, index: int) -> NDArray[np.intp]:
     """Flat indices of the frame's tissue pixels with valid depth."""
     return np.flatnonzero(is_measured(clip, index))
 
 
-def points_at(clip: DepthClip, index: int, pixels: NDArray[np.intp]) -> PointCloud:
+def points_at(clip: Eye, index: int, pixels: NDArray[np.intp]) -> PointCloud:
     """The points of one frame's tissue pixels (flat indices). Depth that was not measured is completed."""
     depth_mm = clip.depth_mm[index].reshape(-1)[pixels]
     measured = depth_mm > 0

@@ -21,6 +21,8 @@ SSIM_SIGMA_PX = 1.5
 SSIM_WINDOW_PX = 11
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 """Stabilisers for a data range of 1 (Wang et al., 2004)."""
+HIGHLIGHT_LEVEL, HIGHLIGHT_PX = 0.6, 7
+"""A pixel whose least channel exceeds this is a highlight, and with it a square of so many pixels around it."""
 COVERED_ALPHA = 0.5
 """Least sum of blending weights at which a pixel counts as covered and its depth as valid."""
 
@@ -33,6 +35,16 @@ def psnr_tissue(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> flo
     _check_shapes(rendered, truth, tissue)
     difference = _unit(rendered) - _unit(truth)
     return _decibel(difference[tissue])
+
+
+def clear_of_highlights(rendered: Image, truth: Image) -> NDArray[np.bool_]:
+    """[H, W] pixels at least HIGHLIGHT_PX / 2 away from what is nearly white in either image.
+
+    A highlight lies elsewhere for every eye: scores without it say how well the tissue itself is modelled.
+    """
+    bright = (_unit(rendered).min(-1) > HIGHLIGHT_LEVEL) | (_unit(truth).min(-1) > HIGHLIGHT_LEVEL)
+    box = np.ones((HIGHLIGHT_PX, HIGHLIGHT_PX), np.uint8)
+    return np.asarray(cv2.dilate(bright.astype(np.uint8), box) == 0)
 
 
 def psnr_paper(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> float:

@@ -20,9 +20,18 @@ from contract.wire.report import FrameScore, Report
 from worker.fusion import CLEAR_CONFIDENCE
 from worker.input.clip import FrameSplit
 from worker.input.clip.types import DepthClip
-from worker.model.metrics import coverage, depth_agreement_mm, depth_errors_mm, psnr_paper, psnr_tissue, ssim
+from worker.model.metrics import (
+    clear_of_highlights,
+    coverage,
+    depth_agreement_mm,
+    depth_errors_mm,
+    psnr_paper,
+    psnr_tissue,
+    ssim,
+)
 from worker.report.baselines import CopyBaselines
 from worker.report.doubts import course_doubts, picture_doubts
+from worker.report.right_eye import RightScores
 from worker.train.scoring import FrameRenderer, sample_frames
 
 MIN_COVERAGE = 0.98
@@ -32,6 +41,8 @@ MIN_HELD_OUT_DB = 24.0
 """An error of 6 % of white: clean clips come to 25 within a hundred iterations, what cuts or jumps stays below."""
 MAX_GAP_DB = 3.0
 """Between training and held-out frames: more means frames were memorised, or the gap between frames is not bridged."""
+MAX_RIGHT_GAP_DB = 4.0
+"""Between the left eye and the right eye, some degrees beside it."""
 OUTLIER_DB = 6.0
 """A held-out frame this far below the mean is named."""
 MAX_DEPTH_SHARE = 0.03
@@ -55,6 +66,7 @@ class Scores:
 
     frames: tuple[int, ...]
     psnr_tissue_db: tuple[float, ...]
+    psnr_clear_db: tuple[float, ...]
     psnr_paper_db: tuple[float, ...]
     ssim: tuple[float, ...]
     coverage: tuple[float, ...]
@@ -91,13 +103,14 @@ def measure(clip: DepthClip, frames: Sequence[int], render: FrameRenderer) -> Sc
     Raises:
         TrainingDiverged: a render holds NaN or infinity.
     """
-    tissue_db, paper_db, similarity, covered = [], [], [], []
+    tissue_db, clear_db, paper_db, similarity, covered = [], [], [], [], []
     errors_mm, depths_mm = [], []
     for index in frames:
         shown, truth, tissue = render(index), clip.rgb[index], clip.tissue[index]
         if not (np.isfinite(shown.rgb).all() and np.isfinite(shown.depth_mm).all() and np.isfinite(shown.alpha).all()):
             raise TrainingDiverged(f"Frame {index} renders as NaN or infinity: training has diverged.")
         tissue_db.append(psnr_tissue(shown.rgb, truth, tissue))
+        clear_db.append(psnr_tissue(shown.rgb, truth, tissue & clear_of_highlights(shown.rgb, truth)))
         paper_db.append(psnr_paper(shown.rgb, truth, tissue))
         similarity.append(ssim(shown.rgb, truth, tissue))
         covered.append(coverage(shown.alpha, tissue))
@@ -106,6 +119,7 @@ def measure(clip: DepthClip, frames: Sequence[int], render: FrameRenderer) -> Sc
     return Scores(
         frames=tuple(frames),
         psnr_tissue_db=tuple(tissue_db),
+        psnr_clear_db=tuple(clear_db),
         psnr_paper_db=tuple(paper_db),
         ssim=tuple(similarity),
         coverage=tuple(covered),
@@ -115,20 +129,32 @@ def measure(clip: DepthClip, frames: Sequence[int], render: FrameRenderer) -> Sc
 
 
 def build_report(
-    clip: DepthClip, split: FrameSplit, held_out: Scores, trained: Scores, baselines: CopyBaselines, training: Training
+    clip: DepthClip,
+    split: FrameSplit,
+    held_out: Scores,
+    right: RightScores,
+    trained: Scores,
+    baselines: CopyBaselines,
+    training: Training,
 ) -> Report:
     """The report of a finished scene.
 
     Args:
         held_out: measure(clip, split.held_out, ...); of no frames if none was held out.
+        right: measure_right(clip, split.held_out, ...).
         trained: measure(clip, sample_frames(split.train), ...), for the comparison.
         baselines: copy_baselines(clip, split.train, split.held_out).
     """
     found = [*clip.warnings, *split.warnings, *training.warnings]
     found += clip_warnings(clip, split.train)
-    found += score_warnings(held_out, trained, baselines)
+    found += score_warnings(held_out, trained, baselines) + right_eye_warnings(held_out, right)
     return Report(
         psnr_tissue_db=_mean(held_out.psnr_tissue_db),
+        psnr_clear_db=_mean(held_out.psnr_clear_db),
+        psnr_right_db=_mean(right.psnr_db),
+        psnr_right_clear_db=_mean(right.clear_db),
+        baseline_warp_db=_mean(right.warp_db),
+        baseline_warp_clear_db=_mean(right.warp_clear_db),
         psnr_paper_db=_mean(held_out.psnr_paper_db),
         ssim=_mean(held_out.ssim),
         baseline_blend_db=_mean(baselines.blend_db),
@@ -136,7 +162,7 @@ def build_report(
         depth_agreement_mm=_known(held_out.depth_agreement_mm),
         coverage=_mean(held_out.coverage),
         train_psnr_tissue_db=_mean(trained.psnr_tissue_db),
-        frames=_frame_scores(held_out, baselines),
+        frames=_frame_scores(held_out, right, baselines),
         warnings=tuple(dict.fromkeys(found)),
         assumptions=tuple(dict.fromkeys((*clip.assumptions, *training.assumptions))),
         measurements={**clip.measurements, **training.measurements},
@@ -248,6 +274,20 @@ def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) 
     return found
 
 
+def right_eye_warnings(held_out: Scores, right: RightScores) -> list[Notice]:
+    """What the right eye says against poses beside the left one."""
+    left_db, right_db = _mean(held_out.psnr_tissue_db), _mean(right.psnr_db)
+    if left_db is None or right_db is None or left_db - right_db <= MAX_RIGHT_GAP_DB:
+        return []
+    return [
+        Notice.warning(
+            NoticeCode.RIGHT_EYE_LOW,
+            f"Held-out frames of the right eye score {right_db:.1f} dB, {left_db - right_db:.1f} dB less than those of "
+            "the left eye: views from other places are less true than the endoscope's own.",
+        )
+    ]
+
+
 def _missing(held_out: Scores, model_db: float | None) -> list[Notice]:
     if not held_out.frames:
         return [
@@ -333,9 +373,10 @@ def _roughness(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(np.maximum(variance, 0)), dtype=np.float32)
 
 
-def _frame_scores(scores: Scores, baselines: CopyBaselines) -> tuple[FrameScore, ...]:
+def _frame_scores(scores: Scores, right: RightScores, baselines: CopyBaselines) -> tuple[FrameScore, ...]:
     columns = {
         "psnr_tissue_db": scores.psnr_tissue_db,
+        **({"psnr_right_db": right.psnr_db} if right.psnr_db else {}),
         "psnr_paper_db": scores.psnr_paper_db,
         "ssim": scores.ssim,
         "coverage": scores.coverage,

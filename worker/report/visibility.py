@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from worker.fusion import COMPLETED_CONFIDENCE
-from worker.input.clip import DepthClip, spread
+from worker.input.clip import spread
 from worker.model.gaussians import Gaussians
 from worker.model.layout import CX, CY, FX, FY, POSE
 from worker.raster.model import Model
@@ -32,7 +32,7 @@ HIDDEN_LOGIT = -30.0
 """Opacity at which nothing is drawn."""
 
 
-def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
+def drop_strays(model: Model, eyes: Sequence[TrainingFrames]) -> int:
     """Take Gaussians out of model that lay on tissue in no training frame, grew wide, and are not missed there; returns
     how many.
 
@@ -40,9 +40,10 @@ def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
     pulled wide at the times nobody sees them, and from another pose they hang over the tissue like a veil. Of few and
     large Gaussians, though, one may show much tissue from a place where there is none.
     """
-    unseen = np.flatnonzero(~_ever_on_tissue(model, clip, frames))
-    widest = _widest(model, unseen, [float(frames.t[index]) for index in spread(frames.indices, SAMPLED_FRAMES)])
-    strays = _not_missed(model, frames, unseen[widest > MAX_UNSEEN_WIDTH])
+    unseen = np.flatnonzero(~_ever_on_tissue(model, eyes))
+    sampled = spread(eyes[0].indices, SAMPLED_FRAMES)
+    widest = _widest(model, unseen, [float(eyes[0].t[index]) for index in sampled])
+    strays = _not_missed(model, eyes, unseen[widest > MAX_UNSEEN_WIDTH])
     if not 0 < len(strays) < model.count:
         return 0
     kept = np.setdiff1d(np.arange(model.count), strays)
@@ -50,17 +51,17 @@ def drop_strays(model: Model, clip: DepthClip, frames: TrainingFrames) -> int:
     return len(strays)
 
 
-def _not_missed(model: Model, frames: TrainingFrames, wide: NDArray[np.intp]) -> NDArray[np.intp]:
+def _not_missed(model: Model, eyes: Sequence[TrainingFrames], wide: NDArray[np.intp]) -> NDArray[np.intp]:
     """Those of wide [M] without which every frame looked at stays as good: all, or those found one after the other."""
     if not len(wide):
         return wide
     opacity_logit = model.parameters()["opacity_logit"]
     trained = opacity_logit.clone()
-    judged = spread(frames.indices, MISSED_IN_FRAMES)
+    judged = [(eye, index) for eye in eyes for index in spread(eye.indices, MISSED_IN_FRAMES)]
 
     def scores_db() -> NDArray[np.float64]:
-        renders = ((index, model.render(frames.cameras[index], float(frames.t[index]))) for index in judged)
-        return np.array([frames.psnr_tissue_db(index, image) for index, image in renders])
+        renders = ((eye, index, model.render(eye.cameras[index], float(eye.t[index]))) for eye, index in judged)
+        return np.array([eye.psnr_tissue_db(index, image) for eye, index, image in renders])
 
     def goes(rows: torch.Tensor) -> bool:
         opacity_logit[rows] = HIDDEN_LOGIT
@@ -75,12 +76,14 @@ def _not_missed(model: Model, frames: TrainingFrames, wide: NDArray[np.intp]) ->
     return found
 
 
-def _ever_on_tissue(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.bool_]:
-    """[N] whether the centre projects onto a tissue pixel in any training frame, hidden or not."""
+def _ever_on_tissue(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.bool_]:
+    """[N] whether the centre projects onto a tissue pixel in any training frame of any eye, hidden or not."""
     found = np.zeros(model.count, np.bool_)
-    for index in frames.indices:
-        inside, i, j, _ = _pixels(model, clip, frames, index)
-        found[inside] |= clip.tissue[index][i, j]
+    for index in eyes[0].indices:
+        mean = model.deformed_mean(float(eyes[0].t[index]))
+        for frames in eyes:
+            inside, i, j, _ = _pixels(mean, frames, index)
+            found[inside] |= frames.eye.tissue[index][i, j]
     return found
 
 
@@ -98,29 +101,30 @@ def _widest(model: Model, chosen: NDArray[np.intp], times: Sequence[float]) -> N
     return widest
 
 
-def seen_share(model: Model, clip: DepthClip, frames: TrainingFrames) -> NDArray[np.float32]:
+def seen_share(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.float32]:
     """[N] in [0, 1]: share of training frames in which a Gaussian's centre lay on visible tissue, times the stereo
-    confidence of that pixel."""
-    trusted = np.zeros(model.count, np.float64)
-    sampled = spread(frames.indices, SAMPLED_FRAMES)
+    confidence of that pixel; of two eyes the one that saw it better."""
+    sampled = spread(eyes[0].indices, SAMPLED_FRAMES // len(eyes))
+    trusted = np.zeros((len(eyes), model.count))
     for index in sampled:
-        image = model.render(frames.cameras[index], float(frames.t[index]))
-        surface = image[3] / np.maximum(image[4], 1e-6)
-        inside, i, j, z = _pixels(model, clip, frames, index)
-        visible = clip.tissue[index][i, j] & (z <= surface[i, j] * (1 + BEHIND))
-        # Completed depth is a guess, not nothing: tissue without stereo keeps a little confidence.
-        confidence = np.maximum(clip.depth_confidence[index][i, j] / 255.0, COMPLETED_CONFIDENCE)
-        trusted[inside] += visible * confidence
-    share: NDArray[np.float32] = (trusted / len(sampled)).astype(np.float32)
+        for place, frames in enumerate(eyes):
+            image = model.render(frames.cameras[index], float(frames.t[index]))
+            surface = image[3] / np.maximum(image[4], 1e-6)
+            inside, i, j, z = _pixels(model.deformed_mean(float(frames.t[index])), frames, index)
+            visible = frames.eye.tissue[index][i, j] & (z <= surface[i, j] * (1 + BEHIND))
+            # Completed depth is a guess, not nothing: tissue without stereo keeps a little confidence.
+            confidence = np.maximum(frames.eye.depth_confidence[index][i, j] / 255.0, COMPLETED_CONFIDENCE)
+            trusted[place, inside] += visible * confidence
+    share: NDArray[np.float32] = (trusted.max(0) / len(sampled)).astype(np.float32)
     return share
 
 
 def _pixels(
-    model: Model, clip: DepthClip, frames: TrainingFrames, index: int
+    mean: NDArray[np.float32], frames: TrainingFrames, index: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
-    """Which centres [N] lie in frame `index`; row, column and camera z of those."""
-    camera, (height, width) = frames.cameras[index], clip.tissue[index].shape
-    x, y, z = _camera_points(model.deformed_mean(float(frames.t[index])), camera)
+    """Which centres (mean [3, N], units) lie in frame `index`; row, column and camera z of those."""
+    camera, (height, width) = frames.cameras[index], frames.eye.tissue[index].shape
+    x, y, z = _camera_points(mean, camera)
     column, row = np.floor(camera[FX] * x / z + camera[CX]), np.floor(camera[FY] * y / z + camera[CY])
     inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return inside, row[inside].astype(np.intp), column[inside].astype(np.intp), z[inside]

@@ -190,8 +190,8 @@ def _match_on_device(
     for first in range(0, len(right), at_once):
         _check_stop(hooks)
         some = slice(first, first + at_once)
-        pairs = (np.stack([_grey(frame) for frame in eye[some]]) for eye in (rgb, right))
-        depth_mm[some], confidence[some] = depth_of(*pairs, plan, focal_baseline, clip.disparity_offset_px)
+        left, other = (np.stack([_grey(frame) for frame in eye[some]]) for eye in (rgb, right))
+        depth_mm[some], confidence[some] = depth_of(left, other, plan, focal_baseline, clip.disparity_offset_px)
         left_over = max(len(right) - first - at_once, 0) / len(right)
         hooks.on_progress(Progress(STAGE, 1 - (1 - DECODING_SHARE - MEASURING_SHARE) * left_over))
     return depth_mm, confidence
@@ -210,7 +210,7 @@ def _right_eye(
     there_mm, trust = np.empty_like(depth_mm), np.empty_like(confidence)
     tissue = np.ones(depth_mm.shape, np.bool_) if clip.tissue_right is None else clip.tissue_right
     middle = clip.frame_count // 2
-    label = painted_over(rgb[middle], right_rgb[middle], ~clip.tissue.any(axis=0))
+    label = painted_over(rgb[middle], right_rgb[middle], np.asarray(~clip.tissue.any(axis=0)))
 
     def work(i: int) -> None:
         there_mm[i], trust[i] = moved_depth(depth_mm[i], confidence[i], focal_baseline, offset_px)

@@ -21,6 +21,7 @@ from worker.scene.scene import Scene
 from worker.train.hooks import TrainingHooks
 from worker.train.run import CurvePoint, Run, frames_at
 from worker.train.schedule import validation_frames
+from worker.train.scoring import HeldOutScore
 
 CURVE_SECONDS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 90, 120, 180, 300, 600)
 """Training times at which held-out frames are scored; the clock is paused meanwhile."""
@@ -57,7 +58,7 @@ def check_sums(sums: StepSums | None, iteration: int) -> None:
 def train(
     run: Run,
     clock: Stopwatch,
-    evaluate: Callable[[], float],
+    evaluate: Callable[[], HeldOutScore],
     hooks: TrainingHooks,
     copy_scene: Callable[[], Scene] | None = None,
 ) -> None:
@@ -65,7 +66,7 @@ def train(
 
     Args:
         clock: t_train_s so far; paused while held-out frames are scored.
-        evaluate: mean psnr_tissue over the held-out frames, NaN without any.
+        evaluate: the score of the held-out frames, NaN without any.
         copy_scene: the scene as the model is now, for hooks.on_snapshot; None shows none.
 
     Raises:
@@ -137,12 +138,13 @@ def _check_finite(run: Run) -> None:
         raise TrainingDiverged(f"After {run.iteration} iterations {', '.join(broken)} hold values that are not finite.")
 
 
-def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], float]) -> float | None:
+def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], HeldOutScore]) -> float | None:
     check_sums(run.model.wait(), run.iteration)  # steps that still run do not count as scoring
     t_train_s = clock.elapsed_s
     with clock.paused():
-        psnr = evaluate()
-    if math.isnan(psnr):
+        score = evaluate()
+    if math.isnan(score.left_db):
         return None
-    run.curve.append(CurvePoint(t_train_s, run.iteration, psnr))
-    return psnr
+    right_db = None if math.isnan(score.right_db) else score.right_db
+    run.curve.append(CurvePoint(t_train_s, run.iteration, score.left_db, right_db))
+    return score.left_db

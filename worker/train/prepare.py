@@ -36,7 +36,9 @@ def prepare(setup: Setup) -> Run:
         preset, chosen = settled(setup.preset, tracks, clip, train)
     with timings.measure("fusion_s"):
         moved = moved_along(tracks, train, clip.intrinsics.width) if tracks is not None else None
-        cloud = fuse(clip, train, fusion_for(preset, clip.intrinsics), seed=setup.options.seed, moved=moved)
+        right = setup.teaching_eyes[1] if len(setup.teaching_eyes) > 1 else None
+        fusion = fusion_for(preset, clip.intrinsics)
+        cloud = fuse(clip, train, fusion, seed=setup.options.seed, moved=moved, right=right)
     setup.hooks.report_stage("start", 0.0)
     with timings.measure("start_s"):
         model = start_model(cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device)

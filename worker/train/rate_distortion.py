@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from contract.wire.notices import Notice, NoticeCode
-from worker.input.clip import DepthClip, spread
+from worker.input.clip import spread
 from worker.model.deformation import SharedBasis
 from worker.raster.backend import CPU, Device
 from worker.raster.model import Model
@@ -25,6 +25,8 @@ from worker.scene.quantize import prepare, round_to
 from worker.scene.scene import Scene
 from worker.train.targets import TrainingFrames
 
+Picture = tuple[TrainingFrames, int]
+"""An eye and one of its training frames."""
 TOLERANCE_DB = 0.1
 """psnr_tissue that a stored scene may lose on its training frames; held-out frames lost less (docs/decisions/012)."""
 SENSITIVITY_FRAMES = 12
@@ -77,26 +79,25 @@ class QuantizedScene:
 
 def quantize_scene(
     scene: Scene,
-    clip: DepthClip,
-    frames: TrainingFrames,
+    eyes: Sequence[TrainingFrames],
     tolerance_db: float = TOLERANCE_DB,
     device: Device = CPU,
 ) -> QuantizedScene | None:
     """The scene in whole numbers; None for a model that is stored as floats, or if no trial kept the tolerance."""
-    with_tissue = [index for index in frames.indices if clip.tissue[index].any()]
-    if not isinstance(scene.deformation, SharedBasis) or scene.gaussians.sh_degree > 0 or not with_tissue:
+    pictures = [(eye, index) for index in eyes[0].indices for eye in eyes if eye.eye.tissue[index].any()]
+    if not isinstance(scene.deformation, SharedBasis) or scene.gaussians.sh_degree > 0 or not pictures:
         return None
-    model, scored = model_of(scene, device), spread(with_tissue, SCORED_FRAMES)
-    exact_db = _mean_db((model.render(frames.cameras[i], float(frames.t[i])) for i in scored), frames, scored)
+    model, scored = model_of(scene, device), _spread(pictures, SCORED_FRAMES)
+    exact_db = _mean_db((model.render(eye.cameras[i], float(eye.t[i])) for eye, i in scored), scored)
     if not math.isfinite(exact_db):
         return None
-    sensitivity = _sensitivity(model, clip, frames, with_tissue, len(scene.deformation.centre))
-    times = [float(frames.t[index]) for index in frames.indices]
+    sensitivity = _sensitivity(model, pictures, len(scene.deformation.centre))
+    times = [float(eyes[0].t[index]) for index in eyes[0].indices]
     prepared = prepare(scene.gaussians, scene.deformation, scene.seen, sensitivity, times)
 
     def trial(step: float) -> tuple[Compact, float]:
         compact = round_to(prepared, step)
-        return compact, exact_db - _mean_db(_renders(compact, scene, frames, scored, device), frames, scored)
+        return compact, exact_db - _mean_db(_renders(compact, scene, scored, device), scored)
 
     found = _coarsest(trial, tolerance_db)
     return None if found is None else _stored(scene, *found, len(scored))
@@ -139,23 +140,27 @@ def _added_error(loss_db: float) -> float:
     return float(10 ** (loss_db / 10) - 1)
 
 
-def _mean_db(images: Iterable[NDArray[np.float32]], frames: TrainingFrames, scored: Sequence[int]) -> float:
-    return float(np.mean([frames.psnr_tissue_db(i, image) for i, image in zip(scored, images, strict=True)]))
+def _spread(pictures: Sequence[Picture], count: int) -> list[Picture]:
+    """At most count pictures, evenly spread over the clip; of two eyes in turn."""
+    return [pictures[place] for place in spread(range(len(pictures)), count)]
+
+
+def _mean_db(images: Iterable[NDArray[np.float32]], scored: Sequence[Picture]) -> float:
+    return float(np.mean([eye.psnr_tissue_db(i, image) for (eye, i), image in zip(scored, images, strict=True)]))
 
 
 def _renders(
-    compact: Compact, scene: Scene, frames: TrainingFrames, scored: Sequence[int], device: Device
+    compact: Compact, scene: Scene, scored: Sequence[Picture], device: Device
 ) -> Iterator[NDArray[np.float32]]:
     """The scored frames, rendered from what is stored. Decodes the Gaussians at their times only, not all weights."""
     rest = SharedBasis.initial(len(scene.gaussians), bases=1)
-    for index, gaussians in zip(scored, compact.at([float(frames.t[index]) for index in scored]), strict=True):
+    times = [float(eye.t[index]) for eye, index in scored]
+    for (eye, index), gaussians in zip(scored, compact.at(times), strict=True):
         still = model_of(dataclasses.replace(scene, gaussians=gaussians, deformation=rest), device)
-        yield still.render(frames.cameras[index], 0.0)
+        yield still.render(eye.cameras[index], 0.0)
 
 
-def _sensitivity(
-    model: Model, clip: DepthClip, frames: TrainingFrames, indices: Sequence[int], bases: int
-) -> NDArray[np.float64]:
+def _sensitivity(model: Model, pictures: Sequence[Picture], bases: int) -> NDArray[np.float64]:
     """[STATE, N]: an error e in a number adds sensitivity * e**2 / N to the mean squared error of the tissue's pixels.
 
     The square of a pixel's derivative, summed over the pixels, is the mean square of the gradient of their sum with
@@ -164,23 +169,21 @@ def _sensitivity(
     A depth also decides which of two Gaussians hides the other, and that has no derivative. Its sensitivity is
     therefore measured once for all Gaussians, with noise of the size that rounding makes.
     """
-    random, sampled = np.random.default_rng(0), spread(indices, SENSITIVITY_FRAMES)
+    random, sampled = np.random.default_rng(0), _spread(pictures, SENSITIVITY_FRAMES)
     sensitivity = np.zeros((STATE, model.count))
-    for index in sampled:
-        tissue = clip.tissue[index]
+    for eye, index in sampled:
+        tissue = eye.eye.tissue[index]
         signs = np.zeros((5, *tissue.shape), np.float32)
         signs[:3] = random.choice(np.array([-1, 1], np.float32), (3, *tissue.shape)) * tissue
-        found = model.image_gradient(frames.cameras[index], float(frames.t[index]), signs)
+        found = model.image_gradient(eye.cameras[index], float(eye.t[index]), signs)
         sensitivity += found.astype(np.float64) ** 2 * (model.count / max(3 * int(tissue.sum()), 1) / len(sampled))
-    across, middle = max(float(sensitivity[:2].mean()), 1e-12), indices[len(indices) // 2]
-    sensitivity[2] = sensitivity[:2].mean(0) * _depth_over_place(model, clip, frames, across, middle, bases)
+    across = max(float(sensitivity[:2].mean()), 1e-12)
+    sensitivity[2] = sensitivity[:2].mean(0) * _depth_over_place(model, pictures[len(pictures) // 2], across, bases)
     return sensitivity
 
 
-def _depth_over_place(
-    model: Model, clip: DepthClip, frames: TrainingFrames, across: float, index: int, bases: int
-) -> float:
-    """How much more an error along the first camera's axis changes frame `index` than one across it, squared.
+def _depth_over_place(model: Model, picture: Picture, across: float, bases: int) -> float:
+    """How much more an error along the first camera's axis changes a picture than one across it, squared.
 
     `across` is the mean sensitivity to an error across the axis.
     """
@@ -188,10 +191,11 @@ def _depth_over_place(
     noise = size * np.random.default_rng(0).standard_normal(model.count).astype(np.float32)
     depth = model.parameters()["canonical"][2]
     exact_depth = depth.clone()
-    camera, t = frames.cameras[index], float(frames.t[index])
+    eye, index = picture
+    camera, t = eye.cameras[index], float(eye.t[index])
     exact = model.render(camera, t)[:3].copy()
     depth += torch.from_numpy(noise).to(depth.device)
-    error = (model.render(camera, t)[:3] - exact)[:, clip.tissue[index]]
+    error = (model.render(camera, t)[:3] - exact)[:, eye.eye.tissue[index]]
     depth.copy_(exact_depth)
     measured = float(np.mean(error.astype(np.float64) ** 2))
     return max(measured / size**2 / across, 1.0)

@@ -80,5 +80,5 @@ def _identity(run: Run) -> dict[str, str]:
         "settings of the preset": hashlib.sha256(repr(run.preset).encode()).hexdigest(),
         "seed": str(run.seed),
         "length": run.asked,
-        "clip, other frames of it, or depth from another device": run.frames.digest(),
+        "clip, other frames of it, or depth from another device": "".join(eye.digest() for eye in run.eyes),
     }

@@ -26,6 +26,7 @@ class CurvePoint:
     t_train_s: float
     iteration: int
     psnr_tissue_db: float
+    psnr_right_db: float | None = None
 
 
 @dataclass
@@ -106,11 +107,20 @@ def frames_at(run: Run, iteration: int) -> list[int]:
 
 
 def write_curve(path: Path, run: Run) -> None:
-    """curve.csv: t_train_s, iteration, psnr_tissue_db of the held-out frames, training frames seen by then."""
+    """curve.csv: t_train_s, iteration, scores of the held-out frames, training frames seen by then.
+
+    psnr_right_db is empty for a clip of one eye.
+    """
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["t_train_s", "iteration", "psnr_tissue_db", "frames_seen"])
+        writer.writerow(["t_train_s", "iteration", "psnr_tissue_db", "frames_seen", "psnr_right_db"])
         writer.writerows(
-            [f"{p.t_train_s:.3f}", p.iteration, f"{p.psnr_tissue_db:.4f}", p.iteration * run.preset.frames_a_step]
+            [
+                f"{p.t_train_s:.3f}",
+                p.iteration,
+                f"{p.psnr_tissue_db:.4f}",
+                p.iteration * run.preset.frames_a_step,
+                "" if p.psnr_right_db is None else f"{p.psnr_right_db:.4f}",
+            ]
             for p in run.curve
         )

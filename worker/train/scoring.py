@@ -1,4 +1,4 @@
-"""A run's frames rendered from the endoscope's own pose, and the score of held-out ones during training.
+"""A run's frames rendered from the endoscope's own eyes, and the score of held-out ones during training.
 
 Symbols: H W pixels.
 """
@@ -7,15 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from worker.input.clip import spread
+from worker.input.clip import Eye, spread
 from worker.model.metrics import psnr_tissue
 from worker.raster.model import Model
+from worker.raster.step import camera_vector
 from worker.train.hooks import RenderedFrame
 from worker.train.run import Run
-from worker.train.targets import solid_depth_mm
+from worker.train.targets import camera_in_units, solid_depth_mm
 
 SAMPLED_FRAMES = 8
 """Training frames that are scored, spread over the clip: enough to compare, cheap to render."""
@@ -23,8 +27,12 @@ MAX_SCORED_FRAMES = 16
 """Held-out frames of one score during training."""
 
 
+CLOSED_SHARE = 0.03
+"""Of the width: gaps of the right eye's depth up to this size are places where stereo failed, not places hidden from
+the left eye."""
+
 FrameRenderer = Callable[[int], RenderedFrame]
-"""Renders the frame of this index from the endoscope's own pose."""
+"""Renders the frame of this index from an eye's own pose."""
 
 
 def sample_frames(frames: Sequence[int], count: int = SAMPLED_FRAMES) -> list[int]:
@@ -32,23 +40,57 @@ def sample_frames(frames: Sequence[int], count: int = SAMPLED_FRAMES) -> list[in
     return spread(frames, count)
 
 
-def frame_renderer(run: Run, model: Model | None = None) -> FrameRenderer:
-    """Renders frames of the run in mm; with `model`, by that model instead of the run's own."""
+def frame_renderer(run: Run, model: Model | None = None, eye: Eye | None = None) -> FrameRenderer:
+    """Renders frames of the run in mm, from the left eye or from `eye`; with `model`, by that instead of the run's."""
+    seen_by, scale = eye or run.setup.clip, run.frames.scale
 
     def render(index: int) -> RenderedFrame:
-        image = (model or run.model).render(run.frames.cameras[index], float(run.frames.t[index])).copy()
-        depth_mm = solid_depth_mm(image[3], image[4], run.frames.scale)
+        camera = camera_vector(camera_in_units(seen_by.intrinsics, seen_by.world_from_camera[index], scale))
+        image = (model or run.model).render(camera, float(run.frames.t[index])).copy()
+        depth_mm = solid_depth_mm(image[3], image[4], scale)
         return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
 
     return render
 
 
-def held_out_psnr(run: Run, render: FrameRenderer) -> float:
-    """Mean psnr_tissue over at most sixteen held-out frames, evenly spread; NaN without any. The hooks see each."""
+@dataclass(frozen=True)
+class HeldOutScore:
+    """Mean psnr_tissue in dB over held-out frames of the left eye, and of the right eye; NaN where there is none."""
+
+    left_db: float
+    right_db: float
+
+
+def held_out_score(run: Run, model: Model | None = None) -> HeldOutScore:
+    """The score over at most sixteen held-out frames, evenly spread; with `model`, of that instead of the run's.
+
+    The hooks see the left eye's renders.
+    """
     clip, scores = run.setup.clip, []
-    for index in sample_frames(run.setup.split.held_out, MAX_SCORED_FRAMES):
+    frames = sample_frames(run.setup.split.held_out, MAX_SCORED_FRAMES)
+    render = frame_renderer(run, model)
+    for index in frames:
         frame = render(index)
         run.setup.hooks.on_held_out(index, frame)
         if clip.tissue[index].any():  # else it has no score
             scores.append(psnr_tissue(frame.rgb, clip.rgb[index], clip.tissue[index]))
-    return float(np.mean(scores)) if scores else math.nan
+    right = _right_scores(run, frames, model)
+    return HeldOutScore(*(float(np.mean(each)) if each else math.nan for each in (scores, right)))
+
+
+def _right_scores(run: Run, frames: Sequence[int], model: Model | None) -> list[float]:
+    """psnr_tissue in dB of the right eye's frames that show tissue which the left eye sees; [] without a right eye."""
+    right = run.setup.clip.right
+    if right is None:
+        return []
+    render = frame_renderer(run, model, right)
+    judged = ((index, judged_pixels(right, index)) for index in frames)
+    return [psnr_tissue(render(index).rgb, right.rgb[index], pixels) for index, pixels in judged if pixels.any()]
+
+
+def judged_pixels(right: Eye, index: int) -> NDArray[np.bool_]:
+    """Tissue [H, W] of the right eye that the left eye sees, too."""
+    side = 2 * round(CLOSED_SHARE * right.intrinsics.width / 2) + 1
+    matched = (right.depth_mm[index] > 0).astype(np.uint8)
+    seen = cv2.morphologyEx(matched, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)) > 0
+    return np.asarray(seen & right.tissue[index])

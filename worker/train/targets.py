@@ -57,8 +57,7 @@ class TrainingFrames:
     """Colour, tissue, inverse depth and camera of every training frame of one eye."""
 
     def __init__(self, eye: Eye, train: Sequence[int], scale: float) -> None:
-        self.indices = list(train)
-        self.scale = scale
+        self.eye, self.indices, self.scale = eye, list(train), scale
         self._row = {index: row for row, index in enumerate(self.indices)}
         height, width = eye.rgb.shape[1:3]
         self._width, stride = width, padded(width)

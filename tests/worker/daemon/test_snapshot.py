@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -29,6 +30,7 @@ from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.request import ReconstructionRequest
 from worker.train.run import Run
+from worker.train.scoring import HeldOutScore
 
 JOB, OTHER = "0" * 32, "1" * 32
 ITERATIONS = 16
@@ -40,7 +42,7 @@ def hooks_of(snapshots: Snapshots) -> TrainingHooks:
 
 
 def trained_with(run: Run, copy_scene: Callable[[], Scene], hooks: TrainingHooks) -> Run:
-    train(run, Stopwatch(), lambda: float("nan"), hooks, copy_scene)
+    train(run, Stopwatch(), lambda: HeldOutScore(math.nan, math.nan), hooks, copy_scene)
     return run
 
 

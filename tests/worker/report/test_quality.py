@@ -19,6 +19,7 @@ from worker.input.clip.types import DepthClip
 from worker.model.metrics import psnr_tissue
 from worker.report.baselines import CopyBaselines, copy_baselines
 from worker.report.quality import Scores, Training, build_report, clip_warnings, measure, score_warnings
+from worker.report.right_eye import RightScores
 from worker.train.hooks import RenderedFrame
 from worker.train.scoring import sample_frames
 
@@ -67,13 +68,15 @@ def report_of(clip: DepthClip, holdout: str = "every8", noise: float = 0.01) -> 
     split = split_frames(clip, holdout)
     held_out = measure(clip, split.held_out, views(clip, noise))
     trained = measure(clip, sample_frames(split.train), views(clip, noise))
-    return build_report(clip, split, held_out, trained, copy_baselines(clip, split.train, split.held_out), TRAINING)
+    return build_report(
+        clip, split, held_out, RightScores(), trained, copy_baselines(clip, split.train, split.held_out), TRAINING
+    )
 
 
 def scores(psnr_db: float = 35.0, *, covered: float = 1.0, depth_agreement_mm: float = 0.5, frames: int = 3) -> Scores:
     same = (psnr_db,) * frames
     return Scores(
-        tuple(range(1, 1 + frames)), same, same, (0.9,) * frames, (covered,) * frames, depth_agreement_mm, 60.0
+        tuple(range(1, 1 + frames)), same, same, same, (0.9,) * frames, (covered,) * frames, depth_agreement_mm, 60.0
     )
 
 
@@ -249,5 +252,7 @@ def test_what_the_clip_and_the_split_warned_of_is_repeated_once() -> None:
     clip = dataclasses.replace(long_clip(), warnings=(info("the sound is missing"), info("the sound is missing")))
     split = FrameSplit([0, *range(2, 24)], [1], [], warnings=(info("1 frame repeats"),))
     held_out, trained = (measure(clip, frames, views(clip)) for frames in ([1], sample_frames(split.train)))
-    report = build_report(clip, split, held_out, trained, copy_baselines(clip, split.train, [1]), TRAINING)
+    report = build_report(
+        clip, split, held_out, RightScores(), trained, copy_baselines(clip, split.train, [1]), TRAINING
+    )
     assert [each.text for each in report.warnings] == ["the sound is missing", "1 frame repeats"]

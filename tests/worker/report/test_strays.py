@@ -12,6 +12,7 @@ from tests.worker.phantoms import prepared
 from worker.input.clip import DepthClip
 from worker.report.visibility import MAX_UNSEEN_WIDTH, drop_strays, seen_share
 from worker.train.run import Run
+from worker.train.targets import TrainingFrames
 
 LOG_SCALE = slice(7, 10)
 OUT_OF_SIGHT = 200.0
@@ -37,17 +38,17 @@ def test_a_wide_gaussian_that_nothing_saw_is_taken_out(preset: str, clip: DepthC
     count = run.model.count
     run.model.canonical[LOG_SCALE, 0] = np.log(2 * MAX_UNSEEN_WIDTH)
     kept = run.model.canonical[:3, 1:count].copy()
-    assert drop_strays(run.model, clip, run.frames) == 1
+    assert drop_strays(run.model, [run.frames]) == 1
     np.testing.assert_array_equal(run.model.canonical[:3, : run.model.count], kept)
 
 
 def test_what_was_seen_may_be_wide_and_what_is_narrow_may_be_unseen(clip: DepthClip) -> None:
     run = start(clip, "fast")
     count = run.model.count
-    seen = seen_share(run.model, clip, run.frames)
+    seen = seen_share(run.model, [run.frames])
     assert seen[:2].tolist() == [0, 0]
     run.model.canonical[LOG_SCALE, int(seen.argmax())] = np.log(2 * MAX_UNSEEN_WIDTH)
-    assert drop_strays(run.model, clip, run.frames) == 0
+    assert drop_strays(run.model, [run.frames]) == 0
     assert run.model.count == count
 
 
@@ -65,5 +66,5 @@ def test_a_wide_gaussian_that_alone_shows_the_tissue_around_it_stays(clip: Depth
     hidden = np.hypot(columns + 0.5 - camera[2], rows + 0.5 - camera[3]) < 5
     under_a_tool = dataclasses.replace(clip, tissue=clip.tissue & ~hidden)
     opacity_logit = run.model.opacity_logit.copy()
-    assert drop_strays(run.model, under_a_tool, run.frames) == 0
+    assert drop_strays(run.model, [TrainingFrames(under_a_tool, run.frames.indices, run.frames.scale)]) == 0
     np.testing.assert_array_equal(run.model.opacity_logit, opacity_logit)

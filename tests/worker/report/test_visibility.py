@@ -15,6 +15,7 @@ from worker.fusion import COMPLETED_CONFIDENCE
 from worker.input.clip import DepthClip
 from worker.report.visibility import MAX_UNSEEN_WIDTH, SAMPLED_FRAMES, drop_strays, seen_share
 from worker.train.run import Run
+from worker.train.targets import TrainingFrames
 
 
 @pytest.fixture
@@ -39,25 +40,28 @@ def test_a_gaussian_counts_in_the_frames_that_show_its_tissue(clip: DepthClip) -
     run = start(clip)
     shown = clip.tissue.reshape(clip.frame_count, -1).mean(0)[pixels(run, clip)]
     assert shown.min() < 0.9
-    assert_close(seen_share(run.model, clip, run.frames), shown, name="shares")
+    assert_close(seen_share(run.model, [run.frames]), shown, name="shares")
 
 
 def test_unsure_depth_makes_a_gaussian_less_seen(clip: DepthClip) -> None:
     run = start(clip)
     unsure = dataclasses.replace(clip, depth_confidence=np.full_like(clip.depth_confidence, 51))
-    assert_close(seen_share(run.model, unsure, run.frames), seen_share(run.model, clip, run.frames) / 5)
+    assert_close(
+        seen_share(run.model, [TrainingFrames(unsure, run.frames.indices, run.frames.scale)]),
+        seen_share(run.model, [run.frames]) / 5,
+    )
 
 
 def test_behind_the_surface_behind_the_camera_and_outside_the_image_nothing_is_seen(clip: DepthClip) -> None:
     run = prepared(clip, "fast", holdout="none")[0]
-    before = seen_share(run.model, clip, run.frames)
+    before = seen_share(run.model, [run.frames])
     row, column = np.divmod(pixels(run, clip), WIDTH)
     chosen = np.flatnonzero((row > 32) & (row < 44) & (column > 8) & (column < WIDTH - 8))[::17]
     behind, turned_away, outside = chosen[0::3], chosen[1::3], chosen[2::3]
     run.model.canonical[:3, behind] *= 1.2
     run.model.canonical[2, turned_away] *= -1
     run.model.canonical[0, outside] += 200
-    seen = seen_share(run.model, clip, run.frames)
+    seen = seen_share(run.model, [run.frames])
     assert before[chosen].min() > 0.9
     assert not seen[chosen].any()
     others = np.setdiff1d(np.arange(run.model.count), chosen)
@@ -68,10 +72,10 @@ def test_a_wide_gaussian_on_tissue_without_depth_is_no_stray(clip: DepthClip) ->
     run = start(clip)
     run.model.canonical[7:10] = np.log(2 * MAX_UNSEEN_WIDTH)
     unsure = dataclasses.replace(clip, depth_confidence=np.zeros_like(clip.depth_confidence))
-    seen = seen_share(run.model, unsure, run.frames)
+    seen = seen_share(run.model, [TrainingFrames(unsure, run.frames.indices, run.frames.scale)])
     assert seen.any()
     assert (seen <= COMPLETED_CONFIDENCE + 1e-6).all()
-    assert drop_strays(run.model, unsure, run.frames) == 0
+    assert drop_strays(run.model, [TrainingFrames(unsure, run.frames.indices, run.frames.scale)]) == 0
 
 
 def test_a_long_clip_is_sampled_evenly() -> None:
@@ -79,4 +83,4 @@ def test_a_long_clip_is_sampled_evenly() -> None:
     clip.tissue[:] = True
     clip.tissue[: clip.frame_count // 2] = False
     run = prepared(clip, "fast", holdout="none")[0]
-    assert np.median(seen_share(run.model, clip, run.frames)) == pytest.approx(0.5, abs=0.05)
+    assert np.median(seen_share(run.model, [run.frames])) == pytest.approx(0.5, abs=0.05)

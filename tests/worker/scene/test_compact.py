@@ -333,7 +333,7 @@ def test_shrinking_keeps_its_tolerance_and_says_what_it_took() -> None:
     run, _ = prepared(clip, iterations=40)
     trained(run)
     scene = scene_of(run)
-    small, tiny = (quantize_scene(scene, clip, run.frames, tolerance_db) for tolerance_db in (0.1, 0.5))
+    small, tiny = (quantize_scene(scene, [run.frames], tolerance_db) for tolerance_db in (0.1, 0.5))
     assert small is not None
     assert tiny is not None
     assert small.loss_db <= 0.1 < tiny.loss_db <= 0.5
@@ -343,7 +343,7 @@ def test_shrinking_keeps_its_tolerance_and_says_what_it_took() -> None:
     assert small.frames == len(judged)
     exact, kept = (mean_db(each, clip, run.frames, judged) for each in (scene, small.scene))
     assert small.loss_db == pytest.approx(exact - kept, abs=1e-3)
-    again = quantize_scene(scene, clip, run.frames, 0.1)
+    again = quantize_scene(scene, [run.frames], 0.1)
     assert again is not None
     assert again.step == small.step
     assert save(dict(again.scene.stored or {})) == save(dict(small.scene.stored or {}))
@@ -362,10 +362,17 @@ def test_frames_without_tissue_are_not_judged_and_where_there_is_none_floats_are
     trained(run)
     scene = scene_of(run)
     hidden = np.zeros_like(clip.tissue)
-    assert quantize_scene(scene, dataclasses.replace(clip, tissue=hidden), run.frames) is None
+    assert (
+        quantize_scene(
+            scene, [TrainingFrames(dataclasses.replace(clip, tissue=hidden), run.frames.indices, run.frames.scale)]
+        )
+        is None
+    )
     first, second = run.frames.indices[:2]
     hidden[[first, second]] = clip.tissue[[first, second]]
-    small = quantize_scene(scene, dataclasses.replace(clip, tissue=hidden), run.frames)
+    small = quantize_scene(
+        scene, [TrainingFrames(dataclasses.replace(clip, tissue=hidden), run.frames.indices, run.frames.scale)]
+    )
     assert small is not None
     assert small.frames == 2
     assert small.loss_db <= TOLERANCE_DB
@@ -376,14 +383,14 @@ def test_a_scene_that_whole_numbers_cannot_hold_stays_as_floats(monkeypatch: pyt
     run, _ = prepared(clip, iterations=10)
     scene = scene_of(run)
     scene.gaussians.mean[3, 0] = 1e9
-    assert quantize_scene(scene, clip, run.frames) is None
+    assert quantize_scene(scene, [run.frames]) is None
     scene.gaussians.mean[3, 0] = 0
     monkeypatch.setattr(compact, "MAX_NUMBERS", 1000)
-    assert quantize_scene(scene, clip, run.frames) is None
+    assert quantize_scene(scene, [run.frames]) is None
 
 
 def test_models_that_are_not_known_are_left_as_floats() -> None:
     clip = phantom_clip()
     run, _ = prepared(clip, iterations=1)
     for scene in (random_scene("fdm-gaussian"), random_scene("hexplane"), random_scene("shared", sh_degree=1)):
-        assert quantize_scene(scene, clip, run.frames) is None
+        assert quantize_scene(scene, [run.frames]) is None

@@ -27,6 +27,7 @@ from worker.train.loop import train
 from worker.train.presets import PRESETS, Preset
 from worker.train.resume import load_run, save_run
 from worker.train.run import CurvePoint, Run, frames_at, write_curve
+from worker.train.scoring import HeldOutScore
 
 SOON = DensifySettings(from_iteration=6, every=6, gradient_threshold=1e-5)
 """Splits early enough to happen in these short runs; so does splitting_soon add harmonics."""
@@ -159,7 +160,7 @@ def test_the_curve_tells_iterations_and_the_frames_they_saw(tmp_path: Path) -> N
     preset = dataclasses.replace(PRESETS["fast"], frames_a_step=2)
     run, split = prepared(phantom_clip(), preset, iterations=5)
     assert run.schedule.epoch == -(-len(split.train) // 2)
-    train(run, Stopwatch(), lambda: 31.5, TrainingHooks())
+    train(run, Stopwatch(), lambda: HeldOutScore(31.5, math.nan), TrainingHooks())
     write_curve(tmp_path / "curve.csv", run)
     with (tmp_path / "curve.csv").open() as file:
         (row,) = csv.DictReader(file)
@@ -241,7 +242,7 @@ def test_a_stop_before_the_first_step_makes_none() -> None:
 def test_the_last_iteration_is_scored_and_reported() -> None:
     run, _ = prepared(phantom_clip(), iterations=5)
     told: list[Progress] = []
-    train(run, Stopwatch(), lambda: 31.5, TrainingHooks(on_progress=told.append))
+    train(run, Stopwatch(), lambda: HeldOutScore(31.5, math.nan), TrainingHooks(on_progress=told.append))
     assert [(point.iteration, point.psnr_tissue_db) for point in run.curve] == [(5, 31.5)]
     assert told
     assert all(each.stage == "train" and 0 <= each.fraction <= 1 and each.iterations == 5 for each in told)

@@ -1,0 +1,89 @@
+"""The right eye as a judge: a real view, some degrees beside the left eye, at every held-out moment.
+
+Judged are the right eye's tissue pixels that the left eye sees, too. Warping the left eye's picture of the same moment
+by its stereo depth is the baseline; no model has that picture.
+
+Symbols: H W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.wire.errors import TrainingDiverged
+from worker.input.clip import DepthClip
+from worker.model.metrics import Image, clear_of_highlights, psnr_tissue
+from worker.train.scoring import FrameRenderer, judged_pixels
+
+
+@dataclass(frozen=True)
+class RightScores:
+    """Scores of the right eye's pictures of some frames, in dB, a number per frame; NaN where there was no tissue.
+
+    psnr_db, warp_db    of the model, and of the warped left eye
+    clear_db, warp_clear_db  the same without highlights
+    """
+
+    psnr_db: tuple[float, ...] = ()
+    clear_db: tuple[float, ...] = ()
+    warp_db: tuple[float, ...] = ()
+    warp_clear_db: tuple[float, ...] = ()
+
+
+def measure_right(clip: DepthClip, frames: Sequence[int], render: FrameRenderer) -> RightScores:
+    """Scores the renders of these frames (clip indices) from the right eye's pose; nothing for a clip of one eye.
+
+    Raises:
+        TrainingDiverged: a render holds NaN or infinity.
+    """
+    if clip.right is None:
+        return RightScores()
+    rows = []
+    for index in frames:
+        shown = render(index).rgb
+        if not np.isfinite(shown).all():
+            raise TrainingDiverged(f"Frame {index} renders as NaN or infinity from the right eye: training diverged.")
+        truth, judged = clip.right.rgb[index], judged_pixels(clip.right, index)
+        warped = warped_left(clip, index)
+        rows.append([score for image in (shown, warped) for score in _scores(image, truth, judged)])
+    model, clear, warp, warp_clear = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return RightScores(model, clear, warp, warp_clear)
+
+
+def warped_left(clip: DepthClip, index: int) -> NDArray[np.uint8]:
+    """The left eye's picture [H, W, 3] warped to the right eye by the right eye's depth; gaps take a neighbour's."""
+    assert clip.right is not None
+    right, left_k = clip.right, clip.intrinsics
+    depth_mm = _filled(right.depth_mm[index])
+    baseline_mm = np.linalg.norm(right.world_from_camera[index][:3, 3] - clip.world_from_camera[index][:3, 3])
+    height, width = depth_mm.shape
+    disparity_px = left_k.fx * float(baseline_mm) / depth_mm + left_k.cx - right.intrinsics.cx
+    x = np.arange(width, dtype=np.float32) + disparity_px.astype(np.float32)
+    y = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, axis=1) + np.float32(
+        left_k.cy - right.intrinsics.cy
+    )
+    warped = cv2.remap(clip.rgb[index], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(warped, np.uint8)
+
+
+def _scores(image: Image, truth: NDArray[np.uint8], judged: NDArray[np.bool_]) -> tuple[float, float]:
+    """psnr_tissue in dB over the judged pixels, and without highlights."""
+    return psnr_tissue(image, truth, judged), psnr_tissue(image, truth, judged & clear_of_highlights(image, truth))
+
+
+def _filled(depth_mm: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depth [H, W]; where there is none, the nearest pixel's that has one."""
+    known = depth_mm > 0
+    if known.all() or not known.any():
+        return np.where(known, depth_mm, np.float32(1e6))
+    _, label = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    by_label = np.zeros(label.max() + 1, np.float32)
+    by_label[label[known]] = depth_mm[known]
+    return np.asarray(np.where(known, depth_mm, by_label[label]), np.float32)
