@@ -1,0 +1,119 @@
+"""The right eye's depth and masks, moved from the left eye, against a scene that is known exactly."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from worker.input.calibration import rectify
+from worker.input.camera import to_camera, unproject
+from worker.input.clip import DepthClip
+from worker.phantom import Phantom, PhantomSettings, make_phantom
+from worker.stereo import estimate_depth
+from worker.stereo.right_eye import moved_depth, moved_tissue, painted_over
+
+HEIGHT, WIDTH = 24, 80
+FOCAL_BASELINE = 800.0  # disparity 8 at 100 mm, 16 at 50 mm
+
+
+def step_mm() -> np.ndarray:
+    """A near square before a far wall."""
+    depth_mm = np.full((HEIGHT, WIDTH), 100.0, np.float32)
+    depth_mm[8:16, 30:50] = 50.0
+    return depth_mm
+
+
+def test_a_surface_moves_by_its_disparity_and_the_nearer_one_hides_the_other() -> None:
+    moved, confidence = moved_depth(step_mm(), np.full((HEIGHT, WIDTH), 200, np.uint8), FOCAL_BASELINE, 0.0)
+    np.testing.assert_allclose(moved[10:14, 15:33], 50.0)  # 30:50 less 16
+    np.testing.assert_allclose(moved[10:14, 0:13], 100.0)
+    assert (moved[10:14, 35:41] == 0).all()  # wall that the square hides from the left eye
+    assert (moved[:, WIDTH - 7 :] == 0).all()  # the strip that only the right eye sees
+    assert (confidence[moved > 0] == 200).all()
+    assert (confidence[moved == 0] == 0).all()
+
+
+def test_depth_that_is_missing_stays_missing() -> None:
+    depth_mm = step_mm()
+    depth_mm[:, 20:28] = 0
+    moved, _ = moved_depth(depth_mm, np.full((HEIGHT, WIDTH), 200, np.uint8), FOCAL_BASELINE, 0.0)
+    assert (moved[2:6, 13:19] == 0).all()
+
+
+def test_an_instrument_without_depth_moves_with_its_nearest_part_that_has_some() -> None:
+    depth_mm, tissue = step_mm(), np.ones((HEIGHT, WIDTH), np.bool_)
+    tissue[8:16, 30:50] = False
+    depth_mm[8:16, 30:40] = 0
+    moved = moved_tissue(tissue, depth_mm, FOCAL_BASELINE, 0.0)
+    assert not moved[8:16, 14:34].any()
+    assert moved[8:16, 40:].all()
+    assert moved[:6].all()
+
+
+def test_an_instrument_that_leaves_the_left_picture_goes_on_in_the_strip_of_the_right_eye() -> None:
+    depth_mm, tissue = np.full((HEIGHT, WIDTH), 100.0, np.float32), np.ones((HEIGHT, WIDTH), np.bool_)
+    tissue[8:16, 60:] = False
+    depth_mm[8:16, 60:] = 50.0
+    moved = moved_tissue(tissue, depth_mm, FOCAL_BASELINE, 0.0)
+    assert not moved[9:15, 44:].any()
+    assert moved[:6, 44:].all()
+
+
+def test_a_clip_without_instruments_has_none_in_the_right_eye() -> None:
+    assert moved_tissue(np.ones((HEIGHT, WIDTH), np.bool_), step_mm(), FOCAL_BASELINE, 0.0).all()
+
+
+def test_a_label_lies_at_the_same_pixels_in_both_eyes_and_an_instrument_does_not() -> None:
+    random = np.random.default_rng(0)
+    left, right = random.integers(0, 255, (2, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    never_tissue = np.zeros((HEIGHT, WIDTH), np.bool_)
+    never_tissue[:4, :20] = never_tissue[10:20, 40:60] = True
+    right[:4, :20] = left[:4, :20]
+    label = painted_over(left, right, never_tissue)
+    assert label[:4, :20].all()
+    assert not label[10:].any()
+
+
+@cache
+def drawn() -> tuple[Phantom, DepthClip]:
+    phantom = make_phantom(PhantomSettings(width=320, height=256, frames=2, motion="breathing"))
+    recording = phantom.stereo_recording()
+    return phantom, estimate_depth(rectify(recording.clip, recording.calibration))
+
+
+def test_the_right_eye_of_a_phantom_has_its_pose_and_its_depth() -> None:
+    phantom, clip = drawn()
+    assert clip.right is not None
+    np.testing.assert_allclose(clip.right.world_from_camera[0], phantom.world_from_right(0), atol=1e-9)
+    truth_mm = phantom.surface_pixels(0, phantom.world_from_right(0)).depth_mm
+    both = clip.right.tissue[0] & (clip.right.depth_mm[0] > 0) & (truth_mm > 0)
+    assert both.mean() > 0.6
+    off_mm = np.abs(clip.right.depth_mm[0] - truth_mm)[both]
+    assert np.median(off_mm) < 1.0
+    assert np.percentile(off_mm, 90) < 3.0
+
+
+def test_the_moved_masks_cover_the_right_eyes_instrument() -> None:
+    phantom, clip = drawn()
+    assert clip.right is not None
+    truth = phantom.stereo_recording().tissue_right[0]
+    assert (~truth).any()
+    assert clip.right.tissue[0][~truth].mean() < 0.05  # instrument that is taken for tissue
+    assert (~clip.right.tissue[0][truth]).mean() < 0.1
+
+
+def test_both_eyes_see_a_point_at_their_own_pixels() -> None:
+    _, clip = drawn()
+    assert clip.right is not None
+    pixels = np.flatnonzero(clip.depth_confidence[0] > 200)[::97]
+    points_mm = unproject(pixels, clip.depth_mm[0].reshape(-1)[pixels], clip.intrinsics, clip.world_from_camera[0])
+    x, y, z = to_camera(points_mm, clip.right.world_from_camera[0]).T
+    k = clip.right.intrinsics
+    column, row = np.floor(k.fx * x / z + k.cx).astype(int), np.floor(k.fy * y / z + k.cy).astype(int)
+    inside = (column >= 0) & (column < k.width)
+    there_mm = clip.right.depth_mm[0][row[inside], column[inside]]
+    seen = there_mm > 0
+    assert seen.mean() > 0.9
+    assert np.median(np.abs(there_mm - z[inside])[seen]) == pytest.approx(0, abs=0.2)
