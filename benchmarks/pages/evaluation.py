@@ -15,6 +15,7 @@ from worker.evaluate.charts import clip_alone
 from worker.evaluate.published import ABLATION, RESULTS, Published
 from worker.evaluate.rows import Results, Row
 from worker.evaluate.summary import Capacity, Group, Sooner, capacities, groups_of, orderings, sooner
+from worker.train.presets import PRESETS
 
 CAPACITY = "capacity"
 """The folder beside runs.csv that holds the grid of capacities."""
@@ -56,6 +57,20 @@ A mark is the median of all seeds, its disc the scene on disk, and the line join
 than. `hexplane` has no kernels of its own here and moves its Gaussians in torch, so its seconds say more about that
 than about the method. The hollow marks are what papers print for other clips on other hardware, in `psnr_paper`, which
 is higher: they say where the field stands, and no distance from them to ours is a measurement.
+""",
+    "curves-eyes": """
+### Left and right eye
+
+![Held-out scores of the left and of the right eye against seconds of training](curves-eyes.png)
+
+The right eye of a stereo recording is a true view some degrees beside the left one. `psnr_right` scores it at held-out
+moments, over tissue that the left eye sees, too ([conventions](../conventions.md#scores)). Series with `eyes=left`,
+drawn hollow, trained on the left eye alone. So did the published method and its rivals. All others trained on both
+eyes, never on a held-out moment of either. Dashed is what warping the left eye's picture of the same moment scores. No
+model has that picture.
+""",
+    "pareto-right": """
+![Final psnr_right against seconds of training](pareto-right.png)
 """,
     "frames": """
 ### Images a second against decibels
@@ -120,7 +135,7 @@ def sections(folder: Path) -> list[str]:
     if any(group.rows for group in groups):
         parts += [_INTRODUCTION.format(count=_counted(results.runs)), _headline(sooner(results.curves))]
         parts += [text for name, text in _CHARTS.items() if (folder / f"{name}.png").exists()]
-        parts += [_truth(groups), _ablation(groups), _parsimony(groups), _published()]
+        parts += [_both_eyes(groups), _truth(groups), _ablation(groups), _parsimony(groups), _published()]
     grid = Results(folder / CAPACITY)
     if found := capacities(groups_of(grid.runs)):
         parts += [
@@ -151,7 +166,8 @@ def write_readme(readme: Path, folder: Path) -> None:
     page = f"[All charts and figures]({folder.relative_to(readme.parent)}/index.md)"
     before, rest = text.split(MARKS[0])
     after = rest.split(MARKS[1])[1]
-    body = "\n\n".join((MARKS[0], picture, caption, f"{_claim(usual)} {page}.", MARKS[1]))
+    claims = filter(None, (_claim(usual), right_eye_claim(groups_of(results.runs)), f"{page}."))
+    body = "\n\n".join((MARKS[0], picture, caption, " ".join(claims), MARKS[1]))
     readme.write_text(f"{before}{body}{after}")
 
 
@@ -209,6 +225,36 @@ def _headline(found: Sequence[Sooner]) -> str:
     if not rows:
         return ""
     return f"\n### How much sooner\n\n{_claim(found)} {_METHOD}\n{table(header, rows)}"
+
+
+_EYES = {
+    "psnr_tissue_db": "left, dB", "psnr_right_db": "right, dB", "warp_db": "warp, dB",
+    "psnr_clear_db": "left without highlights", "psnr_right_clear_db": "right without highlights",
+    "warp_clear_db": "warp without highlights", "t_train_s": "t_train_s", "t_post_s": "t_post_s",
+}  # fmt: skip
+
+
+def _both_eyes(groups: Sequence[Group]) -> str:
+    """A row a group whose right eye was scored."""
+    known = [group for group in groups if not math.isnan(group.median("psnr_right_db"))]
+    rows = [
+        [*group.place, group.series, group.limit, *(_number(group.median(name), 1) for name in _EYES)]
+        for group in known
+    ]
+    header = ["clip", "held out", "series", "limit", *_EYES.values()]
+    return f"\n{right_eye_claim(groups)}\n{table(header, rows)}" if rows else ""
+
+
+def right_eye_claim(groups: Sequence[Group]) -> str:
+    """What `fast` scores in both eyes of each stereo clip, in its usual time; empty without such rows."""
+    fast = [group for group in groups if group.series == "fast" and not math.isnan(group.median("psnr_right_db"))]
+    usual = [group for group in fast if group.limit == f"{PRESETS['fast'].budget_s:g} s"]
+    return " ".join(
+        f"In {group.limit}, `fast` scores {group.median('psnr_tissue_db'):.1f} dB in the left eye of "
+        f"`{group.clip}` ({group.holdout}) and {group.median('psnr_right_db'):.1f} dB in the right eye; the left eye's "
+        f"picture, warped, scores {group.median('warp_db'):.1f} dB there."
+        for group in usual or fast
+    )
 
 
 def _truth(groups: Sequence[Group]) -> str:

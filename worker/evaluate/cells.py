@@ -1,7 +1,8 @@
 """What is measured: a grid of cells, each of them one reconstruction.
 
 A series is a preset, or a preset with some of its numbers changed: `fast:bases=9,points_per_image=20000`. Every grid,
-that of capacity too, is a list of series.
+that of capacity too, is a list of series. `fast:eyes=left` is the preset as it is, trained on the left eye of a stereo
+clip; without it a preset that can takes both.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from contract.wire.errors import InputError
+from contract.wire.names import Eyes
 from contract.wire.options import ReconstructionOptions, parse_options
 from worker.train.presets import PRESETS, Preset, preset_named
 
@@ -25,6 +27,9 @@ DEFAULT_HOLDOUTS = ("every8", "blocks8")
 GRID_BASES = (3, 5, 9, 17, 33)
 GRID_POINTS = (10_000, 20_000, 40_000, 80_000)
 """Bases and Gaussians per image of the grid that the automatic choice is compared with."""
+EYES = "eyes"
+BOTH_EYES: Eyes = "both"
+"""The change in a series that is an option of the reconstruction and no value of its preset, and what it is unsaid."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,7 @@ def plan(
     seeds: Sequence[int],
     budgets_s: Sequence[float] = (),
     iterations: Sequence[int] = (),
+    eyes: Sequence[Eyes] = (BOTH_EYES,),
 ) -> list[Cell]:
     """Every combination, clip by clip so that each is opened once; without budgets and iterations as the presets say.
 
@@ -63,11 +69,13 @@ def plan(
 
     Args:
         series: also "ours" and "rivals".
+        eyes: of the series that do not say themselves; a preset that trains on the left eye alone has one cell.
 
     Raises:
         InputError: a series is not known, or no reconstruction takes a holdout or a seed.
     """
-    presets = dict(_read(name) for each in series for name in SHORTHANDS.get(each, (each,)))
+    named = [name for each in series for name in SHORTHANDS.get(each, (each,))]
+    presets = dict(_read(_with_eyes(name, which)) for name in named for which in eyes)
     cells = []
     for clip in clips:
         for holdout in holdouts:
@@ -91,9 +99,10 @@ def options_of(cell: Cell) -> ReconstructionOptions:
     Raises:
         InputError: no reconstruction takes one of them.
     """
-    preset = {"preset": cell.series} if cell.series in PRESETS else {}
+    preset = {} if is_changed(cell.series) else {"preset": preset_of(cell.series).name}
     length = {"budget_s": cell.budget_s, "iterations": cell.iterations}
-    return parse_options(ReconstructionOptions, {"holdout": cell.holdout, "seed": cell.seed, **length, **preset})
+    chosen = {"holdout": cell.holdout, "seed": cell.seed, EYES: eyes_of(cell.series)}
+    return parse_options(ReconstructionOptions, {**chosen, **length, **preset})
 
 
 def preset_of(series: str) -> Preset:
@@ -105,58 +114,104 @@ def preset_of(series: str) -> Preset:
     return _read(series)[1]
 
 
-def base_of(series: str) -> str:
-    """The preset that a series is a variant of."""
+def preset_name_of(series: str) -> str:
+    """The name of the preset that a series is a variant of."""
     return series.partition(":")[0]
 
 
-def capacity_grid(preset: str) -> list[str]:
-    """The preset, whose capacity is chosen for the scene, and its variants with fixed capacities."""
-    fixed = [f"{preset}:bases={bases},points_per_image={points}" for bases in GRID_BASES for points in GRID_POINTS]
-    return [preset, *fixed]
+def eyes_of(series: str) -> str:
+    """The eyes that a series trains on, where the clip has two and its preset takes two."""
+    return next((change.partition("=")[2] for change in _changes(series) if _is_eyes(change)), BOTH_EYES)
+
+
+def base_of(series: str) -> str:
+    """The series with the same preset and the same eyes that changes none of the preset's values."""
+    return _named(preset_name_of(series), [change for change in _changes(series) if _is_eyes(change)])
+
+
+def is_changed(series: str) -> bool:
+    """Whether the series changes a value of its preset."""
+    return any(not _is_eyes(change) for change in _changes(series))
+
+
+def capacity_grid(series: str) -> list[str]:
+    """The series, whose capacity is chosen for the scene, and its variants with fixed capacities."""
+    name, own = preset_name_of(series), _changes(series)
+    grid = ([f"bases={bases}", f"points_per_image={points}"] for bases in GRID_BASES for points in GRID_POINTS)
+    return [series, *(_named(name, [*fixed, *own]) for fixed in grid)]
+
+
+def _changes(series: str) -> list[str]:
+    return list(filter(None, series.partition(":")[2].split(",")))
+
+
+def _is_eyes(change: str) -> bool:
+    return change.partition("=")[0] == EYES
+
+
+def _named(preset: str, changes: Sequence[str]) -> str:
+    return f"{preset}:{','.join(changes)}" if changes else preset
+
+
+def _with_eyes(series: str, eyes: str) -> str:
+    """The series trained on these eyes, unless it says itself or its preset takes one eye only."""
+    decided = any(_is_eyes(change) for change in _changes(series)) or eyes == BOTH_EYES
+    if decided or not preset_named(preset_name_of(series)).both_eyes:
+        return series
+    return _named(preset_name_of(series), [*_changes(series), f"{EYES}={eyes}"])
 
 
 def _read(series: str) -> tuple[str, Preset]:
     """A series' canonical name, with its changes in alphabetical order, and its preset. Raises as preset_of."""
-    name, _, changes = series.partition(":")
+    name = preset_name_of(series)
     preset = preset_named(name)
     values: dict[str, Any] = {}
-    for change in filter(None, changes.split(",")):
+    for change in _changes(series):
         field, _, text = change.partition("=")
-        plain = _plain_fields()
-        if field not in plain:
-            problem = f"{change!r} in {series!r} changes no plain value of a preset."
-            raise InputError("--series", problem, f"Use FIELD=VALUE with one of: {', '.join(plain)}.")
-        if field == "points_per_image" and preset.fusion.mode != "fill":
-            problem = f"{name!r} does not choose how many points an image gives, so {change!r} would change nothing."
-            raise InputError("--series", problem, "Leave it out.")
+        _check_change(preset, series, change)
         if field in values:
             raise InputError("--series", f"{series!r} gives {field!r} twice.", "Give it once.")
-        values[field] = _value(series, field, text, getattr(preset, field))
-    if not values:
-        return name, preset
-    written = ",".join(f"{field}={str(values[field]).lower()}" for field in sorted(values))
+        values[field] = _value(series, field, text, getattr(preset, field, BOTH_EYES))
+    written = [f"{field}={str(values[field]).lower()}" for field in sorted(values)]
+    values.pop(EYES, None)
     try:
-        return f"{name}:{written}", dataclasses.replace(preset, **values)
+        changed = dataclasses.replace(preset, **values) if values else preset
     except ValueError as error:
         problem = f"{series!r} cannot be trained: {error}."
         raise InputError("--series", problem, "Change what it needs too, or leave the change out.") from None
+    return _named(name, [change for change in written if change != f"{EYES}={BOTH_EYES}"]), changed
+
+
+def _check_change(preset: Preset, series: str, change: str) -> None:
+    """InputError unless the preset has what is changed, and the change has an effect."""
+    field, plain = change.partition("=")[0], [*_plain_fields(), EYES]
+    if field not in plain:
+        problem = f"{change!r} in {series!r} changes no plain value of a preset."
+        raise InputError("--series", problem, f"Use FIELD=VALUE with one of: {', '.join(plain)}.")
+    why = ""
+    if field == "points_per_image" and preset.fusion.mode != "fill":
+        why = "does not choose how many points an image gives"
+    if field == EYES and not preset.both_eyes:
+        why = "trains on the left eye alone"
+    if why:
+        problem = f"{preset.name!r} {why}, so {change!r} would change nothing."
+        raise InputError("--series", problem, "Leave it out.")
 
 
 def _plain_fields() -> list[str]:
     """The fields of a preset that a series can change: numbers, words and switches.
 
-    Not the name, not points_by_budget, which has no effect in a changed preset, and not the length, which is the cell's
-    limit.
+    Not the name, not points_by_budget, which has no effect in a changed preset, not both_eyes, for which there is
+    eyes=left, and not the length, which is the cell's limit.
     """
-    others = ("name", "points_by_budget", "iterations", "budget_s")
+    others = ("name", "points_by_budget", "both_eyes", "iterations", "budget_s")
     names = [each.name for each in dataclasses.fields(Preset) if each.name not in others]
     return [name for name in names if not any(dataclasses.is_dataclass(getattr(x, name)) for x in PRESETS.values())]
 
 
 def _value(series: str, field: str, text: str, current: object) -> object:
     """text as a value of the current one's type."""
-    kind = get_type_hints(Preset)[field]
+    kind = Eyes if field == EYES else get_type_hints(Preset)[field]
     words = get_args(kind) if get_origin(kind) is Literal else ()
     try:
         if text == "none" and type(None) in get_args(kind):

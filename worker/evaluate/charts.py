@@ -1,19 +1,22 @@
 """The charts, drawn from rows alone: a row of panels per clip, a column per way of holding out.
 
 curves  held-out psnr_tissue against seconds of training; curves-ssim, curves-depth: SSIM, median depth error
+curves-eyes  the same of the left eye and of the right eye beside each other, where a clip has two
 pareto  its end against the seconds it took; the front joins what nothing is both sooner and better than
+pareto-right  the same for the right eye
 frames  its end against images rendered a second
 knee    of the grid of capacities: its end against the scene's bytes, and where the automatic choice lies
 
 The area of the disc behind a mark is the scene's size on disk; a small scene's is hidden by its mark. What was not
-measured is named over its panel. Copying the neighbouring frames is dashed everywhere.
+measured is named over its panel. Copying the neighbouring frames is dashed everywhere; for the right eye, warping the
+left eye's picture of the same moment is. Series trained on the left eye alone have hollow marks.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,6 +43,18 @@ OVER_TIME = {
     "curves-depth": ("depth_agreement_mm", "median depth error, mm"),
 }
 """By chart: the column of curves.csv, and what it is called."""
+RIGHT = "psnr_right_db"
+EYES = {
+    "left eye": ("psnr_tissue_db", DECIBEL),
+    "right eye": (RIGHT, "held-out psnr_right, dB"),
+}
+"""By eye: its column in both files, and what it is called."""
+COPY_LINES = {
+    "copy_blend_db": ("copying: blend", (5, 3), 1, "right"),
+    "copy_flow_db": ("copying: flow", (2, 2), 0, "left"),
+}
+WARP_LINES = {"warp_db": ("warped left eye", (5, 3), 1, "right")}
+"""By column: what a dashed line is called, its dashes, the side where its name stands and how that is aligned."""
 
 Points = list[tuple[float, float]]
 
@@ -62,6 +77,10 @@ def draw_all(results: Results, folder: Path) -> list[str]:
             _draw([group for group in presets if group.clip == clip_alone(presets)], _pareto, folder, "pareto-one-clip")
             _draw(presets, _frames, folder, "frames")
             drawn += ["pareto", "pareto-one-clip", "frames"]
+        if stereo := _with_right_eye(presets):
+            _draw_eyes(stereo, results.curves, folder)
+            _draw(stereo, partial(_pareto, score=RIGHT), folder, "pareto-right")
+            drawn += ["curves-eyes", "pareto-right"]
         if choices:
             _draw_knee(groups, choices, folder)
             drawn.append("knee")
@@ -84,14 +103,39 @@ def _draw(groups: Sequence[Group], draw_panel: Callable[[Any, Sequence[Group]], 
             _leave_empty(axis, place)
             continue
         _name(axis, place, here, _missing(here))
-        axis.set_ylabel(OVER_TIME.get(name, ("", DECIBEL))[1])
+        axis.set_ylabel(EYES["right eye"][1] if name == "pareto-right" else OVER_TIME.get(name, ("", DECIBEL))[1])
         draw_panel(axis, here)
         if name not in OVER_TIME or name == "curves":
-            _copies(axis, here)
+            _dashed(axis, here, WARP_LINES if name == "pareto-right" else COPY_LINES)
         _finish(axis)
         if name == "curves":
-            _cut_below(axis, here)
+            _cut_below([axis], [group.median("psnr_tissue_db") for group in here])
     save(figure, folder, name)
+
+
+def _with_right_eye(groups: Sequence[Group]) -> list[Group]:
+    """The groups of the places where the right eye was scored."""
+    places = {group.place for group in groups if not math.isnan(group.median(RIGHT))}
+    return [group for group in groups if group.place in places]
+
+
+def _draw_eyes(groups: Sequence[Group], curves: Sequence[Row], folder: Path) -> None:
+    """Two panels per place on one scale: the held-out frames of the left eye, and of the right."""
+    places = list(dict.fromkeys(group.place for group in groups))
+    figure, axes = figure_of(2 * len(places), 2, _handles(groups, "curves"))
+    for place, *pair in zip(places, axes[::2], axes[1::2], strict=True):
+        here = [group for group in groups if group.place == place]
+        for axis, (eye, (column, label)) in zip(pair, EYES.items(), strict=True):
+            _name(axis, place, here, eye)
+            axis.set_ylabel(label)
+            _curves(axis, here, _points_by_run(curves, column))
+            _dashed(axis, here, WARP_LINES if column == RIGHT else COPY_LINES)
+            _finish(axis)
+        limits = [axis.get_ylim() for axis in pair]
+        for axis in pair:
+            axis.set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
+        _cut_below(pair, [group.median(column) for group in here for column, _ in EYES.values()])
+    save(figure, folder, "curves-eyes")
 
 
 def _points_by_run(curves: Sequence[Row], column: str) -> dict[tuple[str, ...], Points]:
@@ -111,37 +155,43 @@ def _curves(axis: Any, groups: Sequence[Group], points: dict[tuple[str, ...], Po
         runs = sorted((points[key_of(row)] for row in group.rows if key_of(row) in points), key=lambda run: run[-1][1])
         for place, run in enumerate(runs):
             is_middle = place == len(runs) // 2
-            style = {"marker": look.marker, "markersize": 4.5, "linewidth": 1.6} if is_middle else {"alpha": 0.35}
+            marks = {"marker": look.marker, "markersize": 4.5, "markerfacecolor": look.face, "linewidth": 1.6}
+            style = marks if is_middle else {"alpha": 0.35}
             axis.plot(*zip(*run, strict=True), color=look.colour, zorder=3 if is_middle else 2, **style)
             if is_middle:
                 _name_limit(axis, group, groups, run[-1], (3, 4))
 
 
-def _pareto(axis: Any, groups: Sequence[Group]) -> None:
+def _pareto(axis: Any, groups: Sequence[Group], score: str = "psnr_tissue_db") -> None:
     axis.set_xlabel("seconds of training (log)")
-    _marks(axis, groups, "t_train_s")
-    _front(axis, groups)
+    _marks(axis, groups, "t_train_s", score)
+    _front(axis, groups, score)
     if groups and groups[0].place == (REAL_CLIP, PAPERS_HOLDOUT):
         _published(axis, lambda each: each.train_s)
 
 
 def _frames(axis: Any, groups: Sequence[Group]) -> None:
     axis.set_xlabel("images rendered a second, at the clip's size (log)")
-    _marks(axis, groups, "render_fps")
+    _marks(axis, groups, "render_fps", "psnr_tissue_db")
     if groups and groups[0].place == (REAL_CLIP, PAPERS_HOLDOUT):
         _published(axis, lambda each: each.fps)
 
 
-def _marks(axis: Any, groups: Sequence[Group], across: str) -> None:
+def _marks(axis: Any, groups: Sequence[Group], across: str, score: str) -> None:
     """A mark a group at its medians, and behind it a disc whose area is the scene's size."""
     for group in groups:
-        x, y = group.median(across), group.median("psnr_tissue_db")
+        x, y = group.median(across), group.median(score)
         if math.isnan(x) or math.isnan(y):
             continue
         look = look_of(group.series)
         area = AREA_A_MEGABYTE * group.median("scene_bytes") / 1e6
         axis.scatter(x, y, s=area, c=look.colour, alpha=0.25, linewidths=0, zorder=2)
-        axis.scatter(x, y, s=MARK_AREA, c=look.colour, marker=look.marker, edgecolors="white", linewidths=0.5, zorder=4)
+        mark: dict[str, Any] = {
+            "marker": look.marker,
+            "edgecolors": look.edge,
+            "linewidths": 1.2 if look.hollow else 0.5,
+        }
+        axis.scatter(x, y, s=MARK_AREA, c=look.face, zorder=4, **mark)
         _name_limit(axis, group, groups, (x, y), (2 + math.sqrt(max(area, MARK_AREA)) / 2, -3))
 
 
@@ -154,9 +204,9 @@ def _name_limit(
         axis.annotate(group.limit, place, offset, textcoords="offset points", fontsize=7, color=colour, zorder=5)
 
 
-def _front(axis: Any, groups: Sequence[Group]) -> None:
+def _front(axis: Any, groups: Sequence[Group], score: str) -> None:
     """Joins the groups that no other beats in both seconds and decibels."""
-    points = sorted((group.median("t_train_s"), group.median("psnr_tissue_db")) for group in groups if group.rows)
+    points = sorted((group.median("t_train_s"), group.median(score)) for group in groups if group.rows)
     front: Points = []
     for x, y in points:
         if not math.isnan(y) and (not front or y > front[-1][1]):
@@ -176,17 +226,16 @@ def _published(axis: Any, across: Callable[[Published], float | None]) -> None:
         axis.annotate(each.method, (x, y), (0, (6, -12)[place % 2]), textcoords="offset points", **text)
 
 
-def _copies(axis: Any, groups: Sequence[Group]) -> None:
-    """Dashed: what copying the neighbouring frames scores, blended and by optical flow."""
-    both = (("copy_blend_db", "blend", (5, 3), 1, "right"), ("copy_flow_db", "flow", (2, 2), 0, "left"))
-    for name, what, dashes, side, aligned in both:
-        known = [group.median(name) for group in groups if not math.isnan(group.median(name))]
+def _dashed(axis: Any, groups: Sequence[Group], lines: Mapping[str, tuple[str, tuple[int, int], int, str]]) -> None:
+    """Dashed: what copying or warping recorded pictures scores."""
+    for column, (what, dashes, side, aligned) in lines.items():
+        known = [score for group in groups if not math.isnan(score := group.median(column))]
         if known:
             axis.axhline(known[0], color=GREY, linewidth=1.0, dashes=dashes, zorder=1)
             text: dict[str, Any] = {"fontsize": 7, "color": GREY, "ha": aligned, "annotation_clip": True}
             text["xycoords"] = ("axes fraction", "data")
             inside = (0.995 * side + 0.0025, known[0])  # a label on the very edge would count as outside
-            axis.annotate(f"copying: {what}", inside, (4 - 8 * side, 2), textcoords="offset points", **text)
+            axis.annotate(what, inside, (4 - 8 * side, 2), textcoords="offset points", **text)
 
 
 def _missing(groups: Sequence[Group]) -> str:
@@ -221,7 +270,7 @@ def _draw_knee(groups: Sequence[Group], choices: Sequence[Group], folder: Path) 
                     axis.plot(*zip(*sorted(points), strict=True), color=look.colour, **line)
             star = {"s": 170, "marker": "*", "edgecolors": "white", "zorder": 4}
             axis.scatter(*_size_and_score(chosen), c=look_of(chosen.series).colour, **star)
-        _copies(axis, here)
+        _dashed(axis, here, COPY_LINES)
         _finish(axis)
     save(figure, folder, "knee")
 
@@ -248,7 +297,7 @@ def _handles(groups: Sequence[Group], name: str) -> list[Any]:
     series = sorted({group.series for group in groups if group.rows}, key=lambda each: (known.get(each, 99), each))
     looks = {each: look_of(each) for each in series}
     handles = [
-        Line2D([], [], color=look.colour, marker=look.marker, label=each, linestyle=line)
+        Line2D([], [], color=look.colour, marker=look.marker, markerfacecolor=look.face, label=each, linestyle=line)
         for each, look in looks.items()
     ]
     if name in OVER_TIME:
@@ -302,9 +351,10 @@ def _finish(axis: Any) -> None:
     axis.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _cut_below(axis: Any, groups: Sequence[Group]) -> None:
+def _cut_below(axes: Sequence[Any], ends_db: Sequence[float]) -> None:
     """Leave out the beginnings of curves that lie far below where all of them end."""
-    ends = [score for score in (group.median("psnr_tissue_db") for group in groups) if not math.isnan(score)]
-    low, high = axis.get_ylim()
-    if ends:
-        axis.set_ylim(max(low, min(ends) - SHOWN_BELOW_WORST_DB), high)
+    ends = [score for score in ends_db if not math.isnan(score)]
+    for axis in axes:
+        low, high = axis.get_ylim()
+        if ends:
+            axis.set_ylim(max(low, min(ends) - SHOWN_BELOW_WORST_DB), high)

@@ -14,9 +14,9 @@ from contract.runtime.processes import heeding_signals
 from contract.runtime.progress_bar import ProgressBar
 from contract.wire.errors import InputError
 from contract.wire.job import JobProgress
-from contract.wire.names import DeviceName
+from contract.wire.names import DeviceName, Eyes
 from contract.wire.options import ClipOptions, ReconstructionOptions
-from worker.evaluate.cells import DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
+from worker.evaluate.cells import BOTH_EYES, DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
 from worker.evaluate.measure import Bench
 from worker.evaluate.rows import Results, adding_alone, write_rows
@@ -52,6 +52,13 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--holdout", nargs="+", default=list(DEFAULT_HOLDOUTS), help="(default: %(default)s)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N", help="(default: 0)")
     add_options(parser, ReconstructionOptions, "budget_s", "iterations", nargs="+", default=[])
+    parser.add_argument(
+        "--eyes",
+        nargs="+",
+        choices=get_args(Eyes),
+        default=[BOTH_EYES],
+        help="of stereo clips, to train on: left makes rows of series such as fast:eyes=left (default: both)",
+    )
     parser.add_argument(
         "--grid", action="store_true", help="of each series, the grid of fixed capacities in addition to its own choice"
     )
@@ -163,7 +170,8 @@ def _asked(options: argparse.Namespace) -> tuple[Bench, list[Cell]]:
     clips = [source.name for source in sources]
     for twice in {name for name in clips if clips.count(name) > 1}:
         raise InputError("CLIP", f"rows would call two clips {twice!r}.", "Give the files names of their own.")
-    cells = plan(clips, series, options.holdout, options.seeds, options.budget_s, options.iterations)
+    limits = options.budget_s, options.iterations
+    cells = plan(clips, series, options.holdout, options.seeds, *limits, options.eyes)
     return Bench({source.name: source for source in sources}, options.device), cells
 
 
@@ -185,6 +193,8 @@ def _outcome(row: dict[str, object]) -> str:
         return str(row["error"])
     score = row["psnr_tissue_db"]
     shown = "no frames held out" if score is None else f"{score:.2f} dB"
+    if row["psnr_right_db"] is not None:
+        shown += f", right eye {row['psnr_right_db']:.2f} dB"
     return (
         f"{shown}, {row['t_train_s']:.1f} s, {row['gaussians']} Gaussians, {int(str(row['scene_bytes'])) / 1e6:.1f} MB"
     )

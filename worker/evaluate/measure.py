@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.runtime.exits import flag_of
+from contract.wire.errors import InputError
 from contract.wire.names import CURVE, REPORT, DeviceName
 from contract.wire.report import Report
-from worker.evaluate.cells import Cell, options_of, preset_of
-from worker.evaluate.rows import KEY, NO_RESULT, commit, machine
+from worker.evaluate.cells import BOTH_EYES, Cell, eyes_of, is_changed, options_of, preset_of
+from worker.evaluate.rows import KEY, NO_RESULT, SCORES, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
 from worker.evaluate.truth import SceneCandidate, Truth
 from worker.input.clip import DepthClip
@@ -36,7 +37,6 @@ from worker.scene.checkpoint import load_scene
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
 from worker.train.hooks import RenderedFrame, TrainingHooks
-from worker.train.presets import PRESETS
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units
 
@@ -90,10 +90,13 @@ class Bench:
             self._truth.clear()
             self._open[place] = open_source(source, cell.holdout, hooks, choose_device(self.device))
         opened = self._open[place]
+        if opened.clip.right is None and eyes_of(cell.series) != BOTH_EYES:
+            problem = f"{cell.clip} has one eye, so {cell.series!r} would be measured like both eyes."
+            raise InputError("--eyes", problem, "Leave it out.")
         request = ReconstructionRequest(
             clip=opened.clip,
             options=options_of(cell),
-            own_preset=None if cell.series in PRESETS else preset_of(cell.series),
+            own_preset=preset_of(cell.series) if is_changed(cell.series) else None,
             device=self.device,
             accepted_at_s=time.time() - sum(opened.seconds.values()),
         )
@@ -203,10 +206,11 @@ def seconds_of(run: Mapping[str, float], opening: Mapping[str, float], judging_s
 
 def _reported(report: Report, seconds: Mapping[str, float]) -> Values:
     """What the quality report has of it; seconds by stage as JSON."""
-    same = ("psnr_tissue_db", "psnr_paper_db", "ssim", "depth_agreement_mm", "coverage", "train_psnr_tissue_db")
-    return {name: getattr(report, name) for name in (*same, "iterations", "width", "height")} | {
+    return {name: getattr(report, name) for name in (*SCORES, "iterations", "width", "height")} | {
         "copy_blend_db": report.baseline_blend_db,
         "copy_flow_db": report.baseline_flow_db,
+        "warp_db": report.baseline_warp_db,
+        "warp_clear_db": report.baseline_warp_clear_db,
         "t_train_s": seconds["t_train_s"],
         "t_post_s": seconds["t_post_s"],
         "seconds": json.dumps({name: round(value, 3) for name, value in seconds.items()}),

@@ -27,8 +27,11 @@ Row = dict[str, str]
 RUNS, CURVES = "runs.csv", "curves.csv"
 LOCK = ".lock"
 KEY = ("clip", "holdout", "series", "seed", "limit")
-SCORES = ("psnr_tissue_db", "psnr_paper_db", "ssim", "depth_agreement_mm", "coverage", "train_psnr_tissue_db")
-COPIES = ("copy_blend_db", "copy_flow_db")
+SCORES = (
+    "psnr_tissue_db", "psnr_clear_db", "psnr_right_db", "psnr_right_clear_db", "psnr_paper_db", "ssim",
+    "depth_agreement_mm", "coverage", "train_psnr_tissue_db",
+)  # fmt: skip
+COPIES = ("copy_blend_db", "copy_flow_db", "warp_db", "warp_clear_db")
 TRUTH = (
     "psnr_view10_db", "psnr_view15_db", "psnr_baked10_db", "psnr_baked15_db", "bound10_db", "bound15_db",
     "psnr_hidden_db", "depth_error_mm", "motion_error_mm", "moving_error_mm", "moving_mm", "empty_ok", "seen_ok",
@@ -41,7 +44,7 @@ RUN_FIELDS = (*KEY, *SCORES, *COPIES, *TRUTH, *SIZE, *SPEED, *ORIGIN)
 """Empty means not measured. docs/conventions.md defines SCORES and the clocks, truth.py TRUTH, measure.py the rest:
 SIZE in _size and _stored_loss_held_out_db, SPEED in seconds_of and _speed. seconds is JSON, load_1min before the run.
 """
-CURVE_FIELDS = (*KEY, "t_train_s", "iteration", "psnr_tissue_db", "ssim", "depth_agreement_mm")
+CURVE_FIELDS = (*KEY, "t_train_s", "iteration", "psnr_tissue_db", "psnr_right_db", "ssim", "depth_agreement_mm")
 NO_RESULT = (Cancelled, UnavailableError, ModuleNotFoundError)
 """Errors of the caller or of this machine: the method had no part in them, so no row holds them, and where they come
 measuring ends. Any other error is what a method breaks on: a result of its own, with a row."""

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from worker.evaluate.cells import base_of
+from worker.evaluate.cells import BOTH_EYES, eyes_of, preset_name_of
 
 PANEL_INCHES = (5.4, 3.5)
 LEGEND_ROW_INCHES = 0.24
@@ -38,8 +38,19 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class Look:
+    """Of a series' marks and line; one that is hollow has marks filled with white."""
+
     colour: str
     marker: str
+    hollow: bool = False
+
+    @property
+    def face(self) -> str:
+        return "white" if self.hollow else self.colour
+
+    @property
+    def edge(self) -> str:
+        return self.colour if self.hollow else "white"
 
 
 _LOOKS = {
@@ -62,8 +73,9 @@ BASES_LOOKS = (
 
 
 def look_of(series: str) -> Look:
-    """The look of a preset's series; variants look like their preset."""
-    return _LOOKS.get(base_of(series), Look(GREY, "h"))
+    """The look of a preset's series; variants look like their preset, those of the left eye alone are hollow."""
+    look = _LOOKS.get(preset_name_of(series), Look(GREY, "h"))
+    return look if eyes_of(series) == BOTH_EYES else replace(look, hollow=True)
 
 
 def figure_of(panels: int, columns: int, handles: Sequence[Any]) -> tuple[Any, list[Any]]:

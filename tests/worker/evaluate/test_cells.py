@@ -5,7 +5,16 @@ from __future__ import annotations
 import pytest
 
 from contract.wire.errors import InputError
-from worker.evaluate.cells import GRID_BASES, GRID_POINTS, Cell, base_of, capacity_grid, plan, preset_of
+from worker.evaluate.cells import (
+    GRID_BASES,
+    GRID_POINTS,
+    Cell,
+    base_of,
+    capacity_grid,
+    options_of,
+    plan,
+    preset_of,
+)
 from worker.train.presets import PRESETS
 
 
@@ -26,7 +35,7 @@ def test_a_series_is_a_preset_with_its_changes_made() -> None:
         "slow", "fast:speed=3", "fast:rates=1", "fast:densify=1", "fast:name=best", "fast:tracks=maybe",
         "fast:bases=few", "fast:bases", "fast:spread=none", "fast:order=sorted", "paper:points_per_image=9000",
         "fast:points_by_budget=false", "fast:spread=nan", "fast:iterations=20", "fast:budget_s=9",
-        "fast:bases=3,bases=5", "fast:bases=" + 400 * "9",
+        "fast:bases=3,bases=5", "fast:bases=" + 400 * "9", "fast:eyes=right", "paper:eyes=left", "fast:both_eyes=false",
     ],
 )  # fmt: skip
 def test_what_no_preset_has_is_refused_with_its_name(series: str) -> None:
@@ -93,3 +102,24 @@ def test_the_grid_of_capacities_has_every_pair_beside_the_presets_own_choice() -
 def test_a_cells_key_tells_its_length() -> None:
     assert Cell("a", "fast", "every8", 0, budget_s=60.0).limit == "60 s"
     assert Cell("a", "fast", "every8", 0, iterations=300).limit == "300 iterations"
+
+
+def test_the_left_eye_alone_is_a_series_of_its_own_for_presets_that_take_both() -> None:
+    cells = plan(["a"], ["fast", "fast:bases=9", "paper"], ["every8"], [0], [60], eyes=["left", "both"])
+    assert [cell.series for cell in cells] == [
+        "fast:eyes=left",
+        "fast",
+        "fast:bases=9,eyes=left",
+        "fast:bases=9",
+        "paper",
+    ]
+    assert [options_of(cell).eyes for cell in cells] == ["left", "both", "left", "both", "both"]
+    assert {options_of(cell).preset for cell in cells[:2]} == {"fast"}
+    assert preset_of("fast:eyes=left") is PRESETS["fast"], "its points follow the budget as those of the preset do"
+
+
+def test_eyes_that_a_series_names_are_kept_and_both_need_no_name() -> None:
+    cells = plan(["a"], ["fast:eyes=left", "fast:eyes=both"], ["every8"], [0], [60])
+    assert [cell.series for cell in cells] == ["fast:eyes=left", "fast"]
+    assert base_of("fast:bases=9,eyes=left") == base_of("fast:eyes=left") == "fast:eyes=left"
+    assert capacity_grid("fast:eyes=left")[1] == "fast:bases=3,points_per_image=10000,eyes=left"

@@ -62,6 +62,26 @@ def test_a_chart_names_what_is_missing_what_failed_and_what_others_published(dra
     assert text.count(">copying: flow<") == 2
 
 
+def test_left_and_right_eye_stand_beside_each_other_where_a_clip_has_two(tmp_path: Path) -> None:
+    import matplotlib as mpl
+
+    stereo = {"clip": "d4d-a-stereo", "copy_blend_db": "", "warp_db": 30.7}
+    runs = [run_row("fast", 37.5, psnr_right_db=36.0, **stereo), run_row("fast", 40.0)]
+    runs.append(run_row("fast:eyes=left", 38.6, psnr_right_db=30.6, **stereo))
+    curves = [row for run in runs for row in curve_rows(run, [(5.0, 200, 35.0), (60.0, 2900, 39.0)])]
+    write_rows(tmp_path / RUNS, RUN_FIELDS, runs)
+    write_rows(tmp_path / CURVES, CURVE_FIELDS, [row | {"psnr_right_db": "33"} for row in curves])
+    with mpl.rc_context({"svg.fonttype": "none"}):
+        assert draw_all(Results(tmp_path), tmp_path) == [*CHARTS, "curves-eyes", "pareto-right"]
+    eyes, pareto = ((tmp_path / f"{name}.svg").read_text() for name in ("curves-eyes", "pareto-right"))
+    assert (eyes.count(">left eye<"), eyes.count(">right eye<")) == (1, 1), "the clip of one eye has no panel"
+    assert ">held-out psnr_right, dB<" in eyes
+    assert ">fast:eyes=left<" in pareto
+    for text in (eyes, pareto):
+        assert text.count(">warped left eye<") == 1
+    assert "copying" not in pareto
+
+
 def test_a_grid_of_capacities_is_drawn_as_its_knee_alone(tmp_path: Path) -> None:
     rows = [run_row("fast", 30.0)]
     rows += [

@@ -47,7 +47,7 @@ def test_a_run_becomes_a_row_with_every_figure(measured: Path) -> None:
         "hexplane",
     )
     empty = {name for name in RUN_FIELDS if not fast[name]}
-    assert empty == {"error"}
+    assert empty == {"error", "psnr_right_db", "psnr_right_clear_db", "warp_db", "warp_clear_db"}, "it has one eye"
     assert abs(float(fast["stored_loss_held_out_db"])) < 0.3
     assert float(fast["psnr_tissue_db"]) > 15
     seconds = json.loads(fast["seconds"])
@@ -60,16 +60,43 @@ def test_a_run_becomes_a_row_with_every_figure(measured: Path) -> None:
     assert fast["command"] == again
 
 
-def test_a_phantom_is_also_a_stereo_clip_with_its_truth_beside_it(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def both_eyes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("stereo")
     asked = ["evaluate", f"{CLIP}:stereo", "--series", "fast", "--iterations", "12", "--holdout", "every8"]
-    assert main([*asked, "--out", str(tmp_path)]) == ExitCode.OK
-    (row,) = read_rows(tmp_path / RUNS)
+    assert main([*asked, "--eyes", "both", "left", "--out", str(out)]) == ExitCode.OK
+    return out
+
+
+def test_a_phantom_is_also_a_stereo_clip_with_its_truth_beside_it(both_eyes: Path) -> None:
+    row = read_rows(both_eyes / RUNS)[0]
     assert (row["clip"], row["error"]) == (f"{NAME}-stereo", "")
     assert "stereo_s" in json.loads(row["seconds"]), "its depth was matched"
     assert 0 < float(row["depth_error_mm"]) < 20
     for share in ("empty_ok", "seen_ok"):
         assert 0 < float(row[share]) <= 1
     assert f"{CLIP}:stereo" in row["command"]
+
+
+def test_the_right_eye_judges_what_either_number_of_eyes_taught(both_eyes: Path) -> None:
+    both, left = read_rows(both_eyes / RUNS)
+    assert (both["series"], left["series"]) == ("fast", "fast:eyes=left")
+    assert "--series fast:eyes=left" in left["command"]
+    assert float(both["psnr_right_db"]) != float(left["psnr_right_db"])
+    assert both["warp_db"] == left["warp_db"], "no model takes part in it"
+    for name in ("psnr_clear_db", "psnr_right_clear_db", "warp_clear_db"):
+        assert float(both[name]) > 5
+    ends = {row["series"]: row for row in read_rows(both_eyes / CURVES)}
+    assert float(ends["fast"]["psnr_right_db"]) == pytest.approx(float(both["psnr_right_db"]), abs=1e-3)
+    assert {"curves-eyes.png", "pareto-right.png"} <= {path.name for path in both_eyes.iterdir()}
+    summary = {row["series"]: row for row in read_rows(both_eyes / SUMMARY)}
+    assert summary["fast:eyes=left"]["psnr_right_db"] == left["psnr_right_db"]
+
+
+def test_a_clip_of_one_eye_has_no_row_of_the_left_eye_alone(tmp_path: Path) -> None:
+    assert evaluate(tmp_path, "--series", "fast", "--eyes", "left") == ExitCode.FAILED
+    (row,) = read_rows(tmp_path / RUNS)
+    assert row["error"].startswith(f"InputError: --eyes: {NAME} has one eye")
 
 
 def test_the_command_of_a_file_has_what_it_was_read_with(tmp_path: Path) -> None:

@@ -30,6 +30,16 @@ def test_the_page_makes_its_claims_from_rows(tmp_path: Path) -> None:
     assert "4 runs, 1 of them failed" in page
 
 
+def test_the_page_tells_the_right_eye_beside_the_left_one(tmp_path: Path) -> None:
+    folder = results(tmp_path / "results")
+    assert "right eye" not in "".join(sections(folder))
+    stereo = run_row("fast", 37.5, clip="d4d-a-stereo", psnr_right_db=36.04, warp_db=30.7, psnr_clear_db=39)
+    write_rows(folder / RUNS, RUN_FIELDS, [stereo, stereo | {"series": "fast:eyes=left", "psnr_right_db": "30.6"}])
+    page = "".join(sections(folder))
+    assert "In 60 s, `fast` scores 37.5 dB in the left eye of `d4d-a-stereo` (every8) and 36.0 dB in the right" in page
+    assert "| d4d-a-stereo | every8 | fast:eyes=left | 60 s | 37.5 | 30.6 | 30.7 | 39.0 | – |" in page
+
+
 def test_the_page_says_what_failed_and_what_is_missing(tmp_path: Path) -> None:
     page = "".join(sections(results(tmp_path / "results")))
     assert "failed: TrainingDiverged: no more" in page
