@@ -13,8 +13,9 @@ import csv
 from pathlib import Path
 from statistics import median
 
-from benchmarks.pages.evaluation import origin, sections, table, write_readme
+from benchmarks.pages.evaluation import origin, sections, write_readme
 from benchmarks.pages.gpu import gpu_sections
+from benchmarks.pages.markdown import table
 from benchmarks.pages.stability import stability_sections
 from worker.evaluate.stability import STABILITY
 

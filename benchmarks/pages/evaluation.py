@@ -10,12 +10,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import median, mode
 
+from benchmarks.pages.markdown import number, table
+from benchmarks.pages.right_eye import RIGHT_EYE_CHARTS, both_eyes, right_eye_claim
 from worker.evaluate.cells import DEFAULT_SERIES, GRID_BASES, GRID_POINTS, OURS, base_of
 from worker.evaluate.charts import clip_alone
 from worker.evaluate.published import ABLATION, RESULTS, Published
 from worker.evaluate.rows import Results, Row
 from worker.evaluate.summary import Capacity, Group, Sooner, capacities, groups_of, orderings, sooner
-from worker.train.presets import PRESETS
 
 CAPACITY = "capacity"
 """The folder beside runs.csv that holds the grid of capacities."""
@@ -58,20 +59,7 @@ than. `hexplane` has no kernels of its own here and moves its Gaussians in torch
 than about the method. The hollow marks are what papers print for other clips on other hardware, in `psnr_paper`, which
 is higher: they say where the field stands, and no distance from them to ours is a measurement.
 """,
-    "curves-eyes": """
-### Left and right eye
-
-![Held-out scores of the left and of the right eye against seconds of training](curves-eyes.png)
-
-The right eye of a stereo recording is a true view some degrees beside the left one. `psnr_right` scores it at held-out
-moments, over tissue that the left eye sees, too ([conventions](../conventions.md#scores)). Series with `eyes=left`,
-drawn hollow, trained on the left eye alone. So did the published method and its rivals. All others trained on both
-eyes, never on a held-out moment of either. Dashed is what warping the left eye's picture of the same moment scores. No
-model has that picture.
-""",
-    "pareto-right": """
-![Final psnr_right against seconds of training](pareto-right.png)
-""",
+    **RIGHT_EYE_CHARTS,
     "frames": """
 ### Images a second against decibels
 
@@ -135,7 +123,7 @@ def sections(folder: Path) -> list[str]:
     if any(group.rows for group in groups):
         parts += [_INTRODUCTION.format(count=_counted(results.runs)), _headline(sooner(results.curves))]
         parts += [text for name, text in _CHARTS.items() if (folder / f"{name}.png").exists()]
-        parts += [_both_eyes(groups), _truth(groups), _ablation(groups), _parsimony(groups), _published()]
+        parts += [both_eyes(groups), _truth(groups), _ablation(groups), _parsimony(groups), _published()]
     grid = Results(folder / CAPACITY)
     if found := capacities(groups_of(grid.runs)):
         parts += [
@@ -217,44 +205,14 @@ def _headline(found: Sequence[Sooner]) -> str:
               "fast given", "fast, s", "iterations", "times sooner, s", "than paper first", "iterations"]  # fmt: skip
     rows = [
         [each.clip, each.holdout, f"{each.target_db:.2f}", f"{each.their_s:.0f}", f"{each.their_iterations:.0f}",
-         f"{each.their_first_s:.1f}", each.our_limit, _number(each.our_s, 1), _number(each.our_iterations, 0),
-         _number(each.times_in_seconds, 1), _number(each.times_from_their_first, 1),
-         _number(each.times_in_iterations, 1)]
+         f"{each.their_first_s:.1f}", each.our_limit, number(each.our_s, 1), number(each.our_iterations, 0),
+         number(each.times_in_seconds, 1), number(each.times_from_their_first, 1),
+         number(each.times_in_iterations, 1)]
         for each in found
     ]  # fmt: skip
     if not rows:
         return ""
     return f"\n### How much sooner\n\n{_claim(found)} {_METHOD}\n{table(header, rows)}"
-
-
-_EYES = {
-    "psnr_tissue_db": "left, dB", "psnr_right_db": "right, dB", "warp_db": "warp, dB",
-    "psnr_clear_db": "left without highlights", "psnr_right_clear_db": "right without highlights",
-    "warp_clear_db": "warp without highlights", "t_train_s": "t_train_s", "t_post_s": "t_post_s",
-}  # fmt: skip
-
-
-def _both_eyes(groups: Sequence[Group]) -> str:
-    """A row a group whose right eye was scored."""
-    known = [group for group in groups if not math.isnan(group.median("psnr_right_db"))]
-    rows = [
-        [*group.place, group.series, group.limit, *(_number(group.median(name), 1) for name in _EYES)]
-        for group in known
-    ]
-    header = ["clip", "held out", "series", "limit", *_EYES.values()]
-    return f"\n{right_eye_claim(groups)}\n{table(header, rows)}" if rows else ""
-
-
-def right_eye_claim(groups: Sequence[Group]) -> str:
-    """What `fast` scores in both eyes of each stereo clip, in its usual time; empty without such rows."""
-    fast = [group for group in groups if group.series == "fast" and not math.isnan(group.median("psnr_right_db"))]
-    usual = [group for group in fast if group.limit == f"{PRESETS['fast'].budget_s:g} s"]
-    return " ".join(
-        f"In {group.limit}, `fast` scores {group.median('psnr_tissue_db'):.1f} dB in the left eye of "
-        f"`{group.clip}` ({group.holdout}) and {group.median('psnr_right_db'):.1f} dB in the right eye; the left eye's "
-        f"picture, warped, scores {group.median('warp_db'):.1f} dB there."
-        for group in usual or fast
-    )
 
 
 def _truth(groups: Sequence[Group]) -> str:
@@ -269,7 +227,7 @@ def _truth(groups: Sequence[Group]) -> str:
             *group.place,
             group.series,
             group.limit,
-            *(_number(group.median(name), digits) for name, digits in names.items()),
+            *(number(group.median(name), digits) for name, digits in names.items()),
         ]
         for group in known
     ]
@@ -294,7 +252,7 @@ def _ablation(groups: Sequence[Group]) -> str:
     found = orderings(groups)
     rows = [["*published*", "EndoNeRF", *(f"*{score:.2f}*" for score in ABLATION.values()), ""]]
     for each in found:
-        scores = [_number(each.scores_db.get(name, math.nan), 2) for name in ABLATION]
+        scores = [number(each.scores_db.get(name, math.nan), 2) for name in ABLATION]
         rows.append([*each.place, *scores, each.verdict])
     if not found:
         return ""
@@ -330,11 +288,11 @@ _SIZES = ("Gaussians", "bases", "floats", "MB", "loss", "t_train_s", "step, ms",
 
 def _size(group: Group) -> list[str]:
     return [
-        *(_number(group.median(name), 0) for name in ("gaussians", "bases", "floats_a_gaussian")),
-        _number(group.median("scene_bytes") / 1e6, 2),
-        _number(group.median("stored_loss_held_out_db"), 3),
-        *(_number(group.median(name), 1) for name in ("t_train_s", "step_ms")),
-        _number(group.median("render_fps"), 0),
+        *(number(group.median(name), 0) for name in ("gaussians", "bases", "floats_a_gaussian")),
+        number(group.median("scene_bytes") / 1e6, 2),
+        number(group.median("stored_loss_held_out_db"), 3),
+        *(number(group.median(name), 1) for name in ("t_train_s", "step_ms")),
+        number(group.median("render_fps"), 0),
         str(len(group.rows)),
     ]
 
@@ -349,13 +307,13 @@ def _score(group: Group | None) -> str:
     spread = f"spread {group.summary()['spread_db']}" if len(group.rows) > 1 else ""
     gap = "" if math.isnan(trained) else f"training frames {trained - found:+.2f}"
     said = "; ".join(filter(None, (spread, gap)))
-    return f"{_number(found, 2)} ({said})" if said else _number(found, 2)
+    return f"{number(found, 2)} ({said})" if said else number(found, 2)
 
 
 def _published() -> str:
     def cells(rows: Iterable[Published], table: str) -> list[list[str]]:
         return [
-            [table, each.data, each.method, f"{each.psnr_paper_db:.2f}", f"{each.train_s:.0f}", _number(each.fps, 2)]
+            [table, each.data, each.method, f"{each.psnr_paper_db:.2f}", f"{each.train_s:.0f}", number(each.fps, 2)]
             for each in rows
         ]
 
@@ -371,10 +329,10 @@ def _capacity(found: Sequence[Capacity]) -> str:
     header = ["clip", "held out", "preset", "limit", "chosen, dB", "best of the grid", "its dB", "difference",
               "deviation", "seeds", "chosen, MB", "best, MB", "difference from the best at no more bytes"]  # fmt: skip
     rows = [
-        [*each.chosen.place, each.chosen.series, each.chosen.limit, _number(each.chosen.median("psnr_tissue_db"), 2),
-         each.best.series.partition(":")[2], _number(each.best.median("psnr_tissue_db"), 2),
-         f"{each.difference_db:+.2f}", _number(each.deviation_db, 2), str(each.seeds),
-         _number(each.chosen.median("scene_bytes") / 1e6, 2), _number(each.best.median("scene_bytes") / 1e6, 2),
+        [*each.chosen.place, each.chosen.series, each.chosen.limit, number(each.chosen.median("psnr_tissue_db"), 2),
+         each.best.series.partition(":")[2], number(each.best.median("psnr_tissue_db"), 2),
+         f"{each.difference_db:+.2f}", number(each.deviation_db, 2), str(each.seeds),
+         number(each.chosen.median("scene_bytes") / 1e6, 2), number(each.best.median("scene_bytes") / 1e6, 2),
          "none so small" if math.isnan(each.at_bytes_db) else f"{each.at_bytes_db:+.2f}"]
         for each in found
     ]  # fmt: skip
@@ -415,13 +373,3 @@ def _listed(values: Sequence[int]) -> str:
 def _span(values: Iterable[float]) -> str:
     found = sorted(values)
     return f"{found[0]:.1f}" if len(found) == 1 else f"{found[0]:.1f} to {found[-1]:.1f}"
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:.{digits}f}"
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = ["", "| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows]) + "\n"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from benchmarks.pages.evaluation import table
+from benchmarks.pages.markdown import table
 
 Row = dict[str, str]
 ORIGIN = ("machine", "gpu", "driver", "torch", "triton", "commit")
