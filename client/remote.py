@@ -46,7 +46,9 @@ def _add_submit(commands: Commands) -> None:
         "right", type=Path, metavar="RIGHT", nargs="?", help="the right eye, if it is a file of its own"
     )
     parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini")
-    parser.add_argument("--masks", type=Path, metavar="F", help="zip of PNGs or a video that shows the instruments")
+    parser.add_argument(
+        "--masks", type=Path, metavar="F", help="zip of PNGs or a video: the instruments, of the left eye or of both"
+    )
     add_options(parser, JobOptions)
     parser.add_argument("--idempotency-key", metavar="TEXT", help="the same key with the same clip is the same job")
     parser.add_argument("--watch", action="store_true", help="wait for the scene, with a progress bar")

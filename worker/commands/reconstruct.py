@@ -31,7 +31,12 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="SCENE", help="folder for the scene: new, empty, or of a stopped run"
     )
     parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini; for stereo")
-    parser.add_argument("--masks", type=Path, metavar="F", help="zip or folder of PNGs, or a video: the instruments")
+    parser.add_argument(
+        "--masks",
+        type=Path,
+        metavar="F",
+        help="zip or folder of PNGs, or a video: the instruments, of the left eye or of both",
+    )
     add_options(parser, ReconstructionOptions)
     add_device(parser, "auto")
 

@@ -18,13 +18,14 @@ import pytest
 
 from contract.wire.errors import Cancelled, InputError, LimitError
 from tests.worker.input.clip.conftest import Studio
-from worker.input.calibration import load_calibration
+from worker.input.calibration import load_calibration, rectify
 from worker.input.clip import ClipLimits, DepthClip, open_clip
 from worker.input.decode import StereoRecording, decode_clip
 from worker.input.decode.contained import Patience, private_folder, run_contained
 from worker.input.decode.guard import PROTECTIONS, Allowance
 from worker.input.decode.handover import map_array
 from worker.machine.hooks import Hooks, Progress
+from worker.stereo import estimate_depth
 
 CALIBRATION = (
     '{"model": "rectified", "width": 96, "height": 80, "fx_px": 90, "fy_px": 90, "cx_px": 48, "cy_px": 40, '
@@ -79,6 +80,19 @@ def test_a_stereo_clip_comes_out_of_the_process_bit_for_bit(studio: Studio, scra
     assert decoded.calibration == load_calibration(calibration, eye_width=96, eye_height=80)
     assert list(scratch.iterdir()) == []
     assert len(list(decoded.clip.pairs())) == 6  # what is mapped outlives its files, and can be read again
+
+
+def test_masks_of_both_eyes_come_out_of_the_process(studio: Studio, scratch: Path) -> None:
+    tool = studio.tool()
+    packed = studio.masks("masks", np.concatenate([tool, tool[:, ::-1]], axis=2))
+    decoded = decode_clip(side_by_side(studio), calibration=calibrated(studio), masks=packed)
+    assert isinstance(decoded, StereoRecording)
+    assert_same(decoded.clip.tissue, ~tool)
+    assert_same(decoded.clip.tissue_right, ~tool[:, ::-1])
+    eyes = estimate_depth(rectify(decoded.clip, decoded.calibration)).eyes
+    assert_same(eyes[1].tissue, ~tool[:, ::-1])
+    assert "masks of the right eye: as given" in [each.text for each in decoded.clip.assumptions]
+    assert list(scratch.iterdir()) == []
 
 
 def test_a_clip_with_depth_comes_out_of_the_process_bit_for_bit(studio: Studio, scratch: Path) -> None:

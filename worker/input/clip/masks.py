@@ -1,6 +1,9 @@
 """Instrument masks: which pixels are tissue, and what decided it.
 
-Symbols: T frames, H W pixels of the left eye.
+Masks show the left eye, or both: told apart by their names, or packed into one picture as frames are. What white means
+is decided once, by the left eye.
+
+Symbols: T frames, H W pixels of one eye.
 """
 
 from __future__ import annotations
@@ -19,7 +22,8 @@ from contract.wire.names import MaskPolarity
 from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.files import FileTree, check_exists, open_tree
 from worker.input.clip.images import MASK_THRESHOLD, ImageSequence, as_mask, open_images
-from worker.input.clip.naming import left_eye_only
+from worker.input.clip.naming import check_aligned, left_eye_only, right_eye_only
+from worker.input.clip.packing import Packing, halves, packing_by_size
 from worker.input.clip.video import VideoFile, open_video, open_video_in
 
 BrightClass = Literal["tool", "tissue"]  # what a white pixel means
@@ -31,41 +35,35 @@ _POLARITY_REMEDY = 'Say mask_polarity "tool" if white marks instruments, "tissue
 
 @dataclass(frozen=True)
 class TissueMasks:
-    """tissue [T, H, W] bool, True = tissue, with the assumption behind it and warnings."""
+    """tissue [T, H, W] bool, True = tissue, with the assumption behind it and warnings.
+
+    right is the same of the right eye; None if the masks show the left eye alone.
+    """
 
     tissue: NDArray[np.bool_]
     assumption: Notice
     warnings: tuple[Notice, ...] = ()
+    right: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
 class MaskFrames:
-    """Masks of known number and size that are not decoded yet, because a small file may decode to gigabytes."""
+    """Masks of known number and size that are not decoded yet, because a small file may decode to gigabytes.
+
+    right holds those of the right eye, if their names name both eyes; frames are then the left eye's alone.
+    """
 
     frames: ImageSequence | VideoFile
+    right: ImageSequence | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(T, H, W)."""
+        """(T, H, W) of `frames`."""
         return self.frames.frame_count, self.frames.height, self.frames.width
 
-    def white(self) -> NDArray[np.bool_]:
-        """White pixels [T, H, W]. InputError if the images have values but none is white."""
-        decoded: Iterator[NDArray[Any]]
-        if isinstance(self.frames, ImageSequence):
-            decoded = map(self.frames.decode, self.frames.names)
-        else:
-            decoded = self.frames.frames()
-        white = np.empty(self.shape, dtype=np.bool_)
-        largest = 0
-        for index, image in enumerate(decoded):
-            white[index] = as_mask(image)
-            largest = max(largest, int(image.max()) // (257 if image.dtype == np.uint16 else 1))
-        if isinstance(self.frames, ImageSequence) and 0 < largest < MASK_THRESHOLD:
-            raise InputError(
-                _FIELD, f"the largest value in the masks is {largest} of 255.", "Write masks with the values 0 and 255."
-            )
-        return white
+    def packing(self, shape: tuple[int, int, int]) -> Packing | None:
+        """How each picture holds the masks of both eyes of a clip of `shape` (T, H, W); None if it holds one eye's."""
+        return packing_by_size(self.shape[1:], shape[1:]) if self.right is None else None
 
 
 def open_masks(path: Path, limits: ClipLimits) -> MaskFrames:
@@ -74,16 +72,30 @@ def open_masks(path: Path, limits: ClipLimits) -> MaskFrames:
     tree = open_tree(path, _FIELD, limits)
     if tree is None:
         return MaskFrames(open_video(path, _FIELD, limits))
-    names = mask_names(tree) or tree.images()
+    names = _mask_names(tree) or tree.images()
     if not names and len(tree.videos()) == 1:
         return MaskFrames(open_video_in(tree, tree.videos()[0]))
-    return MaskFrames(open_images(tree, left_eye_only(names)))
+    return _mask_images(tree, names)
 
 
-def mask_names(tree: FileTree) -> tuple[str, ...]:
-    """Images in a folder called masks or mask; of two eyes only the left."""
-    names = (name for name in tree.images() if {"masks", "mask"} & {p.lower() for p in PurePosixPath(name).parts[:-1]})
-    return left_eye_only(tuple(names))
+def own_masks(tree: FileTree) -> MaskFrames | None:
+    """The masks in the folders masks or mask of a clip; None without any. InputError, LimitError."""
+    names = _mask_names(tree)
+    return _mask_images(tree, names) if names else None
+
+
+def _mask_names(tree: FileTree) -> tuple[str, ...]:
+    """Images in a folder called masks or mask."""
+    folders = {"masks", "mask"}
+    return tuple(n for n in tree.images() if folders & {part.lower() for part in PurePosixPath(n).parts[:-1]})
+
+
+def _mask_images(tree: FileTree, names: tuple[str, ...]) -> MaskFrames:
+    left, right = left_eye_only(names), right_eye_only(names)
+    if not right:
+        return MaskFrames(open_images(tree, left))
+    check_aligned(_FIELD, left, right)
+    return MaskFrames(open_images(tree, left), open_images(tree, right))
 
 
 def no_masks() -> Notice:
@@ -96,20 +108,37 @@ def tissue_from_masks(
     shape: tuple[int, int, int],
     told: MaskPolarity,
     by_layout: tuple[str, BrightClass] | None = None,
+    *,
+    both_eyes: bool = False,
 ) -> TissueMasks:
     """Tissue pixels of masks. The masks are decoded only if their number and size fit `shape` (T, H, W).
 
     What white means is decided by the caller (`told`), else by the layout (its name and what white means there), else
     by look: the tool is the class that touches the border in most frames and covers less than 40 % of the area.
+    With both_eyes, masks that show the right eye, too, give its tissue.
     InputError if the masks do not fit, contradict the layout, mark nothing, leave no tissue, or if their look does not
     decide.
     """
-    _check_shape(masks.shape, shape)
-    white = masks.white()
+    packing = masks.packing(shape) if both_eyes else None
+    _check_shape(masks.shape, (shape[0], *masks.shape[1:]) if packing else shape, "left")
+    if both_eyes and masks.right is not None:
+        _check_shape((masks.right.frame_count, masks.right.height, masks.right.width), shape, "right")
+    white, right = _white_of_eyes(masks, packing, both_eyes=both_eyes)
     bright, reason = _bright_class(white, told, by_layout)
-    tissue = white if bright == "tissue" else np.logical_not(white, out=white)
-    if not tissue.any():
-        raise InputError(_FIELD, "every pixel of every mask is tool.", _POLARITY_REMEDY)
+    if bright == "tool":
+        for eye in (white, right):
+            if eye is not None:
+                np.logical_not(eye, out=eye)
+    assumption = Notice.info(NoticeCode.MASKS, f"masks: white is {bright} ({reason})")
+    return TissueMasks(white, assumption, _tissue_warnings(white, right), right)
+
+
+def _tissue_warnings(tissue: NDArray[np.bool_], right: NDArray[np.bool_] | None) -> tuple[Notice, ...]:
+    """What looks odd about the tissue of the left eye. InputError if either eye shows none."""
+    for eye in (tissue, right):
+        if eye is not None and not eye.any():
+            which = "" if right is None else f" of the {'left' if eye is tissue else 'right'} eye"
+            raise InputError(_FIELD, f"every pixel of every mask{which} is tool.", _POLARITY_REMEDY)
     warnings = []
     if tissue.all():
         warnings.append(Notice.warning(NoticeCode.MASKS_MARK_NOTHING, "the masks mark no instrument in any frame"))
@@ -121,8 +150,34 @@ def tissue_from_masks(
                 f"{covered} of {len(tissue)} frames are all tool in their masks and cannot be learnt from",
             )
         )
-    assumption = Notice.info(NoticeCode.MASKS, f"masks: white is {bright} ({reason})")
-    return TissueMasks(tissue, assumption, tuple(warnings))
+    return tuple(warnings)
+
+
+def _white_of_eyes(
+    masks: MaskFrames, packing: Packing | None, *, both_eyes: bool
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
+    """White pixels [T, H, W] of the left eye and, if the masks show it and both are wanted, of the right."""
+    white = _white(masks.frames)
+    if packing is not None:
+        left, right = (np.stack(eye) for eye in zip(*(halves(each, packing) for each in white), strict=True))
+        return left, right
+    return white, _white(masks.right) if both_eyes and masks.right is not None else None
+
+
+def _white(frames: ImageSequence | VideoFile) -> NDArray[np.bool_]:
+    """White pixels [T, H, W]. InputError if the images have values but none is white."""
+    decoded: Iterator[NDArray[Any]]
+    decoded = map(frames.decode, frames.names) if isinstance(frames, ImageSequence) else frames.frames()
+    white = np.empty((frames.frame_count, frames.height, frames.width), dtype=np.bool_)
+    largest = 0
+    for index, image in enumerate(decoded):
+        white[index] = as_mask(image)
+        largest = max(largest, int(image.max()) // (257 if image.dtype == np.uint16 else 1))
+    if isinstance(frames, ImageSequence) and 0 < largest < MASK_THRESHOLD:
+        raise InputError(
+            _FIELD, f"the largest value in the masks is {largest} of 255.", "Write masks with the values 0 and 255."
+        )
+    return white
 
 
 def _bright_class(
@@ -166,13 +221,13 @@ def _bright_class_by_look(white: NDArray[np.bool_]) -> BrightClass | None:
     return None
 
 
-def _check_shape(given: tuple[int, int, int], shape: tuple[int, int, int]) -> None:
+def _check_shape(given: tuple[int, int, int], shape: tuple[int, int, int], eye: str) -> None:
     frames, height, width = shape
     if given[0] != frames:
         raise InputError(_FIELD, f"there are {given[0]} masks for {frames} frames.", "Give one mask for each frame.")
     if given[1:] != (height, width):
         raise InputError(
             _FIELD,
-            f"the masks are {given[2]}x{given[1]} pixels, the left eye is {width}x{height}.",
-            "Give masks in the size of the left eye.",
+            f"the masks are {given[2]}x{given[1]} pixels, the {eye} eye is {width}x{height}.",
+            f"Give masks in the size of the {eye} eye.",
         )

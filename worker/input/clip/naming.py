@@ -35,10 +35,16 @@ def eye_of(name: str) -> tuple[Side, str] | None:
 
 def left_eye_only(names: tuple[str, ...]) -> tuple[str, ...]:
     """The names without the right eye's, if they name both eyes; else all names."""
+    right = set(right_eye_only(names))
+    return tuple(name for name in names if name not in right)
+
+
+def right_eye_only(names: tuple[str, ...]) -> tuple[str, ...]:
+    """The right eye's names, if they name both eyes; else none."""
     eyes = {name: found[0] for name in names if (found := eye_of(name))}
     if set(eyes.values()) != {"left", "right"}:
-        return names
-    return tuple(name for name in names if eyes.get(name) != "right")
+        return ()
+    return tuple(name for name in names if eyes.get(name) == "right")
 
 
 def pair_names(names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -16,7 +16,7 @@ from worker.input.clip.images import open_images
 from worker.input.clip.layouts import ClipFiles, detect_layout, layout_named
 from worker.input.clip.layouts.layout import outside_masks
 from worker.input.clip.layouts.stereomis import CALIBRATION_FILE
-from worker.input.clip.masks import MaskFrames, mask_names, no_masks, open_masks
+from worker.input.clip.masks import no_masks, open_masks, own_masks
 from worker.input.clip.packing import FrameSequence
 from worker.input.clip.stereo import two_sequence_clip, with_masks
 from worker.input.clip.types import DepthClip, StereoClip
@@ -36,7 +36,8 @@ def open_clip(
     """The clip in these files, validated. Its `assumptions` list every assumption that was made.
 
     path     a stereo video, a folder or a zip; or the left eye's video or frames when `right` is given
-    masks    zip or folder of PNG, or a video; default: the clip's own masks/ folder, if it has one
+    masks    zip or folder of PNG, or a video, of the left eye or of both (masks.py); default: the clip's own masks/
+             folder, if it has one
     options  layout: one of clip/layouts/ by its name; "auto" detects it by names, shape and content.
              mask_polarity: "auto" decides by layout and look (masks.tissue_from_masks)
 
@@ -57,7 +58,7 @@ def open_clip(
     opened = chosen.open(files)
     if isinstance(opened, DepthClip):
         return opened
-    found = given or (_own_masks(tree) if tree is not None else None)
+    found = given or (own_masks(tree) if tree is not None else None)
     if found is None:
         return _without_masks(opened)
     by_layout = (chosen.title or chosen.name, chosen.white) if chosen.white is not None else None
@@ -104,12 +105,6 @@ def _open_eye(path: Path, field: str, limits: ClipLimits) -> FrameSequence:
         return open_video(path, field, limits)
     videos = outside_masks(tree.videos())
     return open_video_in(tree, videos[0]) if len(videos) == 1 else open_images(tree, outside_masks(tree.images()))
-
-
-def _own_masks(tree: FileTree) -> MaskFrames | None:
-    """The masks that lie in the clip's own folder, if any."""
-    names = mask_names(tree)
-    return MaskFrames(open_images(tree, names)) if names else None
 
 
 def _without_masks(clip: StereoClip) -> StereoClip:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from contract.wire.notices import Notice
 from worker.input.clip.types import RgbFrame
 
 Packing = Literal["sbs", "tb"]
+Pixel = TypeVar("Pixel", np.uint8, np.bool_)
 
 PACKING_WORDS: dict[Packing, str] = {"sbs": "side by side, left eye left", "tb": "top-bottom, left eye on top"}
 
@@ -102,14 +103,22 @@ def pair_sequences(left: FrameSequence, right: FrameSequence) -> TwoSequences:
     return TwoSequences(left, right)
 
 
-def halves(frame: RgbFrame, packing: Packing) -> tuple[RgbFrame, RgbFrame]:
-    """(left, right) eye of a packed picture [H, W, 3], each contiguous."""
+def halves(frame: NDArray[Pixel], packing: Packing) -> tuple[NDArray[Pixel], NDArray[Pixel]]:
+    """(left, right) eye of a packed picture [H, W, 3] or mask [H, W], each contiguous."""
     height, width = frame.shape[:2]
     if packing == "sbs":
         first, second = frame[:, : width // 2], frame[:, width - width // 2 :]
     else:
         first, second = frame[: height // 2], frame[height - height // 2 :]
     return np.ascontiguousarray(first), np.ascontiguousarray(second)
+
+
+def packing_by_size(packed: tuple[int, int], eye: tuple[int, int]) -> Packing | None:
+    """How pictures of one (height, width) hold two eyes of another; None if they do not. An odd middle line is free."""
+    height, width = packed
+    if (height, width // 2) == eye:
+        return "sbs"
+    return "tb" if (height // 2, width) == eye else None
 
 
 def detect_packing(sequence: FrameSequence) -> Packing:

@@ -80,12 +80,19 @@ def eye_images_clip(tree: FileTree, images: tuple[str, ...], title: str) -> Ster
 def with_masks(
     clip: StereoClip, given: MaskFrames, told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
 ) -> StereoClip:
-    """The clip with its tissue pixels; see tissue_from_masks for how white is read."""
-    masks = tissue_from_masks(given, (clip.frame_count, clip.height, clip.width), told, by_layout)
+    """The clip with its tissue pixels, of the right eye if the masks show it; tissue_from_masks says how white is read.
+
+    Without masks of the right eye, stereo moves the left eye's by their depth (worker/stereo/right_eye.py).
+    """
+    shape = (clip.frame_count, clip.height, clip.width)
+    masks = tissue_from_masks(given, shape, told, by_layout, both_eyes=True)
+    source = "the left eye's, moved by depth" if masks.right is None else "as given"
+    right = Notice.info(NoticeCode.MASKS, f"masks of the right eye: {source}")
     return replace(
         clip,
         tissue=masks.tissue,
-        assumptions=(*clip.assumptions, masks.assumption),
+        tissue_right=masks.right,
+        assumptions=(*clip.assumptions, masks.assumption, right),
         warnings=(*clip.warnings, *masks.warnings),
     )
 

@@ -26,7 +26,7 @@ from worker.input.clip.layouts import registered_files
 from worker.input.clip.types import RgbFrame
 from worker.input.decode.contained import MALFORMED, REMEDY, private_folder, run_contained
 from worker.input.decode.guard import LIMITED_MEMORY, PROTECTIONS, Allowance
-from worker.input.decode.handover import DEPTH, map_array
+from worker.input.decode.handover import DEPTH, MASKS, map_array
 from worker.machine.hooks import Hooks, Progress
 
 STAGE = "decode"
@@ -136,8 +136,8 @@ def _received(told: dict[str, Any], folder: Path, allowance: Allowance) -> Stere
             warnings=warnings,
         )
     pairs = _MappedPairs(map_array(folder, "left", size), map_array(folder, "right", size))
-    tissue = map_array(folder, "tissue", size) != 0 if told["masked"] else None
-    clip = StereoClip(frames, height, width, pairs, tissue, frame_times_s, assumptions, warnings)
+    tissue, tissue_right = (map_array(folder, n, size) != 0 if n in told["masked"] else None for n in MASKS)
+    clip = StereoClip(frames, height, width, pairs, tissue, frame_times_s, assumptions, warnings, tissue_right)
     return StereoRecording(clip, _calibration(told["calibration"]))
 
 

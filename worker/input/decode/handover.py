@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 STEREO, DEPTH = "stereo", "depth"
+MASKS = ("tissue", "tissue_right")
+"""The arrays that a stereo clip may lack."""
 
 _TYPES: dict[str, type[np.generic]] = {
     "left": np.uint8,
     "right": np.uint8,
     "rgb": np.uint8,
     "tissue": np.uint8,
+    "tissue_right": np.uint8,
     "depth_mm": np.float32,
     "depth_confidence": np.uint8,
     "world_from_camera": np.float64,
@@ -31,6 +34,7 @@ _SHAPES: dict[str, Callable[[int, int, int], tuple[int, ...]]] = {
     "right": lambda t, h, w: (t, h, w, 3),
     "rgb": lambda t, h, w: (t, h, w, 3),
     "tissue": lambda t, h, w: (t, h, w),
+    "tissue_right": lambda t, h, w: (t, h, w),
     "depth_mm": lambda t, h, w: (t, h, w),
     "depth_confidence": lambda t, h, w: (t, h, w),
     "world_from_camera": lambda t, h, w: (t, 4, 4),

@@ -16,7 +16,7 @@ from contract.wire.options import ClipOptions
 from worker.input.calibration import load_calibration
 from worker.input.clip import ClipLimits, DepthClip, StereoClip, find_calibration, open_clip
 from worker.input.clip.layouts import register_layout
-from worker.input.decode.handover import DEPTH, STEREO, write_arrays
+from worker.input.decode.handover import DEPTH, MASKS, STEREO, write_arrays
 from worker.input.decode.reports import Reports
 
 _OPENING_SHARE = 0.5  # of the stage; a video is walked once to count its frames, and once to hand them over
@@ -54,7 +54,7 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
     calibration = _calibration(path, clip)
     reports.reading("clip")
     write_arrays(folder, _stereo_arrays(clip, reports))
-    masked = clip.tissue is not None
+    masked = [name for name in MASKS if getattr(clip, name) is not None]
     return told | {"kind": STEREO, "masked": masked, "calibration": calibration}
 
 
@@ -72,8 +72,9 @@ def _depth_arrays(clip: DepthClip, reports: Reports) -> Iterator[tuple[str, NDAr
 
 def _stereo_arrays(clip: StereoClip, reports: Reports) -> Iterator[tuple[str, NDArray[Any]]]:
     yield "frame_times_s", clip.frame_times_s
-    if clip.tissue is not None:
-        yield "tissue", clip.tissue
+    for name in MASKS:
+        if (tissue := getattr(clip, name)) is not None:
+            yield name, tissue
     found = 0
     for found, (left, right) in enumerate(clip.pairs(), start=1):
         if found > clip.frame_count:

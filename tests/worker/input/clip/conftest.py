@@ -58,7 +58,11 @@ class Studio:
 
     def masks(self, folder: str, marked: NDArray[np.bool_]) -> Path:
         """A folder of masks, marked pixels white."""
-        return self.images(folder + "/{}.png", np.where(marked, np.uint8(255), np.uint8(0)))
+        return self.masks_named(folder + "/{}.png", marked)
+
+    def masks_named(self, pattern: str, marked: NDArray[np.bool_]) -> Path:
+        """As masks; pattern holds {} for the frame number."""
+        return self.images(pattern, np.where(marked, np.uint8(255), np.uint8(0)))
 
     def endonerf(self, frames: int = 3, height: int = 64, width: int = 80, name: str = "endonerf") -> Path:
         """A good EndoNeRF folder: depth 60 mm with an invalid corner, still camera, tool masks."""

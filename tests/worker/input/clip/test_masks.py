@@ -173,3 +173,88 @@ def test_masks_that_are_missing_or_unreadable_are_refused(frames: Path, tmp_path
     (tmp_path / "none").mkdir()
     with pytest.raises(InputError, match="holds no PNG or JPEG images"):
         open_clip(frames, masks=tmp_path / "none")
+
+
+def right_tool(studio) -> NDArray[np.bool_]:
+    """The tool as the right eye sees it: farther left, and cut off by the border."""
+    return np.roll(studio.tool(), -8, axis=2) & (np.arange(96) < 88)
+
+
+def masked(path: Path, **options) -> StereoClip:
+    clip = open_with(path, **options)
+    assert isinstance(clip, StereoClip)
+    return clip
+
+
+def test_masks_of_the_left_eye_alone_leave_the_right_eye_to_stereo(studio, frames: Path) -> None:
+    clip = masked(frames, masks=studio.masks("masks", studio.tool()))
+    assert clip.tissue_right is None
+    assert "masks of the right eye: the left eye's, moved by depth" in texts(clip.assumptions)
+
+
+@pytest.mark.parametrize("packing", ["sbs", "tb"])
+@pytest.mark.parametrize("odd", [0, 1])
+def test_masks_packed_like_a_stereo_frame_are_those_of_both_eyes(studio, frames: Path, packing: str, odd: int) -> None:
+    tools = (studio.tool(), right_tool(studio))
+    axis = 2 if packing == "sbs" else 1
+    middle = np.ones((6, 80, odd) if packing == "sbs" else (6, odd, 96), np.bool_)
+    packed = np.concatenate([tools[0], middle, tools[1]], axis=axis)
+    clip = masked(frames, masks=studio.masks("masks", packed))
+    np.testing.assert_array_equal(clip.tissue, ~tools[0])
+    np.testing.assert_array_equal(clip.tissue_right, ~tools[1])
+    assert "masks of the right eye: as given" in texts(clip.assumptions)
+
+
+def test_a_video_of_packed_masks_is_of_both_eyes(studio, frames: Path) -> None:
+    packed = np.concatenate([studio.tool(), right_tool(studio)], axis=2)
+    white = np.repeat(np.where(packed, np.uint8(255), np.uint8(0))[..., None], 3, axis=3)
+    clip = masked(frames, masks=studio.video("masks.webm", white))
+    assert clip.tissue_right is not None
+    assert (clip.tissue_right != ~right_tool(studio)).mean() < 0.01
+
+
+@pytest.mark.parametrize("pattern", ["{eye}/{number}.png", "{number}{letter}.png", "{number}_{eye}.png"])
+@pytest.mark.parametrize("beside", [False, True])
+def test_masks_whose_names_name_both_eyes_are_of_both(studio, frames: Path, pattern: str, beside: bool) -> None:
+    folder = "clip/masks/" if beside else "given/"
+    for eye, tool in (("left", studio.tool()), ("right", right_tool(studio))):
+        studio.masks_named(folder + pattern.format(eye=eye, letter=eye[0], number="{}"), tool)
+    clip = masked(frames) if beside else masked(frames, masks=studio.root / "given")
+    np.testing.assert_array_equal(clip.tissue, ~studio.tool())
+    np.testing.assert_array_equal(clip.tissue_right, ~right_tool(studio))
+
+
+def test_the_left_eye_decides_what_white_means_in_both(studio, frames: Path) -> None:
+    """In the right eye the tool covers most of the picture: by its look it would be tissue."""
+    large = np.ones((6, 80, 96), np.bool_)
+    large[:, 60:, 60:] = False
+    clip = masked(frames, masks=studio.masks("masks", np.concatenate([studio.tool(), large], axis=2)))
+    np.testing.assert_array_equal(clip.tissue_right, ~large)
+
+
+def test_a_right_eye_without_any_tissue_is_refused(studio, frames: Path) -> None:
+    packed = np.concatenate([studio.tool(), np.ones((6, 80, 96), np.bool_)], axis=2)
+    with pytest.raises(InputError, match="every pixel of every mask of the right eye is tool"):
+        open_clip(frames, masks=studio.masks("masks", packed))
+
+
+def test_masks_of_the_eyes_that_differ_in_number_or_size_are_refused(studio, frames: Path) -> None:
+    studio.masks_named("few/left/{}.png", studio.tool())
+    studio.masks_named("few/right/{}.png", studio.tool(5))
+    with pytest.raises(InputError, match="there are 5 files like right/"):
+        open_clip(frames, masks=studio.root / "few")
+    studio.masks_named("small/left/{}.png", studio.tool())
+    studio.masks_named("small/right/{}.png", studio.tool(6, 40, 48))
+    with pytest.raises(InputError, match="masks are 48x40 pixels, the right eye is 96x80"):
+        open_clip(frames, masks=studio.root / "small")
+
+
+def test_a_clip_of_one_eye_takes_the_left_masks_alone(studio) -> None:
+    folder = studio.endonerf()
+    for eye, tool in (("left", studio.tool(3, 64, 80)), ("right", ~studio.tool(3, 64, 80))):
+        studio.masks_named(f"given/{eye}/{{}}.png", tool)
+    clip = open_with(folder, masks=studio.root / "given")
+    np.testing.assert_array_equal(clip.tissue, ~studio.tool(3, 64, 80))
+    packed = np.concatenate([studio.tool(3, 64, 80)] * 2, axis=2)
+    with pytest.raises(InputError, match="the masks are 160x64 pixels, the left eye is 80x64"):
+        open_with(folder, masks=studio.masks("packed", packed))
