@@ -16,6 +16,7 @@ import torch
 from contract.wire.errors import Cancelled
 from contract.wire.names import CURVE, REPORT
 from contract.wire.notices import Notice, NoticeCode
+from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM
 from contract.wire.report import Report
 from worker.input.calibration import rectify
 from worker.input.calibration.types import StereoCalibration
@@ -109,7 +110,9 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
         )
     if isinstance(decoded, DepthClip):
         return decoded
-    return match_eyes(decoded.clip, decoded.calibration, request.options.holdout, hooks, timings, device)
+    options = request.options
+    depth_range_mm = options.min_depth_mm, options.max_depth_mm
+    return match_eyes(decoded.clip, decoded.calibration, options.holdout, hooks, timings, device, depth_range_mm)
 
 
 def match_eyes(
@@ -119,6 +122,7 @@ def match_eyes(
     hooks: Hooks,
     timings: Timings,
     device: Device = CPU,
+    depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
 ) -> DepthClip:
     """Rectify a stereo clip and match its eyes: the left frames with depth.
 
@@ -133,7 +137,9 @@ def match_eyes(
         hooks.report_stage("compile", 0.0)
         timings.add("compile_s", examine(device))
     with timings.measure("stereo_s"):
-        return estimate_depth(rectified, hooks, measured_frames=measured, device=device.kind)
+        return estimate_depth(
+            rectified, hooks, measured_frames=measured, device=device.kind, depth_range_mm=depth_range_mm
+        )
 
 
 def optimise(run: Run) -> None:

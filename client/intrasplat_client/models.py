@@ -70,6 +70,7 @@ class NoticeCode(StrEnum):
     BRIGHTNESS_CHANGES = "brightness_changes"
     COLOUR_CHANGES = "colour_changes"
     DEPTH_JUMPS = "depth_jumps"
+    DEPTH_OUT_OF_RANGE = "depth_out_of_range"
     DEPTH_UNUSUAL = "depth_unusual"
     FEW_FRAMES = "few_frames"
     FRAMES_WITHOUT_TISSUE = "frames_without_tissue"
@@ -156,6 +157,10 @@ class JobOptions(Model):
     """instant, fast, quality and small are ours; paper is the method as published"""
     eyes: str = "both"
     """the eyes of a stereo clip to train on; with left, the right eye only judges"""
+    min_depth_mm: float = 10.0
+    """nearest depth that stereo may find, in mm"""
+    max_depth_mm: float = 300.0
+    """farthest depth that stereo may find, in mm"""
     iterations: int | None = None
     """exactly how many steps to train; not with budget_s"""
     budget_s: float | None = None
@@ -302,6 +307,10 @@ class GivenOptions(TypedDict, total=False):
     """instant, fast, quality and small are ours; paper is the method as published"""
     eyes: Literal["left", "both"]
     """the eyes of a stereo clip to train on; with left, the right eye only judges"""
+    min_depth_mm: Annotated[float, Field(gt=0)]
+    """nearest depth that stereo may find, in mm"""
+    max_depth_mm: Annotated[float, Field(gt=0)]
+    """farthest depth that stereo may find, in mm"""
     iterations: Annotated[int, Field(le=1000000, ge=1)] | None
     """exactly how many steps to train; not with budget_s"""
     budget_s: Annotated[float, Field(gt=0, le=7200)] | None

@@ -46,6 +46,7 @@ class NoticeCode(StrEnum):
     BRIGHTNESS_CHANGES = "brightness_changes"
     COLOUR_CHANGES = "colour_changes"
     DEPTH_JUMPS = "depth_jumps"
+    DEPTH_OUT_OF_RANGE = "depth_out_of_range"
     DEPTH_UNUSUAL = "depth_unusual"
     FEW_FRAMES = "few_frames"
     FRAMES_WITHOUT_TISSUE = "frames_without_tissue"

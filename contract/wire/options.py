@@ -21,6 +21,9 @@ Priority = Literal["standard", "high"]
 MAX_HOLDOUT_CHARACTERS = 8000
 """A thousand frame numbers of up to six digits with commas: a job's record must fit into a pipe's buffer."""
 
+MIN_DEPTH_MM, MAX_DEPTH_MM = 10.0, 300.0
+"""What an endoscope sees: sharp from here, and farther on its eyes' pictures differ by a pixel or two."""
+
 FIELD_PREFIX = "options"
 """InputError.field of an option is `options.NAME`."""
 
@@ -55,6 +58,10 @@ class ReconstructionOptions(ClipOptions):
     eyes: Eyes = Field(
         default="both", description="the eyes of a stereo clip to train on; with left, the right eye only judges"
     )
+    min_depth_mm: float = Field(default=MIN_DEPTH_MM, gt=0, description="nearest depth that stereo may find, in mm")
+    max_depth_mm: float = Field(
+        default=MAX_DEPTH_MM, gt=0, validate_default=True, description="farthest depth that stereo may find, in mm"
+    )
     iterations: int | None = Field(
         default=None, ge=1, le=1_000_000, description="exactly how many steps to train; not with budget_s"
     )
@@ -68,6 +75,13 @@ class ReconstructionOptions(ClipOptions):
     def _frames_as_text(cls, value: object) -> object:
         """A JSON list of frame numbers means the same as their comma-separated text."""
         return ",".join(str(frame) for frame in value) if isinstance(value, list) else value
+
+    @field_validator("max_depth_mm")
+    @classmethod
+    def _some_depth(cls, max_depth_mm: float, given: ValidationInfo) -> float:
+        if max_depth_mm <= given.data.get("min_depth_mm", 0):
+            raise ValueError("max_depth_mm must be larger than min_depth_mm")
+        return max_depth_mm
 
     @field_validator("budget_s")
     @classmethod

@@ -50,6 +50,7 @@ def test_terminal_states_are_the_services() -> None:
         {"preset": "paper", "iterations": 30, "holdout": "1,9", "seed": 5},
         {"holdout": [1, 9, 17], "budget_s": 60, "priority": "high", "retention_hours": 12},
         {"budget_s": None, "iterations": 30},
+        {"min_depth_mm": 4.0, "max_depth_mm": 120.0},
     ],
 )
 def test_options_that_the_client_lets_through_are_options_of_a_job(options: dict[str, object]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
-from worker.stereo.matching import DISPARITY_STEPS, Grey, Image, padded, semi_global_matcher, shift_rows
+from worker.stereo.matching import Grey, Image, evidence, semi_global, shift_rows
 
 Agreed = Callable[[NDArray[np.uint8], NDArray[np.uint8], int, int], tuple[Image, NDArray[np.bool_]]]
 """The signature of agreed_disparities, which another device may implement."""
@@ -28,8 +28,8 @@ MAX_CORRECTION_PX = 8.0  # beyond it the calibration belongs to other frames
 MAX_EQUAL_ROWS_PX = 1.0  # row difference of frames that are rectified already
 SWAPPED_SHARE = 0.8
 COARSE_WIDTH = 176  # px; wide enough for tissue, so that a search of all disparities takes milliseconds
-MIN_DEPTH_MM = 12.0  # nearer than this an endoscope is out of focus
 MAX_DISPARITY_SHARE = 0.6  # of the width: beyond it the eyes overlap too little
+MIN_EVIDENCE = 0.5  # of a match that counts
 MIN_TEXTURE = 8.0  # mean |gradient| in grey levels; below it matches are chance
 RANGE_PERCENTILES = (0.5, 99.5)
 RANGE_MARGIN_PX, RANGE_MARGIN = 3.0, 0.1  # the sampled frames do not show every disparity of the clip
@@ -124,9 +124,10 @@ def choose_range(
     row_shift_px: float,
     infinity_px: float,
     focal_baseline_px_mm: float,
+    depth_range_mm: tuple[float, float],
     agreed: Agreed,
 ) -> tuple[float, float]:
-    """The disparity range (low, high) of the clip in px, from a coarse search of all disparities on a few pairs.
+    """The disparity range (low, high) of the clip in px, from a coarse search of all that its depths may have.
 
     Only textured pixels count on which both matching directions agree.
 
@@ -136,23 +137,41 @@ def choose_range(
     height, width = pairs[0][0].shape
     scale = min(1.0, COARSE_WIDTH / width)
     size = (round(width * scale), round(height * scale))
-    widest = min(focal_baseline_px_mm / MIN_DEPTH_MM, MAX_DISPARITY_SHARE * width)
-    low = int(np.floor(infinity_px * scale))
-    count = 16 * max(1, int(np.ceil(widest * scale / 16)))
+    farthest, nearest = (infinity_px + focal_baseline_px_mm / depth_mm for depth_mm in reversed(depth_range_mm))
+    nearest = min(nearest, farthest + MAX_DISPARITY_SHARE * width)
+    low = int(np.floor(farthest * scale))
+    count = 16 * max(1, int(np.ceil((nearest * scale - low) / 16)))
     lefts = np.stack([_resized(left, size) for left, _ in pairs])
     rights = np.stack([_resized(shift_rows(right, row_shift_px), size) for _, right in pairs])
     found, both_agree = agreed(lefts, rights, low, count)
     textured = np.stack([cv2.boxFilter(np.abs(cv2.Sobel(left, cv2.CV_32F, 1, 0)), -1, (5, 5)) for left in lefts])
-    disparities = found[both_agree & (textured > MIN_TEXTURE)].astype(np.float64) / scale
+    within = (found >= farthest * scale) & (found <= nearest * scale)
+    disparities = found[both_agree & within & (textured > MIN_TEXTURE)].astype(np.float64) / scale
     if disparities.size < 0.02 * size[0] * size[1] * len(pairs):
         raise InputError(
             "clip",
-            "left and right have hardly a matching point.",
-            "Check that both eyes show the same scene at the same time, in focus, and that the layout is right.",
+            f"left and right have hardly a matching point {depth_range_mm[0]:g} to {depth_range_mm[1]:g} mm away.",
+            "Check that both eyes show the same scene at the same time, in focus, and that the layout and the "
+            "calibration are right; for other distances give min_depth_mm and max_depth_mm.",
         )
     near_low, near_high = np.percentile(disparities, RANGE_PERCENTILES)
     margin = RANGE_MARGIN_PX + RANGE_MARGIN * (near_high - near_low)
-    return max(float(near_low - margin), infinity_px), float(near_high + margin)
+    return max(float(near_low - margin), farthest), min(float(near_high + margin), nearest)
+
+
+def outside_share(
+    matches: NDArray[np.float64],
+    shift: RowShift,
+    infinity_px: float,
+    focal_baseline_px_mm: float,
+    depth_range_mm: tuple[float, float],
+) -> float:
+    """Share of the matches [M, 4] on equal rows that lie nearer or farther than depth_range_mm; 0 if there are few."""
+    on_row = np.abs(matches[:, 3] - matches[:, 1] - shift.shift_px) < MAX_EQUAL_ROWS_PX
+    if on_row.sum() < MIN_MATCHES:
+        return 0.0
+    per_mm = (matches[on_row, 0] - matches[on_row, 2] - infinity_px) / focal_baseline_px_mm
+    return float(np.mean((per_mm > 1 / depth_range_mm[0]) | (per_mm < 1 / depth_range_mm[1])))
 
 
 def _densest(values: NDArray[np.float64]) -> float:
@@ -191,18 +210,11 @@ def agreed_disparities(
     left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, count: int
 ) -> tuple[Image, NDArray[np.bool_]]:
     """Disparities [F, h, w] of pairs, with low <= d < low + count, and where both matching directions agree."""
-    one, other = (np.empty(left.shape, np.float32) for _ in range(2))
-    matcher = semi_global_matcher(low, count)
-    right_matcher = cv2.ximgproc.createRightMatcher(matcher)
+    disparity, agreed = np.empty(left.shape, np.float32), np.empty(left.shape, np.bool_)
     for i, pair in enumerate(zip(left, right, strict=True)):
-        wide_left, wide_right, pad = padded(*pair, low, count)
-        columns = slice(pad, pad + left.shape[2])
-        one[i] = matcher.compute(wide_left, wide_right)[:, columns] / DISPARITY_STEPS
-        other[i] = -right_matcher.compute(wide_right, wide_left)[:, columns] / DISPARITY_STEPS
-    x_right = np.rint(np.arange(left.shape[2]) - one).astype(np.int64)
-    seen = (x_right >= 0) & (x_right < left.shape[2])
-    back = np.take_along_axis(other, np.clip(x_right, 0, left.shape[2] - 1), axis=2)
-    return one, seen & (np.abs(one - back) <= 1.0)
+        disparity[i], both = semi_global(*pair, low, count)
+        agreed[i] = evidence(disparity[i], both, pair[0]) > MIN_EVIDENCE
+    return disparity, agreed
 
 
 def _resized(image: Grey, size: tuple[int, int]) -> Grey:

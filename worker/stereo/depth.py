@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from contract.wire.errors import Cancelled, InputError
 from contract.wire.notices import Notice, NoticeCode
+from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM
 from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip, Eye
 from worker.machine.cores import cores
@@ -28,8 +29,9 @@ from worker.stereo.alignment import (
     find_features,
     match_features,
     measure_row_shift,
+    outside_share,
 )
-from worker.stereo.matching import MAX_DEPTH_MM, MIN_CONFIDENCE, Grey, MatchPlan, match
+from worker.stereo.matching import MIN_CONFIDENCE, Grey, MatchPlan, match
 from worker.stereo.right_eye import moved_depth, moved_tissue, painted_over
 
 if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
@@ -42,8 +44,10 @@ DECODING_SHARE, MEASURING_SHARE = 0.15, 0.05  # of the stage's progress
 RANGE_PAIRS, ALIGNMENT_PAIRS = 7, 3
 """Pairs, spread over the measured frames. A pair costs 10 ms for the range and 100 ms for the alignment."""
 WARN_SHIFT_PX = 0.5
-WARN_VALID_SHARE = 0.5
-MIN_VALID_SHARE = 0.02  # unrelated images match by chance at 0.2 to 0.4 % of their pixels
+WARN_OUTSIDE_SHARE = 0.1
+WARN_SURE_SHARE = 0.5
+SURE, MIN_SURE_SHARE = 128, 0.005
+"""Of confidence's 255, and the share of tissue that must have as much: unrelated images have 0.0003 by chance."""
 
 
 def estimate_depth(
@@ -52,6 +56,7 @@ def estimate_depth(
     *,
     measured_frames: Sequence[int] | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
+    depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
 ) -> DepthClip:
     """Depth and confidence of every frame. A row shift between the eyes of up to 8 px is measured and corrected.
 
@@ -60,7 +65,8 @@ def estimate_depth(
     depth of others. On "cuda" another matcher (worker/stereo/cuda, needs triton) matches many pairs at once.
 
     `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| left after the correction),
-    min_disparity_px and max_disparity_px (the range searched) and depth_valid_share (of tissue pixels).
+    min_disparity_px and max_disparity_px (the range searched), depth_valid_share (of tissue pixels) and
+    depth_sure_share (those with confidence SURE or more). Nothing outside depth_range_mm is searched or becomes depth.
 
     Raises:
         ValueError: measured_frames is empty or names a frame that does not exist.
@@ -76,13 +82,14 @@ def estimate_depth(
     if device == "cuda":
         hooks.on_progress(Progress(COMPILATION, 0.0))
     with one_opencv_thread(), _pool() as pool:
-        shift, plan = _plan(clip, rgb, right_rgb, measured, pool, device)
+        shift, plan, outside = _plan(clip, rgb, right_rgb, measured, pool, device, depth_range_mm)
         if device == "cuda":
             depth_mm, confidence = _match_on_device(clip, rgb, right_rgb, plan, hooks)
         else:
             depth_mm, confidence = _match_all(clip, rgb, right_rgb, plan, pool, hooks)
         right = _right_eye(clip, rgb, right_rgb, depth_mm, confidence, plan)
-    valid_share = _valid_share(depth_mm, clip.tissue)
+    valid_share, sure_share = (_share_of_tissue(confidence, clip.tissue, least) for least in (1, SURE))
+    _check_depth(sure_share)
     return DepthClip(
         rgb=rgb,
         tissue=np.ascontiguousarray(clip.tissue),
@@ -93,7 +100,7 @@ def estimate_depth(
         frame_times_s=clip.frame_times_s,
         right=right,
         assumptions=(*clip.assumptions, _scale_assumption(clip)),
-        warnings=clip.warnings + _warnings(shift, valid_share),
+        warnings=clip.warnings + _warnings(shift, sure_share) + _range_warnings(outside, depth_range_mm),
         measurements={
             "vertical_misalignment_px": shift.shift_px,
             "vertical_residual_px": shift.residual_px,
@@ -101,6 +108,7 @@ def estimate_depth(
             "min_disparity_px": plan.min_disparity_px,
             "max_disparity_px": plan.max_disparity_px,
             "depth_valid_share": valid_share,
+            "depth_sure_share": sure_share,
         },
     )
 
@@ -129,8 +137,9 @@ def _plan(
     measured: Sequence[int],
     pool: ThreadPoolExecutor,
     device: str,
-) -> tuple[RowShift, MatchPlan]:
-    """Row shift and disparity range, from a few pairs spread over the measured frames."""
+    depth_range_mm: tuple[float, float],
+) -> tuple[RowShift, MatchPlan, float]:
+    """Row shift and disparity range, from a few pairs spread over the measured frames; and outside_share."""
 
     def some_pairs(count: int) -> list[tuple[Grey, Grey]]:
         return [(_grey(rgb[index]), _grey(right[index])) for index in spread(measured, count)]
@@ -143,8 +152,11 @@ def _plan(
         from worker.stereo.cuda import agreed_disparities as agreed
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
     pairs = some_pairs(RANGE_PAIRS)
-    low, high = choose_range(pairs, shift.correction_px, clip.disparity_offset_px, focal_baseline, agreed)
-    return shift, MatchPlan(low, high, shift.correction_px)
+    outside = outside_share(matches, shift, clip.disparity_offset_px, focal_baseline, depth_range_mm)
+    low, high = choose_range(
+        pairs, shift.correction_px, clip.disparity_offset_px, focal_baseline, depth_range_mm, agreed
+    )
+    return shift, MatchPlan(low, high, shift.correction_px, depth_range_mm), outside
 
 
 def _match_all(
@@ -162,7 +174,8 @@ def _match_all(
 
     def work(i: int) -> None:
         disparity, trust = match(_grey(rgb[i]), _grey(right[i]), plan)
-        depth_mm[i], confidence[i] = _to_depth(disparity, trust, focal_baseline, clip.disparity_offset_px)
+        beyond_infinity_px = disparity - np.float32(clip.disparity_offset_px)
+        depth_mm[i], confidence[i] = _to_depth(beyond_infinity_px, trust, focal_baseline, plan.depth_range_mm)
 
     share = 1 - DECODING_SHARE - MEASURING_SHARE
     jobs = [pool.submit(work, i) for i in range(clip.frame_count)]
@@ -233,33 +246,46 @@ def _right_eye(
 
 
 def _to_depth(
-    disparity_px: NDArray[np.float32], confidence: NDArray[np.uint8], focal_baseline: float, offset_px: float
+    beyond_infinity_px: NDArray[np.float32],
+    confidence: NDArray[np.uint8],
+    focal_baseline: float,
+    depth_range_mm: tuple[float, float],
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Depth in mm and confidence; both are 0 at invalid pixels."""
-    beyond_infinity_px = disparity_px - np.float32(offset_px)
-    valid = (confidence >= MIN_CONFIDENCE) & (beyond_infinity_px > focal_baseline / MAX_DEPTH_MM)
+    nearest_mm, farthest_mm = depth_range_mm
+    valid = confidence >= MIN_CONFIDENCE
+    valid &= (beyond_infinity_px >= focal_baseline / farthest_mm) & (beyond_infinity_px <= focal_baseline / nearest_mm)
     depth_mm = np.where(valid, focal_baseline / np.where(valid, beyond_infinity_px, 1.0), 0.0)
     return depth_mm.astype(np.float32), np.where(valid, confidence, 0).astype(np.uint8)
 
 
-def _valid_share(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) -> float:
-    """Share of tissue pixels with depth.
+def _share_of_tissue(confidence: NDArray[np.uint8], tissue: NDArray[np.bool_], least: int) -> float:
+    """Share of tissue pixels with a confidence of at least so much."""
+    found = sum(int(np.count_nonzero(each[mask] >= least)) for each, mask in zip(confidence, tissue, strict=True))
+    return found / max(int(np.count_nonzero(tissue)), 1)
 
-    Raises:
-        InputError: the share is below MIN_VALID_SHARE.
-    """
-    valid = sum(int(np.count_nonzero(depth[mask])) for depth, mask in zip(depth_mm, tissue, strict=True))
-    share = valid / max(int(np.count_nonzero(tissue)), 1)
-    if share < MIN_VALID_SHARE:
+
+def _check_depth(sure_share: float) -> None:
+    """Refuse a clip whose share of tissue with sure depth is below MIN_SURE_SHARE."""
+    if sure_share < MIN_SURE_SHARE:
         raise InputError(
             "clip",
-            f"{share:.1%} of tissue pixels have a valid depth, as good as none.",
+            f"{sure_share:.1%} of tissue pixels have a depth to rely on, as good as none.",
             "Check focus, that left and right belong together, and that the calibration and masks fit the frames.",
         )
-    return share
 
 
-def _warnings(shift: RowShift, valid_share: float) -> tuple[Notice, ...]:
+def _range_warnings(outside: float, depth_range_mm: tuple[float, float]) -> tuple[Notice, ...]:
+    if outside < WARN_OUTSIDE_SHARE:
+        return ()
+    text = (
+        f"{outside:.0%} of matching features are nearer than {depth_range_mm[0]:g} mm or farther than "
+        f"{depth_range_mm[1]:g} mm and get no depth: give min_depth_mm or max_depth_mm, or check the calibration"
+    )
+    return (Notice.warning(NoticeCode.DEPTH_OUT_OF_RANGE, text),)
+
+
+def _warnings(shift: RowShift, sure_share: float) -> tuple[Notice, ...]:
     found = []
     if shift.matches == 0:
         found.append(
@@ -276,10 +302,9 @@ def _warnings(shift: RowShift, valid_share: float) -> tuple[Notice, ...]:
                 "remain): the calibration does not fit this recording exactly",
             )
         )
-    if valid_share < WARN_VALID_SHARE:
-        found.append(
-            Notice.warning(NoticeCode.LITTLE_STEREO_DEPTH, f"only {valid_share:.0%} of tissue has stereo depth")
-        )
+    if sure_share < WARN_SURE_SHARE:
+        text = f"only {sure_share:.0%} of tissue has stereo depth to rely on"
+        found.append(Notice.warning(NoticeCode.LITTLE_STEREO_DEPTH, text))
     return tuple(found)
 
 

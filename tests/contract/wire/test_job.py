@@ -59,6 +59,9 @@ def test_a_list_of_held_out_frames_is_kept_as_text() -> None:
         '{"presett": "fast"}',
         '{"preset": "slow"}',
         '{"seed": -1}',
+        '{"min_depth_mm": 0}',
+        '{"min_depth_mm": 300}',
+        '{"min_depth_mm": 20, "max_depth_mm": 20}',
         '{"budget_s": NaN}',
     ],
 )

@@ -23,20 +23,36 @@ from triton import knobs
 from worker.stereo.cuda import kernels
 from worker.stereo.matching import (
     BLACK_LEVEL,
+    BLACK_PX,
     COLOUR_SIGMA,
+    CONTRAST_PX,
+    DOUBT_AT_LEAST_PX,
+    DOUBT_BY_DEVIATION,
+    DOUBT_BY_EVIDENCE,
+    ENDS_PX,
+    ERROR,
+    ERROR_PX,
+    EVIDENCE_AT_LEAST,
+    EVIDENCE_PX,
+    EVIDENCE_TEXTURE,
     HIGH_PASS_PX,
     MATCHING_WIDTH,
-    MAX_DEPTH_MM,
+    MAX_DEVIATION_PX,
     MAX_REFINEMENT_PX,
     MIN_CONFIDENCE,
+    MIN_WEIGHT,
+    NOISE_AT_LEAST,
     REFERENCE_WIDTH,
     REFINE_DAMPING,
     REFINE_WINDOW_PX,
-    RESIDUAL_FOR_TRUST,
+    ROUGHNESS_PER_PX2,
+    ROUGHNESS_PX,
     SATURATED_LEVEL,
     SATURATED_TRUST,
     SMOOTHNESS,
     TEXTURE_FOR_TRUST,
+    UNKNOWN_DEVIATION_PX,
+    UNSURE_TRUST,
     MatchPlan,
 )
 
@@ -48,10 +64,6 @@ FILTER_PASSES, FILTER_EASING = 3, 0.25
 """The filter alternates rows and columns so often, each time with this share of the strength before."""
 AGREEMENT_PX = 1.5
 """Of the reduced image: by more the disparities of both eyes contradict each other."""
-ROUGHNESS_PX, ROUGHNESS_PER_PX2 = 5, 0.256
-"""Side of the window, and how much trust a variance of the disparity of 1 px^2 within it costs: jumps are not sharp."""
-MIN_WEIGHT = 1e-8
-"""Where the filter finds no start far around."""
 MIN_LANES = 32
 VOLUME_BYTES = 1 << 30
 """Of the cost volumes at a time: some seventy frames, whose lines are enough for a large GPU."""
@@ -87,8 +99,10 @@ def depth_of(
     """Depth in mm, 0 where it is invalid, and its confidence, 0 at the same pixels, of pairs [F, H, W] on the host."""
     device = _device()
     disparity, confidence = match_frames(torch.from_numpy(left).to(device), torch.from_numpy(right).to(device), plan)
+    nearest_mm, farthest_mm = plan.depth_range_mm
     beyond_infinity_px = disparity - offset_px
-    valid = (confidence >= MIN_CONFIDENCE) & (beyond_infinity_px > focal_baseline / MAX_DEPTH_MM)
+    valid = (confidence >= MIN_CONFIDENCE) & (beyond_infinity_px >= focal_baseline / farthest_mm)
+    valid &= beyond_infinity_px <= focal_baseline / nearest_mm
     depth_mm = torch.where(valid, focal_baseline / beyond_infinity_px, 0.0)
     return depth_mm.cpu().numpy(), torch.where(valid, confidence, 0).cpu().numpy()
 
@@ -99,18 +113,46 @@ def match_frames(left: Tensor, right: Tensor, plan: MatchPlan) -> tuple[Tensor, 
     height, width = left.shape[1:]
     size, low, count = _reduced(height, width, plan)
     small_left, small_right = _resized(left, size), _resized(right, size)
-    disparity, opposite = _semi_global(small_left, small_right, low, count)
-    consistency = _consistency(disparity, opposite)
-    disparity = filled(disparity, consistency, small_left)
-    disparity = _enlarged(disparity, (height, width)) * (width / size[1])
+    found, opposite = _semi_global(small_left, small_right, low, count)
+    agreed = _consistency(found, opposite)
+    trust = _evidence(found, agreed, small_left)
+    trust.masked_fill_((found < low + ENDS_PX) | (found > low + count - 1 - ENDS_PX), 0)
+    coarse = filled(found, trust, (255 * small_left.float()).sqrt().round().to(torch.uint8))
+    deviation = torch.where(agreed > 0, (found - coarse).abs().clamp_max(MAX_DEVIATION_PX), UNKNOWN_DEVIATION_PX)
+    doubt = doubt_of(_box(deviation, ROUGHNESS_PX), _box(trust, EVIDENCE_PX))
+    disparity = _enlarged(coarse, (height, width)) * (width / size[1])
     disparity, texture, residual = refine(disparity, left, right)
-    trust = _enlarged(255 * consistency, (height, width))
-    trust *= (texture / TEXTURE_FOR_TRUST).clamp_max(1)
-    trust *= (RESIDUAL_FOR_TRUST / residual.clamp_min(1e-3)).clamp_max(1)
-    trust = torch.where(left >= SATURATED_LEVEL, SATURATED_TRUST * trust, trust)
+    confidence = confidence_of(_enlarged(doubt, (height, width)), texture, residual)
     x_right = torch.arange(width, device=left.device) - disparity
-    unseen = (left <= BLACK_LEVEL) | (x_right < 0) | (x_right > width - 1)
-    return disparity, trust.masked_fill(unseen, 0).round().to(torch.uint8)
+    unsure = (left >= SATURATED_LEVEL) | (x_right < 0) | (x_right > width - 1)
+    least = confidence.clamp_max(MIN_CONFIDENCE)
+    confidence = torch.where(unsure, (UNSURE_TRUST * confidence).maximum(least), confidence)
+    black = _box(left.float(), BLACK_PX).round() <= BLACK_LEVEL
+    return disparity, confidence.masked_fill(black, 0).round().to(torch.uint8)
+
+
+def _evidence(found: Tensor, consistency: Tensor, image: Tensor) -> Tensor:
+    """As matching.evidence, from a consistency that knows the disparities' roughness."""
+    values = image.float()
+    values = functional.pad(values - _box(values, CONTRAST_PX), (1, 1), mode="reflect")
+    texture = _box((0.5 * (values[:, :, 2:] - values[:, :, :-2])).square(), EVIDENCE_PX)
+    burnt_out = functional.max_pool2d((image >= SATURATED_LEVEL).float(), 3, 1, 1) > 0
+    trust = consistency * (texture / (texture + EVIDENCE_TEXTURE)) * torch.where(burnt_out, SATURATED_TRUST, 1.0)
+    unseen = found > torch.arange(found.shape[2], device=found.device)
+    return trust.masked_fill((image <= BLACK_LEVEL) | unseen, 0)
+
+
+def doubt_of(deviation: Tensor, evidence: Tensor) -> Tensor:
+    """As matching.doubt_of."""
+    by_deviation = (deviation + DOUBT_AT_LEAST_PX).pow(DOUBT_BY_DEVIATION)
+    return by_deviation / (evidence + EVIDENCE_AT_LEAST).pow(DOUBT_BY_EVIDENCE)
+
+
+def confidence_of(doubt: Tensor, texture: Tensor, residual: Tensor) -> Tensor:
+    """As matching.confidence_of."""
+    expected_px = ERROR * doubt * (residual / (texture + 1).sqrt() + NOISE_AT_LEAST).sqrt()
+    confidence = 255 / (1 + (expected_px / ERROR_PX).square())
+    return (confidence * (texture / TEXTURE_FOR_TRUST).clamp_max(1)).maximum(confidence.clamp_max(MIN_CONFIDENCE))
 
 
 def agreed_disparities(
