@@ -267,10 +267,11 @@ def summary_of(report: Report) -> str:
     copies = ", ".join(
         f"{name.removeprefix('copying: ')} {value:.1f} dB" for name, value in baselines_of(report).items()
     )
+    right = f", {report.psnr_right_db:.1f} dB in the right eye" if report.psnr_right_db is not None else ""
     return (
         f"{report.gaussians:,} Gaussians after {report.seconds['t_train_s']:.0f} s of training; "
         f"psnr_tissue {report.psnr_tissue_db:.1f} dB on {len(report.frames)} frames it never saw "
-        f"(copying: {copies}); depth {report.depth_agreement_mm:.2f} mm from stereo"
+        f"(copying: {copies}){right}; depth {report.depth_agreement_mm:.2f} mm from stereo"
     )
 
 

@@ -28,6 +28,23 @@ function quality(report) {
   return `${model} on frames it never saw; ${verdict} than copying neighbouring frames (${best.toFixed(2)} dB).`;
 }
 
+/**
+ * Likeness from beside: the right eye of a stereo clip. None for a clip of one eye.
+ * @param {import("./wire.js").Report} report
+ */
+function rightEye({ psnr_right_db: right, baseline_warp_db: warped, psnr_clear_db: leftClear, psnr_right_clear_db: clear }) {
+  if (!Number.isFinite(right)) return null;
+  const sentences = [`${number(right, 2, "dB")} on frames it never saw, where the left eye sees the tissue, too`];
+  if (Number.isFinite(warped)) {
+    const verdict = right > warped ? "better" : "no better";
+    sentences[0] += `; ${verdict} than shifting the left eye's own picture by its depth (${number(warped, 2, "dB")})`;
+  }
+  if (Number.isFinite(clear) && Number.isFinite(leftClear)) {
+    sentences.push(`Without wet highlights ${number(clear, 2, "dB")}, left eye ${number(leftClear, 2, "dB")}`);
+  }
+  return sentences.map((sentence) => `${sentence}.`).join(" ");
+}
+
 /** The one sentence to read first. */
 function verdict(report) {
   const best = Math.max(...baselinesOf(report).map(({ db }) => db));
@@ -46,6 +63,7 @@ function clip({ frame_count: frames, width, height, held_out: heldOut }) {
 function rows(report) {
   return [
     ["Likeness", quality(report)],
+    ["Likeness from the right eye", rightEye(report)],
     ["Depth against stereo", number(report.depth_agreement_mm, 2, "mm (median difference)")],
     ["Tissue covered", share(report.coverage)],
     ["Clip", clip(report)],

@@ -64,6 +64,8 @@ def test_a_clip_is_sent_and_its_job_watched_to_the_scene(site: Site, page: Page)
     page.until_state("live")
     page.until_text("#report", "31.20 dB on frames it never saw; better than copying")
     assert "The clip is short." in page.text("#report")
+    assert "28.40 dB on frames it never saw, where the left eye sees the tissue, too; no better" in page.text("#report")
+    assert "Without wet highlights 30.10 dB, left eye 33.00 dB." in page.text("#report")
     page.until(lambda: page.script("return document.querySelectorAll('#curve .baseline').length") == 2)
 
 

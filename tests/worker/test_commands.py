@@ -16,7 +16,8 @@ import pytest
 import torch
 
 from contract.runtime.exits import ExitCode
-from contract.wire.names import PresetName
+from contract.wire.names import CURVE, REPORT, PresetName
+from contract.wire.report import Report
 from worker.__main__ import main
 from worker.scene.resume_file import RESUME_FILE, load_resume
 from worker.train.presets import PRESETS
@@ -44,6 +45,21 @@ def scene(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_reconstruct_writes_a_scene_with_its_report_and_curve(scene: Path) -> None:
     assert {"manifest.json", "scene.safetensors", "report.json", "curve.csv"} <= {path.name for path in scene.iterdir()}
     assert json.loads((scene / "report.json").read_text())["iterations"] == 10
+
+
+def test_reconstruct_tells_the_right_eyes_score_of_a_clip_that_has_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn, out = tmp_path / "clip", tmp_path / "scene"
+    size = ["--frames", "10", "--width", "128", "--height", "96"]
+    assert main(["phantom", "--format", "stereomis", *size, "--out", str(drawn)]) == ExitCode.OK
+    capsys.readouterr()
+    assert main(["reconstruct", str(drawn), "--eyes", "left", "--iterations", "5", "--out", str(out)]) == ExitCode.OK
+    report = Report.model_validate_json((out / REPORT).read_text())
+    told = capsys.readouterr().out
+    assert f"psnr_right: {report.psnr_right_db:.2f} dB on held-out frames of the right eye (the left eye's" in told
+    assert f"{report.baseline_warp_db:.2f} dB)" in told
+    assert (out / CURVE).read_text().splitlines()[0].endswith(",psnr_right_db")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -100,5 +100,9 @@ def _print_report(report: Report, out: Path) -> None:
     quality = report.psnr_tissue_db
     shown = "not measured (no frames were held out)" if quality is None else f"{quality:.2f} dB on held-out frames"
     print(f"scene: {out}\npsnr_tissue: {shown}")
+    if report.psnr_right_db is not None:
+        warped = f" (the left eye's picture, warped by its depth: {report.baseline_warp_db:.2f} dB)"
+        known = warped if report.baseline_warp_db is not None else ""
+        print(f"psnr_right: {report.psnr_right_db:.2f} dB on held-out frames of the right eye{known}")
     for notice in report.warnings:
         print(f"{notice.severity}: {notice.text}")
