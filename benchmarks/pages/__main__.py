@@ -3,8 +3,8 @@
     python -m benchmarks.pages
 
 Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
-stability`), {ablation,raster,service}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py);
-what is missing is left out.
+stability`), {two-eyes,ablation,raster,service}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of
+bm_soak.py); what is missing is left out.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ import csv
 from pathlib import Path
 from statistics import median
 
-from benchmarks.pages.evaluation import origin, sections, write_readme
+from benchmarks.pages.evaluation import sections, write_readme
 from benchmarks.pages.gpu import gpu_sections
-from benchmarks.pages.markdown import table
+from benchmarks.pages.markdown import origin, table
+from benchmarks.pages.right_eye import two_eyes_sections
 from benchmarks.pages.stability import stability_sections
 from worker.evaluate.stability import STABILITY
 
@@ -80,7 +81,7 @@ while a clip has nothing to show yet, NotFound and Conflict once it is purged or
 
 
 def main() -> None:
-    parts = [_INTRODUCTION, *sections(RESULTS), *stability_sections(RESULTS)]
+    parts = [_INTRODUCTION, *sections(RESULTS), *two_eyes_sections(RESULTS), *stability_sections(RESULTS)]
     if rows := _read(STABILITY):
         parts.append(origin(rows))
     if rows := _latest(_read("ablation.csv"), "change", "clip", "holdout", "seed"):

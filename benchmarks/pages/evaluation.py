@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from statistics import median, mode
+from statistics import mode
 
-from benchmarks.pages.markdown import number, table
-from benchmarks.pages.right_eye import RIGHT_EYE_CHARTS, both_eyes, right_eye_claim
+from benchmarks.pages.markdown import number, origin, table
+from benchmarks.pages.right_eye import RIGHT_EYE_CHARTS, both_eyes, right_eye_claim, two_eyes
 from worker.evaluate.cells import DEFAULT_SERIES, GRID_BASES, GRID_POINTS, OURS, base_of
 from worker.evaluate.charts import clip_alone
 from worker.evaluate.published import ABLATION, RESULTS, Published
@@ -154,7 +154,7 @@ def write_readme(readme: Path, folder: Path) -> None:
     page = f"[All charts and figures]({folder.relative_to(readme.parent)}/index.md)"
     before, rest = text.split(MARKS[0])
     after = rest.split(MARKS[1])[1]
-    claims = filter(None, (_claim(usual), right_eye_claim(groups_of(results.runs)), f"{page}."))
+    claims = filter(None, (_claim(usual), right_eye_claim(two_eyes(folder) or groups_of(results.runs)), f"{page}."))
     body = "\n\n".join((MARKS[0], picture, caption, " ".join(claims), MARKS[1]))
     readme.write_text(f"{before}{body}{after}")
 
@@ -356,14 +356,6 @@ def _counted(runs: Sequence[Row]) -> str:
     return (
         f"{len(runs)} runs, {failed} of them failed; ours are {ours}, all others the published method and its rivals."
     )
-
-
-def origin(runs: Sequence[Row]) -> str:
-    """On which machines rows were measured, with which commits, and beside how much other work where they tell."""
-    machines, commits = (", ".join(sorted({row[name] for row in runs if row[name]})) for name in ("machine", "commit"))
-    loads = [float(row["load_1min"]) for row in runs if row.get("load_1min")]
-    load = f"; load before a run {min(loads):.1f} to {max(loads):.1f}, median {median(loads):.1f}" if loads else ""
-    return f"\nMeasured on {machines}, commits {commits} (+: with changes not yet committed){load}.\n"
 
 
 def _listed(values: Sequence[int]) -> str:

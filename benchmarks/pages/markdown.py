@@ -1,9 +1,12 @@
-"""Figures and tables in Markdown."""
+"""Figures, tables and their origin in Markdown."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import median
+
+from worker.evaluate.rows import Row
 
 
 def number(value: float | None, digits: int) -> str:
@@ -15,3 +18,11 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in Markdown."""
     lines = ["", "| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows]) + "\n"
+
+
+def origin(runs: Sequence[Row]) -> str:
+    """On which machines rows were measured, with which commits, and beside how much other work where they tell."""
+    machines, commits = (", ".join(sorted({row[name] for row in runs if row[name]})) for name in ("machine", "commit"))
+    loads = [float(row["load_1min"]) for row in runs if row.get("load_1min")]
+    load = f"; load before a run {min(loads):.1f} to {max(loads):.1f}, median {median(loads):.1f}" if loads else ""
+    return f"\nMeasured on {machines}, commits {commits} (+: with changes not yet committed){load}.\n"

@@ -4,11 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
-from benchmarks.pages.markdown import number, table
-from worker.evaluate.summary import Group
+from benchmarks.pages.markdown import number, origin, table
+from worker.evaluate.rows import read_rows
+from worker.evaluate.summary import Group, groups_of
 from worker.train.presets import PRESETS
 
+TWO_EYES = "two-eyes.csv"
+"""Rows of bm_two_eyes.py."""
+_TWO_EYES = """
+## Two eyes
+
+`python benchmarks/bm_two_eyes.py` ([two-eyes.csv](two-eyes.csv), a row a run): `fast` on a stereo clip, trained on the
+left eye or on both, judged at held-out moments by the left eye and by the right; medians over seeds. `warp` is what the
+left eye's picture scores in the right eye, warped by stereo depth ([conventions](../conventions.md#scores)).
+"""
 RIGHT_EYE_CHARTS = {
     "curves-eyes": """
 ### Left and right eye
@@ -26,21 +37,35 @@ model has that picture.
 """,
 }
 """By chart: what stands with it."""
-_EYES = {
-    "psnr_tissue_db": "left, dB", "psnr_right_db": "right, dB", "warp_db": "warp, dB",
-    "psnr_clear_db": "left without highlights", "psnr_right_clear_db": "right without highlights",
-    "warp_clear_db": "warp without highlights", "t_train_s": "t_train_s", "t_post_s": "t_post_s",
+_COLUMNS = {
+    "psnr_tissue_db": ("left, dB", 1), "psnr_right_db": ("right, dB", 1), "warp_db": ("warp, dB", 1),
+    "psnr_clear_db": ("left without highlights", 1), "psnr_right_clear_db": ("right without highlights", 1),
+    "warp_clear_db": ("warp without highlights", 1), "iterations": ("iterations", 0), "step_ms": ("step, ms", 1),
+    "t_train_s": ("t_train_s", 1), "t_post_s": ("t_post_s", 1),
 }  # fmt: skip
 
 
 def both_eyes(groups: Sequence[Group]) -> str:
-    """A row a group whose right eye was scored."""
+    """What `fast` reaches, and a row a group whose right eye was scored; empty without any."""
     known = [group for group in groups if not math.isnan(group.median("psnr_right_db"))]
     rows = [
-        [*group.place, group.series, group.limit, *(number(group.median(name), 1) for name in _EYES)] for group in known
+        [*group.place, group.series, group.limit, str(len(group.rows))]
+        + [number(group.median(name), digits) for name, (_, digits) in _COLUMNS.items()]
+        for group in known
     ]
-    header = ["clip", "held out", "series", "limit", *_EYES.values()]
+    header = ["clip", "held out", "series", "limit", "seeds", *(name for name, _ in _COLUMNS.values())]
     return f"\n{right_eye_claim(groups)}\n{table(header, rows)}" if rows else ""
+
+
+def two_eyes(folder: Path) -> list[Group]:
+    """The groups of bm_two_eyes.py's rows in folder."""
+    return groups_of(read_rows(folder / TWO_EYES))
+
+
+def two_eyes_sections(folder: Path) -> list[str]:
+    """The section of bm_two_eyes.py; nothing without rows."""
+    groups = two_eyes(folder)
+    return [_TWO_EYES, both_eyes(groups), origin(read_rows(folder / TWO_EYES))] if groups else []
 
 
 def right_eye_claim(groups: Sequence[Group]) -> str:

@@ -60,9 +60,9 @@ class Results:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self.runs = [_texts(row, RUN_FIELDS) for row in read_rows(folder / RUNS)]
+        self.runs = [texts_of(row, RUN_FIELDS) for row in read_rows(folder / RUNS)]
         kept = {key_of(row) for row in self.runs}
-        self.curves = [_texts(row, CURVE_FIELDS) for row in read_rows(folder / CURVES) if key_of(row) in kept]
+        self.curves = [texts_of(row, CURVE_FIELDS) for row in read_rows(folder / CURVES) if key_of(row) in kept]
 
     def has(self, key: tuple[str, ...]) -> bool:
         """Whether the run has a row, of success or of failure."""
@@ -80,8 +80,8 @@ class Results:
     def add(self, run: Mapping[str, object], curve: Sequence[Mapping[str, object]]) -> None:
         """Keep a run and its curve."""
         key = {name: run[name] for name in KEY}
-        self.curves += [_texts({**key, **point}, CURVE_FIELDS) for point in curve]
-        self.runs.append(_texts(run, RUN_FIELDS))
+        self.curves += [texts_of({**key, **point}, CURVE_FIELDS) for point in curve]
+        self.runs.append(texts_of(run, RUN_FIELDS))
         self._folder.mkdir(parents=True, exist_ok=True)
         write_rows(self._folder / CURVES, CURVE_FIELDS, self.curves)
         write_rows(self._folder / RUNS, RUN_FIELDS, self.runs)
@@ -144,7 +144,8 @@ def commit() -> str:
     return found or "unknown"
 
 
-def _texts(row: Mapping[str, object], fields: Sequence[str]) -> Row:
+def texts_of(row: Mapping[str, object], fields: Sequence[str]) -> Row:
+    """These fields of a row as a file holds them; what the row lacks is empty."""
     return {name: _text(row.get(name)) for name in fields}
 
 

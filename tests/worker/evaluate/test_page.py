@@ -37,7 +37,7 @@ def test_the_page_tells_the_right_eye_beside_the_left_one(tmp_path: Path) -> Non
     write_rows(folder / RUNS, RUN_FIELDS, [stereo, stereo | {"series": "fast:eyes=left", "psnr_right_db": "30.6"}])
     page = "".join(sections(folder))
     assert "In 60 s, `fast` scores 37.5 dB in the left eye of `d4d-a-stereo` (every8) and 36.0 dB in the right" in page
-    assert "| d4d-a-stereo | every8 | fast:eyes=left | 60 s | 37.5 | 30.6 | 30.7 | 39.0 | – |" in page
+    assert "| d4d-a-stereo | every8 | fast:eyes=left | 60 s | 1 | 37.5 | 30.6 | 30.7 | 39.0 | – |" in page
 
 
 def test_the_page_says_what_failed_and_what_is_missing(tmp_path: Path) -> None:
