@@ -52,7 +52,7 @@ WIDTH, HEIGHT, GRID_STEP_PX = 640, 512, 2.86
 SPREAD, OPACITY, DEPTH = 0.6, 0.88, 60.0
 BASES = 17
 TIME = 0.4
-RATES = StepRates(*[1e-7] * 11)  # so small that the scene stays what it is
+RATES = StepRates(*[1e-7] * 13)  # so small that the scene stays what it is
 TARGET_MS = {"render": 1000 / 60, "step": 25.0}
 PAIR_FMA = {"render": 8, "step": 8 + 15}
 """Multiply-adds (or single products and sums) for a pixel and a Gaussian it blends: alpha and its ratio, w, T and four

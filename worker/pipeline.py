@@ -20,6 +20,7 @@ from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM
 from contract.wire.report import Report
 from worker.input.calibration import rectify
 from worker.input.calibration.types import StereoCalibration
+from worker.input.camera import to_camera
 from worker.input.clip import DepthClip, StereoClip, held_out_frames, split_frames
 from worker.input.decode import decode_clip
 from worker.machine.hooks import Hooks, Progress
@@ -179,6 +180,7 @@ def snapshot_of(run: Run) -> Scene:
         preset=run.preset.name,
         trained_t=tuple(float(clip.t[i]) for i in run.setup.split.train),
         seen=torch.zeros(len(gaussians)),
+        right_eye_mm=_right_eye_mm(run),
         seed=run.seed,
         settings={
             "made_iterations": run.iteration,
@@ -186,6 +188,15 @@ def snapshot_of(run: Run) -> Scene:
             "preset": json.loads(json.dumps(asdict(run.preset), default=str)),
         },
     )
+
+
+def _right_eye_mm(run: Run) -> tuple[float, float, float] | None:
+    """Where the right eye is in the left one's camera axes; None where the left eye alone taught."""
+    if run.right is None:
+        return None
+    right = run.right.eye
+    x, y, z = to_camera(right.world_from_camera[:1, :3, 3], run.setup.clip.world_from_camera[0])[0].tolist()
+    return x, y, z
 
 
 def assess(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Report:

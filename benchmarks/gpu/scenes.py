@@ -12,6 +12,7 @@ from torch import Tensor
 
 from tests.worker.raster.scenes import SplatScene, pixels_near_a_cut
 from worker.model.deformation import Deformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
+from worker.model.layout import CAMERA
 from worker.model.loss import LossSettings, training_loss
 from worker.raster import reference
 from worker.raster.cpu import padded
@@ -62,7 +63,7 @@ class Noise:
     @property
     def settings(self) -> Tensor:
         """[5] float32, as the blend takes them."""
-        frame = self.frame(0.0, np.zeros(18))
+        frame = self.frame(0.0, np.zeros(CAMERA))
         return torch.from_numpy(frame.loss_settings(LOSS))
 
     def gradients(self, scene: SplatScene) -> dict[str, Tensor]:

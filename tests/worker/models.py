@@ -29,11 +29,13 @@ RATES = StepRates(
     log_scale=4e-3,
     opacity=5e-3,
     colour=6e-3,
+    gloss=8e-3,
     sh_rest=1e-3,
     motion_mean=7e-3,
     motion_quaternion=7e-3,
     motion_log_scale=7e-3,
     motion_colour=7e-3,
+    motion_gloss=7e-3,
     eps=1e-15,
 )
 """Motion has one rate for all its channels, as a deformation without kernels of its own needs."""

@@ -43,13 +43,13 @@ from worker.evaluate.rows import NO_RESULT, Row, commit, machine, read_rows, wri
 from worker.model.metrics import psnr_tissue
 from worker.phantom import PhantomSettings
 from worker.pipeline import reconstruct
-from worker.raster.step import camera_vector
+from worker.render.camera import view_camera
 from worker.scene.checkpoint import load_scene
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
 from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
-from worker.train.targets import camera_in_units, solid_depth_mm
+from worker.train.targets import solid_depth_mm
 
 STABILITY = "stability.csv"
 KEY = ("condition", "severity", "series", "seed", "iterations", "width", "height", "frames")
@@ -270,8 +270,8 @@ def _judged(given: Given, scene: Scene, moments: Sequence[Moment]) -> tuple[floa
     model, scale = model_of(scene), scene.units_per_mm
     scores, errors_mm = [], []
     for moment in moments:
-        camera = camera_in_units(scene.intrinsics, scene.world_from_camera[moment.frame], scale)
-        image = model.render(camera_vector(camera), moment.t)
+        camera = view_camera(scene, moment.t, scene.world_from_camera[moment.frame], scene.intrinsics)
+        image = model.render(camera, moment.t)
         depth_mm = solid_depth_mm(image[3], image[4], scale)
         truth, scored = given.depth_mm[moment.truth], given.scored[moment.truth]
         scores.append(psnr_tissue(image[:3].transpose(1, 2, 0), given.rgb[moment.truth], scored))

@@ -44,12 +44,11 @@ from worker.evaluate.ranking import PixelErrors, pixel_errors, rank_correlation,
 from worker.input.clip import DepthClip
 from worker.model.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
 from worker.phantom import Phantom
-from worker.raster.step import camera_vector
+from worker.render.camera import view_camera
 from worker.render.view import render_frame
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
 from worker.train.scoring import sample_frames
-from worker.train.targets import camera_in_units
 
 Pose = NDArray[np.float64]
 
@@ -248,7 +247,7 @@ class SceneCandidate:
     def _image(self, frame: int, pose: Pose) -> NDArray[np.float32]:
         """R G B Z A [5, H, W], a copy."""
         scene = self._scene
-        camera = camera_vector(camera_in_units(scene.intrinsics, pose, scene.units_per_mm))
+        camera = view_camera(scene, frame / scene.frame_count, pose, scene.intrinsics)
         return self._model.render(camera, frame / scene.frame_count).copy()
 
 

@@ -7,7 +7,7 @@ Lengths are in optimiser units (the median valid training depth is 60).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -36,6 +36,8 @@ class Gaussians:
     log_scale     [N, 3]     natural logarithm of the three standard deviations in units
     opacity_logit [N]        logit of the opacity
     sh            [N, K, 3]  colour, K in {1, 4, 9, 16}
+    gloss         [N]        how much brighter the right eye sees it than the left one, added to red, green and blue:
+                             wet tissue mirrors the lamp elsewhere for each eye; 0 if not given
     """
 
     mean: Tensor
@@ -43,6 +45,11 @@ class Gaussians:
     log_scale: Tensor
     opacity_logit: Tensor
     sh: Tensor
+    gloss: Tensor = field(default_factory=lambda: torch.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not self.gloss.numel():
+            object.__setattr__(self, "gloss", torch.zeros_like(self.opacity_logit))
 
     def __len__(self) -> int:
         return int(self.mean.shape[0])
@@ -61,21 +68,26 @@ class Gaussians:
     def sh_degree(self) -> int:
         return math.isqrt(int(self.sh.shape[1])) - 1
 
-    def colour(self, camera_centre: Tensor) -> Tensor:
-        """Colour seen from a camera at camera_centre ([3], world, units): [N, 3] RGB, not below 0, unbounded above."""
+    def colour(self, camera_centre: Tensor, side: float = 0.0, dim: float = 0.0) -> Tensor:
+        """Colour seen from a camera at camera_centre ([3], world, units): [N, 3] RGB, not below 0, unbounded above.
+
+        side, dim: of the camera (worker/raster/__init__.py), for the gloss. With other harmonics there is none.
+        """
         if self.sh.shape[1] == 1:  # no view dependence: spare the directions and their gradients
-            return sh_colour(self.sh, torch.zeros_like(self.mean))
+            shine = side * self.gloss - dim * self.gloss.abs()
+            return torch.clamp(0.5 + SH_C0 * self.sh[:, 0] + shine[:, None], min=0.0)
         direction = torch.nn.functional.normalize(self.mean - camera_centre, dim=-1)
         return sh_colour(self.sh, direction)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five tensors by name, to optimise or to store."""
+        """The six tensors by name, to optimise or to store."""
         return {
             "mean": self.mean,
             "quaternion": self.quaternion,
             "log_scale": self.log_scale,
             "opacity_logit": self.opacity_logit,
             "sh": self.sh,
+            "gloss": self.gloss,
         }
 
 

@@ -25,7 +25,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Rates:
-    """One rate a parameter group. motion_* are those of the deformation's weights for its four kinds of channel.
+    """One rate a parameter group. motion_* are those of the deformation's weights for its five kinds of channel.
 
     beta1, beta2  decay of Adam's two moments per step; as published unless a preset says otherwise
     """
@@ -35,11 +35,13 @@ class Rates:
     log_scale: Rate
     opacity: Rate
     colour: Rate
+    gloss: Rate
     sh_rest: Rate
     motion_mean: Rate
     motion_quaternion: Rate
     motion_log_scale: Rate
     motion_colour: Rate
+    motion_gloss: Rate
     eps: float = 1e-15
     beta1: float = 0.9
     beta2: float = 0.999
@@ -54,11 +56,13 @@ class StepRates:
     log_scale: float
     opacity: float
     colour: float
+    gloss: float
     sh_rest: float
     motion_mean: float
     motion_quaternion: float
     motion_log_scale: float
     motion_colour: float
+    motion_gloss: float
     eps: float
     beta1: float = 0.9
     beta2: float = 0.999

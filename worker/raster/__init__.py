@@ -53,6 +53,8 @@ class Camera:
     """A pinhole camera: OpenCV axes, focal lengths and principal point in pixels.
 
     camera_from_world is [4, 4] float64, rigid, translation in optimiser units; a tensor where its gradient is wanted.
+    side and dim say what it sees of the gloss g of a Gaussian (worker/model/gaussians.py): the colour gains side g and
+    loses dim |g|. The left eye has side -1/2, the right eye 1/2. The rasteriser gets colours that have it already.
     """
 
     fx: float
@@ -62,6 +64,8 @@ class Camera:
     width: int
     height: int
     camera_from_world: NDArray[np.float64] | Tensor
+    side: float = 0.0
+    dim: float = 0.0
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1 or min(self.fx, self.fy) <= 0:

@@ -89,8 +89,8 @@ class Model(Protocol):
     def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
         """Gradient of sum(cotangents * render(camera, t)), cotangents [5, H, W], to the Gaussians as they are at t.
 
-        [14, N]: mean 0:3, quaternion 3:7, log-scale 7:10, constant harmonic 10:13 (as if no colour were held above 0),
-        opacity logit 13. Other harmonics are left out.
+        [VALUES, N], rows as in worker/model/layout.py, colours as if none were held above 0. Other harmonics are left
+        out.
         """
         ...
 
@@ -105,8 +105,7 @@ class Model(Protocol):
     def parameters(self) -> dict[str, Tensor]:
         """What is trained, by name; views of the live tensors, on every device of one shape. May be written.
 
-        Among them: canonical [13, N] (mean 0:3, quaternion 3:7, log-scale 7:10, constant harmonic 10:13) and
-        opacity_logit [N].
+        Among them: canonical [ROWS, N], rows as in worker/model/layout.py, and opacity_logit [N].
         """
         ...
 

@@ -21,7 +21,8 @@ def camera_vector(camera: Camera) -> NDArray[np.float64]:
     given = camera.camera_from_world
     matrix = given.detach().double().cpu().numpy() if isinstance(given, torch.Tensor) else given
     pose = np.asarray(matrix, np.float64)[:3].ravel()
-    return np.concatenate([[camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], pose])
+    intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
+    return np.concatenate([intrinsics, [camera.side, camera.dim], pose])
 
 
 def image_size(camera: NDArray[np.float64]) -> tuple[int, int]:

@@ -12,17 +12,16 @@ from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from contract.wire.notices import Notice, NoticeCode
 from worker.input.camera import Intrinsics
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
-from worker.raster.step import camera_vector
+from worker.render.camera import endoscope_pose, view_camera
 from worker.render.unseen import blended_values, unseen_pixels
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
-from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
+from worker.train.targets import MEDIAN_DEPTH_UNITS, solid_depth_mm
 
 POSE_FALL_OFF = 0.25
 """Distance from the nearest trained pose, in median depths, at which confidence has fallen to exp(-1/2): 14 degrees."""
@@ -71,12 +70,12 @@ class SceneRenderer:
         self._lock = Lock()
 
     def layers(
-        self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
+        self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics, *, highlights: bool = True
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """R G B Z A [5, H, W], Z unnormalised in units, and blended_values as they are blended [H, W], as copies."""
         scene = self._scene()
         assert scene is not None
-        camera = camera_vector(camera_in_units(intrinsics, world_from_camera, scene.units_per_mm))
+        camera = view_camera(scene, t, world_from_camera, intrinsics, highlights=highlights)
         with self._lock:
             image = self._model.render(camera, t, self._values).copy()
         return image[:5], None if self._values is None else image[5]
@@ -95,32 +94,25 @@ def renderer_of(scene: Scene, device: Device = CPU) -> SceneRenderer:
         return made[device]
 
 
-def endoscope_pose(scene: Scene, t: float) -> NDArray[np.float64]:
-    """world_from_camera [4, 4] (mm) of the endoscope at model time t, between frames interpolated."""
-    poses, count = scene.world_from_camera, scene.frame_count
-    place = min(max(t * count, 0.0), count - 1.0)
-    before = min(int(place), max(count - 2, 0))
-    if count == 1 or np.array_equal(poses[before], poses[before + 1]):
-        return np.array(poses[before])
-    share = place - before
-    pose = np.eye(4)
-    pose[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(poses[before : before + 2, :3, :3]))(share).as_matrix()
-    pose[:3, 3] = (1 - share) * poses[before, :3, 3] + share * poses[before + 1, :3, 3]
-    return pose
-
-
 def render_frame(
     scene: Scene,
     t: float,
     world_from_camera: NDArray[np.float64] | None = None,
     intrinsics: Intrinsics | None = None,
     device: Device = CPU,
+    *,
+    highlights: bool = True,
 ) -> Frame:
-    """The scene at model time t (held within the clip) from a pose (mm; None: the endoscope's) through a camera."""
+    """The scene at model time t (held within the clip) from a pose (mm; None: the endoscope's) through a camera.
+
+    highlights: as the endoscope's eyes saw them, fading away from both; False: without.
+    """
     last = (scene.frame_count - 1) / scene.frame_count
     shown = min(max(t, 0.0), last)
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
-    image, blended = renderer_of(scene, device).layers(shown, pose, intrinsics or scene.intrinsics)
+    image, blended = renderer_of(scene, device).layers(
+        shown, pose, intrinsics or scene.intrinsics, highlights=highlights
+    )
     alpha = image[4]
     solid = alpha >= COVERED_ALPHA
     unseen = unseen_pixels(solid, blended)

@@ -65,6 +65,7 @@ def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> 
         "seed": scene.seed,
         "settings": scene.settings,
         "trained_t": list(scene.trained_t),
+        "right_eye_mm": scene.right_eye_mm,
         "tensors": {name: {"shape": list(each.shape), "dtype": dtype_name(each)} for name, each in tensors.items()},
         "files": {
             name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
@@ -128,6 +129,10 @@ def _scene_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> Scene:
     gaussians, deformation, seen = _model_of(manifest, tensors)
     poses = np.array(manifest["world_from_camera"], dtype=np.float64)
     times_s = np.array(manifest["frame_times_s"], dtype=np.float64)
+    right_eye_mm = None
+    if (given := manifest.get("right_eye_mm")) is not None:  # scenes of version 0.3 have none
+        x, y, z = (float(each) for each in given)
+        right_eye_mm = x, y, z
     if times_s.ndim != 1 or poses.shape != (len(times_s), 4, 4):
         raise ValueError(f"world_from_camera has shape {poses.shape} for frame_times_s of {times_s.shape}")
     return Scene(
@@ -139,6 +144,7 @@ def _scene_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> Scene:
         units_per_mm=float(manifest["units_per_mm"]),
         preset=str(manifest["preset"]),
         trained_t=tuple(float(t) for t in manifest["trained_t"]),
+        right_eye_mm=right_eye_mm,
         seen=seen,
         seed=int(manifest["seed"]),
         settings=dict(manifest["settings"]),

@@ -1,6 +1,7 @@
 """The compact form of a scene: a table of whole numbers, which the range coder packs, and back to Gaussians.
 
-Symbols: N Gaussians, C channels (10, or 13 with colour), B bases, R = B - 1 patterns of motion per channel, K columns.
+Symbols: N Gaussians, C channels (10, 13 with colour, 14 with gloss), B bases, R = B - 1 patterns of motion per channel,
+K columns.
 
 A decoder undoes four steps (worker/scene/quantize.py does them): motion is coefficients of patterns, numbers are
 multiples of a step, columns may hold differences between neighbours, and the table is range coded. docs/scene-file.md
@@ -20,16 +21,25 @@ from torch import Tensor
 
 from worker.model.deformation import SharedBasis
 from worker.model.gaussians import Gaussians
-from worker.model.layout import CHANNELS, COLOUR, LOG_SCALE, MEAN, OPACITY_ROW, QUATERNION, ROWS, VALUES
+from worker.model.layout import (
+    CHANNELS,
+    COLOUR,
+    COLOUR_CHANNELS,
+    GLOSS_ROW,
+    LOG_SCALE,
+    MEAN,
+    OPACITY_ROW,
+    QUATERNION,
+    ROWS,
+    VALUES,
+)
 from worker.scene.differences import MAX_POWER, MAX_STORED, add_differences, coding_order, take_differences
 from worker.scene.rangecoder import PARTS, decode, encode
 
 Whole = NDArray[np.int64]
 Floats = NDArray[np.float32]
 
-STATE = VALUES
-"""Numbers of a Gaussian at rest, in the order of worker/model/layout.py."""
-GROUP_OF = np.array([0] * 3 + [1] * 7 + [2] * 4)
+GROUP_OF = np.array([0] * 3 + [1] * 7 + [2] * 5)
 """Which power belongs to each number of the state: of place, shape or colour."""
 PLAIN = 3
 """Group of the last columns, the powers and seen, whose steps are 1."""
@@ -44,12 +54,20 @@ OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6
 """Orthonormal: brightness, red - blue, magenta - green."""
 
 
+def state_rows(channels: int) -> list[int]:
+    """Rows of worker/model/layout.py that a table holds of a Gaussian at rest, where its motion has so many channels.
+
+    Without a channel for the gloss there is no gloss.
+    """
+    return [row for row in range(VALUES) if row != GLOSS_ROW or channels == ROWS]
+
+
 @dataclass(frozen=True, eq=False)
 class Compact:
     """A scene in whole numbers.
 
-    table    [N, K] int32     columns: STATE, then R motion coefficients per channel, then the 3 powers, then seen
-    step     [STATE] float32  of the state at power 0
+    table    [N, K] int32     columns: the state's, then R motion coefficients per channel, then the 3 powers, then seen
+    step     [S] float32      of the state at power 0; S = 15, or 14 where the motion has no channel of the gloss
     pattern  [C, R, B] float32  weights of one unit of a motion coefficient at power 0
     centre, width  [B] float32  of the bases
     """
@@ -81,11 +99,11 @@ class Compact:
         return np.exp2(-self.table[:, -4 + group].astype(np.float32))  # exact
 
     def _state(self) -> Floats:
-        """[N, STATE] numbers at rest, colour as red, green and blue."""
+        """[N, VALUES] numbers at rest, colour as red, green and blue."""
         scales = [self._scale(group) for group in range(PLAIN)]
-        state = np.empty((len(self.table), STATE), np.float32)
-        for column, group in enumerate(GROUP_OF):
-            state[:, column] = self.table[:, column] * (scales[group] * self.step[column])
+        state = np.zeros((len(self.table), VALUES), np.float32)
+        for column, row in enumerate(state_rows(self.pattern.shape[0])):
+            state[:, row] = self.table[:, column] * (scales[GROUP_OF[row]] * self.step[column])
         state[:, COLOUR] = state[:, COLOUR] @ OPPONENT.astype(np.float32)
         return state
 
@@ -93,18 +111,21 @@ class Compact:
         """[N, C, X] motion coefficients times patterns [C, R, X], colour as red, green and blue."""
         channels, patterns, columns = pattern.shape
         motion = np.empty((len(self.table), channels, columns), np.float32)
+        at_rest = len(self.step)
 
         def coefficients(first: int, last: int) -> Floats:
-            block = self.table[:, STATE + first * patterns : STATE + last * patterns].astype(np.float32)
+            block = self.table[:, at_rest + first * patterns : at_rest + last * patterns].astype(np.float32)
             block *= self._scale(GROUP_OF[first])[:, None]
             return block
 
         for channel in range(CHANNELS):
             motion[:, channel] = coefficients(channel, channel + 1) @ pattern[channel]
-        if channels == ROWS:
+        if channels > CHANNELS:
             mixed = np.einsum("or,opx->oprx", OPPONENT.astype(np.float32), pattern[COLOUR])
-            colour = coefficients(CHANNELS, channels) @ mixed.reshape(3 * patterns, 3 * columns)
+            colour = coefficients(CHANNELS, COLOUR_CHANNELS) @ mixed.reshape(3 * patterns, 3 * columns)
             motion[:, COLOUR] = colour.reshape(-1, 3, columns)
+        if channels > COLOUR_CHANNELS:
+            motion[:, GLOSS_ROW] = coefficients(GLOSS_ROW, ROWS) @ pattern[GLOSS_ROW]
         return motion
 
     def tensors(self) -> dict[str, Tensor]:
@@ -141,10 +162,11 @@ def unpack(tensors: Mapping[str, Tensor]) -> Compact:
     )
     codes = [_checked(tensors, f"code.{part}", torch.uint8, 1).numpy().tobytes() for part in range(PARTS)]
     channels, patterns, bases = pattern.shape
-    columns = STATE + channels * patterns + 4
-    if count.shape != (1,) or step.shape != (STATE,) or shared.shape != (columns,):
+    at_rest = len(state_rows(channels))
+    columns = at_rest + channels * patterns + 4
+    if count.shape != (1,) or step.shape != (at_rest,) or shared.shape != (columns,):
         raise ValueError(f"count, step and shared do not fit {channels} channels of {patterns} patterns")
-    if patterns != bases - 1 or channels not in (CHANNELS, ROWS):
+    if patterns != bases - 1 or channels not in (CHANNELS, COLOUR_CHANNELS, ROWS):
         raise ValueError(f"{patterns} patterns in {channels} channels do not fit {bases} bases")
     rows = int(count[0])
     check_size(rows, columns)
@@ -158,9 +180,9 @@ def unpack(tensors: Mapping[str, Tensor]) -> Compact:
 def compile_coder() -> float:
     """Compile the coder's kernels for this processor, or load them from the cache; returns seconds."""
     start = time.perf_counter()
-    table = np.ones((2, STATE + 4), np.int32)
-    still = np.zeros((CHANNELS, 0, 1), np.float32)
-    unpack(Compact(table, np.ones(STATE, np.float32), still, torch.zeros(1), torch.ones(1)).tensors())
+    table = np.ones((2, VALUES + 4), np.int32)
+    still = np.zeros((ROWS, 0, 1), np.float32)
+    unpack(Compact(table, np.ones(VALUES, np.float32), still, torch.zeros(1), torch.ones(1)).tensors())
     return time.perf_counter() - start
 
 
@@ -206,7 +228,8 @@ def _undo_differences(table: NDArray[np.int32], shared: NDArray[np.bool_], shape
 def _group(shape: Sequence[int]) -> Whole:
     """[K] which power belongs to each column of the table; shape [C, R, B]."""
     channels, patterns, _ = shape
-    return np.concatenate([GROUP_OF, np.repeat(GROUP_OF[:channels], patterns), np.full(4, PLAIN)])
+    at_rest = GROUP_OF[state_rows(channels)]
+    return np.concatenate([at_rest, np.repeat(GROUP_OF[:channels], patterns), np.full(4, PLAIN)])
 
 
 def _powers(table: NDArray[np.int32]) -> Whole:
@@ -217,7 +240,7 @@ def _powers(table: NDArray[np.int32]) -> Whole:
 
 
 def _gaussians_of(state: Floats) -> Gaussians:
-    """The Gaussians whose numbers at rest are state [N, STATE]."""
+    """The Gaussians whose numbers at rest are state [N, VALUES]."""
     held = torch.from_numpy(state)
     return Gaussians(
         mean=held[:, MEAN].contiguous(),
@@ -225,4 +248,5 @@ def _gaussians_of(state: Floats) -> Gaussians:
         log_scale=held[:, LOG_SCALE].contiguous(),
         opacity_logit=held[:, OPACITY_ROW].contiguous(),
         sh=held[:, None, COLOUR].contiguous(),
+        gloss=held[:, GLOSS_ROW].contiguous(),
     )

@@ -1,6 +1,6 @@
 """Turn a scene into whole numbers: each as coarse as the picture allows.
 
-Symbols: N Gaussians, C channels (10, or 13 with colour), B bases, R = B - 1 patterns of motion per channel.
+Symbols: N Gaussians, C channels (10, 13 with colour, 14 with gloss), B bases, R = B - 1 patterns of motion per channel.
 
 `effect` decides what is lost: the mean squared change of the picture that a change of 1 in a number makes.
 
@@ -27,8 +27,8 @@ from torch import Tensor
 
 from worker.model.deformation import SharedBasis
 from worker.model.gaussians import Gaussians
-from worker.model.layout import COLOUR, COLOUR_ROW, MEAN, QUATERNION, QUATERNION_ROW, ROWS
-from worker.scene.compact import GROUP_OF, MIN_POWER, OPPONENT, SEEN_LEVELS, STATE, Compact, Whole, check_size
+from worker.model.layout import CHANNELS, COLOUR, COLOUR_ROW, MEAN, QUATERNION, QUATERNION_ROW
+from worker.scene.compact import GROUP_OF, MIN_POWER, OPPONENT, SEEN_LEVELS, Compact, Whole, check_size, state_rows
 from worker.scene.differences import MAX_POWER, MAX_STORED
 
 Reals = NDArray[np.float64]
@@ -51,11 +51,11 @@ CURVE_BITS = 16
 class Prepared:
     """A scene in its new coordinates and order, ready for rounding at any step.
 
-    state    [N, STATE]  means over the trained times
+    state    [N, S]      means over the trained times; S as in compact.py
     motion   [C, N, R]   coefficients of the patterns, float32
     pattern  [C, R, B]   weights of each pattern
     power    [N, 3]      precision of place, shape and colour, as powers of two
-    effect   [STATE]     RMS change of the picture when all Gaussians are off by 2**-power
+    effect   [S]         RMS change of the picture when all Gaussians are off by 2**-power
     seen     [N]         in [0, 1]
     basis                of the motion; only its centre and width are read
     """
@@ -76,7 +76,7 @@ def prepare(
 
     Args:
         seen: [N] in [0, 1].
-        effect: [STATE, N]; an error e in a number adds effect * e**2 / N to the picture's mean squared error.
+        effect: [VALUES, N]; an error e in a number adds effect * e**2 / N to the picture's mean squared error.
         trained_t: model times of the training frames, at least one.
     """
     order = np.argsort(_along_curve(gaussians.mean.double().numpy()), kind="stable")
@@ -95,11 +95,12 @@ def prepare(
     effect[QUATERNION] *= length**2
     state[:, COLOUR] = state[:, COLOUR] @ OPPONENT.T
     effect[COLOUR] = effect[COLOUR].mean(0)
-    if channels == ROWS:
+    if channels > CHANNELS:
         weight[:, COLOUR] = OPPONENT.astype(np.float32) @ weight[:, COLOUR]
 
     power = np.stack([_power(effect[group]) for group in (MEAN, SHAPE, COLOUR)], axis=1)
-    scale = np.exp2(power)[:, GROUP_OF]
+    rows = state_rows(channels)
+    state, effect, scale = state[:, rows], effect[rows], np.exp2(power)[:, GROUP_OF[rows]]
     root = np.maximum(np.sqrt(effect.sum(1) / (scale**2).sum(0)), MIN_EFFECT)
     motion, pattern = _patterns(weight, values, scale)
     share = np.clip(seen.double().numpy(), 0, 1)[order]
@@ -116,7 +117,8 @@ def round_to(prepared: Prepared, step: float) -> Compact:
         ValueError: a number would exceed MAX_STORED, or there would be more than MAX_NUMBERS.
     """
     channels, count, patterns = prepared.motion.shape
-    columns = STATE + channels * patterns + 4
+    rows = state_rows(channels)
+    columns = len(rows) + channels * patterns + 4
     check_size(count, columns)
     steps = step / prepared.effect
     steps[QUATERNION] = np.minimum(steps[QUATERNION], MAX_ROTATION_STEP)
@@ -128,10 +130,10 @@ def round_to(prepared: Prepared, step: float) -> Compact:
             raise ValueError(f"a step of {step:g} makes numbers as large as {largest:g}")
         table[:, first : first + numbers.shape[1]] = np.rint(numbers, out=numbers)
 
-    units = np.exp2(prepared.power)[:, GROUP_OF] / steps  # [N, STATE]
+    units = np.exp2(prepared.power)[:, GROUP_OF[rows]] / steps  # [N, S]
     fill(0, prepared.state * units)
     for channel, motion in enumerate(prepared.motion):
-        fill(STATE + channel * patterns, motion * units[:, channel, None].astype(np.float32))
+        fill(len(rows) + channel * patterns, motion * units[:, channel, None].astype(np.float32))
     table[:, -4:-1] = prepared.power
     # What was seen at all stays so: a render marks what was not.
     levels = np.maximum(np.rint(prepared.seen * SEEN_LEVELS), prepared.seen > 0)
@@ -147,6 +149,7 @@ def _state_of(gaussians: Gaussians) -> Reals:
         gaussians.quaternion,
         gaussians.log_scale,
         gaussians.sh[:, 0],
+        gaussians.gloss[:, None],
         gaussians.opacity_logit[:, None],
     ]
     state: Reals = torch.cat(columns, 1).double().numpy()

@@ -36,6 +36,8 @@ class Scene:
     preset, seed, settings  how it was trained; settings is JSON
     trained_t               model times of the training frames
     seen                    [N] float32 in [0, 1]: share of training frames that saw each Gaussian x stereo confidence
+    right_eye_mm            where the right eye is, in the left one's camera axes, if both taught; the eyes decide what
+                            a view shows of the Gaussians' gloss; None: there is none
     stored                  the compact tensors that are written to disk instead of the model's own, and from which
                             gaussians, deformation and seen were unpacked; None: the scene is exact
     """
@@ -49,6 +51,7 @@ class Scene:
     preset: str
     trained_t: tuple[float, ...]
     seen: Tensor
+    right_eye_mm: tuple[float, float, float] | None = None
     seed: int = 0
     settings: dict[str, Any] = field(default_factory=dict)
     stored: Mapping[str, Tensor] | None = None
@@ -63,6 +66,8 @@ class Scene:
         named = {f"gaussians.{name}": each for name, each in self.gaussians.tensors().items()}
         moving = self.deformation.parameters() | self.deformation.constants()
         named |= {f"deformation.{name}": each for name, each in moving.items()}
+        if self.right_eye_mm is None:
+            del named["gaussians.gloss"]
         named["seen"] = self.seen
         return {name: each.detach().cpu().contiguous() for name, each in named.items()}
 
@@ -118,6 +123,7 @@ def _check_counts(scene: Scene) -> None:
         "opacity_logit": ((count,), scene.gaussians.opacity_logit),
         "seen": ((count,), scene.seen),
         "sh": ((count, (degree + 1) ** 2, 3), harmonics),
+        "gloss": ((count,), scene.gaussians.gloss),
     }
     for name, (expected, tensor) in shapes.items():
         if tuple(tensor.shape) != expected or tensor.dtype != torch.float32:
@@ -135,6 +141,9 @@ def _check_values(scene: Scene) -> None:
     """Raise SceneError unless all numbers other than the tensors are finite and in their ranges."""
     if not 0 < scene.units_per_mm < math.inf:
         raise SceneError(f"The scene's units_per_mm is {scene.units_per_mm}, it must be above 0 and finite.")
+    offset_mm = scene.right_eye_mm
+    if offset_mm is not None and not (len(offset_mm) == 3 and 0 < math.hypot(*offset_mm) < math.inf):
+        raise SceneError(f"The scene's right_eye_mm is {offset_mm}, not three finite numbers that are not all 0.")
     for name, numbers in (("world_from_camera", scene.world_from_camera), ("frame_times_s", scene.frame_times_s)):
         if not np.isfinite(numbers).all():
             raise SceneError(f"The scene's {name} holds numbers that are NaN or infinite.")

@@ -41,9 +41,12 @@ def prepare(setup: Setup) -> Run:
         cloud = fuse(clip, train, fusion, seed=setup.options.seed, moved=moved, right=right)
     setup.hooks.report_stage("start", 0.0)
     with timings.measure("start_s"):
-        model = start_model(cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device)
+        model = start_model(
+            cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device, gloss=any(setup.sides)
+        )
     with timings.measure("targets_s"):
-        frames = [TrainingFrames(eye, train, scale) for eye in setup.teaching_eyes]
+        eyes = zip(setup.teaching_eyes, setup.sides, strict=False)
+        frames = [TrainingFrames(eye, train, scale, side) for eye, side in eyes]
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
     run = Run(setup, model, frames[0], preset, Schedule(planned=0), densifier=densifier, chosen=chosen)
     run.right = frames[1] if len(frames) > 1 else None

@@ -114,11 +114,13 @@ _PAPER_RATES = Rates(
     log_scale=Rate(5e-3),
     opacity=Rate(5e-2),
     colour=Rate(2.5e-3),
+    gloss=Rate(0.0),
     sh_rest=Rate(1.25e-4),
     motion_mean=Rate(*_PAPER_DECAY),
     motion_quaternion=Rate(*_PAPER_DECAY),
     motion_log_scale=Rate(*_PAPER_DECAY),
     motion_colour=Rate(0.0),
+    motion_gloss=Rate(0.0),
 )
 
 _PAPER = Preset(
@@ -156,11 +158,13 @@ _FAST_RATES = Rates(
     log_scale=Rate(2e-2, 6e-3),
     opacity=Rate(5e-2, 1.5e-2),
     colour=Rate(2.5e-2, 6e-3),
+    gloss=Rate(2e-2, 5e-3),
     sh_rest=Rate(0.0),
     motion_mean=Rate(1.5e-2, 1.5e-3),
     motion_quaternion=Rate(5e-2, 5e-3),
     motion_log_scale=Rate(5e-2, 5e-3),
     motion_colour=Rate(5e-2, 5e-3),
+    motion_gloss=Rate(2e-2, 2e-3),
     beta1=0.3,
     beta2=0.95,
 )

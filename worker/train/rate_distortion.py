@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip import spread
 from worker.model.deformation import SharedBasis
+from worker.model.layout import VALUES
 from worker.raster.backend import CPU, Device
 from worker.raster.model import Model
-from worker.scene.compact import STATE, Compact
+from worker.scene.compact import Compact
 from worker.scene.model import model_of
 from worker.scene.quantize import prepare, round_to
 from worker.scene.scene import Scene
@@ -161,7 +162,7 @@ def _renders(
 
 
 def _sensitivity(model: Model, pictures: Sequence[Picture], bases: int) -> NDArray[np.float64]:
-    """[STATE, N]: an error e in a number adds sensitivity * e**2 / N to the mean squared error of the tissue's pixels.
+    """[VALUES, N]: an error e in a number adds sensitivity * e**2 / N to the mean squared error of the tissue's pixels.
 
     The square of a pixel's derivative, summed over the pixels, is the mean square of the gradient of their sum with
     random signs: one gradient per frame gives all of them (Hutchinson 1990).
@@ -170,7 +171,7 @@ def _sensitivity(model: Model, pictures: Sequence[Picture], bases: int) -> NDArr
     therefore measured once for all Gaussians, with noise of the size that rounding makes.
     """
     random, sampled = np.random.default_rng(0), _spread(pictures, SENSITIVITY_FRAMES)
-    sensitivity = np.zeros((STATE, model.count))
+    sensitivity = np.zeros((VALUES, model.count))
     for eye, index in sampled:
         tissue = eye.eye.tissue[index]
         signs = np.zeros((5, *tissue.shape), np.float32)

@@ -41,11 +41,13 @@ def sample_frames(frames: Sequence[int], count: int = SAMPLED_FRAMES) -> list[in
 
 
 def frame_renderer(run: Run, model: Model | None = None, eye: Eye | None = None) -> FrameRenderer:
-    """Renders frames of the run in mm, from the left eye or from `eye`; with `model`, by that instead of the run's."""
+    """Renders frames of the run in mm, from the left eye or from `eye`, the clip's right one; with `model`, by that
+    instead of the run's."""
     seen_by, scale = eye or run.setup.clip, run.frames.scale
+    side = run.setup.sides[0 if eye is None else 1]
 
     def render(index: int) -> RenderedFrame:
-        camera = camera_vector(camera_in_units(seen_by.intrinsics, seen_by.world_from_camera[index], scale))
+        camera = camera_vector(camera_in_units(seen_by.intrinsics, seen_by.world_from_camera[index], scale, side))
         image = (model or run.model).render(camera, float(run.frames.t[index])).copy()
         depth_mm = solid_depth_mm(image[3], image[4], scale)
         return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])

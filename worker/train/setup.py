@@ -44,6 +44,14 @@ class Setup:
         return self.clip.eyes if both else self.clip.eyes[:1]
 
     @property
+    def sides(self) -> tuple[float, float]:
+        """Of the left and the right eye's cameras, for the gloss; 0 where there is none.
+
+        One eye alone cannot tell it, and harmonics stand in for it.
+        """
+        return (-0.5, 0.5) if len(self.teaching_eyes) > 1 and self.preset.sh_degree == 0 else (0.0, 0.0)
+
+    @property
     def fixed_iterations(self) -> int | None:
         """The requested iterations, else the preset's own; None where seconds limit the run."""
         return self.options.iterations or (None if self.options.budget_s else self.preset.iterations)

@@ -17,7 +17,7 @@ from worker.input.clip import DepthClip
 from worker.model.constants import SH_C0
 from worker.model.deformation import AtRest, SharedBasis, motion_named
 from worker.model.gaussians import Gaussians, initial_gaussians
-from worker.model.layout import CHANNELS, MEAN
+from worker.model.layout import COLOUR, MEAN
 from worker.motion.capacity import MAX_POINTS, Trials, choose_bases, choose_stride, floor_error, try_bases
 from worker.motion.tracks import GUESSED, Tracks, fit_tracks
 from worker.raster.backend import CPU, Device, make_model
@@ -102,10 +102,13 @@ def start_model(
     scale: float,
     seed: int,
     device: Device = CPU,
+    *,
+    gloss: bool = False,
 ) -> Model:
     """Gaussians at the cloud's points, scaled from mm to optimiser units, with the motion of the (settled) preset.
 
-    A "shared" motion starts from the tracks if there are any. Every other motion starts at rest.
+    A "shared" motion starts from the tracks if there are any. Every other motion starts at rest. gloss: whether two
+    eyes teach.
     """
     gaussians = initial_gaussians(
         cloud.reference_mm * np.float32(scale),  # widths are by neighbours of one time
@@ -118,7 +121,7 @@ def start_model(
         mean=torch.from_numpy(cloud.points_mm * np.float32(scale)),
         log_scale=gaussians.log_scale + math.log(preset.spread),
     )
-    start = AtRest(preset.bases, preset.start_width, [float(clip.t[i]) for i in train], seed)
+    start = AtRest(preset.bases, preset.start_width, [float(clip.t[i]) for i in train], seed, gloss)
     motion = motion_named(preset.deformation).at_rest(gaussians, start)
     if tracks is not None and isinstance(motion, SharedBasis):
         gaussians = _follow_tracks(gaussians, motion, cloud, tracks, clip, train, scale)
@@ -142,7 +145,7 @@ def _follow_tracks(
     weights, _ = fit_tracks(tracks, basis[list(train)], pixels, width, share_px=SHARE_PX, guessed=GUESSED)
     weights *= np.repeat(np.array([scale, 1 / SH_C0], np.float32), 3)
     by_channel = torch.from_numpy(weights).permute(0, 2, 1)
-    motion.weight[:, MEAN], motion.weight[:, CHANNELS:] = by_channel[:, :3], by_channel[:, 3:]
+    motion.weight[:, MEAN], motion.weight[:, COLOUR] = by_channel[:, :3], by_channel[:, 3:]
     moved = torch.from_numpy(np.einsum("nbc,nb->nc", weights, basis[cloud.frame]).astype(np.float32))
     colour = torch.cat([gaussians.sh[:, :1] - moved[:, None, 3:], gaussians.sh[:, 1:]], 1)
     return dataclasses.replace(gaussians, mean=gaussians.mean - moved[:, :3], sh=colour)

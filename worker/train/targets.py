@@ -39,12 +39,17 @@ def units_per_mm(clip: DepthClip, train: Sequence[int]) -> float:
     return MEDIAN_DEPTH_UNITS / float(np.median(depths))
 
 
-def camera_in_units(intrinsics: Intrinsics, world_from_camera: NDArray[np.float64], scale: float) -> Camera:
-    """The rasteriser's camera: the pose inverted and its translation in optimiser units."""
+def camera_in_units(
+    intrinsics: Intrinsics, world_from_camera: NDArray[np.float64], scale: float, side: float = 0.0, dim: float = 0.0
+) -> Camera:
+    """The rasteriser's camera: the pose inverted and its translation in optimiser units.
+
+    side and dim say what it sees of the gloss (worker/raster/__init__.py).
+    """
     camera_from_world: NDArray[np.float64] = np.linalg.inv(world_from_camera).astype(np.float64)
     camera_from_world[:3, 3] *= scale
     k = intrinsics
-    return Camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, camera_from_world)
+    return Camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, camera_from_world, side, dim)
 
 
 def solid_depth_mm(depth: NDArray[np.float32], alpha: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
@@ -56,7 +61,8 @@ def solid_depth_mm(depth: NDArray[np.float32], alpha: NDArray[np.float32], scale
 class TrainingFrames:
     """Colour, tissue, inverse depth and camera of every training frame of one eye."""
 
-    def __init__(self, eye: Eye, train: Sequence[int], scale: float) -> None:
+    def __init__(self, eye: Eye, train: Sequence[int], scale: float, side: float = 0.0) -> None:
+        """side: of the eye's cameras, for the gloss."""
         self.eye, self.indices, self.scale = eye, list(train), scale
         self._row = {index: row for row, index in enumerate(self.indices)}
         height, width = eye.rgb.shape[1:3]
@@ -67,7 +73,7 @@ class TrainingFrames:
         self._inverse_depth = np.zeros((count, height, stride), np.float32)
         self.t = eye.t
         self.cameras = {
-            index: camera_vector(camera_in_units(eye.intrinsics, eye.world_from_camera[index], scale))
+            index: camera_vector(camera_in_units(eye.intrinsics, eye.world_from_camera[index], scale, side))
             for index in range(eye.frame_count)
         }
         self._frames: dict[int, TrainingFrame] = {}

@@ -50,6 +50,7 @@ def moving(kind: str) -> Deformation:
         "fdm-quartic": QuarticFdm.initial(COUNT, bases=5, width=0.1),
         "shared": SharedBasis.initial(COUNT, bases=5),
         "shared with colour": SharedBasis.initial(COUNT, bases=5, colour=True),
+        "shared with gloss": SharedBasis.initial(COUNT, bases=5, gloss=True),
         "pfs": PolynomialFourier.initial(COUNT, weights=8),
         "hexplane": HexPlane.initial(
             torch.tensor([[-2.0, -2.0, -2.0], [2.0, 2.0, 2.0]]), space_cells=(4, 7), time_cells=5, features=3
@@ -60,12 +61,13 @@ def moving(kind: str) -> Deformation:
     return restore(model.kind, tensors | {name: each.double() for name, each in model.constants().items()})
 
 
-KINDS = ["fdm-gaussian", "fdm-quartic", "shared", "shared with colour", "pfs", "hexplane"]
+KINDS = ["fdm-gaussian", "fdm-quartic", "shared", "shared with colour", "shared with gloss", "pfs", "hexplane"]
 STARTS: list[Deformation] = [
     GaussianFdm.initial(COUNT),
     QuarticFdm.initial(COUNT),
     SharedBasis.initial(COUNT),
     SharedBasis.initial(COUNT, colour=True),
+    SharedBasis.initial(COUNT, gloss=True),
     PolynomialFourier.initial(COUNT),
     HexPlane.initial(torch.tensor([[-2.0, -2.0, -2.0], [2.0, 2.0, 2.0]])),
 ]
@@ -272,7 +274,7 @@ def test_gradients_are_those_of_finite_differences(kind: str) -> None:
     assert torch.autograd.gradcheck(channels, leaves, fast_mode=kind == "hexplane")
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "shared with colour"])
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if "with" not in kind])
 def test_deform_leaves_its_inputs_opacity_and_colour_alone(kind: str) -> None:
     model, gaussians = moving(kind), canonical()
     before = {name: each.clone() for name, each in (gaussians.tensors() | model.parameters()).items()}
@@ -309,6 +311,7 @@ def test_a_model_comes_back_from_its_tensors(kind: str) -> None:
         ("fdm-quartic", 3 * 10 * 5, 0),
         ("shared", 10 * 5, 2 * 5),
         ("shared with colour", 13 * 5, 2 * 5),
+        ("shared with gloss", 14 * 5, 2 * 5),
         ("pfs", 10 * 8, 0),
         ("hexplane", 0, 7112),
     ],

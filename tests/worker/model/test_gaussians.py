@@ -124,6 +124,7 @@ def test_a_grid_of_points_starts_as_round_gaussians_one_spacing_wide() -> None:
         "log_scale": (125, 3),
         "opacity_logit": (125,),
         "sh": (125, 16, 3),
+        "gloss": (125,),
     }
     assert all(each.dtype == torch.float32 for each in gaussians.tensors().values())
     assert_close(gaussians.mean, grid)

@@ -63,7 +63,7 @@ def use_everything() -> None:
         for iteration in range(1, 5):
             frame = TrainingFrame(camera, 0.3 * iteration % 1, target, pixels, pixels)
             loss = LossSettings(normalised_depth=bool(iteration % 2))
-            model.step([frame], loss, StepRates(*[1e-3] * 11), iteration, min(degree, iteration - 1))
+            model.step([frame], loss, StepRates(*[1e-3] * 13), iteration, min(degree, iteration - 1))
             model.take(np.arange(model.count)[::-1].copy(), np.zeros(model.count, np.bool_))
         model.render(camera, 0.4)
     one = gaussians(0)

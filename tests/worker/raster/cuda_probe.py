@@ -23,6 +23,7 @@ from triton.runtime.driver import driver
 from triton.runtime.jit import JITFunction
 
 from tests.worker.raster.test_cuda_model import LOSS, RATES, frames, model
+from worker.model.layout import CAMERA, ROWS
 from worker.raster.cuda.rasterizer import CudaRasterizer
 
 CUOBJDUMP = Path(inspect.getfile(triton)).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
@@ -71,8 +72,8 @@ def resources(binary: bytes) -> dict[str, int]:
 
 def projected(count: int, width: int, height: int, frames: int) -> CudaRasterizer:
     rasterizer = CudaRasterizer(width, height, "cpu", frames=frames)
-    camera = torch.zeros(frames, 18, dtype=torch.float64)
-    rasterizer.project(camera, torch.zeros(frames, 13, count), torch.zeros(count), torch.zeros(frames, 3, count))
+    camera = torch.zeros(frames, CAMERA, dtype=torch.float64)
+    rasterizer.project(camera, torch.zeros(frames, ROWS, count), torch.zeros(count), torch.zeros(frames, 3, count))
     return rasterizer
 
 

@@ -26,6 +26,7 @@ from worker.model.deformation import (
     restore,
 )
 from worker.model.gaussians import Gaussians
+from worker.model.layout import ROWS
 from worker.model.loss import LossSettings, training_loss
 from worker.model.optimize import StepRates
 from worker.raster import Camera
@@ -41,19 +42,23 @@ LOSSES = {
 """Weights near the number of pixels, so that gradients are near 1 and the absolute tolerance plays no part."""
 NORMALISED = LOSSES["normalised depth"]
 Fused = SharedBasis | PolynomialFourier | FlexibleDeformation
-KINDS = ["shared", "shared with colour", "pfs", "fdm-gaussian", "fdm-quartic"]
-"""Deformations with kernels of their own; colour moves in one of them."""
+KINDS = ["shared", "shared with colour", "shared with gloss", "pfs", "fdm-gaussian", "fdm-quartic"]
+"""Deformations with kernels of their own; colour moves in one of them, colour and gloss in another."""
+SEEN_GLOSS = {"side": 0.4, "dim": 0.15}
+"""Of a camera that sees some of it."""
 RATES = StepRates(
     mean=1e-3,
     quaternion=2e-3,
     log_scale=3e-3,
     opacity=4e-3,
     colour=5e-3,
+    gloss=11e-3,
     sh_rest=6e-3,
     motion_mean=7e-3,
     motion_quaternion=8e-3,
     motion_log_scale=9e-3,
     motion_colour=10e-3,
+    motion_gloss=12e-3,
     eps=1e-15,
 )
 
@@ -226,10 +231,14 @@ def moving_gaussians(kind: str, sh_degree: int) -> tuple[Gaussians, Fused, Camer
         opacity_logit=torch.logit(scene.opacity).float(),
         sh=sh,
     )
-    if kind in ("shared", "shared with colour", "pfs"):
-        linear: Fused = SharedBasis.initial(90, bases=4, colour=kind == "shared with colour")
+    if kind in ("shared", "shared with colour", "shared with gloss", "pfs"):
+        coloured, glossy = kind == "shared with colour", kind == "shared with gloss"
+        linear: Fused = SharedBasis.initial(90, bases=4, colour=coloured, gloss=glossy)
         linear = PolynomialFourier.initial(90, weights=6) if kind == "pfs" else linear
-        return gaussians, dataclasses.replace(linear, weight=_stirred(linear.weight, 0.05, random)), scene.camera
+        camera = dataclasses.replace(scene.camera, **SEEN_GLOSS) if glossy else scene.camera
+        shine = 0.2 * torch.randn(90, generator=random) if glossy else torch.zeros(90)
+        gaussians = dataclasses.replace(gaussians, gloss=shine)
+        return gaussians, dataclasses.replace(linear, weight=_stirred(linear.weight, 0.05, random)), camera
     form = QuarticFdm if kind == QuarticFdm.kind else GaussianFdm
     fdm = form.initial(90, bases=5, width=0.2)
     moved = {name: _stirred(each, 0.05, random) for name, each in fdm.parameters().items()}
@@ -249,6 +258,7 @@ def _stirred(tensor: Tensor, amount: float, random: torch.Generator) -> Tensor:
         ("shared", 0),
         ("shared with colour", 0),
         ("shared with colour", 3),
+        ("shared with gloss", 0),
         ("pfs", 0),
         ("fdm-gaussian", 0),
         ("fdm-quartic", 1),
@@ -264,14 +274,17 @@ def test_a_fused_step_has_the_gradients_of_the_stages_one_by_one(kind: str, sh_d
     scene = _scene_of(moved, camera)
     frame = random_frame(camera, pixels_near_a_cut(scene))
     everything = [*leaves.values(), *motion.values()]
-    gradients = torch.autograd.grad(frame.loss(scene, NORMALISED), everything)
+    gradients = torch.autograd.grad(
+        frame.loss(scene, NORMALISED), everything, allow_unused=True, materialize_grads=True
+    )
     wanted = dict(zip([*leaves, *motion], gradients, strict=True))
 
     model = CpuModel(gaussians, deformation, camera.width, camera.height)
     model.step([frame.seen_from(camera, t, model.rasterizer)], NORMALISED, RATES, 1, sh_degree)
     stored = {name: 10 * np.asarray(each) for name, each in model.arrays().items()}
 
-    canonical = torch.cat([wanted["mean"], wanted["quaternion"], wanted["log_scale"], wanted["sh"][:, 0]], dim=1)
+    names = ("mean", "quaternion", "log_scale")
+    canonical = torch.cat([*(wanted[name] for name in names), wanted["sh"][:, 0], wanted["gloss"][:, None]], dim=1)
     assert_close(stored["moments.canonical"][0, :, :90].T, canonical, name="canonical")
     assert_close(stored["moments.opacity_logit"][0, :90], wanted["opacity_logit"], name="opacity_logit")
     assert_close(stored["moments.sh_rest"][0, :, :, :90], wanted["sh"][:, 1:].permute(1, 2, 0), name="sh_rest")
@@ -288,14 +301,14 @@ def _scene_of(gaussians: Gaussians, camera: Camera) -> SplatScene:
         quaternion=gaussians.quaternion,
         scale=gaussians.scale,
         opacity=gaussians.opacity,
-        colour=gaussians.colour(camera.centre(gaussians.mean)),
+        colour=gaussians.colour(camera.centre(gaussians.mean), camera.side, camera.dim),
         camera=camera,
     )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_fused_render_is_the_reference_of_the_deformed_gaussians(kind: str) -> None:
-    gaussians, deformation, camera = moving_gaussians(kind, 1)
+    gaussians, deformation, camera = moving_gaussians(kind, 0 if kind == "shared with gloss" else 1)
     scene = _scene_of(deformation.deform(gaussians, 0.4), camera)
     kept = ~pixels_near_a_cut(scene)
     wanted = scene.to(torch.float64).render()
@@ -326,16 +339,17 @@ def test_motion_takes_the_steps_of_torchs_adam(kind: str) -> None:
     constants = {name: each.double() for name, each in deformation.constants().items()}
     canonical = Gaussians(**{name: each.double() for name, each in gaussians.tensors().items()})
     optimiser = torch.optim.Adam(leaves.values(), lr=RATES.motion_mean, eps=RATES.eps)
-    same = {f"motion_{channels}": RATES.motion_mean for channels in ("quaternion", "log_scale", "colour")}
+    same = {f"motion_{channels}": RATES.motion_mean for channels in ("quaternion", "log_scale", "colour", "gloss")}
     rates = dataclasses.replace(RATES, **same)
     random = np.random.default_rng(6)
     for iteration, times in enumerate([[0.4], [0.45, 0.35], [0.35, 0.4, 0.45]], start=1):
-        cotangents = random.normal(size=(len(times), 13, columns)).astype(np.float32)
+        cotangents = random.normal(size=(len(times), ROWS, columns)).astype(np.float32)
         motion.update(cotangents, times, rates, iteration)
         optimiser.zero_grad()
         for cotangent, t in zip(cotangents, times, strict=True):
             moved = restore(deformation.kind, leaves | constants).deform(canonical, t)
-            channels = torch.cat([moved.mean, moved.quaternion, moved.log_scale, moved.sh[:, 0]], dim=1)
+            of_colour = (moved.sh[:, 0], moved.gloss[:, None])
+            channels = torch.cat([moved.mean, moved.quaternion, moved.log_scale, *of_colour], dim=1)
             to_sum = channels * torch.from_numpy(cotangent[:, :count].T).double()
             to_sum.sum().backward()  # type: ignore[no-untyped-call]
         optimiser.step()

@@ -21,6 +21,8 @@ from tests.worker.raster import replays
 from tests.worker.raster.scenes import random_scene
 from worker.model.deformation import FlexibleDeformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
 from worker.model.gaussians import Gaussians
+from worker.model.layout import POSE, SIDE
+from worker.model.layout import WIDTH as WIDTH_PLACE
 from worker.model.loss import LossSettings
 from worker.raster.cpu import padded
 from worker.raster.cpu.model import CpuModel
@@ -48,6 +50,7 @@ def gaussians(sh_degree: int = 0) -> Gaussians:
         log_scale=SCENE.scale.log().float(),
         opacity_logit=torch.logit(SCENE.opacity).float(),
         sh=sh,
+        gloss=0.2 * torch.randn(COUNT, generator=random),
     )
 
 
@@ -62,13 +65,14 @@ def deformation(kind: str) -> Fused:
         fdm = form.initial(COUNT, bases=2, width=0.3)
         weight, centre, width = (stirred(each) for each in fdm.parameters().values())
         return form(weight, centre, width)
-    linear: Fused = SharedBasis.initial(COUNT, bases=4, colour=kind == "shared with colour")
+    coloured, glossy = kind == "shared with colour", kind == "shared with gloss"
+    linear: Fused = SharedBasis.initial(COUNT, bases=4, colour=coloured, gloss=glossy)
     linear = PolynomialFourier.initial(COUNT, weights=4) if kind == "pfs" else linear
     return dataclasses.replace(linear, weight=stirred(linear.weight))
 
 
-def frames(count: int = 3, width: int = WIDTH) -> list[TrainingFrame]:
-    """Noise in coarse squares, with holes in tissue and depth."""
+def frames(count: int = 3, width: int = WIDTH, *, glossy: bool = False) -> list[TrainingFrame]:
+    """Noise in coarse squares, with holes in tissue and depth; where glossy, of the eyes in turn."""
     random = np.random.default_rng(51)
     made = []
     for k in range(count):
@@ -83,7 +87,8 @@ def frames(count: int = 3, width: int = WIDTH) -> list[TrainingFrame]:
         weight[:, :width] = tissue * 255
         inverse[:, :width] = np.where(measured, 1 / random.uniform(50, 70, shape), 0)
         camera = CAMERA.copy()
-        camera[4], camera[9] = width, camera[9] + 0.1 * k
+        camera[[WIDTH_PLACE, SIDE]] = width, (0.5 - k % 2) * glossy
+        camera[POSE + 3] += 0.1 * k
         target = Target(rgb.ravel(), weight.ravel(), inverse.ravel())
         made.append(TrainingFrame(camera, 0.3 + 0.4 * k / count, target, int(tissue.sum()), int(measured.sum())))
     return made
@@ -113,13 +118,20 @@ def assert_same_bits(got: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "sh_degree"),
-    [("shared", 1), ("shared with colour", 0), ("pfs", 0), ("fdm-gaussian", 0), ("fdm-quartic", 0)],
+    [
+        ("shared", 1),
+        ("shared with colour", 0),
+        ("shared with gloss", 0),
+        ("pfs", 0),
+        ("fdm-gaussian", 0),
+        ("fdm-quartic", 0),
+    ],
 )
 def test_steps_change_a_model_as_they_do_on_the_cpu(kind: str, sh_degree: int, device: str) -> None:
     cpu = CpuModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT)
     cuda = model(device, kind, sh_degree)
     for trained in (cpu, cuda):
-        train(trained, frames(2), sh_degree)
+        train(trained, frames(2, glossy=kind == "shared with gloss"), sh_degree)
     before = CpuModel(gaussians(sh_degree), deformation(kind), WIDTH, HEIGHT).parameters()
     wanted = cpu.arrays()
     got = stored(cuda)

@@ -20,18 +20,22 @@ from tests.worker.raster.test_cpu import KINDS, RATES, Fused, moving_gaussians
 from worker.model.constants import SH_C0
 from worker.model.deformation import GaussianFdm, SharedBasis, restore
 from worker.model.gaussians import Gaussians
-from worker.model.layout import ROWS, VALUES
+from worker.model.layout import COLOUR, COLOUR_CHANNELS, GLOSS, ROWS, VALUES
 from worker.model.optimize import StepRates
 from worker.raster.cpu.motion import NEGLIGIBLE
 from worker.raster.cpu.motion import motion_of as cpu_motion_of
 from worker.raster.cuda import harmonics
-from worker.raster.cuda.control import Control, adam_fields, write_adam
+from worker.raster.cuda.control import Control, Field, adam_fields, write_adam
 from worker.raster.cuda.motion import LinearMotion, Motion, Trained, motion_of
 from worker.raster.cuda.update import MADE, SEEN, SUMS, padded
 
 COUNT = 30
+SIDES = (-0.5, 0.5)
+"""What the frames' cameras see of the gloss."""
 TIMES = (0.4, 0.55)
-SAME_RATE = dataclasses.replace(RATES, motion_quaternion=7e-3, motion_log_scale=7e-3, motion_colour=7e-3)
+SAME_RATE = dataclasses.replace(
+    RATES, motion_quaternion=7e-3, motion_log_scale=7e-3, motion_colour=7e-3, motion_gloss=7e-3
+)
 """One rate for all motion, as FDM needs."""
 
 RATED = [field.name for field in dataclasses.fields(RATES) if field.name not in ("eps", "beta1", "beta2")]
@@ -57,6 +61,7 @@ class MotionBench:
     def deform(self) -> None:
         self.wait()
         self.motion.write_times(self.control.rows[0], self.times)
+        self._see_gloss()
         self.control.send(0)
         self.motion.deform(self.trained.values, self.control.values, self.state, self.trained.colour)
 
@@ -66,8 +71,12 @@ class MotionBench:
         self.motion.write_times(self.control.rows[0], self.times)
         self.motion.write_rates(self.control.rows[0], self.times, rates, iteration)
         write_adam(self.control.rows[0], 0, rates, iteration)
+        self._see_gloss()
         self.control.send(0)
         self.motion.update(self.trained, self.control.values)
+
+    def _see_gloss(self) -> None:
+        self.control.rows[0]["shine"][:, 0] = SIDES[: len(self.times)]
 
     def draw_gradients(self, random: np.random.Generator) -> None:
         """Random ones, but none for the columns that only fill the rows."""
@@ -81,6 +90,7 @@ def bench(kind: str, device: str, times: tuple[float, ...] = TIMES) -> MotionBen
     gaussians, deformation = some_gaussians(kind, 0)
     columns, frames = padded(COUNT), len(times)
     motion = motion_of(deformation, columns, torch.device(device))
+    control = Control(adam_fields() | {"shine": Field((frames, 2))} | motion.fields(frames), 1, torch.device(device))
     values = torch.zeros(VALUES, columns, device=device)
     values[:, :COUNT] = torch.cat([canonical_rows(gaussians), gaussians.opacity_logit[None]]).to(device)
 
@@ -90,11 +100,11 @@ def bench(kind: str, device: str, times: tuple[float, ...] = TIMES) -> MotionBen
     trained = Trained(
         values, torch.zeros(2, *values.shape, device=device),
         poisoned(frames, 10, columns), poisoned(frames, columns), poisoned(frames, 3, columns),
-        poisoned(frames, 3, columns), torch.zeros(frames, columns, dtype=torch.int32, device=device),
+        poisoned(frames, 3, columns), control.values["shine"],
+        torch.zeros(frames, columns, dtype=torch.int32, device=device),
         torch.rand(frames, 300, 4, generator=torch.Generator().manual_seed(1)).to(device),
         torch.ones(1, dtype=torch.int32, device=device), torch.zeros(SEEN + 1, dtype=torch.int32, device=device),
     )  # fmt: skip
-    control = Control(adam_fields() | motion.fields(frames), 1, torch.device(device))
     return MotionBench(gaussians, deformation, motion, control, trained, poisoned(frames, ROWS, columns), times)
 
 
@@ -106,8 +116,9 @@ def some_gaussians(kind: str, degree: int) -> tuple[Gaussians, Fused]:
 
 
 def canonical_rows(gaussians: Gaussians) -> Tensor:
-    """[13, N]."""
-    return torch.cat([gaussians.mean, gaussians.quaternion, gaussians.log_scale, gaussians.sh[:, 0]], 1).T
+    """[ROWS, N]."""
+    of_colour = (gaussians.sh[:, 0], gaussians.gloss[:, None])
+    return torch.cat([gaussians.mean, gaussians.quaternion, gaussians.log_scale, *of_colour], 1).T
 
 
 def exact(gaussians: Gaussians) -> Gaussians:
@@ -129,7 +140,7 @@ def test_the_state_at_several_times_is_that_of_the_deformation(kind: str, device
     for frame, t in enumerate(TIMES):
         wanted = canonical_rows(deformation.deform(exact(made.gaussians), t)).detach()
         assert_close(made.state[frame, :, :COUNT], wanted, relative=1e-5, name="state")
-        colour = torch.clamp(0.5 + SH_C0 * wanted[10:], min=0.0)
+        colour = torch.clamp(0.5 + SH_C0 * wanted[COLOUR] + SIDES[frame] * wanted[GLOSS], min=0.0)
         assert_close(made.trained.colour[frame, :, :COUNT], colour, relative=1e-5, name="colour")
 
 
@@ -145,9 +156,10 @@ def test_one_frame_moves_and_trains_as_on_the_cpu(kind: str, device: str) -> Non
         cpu.deform(canonical, t, state)
         assert_close(made.state[0], state, relative=1e-5, name="state")
         made.draw_gradients(random)
-        v_constant = made.trained.v_colour[0] * (made.trained.colour[0] > 0) * SH_C0
-        v_state = torch.cat([made.trained.v_state[0], v_constant]).cpu().numpy()
-        no_canonical = dataclasses.replace(SAME_RATE, mean=0, quaternion=0, log_scale=0, opacity=0, colour=0)
+        v_shown = made.trained.v_colour[0] * (made.trained.colour[0] > 0)
+        v_gloss = SIDES[0] * v_shown.sum(0, keepdim=True)
+        v_state = torch.cat([made.trained.v_state[0], v_shown * SH_C0, v_gloss]).cpu().numpy()
+        no_canonical = dataclasses.replace(SAME_RATE, mean=0, quaternion=0, log_scale=0, opacity=0, colour=0, gloss=0)
         made.update(no_canonical, iteration)
         cpu.update(v_state[None], (t,), SAME_RATE, iteration)
     assert bool((made.trained.values[:ROWS].cpu() == torch.from_numpy(canonical)).all())
@@ -162,7 +174,7 @@ def test_several_frames_take_the_step_of_torchs_adam_on_their_sum(kind: str, dev
     deformation, leaves = differentiable(made.deformation)
     gaussians = {name: each.double().requires_grad_() for name, each in made.gaussians.tensors().items()}
     rates = {"mean": RATES.mean, "quaternion": RATES.quaternion, "log_scale": RATES.log_scale}
-    rates |= {"opacity_logit": RATES.opacity, "sh": RATES.colour}
+    rates |= {"opacity_logit": RATES.opacity, "sh": RATES.colour, "gloss": RATES.gloss}
     groups = [{"params": [gaussians[name]], "lr": rate} for name, rate in rates.items()]
     groups += [{"params": list(leaves.values()), "lr": SAME_RATE.motion_mean}]
     optimiser = torch.optim.Adam(groups, eps=RATES.eps)
@@ -173,7 +185,7 @@ def test_several_frames_take_the_step_of_torchs_adam_on_their_sum(kind: str, dev
         loss = torch.zeros((), dtype=torch.float64)
         for frame, t in enumerate(times):
             moved = deformation.deform(Gaussians(**gaussians), t)
-            colour = torch.clamp(0.5 + SH_C0 * moved.sh[:, 0], min=0.0)
+            colour = moved.colour(torch.zeros(3), SIDES[frame])
             v_state, v_colour = made.trained.v_state[frame].cpu(), made.trained.v_colour[frame].cpu()
             loss = loss + (canonical_rows(moved)[:10] * v_state[:10, :COUNT]).sum()
             loss = loss + (colour.T * v_colour[:, :COUNT]).sum()
@@ -231,9 +243,9 @@ def test_every_row_has_its_own_rate(kind: str, device: str) -> None:
     still = [name for name in RATED if name not in ("mean", "motion_mean")]
     made.update(dataclasses.replace(RATES, **dict.fromkeys(still, 0.0)), 1)
     changed = (made.trained.moments[0] != 0).any(1).tolist()
-    assert changed == [True] * 3 + [False] * 11
+    assert changed == [True] * 3 + [False] * (VALUES - 3)
     if kind == "shared with colour":
-        assert (made.motion.arrays(COUNT)["motion.first"] != 0).any(2).any(0).tolist() == changed[:ROWS]
+        assert (made.motion.arrays(COUNT)["motion.first"] != 0).any(2).any(0).tolist() == changed[:COLOUR_CHANNELS]
 
 
 def test_beyond_six_widths_fdm_gives_the_canonical_state(device: str) -> None:

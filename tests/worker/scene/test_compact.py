@@ -21,11 +21,12 @@ from tests.worker.scenes import random_scene
 from worker.input.clip import DepthClip, spread
 from worker.model.deformation import SharedBasis
 from worker.model.gaussians import Gaussians
+from worker.model.layout import COLOUR_CHANNELS, VALUES
 from worker.model.metrics import psnr_tissue
 from worker.pipeline import scene_of
 from worker.scene import compact
 from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
-from worker.scene.compact import MIN_POWER, STATE, Compact, unpack
+from worker.scene.compact import MIN_POWER, Compact, state_rows, unpack
 from worker.scene.differences import MAX_STORED
 from worker.scene.model import model_of
 from worker.scene.quantize import prepare, round_to
@@ -38,7 +39,7 @@ TIMES = tuple(np.arange(6) / 6)
 
 def effect_of(count: int) -> NDArray[np.float64]:
     """Every number of every Gaussian matters the same."""
-    return np.ones((STATE, count))
+    return np.ones((VALUES, count))
 
 
 def shared(scene: Scene) -> SharedBasis:
@@ -265,7 +266,7 @@ def test_unpacking_takes_few_bytes_a_number(bases: int) -> None:
     tracemalloc.start()
     back = unpack(stored)
     back.model()
-    peak = tracemalloc.get_traced_memory()[1] + 4 * STATE * len(back.table)  # of numpy; and the Gaussians, of torch
+    peak = tracemalloc.get_traced_memory()[1] + 4 * VALUES * len(back.table)  # of numpy; and the Gaussians, of torch
     tracemalloc.stop()
     assert peak < 14 * back.table.size + 2e6  # and the coder's models
 
@@ -289,7 +290,7 @@ def test_a_hostile_file_is_refused_by_its_folder_name(tmp_path: Path) -> None:
     for name, value in (
         ("code.1", torch.randint(0, 256, (500,), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))),
         ("width", torch.zeros(5)),
-        ("step", torch.full((STATE,), torch.inf)),
+        ("step", torch.full((len(state_rows(COLOUR_CHANNELS)),), torch.inf)),
     ):
         save_scene(tmp_path, dataclasses.replace(scene, stored=dict(scene.stored) | {name: value}))
         with pytest.raises(SceneError, match=tmp_path.name + "|step"):

@@ -12,6 +12,7 @@ from tests.helpers import assert_close
 from tests.worker.clips import HEIGHT, WIDTH, plane_clip
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip
+from worker.model.layout import POSE
 from worker.model.loss import LossSettings
 from worker.raster.cpu import padded
 from worker.raster.step import camera_vector
@@ -112,7 +113,7 @@ def test_a_point_in_mm_and_in_units_lands_on_the_same_pixel() -> None:
     scale, point_mm = 0.8, np.array([4.0, 1.0, 70.0])
     x, y, z = np.linalg.inv(pose)[:3] @ [*point_mm, 1]
     camera = camera_vector(camera_in_units(intrinsics, pose, scale))
-    extrinsic = camera[6:].reshape(3, 4)
+    extrinsic = camera[POSE:].reshape(3, 4)
     seen = extrinsic[:, :3] @ (point_mm * scale) + extrinsic[:, 3]
     assert_close(seen / scale, np.array([x, y, z]))
     assert_close(camera[:4], np.array([80.0, 75.0, 31.0, 25.0]))

@@ -2,7 +2,7 @@
 
 Symbols: N Gaussians, B bases or weights per channel, C = 10 channels, t model time in [0, 1).
 The channels are the rows of a state (worker/model/layout.py). Opacity never deforms; colour does where a motion has
-channels 10:13 for it.
+channels 10:13 for it, and gloss where it has channel 13.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from worker.model.gaussians import Gaussians
-from worker.model.layout import CHANNELS, LOG_SCALE, MEAN, QUATERNION
+from worker.model.layout import CHANNELS, COLOUR, COLOUR_CHANNELS, GLOSS_ROW, LOG_SCALE, MEAN, QUATERNION
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,14 @@ class AtRest:
     width  of a basis, model time; None: the motion chooses
     times  model times of the training frames
     seed   of random numbers
+    gloss  whether two eyes teach, so that there is gloss to move
     """
 
     bases: int | None
     width: float | None
     times: Sequence[float]
     seed: int
+    gloss: bool = False
 
 
 class Deformation(ABC):
@@ -89,7 +91,8 @@ class LinearDeformation(Deformation):
 
     A subclass gives basis(t), and has kernels by that.
 
-    weight [N, C, B]  trained, in the channel's unit; C = 10, or 13 where channels 10:13 add to the colour's harmonic 0
+    weight [N, C, B]  trained, in the channel's unit; C = 10, 13 where channels 10:13 add to the colour's harmonic 0, or
+                      14 where channel 13 adds to the gloss, too
     """
 
     weight: Tensor
@@ -108,10 +111,12 @@ class LinearDeformation(Deformation):
         """The Gaussians at time t."""
         offsets = self.weight @ self.basis(t)
         moved = add_offsets(gaussians, offsets[:, :CHANNELS])
-        if offsets.shape[1] == CHANNELS:
-            return moved
-        constant = moved.sh[:, :1] + offsets[:, None, CHANNELS:]
-        return dataclasses.replace(moved, sh=torch.cat([constant, moved.sh[:, 1:]], 1))
+        if offsets.shape[1] > CHANNELS:
+            constant = moved.sh[:, :1] + offsets[:, None, COLOUR]
+            moved = dataclasses.replace(moved, sh=torch.cat([constant, moved.sh[:, 1:]], 1))
+        if offsets.shape[1] > COLOUR_CHANNELS:
+            moved = dataclasses.replace(moved, gloss=moved.gloss + offsets[:, GLOSS_ROW])
+        return moved
 
     def parameters(self) -> dict[str, Tensor]:
         return {"weight": self.weight}

@@ -18,7 +18,7 @@ from worker.raster.cpu.rasterizer import padded
 from worker.raster.step import Target, TrainingFrame, camera_vector
 
 _COUNT, _WIDTH, _HEIGHT = 8, 16, 16
-_RATES = StepRates(*[1e-3] * 11)
+_RATES = StepRates(*[1e-3] * 13)
 
 
 def compile_kernels(on_progress: Callable[[float], None] = lambda share: None) -> float:

@@ -17,7 +17,19 @@ from torch import Tensor
 from worker.model.constants import SH_C0
 from worker.model.deformation import Deformation
 from worker.model.gaussians import Gaussians
-from worker.model.layout import COLOUR, GEOMETRY, LOG_SCALE, MEAN, QUATERNION, QUATERNION_ROW, ROWS
+from worker.model.layout import (
+    COLOUR,
+    DIM,
+    GEOMETRY,
+    GLOSS,
+    GLOSS_ROW,
+    LOG_SCALE,
+    MEAN,
+    QUATERNION,
+    QUATERNION_ROW,
+    ROWS,
+    SIDE,
+)
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu import harmonics, update
@@ -54,6 +66,7 @@ class CpuModel:
         self.canonical[QUATERNION_ROW] = 1.0
         self.canonical[GEOMETRY, : self.count] = canonical.T
         self.canonical[COLOUR, : self.count] = gaussians.sh[:, 0].T.numpy()
+        self.canonical[GLOSS_ROW, : self.count] = gaussians.gloss.numpy()
         self.opacity_logit = np.full(columns, PAD_LOGIT, np.float32)
         self.opacity_logit[: self.count] = gaussians.opacity_logit.numpy()
         self.sh_rest = np.zeros((gaussians.sh.shape[1] - 1, 3, columns), np.float32)
@@ -108,6 +121,9 @@ class CpuModel:
         if sh_degree == 0:
             np.multiply(self.state[COLOUR], np.float32(SH_C0), out=self.colour)
             self.colour += np.float32(0.5)
+            if camera[SIDE] or camera[DIM]:
+                gloss = self.state[GLOSS_ROW]
+                self.colour += np.float32(camera[SIDE]) * gloss - np.float32(camera[DIM]) * np.abs(gloss)
             np.maximum(self.colour, 0, out=self.colour)
         else:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
@@ -124,11 +140,17 @@ class CpuModel:
         return blended
 
     def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
-        """Gradient of sum(cotangents * render(camera, t)) to the Gaussians as they are at t, [14, N]."""
+        """Gradient of sum(cotangents * render(camera, t)) to the Gaussians as they are at t, [VALUES, N]."""
         self.project(camera, t, 0)
         gradients = self.rasterizer.cotangent_backward(cotangents)
-        colour = gradients.colour * np.float32(SH_C0)
-        return np.concatenate([gradients.state[GEOMETRY], colour, gradients.opacity_logit[None]])[:, : self.count]
+        colour, gloss = gradients.colour * np.float32(SH_C0), self._shine(camera) * gradients.colour.sum(0)
+        rows = [gradients.state[GEOMETRY], colour, gloss[None], gradients.opacity_logit[None]]
+        return np.concatenate(rows)[:, : self.count]
+
+    def _shine(self, camera: NDArray[np.float64]) -> Floats:
+        """[N] derivative of the colour, of each of its channels, to the gloss."""
+        gloss: Floats = self.state[GLOSS_ROW]
+        return np.float32(camera[SIDE]) - np.float32(camera[DIM]) * np.sign(gloss)
 
     def deformed_mean(self, t: float) -> Floats:
         """Centres at time t, [3, N] in units, as a copy."""
@@ -166,13 +188,15 @@ class CpuModel:
         self._project_state(frame.camera, sh_degree)
         self.rasterizer.loss_backward(frame.target, frame.loss_settings(loss), gradients)
         if sh_degree == 0:
+            gradients.colour *= self.colour > 0
             np.multiply(gradients.colour, np.float32(SH_C0), out=gradients.state[COLOUR])
-            gradients.state[COLOUR] *= self.colour > 0
+            np.multiply(gradients.colour.sum(0), self._shine(frame.camera), out=gradients.state[GLOSS_ROW])
         else:
             run(
                 harmonics.colour_from_sh_backward, sh_degree, camera_centre(frame.camera), self.state, self.sh_rest,
                 self.colour, gradients.colour, self._v_rest[place], gradients.state,
             )  # fmt: skip
+            gradients.state[GLOSS_ROW] = 0
         self._seen |= self.rasterizer.radius2 >= 0
         sums: NDArray[np.float64] = self.rasterizer.statistics.sum(0, dtype=np.float64)
         return sums
@@ -213,6 +237,7 @@ class CpuModel:
             (QUATERNION, rates.quaternion),
             (LOG_SCALE, rates.log_scale),
             (COLOUR, rates.colour),
+            (GLOSS, rates.gloss),
         )
         for rows, rate in groups:
             _adam(canonical[rows], gradients.state[rows], moments[:, rows], rate, rates, iteration)
@@ -262,6 +287,7 @@ class CpuModel:
             canonical[:, LOG_SCALE].contiguous(),
             torch.from_numpy(self.opacity_logit[: self.count].copy()),
             torch.from_numpy(np.ascontiguousarray(sh.transpose(2, 0, 1))),
+            torch.from_numpy(self.canonical[GLOSS_ROW, : self.count].copy()),
         )
         return gaussians, self.motion.export(self.count)
 

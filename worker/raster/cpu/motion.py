@@ -1,6 +1,6 @@
 """The motion in a training step, with Adam's moments: linear, FDM, or any other through autograd (unfused.py).
 
-N Gaussians (padded), F frames per step, B bases, C channels (10, or 13 where colour moves too), rows of N floats.
+N Gaussians (padded), F frames per step, B bases, C channels (10, 13 or 14), rows of N floats.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class Motion(Protocol):
     """A deformation that a step can evaluate and train."""
 
     def deform(self, canonical: Floats, t: float, state: Floats, *, trains: bool = False) -> None:
-        """state [13, N] = canonical + psi(t). Where trains, update follows."""
+        """state [ROWS, N] = canonical + psi(t). Where trains, update follows."""
 
     def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
-        """One Adam step, iteration counted from 1, given dL/dstate [F, 13, N] at the F times of the last deform calls.
+        """One Adam step, iteration counted from 1, given dL/dstate [F, ROWS, N] at the F times of the last deforms.
 
         Turns v_state into dL/dcanonical, frame by frame. A motion may train only the weights that reach these times.
         """
@@ -55,8 +55,14 @@ def kept_where_old(moments: Floats, columns: np.ndarray, fresh: np.ndarray) -> F
 
 
 def _channel_rates(rates: StepRates) -> Floats:
-    groups = [rates.motion_mean, rates.motion_quaternion, rates.motion_log_scale, rates.motion_colour]
-    return np.repeat(np.array(groups, np.float32), [3, 4, 3, 3])
+    groups = [
+        rates.motion_mean,
+        rates.motion_quaternion,
+        rates.motion_log_scale,
+        rates.motion_colour,
+        rates.motion_gloss,
+    ]
+    return np.repeat(np.array(groups, np.float32), [3, 4, 3, 3, 1])
 
 
 class LinearMotion:

@@ -37,7 +37,7 @@ def padded(count: int) -> int:
 class Gradients:
     """dL/d of every Gaussian's deformed state, opacity logit and colour, and of camera_from_world; |dL/dmean2d|."""
 
-    state: Floats  # [ROWS, N]; COLOUR is the caller's to fill
+    state: Floats  # [ROWS, N]; COLOUR and GLOSS are the caller's to fill
     opacity_logit: Floats  # [N]
     colour: Floats  # [3, N]
     mean2d_norm: Floats  # [N], in normalised device coordinates
@@ -45,7 +45,7 @@ class Gradients:
 
     @classmethod
     def room(cls, state: Floats) -> Gradients:
-        """Zeros for as many Gaussians as state has, [13, N], which becomes a part of them."""
+        """Zeros for as many Gaussians as state has, [ROWS, N], which becomes a part of them."""
         count = state.shape[1]
         logit, norm = np.zeros((2, count), np.float32)
         return cls(state, logit, np.zeros((3, count), np.float32), norm, np.zeros((thread_count(), 12)))

@@ -17,7 +17,7 @@ from torch import Tensor
 from contract.wire.errors import TrainingDiverged
 from worker.model.deformation import Deformation
 from worker.model.gaussians import Gaussians
-from worker.model.layout import COLOUR, LOG_SCALE, MEAN, QUATERNION
+from worker.model.layout import COLOUR, GLOSS_ROW, LOG_SCALE, MEAN, QUATERNION
 from worker.model.optimize import AdamStep, StepRates, adam_step
 from worker.raster.cpu.rasterizer import Floats
 
@@ -57,7 +57,7 @@ class AutogradMotion:
         state[:] = moved.detach().T.numpy()
 
     def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
-        """One Adam step, given dL/dstate [F, 13, N] at the times deformed to since the last; turns it into
+        """One Adam step, given dL/dstate [F, ROWS, N] at the times deformed to since the last; turns it into
         dL/dcanonical.
 
         The two differ where offsets depend on the canonical state: a field of offsets is sampled at the mean.
@@ -101,16 +101,17 @@ class AutogradMotion:
 
 
 def _deformed(deformation: Deformation, canonical: Tensor, t: float) -> Tensor:
-    """Canonical rows [N, 13] at time t. Opacity and the other harmonics do not move and are not asked for."""
+    """Canonical rows [N, ROWS] at time t. Opacity and the other harmonics do not move and are not asked for."""
     gaussians = Gaussians(
         mean=canonical[:, MEAN],
         quaternion=canonical[:, QUATERNION],
         log_scale=canonical[:, LOG_SCALE],
         opacity_logit=canonical.new_zeros(len(canonical)),
         sh=canonical[:, None, COLOUR],
+        gloss=canonical[:, GLOSS_ROW],
     )
     moved = deformation.deform(gaussians, t)
-    return torch.cat([moved.mean, moved.quaternion, moved.log_scale, moved.sh[:, 0]], dim=1)
+    return torch.cat([moved.mean, moved.quaternion, moved.log_scale, moved.sh[:, 0], moved.gloss[:, None]], dim=1)
 
 
 def _adam(value: Tensor, gradient: Tensor, moments: Tensor, adam: AdamStep) -> None:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from worker.model.layout import CAMERA, ROWS
+from worker.model.layout import CAMERA, DIM, ROWS, SIDE
 from worker.raster.cuda.captured import Captured
 from worker.raster.cuda.control import Control, Field, adam_fields
 from worker.raster.cuda.motion import Motion
@@ -33,7 +33,11 @@ class FrameBuffers:
     ) -> None:
         self.frames, self._device = frames, device
         self.rasterizer = CudaRasterizer(width, height, device, frames=frames)
-        cameras = {"camera": Field((frames, CAMERA), "double"), "centre": Field((frames, 3))}
+        cameras = {
+            "camera": Field((frames, CAMERA), "double"),
+            "centre": Field((frames, 3)),
+            "shine": Field((frames, 2)),
+        }
         training = {"loss": Field((frames, 5)), "frame": Field((frames,), "int")} | adam_fields()
         self.control = Control(cameras | motion.fields(frames) | training, rows, device)
         self.launches = Captured(device)
@@ -52,3 +56,4 @@ class FrameBuffers:
         written = self.control.rows[row]
         for frame, camera in enumerate(cameras):
             written["camera"][frame], written["centre"][frame] = camera, camera_centre(camera)
+            written["shine"][frame] = camera[SIDE], camera[DIM]

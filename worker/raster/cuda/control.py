@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from worker.model.layout import COLOUR, LOG_SCALE, MEAN, OPACITY_ROW, QUATERNION, VALUES
+from worker.model.layout import COLOUR, GLOSS, LOG_SCALE, MEAN, OPACITY_ROW, QUATERNION, VALUES
 from worker.model.optimize import StepRates, adam_step
 
 ALIGNMENT = 16
@@ -83,7 +83,7 @@ def write_adam(row: Mapping[str, np.ndarray], slot: int, rates: StepRates, itera
     unit = adam_step(1.0, rates, iteration)
     size = row["size"]
     size[MEAN], size[QUATERNION], size[LOG_SCALE] = rates.mean, rates.quaternion, rates.log_scale
-    size[COLOUR], size[OPACITY_ROW] = rates.colour, rates.opacity
+    size[COLOUR], size[GLOSS], size[OPACITY_ROW] = rates.colour, rates.gloss, rates.opacity
     size *= np.float32(unit.size)
     row["rest_size"][0] = rates.sh_rest * unit.size
     row["floor"][0] = unit.floor

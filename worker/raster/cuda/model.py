@@ -1,6 +1,6 @@
 """The training step on the device: deform, project, bin, blend with loss and gradients, Adam; captured in a CUDA graph.
 
-N Gaussians (padded to COLUMNS), rows of N floats; F frames per step; values [14, N] as in update.py; H W pixels.
+N Gaussians (padded to COLUMNS), rows of N floats; F frames per step; values [VALUES, N] as in update.py; H W pixels.
 
 step() returns before its step is made. What changes from step to step goes to the device as one row of the control
 block (control.py); everything else lies there already, so a step is a copy of some hundred floats and a replay.
@@ -27,7 +27,20 @@ from torch import Tensor
 from worker.model.constants import SH_C0
 from worker.model.deformation import Deformation
 from worker.model.gaussians import Gaussians
-from worker.model.layout import COLOUR, LOG_SCALE, MEAN, OPACITY_ROW, QUATERNION, ROWS, VALUES
+from worker.model.layout import (
+    COLOUR,
+    DIM,
+    GLOSS,
+    GLOSS_ROW,
+    LOG_SCALE,
+    MEAN,
+    OPACITY_ROW,
+    QUATERNION,
+    QUATERNION_ROW,
+    ROWS,
+    SIDE,
+    VALUES,
+)
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
 from worker.raster.cuda import harmonics
@@ -66,9 +79,10 @@ class CudaModel:
         self.count, self.device = len(gaussians), torch.device(device)
         columns = padded(self.count)
         values = torch.zeros(VALUES, columns)
-        values[3], values[13] = 1.0, PAD_LOGIT
+        values[QUATERNION_ROW], values[OPACITY_ROW] = 1.0, PAD_LOGIT
         parts = [gaussians.mean, gaussians.quaternion, gaussians.log_scale, gaussians.sh[:, 0]]
-        values[:, : self.count] = torch.cat([*parts, gaussians.opacity_logit[:, None]], 1).T
+        parts += [gaussians.gloss[:, None], gaussians.opacity_logit[:, None]]
+        values[:, : self.count] = torch.cat(parts, 1).T
         sh_rest = torch.zeros(gaussians.sh.shape[1] - 1, 3, columns)
         sh_rest[:, :, : self.count] = gaussians.sh[:, 1:].permute(1, 2, 0)
         self.sh_degree = gaussians.sh_degree  # of those stored; a schedule may use fewer
@@ -154,7 +168,7 @@ class CudaModel:
             )
         trained = Trained(
             self._values, self._moments, gradients.state, gradients.opacity_logit, gradients.colour, view.colour,
-            rasterizer.count, rasterizer.statistics, rasterizer.ok, self._report,
+            control["shine"], rasterizer.count, rasterizer.statistics, rasterizer.ok, self._report,
         )  # fmt: skip
         self.motion.update(trained, control)
         self._gradients = gradients
@@ -286,7 +300,7 @@ class CudaModel:
         return image
 
     def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
-        """Gradient of sum(cotangents * image), cotangents [5, H, W], to the Gaussians as they are at t, [14, N]."""
+        """Gradient of sum(cotangents * image), cotangents [5, H, W], to the Gaussians as they are at t, [VALUES, N]."""
         view = self._steer(camera, [t])
         wanted = torch.from_numpy(np.ascontiguousarray(cotangents, np.float32)).to(self.device)[None]
         while True:
@@ -294,7 +308,9 @@ class CudaModel:
             found = view.rasterizer.cotangent_backward(wanted)
             if self._fitted(view):
                 break
-        rows = torch.cat([found.state[0], found.colour[0] * SH_C0, found.opacity_logit])
+        shine = float(camera[SIDE]) - float(camera[DIM]) * torch.sign(view.state[0, GLOSS])
+        gloss = shine * found.colour[0].sum(0)
+        rows = torch.cat([found.state[0], found.colour[0] * SH_C0, gloss, found.opacity_logit])
         gradient: Floats = rows[:, : self.count].cpu().numpy()
         return gradient
 
@@ -357,5 +373,6 @@ class CudaModel:
             values[rows].T.clone(memory_format=torch.contiguous_format) for rows in (MEAN, QUATERNION, LOG_SCALE)
         )
         sh = torch.cat([values[None, COLOUR], sh_rest]).permute(2, 0, 1).contiguous()
-        gaussians = Gaussians(mean, quaternion, log_scale, values[OPACITY_ROW].clone(), sh)
+        opacity_logit, gloss = values[OPACITY_ROW].clone(), values[GLOSS_ROW].clone()
+        gaussians = Gaussians(mean, quaternion, log_scale, opacity_logit, sh, gloss)
         return gaussians, self.motion.export(self.count)

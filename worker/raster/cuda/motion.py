@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from worker.model.deformation import Deformation, FlexibleDeformation, LinearDeformation
-from worker.model.layout import COLOUR, LOG_SCALE, MEAN, QUATERNION, ROWS
+from worker.model.layout import COLOUR, GLOSS, LOG_SCALE, MEAN, QUATERNION, ROWS
 from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu.motion import NEGLIGIBLE
 from worker.raster.cuda import motion_kernels as kernels
@@ -34,6 +34,7 @@ class Trained:
     v_opacity_logit: Tensor
     v_colour: Tensor
     colour: Tensor
+    shine: Tensor
     touched: Tensor
     statistics: Tensor
     ok: Tensor
@@ -72,7 +73,7 @@ class Motion(Protocol):
         """Fill what else update reads, and count the step from 1."""
 
     def deform(self, values: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
-        """state [F, 13, N] = values [14, N] + psi(t) at the times, colour [F, 3, N] without other harmonics."""
+        """state [F, ROWS, N] = values [VALUES, N] + psi(t) at the times, colour [F, 3, N] without other harmonics."""
 
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
         """One Adam step of the values and of the weights that reach the times, and its report."""
@@ -183,12 +184,13 @@ class LinearMotion:
         channel_rate = row["channel_rate"]
         channel_rate[MEAN], channel_rate[QUATERNION] = rates.motion_mean, rates.motion_quaternion
         channel_rate[LOG_SCALE], channel_rate[COLOUR] = rates.motion_log_scale, rates.motion_colour
+        channel_rate[GLOSS] = rates.motion_gloss
 
     def deform(self, values: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
         frames, _, columns = state.shape
         kernels.deform_linear[_grid(columns, frames)](
-            values, self.weight, control["basis"], control["span"], state, colour, columns, self._bases,
-            CHANNELS=self._channels,
+            values, self.weight, control["basis"], control["span"], state, colour, control["shine"], columns,
+            self._bases, CHANNELS=self._channels,
         )  # fmt: skip
 
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
@@ -237,8 +239,8 @@ class FdmMotion:
     def deform(self, values: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
         frames, _, columns = state.shape
         kernels.deform_fdm[_grid(columns, frames)](
-            values, self.weight, self.centre, self.width, control["time"], state, colour, columns,
-            self.weight.shape[1], QUARTIC=self._form.quartic,
+            values, self.weight, self.centre, self.width, control["time"], state, colour, control["shine"],
+            columns, self.weight.shape[1], QUARTIC=self._form.quartic,
         )  # fmt: skip
 
     def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:

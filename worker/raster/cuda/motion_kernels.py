@@ -1,7 +1,7 @@
 """How Gaussians move on the device: deformation to the frames' times, and Adam on everything but the other harmonics.
 
-N Gaussians in rows of `columns` floats, F frames per step, B bases, C channels (10, or 13 where colour moves too);
-state [F, 13, columns], the rest and a program's share as in update.py. The equations are those of raster/cpu/update.py.
+N Gaussians in rows of `columns` floats, F frames per step, B bases, C channels (10, 13 or 14);
+state [F, 14, columns], the rest and a program's share as in update.py. The equations are those of raster/cpu/update.py.
 A loop whose length only the device knows is a while loop: with a recent NumPy, Triton's interpreter runs no other kind.
 """
 
@@ -16,6 +16,7 @@ from worker.raster.cuda.update import (
     COLOUR_ROW,
     COLUMNS,
     CONSTANT_HARMONIC,
+    GLOSS_ROW,
     STATE_ROWS,
     TILE_ROWS,
     adam,
@@ -39,17 +40,22 @@ def _place():  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _store_state(state, colour, frame, row, at, moved, columns):  # type: ignore[no-untyped-def]
-    """The state, and the colour that it shows where no other harmonic is in use."""
+def _store_state(state, colour, shine, frame, row, at, moved, columns):  # type: ignore[no-untyped-def]
+    """The state, and the colour that it shows where no other harmonic is in use.
+
+    shine [F, 2]: what the frame's camera sees of the gloss, side and dim (worker/raster/__init__.py).
+    """
     tl.store(state + (frame * STATE_ROWS + row) * columns + at, moved, mask=row < STATE_ROWS)
-    shown = tl.maximum(moved * CONSTANT_HARMONIC + 0.5, 0.0)
-    is_colour = (row >= COLOUR_ROW) & (row < STATE_ROWS)
+    gloss = tl.sum(tl.where(row == GLOSS_ROW, moved, 0.0), 0)[None, :]
+    seen = tl.load(shine + 2 * frame) * gloss - tl.load(shine + 2 * frame + 1) * tl.abs(gloss)
+    shown = tl.maximum(moved * CONSTANT_HARMONIC + 0.5 + seen, 0.0)
+    is_colour = (row >= COLOUR_ROW) & (row < GLOSS_ROW)
     tl.store(colour + (frame * 3 + row - COLOUR_ROW) * columns + at, shown, mask=is_colour)
 
 
 @triton.jit(do_not_specialize=["bases"])
 def deform_linear(  # type: ignore[no-untyped-def]
-    values, weight, basis, span, state, colour, columns, bases, CHANNELS: tl.constexpr
+    values, weight, basis, span, state, colour, shine, columns, bases, CHANNELS: tl.constexpr
 ):
     """state = canonical + sum over j in span of basis_j weight_j, and its colour. Grid (lines, F).
 
@@ -63,25 +69,25 @@ def deform_linear(  # type: ignore[no-untyped-def]
         weights = tl.load(weight + (j * CHANNELS + row) * columns + at, mask=row < CHANNELS, other=0.0)
         moved += tl.load(basis + frame * bases + j) * weights
         j += 1
-    _store_state(state, colour, frame, row, at, moved, columns)
+    _store_state(state, colour, shine, frame, row, at, moved, columns)
 
 
 @triton.jit(do_not_specialize=["bases", "tiles"])
 def update_linear(  # type: ignore[no-untyped-def]
-    values, moments, weight, first, second, v_state, v_opacity, v_colour, colour, touched, statistics, ok, report,
-    slot, size, floor, betas, basis, alive, basis_size, basis_floor, channel_rate, columns, bases, tiles,
+    values, moments, weight, first, second, v_state, v_opacity, v_colour, colour, shine, touched, statistics, ok,
+    report, slot, size, floor, betas, basis, alive, basis_size, basis_floor, channel_rate, columns, bases, tiles,
     CHANNELS: tl.constexpr, FRAMES: tl.constexpr,
 ):  # fmt: skip
     """Adam on the values and on the weights of the bases in use; the report. Grid (lines,).
 
     weight and its moments [B, C, columns]; basis [F, B], 0 where a frame does not use it; alive int32 [1 + B]: how many
-    bases are in use, and which. Their step's size is basis_size [B] times channel_rate [13], its floor basis_floor [B].
+    bases are in use, and which. Their step's size is basis_size [B] times channel_rate [14], its floor basis_floor [B].
     """
     row, at = _place()
     if tl.load(ok) != 0:
         report_step(touched, statistics, report, slot, at, columns, tiles, FRAMES)
         total = update_values(
-            values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, columns, FRAMES
+            values, moments, v_state, v_opacity, v_colour, colour, shine, size, floor, betas, row, at, columns, FRAMES
         )  # fmt: skip
         rate = tl.load(channel_rate + row, mask=row < CHANNELS, other=0.0)
         used, left = rate != 0.0, tl.load(alive)
@@ -94,7 +100,7 @@ def update_linear(  # type: ignore[no-untyped-def]
             else:
                 gradient = tl.zeros_like(total)
                 for frame in tl.static_range(FRAMES):
-                    share = gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, columns)
+                    share = gradient_of_values(v_state, v_opacity, v_colour, colour, shine, frame, row, at, columns)
                     gradient += tl.load(basis + frame * bases + j) * share
             step, low = tl.load(basis_size + j) * rate, tl.load(basis_floor + j)
             value, m, v = adam(value, m, v, gradient, step, low, betas)
@@ -128,7 +134,7 @@ def fdm_basis(t, centre, width, QUARTIC: tl.constexpr):  # type: ignore[no-untyp
 
 @triton.jit(do_not_specialize=["bases"])
 def deform_fdm(  # type: ignore[no-untyped-def]
-    values, weight, centre, width, time, state, colour, columns, bases, QUARTIC: tl.constexpr
+    values, weight, centre, width, time, state, colour, shine, columns, bases, QUARTIC: tl.constexpr
 ):
     """state = canonical + FDM at the frames' times, and its colour. Grid (lines, F).
 
@@ -145,13 +151,13 @@ def deform_fdm(  # type: ignore[no-untyped-def]
         widths = tl.load(width + place, mask=used, other=1.0)
         value, _, _ = fdm_basis(t, centres, widths, QUARTIC)
         moved += tl.load(weight + place, mask=used, other=0.0) * value
-    _store_state(state, colour, frame, row, at, moved, columns)
+    _store_state(state, colour, shine, frame, row, at, moved, columns)
 
 
 @triton.jit(do_not_specialize=["bases", "tiles"])
 def update_fdm(  # type: ignore[no-untyped-def]
-    values, moments, weight, centre, width, first, second, v_state, v_opacity, v_colour, colour, touched, statistics,
-    ok, report, slot, size, floor, betas, time, motion_size, columns, bases, tiles,
+    values, moments, weight, centre, width, first, second, v_state, v_opacity, v_colour, colour, shine, touched,
+    statistics, ok, report, slot, size, floor, betas, time, motion_size, columns, bases, tiles,
     QUARTIC: tl.constexpr, FRAMES: tl.constexpr,
 ):  # fmt: skip
     """Adam on the values and on weight, centre and width of every basis; the report. Grid (lines,).
@@ -162,7 +168,7 @@ def update_fdm(  # type: ignore[no-untyped-def]
     if tl.load(ok) != 0:
         report_step(touched, statistics, report, slot, at, columns, tiles, FRAMES)
         total = update_values(
-            values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, columns, FRAMES
+            values, moments, v_state, v_opacity, v_colour, colour, shine, size, floor, betas, row, at, columns, FRAMES
         )  # fmt: skip
         step, low, group = tl.load(motion_size), tl.load(floor), FDM_CHANNELS * bases * columns
         used, left = row < FDM_CHANNELS, bases
@@ -178,11 +184,11 @@ def update_fdm(  # type: ignore[no-untyped-def]
             if FRAMES == 1:
                 share = total * value
             else:
-                share = value * gradient_of_values(v_state, v_opacity, v_colour, colour, 0, row, at, columns)
+                share = value * gradient_of_values(v_state, v_opacity, v_colour, colour, shine, 0, row, at, columns)
             to_w, to_c, to_s = share, share * w * by_centre, share * w * by_width
             for frame in tl.static_range(1, FRAMES):
                 value, by_centre, by_width = fdm_basis(tl.load(time + frame), c, s, QUARTIC)
-                share = gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, columns)
+                share = gradient_of_values(v_state, v_opacity, v_colour, colour, shine, frame, row, at, columns)
                 share = share * value
                 to_w += share
                 to_c += share * w * by_centre

@@ -25,7 +25,7 @@ TILE_ROWS = tl.constexpr(16)
 STATE_ROWS, VALUE_ROWS = tl.constexpr(layout.ROWS), tl.constexpr(layout.VALUES)
 COLOUR_ROW = tl.constexpr(layout.COLOUR_ROW)
 """Of the rows before it the rasteriser gives gradients."""
-OPACITY_ROW = tl.constexpr(layout.OPACITY_ROW)
+GLOSS_ROW, OPACITY_ROW = tl.constexpr(layout.GLOSS_ROW), tl.constexpr(layout.OPACITY_ROW)
 CONSTANT_HARMONIC = tl.constexpr(SH_C0)
 SUMS, MADE, SEEN = 4, 4, 5
 """The report: floats before SUMS, the sums that rasterizer.statistics lists; then, as int32, how many steps were made,
@@ -70,30 +70,35 @@ def store_trained(value, first, second, at, mask, new, m, v):  # type: ignore[no
 
 @triton.jit
 def gradient_of_values(  # type: ignore[no-untyped-def]
-    v_state, v_opacity, v_colour, colour, frame, row, at, columns
+    v_state, v_opacity, v_colour, colour, shine, frame, row, at, columns
 ):
-    """dL/dvalues of a frame: v_state [F, 10, columns]; what v_colour [F, 3, columns] says of the constant harmonic
-    where the colour was not held at 0; v_opacity [F, columns]. row [TILE_ROWS, 1], at [1, COLUMNS]."""
-    of_colour = (row >= COLOUR_ROW) & (row < OPACITY_ROW)
+    """dL/dvalues of a frame: v_state [F, 10, columns]; what v_colour [F, 3, columns] says of the constant harmonic and
+    the gloss where the colour was not held at 0; v_opacity [F, columns]. shine [F, 2]: side and dim of the frame's
+    camera; dim is 0 of every camera that trains. row [TILE_ROWS, 1], at [1, COLUMNS]."""
+    of_colour = (row >= COLOUR_ROW) & (row < GLOSS_ROW)
     gradient = tl.load(v_state + (frame * COLOUR_ROW + row) * columns + at, mask=row < COLOUR_ROW, other=0.0)
     hue = (frame * 3 + row - COLOUR_ROW) * columns + at
     shown = tl.load(colour + hue, mask=of_colour, other=0.0) > 0.0
-    gradient += CONSTANT_HARMONIC * tl.load(v_colour + hue, mask=of_colour & shown, other=0.0)
+    by_hue = tl.load(v_colour + hue, mask=of_colour & shown, other=0.0)
+    gradient += CONSTANT_HARMONIC * by_hue
+    by_gloss = tl.load(shine + 2 * frame) * tl.sum(by_hue, 0)[None, :]
+    gradient += tl.where(row == GLOSS_ROW, by_gloss, 0.0)
     gradient += tl.load(v_opacity + frame * columns + at + 0 * row, mask=row == OPACITY_ROW, other=0.0)
     return gradient
 
 
 @triton.jit
 def update_values(  # type: ignore[no-untyped-def]
-    values, moments, v_state, v_opacity, v_colour, colour, size, floor, betas, row, at, columns, FRAMES: tl.constexpr
-):
+    values, moments, v_state, v_opacity, v_colour, colour, shine, size, floor, betas, row, at, columns,
+    FRAMES: tl.constexpr,
+):  # fmt: skip
     """Adam on a program's values; returns their gradient. moments [2, VALUES, columns], size [VALUES], floor [1]."""
     rate = tl.load(size + row, mask=row < VALUE_ROWS, other=0.0)
     second, place = moments + VALUE_ROWS * columns, row * columns + at
     value, m, v = load_trained(values, moments, second, place, rate != 0.0)
-    gradient = gradient_of_values(v_state, v_opacity, v_colour, colour, 0, row, at, columns)
+    gradient = gradient_of_values(v_state, v_opacity, v_colour, colour, shine, 0, row, at, columns)
     for frame in tl.static_range(1, FRAMES):
-        gradient += gradient_of_values(v_state, v_opacity, v_colour, colour, frame, row, at, columns)
+        gradient += gradient_of_values(v_state, v_opacity, v_colour, colour, shine, frame, row, at, columns)
     value, m, v = adam(value, m, v, gradient, rate, tl.load(floor), betas)
     store_trained(values, moments, second, place, rate != 0.0, value, m, v)
     return gradient

@@ -1,0 +1,65 @@
+"""The rasteriser's camera of a view of a scene, and what that view shows of the gloss.
+
+Wet tissue mirrors the lamp elsewhere for each eye. A Gaussian's gloss is how much brighter the right eye saw it than
+the left one; between the eyes a view takes its share of it. Where the lamp's image lies for anybody else is not known:
+with the distance from both eyes highlights fade to the darker of the two, which is the tissue without them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from worker.input.camera import Intrinsics
+from worker.raster.step import camera_vector
+from worker.scene.scene import Scene
+from worker.train.targets import camera_in_units
+
+FADING = 1.0
+"""Distance from the line between the eyes, in baselines, at which highlights have faded to exp(-1/2)."""
+
+
+def endoscope_pose(scene: Scene, t: float) -> NDArray[np.float64]:
+    """world_from_camera [4, 4] (mm) of the endoscope's left eye at model time t, between frames interpolated."""
+    poses, count = scene.world_from_camera, scene.frame_count
+    place = min(max(t * count, 0.0), count - 1.0)
+    before = min(int(place), max(count - 2, 0))
+    if count == 1 or np.array_equal(poses[before], poses[before + 1]):
+        return np.array(poses[before])
+    share = place - before
+    pose = np.eye(4)
+    pose[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(poses[before : before + 2, :3, :3]))(share).as_matrix()
+    pose[:3, 3] = (1 - share) * poses[before, :3, 3] + share * poses[before + 1, :3, 3]
+    return pose
+
+
+def view_camera(
+    scene: Scene,
+    t: float,
+    world_from_camera: NDArray[np.float64],
+    intrinsics: Intrinsics,
+    *,
+    highlights: bool = True,
+) -> NDArray[np.float64]:
+    """The camera vector (worker/raster/step.py) of a view [4, 4] mm at model time t."""
+    side, dim = gloss_seen(scene, t, world_from_camera[:3, 3], highlights=highlights)
+    return camera_vector(camera_in_units(intrinsics, world_from_camera, scene.units_per_mm, side, dim))
+
+
+def gloss_seen(
+    scene: Scene, t: float, centre_mm: NDArray[np.float64], *, highlights: bool = True
+) -> tuple[float, float]:
+    """side and dim (worker/raster/__init__.py) of a camera whose centre [3] is in the world, mm."""
+    if scene.right_eye_mm is None:
+        return 0.0, 0.0
+    if not highlights:
+        return 0.0, 0.5
+    left_eye = endoscope_pose(scene, t)
+    baseline_mm = left_eye[:3, :3] @ np.array(scene.right_eye_mm)
+    from_left_mm = centre_mm - left_eye[:3, 3]
+    length_mm = float(np.linalg.norm(baseline_mm))
+    along = min(max(float(from_left_mm @ baseline_mm) / length_mm**2, 0.0), 1.0)
+    away = float(np.linalg.norm(from_left_mm - along * baseline_mm)) / length_mm
+    known = float(np.exp(-0.5 * (away / FADING) ** 2))
+    return known * (along - 0.5), (1 - known) / 2
