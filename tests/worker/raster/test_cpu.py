@@ -3,6 +3,8 @@
 The gradients of a step are read from Adam's first moments, which after one step from zero are 0.1 of them.
 """
 
+# long: one table of motions, and what each kernel must do with every one of them
+
 from __future__ import annotations
 
 import dataclasses
