@@ -27,8 +27,9 @@ POSE_FALL_OFF = 0.25
 """Distance from the nearest trained pose, in median depths, at which confidence has fallen to exp(-1/2): 14 degrees."""
 FAR_POSE = 0.35
 """In the same unit: beyond it the frame carries a warning, because it shows sides that the clip never saw."""
-LOW_CONFIDENCE, MAX_LOW_SHARE = 0.3, 0.1
-"""A frame warns when more than this share of its pixels lies below this confidence."""
+LOW_CONFIDENCE, MAX_LOW_SHARE = 0.08, 0.1
+"""A frame warns when more than this share of its pixels is seen but lies below this confidence, which is that of tissue
+without measured depth, seen throughout (0.1), from 9 degrees off."""
 HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
 MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from contract.wire.notices import NoticeCode
@@ -56,6 +57,14 @@ def test_a_time_outside_the_clip_shows_its_first_or_last_frame_and_warns(scene: 
 
 def test_the_endoscopes_own_view_needs_no_warning(scene: Scene) -> None:
     assert render_frame(scene, 0.4).warnings == ()
+
+
+@pytest.mark.parametrize(("seen", "warns"), [(0.1, False), (0.02, True)])
+def test_tissue_without_measured_depth_is_no_reason_to_warn_but_tissue_that_hardly_a_frame_saw_is(
+    scene: Scene, seen: float, warns: bool
+) -> None:
+    frame = render_frame(dataclasses.replace(scene, seen=torch.full_like(scene.seen, seen)), 0.4)
+    assert [warning.code for warning in frame.warnings] == [NoticeCode.HARDLY_SEEN] * warns
 
 
 @pytest.mark.parametrize("size", [(97, 81), (33, 17), (8, 8), (200, 150)])
