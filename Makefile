@@ -110,7 +110,7 @@ gpu-check: ## with an NVIDIA GPU: check its kernels and time them; at most 7 min
 evaluate: setup ## every preset on every clip, and the charts; takes hours, and resumes (CLIPS="phantom:pull ...")
 	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out docs/results
 	@$(EVALUATE) $(CLIPS) --series fast --budget-s 15 --seeds 0 1 2 --out docs/results
-	@$(if $(filter d4d_%,$(CLIPS)),$(EVALUATE) d4d_stereo --series instant fast --holdout every8 --out docs/results)
+	@$(if $(filter d4d_%,$(CLIPS)),$(EVALUATE) d4d_stereo --series instant fast --holdout every8 --eyes left both --out docs/results)
 	@$(EVALUATE) $(CLIPS) --series rivals --out docs/results
 	@$(BIN)/python -m benchmarks.pages
 

@@ -13,6 +13,7 @@ through INTRASPLAT_DATA; without it a synthetic clip is measured.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -65,7 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             else:
                 rows.append(texts_of(row, RUN_FIELDS))
                 write_rows(options.csv, FIELDS, rows)
-            print(" ".join(cell.key), row.get("error") or f"{row['psnr_tissue_db']} {row['psnr_right_db']}", flush=True)
+            scores = " / ".join(texts_of(row, ("psnr_tissue_db", "psnr_right_db")).values())
+            print(f"{' '.join(cell.key)}: {row.get('error') or scores}", flush=True)
     print(medians(groups_of(rows)))
     return int(failed > 0)
 
@@ -74,7 +76,8 @@ def medians(groups: Sequence[Group]) -> str:
     """A line a clip, way of holding out, series and limit: medians over seeds; clear is without highlights."""
     lines = [["clip", "held out", "series", "limit", "seeds", *(name for name, _ in COLUMNS.values())]]
     for group in groups:
-        figures = [f"{group.median(name):.{digits}f}" for name, (_, digits) in COLUMNS.items()]
+        known = ((group.median(name), digits) for name, (_, digits) in COLUMNS.items())
+        figures = ["-" if math.isnan(value) else f"{value:.{digits}f}" for value, digits in known]
         lines.append([*group.place, group.series, group.limit, str(len(group.rows)), *figures])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(text.rjust(width) for text, width in zip(line, widths, strict=True)) for line in lines)

@@ -75,7 +75,7 @@ def plan(
         InputError: a series is not known, or no reconstruction takes a holdout or a seed.
     """
     named = [name for each in series for name in SHORTHANDS.get(each, (each,))]
-    presets = dict(_read(_with_eyes(name, which)) for name in named for which in eyes)
+    presets = dict(_read(with_eyes(name, which)) for name in named for which in eyes)
     cells = []
     for clip in clips:
         for holdout in holdouts:
@@ -124,6 +124,15 @@ def eyes_of(series: str) -> str:
     return next((change.partition("=")[2] for change in _changes(series) if _is_eyes(change)), BOTH_EYES)
 
 
+def with_eyes(series: str, eyes: Eyes) -> str:
+    """The series trained on these eyes, unless it says itself or its preset takes one eye only."""
+    preset = PRESETS.get(preset_name_of(series))
+    decided = any(_is_eyes(change) for change in _changes(series)) or eyes == BOTH_EYES
+    if decided or preset is None or not preset.both_eyes:
+        return series
+    return _named(preset.name, sorted([*_changes(series), f"{EYES}={eyes}"]))
+
+
 def base_of(series: str) -> str:
     """The series with the same preset and the same eyes that changes none of the preset's values."""
     return _named(preset_name_of(series), [change for change in _changes(series) if _is_eyes(change)])
@@ -151,14 +160,6 @@ def _is_eyes(change: str) -> bool:
 
 def _named(preset: str, changes: Sequence[str]) -> str:
     return f"{preset}:{','.join(changes)}" if changes else preset
-
-
-def _with_eyes(series: str, eyes: str) -> str:
-    """The series trained on these eyes, unless it says itself or its preset takes one eye only."""
-    decided = any(_is_eyes(change) for change in _changes(series)) or eyes == BOTH_EYES
-    if decided or not preset_named(preset_name_of(series)).both_eyes:
-        return series
-    return _named(preset_name_of(series), [*_changes(series), f"{EYES}={eyes}"])
 
 
 def _read(series: str) -> tuple[str, Preset]:

@@ -21,6 +21,7 @@ from pathlib import Path
 from contract.runtime.locks import FolderLock
 from contract.store.durable import FOR_ALL, replace_file
 from contract.wire.errors import Cancelled, InputError, UnavailableError
+from worker.evaluate.cells import with_eyes
 
 Row = dict[str, str]
 
@@ -56,13 +57,21 @@ def key_of(row: Mapping[str, str]) -> tuple[str, ...]:
 
 
 class Results:
-    """The runs and curves of a folder, as they are now; columns that an older file lacks are empty."""
+    """The runs and curves of a folder, as they are now; columns that an older file lacks are empty.
+
+    Runs on stereo clips from before both eyes could teach are of the left eye: their series say so here.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self.runs = [texts_of(row, RUN_FIELDS) for row in read_rows(folder / RUNS)]
+        curves = [texts_of(row, CURVE_FIELDS) for row in read_rows(folder / CURVES)]
+        before = {key_of(row) for row in self.runs if _is_of_left_eye(row)}
+        for row in (*self.runs, *curves):
+            if key_of(row) in before and not row["psnr_right_db"]:
+                row["series"] = with_eyes(row["series"], "left")
         kept = {key_of(row) for row in self.runs}
-        self.curves = [texts_of(row, CURVE_FIELDS) for row in read_rows(folder / CURVES) if key_of(row) in kept]
+        self.curves = [row for row in curves if key_of(row) in kept]
 
     def has(self, key: tuple[str, ...]) -> bool:
         """Whether the run has a row, of success or of failure."""
@@ -142,6 +151,11 @@ def commit() -> str:
     except OSError:
         found = ""
     return found or "unknown"
+
+
+def _is_of_left_eye(row: Row) -> bool:
+    """Whether a stereo clip was scored, and its right eye was not: before version 0.3 it took no part."""
+    return bool(row["psnr_tissue_db"]) and not row["psnr_right_db"] and '"stereo_s"' in row["seconds"]
 
 
 def texts_of(row: Mapping[str, object], fields: Sequence[str]) -> Row:

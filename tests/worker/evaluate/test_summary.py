@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 
 from tests.worker.evaluate.made_up import curve_rows, failed_row, run_row
+from worker.evaluate.rows import CURVE_FIELDS, CURVES, RUN_FIELDS, RUNS, Results, write_rows
 from worker.evaluate.summary import capacities, groups_of, orderings, reach, sooner
 
 RISING = [(2.0, 100, 30.0), (8.0, 400, 34.0), (32.0, 1600, 36.0)]
@@ -111,3 +113,16 @@ def test_the_papers_ablation_is_confirmed_or_contradicted_in_words(scores: dict[
     (found,) = orderings(groups_of([run_row(series, score) for series, score in scores.items()]))
     assert found.verdict.startswith(verdict)
     assert list(found.scores_db) == sorted(scores, key=lambda series: -scores[series])
+
+
+def test_rows_of_stereo_clips_from_before_both_eyes_taught_are_of_the_left_eye(tmp_path: Path) -> None:
+    stereo = {"clip": "d4d-a-stereo", "seconds": '{"decode_s": 2.0, "stereo_s": 2.2}'}
+    old = [run_row("fast", 38.6, **stereo), run_row("paper", 37.0, **stereo), run_row("fast", 40.0)]
+    fields = [name for name in RUN_FIELDS if name != "psnr_right_db"]
+    write_rows(tmp_path / RUNS, fields, old)
+    write_rows(tmp_path / CURVES, CURVE_FIELDS, [row for run in old for row in curve_rows(run, RISING)])
+    results = Results(tmp_path)
+    assert [row["series"] for row in results.runs] == ["fast:eyes=left", "paper", "fast"]
+    assert [row["series"] for row in results.curves[::3]] == ["fast:eyes=left", "paper", "fast"]
+    results.add(run_row("fast", 37.5, psnr_right_db=36.0, **stereo), [])
+    assert [row["series"] for row in Results(tmp_path).runs] == ["fast:eyes=left", "paper", "fast", "fast"]
