@@ -30,7 +30,8 @@ from worker.raster.cpu import compile_kernels
 from worker.report.baselines import copy_baselines
 from worker.report.quality import Training, build_report, measure
 from worker.report.right_eye import measure_right
-from worker.report.visibility import drop_strays, seen_share
+from worker.report.trust import trust
+from worker.report.visibility import drop_strays
 from worker.scene.checkpoint import save_scene
 from worker.scene.compact import compile_coder
 from worker.scene.model import model_of
@@ -163,7 +164,7 @@ def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
 def scene_of(run: Run) -> Scene:
     """The scene of a trained run; strays are removed from its model first."""
     drop_strays(run.model, run.eyes)
-    return dataclasses.replace(snapshot_of(run), seen=torch.from_numpy(seen_share(run.model, run.eyes)))
+    return dataclasses.replace(snapshot_of(run), seen=torch.from_numpy(trust(run.model, run.eyes)))
 
 
 def snapshot_of(run: Run) -> Scene:

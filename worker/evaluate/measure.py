@@ -25,6 +25,7 @@ from contract.wire.errors import InputError
 from contract.wire.names import CURVE, REPORT, DeviceName
 from contract.wire.report import Report
 from worker.evaluate.cells import BOTH_EYES, Cell, eyes_of, is_changed, options_of, preset_of
+from worker.evaluate.right_eye import right_eye_ranks
 from worker.evaluate.rows import KEY, NO_RESULT, SCORES, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
 from worker.evaluate.truth import SceneCandidate, Truth
@@ -123,8 +124,10 @@ class Bench:
         return values | self._true(place, opened, scene, report), curve
 
     def _true(self, place: tuple[str, str], opened: OpenClip, scene: Scene, report: Report) -> Values:
-        """The scores against the truth, for a clip that has one."""
-        if opened.phantom is None or not report.held_out:
+        """The scores against the truth, for a clip that has one, or against the recorded right eye."""
+        if opened.phantom is None:
+            return dict(right_eye_ranks(scene, opened.clip, report.held_out))
+        if not report.held_out:
             return {}
         if place not in self._truth:
             unused = {*report.held_out, *report.repeated}

@@ -36,7 +36,8 @@ COPIES = ("copy_blend_db", "copy_flow_db", "warp_db", "warp_clear_db")
 TRUTH = (
     "psnr_view10_db", "psnr_view15_db", "psnr_baked10_db", "psnr_baked15_db", "bound10_db", "bound15_db",
     "psnr_hidden_db", "depth_error_mm", "motion_error_mm", "moving_error_mm", "moving_mm", "empty_ok", "seen_ok",
-    "rank_colour", "rank_depth", "rank_right_colour", "rank_right_depth",
+    "rank_colour", "rank_depth", "rank_colour_8px", "rank_depth_8px",
+    "rank_right_colour", "rank_right_depth", "rank_right_colour_8px", "rank_right_depth_8px",
 )  # fmt: skip
 SIZE = ("iterations", "gaussians", "bases", "floats_a_gaussian", "scene_bytes", "stored_loss_held_out_db")
 SPEED = ("t_train_s", "t_post_s", "seconds", "step_ms", "render_ms", "render_fps", "width", "height", "load_1min")

@@ -19,7 +19,7 @@ empty_ok  share of all pixels of those views in which nothing solid is drawn whe
 seen_ok   share of the judged pixels of those views in which something solid is drawn.
 rank   Spearman's rank correlation of the confidence layer with the smallness of a pixel's error (ranking.py), over all
        pixels that show tissue, seen or not, in those views: rank_colour, rank_depth; and in the right eye's own
-       views of the same frames: rank_right_colour, rank_right_depth.
+       views of the same frames: rank_right_colour, rank_right_depth. Those that end in _8px are of squares of 8 pixels.
 motion of what a pixel of frame 0 shows: the displacements of the Gaussians it is blended of, each from its own centre
        at frame 0 to that at frame i, blended with the same weights. Gaussians a pixel hardly shows hardly count, and
        none has to be declared the nearest. The end-point error is its distance to the true displacement of the
@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.pose import OrbitPose, world_from_camera
-from worker.evaluate.ranking import PixelErrors, pixel_errors, rank_correlation, together
+from worker.evaluate.ranking import PixelErrors, pixel_errors, rank_scores, together
 from worker.input.clip import DepthClip
 from worker.model.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
 from worker.phantom import Phantom
@@ -110,12 +110,16 @@ class TruthScores:
     seen_ok: float
     rank_colour: float
     rank_depth: float
+    rank_colour_8px: float
+    rank_depth_8px: float
     rank_right_colour: float
     rank_right_depth: float
+    rank_right_colour_8px: float
+    rank_right_depth_8px: float
 
 
 @dataclass(frozen=True, eq=False)
-class _Expected:
+class Expected:
     """A picture, the same with mirrored light as the endoscope sees it, the pixels both are judged on, and depth."""
 
     frame: int
@@ -169,36 +173,36 @@ class Truth:
             moving_mm=moving_mm,
             empty_ok=float(np.mean([_is_clear(*pair) for pair in zip(shown, expected, strict=True)])),
             seen_ok=_share_solid(shown, expected),
-            **_ranks(_errors(shown, expected), self._right_errors(candidate)),
+            **rank_scores(errors_of(shown, expected), "rank"),
+            **rank_scores(self._right_errors(candidate), "rank_right"),
         )
 
-    def errors(self, candidate: Candidate) -> dict[str, PixelErrors]:
-        """The confidence and the errors of every pixel that shows tissue, of the `off-axis` and `right` views."""
-        expected = [each for views in self._views.values() for each in views]
-        off_axis = _errors(self._shown(candidate, expected), expected)
-        return {"off-axis": off_axis, "right": self._right_errors(candidate)}
+    @property
+    def expected(self) -> dict[str, list[Expected]]:
+        """The views `off-axis`, and those of the `right` eye."""
+        return {"off-axis": [each for views in self._views.values() for each in views], "right": self._right}
 
     def _right_errors(self, candidate: Candidate) -> PixelErrors:
-        return _errors(self._shown(candidate, self._right), self._right)
+        return errors_of(self._shown(candidate, self._right), self._right)
 
-    def _shown(self, candidate: Candidate, expected: Sequence[_Expected]) -> list[ShownView]:
+    def _shown(self, candidate: Candidate, expected: Sequence[Expected]) -> list[ShownView]:
         return [candidate.view(each.frame, each.pose) for each in expected]
 
-    def _off_axis(self, angle_deg: float, pivot_mm: float) -> Iterable[_Expected]:
+    def _off_axis(self, angle_deg: float, pivot_mm: float) -> Iterable[Expected]:
         for place, frame in enumerate(self._judged_frames):
             yaw, pitch = DIRECTIONS[place % len(DIRECTIONS)]
             orbit = OrbitPose(yaw_deg=yaw * angle_deg, pitch_deg=pitch * angle_deg, zoom=1.0)
             pose = np.array(world_from_camera(orbit, pivot_mm), np.float64)
             yield self._expected(frame, pose)
 
-    def _expected(self, frame: int, pose: Pose) -> _Expected:
+    def _expected(self, frame: int, pose: Pose) -> Expected:
         rgb, depth_mm = self._phantom.render(frame, pose)
         eye_mm = self._phantom.world_from_camera(frame)[:3, 3]
         baked = rgb if np.array_equal(pose[:3, 3], eye_mm) else self._phantom.render(frame, pose, eye_mm=eye_mm)[0]
         row, column, shows = _cells(self._phantom.surface_pixels(frame, pose).atlas_xy)
-        return _Expected(frame, pose, rgb, baked, shows & self._seen[row, column], depth_mm)
+        return Expected(frame, pose, rgb, baked, shows & self._seen[row, column], depth_mm)
 
-    def _behind_instrument(self, own: _Expected) -> _Expected:
+    def _behind_instrument(self, own: Expected) -> Expected:
         return replace(own, judged=own.judged & ~self._clip.tissue[own.frame])
 
     def _depth(self, own: Sequence[ShownView]) -> float:
@@ -278,21 +282,21 @@ def _seen_by(
     return np.asarray(inner, np.bool_), float(np.median(medians_mm))
 
 
-def _is_clear(shown: ShownView, expected: _Expected) -> NDArray[np.bool_]:
+def _is_clear(shown: ShownView, expected: Expected) -> NDArray[np.bool_]:
     """[H, W] whether nothing solid is drawn in front of the nearest true surface within one pixel."""
     true_mm = np.where(expected.depth_mm > 0, expected.depth_mm, np.inf).astype(np.float32)
     nearest_mm = cv2.erode(true_mm, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     return np.asarray((shown.depth_mm <= 0) | (shown.depth_mm >= nearest_mm * (1 - FREE_SPACE)), np.bool_)
 
 
-def _share_solid(shown: Sequence[ShownView], expected: Sequence[_Expected]) -> float:
+def _share_solid(shown: Sequence[ShownView], expected: Sequence[Expected]) -> float:
     """Share of the judged pixels in which something solid is drawn."""
     solid = [view.depth_mm[each.judged] > 0 for view, each in zip(shown, expected, strict=True)]
     judged = np.concatenate(solid)
     return float(judged.mean()) if judged.size else math.nan
 
 
-def _errors(shown: Sequence[ShownView], expected: Sequence[_Expected]) -> PixelErrors:
+def errors_of(shown: Sequence[ShownView], expected: Sequence[Expected]) -> PixelErrors:
     """The errors of every pixel that shows tissue in truth."""
     return together(
         [
@@ -300,14 +304,6 @@ def _errors(shown: Sequence[ShownView], expected: Sequence[_Expected]) -> PixelE
             for view, each in zip(shown, expected, strict=True)
         ]
     )
-
-
-def _ranks(off_axis: PixelErrors, right: PixelErrors) -> dict[str, float]:
-    found = {}
-    for name, errors in (("rank", off_axis), ("rank_right", right)):
-        found[f"{name}_colour"] = rank_correlation(errors.confidence, errors.colour)
-        found[f"{name}_depth"] = rank_correlation(errors.confidence, errors.depth)
-    return found
 
 
 def _pictures(shown: Sequence[ShownView]) -> list[NDArray[np.float32]]:
@@ -322,7 +318,7 @@ def _cells(atlas_xy: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def _mean_psnr(
-    pictures: Sequence[NDArray[np.float32]], expected: Sequence[_Expected], against: Literal["rgb", "baked"] = "rgb"
+    pictures: Sequence[NDArray[np.float32]], expected: Sequence[Expected], against: Literal["rgb", "baked"] = "rgb"
 ) -> float:
     """Mean over frames of the PSNR on judged pixels, dB; NaN if no frame has any."""
     pairs = zip(pictures, expected, strict=True)

@@ -11,11 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.fusion import COMPLETED_CONFIDENCE
-
-NEVER_SEEN = -COMPLETED_CONFIDENCE
-"""What a Gaussian that no training frame saw counts in the blend: it outweighs as much tissue without measured depth
-that every frame saw. So one blended plane decides what is unseen and, above 0, holds the confidence."""
+NEVER_SEEN = -0.1
+"""What a Gaussian that no training frame saw counts in the blend: it outweighs as much that is trusted by a tenth. So
+one blended plane decides what is unseen and, above 0, holds the trust."""
 SMOOTHED_SHARE = 1 / 128
 """Side of the square of pixels whose majority decides, as a share of the image's width: 5 pixels of 640."""
 STRIPE_SHARE = 1 / 96

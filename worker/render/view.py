@@ -6,8 +6,9 @@ N Gaussians, H W pixels. Scenes keep their kernels' buffers between frames, so t
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property, partial
 from threading import Lock
 
 import numpy as np
@@ -18,18 +19,17 @@ from worker.input.camera import Intrinsics
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
 from worker.render.camera import endoscope_pose, view_camera
+from worker.render.confidence import confidence, evidence, seen_from_endoscope
 from worker.render.unseen import blended_values, unseen_pixels
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS, solid_depth_mm
 
-POSE_FALL_OFF = 0.25
-"""Distance from the nearest trained pose, in median depths, at which confidence has fallen to exp(-1/2): 14 degrees."""
 FAR_POSE = 0.35
-"""In the same unit: beyond it the frame carries a warning, because it shows sides that the clip never saw."""
-LOW_CONFIDENCE, MAX_LOW_SHARE = 0.08, 0.1
-"""A frame warns when more than this share of its pixels is seen but lies below this confidence, which is that of tissue
-without measured depth, seen throughout (0.1), from 9 degrees off."""
+"""Distance from the nearest trained pose, in median depths, beyond which the frame carries a warning, because it shows
+sides that the clip never saw."""
+LOW_TRUST, MAX_LOW_SHARE = 0.1, 0.1
+"""A frame warns when more than this share of its pixels show Gaussians that are trusted less, as seen by the clip."""
 HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
 MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""
@@ -43,17 +43,23 @@ class Frame:
 
     rgb        [H, W, 3] uint8
     depth_mm   [H, W] float32, camera z, 0 where nothing solid is
-    confidence [H, W] float32 in [0, 1]: share of training frames that saw the blended Gaussians, times their stereo
-               confidence, times a fall-off with the distance from the trained poses
     unseen     [H, W] bool: no training frame saw what is shown here; the other layers hold the model's guess
     warnings   what to distrust about this frame
     """
 
     rgb: NDArray[np.uint8]
     depth_mm: NDArray[np.float32]
-    confidence: NDArray[np.float32]
     unseen: NDArray[np.bool_]
     warnings: tuple[Notice, ...]
+    _confidence: Callable[[], NDArray[np.float32]]
+
+    @cached_property
+    def confidence(self) -> NDArray[np.float32]:
+        """[H, W] float32 in [0, 1]: how likely colour and depth are right (confidence.py); 0 where nothing solid is.
+
+        Computed when it is first asked for: from another pose than the endoscope's it takes a second render.
+        """
+        return self._confidence()
 
     @property
     def unseen_share(self) -> float:
@@ -111,27 +117,43 @@ def render_frame(
     last = (scene.frame_count - 1) / scene.frame_count
     shown = min(max(t, 0.0), last)
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
-    image, blended = renderer_of(scene, device).layers(
-        shown, pose, intrinsics or scene.intrinsics, highlights=highlights
-    )
+    camera = (intrinsics or scene.intrinsics, pose)
+    image, blended = renderer_of(scene, device).layers(shown, pose, camera[0], highlights=highlights)
     alpha = image[4]
     solid = alpha >= COVERED_ALPHA
     unseen = unseen_pixels(solid, blended)
-    distance = _distance_from_trained(scene, pose)
     # Of a snapshot nothing is known yet: nothing is blended, and 0 is shown.
-    confidence = np.zeros_like(alpha) if blended is None else _confidence(blended, alpha, distance)
+    trust = np.zeros_like(alpha) if blended is None else np.clip(blended / np.where(solid, alpha, 1), 0, 1) * solid
     rgb = np.clip(image[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255).astype(np.uint8)
     in_clip = 0.0 <= t <= last + ROUNDING
     warnings = () if in_clip else (_warning_of_time(t, shown),)
-    warnings = (*warnings, *_warnings_of_pose(distance, confidence, unseen))
-    return Frame(rgb, solid_depth_mm(image[3], alpha, scene.units_per_mm), confidence, unseen, warnings)
+    warnings = (*warnings, *_warnings_of_pose(_distance_from_trained(scene, pose), trust, unseen))
+    depth_mm = solid_depth_mm(image[3], alpha, scene.units_per_mm)
+    own_view = partial(_endoscope_rgb, scene, shown, device, highlights)
+    layer = partial(_confidence, scene, endoscope_pose(scene, shown), camera, (image[:3], depth_mm, trust), own_view)
+    return Frame(rgb, depth_mm, unseen, warnings, layer)
 
 
-def _confidence(blended: NDArray[np.float32], alpha: NDArray[np.float32], distance: float) -> NDArray[np.float32]:
-    """[H, W] in [0, 1], 0 where nothing solid is; distance as of _distance_from_trained."""
-    solid = alpha >= COVERED_ALPHA
-    fall_off = np.float32(np.exp(-0.5 * (distance / POSE_FALL_OFF) ** 2))
-    return np.where(solid, np.clip(blended / np.where(solid, alpha, 1) * fall_off, 0, 1), 0).astype(np.float32)
+def _endoscope_rgb(scene: Scene, t: float, device: Device, highlights: bool) -> NDArray[np.float32]:
+    """[3, H, W] of the endoscope's own view at t."""
+    image, _ = renderer_of(scene, device).layers(t, endoscope_pose(scene, t), scene.intrinsics, highlights=highlights)
+    return image[:3]
+
+
+def _confidence(
+    scene: Scene,
+    own_pose: NDArray[np.float64],
+    camera: tuple[Intrinsics, NDArray[np.float64]],
+    view: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+    own_view: Callable[[], NDArray[np.float32]],
+) -> NDArray[np.float32]:
+    """The confidence layer [H, W] of a view, given as colours [3, H, W], depth in mm and trust; 0 where trust is."""
+    rgb, depth_mm, trust = view
+    known_rgb = rgb
+    if not np.array_equal(camera[1], own_pose) or camera[0] != scene.intrinsics:
+        known_rgb = seen_from_endoscope(own_view(), depth_mm, camera, (scene.intrinsics, own_pose))
+    likely = confidence(evidence(trust, rgb, known_rgb))
+    return np.where(trust > 0, likely, 0).astype(np.float32)
 
 
 def _warning_of_time(t: float, shown: float) -> Notice:
@@ -139,14 +161,14 @@ def _warning_of_time(t: float, shown: float) -> Notice:
     return Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, text)
 
 
-def _warnings_of_pose(distance: float, confidence: NDArray[np.float32], unseen: NDArray[np.bool_]) -> Iterator[Notice]:
+def _warnings_of_pose(distance: float, trust: NDArray[np.float32], unseen: NDArray[np.bool_]) -> Iterator[Notice]:
     if distance > FAR_POSE:
         text = f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess."
         yield Notice.warning(NoticeCode.POSE_FAR, text)
     if (share := float(unseen.mean())) > MAX_UNSEEN_SHARE:
         text = f"No frame saw {share:.0%} of this view. unseen=mark hatches it, unseen=guess shows a guess."
         yield Notice.warning(NoticeCode.UNSEEN, text)
-    if ((confidence < LOW_CONFIDENCE) & ~unseen).mean() > MAX_LOW_SHARE:
+    if ((trust < LOW_TRUST) & ~unseen).mean() > MAX_LOW_SHARE:
         yield Notice.warning(NoticeCode.HARDLY_SEEN, HARDLY_SEEN)
 
 

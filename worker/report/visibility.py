@@ -1,4 +1,4 @@
-"""Which Gaussians the clip really saw: what the confidence layer blends, and which of the others must go.
+"""Which Gaussians the clip never saw and must go.
 
 Symbols: N Gaussians, H W pixels.
 """
@@ -12,20 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worker.fusion import COMPLETED_CONFIDENCE
 from worker.input.clip import spread
-from worker.model.constants import SH_C0
 from worker.model.gaussians import Gaussians
-from worker.model.layout import COLOUR, CX, CY, FX, FY, POSE
+from worker.model.layout import CX, CY, FX, FY, POSE
 from worker.raster.model import Model
 from worker.train.targets import TrainingFrames
 
 SAMPLED_FRAMES = 24
-"""Training frames of all eyes looked at, evenly spread: the share is known to a few per cent."""
-MIN_TISSUE_PX = 0.5
-"""A frame sees a Gaussian if its weights on tissue add up to so many pixels; of what is hidden less shines through."""
-MIN_TISSUE_SHARE = 0.2
-"""And to this share of all its weights there. Behind an instrument's edge the rest of it is held by what shows."""
+"""Training frames looked at, evenly spread."""
 
 MAX_UNSEEN_WIDTH = 3.0
 """Units, a twentieth of the median depth: a Gaussian that nothing saw may be no wider at any time of the clip."""
@@ -103,34 +97,6 @@ def _widest(model: Model, chosen: NDArray[np.intp], times: Sequence[float]) -> N
             scale = motion.deform(gaussians, t).log_scale.exp()
             widest = np.maximum(widest, scale.numpy().max(axis=1, initial=0.0))
     return widest
-
-
-def seen_share(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.float32]:
-    """[N] in [0, 1]: share of training frames that saw a Gaussian, times the stereo confidence of the pixels that
-    showed it; of two eyes that of the one that saw it better. 0: no frame saw it."""
-    sampled = spread(eyes[0].indices, SAMPLED_FRAMES // len(eyes))
-    trusted = np.zeros((len(eyes), model.count))
-    for index in sampled:
-        for place, frames in enumerate(eyes):
-            trusted[place] += _trust_in(model, frames, index)
-    share: NDArray[np.float32] = (trusted.max(0) / len(sampled)).astype(np.float32)
-    return share
-
-
-def _trust_in(model: Model, frames: TrainingFrames, index: int) -> NDArray[np.float32]:
-    """[N] in [0, 1]: mean stereo confidence where frame `index` draws each Gaussian, 0 off tissue; 0: it sees it not.
-
-    A Gaussian's weights in the picture, summed over chosen pixels, are the gradient of a colour summed over them.
-    """
-    tissue = frames.eye.tissue[index]
-    # Completed depth is a guess, not nothing: tissue without stereo keeps a little confidence.
-    confidence = np.maximum(frames.eye.depth_confidence[index] / np.float32(255), np.float32(COMPLETED_CONFIDENCE))
-    cotangents = np.zeros((5, *tissue.shape), np.float32)
-    cotangents[0], cotangents[1], cotangents[2] = tissue * confidence, tissue, 1
-    gradient = model.image_gradient(frames.cameras[index], float(frames.t[index]), cotangents)
-    on_trusted, on_tissue, drawn = gradient[COLOUR] / np.float32(SH_C0)
-    is_seen = (on_tissue >= MIN_TISSUE_PX) & (on_tissue >= MIN_TISSUE_SHARE * drawn)
-    return np.where(is_seen, np.minimum(on_trusted / np.where(is_seen, drawn, 1), 1), 0)
 
 
 def _pixels(

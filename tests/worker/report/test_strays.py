@@ -10,7 +10,8 @@ import pytest
 from tests.worker.clips import plane_clip
 from tests.worker.phantoms import prepared
 from worker.input.clip import DepthClip
-from worker.report.visibility import MAX_UNSEEN_WIDTH, drop_strays, seen_share
+from worker.report.trust import trust
+from worker.report.visibility import MAX_UNSEEN_WIDTH, drop_strays
 from worker.train.run import Run
 from worker.train.targets import TrainingFrames
 
@@ -45,7 +46,7 @@ def test_a_wide_gaussian_that_nothing_saw_is_taken_out(preset: str, clip: DepthC
 def test_what_was_seen_may_be_wide_and_what_is_narrow_may_be_unseen(clip: DepthClip) -> None:
     run = start(clip, "fast")
     count = run.model.count
-    seen = seen_share(run.model, [run.frames])
+    seen = trust(run.model, [run.frames])
     assert seen[:2].tolist() == [0, 0]
     run.model.canonical[LOG_SCALE, int(seen.argmax())] = np.log(2 * MAX_UNSEEN_WIDTH)
     assert drop_strays(run.model, [run.frames]) == 0

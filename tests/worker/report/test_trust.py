@@ -1,4 +1,4 @@
-"""How often a Gaussian was seen: drawn on tissue, not hidden by the surface, as sure as its depth was."""
+"""How likely a Gaussian is right: seen on tissue, in the image, not behind the surface, in colour and at its depth."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from tests.helpers import assert_close
 from tests.worker.clips import HEIGHT, WIDTH, plane_clip
 from tests.worker.phantoms import prepared
-from worker.fusion import COMPLETED_CONFIDENCE
 from worker.input.clip import DepthClip
-from worker.report.visibility import MAX_UNSEEN_WIDTH, SAMPLED_FRAMES, drop_strays, seen_share
+from worker.report.trust import SAMPLED_PICTURES, evidence, trust
+from worker.report.visibility import MAX_UNSEEN_WIDTH, drop_strays
 from worker.train.run import Run
 from worker.train.targets import TrainingFrames
 
@@ -36,11 +36,21 @@ def pixels(run: Run, clip: DepthClip) -> NDArray[np.intp]:
     return np.asarray(row * WIDTH + column, np.intp)
 
 
+def share(run: Run, *eyes: TrainingFrames) -> NDArray[np.float64]:
+    """[N] share of the training frames that saw each Gaussian."""
+    return evidence(run.model, eyes or [run.frames])[0]
+
+
+def as_given(run: Run, clip: DepthClip) -> TrainingFrames:
+    """The run's frames of another clip."""
+    return TrainingFrames(clip, run.frames.indices, run.frames.scale)
+
+
 def test_a_gaussian_counts_in_the_frames_that_show_its_tissue(clip: DepthClip) -> None:
     run = start(clip)
     shown = clip.tissue.reshape(clip.frame_count, -1).mean(0)[pixels(run, clip)]
     assert shown.min() < 0.9
-    seen = seen_share(run.model, [run.frames])
+    seen = share(run)
     assert np.abs(seen - shown).mean() < 0.05  # it is drawn around its centre, too
     assert_close(seen[shown == 1], np.ones(int((shown == 1).sum())), absolute=0.5)
     assert np.corrcoef(seen, shown)[0, 1] > 0.9
@@ -55,24 +65,22 @@ def test_a_gaussian_whose_centre_no_frame_shows_is_seen_if_tissue_shows_much_of_
         tissue = np.ones_like(clip.tissue)
         tissue[:, :, :hidden_columns] = False
         hidden = TrainingFrames(dataclasses.replace(clip, tissue=tissue), run.frames.indices, run.frames.scale)
-        shares.append(float(seen_share(run.model, [hidden])[middle]))
+        shares.append(float(share(run, hidden)[middle]))
     assert 0.2 < shares[0] < 0.6
     assert shares[1] == 0
 
 
-def test_unsure_depth_makes_a_gaussian_less_seen(clip: DepthClip) -> None:
+def test_of_two_eyes_the_one_counts_that_saw_it_oftener(clip: DepthClip) -> None:
     run = start(clip)
-    unsure = dataclasses.replace(clip, depth_confidence=np.full_like(clip.depth_confidence, 51))
-    assert_close(
-        seen_share(run.model, [TrainingFrames(unsure, run.frames.indices, run.frames.scale)]),
-        seen_share(run.model, [run.frames]) / 5,
-    )
+    blind = as_given(run, dataclasses.replace(clip, tissue=np.zeros_like(clip.tissue)))
+    sampled = share(run, run.frames, run.frames)
+    assert_close(share(run, run.frames, blind), sampled, name="shares")
 
 
 def test_behind_the_surface_behind_the_camera_and_outside_the_image_nothing_is_seen(clip: DepthClip) -> None:
     run = prepared(clip, "fast", holdout="none")[0]
     run.model.opacity_logit[:] = 3
-    count, before = run.model.count, seen_share(run.model, [run.frames])
+    count, before = run.model.count, share(run)
     row, column = np.divmod(pixels(run, clip), WIDTH)
     chosen = np.flatnonzero((row > 32) & (row < 44) & (column > 8) & (column < WIDTH - 8))[::17]
     assert before[chosen].min() > 0.9
@@ -81,24 +89,42 @@ def test_behind_the_surface_behind_the_camera_and_outside_the_image_nothing_is_s
     run.model.canonical[:3, behind] *= 1.2
     run.model.canonical[2, turned_away] *= -1
     run.model.canonical[0, outside] += 200
-    seen = seen_share(run.model, [run.frames])
+    seen = share(run)
     assert not seen[count:].any()
+    assert not trust(run.model, [run.frames])[count:].any()
     assert_close(seen[:count], before, absolute=1e-3)
+
+
+def test_wrong_colours_and_wrong_depth_make_a_gaussian_less_trusted_where_it_shows_them(clip: DepthClip) -> None:
+    run = start(clip)
+    column = pixels(run, clip) % WIDTH
+    spoilt, sound = column < 20, column > 40
+    before = evidence(run.model, [run.frames])[1]
+    trusted = trust(run.model, [run.frames])
+    other_rgb, other_mm = clip.rgb.copy(), clip.depth_mm.copy()
+    other_rgb[:, :, :30] = 255
+    other_mm[:, :, :30] *= 1.1
+    for changed in (dataclasses.replace(clip, rgb=other_rgb), dataclasses.replace(clip, depth_mm=other_mm)):
+        frames = as_given(run, changed)
+        errors = evidence(run.model, [frames])[1]
+        assert np.median(errors[spoilt]) > np.median(before[spoilt]) + 1
+        assert_close(errors[sound], before[sound], name="errors elsewhere")
+        now = trust(run.model, [frames])
+        assert np.median(now[spoilt]) < np.median(trusted[spoilt]) - 0.01
+        assert_close(now[sound], trusted[sound], name="trust elsewhere")
 
 
 def test_a_wide_gaussian_on_tissue_without_depth_is_no_stray(clip: DepthClip) -> None:
     run = start(clip)
     run.model.canonical[7:10] = np.log(2 * MAX_UNSEEN_WIDTH)
-    unsure = dataclasses.replace(clip, depth_confidence=np.zeros_like(clip.depth_confidence))
-    seen = seen_share(run.model, [TrainingFrames(unsure, run.frames.indices, run.frames.scale)])
-    assert seen.any()
-    assert (seen <= COMPLETED_CONFIDENCE + 1e-6).all()
-    assert drop_strays(run.model, [TrainingFrames(unsure, run.frames.indices, run.frames.scale)]) == 0
+    unsure = as_given(run, dataclasses.replace(clip, depth_mm=np.zeros_like(clip.depth_mm)))
+    assert trust(run.model, [unsure]).any()
+    assert drop_strays(run.model, [unsure]) == 0
 
 
 def test_a_long_clip_is_sampled_evenly() -> None:
-    clip = plane_clip(2 * SAMPLED_FRAMES)
+    clip = plane_clip(2 * SAMPLED_PICTURES)
     clip.tissue[:] = True
     clip.tissue[: clip.frame_count // 2] = False
     run = prepared(clip, "fast", holdout="none")[0]
-    assert np.median(seen_share(run.model, [run.frames])) == pytest.approx(0.5, abs=0.05)
+    assert np.median(share(run)) == pytest.approx(0.5, abs=0.05)
