@@ -119,9 +119,9 @@ def preset_name_of(series: str) -> str:
     return series.partition(":")[0]
 
 
-def eyes_of(series: str) -> str:
+def eyes_of(series: str) -> Eyes:
     """The eyes that a series trains on, where the clip has two and its preset takes two."""
-    return next((change.partition("=")[2] for change in _changes(series) if _is_eyes(change)), BOTH_EYES)
+    return "left" if f"{EYES}=left" in _changes(series) else BOTH_EYES
 
 
 def with_eyes(series: str, eyes: Eyes) -> str:

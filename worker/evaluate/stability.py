@@ -27,7 +27,7 @@ from contract.wire.errors import InputError, TrainingDiverged
 from contract.wire.notices import Severity
 from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
-from worker.evaluate.cells import preset_of
+from worker.evaluate.cells import eyes_of, preset_of
 from worker.evaluate.conditions import (
     CLEAN,
     CLEAN_STEREO,
@@ -250,7 +250,7 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Trainin
             else ReconstructionRequest(given.clip)
         )
         preset = preset_of(cell.series)
-        options = ReconstructionOptions(iterations=grid.iterations, seed=cell.seed)
+        options = ReconstructionOptions(iterations=grid.iterations, seed=cell.seed, eyes=eyes_of(cell.series))
         request = dataclasses.replace(asked, own_preset=preset, options=options)
         report = reconstruct(request, Path(folder, "scene"), hooks)
         scene = load_scene(Path(folder, "scene"))

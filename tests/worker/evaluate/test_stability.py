@@ -31,6 +31,7 @@ from worker.evaluate.stability import (
 )
 from worker.machine.hooks import Progress
 from worker.train.hooks import TrainingHooks
+from worker.train.request import ReconstructionRequest
 
 SMALL = Grid(width=96, height=80, frames=12, iterations=15)
 
@@ -261,3 +262,19 @@ def test_the_page_says_why_a_place_is_silent(tmp_path: Path) -> None:
     assert "Why fast pulls" not in page
     draw_map(places_of(ROWS, "fast"), "fast", tmp_path)
     assert "[stability-fast.png](stability-fast.png)" in "".join(stability_sections(tmp_path))
+
+
+@pytest.mark.parametrize(("series", "eyes"), [("fast", "both"), ("fast:eyes=left", "left")])
+def test_a_cell_trains_on_the_eyes_that_its_series_names(
+    series: str, eyes: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[ReconstructionRequest] = []
+
+    def stop(request: ReconstructionRequest, *_: object) -> None:
+        asked.append(request)
+        raise Cancelled("seen enough")
+
+    monkeypatch.setattr("worker.evaluate.stability.reconstruct", stop)
+    with pytest.raises(Cancelled):
+        measured(StabilityCell(CLEAN_STEREO, 0, series, 0), clean_clip(SMALL.settings(0)), SMALL, TrainingHooks())
+    assert asked[0].options.eyes == eyes
