@@ -4,9 +4,10 @@
 
 Trains `fast` on a phantom of 320x256 for each motion, under an instrument that never moves: the mask of frame 0 lies on
 all frames. Prints of each, in the held-out frames: of the pixels that no frame shows as tissue, and of the tissue, the
-share that is hatched (tissue that moves comes out from under the instrument and is seen); psnr_tissue with the hatch, and of the guess; from 12 degrees off the share of pixels that two
-planes, weights of all Gaussians and of those seen, would decide otherwise. Then the medians of so many renders in
-turn: colour, depth and alpha alone; with the plane that decides; with a second one; and render_frame with all it does.
+share that is hatched (tissue that moves comes out from under the instrument and is seen); psnr_tissue with the hatch,
+and of the guess; from 12 degrees off the share of pixels that two planes, weights of all Gaussians and of those seen,
+would decide otherwise. Then the medians of so many renders in turn: colour, depth and alpha alone; with the plane that
+decides; with a second one; and render_frame with all it does.
 """
 
 from __future__ import annotations
