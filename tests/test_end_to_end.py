@@ -37,10 +37,13 @@ def pixels(content: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 def assert_renders(client: Client, scene: str) -> None:
     """Any time, pose, size and layer."""
     first = client.render(0.0, scene=scene)
-    assert pixels(first.content).shape == (HEIGHT, WIDTH, 3)
+    assert pixels(first.content).shape == (HEIGHT, WIDTH, 4)
+    assert 0 <= first.unseen < 0.2
+    assert (pixels(first.content)[..., 3] == 0).mean() == pytest.approx(first.unseen, abs=1e-3)
+    assert pixels(client.render(0.0, scene=scene, unseen="guess").content).shape == (HEIGHT, WIDTH, 3)
     assert client.render(0.0, scene=scene).content == first.content
     assert client.render(0.5, pose="orbit:10,0,1").content != first.content
-    assert pixels(client.render(0.5, scene=scene, width=80).content).shape == (HEIGHT // 2, WIDTH // 2, 3)
+    assert pixels(client.render(0.5, scene=scene, width=80).content).shape == (HEIGHT // 2, WIDTH // 2, 4)
     depth_mm = client.render(0.5, scene=scene, layer="depth", format="npy").array()
     assert depth_mm.shape == (HEIGHT, WIDTH)
     assert 10 < np.median(depth_mm[depth_mm > 0]) < 300
