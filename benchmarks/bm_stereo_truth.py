@@ -6,8 +6,10 @@ FOLDER (INTRASPLAT_DATA, else ../shared/data) may hold `scared_pair`: left.png, 
 left eye, 0: none) of real tissue under structured light. No calibration comes with it: PAIR_FX_PX and PAIR_BASELINE_MM
 are those of such an endoscope, and errors are px. With TRITON_INTERPRET=1 "cuda" needs no GPU.
 
-A row a clip. valid_share: of the pixels with truth, those with depth. median_px, off_3px_share: of |error| where valid.
-rank: Spearman's correlation of confidence and -|error|; 1: the surer, the truer. clear_share: of the pixels with truth,
+A row a clip. valid_share: of the pixels with truth, those with depth. median_px, off_1px_share, off_3px_share: of |error| where valid.
+rank: Spearman's correlation of confidence and -|error|; 1: the surer, the truer; rank_patches: of
+their means over squares of PATCH_PX, where the scatter of the truth itself averages out; rank_bound: the rank that the
+root mean square error of those squares would have as confidence, which nobody can know. clear_share: of the pixels with truth,
 those with confidence >= 0.5; median_mm and p90_mm: of |error| there. burnt_out_share: of the drawn
 picture.
 """
@@ -41,6 +43,7 @@ WIDTH, HEIGHT = 640, 512
 DRAWN = PhantomSettings(width=800, height=640, frames=2, noise=False)
 """Wider than the recorded picture, so that distortion finds something at its corners."""
 FRAME, SEEDS = 1, (0, 1, 2)
+PATCH_PX = 8
 DISTORTION = ((-0.30, 0.02, 0.0, 0.0), (-0.29, 0.02, 0.0, 0.0))
 """k1 k2 p1 p2 of each eye: the picture's corner moves by 47 px."""
 CENTRES_PX = 6.0  # the right eye's principal point lies so far to the left of the left eye's
@@ -50,8 +53,8 @@ WETNESS, ROUGHNESS = 150.0, 0.4
 """Factors of the wet film's mirrored light and of its slopes: broad highlights burn out a third of the picture."""
 FLAT_SHARE = 0.97  # of the contrast that flat tissue has lost
 FIELDS = (
-    "machine", "commit", "device", "clip", "seed", "valid_share", "median_px", "off_3px_share", "rank",
-    "clear_share", "median_mm", "p90_mm", "burnt_out_share",
+    "machine", "commit", "device", "clip", "seed", "valid_share", "median_px", "off_1px_share",
+    "off_3px_share", "rank", "rank_patches", "rank_bound", "clear_share", "median_mm", "p90_mm", "burnt_out_share",
 )  # fmt: skip
 CLIPS = {
     "clean": frozenset[str](),
@@ -201,20 +204,40 @@ def _scores(judged: Judged, device: str) -> dict[str, str]:
     clear = valid & (confidence >= CLEAR_CONFIDENCE)
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
     found_px = focal_baseline / np.where(valid, depth_mm, 1) + clip.disparity_offset_px
-    error_px = np.abs(found_px - truth_px)[valid]
+    error_image_px = np.where(valid, np.abs(found_px - truth_px), 0)
+    error_px = error_image_px[valid]
+    patch_rms_px, _ = _patches(error_image_px**2, valid)
+    patch_error_px, some = _patches(error_image_px, valid)
+    patch_confidence, _ = _patches(confidence, valid)
+    whole = valid[: PATCH_PX * some.shape[0], : PATCH_PX * some.shape[1]]
+    bound = np.kron(patch_rms_px, np.ones((PATCH_PX, PATCH_PX)))[whole]
+    bounded_px = error_image_px[: whole.shape[0], : whole.shape[1]][whole]
     true_mm = focal_baseline / (truth_px[clear] - clip.disparity_offset_px)
     median_mm, p90_mm = np.percentile(np.abs(depth_mm[clear] - true_mm), [50, 90])
     scores = {
         "valid_share": valid.sum() / known.sum(),
         "median_px": np.median(error_px),
+        "off_1px_share": np.mean(error_px > 1),
         "off_3px_share": np.mean(error_px > 3),
         "rank": -spearmanr(confidence[valid], error_px).statistic,
+        "rank_patches": -spearmanr(patch_confidence[some], patch_error_px[some]).statistic,
+        "rank_bound": spearmanr(bound, bounded_px).statistic,
         "clear_share": clear.sum() / known.sum(),
         "median_mm": median_mm,
         "p90_mm": p90_mm,
         "burnt_out_share": judged.burnt_out_share,
     }
     return {name: "" if np.isnan(value) else f"{value:.4f}" for name, value in scores.items()}
+
+
+def _patches(image: NDArray[np.generic], valid: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_]]:
+    """Means over the valid pixels of each square of PATCH_PX, and which squares have one."""
+    rows, columns = (side // PATCH_PX for side in valid.shape)
+    squares = (slice(rows * PATCH_PX), slice(columns * PATCH_PX))
+    shape = (rows, PATCH_PX, columns, PATCH_PX)
+    number = valid[squares].reshape(shape).sum(axis=(1, 3))
+    total = np.where(valid, image, 0)[squares].reshape(shape).sum(axis=(1, 3))
+    return (total / np.maximum(number, 1)).astype(np.float32), number > 0
 
 
 if __name__ == "__main__":
