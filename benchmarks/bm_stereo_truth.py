@@ -6,12 +6,11 @@ FOLDER (INTRASPLAT_DATA, else ../shared/data) may hold `scared_pair`: left.png, 
 left eye, 0: none) of real tissue under structured light. No calibration comes with it: PAIR_FX_PX and PAIR_BASELINE_MM
 are those of such an endoscope, and errors are px. With TRITON_INTERPRET=1 "cuda" needs no GPU.
 
-A row a clip. valid_share: of the pixels with truth, those with depth. median_px, off_1px_share, off_3px_share: of |error| where valid.
-rank: Spearman's correlation of confidence and -|error|; 1: the surer, the truer; rank_patches: of
-their means over squares of PATCH_PX, where the scatter of the truth itself averages out; rank_bound: the rank that the
-root mean square error of those squares would have as confidence, which nobody can know. clear_share: of the pixels with truth,
-those with confidence >= 0.5; median_mm and p90_mm: of |error| there. burnt_out_share: of the drawn
-picture.
+A row a clip. valid_share: of the pixels with truth, those with depth. median_px, off_1px_share and off_3px_share: of
+|error| where valid. rank: Spearman's correlation of confidence and -|error|; 1: the surer, the truer. rank_patches: of
+their means over squares of PATCH_PX, where the scatter of the truth itself averages out. rank_bound: the rank of a
+confidence that knows the root mean square error of each square, which nobody can. clear_share: of the pixels with
+truth, those with confidence >= 0.5; median_mm and p90_mm: of |error| there. burnt_out_share: of the drawn picture.
 """
 
 from __future__ import annotations
