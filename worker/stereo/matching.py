@@ -2,7 +2,7 @@
 
 Symbols: H W pixels of one eye; d disparity, x_left - x_right in px of the full image; h w pixels the matcher works on.
 
-Semi-global matching (Hirschmueller 2008; OpenCV's form with eight paths) runs on half the resolution or less, where it
+Semi-global matching (Hirschmueller 2008; OpenCV's form with five paths) runs on half the resolution or less, where it
 costs an eighth, on pictures of even contrast. An edge-aware weighted-least-squares filter (Min et al. 2014,
 cv2.ximgproc) smooths what both eyes agree on and fills the rest. One Lucas-Kanade step along the row at full resolution
 then restores the sub-pixel part that the reduction lost (docs/decisions/001 and 029 have figures).
@@ -126,7 +126,7 @@ def semi_global(left: Grey, right: Grey, low: int, count: int) -> tuple[Image, N
         disp12MaxDiff=AGREEMENT_PX,
         uniquenessRatio=0,
         preFilterCap=PREFILTER_CAP,
-        mode=cv2.STEREO_SGBM_MODE_HH,
+        mode=cv2.STEREO_SGBM_MODE_SGBM,
     )
     found = matcher.compute(wide[0], wide[1])[:, before : before + left.shape[1]]
     return found.astype(np.float32) / DISPARITY_STEPS, found >= low * DISPARITY_STEPS
