@@ -33,7 +33,7 @@ ANSWER_HEADERS = {
 EXPOSED_HEADERS = (
     *("Location", "Retry-After", "ETag", "Server-Timing", "X-Request-Id"),
     *("Upload-Offset", "Upload-Length", "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Max-Size"),
-    *(f"X-Intrasplat-{name}" for name in ("Scene", "State", "T", "Iteration", "Warning", "Warning-Codes")),
+    *(f"X-Intrasplat-{name}" for name in ("Scene", "State", "T", "Iteration", "Unseen", "Warning", "Warning-Codes")),
 )
 """What a page from elsewhere may read of an answer."""
 CORS_METHODS = ("GET", "HEAD", "POST", "PATCH", "DELETE")

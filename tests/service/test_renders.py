@@ -132,6 +132,15 @@ def test_a_render_says_how_much_of_it_nothing_saw_and_the_caller_chooses_what_is
     assert "x-intrasplat-unseen" not in export.headers
 
 
+def test_a_page_from_elsewhere_may_read_what_a_render_says_of_itself(tmp_path: Path) -> None:
+    origin = "https://viewer.hospital"
+    for service in running_service(tmp_path, cors_origins=(origin,)):
+        query = {"scene": service.finished_scene(), "t": "2"}
+        headers = service.http.get("/render", params=query, headers={"origin": origin}).headers
+        exposed = {each.strip().lower() for each in headers["access-control-expose-headers"].split(",")}
+        assert {each for each in headers if each.startswith("x-intrasplat-")} <= exposed
+
+
 def test_an_answer_says_how_long_it_took(service: ServiceUnderTest) -> None:
     timing = service.http.get("/render", params={"scene": service.finished_scene()}).headers["server-timing"]
     figures = re.fullmatch(r"render;dur=(\d+\.\d), total;dur=(\d+\.\d)", timing)
