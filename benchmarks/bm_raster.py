@@ -166,7 +166,8 @@ def measure(
     """Median ms of a render and of a step, printed with their parts, as rows."""
     model = CpuModel(gaussians, deformation, camera.width, camera.height)
     view, pixels = camera_vector(camera), camera.width * camera.height
-    frame = TrainingFrame(view, TIME, _target(model.rasterizer), pixels, pixels)
+    target = _target(model.rasterizer)
+    frame = TrainingFrame(view, TIME, lambda: target, pixels, pixels)
     works: dict[str, Callable[[], object]] = {
         "render": lambda: model.render(view, TIME),
         "step": lambda: model.step([frame], LossSettings(), RATES, 1, model.sh_degree),

@@ -54,7 +54,7 @@ class Noise:
         rgb[:, :, :width], weight[:, :width] = self._rgb.transpose(2, 0, 1), self._tissue * np.uint8(255)
         inverse[:, :width] = self._inverse
         target = Target(rgb.ravel(), weight.ravel(), inverse.ravel())
-        return TrainingFrame(camera, t, target, *self._counts)
+        return TrainingFrame(camera, t, lambda: target, *self._counts)
 
     @property
     def _counts(self) -> tuple[int, int]:

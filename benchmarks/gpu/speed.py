@@ -89,7 +89,7 @@ class Speed:
             np.full(pixels, 1 / 60, np.float32),
         )
         seen = self._width * self._height
-        return TrainingFrame(self.camera, t, target, seen, seen)
+        return TrainingFrame(self.camera, t, lambda: target, seen, seen)
 
     # Compilation
 

@@ -65,7 +65,7 @@ class Picture:
     def seen_from(self, camera: NDArray[np.float64]) -> TrainingFrame:
         """As a step takes it."""
         measured = self.tissue & (self.depth > 0)
-        return TrainingFrame(camera, self.t, self.target(), int(self.tissue.sum()), int(measured.sum()))
+        return TrainingFrame(camera, self.t, self.target, int(self.tissue.sum()), int(measured.sum()))
 
 
 def endoscope(sideways: float = 0.0) -> Camera:

@@ -5,6 +5,7 @@ Symbols: H W pixels; stride = W rounded up to whole vectors of the CPU's kernels
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,16 +52,21 @@ class TrainingFrame:
 
     camera           camera_vector, in optimiser units
     t                model time
-    target           on the host
+    make_target      gives the target, on the host
     tissue_pixels    how many pixels are tissue
     measured_pixels  how many of those have a depth
     """
 
     camera: NDArray[np.float64]
     t: float
-    target: Target
+    make_target: Callable[[], Target]
     tissue_pixels: int
     measured_pixels: int
+
+    @property
+    def target(self) -> Target:
+        """What the render is compared with, made anew."""
+        return self.make_target()
 
     def loss_settings(self, loss: LossSettings) -> NDArray[np.float32]:
         """[5] as the blend applies them per pixel (cpu/blend.py): each loss is a mean over its valid pixels."""

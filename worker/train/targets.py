@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from functools import partial
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,43 +60,54 @@ def solid_depth_mm(depth: NDArray[np.float32], alpha: NDArray[np.float32], scale
     return np.where(solid, depth / np.where(solid, alpha, 1) / scale, 0).astype(np.float32)
 
 
+MIN_DEPTH_MM = np.float32(1e-3)
+"""Any number above 0: pixels without depth are masked after the division."""
+
+
 class TrainingFrames:
-    """Colour, tissue, inverse depth and camera of every training frame of one eye."""
+    """Colour, tissue, inverse depth and camera of every training frame of one eye.
+
+    A frame's target is made anew for every step that asks for it: that takes a few hundredths of the step, and keeping
+    all of them would take as much memory as the clip.
+    """
 
     def __init__(self, eye: Eye, train: Sequence[int], scale: float, side: float = 0.0) -> None:
         """side: of the eye's cameras, for the gloss."""
-        self.eye, self.indices, self.scale = eye, list(train), scale
-        self._row = {index: row for row, index in enumerate(self.indices)}
-        height, width = eye.rgb.shape[1:3]
-        self._width, stride = width, padded(width)
-        count = len(self.indices)
-        self._rgb = np.zeros((count, 3, height, stride), np.uint8)
-        self._weight = np.zeros((count, height, stride), np.uint8)
-        self._inverse_depth = np.zeros((count, height, stride), np.float32)
-        self.t = eye.t
+        self.eye, self.indices, self.scale, self.t = eye, list(train), scale, eye.t
         self.cameras = {
             index: camera_vector(camera_in_units(eye.intrinsics, eye.world_from_camera[index], scale, side))
             for index in range(eye.frame_count)
         }
-        self._frames: dict[int, TrainingFrame] = {}
-        for row, index in enumerate(self.indices):
-            tissue, depth_mm = eye.tissue[index], eye.depth_mm[index]
-            measured = tissue & (depth_mm > 0)
-            self._rgb[row, :, :, :width] = eye.rgb[index].transpose(2, 0, 1)
-            self._weight[row, :, :width] = np.where(tissue, np.uint8(255), np.uint8(0))
-            np.divide(1 / scale, depth_mm, out=self._inverse_depth[row, :, :width], where=measured)
-            target = Target(self._rgb[row].ravel(), self._weight[row].ravel(), self._inverse_depth[row].ravel())
-            counts = int(tissue.sum()), int(measured.sum())
-            self._frames[index] = TrainingFrame(self.cameras[index], float(self.t[index]), target, *counts)
+        self._frames = {index: self._frame(index) for index in self.indices}
+
+    def _frame(self, index: int) -> TrainingFrame:
+        counts = int(self.eye.tissue[index].sum()), int(self._measured(index).sum())
+        return TrainingFrame(self.cameras[index], float(self.t[index]), partial(self._target, index), *counts)
+
+    def _measured(self, index: int) -> NDArray[np.bool_]:
+        return np.asarray(self.eye.tissue[index] & (self.eye.depth_mm[index] > 0))
+
+    def _target(self, index: int) -> Target:
+        height, width = self.eye.tissue.shape[1:]
+        rgb = np.zeros((3, height, padded(width)), np.uint8)
+        weight, inverse_depth = np.zeros_like(rgb[0]), np.zeros(rgb.shape[1:], np.float32)
+        for plane, channel in zip(rgb, cv2.split(self.eye.rgb[index]), strict=True):
+            plane[:, :width] = channel
+        np.multiply(self.eye.tissue[index].view(np.uint8), np.uint8(255), out=weight[:, :width])
+        inside = inverse_depth[:, :width]  # a division everywhere, then a mask: faster than one where it is asked for
+        np.divide(np.float32(1 / self.scale), np.maximum(self.eye.depth_mm[index], MIN_DEPTH_MM), out=inside)
+        inside *= self._measured(index)
+        return Target(rgb.ravel(), weight.ravel(), inverse_depth.ravel())
 
     def frame(self, index: int) -> TrainingFrame:
-        """Frame `index` as a training step needs it: views of the arrays, the same object every time."""
+        """Frame `index` as a training step needs it, the same object every time."""
         return self._frames[index]
 
     def picture(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """The frame itself: rgb [H, W, 3] and tissue [H, W]."""
-        row, width = self._row[index], self._width
-        return self._rgb[row, :, :, :width].transpose(1, 2, 0), self._weight[row, :, :width] > 0
+        """The frame itself: rgb [H, W, 3] and tissue [H, W]. KeyError if it is no training frame."""
+        if index not in self._frames:
+            raise KeyError(index)
+        return self.eye.rgb[index], self.eye.tissue[index]
 
     def psnr_tissue_db(self, index: int, image: NDArray[np.float32]) -> float:
         """Of a model's render [5, H, W] against frame `index`; NaN without tissue."""
@@ -102,8 +115,9 @@ class TrainingFrames:
 
     def digest(self) -> str:
         """SHA-256 of everything that training reads of the eye; equal for two runs on the same frames."""
-        found = hashlib.sha256(f"{self.indices} {self.scale!r} {self._rgb.shape}".encode())
-        cameras = np.stack([self.cameras[index] for index in self.indices])
-        for values in (self._rgb, self._weight, self._inverse_depth, cameras):
-            found.update(np.ascontiguousarray(values).data)
+        found = hashlib.sha256(f"{self.indices} {self.scale!r} {self.eye.rgb.shape}".encode())
+        for index in self.indices:
+            target = self._target(index)
+            for values in (target.rgb, target.weight, target.inverse_depth, self.cameras[index]):
+                found.update(values.data)
         return found.hexdigest()

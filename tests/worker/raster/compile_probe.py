@@ -8,6 +8,8 @@ from __future__ import annotations
 import importlib
 import json
 
+from functools import partial
+
 import numpy as np
 import torch
 from numba.core.dispatcher import Dispatcher
@@ -59,9 +61,9 @@ def use_everything() -> None:
         model = CpuModel(gaussians(degree), motion, WIDTH, HEIGHT)
         pixels = HEIGHT * model.rasterizer.stride
         rgb, weight = np.full(3 * pixels, 100, np.uint8), np.full(pixels, 255, np.uint8)
-        target = Target(rgb, weight, np.ones(pixels, np.float32))
+        inverse = np.ones(pixels, np.float32)
         for iteration in range(1, 5):
-            frame = TrainingFrame(camera, 0.3 * iteration % 1, target, pixels, pixels)
+            frame = TrainingFrame(camera, 0.3 * iteration % 1, partial(Target, rgb, weight, inverse), pixels, pixels)
             loss = LossSettings(normalised_depth=bool(iteration % 2))
             model.step([frame], loss, StepRates(*[1e-3] * 13), iteration, min(degree, iteration - 1))
             model.take(np.arange(model.count)[::-1].copy(), np.zeros(model.count, np.bool_))

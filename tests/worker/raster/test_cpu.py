@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -103,7 +104,7 @@ class RawFrame:
     def seen_from(self, camera: Camera, t: float, rasterizer: Rasterizer) -> TrainingFrame:
         """As a step takes it."""
         counts = int(self.tissue.sum()), int((self.tissue & (self.depth > 0)).sum())
-        return TrainingFrame(camera_vector(camera), t, self.target(rasterizer), *counts)
+        return TrainingFrame(camera_vector(camera), t, partial(self.target, rasterizer), *counts)
 
     def loss(self, scene: SplatScene, settings: LossSettings) -> Tensor:
         """worker.model.loss on the reference's render."""

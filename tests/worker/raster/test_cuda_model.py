@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import pytest
@@ -89,8 +90,9 @@ def frames(count: int = 3, width: int = WIDTH, *, glossy: bool = False) -> list[
         camera = CAMERA.copy()
         camera[[WIDTH_PLACE, SIDE]] = width, (0.5 - k % 2) * glossy
         camera[POSE + 3] += 0.1 * k
-        target = Target(rgb.ravel(), weight.ravel(), inverse.ravel())
-        made.append(TrainingFrame(camera, 0.3 + 0.4 * k / count, target, int(tissue.sum()), int(measured.sum())))
+        target = rgb.ravel(), weight.ravel(), inverse.ravel()
+        counts = int(tissue.sum()), int(measured.sum())
+        made.append(TrainingFrame(camera, 0.3 + 0.4 * k / count, partial(Target, *target), *counts))
     return made
 
 

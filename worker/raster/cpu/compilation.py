@@ -66,5 +66,5 @@ def _step(model: CpuModel, camera: np.ndarray, sh_degree: int) -> None:
     pixels = _HEIGHT * padded(_WIDTH)
     weight, inverse_depth = np.full(pixels, 255, np.uint8), np.full(pixels, 1 / 60, np.float32)
     target = Target(np.zeros(3 * pixels, np.uint8), weight, inverse_depth)
-    frame = TrainingFrame(camera, 0.5, target, pixels, pixels)
+    frame = TrainingFrame(camera, 0.5, lambda: target, pixels, pixels)
     model.step([frame], LossSettings(), _RATES, 1, sh_degree)

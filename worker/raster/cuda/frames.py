@@ -52,9 +52,10 @@ class FrameStore:
                 for each in (self.rgb, self.weight, self.inverse_depth)
             )
         row = self._rows[frame] = len(self._rows)
-        self.rgb[row] = self._cropped(torch.from_numpy(frame.target.rgb).view(3, height, -1))
-        self.weight[row] = self._cropped(torch.from_numpy(frame.target.weight).view(height, -1))
-        self.inverse_depth[row] = self._cropped(torch.from_numpy(frame.target.inverse_depth).view(height, -1))
+        target = frame.target
+        self.rgb[row] = self._cropped(torch.from_numpy(target.rgb).view(3, height, -1))
+        self.weight[row] = self._cropped(torch.from_numpy(target.weight).view(height, -1))
+        self.inverse_depth[row] = self._cropped(torch.from_numpy(target.inverse_depth).view(height, -1))
         return row
 
     def _cropped(self, padded: Tensor) -> Tensor:
