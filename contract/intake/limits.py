@@ -18,10 +18,9 @@ if TYPE_CHECKING:
 MIN_SIDE_PX = 16  # stereo matching and the rasteriser's tiles need as much
 
 HELD_BYTES_PER_PIXEL = 18
-"""Memory of a pixel of one eye in every frame while a clip is reconstructed.
+"""Memory of a pixel of both eyes in every frame while a clip is reconstructed; one eye alone takes half.
 
-9 in the DepthClip (rgb 3, depth_mm 4, depth_confidence 1, tissue 1), 8 in the training frames made from it (rgb 3,
-weight 1, inverse depth 4), and 1 for their padding; before these exist, masks and the grey right eye take less.
+9 of each eye in the DepthClip: rgb 3, depth_mm 4, depth_confidence 1, tissue 1. Training frames are views of it.
 """
 
 MAX_MEMORY_BYTES = 8 * 1024**3  # of a clip, on any machine: more frames would train for too long

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import json
-
 from functools import partial
 
 import numpy as np
