@@ -48,6 +48,8 @@ WARN_OUTSIDE_SHARE = 0.1
 WARN_SURE_SHARE = 0.5
 SURE, MIN_SURE_SHARE = 128, 0.005
 """Of confidence's 255, and the share of tissue that must have as much: unrelated images have 0.0003 by chance."""
+BESIDE_PX = 6
+"""Tissue this near to an instrument gets no depth: matching windows reach over the edge and find the instrument."""
 
 
 def estimate_depth(
@@ -88,6 +90,11 @@ def estimate_depth(
         else:
             depth_mm, confidence = _match_all(clip, rgb, right_rgb, plan, pool, hooks)
         right = _right_eye(clip, rgb, right_rgb, depth_mm, confidence, plan)
+    for tissue, depths_mm, trust in (
+        (clip.tissue, depth_mm, confidence),
+        (right.tissue, right.depth_mm, right.depth_confidence),
+    ):
+        _drop_beside_instruments(tissue, depths_mm, trust)
     valid_share, sure_share = (_share_of_tissue(confidence, clip.tissue, least) for least in (1, SURE))
     _check_depth(sure_share)
     return DepthClip(
@@ -257,6 +264,17 @@ def _to_depth(
     valid &= (beyond_infinity_px >= focal_baseline / farthest_mm) & (beyond_infinity_px <= focal_baseline / nearest_mm)
     depth_mm = np.where(valid, focal_baseline / np.where(valid, beyond_infinity_px, 1.0), 0.0)
     return depth_mm.astype(np.float32), np.where(valid, confidence, 0).astype(np.uint8)
+
+
+def _drop_beside_instruments(
+    tissue: NDArray[np.bool_], depth_mm: NDArray[np.float32], confidence: NDArray[np.uint8]
+) -> None:
+    """Set depth and confidence [T, H, W] of the tissue within BESIDE_PX of what is not tissue to 0, in place."""
+    side = 2 * BESIDE_PX + 1
+    for i, shown in enumerate(tissue):
+        if not shown.all():
+            beside = shown & (cv2.dilate((~shown).astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+            depth_mm[i][beside], confidence[i][beside] = 0, 0
 
 
 def _share_of_tissue(confidence: NDArray[np.uint8], tissue: NDArray[np.bool_], least: int) -> float:
