@@ -17,6 +17,7 @@ from contract.wire.job import JobState
 from contract.wire.pose import parse_pose
 from contract.wire.rendering import (
     MEDIA_TYPES,
+    Highlights,
     ImageFormat,
     IntrinsicsOverride,
     Layer,
@@ -84,6 +85,11 @@ class RenderQuery(BaseModel):
         default=Unseen.MARK,
         description="what to show where no training frame saw anything: mark, a hatch, alpha 0 in png and webp, depth "
         "and confidence 0; guess, what the model draws there",
+    )
+    highlights: Highlights = Field(
+        default=Highlights.ON,
+        description="of layer rgb; off: without the highlights that both eyes of a stereo clip told apart; a scene of "
+        "one eye knows none and is shown as it is",
     )
 
 
@@ -187,6 +193,7 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
         format=query.format,
         quality=query.quality,
         unseen=query.unseen,
+        highlights=query.highlights,
         max_pixels=settings.max_render_pixels,
     )
 

@@ -24,6 +24,7 @@ const viewer = new Viewer({
   timeValue: get("time-value"),
   layer: get("layer"),
   guess: get("guess"),
+  highlights: get("highlights"),
   home: get("home"),
   play: get("play"),
 });

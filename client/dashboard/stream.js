@@ -5,7 +5,8 @@ import { connectionLost, Problem } from "./problem.js";
 
 /**
  * What is asked for; the query of GET /render.
- * @typedef {{scene: string, t: number, pose?: string, layer: string, unseen: string, format: string}} View
+ * @typedef {{scene: string, t: number, pose?: string, layer: string, unseen: string, highlights: string,
+ *   format: string}} View
  */
 /**
  * What came. isExtrapolated: it shows a guess, or a pose or time far from the clip's (set by Pictures.ask).

@@ -70,9 +70,11 @@ export class Viewer {
   async #showOnce(scene, visit) {
     const began = (this.askedAt = performance.now());
     const guesses = this.parts.guess.checked ? ", guesses shown" : "";
-    const name = `${this.parts.layer.selectedOptions[0].text}, ${this.orbit.words}${guesses}`;
+    const view = this.#view(scene);
+    const highlights = view.highlights === "off" ? ", without highlights" : "";
+    const name = `${this.parts.layer.selectedOptions[0].text}, ${this.orbit.words}${guesses}${highlights}`;
     try {
-      const picture = await this.pictures.ask(this.#view(scene));
+      const picture = await this.pictures.ask(view);
       const bitmap = await createImageBitmap(picture.blob);
       if (visit !== this.visit) return; // another was opened meanwhile: never its neighbour's picture
       this.screen.show(picture, bitmap, `${name}, t ${picture.t.toFixed(3)}`);
@@ -86,11 +88,13 @@ export class Viewer {
   }
 
   #view(scene) {
+    const { checked, disabled } = this.parts.highlights;
     const view = {
       scene,
       t: Number(this.timeline.t.toFixed(4)),
       layer: this.parts.layer.value,
       unseen: this.parts.guess.checked ? "guess" : "mark",
+      highlights: checked || disabled ? "on" : "off",
       format: "jpeg",
     };
     if (this.orbit.pose) view.pose = this.orbit.pose;
@@ -111,7 +115,7 @@ export class Viewer {
   }
 
   #listen() {
-    const { stage, layer, guess, home } = this.parts;
+    const { stage, layer, guess, highlights, home } = this.parts;
     const change = (work) => (...given) => {
       if (!this.scene) return;
       work(...given);
@@ -124,8 +128,8 @@ export class Viewer {
       home: goHome,
       play: () => this.timeline.play(!this.timeline.isPlaying),
     });
-    layer.addEventListener("change", () => this.refresh());
-    guess.addEventListener("change", () => this.refresh());
+    layer.addEventListener("change", () => (highlights.disabled = layer.value !== "rgb"));
+    for (const choice of [layer, guess, highlights]) choice.addEventListener("change", () => this.refresh());
     home.addEventListener("click", goHome);
   }
 }

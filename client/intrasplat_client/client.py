@@ -117,6 +117,7 @@ class Client:
         format: str = "png",
         quality: int | None = None,
         unseen: str | None = None,
+        highlights: str | None = None,
         known: Image | None = None,
         **camera: float,
     ) -> Image:
@@ -130,6 +131,7 @@ class Client:
                 format=format,
                 quality=quality,
                 unseen=unseen,
+                highlights=highlights,
                 known=known,
                 **camera,
             )
@@ -143,16 +145,21 @@ class Client:
         pose: str | None = None,
         layer: str = "rgb",
         unseen: str | None = None,
+        highlights: str | None = None,
         **camera: float,
     ) -> NDArray[Any]:
         """One view's exact values: uint8 [H, W, 3] of rgb, float32 [H, W] of depth (mm, 0 invalid) and confidence.
 
-        unseen as render has it: marked, rgb shows the hatch, and depth and confidence are 0.
+        unseen as render has it: marked, rgb shows the hatch, and depth and confidence are 0. highlights: as there.
 
         Raises:
             ImportError: numpy is not installed.
         """
-        return run(self._core.render_array(t, scene=scene, pose=pose, layer=layer, unseen=unseen, **camera))
+        return run(
+            self._core.render_array(
+                t, scene=scene, pose=pose, layer=layer, unseen=unseen, highlights=highlights, **camera
+            )
+        )
 
     def stream(self, scene: str) -> Viewer:
         """A connection for many views: `with client.stream(scene) as viewer: viewer.render(t, pose)`."""

@@ -100,6 +100,7 @@ class Core:
         format: str = "png",
         quality: int | None = None,
         unseen: str | None = None,
+        highlights: str | None = None,
         known: Image | None = None,
         **camera: float,
     ) -> Image:
@@ -111,10 +112,12 @@ class Core:
         layer: rgb, depth or confidence. format: png, jpeg, webp or npy. quality: of jpeg and webp, 1 to 100.
         unseen: mark (the default) hatches what no training frame saw, and makes it transparent in png and webp; guess
             shows what the model draws there.
+        highlights: off shows rgb without the highlights that both eyes of a stereo clip told apart; a scene of one eye
+            knows none and is shown as it is. on is the default.
         known: an earlier view; it is returned if it is still what the service would send.
         camera: width, height, fx, fy, cx, cy in pixels.
         """
-        query = view_query(t, scene, pose, layer, format, quality, unseen, camera)
+        query = view_query(t, scene, pose, layer, format, quality, unseen, highlights, camera)
         return await views.render(self._session, query, known)
 
     async def render_array(
@@ -125,16 +128,17 @@ class Core:
         pose: str | None = None,
         layer: str = "rgb",
         unseen: str | None = None,
+        highlights: str | None = None,
         **camera: float,
     ) -> NDArray[Any]:
         """One view's exact values: uint8 [H, W, 3] of rgb, float32 [H, W] of depth (mm, 0 invalid) and confidence.
 
-        unseen as render has it: marked, rgb shows the hatch, and depth and confidence are 0.
+        unseen as render has it: marked, rgb shows the hatch, and depth and confidence are 0. highlights: as there.
 
         Raises:
             ImportError: numpy is not installed.
         """
-        query = view_query(t, scene, pose, layer, "npy", None, unseen, camera)
+        query = view_query(t, scene, pose, layer, "npy", None, unseen, highlights, camera)
         return (await views.render(self._session, query, None)).array()
 
     async def scenes(self, limit: int | None = None) -> list[dict[str, Any]]:

@@ -105,6 +105,7 @@ class NoticeCode(StrEnum):
     TIME_TOO_SHORT = "time_too_short"
     TRAINING_SCORE_LOW = "training_score_low"
     HARDLY_SEEN = "hardly_seen"
+    HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"
     TIME_OUTSIDE_CLIP = "time_outside_clip"
     TRAINING_GOES_ON = "training_goes_on"

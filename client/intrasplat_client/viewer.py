@@ -41,11 +41,12 @@ class StreamMessages:
         format: str,
         quality: int | None,
         unseen: str | None,
+        highlights: str | None,
         camera: dict[str, float],
     ) -> str:
         """The message that asks for a view."""
         self._last_id += 1
-        query = view_query(t, self._scene, pose, layer, format, quality, unseen, camera)
+        query = view_query(t, self._scene, pose, layer, format, quality, unseen, highlights, camera)
         return json.dumps({"id": self._last_id, **query})
 
     def answer(self, message: str | bytes) -> Image | None:
@@ -96,11 +97,12 @@ class Viewer:
         format: str = "jpeg",
         quality: int | None = None,
         unseen: str | None = None,
+        highlights: str | None = None,
         **camera: float,
     ) -> Image:
         """One view; arguments as Client.render has them."""
         try:
-            self._socket.send(self._messages.request(t, pose, layer, format, quality, unseen, camera))
+            self._socket.send(self._messages.request(t, pose, layer, format, quality, unseen, highlights, camera))
             while True:
                 image = self._messages.answer(self._socket.recv(ANSWER_TIMEOUT_S))
                 if image is not None:
@@ -137,13 +139,14 @@ class AsyncViewer:
         format: str = "jpeg",
         quality: int | None = None,
         unseen: str | None = None,
+        highlights: str | None = None,
         **camera: float,
     ) -> Image:
         """One view; arguments as Client.render has them."""
         import asyncio
 
         try:
-            await self._socket.send(self._messages.request(t, pose, layer, format, quality, unseen, camera))
+            await self._socket.send(self._messages.request(t, pose, layer, format, quality, unseen, highlights, camera))
             async with asyncio.timeout(ANSWER_TIMEOUT_S):
                 while True:
                     image = self._messages.answer(await self._socket.recv())

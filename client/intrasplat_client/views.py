@@ -67,11 +67,13 @@ def view_query(
     format: str,
     quality: int | None,
     unseen: str | None,
+    highlights: str | None,
     camera: Mapping[str, float],
 ) -> dict[str, Any]:
     """The parameters of a view, as GET /render and the messages of the stream have them."""
     values = {"t": t, "scene": scene, "pose": pose, "layer": layer, "format": format, "quality": quality}
-    return {name: value for name, value in (values | {"unseen": unseen} | camera).items() if value is not None}
+    shown = {"unseen": unseen, "highlights": highlights}
+    return {name: value for name, value in (values | shown | camera).items() if value is not None}
 
 
 async def render(session: Session, query: Mapping[str, Any], known: Image | None) -> Image:

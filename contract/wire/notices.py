@@ -83,6 +83,7 @@ class NoticeCode(StrEnum):
     TRAINING_SCORE_LOW = "training_score_low"
     # what to know of one render
     HARDLY_SEEN = "hardly_seen"
+    HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"
     TIME_OUTSIDE_CLIP = "time_outside_clip"
     TRAINING_GOES_ON = "training_goes_on"

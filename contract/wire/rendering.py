@@ -41,6 +41,17 @@ class Unseen(StrEnum):
     GUESS = "guess"
 
 
+class Highlights(StrEnum):
+    """Whether a render's colours show the highlights that both eyes of a stereo clip told apart."""
+
+    ON = "on"
+    OFF = "off"
+
+    def shown_in(self, layer: Layer) -> bool:
+        """Whether the render behind a layer has them; only colours can do without."""
+        return self is Highlights.ON or layer is not Layer.RGB
+
+
 MEDIA_TYPES = {
     ImageFormat.PNG: "image/png",
     ImageFormat.JPEG: "image/jpeg",
@@ -88,6 +99,7 @@ class RenderRequest(BaseModel):
     quality: int = Field(default=90, ge=1, le=100)
     """The quality of a jpeg or webp image."""
     unseen: Unseen = Unseen.MARK
+    highlights: Highlights = Highlights.ON
     max_pixels: int = Field(default=4096 * 2160, gt=0)
 
 

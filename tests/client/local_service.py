@@ -22,7 +22,7 @@ from contract.runtime.settings import Settings
 from contract.store.store import Store
 from contract.wire.job import JobError
 from contract.wire.names import CURVE, MANIFEST, REPORT
-from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, Unseen, WorkerAddress
+from contract.wire.rendering import MEDIA_TYPES, ExportRequest, Highlights, RenderRequest, Unseen, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
@@ -34,11 +34,15 @@ SNAPSHOT_ITERATION = 7
 
 
 def paint(request: RenderRequest | ExportRequest) -> Reply:
-    """A 4 x 6 depth map that holds t everywhere; a quarter of it is unseen, unless guesses are asked for."""
+    """A 4 x 6 depth map that holds t everywhere, -t without highlights.
+
+    A quarter of it is unseen, unless guesses are asked for.
+    """
     if isinstance(request, ExportRequest):
         return Reply(b"ply\n", "application/octet-stream", request.t)
     buffer = io.BytesIO()
-    np.save(buffer, np.full((4, 6), request.t, np.float32))
+    shown = request.t if request.highlights is Highlights.ON else -request.t
+    np.save(buffer, np.full((4, 6), shown, np.float32))
     iteration = SNAPSHOT_ITERATION if request.attempt is None else None
     unseen, warnings = 0.25 if request.unseen is Unseen.MARK else 0.0, (a_warning("seen from afar"),)
     return Reply(buffer.getvalue(), MEDIA_TYPES[request.format], request.t, warnings, iteration, unseen)

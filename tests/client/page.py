@@ -33,7 +33,7 @@ from contract.wire.job import JobFiles, JobProgress, JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import OrbitPose
-from contract.wire.rendering import MEDIA_TYPES, ExportRequest, RenderRequest, Unseen, WorkerAddress
+from contract.wire.rendering import MEDIA_TYPES, ExportRequest, Highlights, RenderRequest, Unseen, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
@@ -48,6 +48,7 @@ SNAPSHOT_ITERATION = 40
 FAR_DEG = 25.0
 FAR_OUT_ZOOM = 0.9
 UNSEEN = "No frame saw 12% of this view."
+HIGHLIGHTS_STAY = "This scene was taught by one eye."
 FAR = "This pose is far from the endoscope's: most of it is a guess."
 REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
     update={
@@ -79,18 +80,21 @@ class Painter:
     def __init__(self) -> None:
         self.pause_s = 0.0
         self.shown_unseen: Unseen | None = None
+        self.shown_highlights: Highlights | None = None
 
     def answer(self, request: RenderRequest | ExportRequest) -> Reply:
         if isinstance(request, ExportRequest):
             return Reply(b"ply\n", "application/octet-stream", request.t)
         time.sleep(self.pause_s)
-        self.shown_unseen = request.unseen
+        self.shown_unseen, self.shown_highlights = request.unseen, request.highlights
         picture = np.full((48, 60, 3), grey_of(request.scene_id), np.uint8)
         warnings = []
         if isinstance(request.pose, OrbitPose) and abs(request.pose.yaw_deg) > FAR_DEG:
             warnings.append(a_warning(FAR, NoticeCode.POSE_FAR))
         if isinstance(request.pose, OrbitPose) and request.pose.zoom < FAR_OUT_ZOOM:
             warnings.append(a_warning(UNSEEN, NoticeCode.UNSEEN))
+        if request.highlights is Highlights.OFF:
+            warnings.append(Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
         image = cv2.imencode(f".{request.format.value}", picture)[1].tobytes()
         iteration = SNAPSHOT_ITERATION if request.attempt is None else None
         return Reply(

@@ -59,6 +59,7 @@ def test_many_views_come_over_one_connection(service: LocalService, clip: Path) 
                     assert (await viewer.render(t, format="npy")).array()[0, 0] == t
                 assert (await viewer.render(unseen="mark")).unseen == 0.25
                 assert (await viewer.render(unseen="guess")).unseen == 0.0
+                assert (await viewer.render(1.0, format="npy", highlights="off")).array()[0, 0] == -1.0
                 with pytest.raises(RequestRefused, match="yaw"):
                     await viewer.render(pose="orbit:999,0,1")
         async with AsyncClient(service.url, api_key="isp_wrong") as client:

@@ -70,6 +70,17 @@ def test_a_render_comes_as_a_file_as_an_array_or_as_what_is_known(
         client.render(t=0.5, scene=job.id).array()
 
 
+def test_highlights_can_be_left_out(service: LocalService, client: Client, clip: Path) -> None:
+    job = client.reconstruct(clip)
+    service.finish()
+    with client.stream(job.id) as viewer:
+        for highlights, expected in ((None, 0.5), ("on", 0.5), ("off", -0.5)):
+            image = client.render(t=0.5, scene=job.id, format="npy", highlights=highlights)
+            streamed = viewer.render(0.5, format="npy", highlights=highlights)
+            array = client.render_array(t=0.5, scene=job.id, highlights=highlights)
+            assert [each[0, 0] for each in (image.array(), streamed.array(), array)] == [expected] * 3
+
+
 def test_a_job_that_trains_shows_its_newest_snapshot_and_one_that_waits_is_a_conflict(
     service: LocalService, client: Client, clip: Path
 ) -> None:

@@ -12,9 +12,9 @@ from selenium.webdriver.common.keys import Keys
 
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobError, JobState
-from contract.wire.rendering import Unseen
+from contract.wire.rendering import Highlights, Unseen
 from tests.client.local_service import CLIP
-from tests.client.page import FAR, UNSEEN, Page, Site, browser, grey_of, site_at
+from tests.client.page import FAR, HIGHLIGHTS_STAY, UNSEEN, Page, Site, browser, grey_of, site_at
 
 
 @pytest.fixture(scope="module")
@@ -158,6 +158,22 @@ def test_what_was_never_seen_is_hatched_or_guessed_and_the_badge_knows(site: Sit
     assert "guesses shown" in page.view
     page.click("#guess")
     page.until_state("live")
+
+
+def test_colours_are_shown_without_highlights_and_that_is_no_guess(site: Site, page: Page) -> None:
+    page.press(site.scene(), "View")
+    page.until_state("live")
+    assert site.painter.shown_highlights is Highlights.ON
+    page.click("#highlights")
+    page.until_text("#readout", "without highlights")
+    assert (site.painter.shown_highlights, page.state) == (Highlights.OFF, "live")
+    assert page.text("#picture-warning") == HIGHLIGHTS_STAY
+    page.script(
+        "const layer = document.querySelector('#layer'); layer.value = 'depth';layer.dispatchEvent(new Event('change'))"
+    )
+    page.until_text("#readout", "depth")
+    assert site.painter.shown_highlights is Highlights.ON
+    assert not page.find("#highlights").is_enabled()
 
 
 def test_a_picture_is_stale_while_the_service_is_away_and_live_when_it_is_back(site: Site, page: Page) -> None:

@@ -141,6 +141,15 @@ def test_a_page_from_elsewhere_may_read_what_a_render_says_of_itself(tmp_path: P
         assert {each for each in headers if each.startswith("x-intrasplat-")} <= exposed
 
 
+def test_the_caller_chooses_whether_highlights_are_shown(service: ServiceUnderTest) -> None:
+    query = {"scene": service.finished_scene()}
+    answers = [service.http.get("/render", params=query | each) for each in ({}, {"highlights": "off"})]
+    assert answers[0].headers["etag"] != answers[1].headers["etag"]
+    asked = [each.highlights for each in service.painter.requests if isinstance(each, RenderRequest)]
+    assert asked == ["on", "off"]
+    assert_problem(service.http.get("/render", params=query | {"highlights": "some"}), 422, "highlights")
+
+
 def test_an_answer_says_how_long_it_took(service: ServiceUnderTest) -> None:
     timing = service.http.get("/render", params={"scene": service.finished_scene()}).headers["server-timing"]
     figures = re.fullmatch(r"render;dur=(\d+\.\d), total;dur=(\d+\.\d)", timing)

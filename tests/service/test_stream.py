@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
-from contract.wire.rendering import ExportRequest, RenderRequest, Unseen
+from contract.wire.rendering import ExportRequest, Highlights, RenderRequest, Unseen
 from tests.reports import a_warning
 from tests.service.live import LiveService, live_service
 from worker.daemon.serve import NotYetError, Reply
@@ -29,6 +29,7 @@ class Painter:
 
     def __init__(self) -> None:
         self.asked: list[float] = []
+        self.highlights: list[Highlights] = []
         self.go_on = threading.Event()
         self.go_on.set()
         self.began = threading.Event()
@@ -42,6 +43,8 @@ class Painter:
             raise NotYetError("Nothing to show yet.")
         if request.t == 600:
             raise RuntimeError("patient Smith")
+        if isinstance(request, RenderRequest):
+            self.highlights.append(request.highlights)
         iteration = 7 if request.attempt is None else None
         unseen = 0.0 if isinstance(request, ExportRequest) or request.unseen is Unseen.GUESS else 0.12345
         return Reply(b"\xff" * self.bytes, "image/jpeg", request.t, (LOOK_OUT,), iteration, unseen)
@@ -110,6 +113,17 @@ def test_one_connection_shows_a_finished_scene_and_a_running_job(service: LiveSe
         ask(viewer, scene=job_id, id=2)
         head, _ = view(viewer)
         assert (head["id"], head["scene"], head["state"], head["iteration"]) == (2, job_id, "running", 7)
+
+
+def test_a_stream_asks_for_views_with_and_without_highlights(service: LiveService, painter: Painter) -> None:
+    scene = service.finished_scene()
+    with viewing(service) as viewer:
+        for highlights in ("off", "on"):
+            ask(viewer, scene=scene, highlights=highlights)
+            view(viewer)
+        ask(viewer, scene=scene)
+        view(viewer)
+    assert painter.highlights == [Highlights.OFF, Highlights.ON, Highlights.ON]
 
 
 def test_while_one_view_is_made_only_the_newest_request_waits(service: LiveService, painter: Painter) -> None:

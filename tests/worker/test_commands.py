@@ -42,6 +42,16 @@ def scene(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.fixture(scope="module")
+def scene_of_two_eyes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("two-eyes")
+    size = ["--frames", "10", "--width", "128", "--height", "96"]
+    assert main(["phantom", "--format", "stereomis", *size, "--out", str(folder / "clip")]) == ExitCode.OK
+    train = ["--eyes", "both", "--iterations", "10", "--out", str(folder / "scene")]
+    assert main(["reconstruct", str(folder / "clip"), *train]) == ExitCode.OK
+    return folder / "scene"
+
+
 def test_reconstruct_writes_a_scene_with_its_report_and_curve(scene: Path) -> None:
     assert {"manifest.json", "scene.safetensors", "report.json", "curve.csv"} <= {path.name for path in scene.iterdir()}
     assert json.loads((scene / "report.json").read_text())["iterations"] == 10
@@ -86,6 +96,22 @@ def test_render_writes_any_layer_from_any_pose(scene: Path, tmp_path: Path) -> N
     view = ["--t", "0.4", "--pose", "orbit:5,0,1", "--width", "48", "--layer", "depth", "--out", str(out)]
     assert main(["render", str(scene), *view]) == ExitCode.OK
     assert np.load(out).shape == (HEIGHT // 2, WIDTH // 2)
+
+
+def test_render_leaves_out_highlights_that_two_eyes_told_apart(
+    scene: Path, scene_of_two_eyes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def rendered(folder: Path, highlights: str) -> np.ndarray:
+        view = ["--t", "0", "--highlights", highlights, "--out", str(tmp_path / "view.npy")]
+        assert main(["render", str(folder), *view]) == ExitCode.OK
+        return np.load(tmp_path / "view.npy").astype(int)
+
+    on, off = (rendered(scene_of_two_eyes, highlights) for highlights in ("on", "off"))
+    assert (off <= on).all()
+    assert (off < on).any()
+    assert "highlights" not in capsys.readouterr().err
+    np.testing.assert_array_equal(rendered(scene, "on"), rendered(scene, "off"))
+    assert "info: This scene was taught by one eye" in capsys.readouterr().err
 
 
 def test_render_marks_what_was_not_seen_or_guesses(scene: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from contract.runtime.arguments import finite
 from contract.runtime.exits import ExitCode
 from contract.wire.errors import InputError
 from contract.wire.names import MANIFEST
-from contract.wire.rendering import ImageFormat, IntrinsicsOverride, Layer, Unseen
+from contract.wire.rendering import Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 from worker.commands.device import add_device
 
 SUFFIX_FORMATS = {
@@ -54,6 +54,13 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "and confidence 0; guess, what the model draws there (default: mark)",
     )
     parser.add_argument(
+        "--highlights",
+        choices=[each.value for each in Highlights],
+        default=Highlights.ON.value,
+        help="off: colours without the highlights that both eyes of a stereo clip told apart; a scene of one eye knows "
+        "none and is shown as it is (default: on)",
+    )
+    parser.add_argument(
         "--out", type=Path, required=True, metavar="PATH", help="a .png, .jpg or .npy file; with --frames a folder"
     )
     add_device(parser, "cpu")  # a GPU needs longer to begin than the CPU for a few images
@@ -87,6 +94,8 @@ def run_cli(options: argparse.Namespace) -> int:
     if not (options.scene / MANIFEST).is_file():
         raise InputError("SCENE", f"{options.scene} holds no scene.", "Name a folder that `reconstruct --out` wrote.")
     scene = load_scene(options.scene)
+    layer = Layer(options.layer)
+    highlights = Highlights(options.highlights).shown_in(layer)
     wanted = _camera(options)
     camera = camera_of(scene.intrinsics, wanted, MAX_RENDER_PIXELS)
     pose = pose_of(scene, None if options.pose is None else parse_pose(options.pose))
@@ -94,9 +103,9 @@ def run_cli(options: argparse.Namespace) -> int:
         image_format = SUFFIX_FORMATS.get(path.suffix.lower())
         if image_format is None:
             raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
-        frame = render_frame(scene, t, pose, camera, device)
+        frame = render_frame(scene, t, pose, camera, device, highlights=highlights)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encode_layer(frame, Layer(options.layer), image_format, unseen=Unseen(options.unseen)))
+        path.write_bytes(encode_layer(frame, layer, image_format, unseen=Unseen(options.unseen)))
         print(path)
         for notice in frame.warnings:
             print(f"{notice.severity}: {notice.text}", file=sys.stderr)

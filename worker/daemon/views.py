@@ -111,7 +111,8 @@ class Views:
 def _render(scene: Scene, request: RenderRequest, device: Device, iteration: int | None = None) -> Reply:
     """One render; iteration: of a snapshot, None for a finished scene."""
     intrinsics = camera_of(scene.intrinsics, request.camera, request.max_pixels)
-    frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics, device)
+    highlights = request.highlights.shown_in(request.layer)
+    frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics, device, highlights=highlights)
     body = encode_layer(frame, request.layer, request.format, request.quality, request.unseen)
     warnings = frame.warnings
     if iteration is not None:

@@ -33,6 +33,7 @@ LOW_TRUST, MAX_LOW_SHARE = 0.1, 0.1
 HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
 MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""
+HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not known apart: they stay."
 ROUNDING = 1e-6
 """Model time by which t may exceed the last frame's without a warning: a decimal fraction may round i / T."""
 
@@ -44,7 +45,7 @@ class Frame:
     rgb        [H, W, 3] uint8
     depth_mm   [H, W] float32, camera z, 0 where nothing solid is
     unseen     [H, W] bool: no training frame saw what is shown here; the other layers hold the model's guess
-    warnings   what to distrust about this frame
+    warnings   what to distrust about this frame, and what to know of it
     """
 
     rgb: NDArray[np.uint8]
@@ -128,6 +129,8 @@ def render_frame(
     in_clip = 0.0 <= t <= last + ROUNDING
     warnings = () if in_clip else (_warning_of_time(t, shown),)
     warnings = (*warnings, *_warnings_of_pose(_distance_from_trained(scene, pose), trust, unseen))
+    if not highlights and scene.right_eye_mm is None:
+        warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
     depth_mm = solid_depth_mm(image[3], alpha, scene.units_per_mm)
     own_view = partial(_endoscope_rgb, scene, shown, device, highlights)
     layer = partial(_confidence, scene, endoscope_pose(scene, shown), camera, (image[:3], depth_mm, trust), own_view)

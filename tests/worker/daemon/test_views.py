@@ -16,7 +16,15 @@ from contract.store.store import Store
 from contract.wire.errors import LimitError, SceneError
 from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose
-from contract.wire.rendering import ExportRequest, ImageFormat, IntrinsicsOverride, Layer, RenderRequest, Unseen
+from contract.wire.rendering import (
+    ExportRequest,
+    Highlights,
+    ImageFormat,
+    IntrinsicsOverride,
+    Layer,
+    RenderRequest,
+    Unseen,
+)
 from worker.daemon.serve import NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import COPIES, Views, camera_of, pose_of, shown_time
@@ -69,10 +77,16 @@ def scene_id(store: Store) -> str:
     return job_id
 
 
-def publish(store: Store, job_id: str, attempt: int = 1, *, dimmed: float = 0.0) -> Scene:
-    """A stored scene; its colours are dimmed by so much, so that attempts can be told apart."""
+def publish(store: Store, job_id: str, attempt: int = 1, *, dimmed: float = 0.0, gloss: float = 0.0) -> Scene:
+    """A stored scene; its colours are dimmed by so much, so that attempts can be told apart.
+
+    gloss: of every Gaussian; unless it is 0 both eyes taught.
+    """
     made = scene()
     made.gaussians.sh.sub_(dimmed)
+    if gloss:
+        made.gaussians.gloss.add_(gloss)
+        made = dataclasses.replace(made, right_eye_mm=(4.0, 0.0, 0.0))
     save_scene(store.work_folder(job_id, attempt), made)
     store.publish_scene(job_id, attempt)
     return made
@@ -106,6 +120,27 @@ def test_a_render_marks_what_no_frame_saw_unless_it_is_asked_to_guess(store: Sto
     assert NoticeCode.UNSEEN in [each.code for each in marked.warnings]
     differs = (np.load(io.BytesIO(marked.body)) != np.load(io.BytesIO(guessed.body))).any(-1)
     assert 0.9 * marked.unseen < differs.mean() <= marked.unseen
+
+
+@pytest.mark.parametrize("layer", Layer)
+def test_only_colours_are_shown_without_highlights(store: Store, layer: Layer) -> None:
+    job_id = new_job_id()
+    publish(store, job_id, gloss=-0.2)  # seen by the left eye
+    request = request_of(job_id).model_copy(update={"layer": layer})
+    on, off = (Views(store).answer(request.model_copy(update={"highlights": each})) for each in Highlights)
+    assert on.warnings == off.warnings
+    assert (on.body != off.body) == (layer is Layer.RGB)
+
+
+@pytest.mark.parametrize("layer", Layer)
+def test_highlights_that_are_not_known_apart_stay_and_the_render_says_so(
+    store: Store, scene_id: str, layer: Layer
+) -> None:
+    request = request_of(scene_id).model_copy(update={"layer": layer})
+    on, off = (Views(store).answer(request.model_copy(update={"highlights": each})) for each in Highlights)
+    assert on.body == off.body
+    added = [each.code for each in off.warnings if each not in on.warnings]
+    assert added == [NoticeCode.HIGHLIGHTS_UNKNOWN] * (layer is Layer.RGB)
 
 
 def test_a_deleted_scene_is_not_shown_from_memory(store: Store, scene_id: str) -> None:

@@ -1,0 +1,87 @@
+"""What a view shows of the gloss: each eye its own highlights, far from both the tissue without them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from contract.wire.notices import NoticeCode
+from tests.worker.scenes import random_scene
+from worker.render.camera import FADING, endoscope_pose, gloss_seen
+from worker.render.view import render_frame
+from worker.scene.scene import Scene
+
+RIGHT_EYE_MM = (3.0, 0.0, 4.0)
+BASELINE_MM = 5.0
+T = 0.5
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Each Gaussian is solid, and one eye saw it brighter, some the left eye, some the right one."""
+    made = random_scene(count=40)
+    turned = made.world_from_camera.copy()
+    turned[:, :3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    gaussians = dataclasses.replace(
+        made.gaussians,
+        opacity_logit=torch.full_like(made.gaussians.opacity_logit, 4.0),
+        gloss=torch.linspace(-0.4, 0.4, 40),
+    )
+    return dataclasses.replace(made, gaussians=gaussians, world_from_camera=turned, right_eye_mm=RIGHT_EYE_MM)
+
+
+def beside(scene: Scene, place: float, away_mm: float = 0.0) -> NDArray[np.float64]:
+    """The endoscope's pose [4, 4], moved along the baseline (1: to the right eye) and away from it."""
+    pose = endoscope_pose(scene, T)
+    pose[:3, 3] += pose[:3, :3] @ (place * np.array(RIGHT_EYE_MM) + [0, away_mm, 0])
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("place", "away_mm", "side", "dim"),
+    [
+        (0.0, 0.0, -0.5, 0.0),
+        (1.0, 0.0, 0.5, 0.0),
+        (0.5, 0.0, 0.0, 0.0),
+        (0.75, 0.0, 0.25, 0.0),
+        (0.0, 1000.0, 0.0, 0.5),
+        (1.0, 1000.0, 0.0, 0.5),
+        (1.0, FADING * BASELINE_MM, np.exp(-0.5) / 2, (1 - np.exp(-0.5)) / 2),
+        (2.0, 0.0, np.exp(-0.5 / FADING**2) / 2, (1 - np.exp(-0.5 / FADING**2)) / 2),
+    ],
+)
+def test_each_eye_sees_its_highlights_and_away_from_both_they_fade(
+    scene: Scene, place: float, away_mm: float, side: float, dim: float
+) -> None:
+    centre_mm = beside(scene, place, away_mm)[:3, 3]
+    assert gloss_seen(scene, T, centre_mm) == pytest.approx((side, dim), abs=1e-12)
+    assert gloss_seen(scene, T, centre_mm, highlights=False) == (0.0, 0.5)
+
+
+def test_a_scene_of_one_eye_has_no_gloss_to_see(scene: Scene) -> None:
+    one_eyed = dataclasses.replace(scene, right_eye_mm=None)
+    for highlights in (True, False):
+        assert gloss_seen(one_eyed, T, np.zeros(3), highlights=highlights) == (0.0, 0.0)
+    on, off = (render_frame(one_eyed, T, highlights=each) for each in (True, False))
+    np.testing.assert_array_equal(on.rgb, off.rgb)
+    assert [each.code for each in off.warnings if each not in on.warnings] == [NoticeCode.HIGHLIGHTS_UNKNOWN]
+
+
+@pytest.mark.parametrize("place", [0.0, 1.0])
+def test_without_highlights_no_pixel_is_brighter_than_an_eye_saw_it(scene: Scene, place: float) -> None:
+    on, off = (render_frame(scene, T, beside(scene, place), highlights=each) for each in (True, False))
+    assert (off.rgb <= on.rgb).all()
+    assert (on.rgb.astype(int) - off.rgb).max() > 5
+    np.testing.assert_array_equal(off.depth_mm, on.depth_mm)
+    assert off.warnings == on.warnings
+
+
+def test_far_from_both_eyes_there_are_no_highlights_left(scene: Scene) -> None:
+    far = beside(scene, 0.5, 6 * BASELINE_MM)
+    on, off = (render_frame(scene, T, far, highlights=each) for each in (True, False))
+    np.testing.assert_array_equal(on.rgb, off.rgb)
