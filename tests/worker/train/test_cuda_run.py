@@ -115,7 +115,7 @@ def test_a_scene_looks_the_same_from_both_devices(
     """Also in another size, and to the confidence layer."""
     run = runs[gpu]
     scene = scene_of(run)
-    assert float(scene.seen.max()) > 0.5
+    assert float(scene.seen.max()) > 0.3
     for size in ((WIDTH, HEIGHT), (15, 10), (WIDTH, HEIGHT)):
         views = [
             render_frame(scene, 0.3, None, scene.intrinsics.resized(*size), device).confidence for device in (CPU, gpu)
