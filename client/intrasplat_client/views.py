@@ -73,7 +73,7 @@ def view_query(
     """The parameters of a view, as GET /render and the messages of the stream have them."""
     values = {"t": t, "scene": scene, "pose": pose, "layer": layer, "format": format, "quality": quality}
     shown = {"unseen": unseen, "highlights": highlights}
-    return {name: value for name, value in (values | shown | camera).items() if value is not None}
+    return {name: value for name, value in {**values, **shown, **camera}.items() if value is not None}
 
 
 async def render(session: Session, query: Mapping[str, Any], known: Image | None) -> Image:
