@@ -89,7 +89,7 @@ def estimate_depth(
             depth_mm, confidence = _match_on_device(clip, rgb, right_rgb, plan, hooks)
         else:
             depth_mm, confidence = _match_all(clip, rgb, right_rgb, plan, pool, hooks)
-        right = _right_eye(clip, rgb, right_rgb, depth_mm, confidence, plan)
+        right = _right_eye(clip, rgb, right_rgb, depth_mm, confidence, plan, measured)
     for tissue, depths_mm, trust in (
         (clip.tissue, depth_mm, confidence),
         (right.tissue, right.depth_mm, right.depth_confidence),
@@ -224,13 +224,17 @@ def _right_eye(
     depth_mm: NDArray[np.float32],
     confidence: NDArray[np.uint8],
     plan: MatchPlan,
+    measured: Sequence[int],
 ) -> Eye:
-    """The right eye with the left one's depth. Its camera lies on the calibrated baseline, lowered by the row shift."""
+    """The right eye with the left one's depth. Its camera lies on the calibrated baseline, lowered by the row shift.
+
+    Labels are found in the measured frames alone.
+    """
     focal_baseline, offset_px = clip.intrinsics.fx * clip.baseline_mm, clip.disparity_offset_px
     there_mm, trust = np.empty_like(depth_mm), np.empty_like(confidence)
     tissue = np.ones(depth_mm.shape, np.bool_) if clip.tissue_right is None else clip.tissue_right
-    middle = clip.frame_count // 2
-    label = painted_over(rgb[middle], right_rgb[middle], np.asarray(~clip.tissue.any(axis=0)))
+    middle, never_tissue = measured[len(measured) // 2], np.asarray(~clip.tissue[measured].any(axis=0))
+    label = painted_over(rgb[middle], right_rgb[middle], never_tissue)
 
     def work(i: int) -> None:
         there_mm[i], trust[i] = moved_depth(depth_mm[i], confidence[i], focal_baseline, offset_px)

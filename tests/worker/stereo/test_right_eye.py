@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cache
+import dataclasses
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -117,3 +118,25 @@ def test_both_eyes_see_a_point_at_their_own_pixels() -> None:
     seen = there_mm > 0
     assert seen.mean() > 0.9
     assert np.median(np.abs(there_mm - z[inside])[seen]) == pytest.approx(0, abs=0.2)
+
+
+def test_frames_that_are_not_measured_do_not_change_the_right_eye_of_others() -> None:
+    """A label is found in the measured frames alone, whatever the held-out ones show."""
+    phantom, _ = drawn()
+    recording = phantom.stereo_recording()
+    clip = rectify(recording.clip, recording.calibration)
+    label = np.s_[:20, 100:140]
+    tissue, pairs = clip.tissue.copy(), [(left.copy(), right.copy()) for left, right in clip.pairs()]
+    tissue[0][label] = False
+    pairs[0][1][label] = pairs[0][0][label]
+    spoilt = [pairs[0], (pairs[1][0], 255 - pairs[1][1])]
+    given = dataclasses.replace(clip, tissue=tissue)
+    one, other = (
+        estimate_depth(dataclasses.replace(given, pairs=partial(iter, each)), measured_frames=[0])
+        for each in (pairs, spoilt)
+    )
+    assert one.right is not None
+    assert other.right is not None
+    assert not one.right.tissue[0][label].any()
+    np.testing.assert_array_equal(one.right.tissue[0], other.right.tissue[0])
+    np.testing.assert_array_equal(one.right.depth_mm[0], other.right.depth_mm[0])
