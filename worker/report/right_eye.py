@@ -18,7 +18,11 @@ from numpy.typing import NDArray
 from contract.wire.errors import TrainingDiverged
 from worker.input.clip import DepthClip
 from worker.model.metrics import Image, clear_of_highlights, psnr_tissue
+from worker.stereo.right_eye import nearest_known
 from worker.train.scoring import FrameRenderer, judged_pixels
+
+FAR_MM = 1e6
+"""Depth at which the eyes see the same."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,8 @@ def warped_left(clip: DepthClip, index: int) -> NDArray[np.uint8]:
     """The left eye's picture [H, W, 3] warped to the right eye by the right eye's depth; gaps take a neighbour's."""
     assert clip.right is not None
     right, left_k = clip.right, clip.intrinsics
-    depth_mm = _filled(right.depth_mm[index])
+    found_mm = nearest_known(right.depth_mm[index], right.depth_mm[index] > 0)
+    depth_mm = np.where(found_mm > 0, found_mm, np.float32(FAR_MM))  # no pixel has any
     baseline_mm = np.linalg.norm(right.world_from_camera[index][:3, 3] - clip.world_from_camera[index][:3, 3])
     height, width = depth_mm.shape
     disparity_px = left_k.fx * float(baseline_mm) / depth_mm + left_k.cx - right.intrinsics.cx
@@ -74,16 +79,3 @@ def warped_left(clip: DepthClip, index: int) -> NDArray[np.uint8]:
 def _scores(image: Image, truth: NDArray[np.uint8], judged: NDArray[np.bool_]) -> tuple[float, float]:
     """psnr_tissue in dB over the judged pixels, and without highlights."""
     return psnr_tissue(image, truth, judged), psnr_tissue(image, truth, judged & clear_of_highlights(image, truth))
-
-
-def _filled(depth_mm: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth [H, W]; where there is none, the nearest pixel's that has one."""
-    known = depth_mm > 0
-    if known.all() or not known.any():
-        return np.where(known, depth_mm, np.float32(1e6))
-    _, label = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    by_label = np.zeros(label.max() + 1, np.float32)
-    by_label[label[known]] = depth_mm[known]
-    return np.asarray(np.where(known, depth_mm, by_label[label]), np.float32)

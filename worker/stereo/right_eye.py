@@ -59,7 +59,9 @@ def moved_tissue(tissue: Mask, depth_mm: Image, focal_baseline: float, offset_px
     if not tool.any():
         return np.ones_like(tissue)
     width = tissue.shape[1]
-    disparity = _nearest_known(np.where(depth_mm > 0, focal_baseline / np.maximum(depth_mm, 1e-6) + offset_px, 0), tool)
+    found = depth_mm > 0
+    disparity = np.where(found, focal_baseline / np.where(found, depth_mm, 1) + offset_px, 0).astype(np.float32)
+    disparity = nearest_known(disparity, found & tool)
     moved = np.zeros(tissue.shape, np.uint8)
     _write_moved(moved, disparity, tool, tool.astype(np.uint8))
     for row in np.flatnonzero(tool[:, -2:].any(axis=1)):
@@ -88,17 +90,16 @@ def _write_moved(target: NDArray[np.generic], disparity: Image, chosen: Mask, va
     target[rows[inside], there[inside]] = values[rows[inside], columns[inside]]
 
 
-def _nearest_known(disparity: NDArray[np.floating], tool: Mask) -> Image:
-    """Disparity [H, W] in px; where it is 0, that of the nearest pixel of the instrument that has one."""
-    known = (disparity > 0) & tool
+def nearest_known(values: Image, known: Mask) -> Image:
+    """values [H, W], where not known those of the nearest pixel that is; as they are if none is."""
     if not known.any():
-        return disparity.astype(np.float32)
+        return values
     _, label = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
     )
     by_label = np.zeros(label.max() + 1, np.float32)
-    by_label[label[known]] = disparity[known]
-    return np.where(disparity > 0, disparity, by_label[label]).astype(np.float32)
+    by_label[label[known]] = values[known]
+    return np.where(known, values, by_label[label])
 
 
 def _box(side_px: float) -> NDArray[np.uint8]:
