@@ -85,11 +85,11 @@ def quantize_scene(
     device: Device = CPU,
 ) -> QuantizedScene | None:
     """The scene in whole numbers; None for a model that is stored as floats, or if no trial kept the tolerance."""
-    pictures = [(eye, index) for index in eyes[0].indices for eye in eyes if eye.eye.tissue[index].any()]
+    pictures = [(frames, index) for index in eyes[0].indices for frames in eyes if frames.eye.tissue[index].any()]
     if not isinstance(scene.deformation, SharedBasis) or scene.gaussians.sh_degree > 0 or not pictures:
         return None
     model, scored = model_of(scene, device), _spread(pictures, SCORED_FRAMES)
-    exact_db = _mean_db((model.render(eye.cameras[i], float(eye.t[i])) for eye, i in scored), scored)
+    exact_db = _mean_db((model.render(frames.cameras[i], float(frames.t[i])) for frames, i in scored), scored)
     if not math.isfinite(exact_db):
         return None
     sensitivity = _sensitivity(model, pictures, len(scene.deformation.centre))
@@ -147,7 +147,7 @@ def _spread(pictures: Sequence[Picture], count: int) -> list[Picture]:
 
 
 def _mean_db(images: Iterable[NDArray[np.float32]], scored: Sequence[Picture]) -> float:
-    return float(np.mean([eye.psnr_tissue_db(i, image) for (eye, i), image in zip(scored, images, strict=True)]))
+    return float(np.mean([frames.psnr_tissue_db(i, image) for (frames, i), image in zip(scored, images, strict=True)]))
 
 
 def _renders(
@@ -155,10 +155,10 @@ def _renders(
 ) -> Iterator[NDArray[np.float32]]:
     """The scored frames, rendered from what is stored. Decodes the Gaussians at their times only, not all weights."""
     rest = SharedBasis.initial(len(scene.gaussians), bases=1)
-    times = [float(eye.t[index]) for eye, index in scored]
-    for (eye, index), gaussians in zip(scored, compact.at(times), strict=True):
+    times = [float(frames.t[index]) for frames, index in scored]
+    for (frames, index), gaussians in zip(scored, compact.at(times), strict=True):
         still = model_of(dataclasses.replace(scene, gaussians=gaussians, deformation=rest), device)
-        yield still.render(eye.cameras[index], 0.0)
+        yield still.render(frames.cameras[index], 0.0)
 
 
 def _sensitivity(model: Model, pictures: Sequence[Picture], bases: int) -> NDArray[np.float64]:
@@ -172,11 +172,11 @@ def _sensitivity(model: Model, pictures: Sequence[Picture], bases: int) -> NDArr
     """
     random, sampled = np.random.default_rng(0), _spread(pictures, SENSITIVITY_FRAMES)
     sensitivity = np.zeros((VALUES, model.count))
-    for eye, index in sampled:
-        tissue = eye.eye.tissue[index]
+    for frames, index in sampled:
+        tissue = frames.eye.tissue[index]
         signs = np.zeros((5, *tissue.shape), np.float32)
         signs[:3] = random.choice(np.array([-1, 1], np.float32), (3, *tissue.shape)) * tissue
-        found = model.image_gradient(eye.cameras[index], float(eye.t[index]), signs)
+        found = model.image_gradient(frames.cameras[index], float(frames.t[index]), signs)
         sensitivity += found.astype(np.float64) ** 2 * (model.count / max(3 * int(tissue.sum()), 1) / len(sampled))
     across = max(float(sensitivity[:2].mean()), 1e-12)
     sensitivity[2] = sensitivity[:2].mean(0) * _depth_over_place(model, pictures[len(pictures) // 2], across, bases)
@@ -192,11 +192,11 @@ def _depth_over_place(model: Model, picture: Picture, across: float, bases: int)
     noise = size * np.random.default_rng(0).standard_normal(model.count).astype(np.float32)
     depth = model.parameters()["canonical"][2]
     exact_depth = depth.clone()
-    eye, index = picture
-    camera, t = eye.cameras[index], float(eye.t[index])
+    frames, index = picture
+    camera, t = frames.cameras[index], float(frames.t[index])
     exact = model.render(camera, t)[:3].copy()
     depth += torch.from_numpy(noise).to(depth.device)
-    error = (model.render(camera, t)[:3] - exact)[:, eye.eye.tissue[index]]
+    error = (model.render(camera, t)[:3] - exact)[:, frames.eye.tissue[index]]
     depth.copy_(exact_depth)
     measured = float(np.mean(error.astype(np.float64) ** 2))
     return max(measured / size**2 / across, 1.0)
