@@ -46,7 +46,8 @@ def pixel_errors(
     """The errors of a view at the judged pixels [H, W], of (rendered, true) colours [H, W, 3] and depths [H, W]."""
     shown, true = (each[judged] for each in rgb)
     shown_mm, true_mm = (each[judged] for each in depth_mm)
-    depth = np.where(shown_mm > 0, np.abs(shown_mm - true_mm) / true_mm, np.inf)
+    both = (shown_mm > 0) & (true_mm > 0)
+    depth = np.divide(np.abs(shown_mm - true_mm), true_mm, out=np.full(both.shape, np.inf, np.float32), where=both)
     colour = np.abs(np.clip(shown, 0, 1) - true).mean(axis=1)
     row, column = (each // SQUARE_PX for each in np.nonzero(judged))
     square = row * (judged.shape[1] // SQUARE_PX + 1) + column
