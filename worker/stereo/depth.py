@@ -89,7 +89,7 @@ def estimate_depth(
             depth_mm, confidence = _match_on_device(clip, rgb, right_rgb, plan, hooks)
         else:
             depth_mm, confidence = _match_all(clip, rgb, right_rgb, plan, pool, hooks)
-        right = _right_eye(clip, rgb, right_rgb, depth_mm, confidence, plan, measured)
+        right = _right_eye(clip, rgb, right_rgb, depth_mm, confidence, plan, measured, hooks)
     for tissue, depths_mm, trust in (
         (clip.tissue, depth_mm, confidence),
         (right.tissue, right.depth_mm, right.depth_confidence),
@@ -225,6 +225,7 @@ def _right_eye(
     confidence: NDArray[np.uint8],
     plan: MatchPlan,
     measured: Sequence[int],
+    hooks: Hooks,
 ) -> Eye:
     """The right eye with the left one's depth. Its camera lies on the calibrated baseline, lowered by the row shift.
 
@@ -242,7 +243,11 @@ def _right_eye(
             tissue[i] = moved_tissue(clip.tissue[i] | label, depth_mm[i], focal_baseline, offset_px) & ~label
 
     with _pool() as pool:
-        list(pool.map(work, range(clip.frame_count)))
+        try:
+            for _ in pool.map(work, range(clip.frame_count)):
+                _check_stop(hooks)
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
     k = clip.intrinsics
     pose = np.eye(4)
     pose[0, 3] = clip.baseline_mm

@@ -13,7 +13,7 @@ from worker.input.camera import to_camera, unproject
 from worker.input.clip import DepthClip
 from worker.phantom import Phantom, PhantomSettings, make_phantom
 from worker.stereo import estimate_depth
-from worker.stereo.right_eye import moved_depth, moved_tissue, painted_over
+from worker.stereo.right_eye import ROWS_AT_ONCE, moved_depth, moved_tissue, nearest_known, painted_over
 
 HEIGHT, WIDTH = 24, 80
 FOCAL_BASELINE = 800.0  # disparity 8 at 100 mm, 16 at 50 mm
@@ -34,6 +34,23 @@ def test_a_surface_moves_by_its_disparity_and_the_nearer_one_hides_the_other() -
     assert (moved[:, WIDTH - 7 :] == 0).all()  # the strip that only the right eye sees
     assert (confidence[moved > 0] == 200).all()
     assert (confidence[moved == 0] == 0).all()
+
+
+def test_rows_move_alike_wherever_they_lie() -> None:
+    copies = ROWS_AT_ONCE // HEIGHT + 2
+    confidence = np.full((HEIGHT, WIDTH), 200, np.uint8)
+    one, _ = moved_depth(step_mm(), confidence, FOCAL_BASELINE, 0.25)
+    many, _ = moved_depth(np.tile(step_mm(), (copies, 1)), np.tile(confidence, (copies, 1)), FOCAL_BASELINE, 0.25)
+    np.testing.assert_array_equal(many, np.tile(one, (copies, 1)))
+
+
+def test_only_what_is_wanted_takes_the_nearest_known_value() -> None:
+    values = np.float32([[7, 0, 0, 0, 3]])
+    known = values > 0
+    np.testing.assert_array_equal(nearest_known(values, known)[0, [0, 1, 3, 4]], [7, 7, 3, 3])
+    wanted = np.array([[False, True, False, False, False]])
+    np.testing.assert_array_equal(nearest_known(values, known, wanted), [[7, 7, 0, 0, 3]])
+    np.testing.assert_array_equal(nearest_known(values, np.zeros_like(known)), values)
 
 
 def test_depth_that_is_missing_stays_missing() -> None:
