@@ -43,6 +43,7 @@ DRAWN = PhantomSettings(width=800, height=640, frames=2, noise=False)
 """Wider than the recorded picture, so that distortion finds something at its corners."""
 FRAME, SEEDS = 1, (0, 1, 2)
 PATCH_PX = 8
+BESIDE_PX = 24  # from an instrument's edge; nearer than BESIDE_PX of worker/stereo/depth.py no depth is given
 DISTORTION = ((-0.30, 0.02, 0.0, 0.0), (-0.29, 0.02, 0.0, 0.0))
 """k1 k2 p1 p2 of each eye: the picture's corner moves by 47 px."""
 CENTRES_PX = 6.0  # the right eye's principal point lies so far to the left of the left eye's
@@ -62,8 +63,9 @@ CLIPS = {
     "flat": frozenset({"flat"}),
     "distorted": frozenset({"distorted"}),
     "hard": frozenset({"dark", "wet", "distorted"}),
+    "beside": frozenset({"masked"}),
 }
-"""What is wrong with each synthetic clip."""
+"""What is wrong with each synthetic clip; "masked": nothing, but it is judged beside instruments alone."""
 
 Rgb = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -118,7 +120,7 @@ def real_pair(folder: Path) -> Judged:
 
 def synthetic(flaws: frozenset[str], seed: int) -> Judged:
     """One pair of synthetic tissue, recorded with these flaws."""
-    dry = make_phantom(replace(DRAWN, seed=seed))
+    dry = make_phantom(replace(DRAWN, seed=seed, motion="cut" if "masked" in flaws else DRAWN.motion))
     albedo, film = dry.paint.albedo, dry.paint.film
     if "wet" in flaws:
         film = film * np.float32([ROUGHNESS, ROUGHNESS, 1])
@@ -134,10 +136,13 @@ def synthetic(flaws: frozenset[str], seed: int) -> Judged:
         _recorded(picture, camera, "dark" in flaws, random)
         for picture, camera in ((drawn.left, calibration.left), (drawn.right, calibration.right))
     ]
-    recording = StereoClip(1, HEIGHT, WIDTH, lambda: iter([(pair[0], pair[1])]), None, np.zeros(1))
+    masks = _as_recorded(drawn.tissue)[None] > 0 if "masked" in flaws else None
+    recording = StereoClip(1, HEIGHT, WIDTH, lambda: iter([(pair[0], pair[1])]), masks, np.zeros(1))
     clip = rectify(recording, calibration)
     depth_mm, tissue = (_as_rectified(each, clip.intrinsics) for each in (drawn.depth_mm, drawn.tissue))
     seen = (tissue > 0) & (depth_mm > 0)
+    if "masked" in flaws:
+        seen &= cv2.distanceTransform((tissue > 0).astype(np.uint8), cv2.DIST_C, 3) <= BESIDE_PX
     truth_px = clip.intrinsics.fx * clip.baseline_mm / np.where(seen, depth_mm, 1) + clip.disparity_offset_px
     return Judged(clip, np.where(seen, truth_px, 0).astype(np.float32), float(burnt_out.mean()))
 
@@ -183,6 +188,15 @@ def _recorded(drawn: Rgb, eye: RawEye, dark: bool, random: np.random.Generator) 
         away = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) / np.hypot(WIDTH / 2, HEIGHT / 2)
         light *= np.clip((BLACK_FROM - away) / (BLACK_FROM - DARK_FROM), 0, 1)[..., None] ** 1.5
     return np.clip(255 * add_noise(light, random) + 0.5, 0, 255).astype(np.uint8)
+
+
+def _as_recorded(drawn: NDArray[np.generic]) -> Floats:
+    """What is drawn of the left eye, in the pixels of a lens without distortion; nearest neighbour."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    maps = x + (DRAWN.width - WIDTH) / 2, y + (DRAWN.height - HEIGHT) / 2
+    return np.asarray(
+        cv2.remap(drawn.astype(np.float32), *(each.astype(np.float32) for each in maps), cv2.INTER_NEAREST)
+    )
 
 
 def _as_rectified(drawn: NDArray[np.generic], camera: Intrinsics) -> Floats:

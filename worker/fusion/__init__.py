@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 
 from contract.wire.errors import InputError
-from worker.fusion.complete import complete_depth
 from worker.fusion.fill import fill
 from worker.fusion.points import (
     CLEAR_CONFIDENCE,
@@ -36,7 +35,6 @@ __all__ = [
     "COMPLETED_CONFIDENCE",
     "FusionSettings",
     "PointCloud",
-    "complete_depth",
     "fuse",
     "motion_mask",
 ]

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.fusion.complete import complete_depth
 from worker.fusion.points import (
     CLEAR_CONFIDENCE,
     COMPLETED_CONFIDENCE,
@@ -29,6 +28,7 @@ from worker.fusion.points import (
 from worker.input.camera import Intrinsics, unproject_at
 from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip, Eye
+from worker.motion.complete import complete_depth
 from worker.motion.tracks import Moved
 
 EDGE_PX = 5

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.fusion.complete import complete_depth
 from worker.input.camera import Intrinsics, to_camera, unproject
 from worker.input.clip.types import Eye
+from worker.motion.complete import complete_depth
 
 COMPLETED_CONFIDENCE = 0.1
 """Confidence of a point with completed depth: above 0, because its position in the image is known."""

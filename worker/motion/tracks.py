@@ -25,6 +25,7 @@ from worker.input.camera import unproject
 from worker.input.clip import DepthClip
 from worker.machine.cores import cores
 from worker.machine.opencv import one_opencv_thread
+from worker.motion.complete import complete_depth
 
 Floats = NDArray[np.float32]
 Moved = Callable[[int, NDArray[np.intp]], Floats]
@@ -44,6 +45,9 @@ STEADINESS = 0.02
 """Weight of the differences between neighbouring bases; a fully trusted frame has 1. It carries motion across gaps."""
 SURROUNDINGS = 0.1
 """Weight of the wider surroundings' mean in an average; full trust has 1."""
+LOST, LOST_SMOOTH_PX = 0.1, 1.0
+"""A track of less confidence ends on the surface that surrounds it; px of the coarse grid over which that eases in."""
+MIN_DEPTH_MM = 1e-3
 GUESSED = 0.02
 """Minimum confidence of a track when a motion starts from it: the surroundings' displacement is better than none."""
 RIDGE = 1e-3
@@ -170,13 +174,22 @@ class _Grid:
         self.rays = rays.reshape(*rows.shape, 3).astype(np.float32)
         """[h, w, 3] points at depth 1, camera axes."""
 
+    def cells_at(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Column and row in the grid, not rounded, of what lies at (x, y) at depth 1, camera axes."""
+        height, width = self.rays.shape[:2]
+        (left, top, _), (right, bottom, _) = self.rays[0, 0], self.rays[-1, -1]
+        return (x - left) * ((width - 1) / (right - left)), (y - top) * ((height - 1) / (bottom - top))
+
     def sample(self, values: NDArray[Any]) -> NDArray[Any]:
         """[h, w] the cells' middle pixels of an image; a view."""
         return values[self.step // 2 :: self.step, self.step // 2 :: self.step][: self.size[1], : self.size[0]]
 
 
 class _Coarse:
-    """A frame on the coarse grid: colour, grey, points (world, mm), and the confidence of depth and mask."""
+    """A frame on the coarse grid: colour, grey, depth, points (world, mm), and the confidence of depth and mask.
+
+    Where no tissue is measured, depth is completed from around; it is 0 in a frame without any.
+    """
 
     def __init__(self, clip: DepthClip, index: int, grid: _Grid) -> None:
         self.grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), grid.step)
@@ -184,8 +197,9 @@ class _Coarse:
         depth_mm = grid.sample(clip.depth_mm[index])
         usable = grid.sample(clip.tissue[index]) & (depth_mm > 0)
         pose = clip.world_from_camera[index].astype(np.float32)
-        camera_mm = grid.rays * np.where(usable, depth_mm, np.float32(1))[..., None]
-        self.points_mm: Floats = camera_mm @ pose[:3, :3].T + pose[:3, 3]
+        self.grid, self.axes, self.place_mm = grid, pose[:3, :3], pose[:3, 3]
+        self.depth_mm = complete_depth(depth_mm, usable, np.ones_like(usable))
+        self.points_mm: Floats = (grid.rays * self.depth_mm[..., None]) @ self.axes.T + self.place_mm
         confidence = grid.sample(clip.depth_confidence[index]) / np.float32(255)
         self.trust = np.where(usable, confidence, np.float32(0))
 
@@ -205,8 +219,25 @@ def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats
     confidence = reference.trust * trust * (trust > 0.5) * agree
     point_mm = at_target(target.points_mm * target.trust[..., None]) / np.maximum(trust, 1e-3)[..., None]
     displacement = _averaged(np.subtract(point_mm, reference.points_mm), confidence, SMOOTH_PX)
+    if target.depth_mm.any():  # else nobody knows its surface
+        displacement = _onto_surface(reference, target, displacement, confidence)
     colour = _averaged(np.subtract(at_target(target.rgb), reference.rgb), confidence, COLOUR_SMOOTH_PX)
     return displacement, colour, np.minimum(confidence, 1).astype(np.float32)
+
+
+def _onto_surface(reference: _Coarse, target: _Coarse, displacement: Floats, confidence: Floats) -> Floats:
+    """The displacement [h, w, 3] with the ends of lost tracks on target's surface, along the line of sight.
+
+    What hides stays on the surface around it: a displacement that is guessed from farther away, where tissue may be
+    pulled towards the camera, would lift it into free space.
+    """
+    end_mm = (reference.points_mm + displacement - target.place_mm) @ target.axes
+    z = np.maximum(end_mm[..., 2], MIN_DEPTH_MM)
+    x, y = target.grid.cells_at(end_mm[..., 0] / z, end_mm[..., 1] / z)
+    surface_mm = cv2.remap(target.depth_mm, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    lost = cv2.GaussianBlur((confidence < LOST).astype(np.float32), (0, 0), LOST_SMOOTH_PX)
+    along_mm = end_mm * (lost * (surface_mm / z - 1))[..., None]
+    return np.asarray(displacement + along_mm @ target.axes.T, np.float32)
 
 
 def _averaged(values: Floats, confidence: Floats, over_px: float) -> Floats:

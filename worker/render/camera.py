@@ -2,7 +2,7 @@
 
 Wet tissue mirrors the lamp elsewhere for each eye. A Gaussian's gloss is how much brighter the right eye saw it than
 the left one; between the eyes a view takes its share of it. Where the lamp's image lies for anybody else is not known:
-with the distance from both eyes highlights fade to the darker of the two, which is the tissue without them.
+with the distance from both eyes the view turns to the mean of the two, which is the best guess (docs/decisions/032).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from worker.scene.scene import Scene
 from worker.train.targets import camera_in_units
 
 FADING = 1.0
-"""Distance from the line between the eyes, in baselines, at which highlights have faded to exp(-1/2)."""
+"""Distance from the line between the eyes, in baselines, at which the gloss has faded to exp(-1/2)."""
 
 
 def endoscope_pose(scene: Scene, t: float) -> NDArray[np.float64]:
@@ -62,4 +62,4 @@ def gloss_seen(
     along = min(max(float(from_left_mm @ baseline_mm) / length_mm**2, 0.0), 1.0)
     away = float(np.linalg.norm(from_left_mm - along * baseline_mm)) / length_mm
     known = float(np.exp(-0.5 * (away / FADING) ** 2))
-    return known * (along - 0.5), (1 - known) / 2
+    return known * (along - 0.5), 0.0

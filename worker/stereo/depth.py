@@ -180,7 +180,7 @@ def _match_all(
     confidence = np.zeros(right.shape[:3], np.uint8)
 
     def work(i: int) -> None:
-        disparity, trust = match(_grey(rgb[i]), _grey(right[i]), plan)
+        disparity, trust = match(_grey(rgb[i]), _grey(right[i]), plan, clip.tissue[i])
         beyond_infinity_px = disparity - np.float32(clip.disparity_offset_px)
         depth_mm[i], confidence[i] = _to_depth(beyond_infinity_px, trust, focal_baseline, plan.depth_range_mm)
 
@@ -211,7 +211,9 @@ def _match_on_device(
         _check_stop(hooks)
         some = slice(first, first + at_once)
         left, other = (np.stack([_grey(frame) for frame in eye[some]]) for eye in (rgb, right))
-        depth_mm[some], confidence[some] = depth_of(left, other, plan, focal_baseline, clip.disparity_offset_px)
+        depth_mm[some], confidence[some] = depth_of(
+            left, other, np.ascontiguousarray(clip.tissue[some]), plan, focal_baseline, clip.disparity_offset_px
+        )
         left_over = max(len(right) - first - at_once, 0) / len(right)
         hooks.on_progress(Progress(STAGE, 1 - (1 - DECODING_SHARE - MEASURING_SHARE) * left_over))
     return depth_mm, confidence

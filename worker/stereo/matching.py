@@ -34,6 +34,8 @@ ROUGHNESS_PX, ROUGHNESS_PER_PX2 = 5, 0.256
 """Side of the window, and how much trust a variance of the disparity of 1 px^2 within it costs: jumps are not sharp."""
 ENDS_PX = 1.0  # so near the ends of the range a match may lie beyond them
 EVIDENCE_PX, EVIDENCE_TEXTURE = 7, 3.0  # window, and mean squared gradient (grey levels) of half the trust
+BESIDE_INSTRUMENTS_PX = 3  # of the reduced image: matching windows reach over the edge and find the instrument
+SURE_TRUST, SURFACE_PERCENTILE = 0.3, 25  # of the matches that tell the disparity of tissue behind instruments
 SATURATED_TRUST = 0.02  # highlights move with the eye: a match there may not be the surface
 SMOOTHNESS, COLOUR_SIGMA = 10.0, 10.0  # of the edge-aware filter
 MIN_WEIGHT = 1e-12  # where the filter finds no match far around
@@ -69,11 +71,15 @@ class MatchPlan:
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM)
 
 
-def match(left: Grey, right: Grey, plan: MatchPlan) -> tuple[Image, NDArray[np.uint8]]:
+def match(
+    left: Grey, right: Grey, plan: MatchPlan, tissue: NDArray[np.bool_] | None = None
+) -> tuple[Image, NDArray[np.uint8]]:
     """Disparity [H, W] float32 in px and confidence [H, W] uint8 of one pair, in the left eye's pixels.
 
     Confidence falls with the error that is expected (ERROR_PX); 0: the picture is black or the match is a guess. What
     cannot be matched, as it is flat, burnt out or seen by one eye alone, is filled from around at low confidence.
+
+    tissue [H, W]: of the left eye; the rest is instruments. Neither is filled from the other. None: all is tissue.
     """
     right = shift_rows(right, plan.row_shift_px)
     height, width = left.shape
@@ -86,7 +92,13 @@ def match(left: Grey, right: Grey, plan: MatchPlan) -> tuple[Image, NDArray[np.u
     found, agreed = semi_global(small, _resized(right, size), low, count)
     trust = evidence(found, agreed, small)
     trust[(found < low + ENDS_PX) | (found > low + count - 1 - ENDS_PX)] = 0
-    coarse = _smoothed(found, trust, small)
+    if tissue is None or tissue.all():
+        coarse = _smoothed(found, trust, small)
+    else:
+        instrument = cv2.resize((~tissue).view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > 0
+        coarse = _smoothed(found, trust * instrument, small)
+        trust[~instrument & beside_instruments(found, trust, instrument)] = 0
+        coarse = np.where(instrument, coarse, _smoothed(found, trust * ~instrument, small))
     deviation = np.where(agreed, np.minimum(np.abs(found - coarse), MAX_DEVIATION_PX), UNKNOWN_DEVIATION_PX)
     doubt = doubt_of(_mean(deviation.astype(np.float32), ROUGHNESS_PX), _mean(trust, EVIDENCE_PX))
     disparity, texture, residual = _refine(_enlarged(coarse, left) / np.float32(scale), left, right)
@@ -155,6 +167,25 @@ def evidence(found: Image, agreed: NDArray[np.bool_], image: Grey) -> Image:
     trust[burnt_out > 0] *= SATURATED_TRUST
     trust[(image <= BLACK_LEVEL) | (found > np.arange(found.shape[1]))] = 0  # the right eye does not see the latter
     return trust
+
+
+def beside_instruments(found: Image, trust: Image, instrument: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[h, w] pixels at which a match may be an instrument's: near one, or hidden by it from the right eye.
+
+    An instrument of disparity D hides from the right eye a strip of D - d to its left, d being that of the tissue.
+    """
+    side = 2 * BESIDE_INSTRUMENTS_PX + 1
+    beside = cv2.dilate(instrument.view(np.uint8), np.ones((side, side), np.uint8)).view(np.bool_)
+    surface = found[~beside & (trust >= SURE_TRUST)]
+    row, column = np.nonzero(instrument & (trust > 0))
+    if surface.size and row.size:
+        hidden = found[row, column] - np.percentile(surface, SURFACE_PERCENTILE)
+        start = np.clip(column - 1 - np.ceil(np.maximum(hidden, 0)).astype(np.intp), 0, None)
+        begun = np.zeros(found.shape, np.int32)
+        np.add.at(begun, (row, start), 1)
+        np.add.at(begun, (row, column), -1)
+        beside |= begun.cumsum(axis=1) > 0
+    return beside
 
 
 def _smoothed(found: Image, trust: Image, image: Grey) -> Image:

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from contract.wire.errors import Cancelled
 from tests.helpers import assert_close
+from worker.input.camera import unproject
 from worker.input.clip import DepthClip
 from worker.model.deformation import SharedBasis
+from worker.motion.complete import complete_depth
 from worker.motion.tracks import GUESSED, Tracks, cell_means, fit_tracks, track
 from worker.phantom import Motion, PhantomSettings, Trajectories, make_phantom
 
@@ -211,6 +213,33 @@ def test_what_is_never_seen_moves_like_what_surrounds_it() -> None:
     assert not tracks.confidence[:, rows, columns][:, hidden].any()
     assert np.linalg.norm(moved_mm, axis=-1).max() > 3
     assert np.median(off_mm) < 0.2 * np.median(np.linalg.norm(moved_mm, axis=-1))
+
+
+def test_what_hides_for_a_while_stays_on_the_surface_around_it() -> None:
+    """A wall at 60 mm; left of an instrument it comes 20 mm nearer, right of it it rests."""
+    clip = copied(phantom("still", noise=False)[0])
+    clip.depth_mm[:] = 60.0
+    columns = np.arange(WIDTH)
+    comes_mm = np.float32(20) * (columns < 60)
+    instrument = (columns >= 60) & (columns < 100)
+    for index in TRAIN[1:]:
+        clip.depth_mm[index] = 60.0 - comes_mm * index / FRAMES
+        clip.tissue[index] = ~instrument
+    clip.tissue[0] = True
+    last = TRAIN[-1]
+    tracks = track(clip, TRAIN)
+    assert not tracks.confidence[-1][:, 70:90].any()
+    hidden = np.flatnonzero(instrument[None] & (np.abs(np.arange(HEIGHT) - HEIGHT / 2) < 40)[:, None])
+    starts_mm = unproject(hidden, clip.depth_mm[0].ravel()[hidden], clip.intrinsics, clip.world_from_camera[0])
+    ends_mm = starts_mm + tracks.displacement_mm[-1].reshape(-1, 3)[hidden]
+    surface_mm = complete_depth(clip.depth_mm[last], clip.tissue[last], np.ones_like(clip.tissue[last]))
+    k = clip.intrinsics
+    column, row = (
+        (focal * ends_mm[:, axis] / ends_mm[:, 2] + centre).astype(int)
+        for axis, focal, centre in ((0, k.fx, k.cx), (1, k.fy, k.cy))
+    )
+    above_mm = surface_mm[row, column] - ends_mm[:, 2]
+    assert np.percentile(np.abs(above_mm), 95) < 1.0
 
 
 def test_a_guess_fills_what_no_frame_knows_and_hardly_bends_what_is_known(rng: np.random.Generator) -> None:

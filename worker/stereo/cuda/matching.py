@@ -22,6 +22,7 @@ from triton import knobs
 
 from worker.stereo.cuda import kernels
 from worker.stereo.matching import (
+    BESIDE_INSTRUMENTS_PX,
     BLACK_LEVEL,
     BLACK_PX,
     COLOUR_SIGMA,
@@ -50,6 +51,8 @@ from worker.stereo.matching import (
     SATURATED_LEVEL,
     SATURATED_TRUST,
     SMOOTHNESS,
+    SURE_TRUST,
+    SURFACE_PERCENTILE,
     TEXTURE_FOR_TRUST,
     UNKNOWN_DEVIATION_PX,
     UNSURE_TRUST,
@@ -94,11 +97,11 @@ def frames_at_once(height: int, width: int, plan: MatchPlan) -> int:
 
 
 def depth_of(
-    left: Greys, right: Greys, plan: MatchPlan, focal_baseline: float, offset_px: float
+    left: Greys, right: Greys, tissue: NDArray[np.bool_], plan: MatchPlan, focal_baseline: float, offset_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Depth in mm, 0 where it is invalid, and its confidence, 0 at the same pixels, of pairs [F, H, W] on the host."""
-    device = _device()
-    disparity, confidence = match_frames(torch.from_numpy(left).to(device), torch.from_numpy(right).to(device), plan)
+    left_eye, right_eye, shown = (torch.from_numpy(each).to(_device()) for each in (left, right, tissue))
+    disparity, confidence = match_frames(left_eye, right_eye, plan, shown)
     nearest_mm, farthest_mm = plan.depth_range_mm
     beyond_infinity_px = disparity - offset_px
     valid = (confidence >= MIN_CONFIDENCE) & (beyond_infinity_px >= focal_baseline / farthest_mm)
@@ -107,8 +110,11 @@ def depth_of(
     return depth_mm.cpu().numpy(), torch.where(valid, confidence, 0).cpu().numpy()
 
 
-def match_frames(left: Tensor, right: Tensor, plan: MatchPlan) -> tuple[Tensor, Tensor]:
-    """Disparity float32 in px and confidence uint8 of pairs uint8 [F, H, W], on their device; see matching.match."""
+def match_frames(left: Tensor, right: Tensor, plan: MatchPlan, tissue: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Disparity float32 in px and confidence uint8 of pairs uint8 [F, H, W], on their device; see matching.match.
+
+    tissue: bool [F, H, W], of the left eye; None: all is tissue.
+    """
     right = shift_rows(right, plan.row_shift_px)
     height, width = left.shape[1:]
     size, low, count = _reduced(height, width, plan)
@@ -117,7 +123,14 @@ def match_frames(left: Tensor, right: Tensor, plan: MatchPlan) -> tuple[Tensor, 
     agreed = _consistency(found, opposite)
     trust = _evidence(found, agreed, small_left)
     trust.masked_fill_((found < low + ENDS_PX) | (found > low + count - 1 - ENDS_PX), 0)
-    coarse = filled(found, trust, (255 * small_left.float()).sqrt().round().to(torch.uint8))
+    guide = (255 * small_left.float()).sqrt().round().to(torch.uint8)
+    if tissue is None or bool(tissue.all()):
+        coarse = filled(found, trust, guide)
+    else:
+        instrument = functional.adaptive_max_pool2d((~tissue).float(), size) > 0
+        coarse = filled(found, trust * instrument, guide)
+        trust.masked_fill_(~instrument & _beside_instruments(found, trust, instrument), 0)
+        coarse = torch.where(instrument, coarse, filled(found, trust * ~instrument, guide))
     deviation = torch.where(agreed > 0, (found - coarse).abs().clamp_max(MAX_DEVIATION_PX), UNKNOWN_DEVIATION_PX)
     doubt = doubt_of(_box(deviation, ROUGHNESS_PX), _box(trust, EVIDENCE_PX))
     disparity = _enlarged(coarse, (height, width)) * (width / size[1])
@@ -140,6 +153,23 @@ def _evidence(found: Tensor, consistency: Tensor, image: Tensor) -> Tensor:
     trust = consistency * (texture / (texture + EVIDENCE_TEXTURE)) * torch.where(burnt_out, SATURATED_TRUST, 1.0)
     unseen = found > torch.arange(found.shape[2], device=found.device)
     return trust.masked_fill((image <= BLACK_LEVEL) | unseen, 0)
+
+
+def _beside_instruments(found: Tensor, trust: Tensor, instrument: Tensor) -> Tensor:
+    """As matching.beside_instruments, of frames [F, h, w]."""
+    reach = BESIDE_INSTRUMENTS_PX
+    beside = functional.max_pool2d(instrument.float(), 2 * reach + 1, 1, reach) > 0
+    surface = ~beside & (trust >= SURE_TRUST)
+    matched = instrument & (trust > 0)
+    behind = torch.full((len(found), 1, 1), math.inf, device=found.device)
+    for each in torch.nonzero(surface.flatten(1).any(1)).flatten():
+        behind[each] = torch.quantile(found[each][surface[each]], SURFACE_PERCENTILE / 100)
+    hidden = torch.where(matched, (found - behind).clamp_min(0), 0)
+    column = torch.arange(found.shape[2], device=found.device).expand_as(matched)
+    start = (column - 1 - hidden.ceil().long()).clamp_min(0)
+    begun = torch.zeros(found.shape, dtype=torch.int32, device=found.device)
+    begun.scatter_add_(2, start, matched.int())
+    return beside | ((begun - matched.int()).cumsum(2) > 0)
 
 
 def doubt_of(deviation: Tensor, evidence: Tensor) -> Tensor:
