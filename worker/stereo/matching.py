@@ -175,7 +175,7 @@ def beside_instruments(found: Image, trust: Image, instrument: NDArray[np.bool_]
     An instrument of disparity D hides from the right eye a strip of D - d to its left, d being that of the tissue.
     """
     side = 2 * BESIDE_INSTRUMENTS_PX + 1
-    beside = cv2.dilate(instrument.view(np.uint8), np.ones((side, side), np.uint8)).view(np.bool_)
+    beside = np.asarray(cv2.dilate(instrument.view(np.uint8), np.ones((side, side), np.uint8)), np.bool_)
     surface = found[~beside & (trust >= SURE_TRUST)]
     row, column = np.nonzero(instrument & (trust > 0))
     if surface.size and row.size:
@@ -185,7 +185,7 @@ def beside_instruments(found: Image, trust: Image, instrument: NDArray[np.bool_]
         np.add.at(begun, (row, start), 1)
         np.add.at(begun, (row, column), -1)
         beside |= begun.cumsum(axis=1) > 0
-    return beside
+    return np.asarray(beside)
 
 
 def _smoothed(found: Image, trust: Image, image: Grey) -> Image:
