@@ -83,13 +83,13 @@ class RenderQuery(BaseModel):
     quality: int = Field(default=90, ge=1, le=100, description="quality of a jpeg or webp image")
     unseen: Unseen = Field(
         default=Unseen.MARK,
-        description="what to show where no training frame saw anything: mark, a hatch, alpha 0 in png and webp, depth "
-        "and confidence 0; guess, what the model draws there",
+        description="what to show where no training frame saw anything: mark: a hatch, transparent in png and webp, "
+        "and depth and confidence 0; guess: what the model draws there",
     )
     highlights: Highlights = Field(
         default=Highlights.ON,
-        description="of layer rgb; off: without the highlights that both eyes of a stereo clip told apart; a scene of "
-        "one eye knows none and is shown as it is",
+        description="in layer rgb; off: colours without the highlights that the eyes of a stereo clip told apart. A "
+        "scene that one eye taught knows none: it is shown as it is, with the notice highlights_unknown",
     )
 
 

@@ -50,8 +50,8 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "--unseen",
         choices=[each.value for each in Unseen],
         default=Unseen.MARK.value,
-        help="what to show where no frame of the clip saw anything: mark, a hatch, transparent in PNG and WebP, depth "
-        "and confidence 0; guess, what the model draws there (default: mark)",
+        help="what to show where no frame of the clip saw anything: mark: a hatch, transparent in PNG and WebP, and "
+        "depth and confidence 0; guess: what the model draws there (default: mark)",
     )
     parser.add_argument(
         "--highlights",

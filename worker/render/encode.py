@@ -6,7 +6,7 @@ depth       16 bit, 0.01 mm, 0 invalid  float32 mm [H, W]     false colour, near
 confidence  8 bit, 255 = 1              float32 [H, W]        false colour
 
 Where unseen pixels are marked, depth and confidence are 0 there, and rgb shows a hatch; png and webp of rgb then have
-an alpha channel, 0 there and 255 elsewhere. A lossy webp flattens the hatch that its alpha hides; png keeps it.
+an alpha channel: 255 elsewhere, and there UNSEEN_ALPHA, as good as transparent. Whoever ignores alpha sees the hatch.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from worker.render.unseen import hatched
 DEPTH_PNG_PER_MM = 100.0
 DEFAULT_QUALITY = 90
 FOR_EYES = frozenset({ImageFormat.JPEG, ImageFormat.WEBP})
-WITH_ALPHA = frozenset({ImageFormat.PNG, ImageFormat.WEBP})
+UNSEEN_ALPHA = {ImageFormat.PNG: 0, ImageFormat.WEBP: 1}
+"""Alpha of an unseen pixel, of 255, in the formats that have alpha. webp's encoder flattens what alpha 0 hides, at any
+quality, and keeps what alpha 1 shows."""
 PNG_COMPRESSION = 1
 """Fast rather than small: renders travel over the loopback or a hospital's own network."""
 
@@ -80,10 +82,10 @@ def _encode_colour(
         rgb = hatched(rgb, marked)
     if image_format is ImageFormat.NPY:
         return _npy(rgb)
-    if marked is None or image_format not in WITH_ALPHA:
+    if marked is None or image_format not in UNSEEN_ALPHA:
         return _image(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), np.uint8), image_format, quality)
     pixels = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGRA), np.uint8)
-    pixels[..., 3] = np.where(marked, np.uint8(0), np.uint8(255))
+    pixels[..., 3] = np.where(marked, np.uint8(UNSEEN_ALPHA[image_format]), np.uint8(255))
     return _image(pixels, image_format, quality)
 
 

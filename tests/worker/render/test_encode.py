@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from contract.wire.rendering import ImageFormat, Layer, Unseen
-from worker.render.encode import encode_layer
+from worker.render.encode import DEFAULT_QUALITY, encode_layer
+from worker.render.unseen import DARK_GREY, LIGHT_GREY
 
 HEIGHT, WIDTH = 12, 17
 
@@ -92,7 +93,22 @@ def test_a_png_shows_a_hatch_of_two_dark_greys_under_alpha_0_where_nothing_was_s
 
 def test_a_webp_is_transparent_where_nothing_was_seen(images: Images) -> None:
     image = decoded(encode_layer(images, Layer.RGB, ImageFormat.WEBP))
-    np.testing.assert_array_equal(image[..., 3], np.where(images.unseen, 0, 255))
+    np.testing.assert_array_equal(image[..., 3], np.where(images.unseen, 1, 255))
+
+
+@pytest.mark.parametrize("image_format", [ImageFormat.JPEG, ImageFormat.WEBP])
+@pytest.mark.parametrize("quality", [30, 50, DEFAULT_QUALITY, 100])
+def test_the_hatch_outlives_the_encoder(image_format: ImageFormat, quality: int) -> None:
+    height, width = 240, 320
+    unseen = np.zeros((height, width), np.bool_)
+    unseen[40:200, 60:260] = True
+    rgb = np.random.default_rng(0).normal((170, 80, 70), 8, (height, width, 3)).clip(0, 255).astype(np.uint8)
+    image = Images(rgb, np.ones((height, width), np.float32), np.ones((height, width), np.float32), unseen)
+    shown = decoded(encode_layer(image, Layer.RGB, image_format, quality))[..., :3].mean(axis=-1)
+    inner = cv2.erode(unseen.astype(np.uint8), np.ones((17, 17), np.uint8)) > 0  # the encoder mixes neighbours
+    light = decoded(encode_layer(image, Layer.RGB, ImageFormat.PNG))[..., 0] == LIGHT_GREY
+    assert shown[inner & light].mean() - shown[inner & ~light].mean() > 0.5 * (LIGHT_GREY - DARK_GREY)
+    assert np.corrcoef(shown[inner], light[inner])[0, 1] > 0.75
 
 
 def test_a_jpeg_of_what_was_not_seen_is_dark_and_without_colour(images: Images) -> None:
