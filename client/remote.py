@@ -134,6 +134,7 @@ def progress_of(job: JobView) -> JobProgress:
         iteration=job.iteration or 0,
         iterations=job.iterations or 0,
         psnr_db=job.psnr_db,
+        psnr_right_db=job.psnr_right_db,
         seconds_left=job.seconds_left,
     )
 

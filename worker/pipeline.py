@@ -23,7 +23,7 @@ from worker.input.calibration.types import StereoCalibration
 from worker.input.camera import to_camera
 from worker.input.clip import DepthClip, StereoClip, held_out_frames, split_frames
 from worker.input.decode import decode_clip
-from worker.machine.hooks import Hooks, Progress
+from worker.machine.hooks import Hooks
 from worker.machine.timing import Timings
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
@@ -153,7 +153,7 @@ def optimise(run: Run) -> None:
 
 def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
     """The scene to keep, quantized where that loses next to nothing, and what it loses."""
-    run.setup.hooks.on_progress(Progress("finish", 0.0, run.iteration, run.iterations))
+    run.setup.hooks.on_progress(run.progress("finish", 0.0))
     with run.setup.timings.measure("finish_s"):
         scene = scene_of(run)
     with run.setup.timings.measure("shrink_s"):
@@ -219,7 +219,7 @@ def assess(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Report:
     if report.psnr_tissue_db is not None and run.curve:
         left_db, right_db = report.psnr_tissue_db, report.psnr_right_db
         run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=left_db, psnr_right_db=right_db)
-    run.setup.hooks.on_progress(Progress("score", 1.0, run.iteration, run.iterations, report.psnr_tissue_db))
+    run.setup.hooks.on_progress(run.progress("score", 1.0))
     return report
 
 
@@ -229,8 +229,7 @@ def _reporting(run: Run, render: FrameRenderer) -> FrameRenderer:
 
     def reported(index: int) -> RenderedFrame:
         nonlocal done
-        latest = run.curve[-1].psnr_tissue_db if run.curve else None
-        run.setup.hooks.on_progress(Progress("score", done / total, run.iteration, run.iterations, latest))
+        run.setup.hooks.on_progress(run.progress("score", done / total))
         if run.setup.hooks.should_stop():
             raise Cancelled("Stopped while scoring.")
         done += 1

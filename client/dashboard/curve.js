@@ -1,4 +1,5 @@
-// The curve: likeness to frames that training never sees, over iterations; dashed, what copying neighbours reaches.
+// The curve: likeness to frames that training never sees, over iterations; the right eye's is thinner. Dashed is what
+// copying neighbours reaches.
 
 const WIDTH = 300;
 const HEIGHT = 120;
@@ -9,7 +10,7 @@ const BOTTOM = 18;
 /** The axis spans at least so much, so that noise does not look like progress. */
 const MIN_SPAN_DB = 4;
 
-/** @typedef {{iteration: number, db: number}} Point */
+/** @typedef {{iteration: number, db: number, rightDb: number}} Point a clip of one eye has no rightDb: NaN */
 
 /**
  * @param {string} csv curve.csv
@@ -19,7 +20,12 @@ export function pointsOfCsv(csv) {
   const [header, ...rows] = csv.trim().split(/\r?\n/).map((line) => line.split(","));
   const iteration = header.indexOf("iteration");
   const db = header.indexOf("psnr_tissue_db");
-  const points = rows.map((row) => ({ iteration: Number(row[iteration]), db: Number(row[db]) }));
+  const rightDb = header.indexOf("psnr_right_db");
+  const points = rows.map((row) => ({
+    iteration: Number(row[iteration]),
+    db: Number.parseFloat(row[db]),
+    rightDb: Number.parseFloat(row[rightDb]), // empty where there is no right eye
+  }));
   return points.filter((point) => Number.isFinite(point.iteration) && Number.isFinite(point.db));
 }
 
@@ -41,7 +47,8 @@ export function drawCurve(svg, points, baselines) {
   svg.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
   svg.toggleAttribute("hidden", points.length === 0);
   if (points.length === 0) return;
-  const values = [...points, ...baselines].map((each) => each.db);
+  const right = points.filter(({ rightDb }) => Number.isFinite(rightDb));
+  const values = [...[...points, ...baselines].map((each) => each.db), ...right.map((each) => each.rightDb)];
   const middle = (Math.min(...values) + Math.max(...values)) / 2;
   const half = Math.max(MIN_SPAN_DB, Math.max(...values) - Math.min(...values)) / 2 + 0.5;
   const last = Math.max(1, points.at(-1).iteration);
@@ -55,10 +62,17 @@ export function drawCurve(svg, points, baselines) {
     draw(svg, "line", { class: "baseline", x1: LEFT, x2: WIDTH - RIGHT, y1: y(db), y2: y(db) });
     draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: y(db) - 3 }, `${name} ${db.toFixed(1)}`);
   }
-  const corners = points.map((each) => `${x(each.iteration).toFixed(1)},${y(each.db).toFixed(1)}`);
-  draw(svg, "polyline", { points: corners.join(" ") });
-  draw(svg, "circle", { cx: x(last), cy: y(points.at(-1).db), r: 2.5 });
-  draw(svg, "text", { class: "tick", x: LEFT, y: HEIGHT - 4 }, "dB on unseen frames, over iterations");
+  const line = (name, corners, radius) => {
+    const places = corners.map(([iteration, db]) => [x(iteration).toFixed(1), y(db).toFixed(1)]);
+    draw(svg, "polyline", { class: name, points: places.join(" ") });
+    draw(svg, "circle", { class: name, cx: places.at(-1)[0], cy: places.at(-1)[1], r: radius });
+  };
+  if (right.length > 0) line("beside", right.map((each) => [each.iteration, each.rightDb]), 1.8);
+  line("score", points.map((each) => [each.iteration, each.db]), 2.5);
+  const what = `dB on unseen frames${right.length > 0 ? ", thin: right eye" : ""}, over iterations`;
+  draw(svg, "text", { class: "tick", x: LEFT, y: HEIGHT - 4 }, what);
   draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: HEIGHT - 4 }, String(last));
-  svg.setAttribute("aria-label", `Likeness over training: ${points.at(-1).db.toFixed(1)} dB after ${last} iterations`);
+  const beside = right.length > 0 ? `, right eye ${right.at(-1).rightDb.toFixed(1)} dB` : "";
+  const score = `${points.at(-1).db.toFixed(1)} dB${beside}`;
+  svg.setAttribute("aria-label", `Likeness over training: ${score} after ${last} iterations`);
 }

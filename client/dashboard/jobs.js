@@ -14,20 +14,21 @@ const isActive = (job) => job.state === "queued" || job.state === "running";
 /** A job's scores while it trains, by iteration. */
 class Scores {
   constructor() {
+    /** @type {Map<number, import("./curve.js").Point>} */
     this.byIteration = new Map();
     this.latest = null;
   }
 
   /** @param {Job} job */
-  note({ iteration, psnr_db: db }) {
+  note({ iteration, psnr_db: db, psnr_right_db: rightDb }) {
     for (const each of this.byIteration.keys()) if (each > iteration) this.byIteration.delete(each); // it began again
     if (!iteration || db == null || (db === this.latest && this.byIteration.size > 0)) return;
     this.latest = db;
-    this.byIteration.set(iteration, db);
+    this.byIteration.set(iteration, { iteration, db, rightDb: rightDb ?? NaN });
   }
 
   get points() {
-    return [...this.byIteration].sort(([a], [b]) => a - b).map(([iteration, db]) => ({ iteration, db }));
+    return [...this.byIteration.values()].sort((a, b) => a.iteration - b.iteration);
   }
 }
 

@@ -48,6 +48,7 @@
  *   iteration?: number | null,
  *   iterations?: number | null,
  *   psnr_db?: number | null,
+ *   psnr_right_db?: number | null,
  *   seconds_left?: number | null,
  *   position?: number | null,
  *   eta_s?: number | null,

@@ -184,6 +184,9 @@ class JobView(Model):
     iteration: int | None = None
     iterations: int | None = None
     psnr_db: float | None = None
+    """last score on held-out frames of the left eye"""
+    psnr_right_db: float | None = None
+    """the same of the right eye; None without one"""
     seconds_left: float | None = None
     position: int | None = None
     """jobs that will be claimed before this one; while queued"""

@@ -64,7 +64,10 @@ class JobFiles(BaseModel):
 
 
 class JobProgress(BaseModel):
-    """The last report of progress. fraction is of the stage, in [0, 1]; psnr_db is the last held-out psnr_tissue."""
+    """The last report of progress. fraction is of the stage, in [0, 1].
+
+    psnr_db and psnr_right_db are the last held-out psnr_tissue of the left and of the right eye.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -73,6 +76,7 @@ class JobProgress(BaseModel):
     iteration: int = 0
     iterations: int = 0
     psnr_db: float | None = None
+    psnr_right_db: float | None = None
     seconds_left: float | None = None
 
 
@@ -135,7 +139,8 @@ class JobView(BaseModel):
     fraction: float | None = None
     iteration: int | None = None
     iterations: int | None = None
-    psnr_db: float | None = None
+    psnr_db: float | None = Field(default=None, description="last score on held-out frames of the left eye")
+    psnr_right_db: float | None = Field(default=None, description="the same of the right eye; None without one")
     seconds_left: float | None = None
     position: int | None = Field(default=None, description="jobs that will be claimed before this one; while queued")
     eta_s: float | None = Field(default=None, description="estimated seconds until it is done; None if unknown")

@@ -24,7 +24,7 @@ BUDGET_S = 15
 TRAINED_WITHIN_S = 100.0
 SHOWN_T = "0.4"
 COLOURS = 256
-CURVE = "return document.querySelector('#curve polyline')?.points ?? []"
+CURVE = "return document.querySelector('#curve polyline.score')?.points ?? []"
 
 
 def main() -> None:

@@ -50,6 +50,7 @@ FAR_OUT_ZOOM = 0.9
 UNSEEN = "No frame saw 12% of this view."
 HIGHLIGHTS_STAY = "This scene was taught by one eye."
 FAR = "This pose is far from the endoscope's: most of it is a guess."
+CURVE_OF_THE_PAGE = "t_train_s,iteration,psnr_tissue_db,psnr_right_db\n1,10,27,\n2,50,30,27.5\n3,100,31.2,28.4\n"
 REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
     update={
         "psnr_tissue_db": 31.2,
@@ -150,18 +151,18 @@ class Site:
         self.announce(record.job_id)
         return Claim(record.job_id, record.attempt, WORKER)
 
-    def train(self, claim: Claim, iteration: int, psnr_db: float) -> None:
+    def train(self, claim: Claim, iteration: int, psnr_db: float, psnr_right_db: float | None = None) -> None:
         """Tell that training has come so far, of 100."""
         progress = JobProgress(
             stage="train", fraction=iteration / 100, iteration=iteration, iterations=100, psnr_db=psnr_db
         )
-        self.queue.beat(claim, progress.model_copy(update={"seconds_left": 20.0}))
+        self.queue.beat(claim, progress.model_copy(update={"seconds_left": 20.0, "psnr_right_db": psnr_right_db}))
 
     def finish(self, claim: Claim) -> str:
         folder = self.store.work_folder(claim.job_id, claim.attempt)
         (folder / MANIFEST).write_text("{}")
         (folder / REPORT).write_text(REPORT_OF_THE_PAGE.model_dump_json())
-        (folder / CURVE).write_text("t_train_s,iteration,psnr_tissue_db\n1,10,27\n2,50,30\n3,100,31.2\n")
+        (folder / CURVE).write_text(CURVE_OF_THE_PAGE)
         self.store.publish_scene(claim.job_id, claim.attempt)
         assert self.queue.finish(claim)
         self.announce()

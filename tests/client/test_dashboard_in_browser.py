@@ -16,6 +16,8 @@ from contract.wire.rendering import Highlights, Unseen
 from tests.client.local_service import CLIP
 from tests.client.page import FAR, HIGHLIGHTS_STAY, UNSEEN, Page, Site, browser, grey_of, site_at
 
+POINTS = "return document.querySelector(`#curve polyline.${arguments[0]}`)?.points ?? []"
+
 
 @pytest.fixture(scope="module")
 def driver() -> Iterator[webdriver.Chrome]:
@@ -56,10 +58,12 @@ def test_a_clip_is_sent_and_its_job_watched_to_the_scene(site: Site, page: Page)
     page.until_text("#jobs", "training · 24.0 dB · 20 s left")
     page.until_state("training")  # it opened by itself
     assert "iteration 40" in page.text("#badge")
-    for iteration, psnr_db in ((40, 27.5), (60, 28.5)):
-        site.train(claim, iteration, psnr_db)
+    for iteration, psnr_db, psnr_right_db in ((40, 27.5, 24.0), (60, 28.5, 26.5)):
+        site.train(claim, iteration, psnr_db, psnr_right_db)
         page.until_text("#jobs", f"{psnr_db} dB")
-    page.until(lambda: len(page.script("return document.querySelector('#curve polyline')?.points ?? []")) == 3)
+    page.until(lambda: len(page.script(POINTS, "score")) == 3)
+    assert len(page.script(POINTS, "beside")) == 2  # of the right eye; the first report had none
+    assert "28.5 dB, right eye 26.5 dB" in page.find("#curve").get_attribute("aria-label")
     site.finish(claim)
     page.until_state("live")
     page.until_text("#report", "31.20 dB on frames it never saw; better than copying")
@@ -67,6 +71,8 @@ def test_a_clip_is_sent_and_its_job_watched_to_the_scene(site: Site, page: Page)
     assert "28.40 dB on frames it never saw, where the left eye sees the tissue, too; no better" in page.text("#report")
     assert "Without wet highlights 30.10 dB, left eye 33.00 dB." in page.text("#report")
     page.until(lambda: page.script("return document.querySelectorAll('#curve .baseline').length") == 2)
+    assert (len(page.script(POINTS, "score")), len(page.script(POINTS, "beside"))) == (3, 2)
+    assert "31.2 dB, right eye 28.4 dB" in page.find("#curve").get_attribute("aria-label")
 
 
 def test_what_is_dropped_finds_its_place(page: Page) -> None:

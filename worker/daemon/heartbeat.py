@@ -57,7 +57,8 @@ class Heartbeat:
         with self._changed:
             before = self._progress
             if progress.psnr_db is None and before is not None:  # keep showing what training reached
-                progress = progress.model_copy(update={"psnr_db": before.psnr_db})
+                kept = {"psnr_db": before.psnr_db, "psnr_right_db": before.psnr_right_db}
+                progress = progress.model_copy(update=kept)
             self._urgent = self._urgent or before is None or before.stage != progress.stage
             self._progress, self._unsent = progress, True
             self._changed.notify()

@@ -119,6 +119,7 @@ def job_progress(progress: Progress) -> JobProgress:
         iteration=progress.iteration,
         iterations=progress.iterations,
         psnr_db=_finite(progress.psnr_db),
+        psnr_right_db=_finite(progress.psnr_right_db),
         seconds_left=_finite(progress.seconds_left),
     )
 

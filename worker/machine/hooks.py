@@ -10,13 +10,17 @@ from contract.wire.errors import Cancelled
 
 @dataclass(frozen=True)
 class Progress:
-    """One report of progress. fraction is of the stage, in [0, 1]; psnr_db is the last held-out psnr_tissue, if any."""
+    """One report of progress. fraction is of the stage, in [0, 1].
+
+    psnr_db and psnr_right_db are the last held-out psnr_tissue of the left and of the right eye, if any.
+    """
 
     stage: str
     fraction: float
     iteration: int = 0
     iterations: int = 0
     psnr_db: float | None = None
+    psnr_right_db: float | None = None
     seconds_left: float | None = None
 
 

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from contract.wire.errors import Cancelled, TrainingDiverged
-from worker.machine.hooks import Progress
 from worker.machine.timing import Stopwatch
 from worker.model.optimize import rates_at
 from worker.raster.step import StepSums
@@ -74,9 +73,8 @@ def train(
         TrainingDiverged: the loss or a parameter is not finite, or no Gaussian is visible.
     """
     marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s]
-    scored: float | None = run.curve[-1].psnr_tissue_db if run.curve else None
     reported, began, begun_at = -math.inf, clock.elapsed_s, run.iteration
-    hooks.on_progress(Progress("train", run.iteration / run.iterations, run.iteration, run.iterations, scored))
+    hooks.on_progress(run.progress("train", run.iteration / run.iterations))
     while run.iteration < run.iterations:
         if hooks.should_stop():
             raise Cancelled(f"Stopped after iteration {run.iteration} of {run.iterations}.")
@@ -85,12 +83,11 @@ def train(
         iteration = _advance(run)
         if iteration < run.iterations and (iteration in run.schedule.ends or (marks and clock.elapsed_s >= marks[0])):
             marks = [mark for mark in marks if mark > clock.elapsed_s]
-            scored = _score(run, clock, evaluate)
+            _score(run, clock, evaluate)
         if (now := clock.elapsed_s) - reported >= REPORT_EVERY_S:
             reported = now
             left_s = (now - began) / (iteration - begun_at) * (run.iterations - iteration)
-            share = iteration / run.iterations
-            hooks.on_progress(Progress("train", share, iteration, run.iterations, scored, left_s))
+            hooks.on_progress(run.progress("train", iteration / run.iterations, left_s))
     check_sums(run.model.wait(), run.iteration)
     _check_finite(run)
     if not run.curve or run.curve[-1].iteration < run.iteration:  # else it was stopped after its last score
@@ -138,13 +135,12 @@ def _check_finite(run: Run) -> None:
         raise TrainingDiverged(f"After {run.iteration} iterations {', '.join(broken)} hold values that are not finite.")
 
 
-def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], HeldOutScore]) -> float | None:
+def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], HeldOutScore]) -> None:
     check_sums(run.model.wait(), run.iteration)  # steps that still run do not count as scoring
     t_train_s = clock.elapsed_s
     with clock.paused():
         score = evaluate()
     if math.isnan(score.left_db):
-        return None
+        return
     right_db = None if math.isnan(score.right_db) else score.right_db
     run.curve.append(CurvePoint(t_train_s, run.iteration, score.left_db, right_db))
-    return score.left_db

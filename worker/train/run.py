@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from contract.wire.notices import Notice
+from worker.machine.hooks import Progress
 from worker.raster.backend import Device
 from worker.raster.model import Model
 from worker.train.average import RunningMean
@@ -88,6 +89,13 @@ class Run:
     def steps_an_epoch(self) -> int:
         """The fewest iterations in which every training frame is seen."""
         return -(-len(self.frames.indices) // self.preset.frames_a_step)
+
+    def progress(self, stage: str, fraction: float, seconds_left: float | None = None) -> Progress:
+        """A report of progress with the iterations and the curve's last scores."""
+        report = Progress(stage, fraction, self.iteration, self.iterations, seconds_left=seconds_left)
+        if not self.curve:
+            return report
+        return replace(report, psnr_db=self.curve[-1].psnr_tissue_db, psnr_right_db=self.curve[-1].psnr_right_db)
 
 
 def frames_at(run: Run, iteration: int) -> list[int]:

@@ -77,8 +77,10 @@ def test_time_in_which_the_supervisor_itself_was_stopped_is_not_held_against_the
 
 
 def test_progress_holds_only_numbers_that_json_can() -> None:
-    odd = Progress("train", 1.5, psnr_db=float("nan"), seconds_left=float("inf"))
+    odd = Progress("train", 1.5, psnr_db=float("nan"), psnr_right_db=float("-inf"), seconds_left=float("inf"))
     assert job_progress(odd) == JobProgress(stage="train", fraction=1.0)
+    both = Progress("train", 0.5, psnr_db=30.0, psnr_right_db=28.0)
+    assert job_progress(both) == JobProgress(stage="train", fraction=0.5, psnr_db=30.0, psnr_right_db=28.0)
 
 
 def test_a_reconstruction_from_stereo_advances_with_every_frame_and_knows_no_stage_without_a_limit(
@@ -88,7 +90,10 @@ def test_a_reconstruction_from_stereo_advances_with_every_frame_and_knows_no_sta
     write_stereo_video(make_phantom(PhantomSettings(width=192, height=160, frames=frames)), tmp_path / "clip")
     told: list[Progress] = []
     request = ReconstructionRequest(tmp_path / "clip", ReconstructionOptions(iterations=5))
-    reconstruct(request, tmp_path / "out", TrainingHooks(on_progress=told.append))
+    report = reconstruct(request, tmp_path / "out", TrainingHooks(on_progress=told.append))
+    (scored,) = (each for each in told if each.stage == "score" and each.fraction == 1.0)
+    assert (scored.psnr_db, scored.psnr_right_db) == (report.psnr_tissue_db, report.psnr_right_db)
+    assert None not in (scored.psnr_db, scored.psnr_right_db)
     places = {stage: {each.fraction for each in told if each.stage == stage} for stage in STAGE_LIMITS_S}
     assert {each.stage for each in told} <= set(STAGE_LIMITS_S)
     assert len(places["stereo"]) >= frames

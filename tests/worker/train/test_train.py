@@ -242,8 +242,9 @@ def test_a_stop_before_the_first_step_makes_none() -> None:
 def test_the_last_iteration_is_scored_and_reported() -> None:
     run, _ = prepared(phantom_clip(), iterations=5)
     told: list[Progress] = []
-    train(run, Stopwatch(), lambda: HeldOutScore(31.5, math.nan), TrainingHooks(on_progress=told.append))
-    assert [(point.iteration, point.psnr_tissue_db) for point in run.curve] == [(5, 31.5)]
+    train(run, Stopwatch(), lambda: HeldOutScore(31.5, 28.5), TrainingHooks(on_progress=told.append))
+    assert [(each.iteration, each.psnr_tissue_db, each.psnr_right_db) for each in run.curve] == [(5, 31.5, 28.5)]
+    assert run.progress("score", 0.5) == Progress("score", 0.5, 5, 5, psnr_db=31.5, psnr_right_db=28.5)
     assert told
     assert all(each.stage == "train" and 0 <= each.fraction <= 1 and each.iterations == 5 for each in told)
 
