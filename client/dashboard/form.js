@@ -6,7 +6,7 @@ import { Upload } from "./upload.js";
 import { LIMITS } from "./wire.js";
 
 const PARTS = ["clip", "right", "calibration", "masks"];
-const OPTIONS = ["budget_s", "layout", "priority", "mask_polarity"];
+const OPTIONS = ["budget_s", "layout", "eyes", "priority", "mask_polarity"];
 const LABELS = {
   mask_polarity: { auto: "to be found out", tool: "the instrument", tissue: "the tissue" },
   layout: {
@@ -17,6 +17,7 @@ const LABELS = {
     endonerf: "EndoNeRF",
     stereomis: "StereoMIS",
   },
+  eyes: { both: "both eyes", left: "the left eye; the right one judges" },
   priority: { standard: "standard", high: "high: before all others" },
 };
 const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;

@@ -9,6 +9,7 @@ import pytest
 from selenium import webdriver
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.select import Select
 
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobError, JobState
@@ -87,6 +88,17 @@ def test_what_is_dropped_finds_its_place(page: Page) -> None:
         """
     )
     assert chosen == ["left.mp4", "right.mp4", "tool_masks.zip", "calibration.json"]
+
+
+def test_a_stereo_clip_may_be_trained_on_its_left_eye_alone(site: Site, page: Page) -> None:
+    page.choose("clip", CLIP)
+    page.click("#upload summary")
+    eyes = Select(page.find("#upload [name=eyes]"))
+    assert eyes.first_selected_option.text == "both eyes"
+    eyes.select_by_value("left")
+    page.click("#upload [type=submit]")
+    page.until(lambda: site.queue.records())
+    assert site.queue.records()[0].options.eyes == "left"
 
 
 def test_a_clip_that_cannot_be_used_is_refused_in_words(page: Page, tmp_path: Path) -> None:
