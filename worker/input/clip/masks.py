@@ -1,7 +1,7 @@
 """Instrument masks: which pixels are tissue, and what decided it.
 
-Masks show the left eye, or both: told apart by their names, or packed into one picture as frames are. What white means
-is decided once, by the left eye.
+Masks show the left eye, or both: told apart by their names, two videos or one image a frame and eye, or packed into one
+picture as frames are. What white means is decided once, by the left eye.
 
 Symbols: T frames, H W pixels of one eye.
 """
@@ -54,7 +54,7 @@ class MaskFrames:
     """
 
     frames: ImageSequence | VideoFile
-    right: ImageSequence | None = None
+    right: ImageSequence | VideoFile | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -67,27 +67,38 @@ class MaskFrames:
 
 
 def open_masks(path: Path, limits: ClipLimits) -> MaskFrames:
-    """The masks in a zip or folder of images, or in a video. InputError, LimitError."""
+    """The masks in a video, or in a zip or folder of images, of one video or of two. InputError, LimitError."""
     check_exists(path, _FIELD)
     tree = open_tree(path, _FIELD, limits)
     if tree is None:
         return MaskFrames(open_video(path, _FIELD, limits))
-    names = _mask_names(tree) or tree.images()
-    if not names and len(tree.videos()) == 1:
-        return MaskFrames(open_video_in(tree, tree.videos()[0]))
-    return _mask_images(tree, names)
+    return own_masks(tree) or _masks_named(tree, tree.images(), tree.videos())
 
 
 def own_masks(tree: FileTree) -> MaskFrames | None:
     """The masks in the folders masks or mask of a clip; None without any. InputError, LimitError."""
-    names = _mask_names(tree)
-    return _mask_images(tree, names) if names else None
+    images, videos = _in_mask_folders(tree.images()), _in_mask_folders(tree.videos())
+    return _masks_named(tree, images, videos) if images or videos else None
 
 
-def _mask_names(tree: FileTree) -> tuple[str, ...]:
-    """Images in a folder called masks or mask."""
+def _in_mask_folders(names: tuple[str, ...]) -> tuple[str, ...]:
     folders = {"masks", "mask"}
-    return tuple(n for n in tree.images() if folders & {part.lower() for part in PurePosixPath(n).parts[:-1]})
+    return tuple(name for name in names if folders & {part.lower() for part in PurePosixPath(name).parts[:-1]})
+
+
+def _masks_named(tree: FileTree, images: tuple[str, ...], videos: tuple[str, ...]) -> MaskFrames:
+    return _mask_videos(tree, videos) if videos and not images else _mask_images(tree, images)
+
+
+def _mask_videos(tree: FileTree, names: tuple[str, ...]) -> MaskFrames:
+    left, right = left_eye_only(names), right_eye_only(names)
+    if len(left) > 1 or len(right) > 1:
+        raise InputError(
+            _FIELD,
+            f"{tree.label} holds {len(names)} videos ({', '.join(names[:4])}).",
+            "Keep one video of masks, or two named left and right.",
+        )
+    return MaskFrames(open_video_in(tree, left[0]), open_video_in(tree, right[0]) if right else None)
 
 
 def _mask_images(tree: FileTree, names: tuple[str, ...]) -> MaskFrames:
@@ -224,7 +235,10 @@ def _bright_class_by_look(white: NDArray[np.bool_]) -> BrightClass | None:
 def _check_shape(given: tuple[int, int, int], shape: tuple[int, int, int], eye: str) -> None:
     frames, height, width = shape
     if given[0] != frames:
-        raise InputError(_FIELD, f"there are {given[0]} masks for {frames} frames.", "Give one mask for each frame.")
+        of = " of the right eye" if eye == "right" else ""
+        raise InputError(
+            _FIELD, f"there are {given[0]} masks{of} for {frames} frames.", "Give one mask for each frame."
+        )
     if given[1:] != (height, width):
         raise InputError(
             _FIELD,

@@ -36,8 +36,8 @@ def open_clip(
     """The clip in these files, validated. Its `assumptions` list every assumption that was made.
 
     path     a stereo video, a folder or a zip; or the left eye's video or frames when `right` is given
-    masks    zip or folder of PNG, or a video, of the left eye or of both (masks.py); default: the clip's own masks/
-             folder, if it has one
+    masks    zip or folder of PNG, or of videos, or a video, of the left eye or of both (masks.py); default: the clip's
+             own masks/ folder, if it has one
     options  layout: one of clip/layouts/ by its name; "auto" detects it by names, shape and content.
              mask_polarity: "auto" decides by layout and look (masks.tissue_from_masks)
 

@@ -92,6 +92,7 @@ class Studio:
     def video(self, name: str, frames: Frames, codec: str = "VP90", rate_hz: float = 25.0) -> Path:
         """A lossy video of RGB frames [T, H, W, 3]; the suffix of name chooses the container."""
         path = self.root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
         height, width = frames.shape[1:3]
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), rate_hz, (width, height))
         assert writer.isOpened()

@@ -213,6 +213,50 @@ def test_a_video_of_packed_masks_is_of_both_eyes(studio, frames: Path) -> None:
     assert (clip.tissue_right != ~right_tool(studio)).mean() < 0.01
 
 
+def mask_video(studio, name: str, tool: NDArray[np.bool_]) -> Path:
+    return studio.video(name, np.repeat(np.where(tool, np.uint8(255), np.uint8(0))[..., None], 3, axis=3))
+
+
+@pytest.mark.parametrize("names", [("left.webm", "right.webm"), ("tool_l.webm", "tool_r.webm")])
+@pytest.mark.parametrize("kind", ["zip", "folder", "beside"])
+def test_two_videos_of_masks_named_left_and_right_are_of_both_eyes(
+    studio, frames: Path, names: tuple[str, str], kind: str
+) -> None:
+    folder = "clip/masks" if kind == "beside" else "given"
+    for name, tool in zip(names, (studio.tool(), right_tool(studio)), strict=True):
+        mask_video(studio, f"{folder}/{name}", tool)
+    given = {"zip": lambda: studio.zip(studio.root / "given", "masks.zip"), "folder": lambda: studio.root / "given"}
+    clip = masked(frames) if kind == "beside" else masked(frames, masks=given[kind]())
+    assert clip.tissue is not None
+    assert clip.tissue_right is not None
+    assert (clip.tissue != ~studio.tool()).mean() < 0.01
+    assert (clip.tissue_right != ~right_tool(studio)).mean() < 0.01
+    assert "masks of the right eye: as given" in texts(clip.assumptions)
+
+
+@pytest.mark.parametrize(
+    "names", [("a.webm", "b.webm"), ("left.webm", "right.webm", "more.webm"), ("left_a.webm", "left_b.webm")]
+)
+def test_several_videos_of_masks_that_name_no_pair_of_eyes_are_refused(studio, frames: Path, names) -> None:
+    for name in names:
+        mask_video(studio, f"given/{name}", studio.tool())
+    with pytest.raises(InputError, match=f"holds {len(names)} videos") as caught:
+        open_clip(frames, masks=studio.root / "given")
+    assert caught.value.field == "masks"
+    assert "two named left and right" in caught.value.remedy
+
+
+def test_videos_of_masks_that_differ_in_number_or_size_are_refused(studio, frames: Path) -> None:
+    mask_video(studio, "few/left.webm", studio.tool())
+    mask_video(studio, "few/right.webm", studio.tool(5))
+    with pytest.raises(InputError, match="there are 5 masks of the right eye for 6 frames"):
+        open_clip(frames, masks=studio.root / "few")
+    mask_video(studio, "small/left.webm", studio.tool())
+    mask_video(studio, "small/right.webm", studio.tool(6, 64, 80))
+    with pytest.raises(InputError, match="masks are 80x64 pixels, the right eye is 96x80"):
+        open_clip(frames, masks=studio.root / "small")
+
+
 @pytest.mark.parametrize("pattern", ["{eye}/{number}.png", "{number}{letter}.png", "{number}_{eye}.png"])
 @pytest.mark.parametrize("beside", [False, True])
 def test_masks_whose_names_name_both_eyes_are_of_both(studio, frames: Path, pattern: str, beside: bool) -> None:
