@@ -50,8 +50,7 @@ class Model(Protocol):
         """One iteration (counted from 1): one step of Adam down the sum of the frames' losses.
 
         Args:
-            frames: F of one size; a frame may occur more than once. The buffers fit the F of the last step; another F
-                allocates new ones.
+            frames: F of one size; a frame may occur more than once. Another F may allocate new buffers.
             sh_degree: the harmonics in use at this iteration.
 
         Returns:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tests.helpers import assert_close
@@ -29,7 +30,7 @@ from worker.model.deformation import (
     restore,
 )
 from worker.model.gaussians import Gaussians
-from worker.model.layout import ROWS
+from worker.model.layout import COLOUR_CHANNELS, ROWS
 from worker.model.loss import LossSettings, training_loss
 from worker.model.optimize import StepRates
 from worker.raster import Camera
@@ -298,6 +299,37 @@ def test_a_fused_step_has_the_gradients_of_the_stages_one_by_one(kind: str, sh_d
             assert_close(stored["motion.first"][row, ..., :90], wanted[name].permute(1, 2, 0), name=name)
 
 
+@pytest.mark.parametrize("yaw_deg", [0, 4], ids=["one depth axis", "two depth axes"])
+@pytest.mark.parametrize(
+    ("kind", "sh_degree"), [("shared with gloss", 0), ("shared with colour", 3), ("fdm-quartic", 0)]
+)
+def test_a_step_on_both_eyes_has_the_gradients_of_each_added(kind: str, sh_degree: int, yaw_deg: float) -> None:
+    gaussians, deformation, left = moving_gaussians(kind, sh_degree)
+    moved = np.eye(4)
+    moved[:3, :3] = Rotation.from_euler("y", yaw_deg, degrees=True).as_matrix()
+    moved[0, 3] = -9.0  # so far that either eye sees some Gaussians alone
+    right = dataclasses.replace(left, camera_from_world=moved @ left.camera_from_world, side=-0.3)
+    everywhere = random_frame(left, np.zeros((left.height, left.width), bool))
+    padding = Rasterizer(left.width, left.height)
+    eyes = [everywhere.seen_from(camera, t, padding) for t, camera in [(0.4, left), (0.4, right), (0.6, right)]]
+
+    def after(frames: list[TrainingFrame]) -> CpuModel:
+        model = CpuModel(gaussians, deformation, left.width, left.height)
+        model.step(frames, NORMALISED, RATES, 1, sh_degree)
+        return model
+
+    together, apart = after(eyes), [after([each]) for each in eyes]
+    for name, stored in together.arrays().items():
+        if "moments." in name or name == "motion.first":
+            first = 0 if "moments." in name else slice(None)
+            wanted = sum(each.arrays()[name][first] for each in apart)
+            assert_close(stored[first], wanted, relative=1e-5, name=name)
+    assert not bool((apart[0].visible == apart[1].visible).all())
+    assert bool((together.visible == apart[0].visible | apart[1].visible | apart[2].visible).all())
+    norms = torch.stack([each.gradient_norm for each in apart])
+    assert bool((together.gradient_norm == norms.amax(0)).all())
+
+
 def _scene_of(gaussians: Gaussians, camera: Camera) -> SplatScene:
     return SplatScene(
         mean=gaussians.mean,
@@ -365,11 +397,12 @@ def test_bases_that_are_negligible_are_left_out_of_deformation_and_training() ->
     weight = torch.randn(shared.weight.shape, generator=torch.Generator().manual_seed(8))
     deformation = dataclasses.replace(shared, weight=weight)
     motion = LinearMotion(deformation, 16)
-    state = np.empty((13, 16), np.float32)
-    motion.deform(np.zeros((13, 16), np.float32), 0.26, state)
+    state = np.empty((ROWS, 16), np.float32)
+    motion.deform(np.zeros((ROWS, 16), np.float32), 0.26, state)
     bound = NEGLIGIBLE * float(weight.abs().sum(-1).max())
-    assert_close(state.T, weight @ deformation.basis(0.26), relative=0.0, absolute=bound)
-    motion.update(np.ones((1, 13, 16), np.float32), [0.26], RATES, 1)
+    assert_close(state[COLOUR_CHANNELS:], np.zeros((1, 16)))
+    assert_close(state[:COLOUR_CHANNELS].T, weight @ deformation.basis(0.26), relative=0.0, absolute=bound)
+    motion.update(np.ones((1, ROWS, 16), np.float32), [0.26], RATES, 1)
     changed = (motion.export(16).weight != weight).any(dim=0).any(dim=0)
     alive = deformation.basis(0.26) >= NEGLIGIBLE
     assert 0 < int(alive.sum()) < 9
@@ -379,8 +412,8 @@ def test_bases_that_are_negligible_are_left_out_of_deformation_and_training() ->
 def test_beyond_six_widths_the_kernels_of_fdm_give_the_canonical_state() -> None:
     fdm = GaussianFdm.initial(16, bases=3, width=0.01)
     fdm = dataclasses.replace(fdm, weight=torch.ones_like(fdm.weight))
-    canonical = np.random.default_rng(0).normal(size=(13, 16)).astype(np.float32)
-    state = np.full((13, 16), np.nan, np.float32)
+    canonical = np.random.default_rng(0).normal(size=(ROWS, 16)).astype(np.float32)
+    state = np.full((ROWS, 16), np.nan, np.float32)
     FdmMotion(fdm, 16).deform(canonical, 0.25, state)  # 25 widths from the nearest centre
     assert bool((state == canonical).all())
 

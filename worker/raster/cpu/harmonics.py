@@ -1,4 +1,6 @@
-"""Spherical harmonics to colour and back, for scenes whose camera moves (worker/model/gaussians.py: the same in torch).
+"""The colour of a state and its gradient (worker/model/gaussians.py: the same in torch).
+
+With gloss alone, or with spherical harmonics, for scenes whose camera moves.
 
 N Gaussians, K = (degree + 1)^2 coefficients per channel: the constant one in state[COLOUR], the others in
 rest [K - 1, 3, N]; colour [3, N], mean in state[MEAN].
@@ -12,10 +14,54 @@ import numpy as np
 
 from worker.machine.cache import kernel
 from worker.model.constants import SH_C0, SH_C1, SH_C2, SH_C3
-from worker.model.layout import COLOUR_ROW, MEAN_ROW
+from worker.model.layout import COLOUR_ROW, DIM, GLOSS_ROW, MEAN_ROW, SIDE
+from worker.raster.cpu.simd import load, maximum, splat, store, where_less
+from worker.raster.cpu.vectors import LANES
 
 _C2 = (SH_C2[0], -SH_C2[0], SH_C2[1], -SH_C2[0], SH_C2[2])
 _C3 = (-SH_C3[0], SH_C3[1], -SH_C3[2], SH_C3[3], -SH_C3[2], SH_C3[4], -SH_C3[0])
+
+
+_ZERO, _ONE, _HALF, _C0 = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(SH_C0)
+
+
+@kernel
+def colour_from_gloss(thread, threads, camera, state, colour):  # type: ignore[no-untyped-def]
+    """colour = max(0, 0.5 + c Y_0 + side g - dim |g|), of the camera's side and dim."""
+    zero, side, dim = splat(_ZERO), splat(np.float32(camera[SIDE])), splat(np.float32(camera[DIM]))
+    has_gloss = camera[SIDE] != 0.0 or camera[DIM] != 0.0
+    vectors = state.shape[1] // LANES
+    for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
+        i = k * LANES
+        seen = zero
+        if has_gloss:
+            gloss = load(state[GLOSS_ROW], i)
+            seen = side * gloss - dim * maximum(gloss, zero - gloss)
+        for channel in range(3):
+            shown = load(state[COLOUR_ROW + channel], i) * splat(_C0) + splat(_HALF) + seen
+            store(colour[channel], i, where_less(shown, zero, zero, shown))
+
+
+@kernel
+def colour_from_gloss_backward(  # type: ignore[no-untyped-def]
+    thread, threads, camera, state, colour, v_colour, adds, v_state
+):
+    """Write v_state[COLOUR] and v_state[GLOSS], or add to them; v_colour becomes 0 where the colour was held at 0."""
+    zero, one = splat(_ZERO), splat(_ONE)
+    side, dim = splat(np.float32(camera[SIDE])), splat(np.float32(camera[DIM]))
+    vectors = state.shape[1] // LANES
+    for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
+        i = k * LANES
+        gloss = load(state[GLOSS_ROW], i)
+        shine = side - dim * (where_less(zero, gloss, one, zero) - where_less(gloss, zero, one, zero))
+        total = zero
+        for channel in range(3):
+            gradient = load(v_colour[channel], i) * where_less(zero, load(colour[channel], i), one, zero)
+            total = total + gradient
+            before = load(v_state[COLOUR_ROW + channel], i) if adds else zero
+            store(v_state[COLOUR_ROW + channel], i, before + gradient * splat(_C0))
+        before = load(v_state[GLOSS_ROW], i) if adds else zero
+        store(v_state[GLOSS_ROW], i, before + total * shine)
 
 
 @kernel
@@ -82,9 +128,9 @@ def colour_from_sh(thread, threads, degree, centre, state, rest, colour):  # typ
 
 @kernel
 def colour_from_sh_backward(  # type: ignore[no-untyped-def]
-    thread, threads, degree, centre, state, rest, colour, v_colour, v_rest, v_state
+    thread, threads, degree, centre, state, rest, colour, v_colour, adds, adds_state, v_rest, v_state
 ):
-    """Write v_rest [K - 1, 3, N] and v_state[COLOUR]; add the direction's share to v_state[MEAN]."""
+    """Write v_rest [K - 1, 3, N] and v_state[COLOUR], or add to them; add the direction's share to v_state[MEAN]."""
     terms = (degree + 1) * (degree + 1)
     value, slope, v_direction = np.empty(terms), np.empty((terms, 3)), np.empty(3)
     count = state.shape[1]
@@ -94,9 +140,11 @@ def colour_from_sh_backward(  # type: ignore[no-untyped-def]
         v_direction[:] = 0.0
         for channel in range(3):
             gradient = v_colour[channel, g] if colour[channel, g] > 0.0 else np.float32(0.0)
-            v_state[COLOUR_ROW + channel, g] = gradient * SH_C0
+            before = v_state[COLOUR_ROW + channel, g] if adds_state else np.float32(0.0)
+            v_state[COLOUR_ROW + channel, g] = before + np.float32(gradient * SH_C0)
             for k in range(1, terms):
-                v_rest[k - 1, channel, g] = gradient * value[k]
+                before = v_rest[k - 1, channel, g] if adds else np.float32(0.0)
+                v_rest[k - 1, channel, g] = before + np.float32(gradient * value[k])
                 for axis in range(3):
                     v_direction[axis] += gradient * rest[k - 1, channel, g] * slope[k, axis]
         along = v_direction[0] * x + v_direction[1] * y + v_direction[2] * z

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import astuple
+from dataclasses import astuple, replace
+from itertools import groupby
+from operator import attrgetter
 
 import numpy as np
 import torch
@@ -25,6 +27,7 @@ from worker.model.layout import (
     GLOSS_ROW,
     LOG_SCALE,
     MEAN,
+    POSE,
     QUATERNION,
     QUATERNION_ROW,
     ROWS,
@@ -34,7 +37,7 @@ from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu import harmonics, update
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
-from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, padded
+from worker.raster.cpu.rasterizer import Floats, Gradients, Order, Rasterizer, padded
 from worker.raster.cpu.threads import run
 from worker.raster.model import put_back
 from worker.raster.step import StepSums, TrainingFrame, camera_centre, image_size
@@ -81,14 +84,15 @@ class CpuModel:
     def _parameters(self) -> dict[str, Floats]:
         return {"canonical": self.canonical, "opacity_logit": self.opacity_logit, "sh_rest": self.sh_rest}
 
-    def _allocate(self, frames: int = 1) -> None:
-        """Room for the Gaussians at one time, and for their gradients in so many frames per step."""
+    def _allocate(self, moments: int = 1) -> None:
+        """Room for the Gaussians at one time, and for their gradients at so many moments per step."""
         columns = self.canonical.shape[1]
         self.state = np.zeros((ROWS, columns), np.float32)
         self.colour = np.zeros((3, columns), np.float32)
-        self._v_state = np.zeros((frames, ROWS, columns), np.float32)
-        self._v_rest = np.zeros((frames, *self.sh_rest.shape), np.float32)
-        self._gradients = [Gradients.room(v_state) for v_state in self._v_state]
+        self._v_state = np.zeros((moments, ROWS, columns), np.float32)
+        self._v_rest = np.zeros(self.sh_rest.shape, np.float32)
+        total = Gradients.room(self._v_state[0])
+        self._gradients = [replace(total, state=v_state) for v_state in self._v_state]  # only the states are apart
         self._seen = np.zeros(columns, np.bool_)
 
     def _rasterizer(self, width: int, height: int) -> Rasterizer:
@@ -115,19 +119,14 @@ class CpuModel:
         self.motion.deform(self.canonical, t, self.state)
         self._project_state(camera, sh_degree)
 
-    def _project_state(self, camera: NDArray[np.float64], sh_degree: int) -> None:
+    def _project_state(self, camera: NDArray[np.float64], sh_degree: int, order: Order = Order.OF_ITS_OWN) -> None:
         """The Gaussians of the state on this camera's image."""
         self.rasterizer = self._rasterizer(*image_size(camera))
         if sh_degree == 0:
-            np.multiply(self.state[COLOUR], np.float32(SH_C0), out=self.colour)
-            self.colour += np.float32(0.5)
-            if camera[SIDE] or camera[DIM]:
-                gloss = self.state[GLOSS_ROW]
-                self.colour += np.float32(camera[SIDE]) * gloss - np.float32(camera[DIM]) * np.abs(gloss)
-            np.maximum(self.colour, 0, out=self.colour)
+            run(harmonics.colour_from_gloss, camera, self.state, self.colour)
         else:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
-        self.rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
+        self.rasterizer.project(camera, self.state, self.opacity_logit, self.colour, order)
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
         """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
@@ -161,70 +160,50 @@ class CpuModel:
         self, frames: Sequence[TrainingFrame], loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
     ) -> StepSums:
         """One iteration (counted from 1) on the sum of the frames' losses; sh_degree: the harmonics in use at it."""
-        if len(frames) != len(self._gradients):
-            self._allocate(len(frames))
+        moments = [(t, list(same)) for t, same in groupby(frames, key=attrgetter("t"))]
+        if len(moments) > len(self._gradients):
+            self._allocate(len(moments))
         self._seen[:] = False
         sums = [
-            self._backward(place, frame, loss, sh_degree, moved=place > 0 and frames[place - 1].t == frame.t)
-            for place, frame in enumerate(frames)
+            each for place, (t, same) in enumerate(moments) for each in self._backward(place, t, same, loss, sh_degree)
         ]
-        times = self._add_moments([frame.t for frame in frames])
-        self.motion.update(self._v_state[: len(times)], times, rates, iteration)
-        self._add_frames(len(times))
+        self.motion.update(self._v_state[: len(moments)], [t for t, _ in moments], rates, iteration)
+        for v_state in self._v_state[1 : len(moments)]:
+            self._v_state[0] += v_state
         self.update_canonical(self._gradients[0], rates, iteration, sh_degree)
         colour_l1, depth_l1, squared_error, holes = np.sum(sums, axis=0).tolist()
         return StepSums(colour_l1, depth_l1, squared_error, holes, int(np.count_nonzero(self._seen[: self.count])))
 
     def _backward(
-        self, place: int, frame: TrainingFrame, loss: LossSettings, sh_degree: int, *, moved: bool
-    ) -> NDArray[np.float64]:
-        """The gradients of a frame's loss, to its place among those of the step; the loss's sums (StepSums).
+        self, place: int, t: float, frames: Sequence[TrainingFrame], loss: LossSettings, sh_degree: int
+    ) -> list[NDArray[np.float64]]:
+        """Add the gradients of the losses of all frames of a moment to those of the step; the losses' sums (StepSums).
 
-        moved: the frame before was of the same moment, so that the state is that of this one already.
+        place: of the moment among those of the step. They share its state, and its depth order if their cameras do.
         """
-        gradients = self._gradients[place]
-        if not moved:
-            self.motion.deform(self.canonical, frame.t, self.state, trains=True)
-        self._project_state(frame.camera, sh_degree)
-        self.rasterizer.loss_backward(frame.target, frame.loss_settings(loss), gradients)
-        if sh_degree == 0:
-            gradients.colour *= self.colour > 0
-            np.multiply(gradients.colour, np.float32(SH_C0), out=gradients.state[COLOUR])
-            np.multiply(gradients.colour.sum(0), self._shine(frame.camera), out=gradients.state[GLOSS_ROW])
-        else:
-            run(
-                harmonics.colour_from_sh_backward, sh_degree, camera_centre(frame.camera), self.state, self.sh_rest,
-                self.colour, gradients.colour, self._v_rest[place], gradients.state,
-            )  # fmt: skip
-            gradients.state[GLOSS_ROW] = 0
-        self._seen |= self.rasterizer.radius2 >= 0
-        sums: NDArray[np.float64] = self.rasterizer.statistics.sum(0, dtype=np.float64)
+        gradients, sums = self._gradients[place], []
+        self.motion.deform(self.canonical, t, self.state, trains=True)
+        orders = _orders(frames)
+        for k, (frame, order) in enumerate(zip(frames, orders, strict=True)):
+            adds, adds_state = place + k > 0, k > 0
+            self._project_state(frame.camera, sh_degree, order)
+            self.rasterizer.loss_backward(
+                frame.target, frame.loss_settings(loss), gradients, adds=adds, adds_state=adds_state
+            )
+            if sh_degree == 0:
+                run(
+                    harmonics.colour_from_gloss_backward, frame.camera, self.state, self.colour, gradients.colour,
+                    adds_state, gradients.state,
+                )  # fmt: skip
+            else:
+                run(
+                    harmonics.colour_from_sh_backward, sh_degree, camera_centre(frame.camera), self.state,
+                    self.sh_rest, self.colour, gradients.colour, adds, adds_state, self._v_rest, gradients.state,
+                )  # fmt: skip
+                gradients.state[GLOSS_ROW] = 0
+            self._seen |= self.rasterizer.radius2 >= 0
+            sums.append(self.rasterizer.statistics.sum(0, dtype=np.float64))
         return sums
-
-    def _add_moments(self, times: Sequence[float]) -> list[float]:
-        """Add up the states' gradients of neighbouring frames of one moment, for they share its state.
-
-        Returns the moments. Their gradients are the first of _v_state.
-        """
-        moments: list[float] = []
-        for place, t in enumerate(times):
-            if moments and moments[-1] == t:
-                self._v_state[len(moments) - 1] += self._v_state[place]
-                continue
-            if place > len(moments):
-                self._v_state[len(moments)] = self._v_state[place]
-            moments.append(t)
-        return moments
-
-    def _add_frames(self, moments: int) -> None:
-        """Make the first frame's gradients those of all, in order, and its norms the largest."""
-        total = self._gradients[0]
-        for v_state in self._v_state[1:moments]:
-            total.state += v_state
-        for place, each in enumerate(self._gradients[1:], start=1):
-            total.opacity_logit += each.opacity_logit
-            np.maximum(total.mean2d_norm, each.mean2d_norm, out=total.mean2d_norm)
-            self._v_rest[0] += self._v_rest[place]
 
     def wait(self) -> None:
         """Every step has been waited for, and answered."""
@@ -245,7 +224,7 @@ class CpuModel:
         _adam(self.opacity_logit, gradients.opacity_logit, opacity_moments, rates.opacity, rates, iteration)
         if sh_degree > 0:
             rest, used = self._moments["sh_rest"], slice(0, (sh_degree + 1) ** 2 - 1)
-            _adam(self.sh_rest[used], self._v_rest[0, used], rest[:, used], rates.sh_rest, rates, iteration)
+            _adam(self.sh_rest[used], self._v_rest[used], rest[:, used], rates.sh_rest, rates, iteration)
 
     def take(self, columns: NDArray[np.int64], fresh: NDArray[np.bool_]) -> None:
         """Keep these Gaussians, in this order (repeats are copies); Adam's moments start at 0 where fresh."""
@@ -290,6 +269,14 @@ class CpuModel:
             torch.from_numpy(self.canonical[GLOSS_ROW, : self.count].copy()),
         )
         return gaussians, self.motion.export(self.count)
+
+
+def _orders(frames: Sequence[TrainingFrame]) -> list[Order]:
+    """The depth order of each frame of a moment: one for all if every camera sees all points at the same depth."""
+    depth_axes = [frame.camera[POSE + 8 : POSE + 12] for frame in frames]
+    if len(frames) > 1 and all(np.array_equal(each, depth_axes[0]) for each in depth_axes):
+        return [Order.FOR_THE_NEXT, *[Order.OF_THE_LAST] * (len(frames) - 1)]
+    return [Order.OF_ITS_OWN] * len(frames)
 
 
 def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, rates: StepRates, iteration: int) -> None:

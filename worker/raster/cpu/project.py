@@ -260,17 +260,25 @@ def _add_homes(first, homes, sums, totals):  # type: ignore[no-untyped-def]
         store(totals, lane * GRADIENT, head)
 
 
+@kernel(inline="always")
+def _put(row, i, value, adds):  # type: ignore[no-untyped-def]
+    """LANES numbers into row[i], added to what is there if asked."""
+    if adds:
+        value = load(row, i) + value
+    store(row, i, value)
+
+
 @kernel
 def project_backward(  # type: ignore[no-untyped-def]
-    thread, threads, camera, state, opacity_logit, radius2, homes, sums,
+    thread, threads, camera, state, opacity_logit, radius2, homes, sums, adds, adds_state,
     v_state, v_opacity_logit, v_colour, v_mean2d_norm, v_pose,
 ):  # fmt: skip
     """Sum the blend's gradients of each Gaussian over its homes (bins.py) and carry them back to its parameters.
 
-    sums [homes * GRADIENT]. Every
-    v_* row is written (zeros for culled Gaussians). v_mean2d_norm [N]: |dL/dmean2d| in normalised device coordinates
-    (x times W / 2, y times H / 2), the unit in which densification thresholds are published. v_pose [threads, 12]: the
-    thread's share of dL/d camera_from_world.
+    sums [homes * GRADIENT]. Every v_* row is written (zeros for culled Gaussians). Where adds_state, v_state is added
+    to, and where adds, v_opacity_logit; v_mean2d_norm then keeps what is larger. v_mean2d_norm [N]: |dL/dmean2d| in
+    normalised device coordinates (x times W / 2, y times H / 2), the unit in which densification thresholds are
+    published. v_pose [threads, 12]: the thread's share of dL/d camera_from_world.
 
     With G = dL/dconic: dL/dcov2d = -conic G conic; dL/dSigma = A^T dL/dcov2d A.
     One long function, because each step of this chain needs most of what the steps before it computed.
@@ -292,7 +300,7 @@ def project_backward(  # type: ignore[no-untyped-def]
         store(v_colour[2], i, load_strided(totals, 2, GRADIENT))
         odds = _exp(zero - widen(load(opacity_logit, i)))
         # times 1 - opacity, exact also where opacity rounds to 1
-        store(v_opacity_logit, i, narrow(widen(load_strided(totals, 4, GRADIENT)) * odds / (1.0 + odds)))
+        _put(v_opacity_logit, i, narrow(widen(load_strided(totals, 4, GRADIENT)) * odds / (1.0 + odds)), adds)
 
         # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + EPS2D I.
         mean = _rows_of(state, MEAN_ROW, i)
@@ -316,7 +324,8 @@ def project_backward(  # type: ignore[no-untyped-def]
         m_x, m_y = widen(load_strided(totals, 5, GRADIENT)), widen(load_strided(totals, 6, GRADIENT))
         v_mx, v_my = ka * m_x + kb * m_y, kb * m_x + kc * m_y
         on_image = v_mx * v_mx * (0.25 * width * width) + v_my * v_my * (0.25 * height * height)
-        store(v_mean2d_norm, i, where_less(visible, none, none, narrow(sqrt(on_image))))
+        norm = where_less(visible, none, none, narrow(sqrt(on_image)))
+        store(v_mean2d_norm, i, maximum(load(v_mean2d_norm, i), norm) if adds else norm)
         g00 = -0.5 * widen(load_strided(totals, 7, GRADIENT))  # dL/dconic, symmetric halves
         g01 = -0.5 * widen(load_strided(totals, 8, GRADIENT))
         g11 = -0.5 * widen(load_strided(totals, 9, GRADIENT))
@@ -328,15 +337,14 @@ def project_backward(  # type: ignore[no-untyped-def]
         e0, e1 = _sum(2 * c00, t0, 2 * c01, t1), _sum(2 * c01, t0, 2 * c11, t1)
         by_scale = _each(b0, e0), _each(b1, e1)
         for c in range(3):
-            store(
-                v_state[LOG_SCALE_ROW + c], i, where_less(visible, none, none, narrow(by_scale[0][c] + by_scale[1][c]))
-            )
+            log_scale = where_less(visible, none, none, narrow(by_scale[0][c] + by_scale[1][c]))
+            _put(v_state[LOG_SCALE_ROW + c], i, log_scale, adds_state)
 
         # dL/dR = A^T E, then through R(q / |q|).
         p = (_sum(a0[0], e0, a1[0], e1), _sum(a0[1], e0, a1[1], e1), _sum(a0[2], e0, a1[2], e1))
         v_quaternion = _quaternion_gradient(q, n, p)
         for c in range(4):
-            store(v_state[QUATERNION_ROW + c], i, where_less(visible, none, none, narrow(v_quaternion[c])))
+            _put(v_state[QUATERNION_ROW + c], i, where_less(visible, none, none, narrow(v_quaternion[c])), adds_state)
 
         # dL/dA = E R^T =: F, then to the camera point through A = diag(j) (W_xy - (u, v) W_z).
         f0, f1 = _onto(r, e0), _onto(r, e1)
@@ -349,7 +357,7 @@ def project_backward(  # type: ignore[no-untyped-def]
         v_x, v_y, v_z = v_x + v_u, v_y + v_v, v_z - v_u * ratio_x - v_v * ratio_y
         v_mean = _through((v_x, v_y, v_z), w)
         for c in range(3):
-            store(v_state[MEAN_ROW + c], i, where_less(visible, none, none, narrow(v_mean[c])))
+            _put(v_state[MEAN_ROW + c], i, where_less(visible, none, none, narrow(v_mean[c])), adds_state)
         # dL/d camera_from_world: what reaches x, y, z times the mean, and J^T dL/dA.
         j0_u, j1_v = j0 * u, j1 * v
         to_x, to_y = _sum(v_x, mean, j0, f0), _sum(v_y, mean, j1, f1)

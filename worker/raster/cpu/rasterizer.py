@@ -6,6 +6,7 @@ N Gaussians (a multiple of LANES, see padded), M slots, H W pixels. All arrays a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +34,20 @@ def padded(count: int) -> int:
     return -(-count // LANES) * LANES
 
 
+class Order(Enum):
+    """Which depth order the splats are sorted by: those of a moment are as far from every camera of one depth axis."""
+
+    OF_ITS_OWN = auto()
+    FOR_THE_NEXT = auto()  # of all that the next camera, too, may draw
+    OF_THE_LAST = auto()  # made by FOR_THE_NEXT, of the same state and depth axis
+
+
 @dataclass
 class Gradients:
-    """dL/d of every Gaussian's deformed state, opacity logit and colour, and of camera_from_world; |dL/dmean2d|."""
+    """dL/d of every Gaussian's deformed state, opacity logit and colour, and of camera_from_world; |dL/dmean2d|.
+
+    Of several frames, those of the state, of the opacity and the norm are of all; the others of the last.
+    """
 
     state: Floats  # [ROWS, N]; COLOUR and GLOSS are the caller's to fill
     opacity_logit: Floats  # [N]
@@ -82,6 +94,7 @@ class Rasterizer:
         self._homes = np.zeros((count, 4), np.int32)
         self._order = np.zeros((2, count), np.int32)
         self._keys = np.zeros((2, count), np.uint32)
+        self._sorted = self._order[0]
         self.gradients = Gradients.room(np.zeros((ROWS, count), np.float32))
 
     def _allocate_slots(self, slots: int, homes: int) -> None:
@@ -89,11 +102,18 @@ class Rasterizer:
         self._slot_info, self._entries = np.zeros((2, self.threads * slots), np.uint32)
         self._sums = np.zeros(self.threads * homes * bins.GRADIENT, np.float32)
 
-    def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
+    def project(
+        self,
+        camera: NDArray[np.float64],
+        state: Floats,
+        opacity_logit: Floats,
+        colour: Floats,
+        order: Order = Order.OF_ITS_OWN,
+    ) -> None:
         """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N]."""
         self.place(camera, state, opacity_logit, colour)
         self.bin()
-        self.sort()
+        self.sort(order)
 
     def place(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
         """First third of project: the splats on the image."""
@@ -129,12 +149,15 @@ class Rasterizer:
         """Slots and homes of the thread that has most."""
         return np.asarray((self._region_end - self._regions() * np.arange(self.threads)[:, None]).max(0))
 
-    def sort(self) -> None:
+    def sort(self, order: Order = Order.OF_ITS_OWN) -> None:
         """Last third: the slots of every tile, nearest first."""
-        order, keys = self._order, self._keys
-        visible, is_first = bins.depth_order(self.splats, self.radius2, order[0], keys[0], order[1], keys[1])
+        if order is not Order.OF_THE_LAST:
+            drawn = self.radius2 if order is Order.OF_ITS_OWN else np.ascontiguousarray(self.splats[:, 9])
+            ranks, keys = self._order, self._keys
+            count, is_first = bins.depth_order(self.splats, drawn, ranks[0], keys[0], ranks[1], keys[1])
+            self._sorted = ranks[0 if is_first else 1, :count]
         bins.sort_into_tiles(
-            order[0 if is_first else 1], visible, self.slot_start, self._slot_count, self._slot_info, self._region_end,
+            self._sorted, len(self._sorted), self.slot_start, self._slot_count, self._slot_info, self._region_end,
             self._tile_start, self._entries,
         )  # fmt: skip
 
@@ -176,13 +199,22 @@ class Rasterizer:
         planes = 5 if values is None else 6
         return self.image.reshape(6, self.height, self.stride)[:planes, :, : self.width]
 
-    def loss_backward(self, target: Target, loss_settings: Floats, out: Gradients | None = None) -> Gradients:
+    def loss_backward(
+        self,
+        target: Target,
+        loss_settings: Floats,
+        out: Gradients | None = None,
+        *,
+        adds: bool = False,
+        adds_state: bool = False,
+    ) -> Gradients:
         """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums per tile.
 
-        out: where they are written; None: where the next ones will be, too.
+        out: where they are written; None: where the next ones will be, too. adds: out holds those of other frames,
+        which these are added to; adds_state: those of the state, too.
         """
         self.blend(LOSS, target, loss_settings, self.image)
-        return self.carry_back(out)
+        return self.carry_back(out, adds=adds, adds_state=adds_state)
 
     def cotangent_backward(self, cotangents: Floats) -> Gradients:
         """Gradients of sum(cotangents * image), cotangents [5, H, W]."""
@@ -191,12 +223,12 @@ class Rasterizer:
         self.blend(COTANGENT, self._no_target, _NO_LOSS, padded_cotangents.ravel())
         return self.carry_back()
 
-    def carry_back(self, out: Gradients | None = None) -> Gradients:
+    def carry_back(self, out: Gradients | None = None, *, adds: bool = False, adds_state: bool = False) -> Gradients:
         """The slots' gradients, left by blend, to the parameters of their Gaussians."""
         out = out or self.gradients
         run(
             project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,
-            self._homes, self._sums,
+            self._homes, self._sums, adds, adds_state,
             out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
         )  # fmt: skip
         return out
