@@ -29,8 +29,7 @@ from worker.input.calibration import RectifiedClip, load_calibration, rectify
 from worker.input.clip import DepthClip, StereoClip, open_clip
 from worker.phantom import PhantomSettings, make_phantom
 from worker.stereo import estimate_depth
-from worker.stereo.alignment import RowShift, find_features, match_features, measure_row_shift
-from worker.stereo.matching import shift_rows
+from worker.stereo.alignment import find_features, match_features, measure_row_shift
 
 ROW_CHECKED_PAIRS = 5
 SYNTHETIC = PhantomSettings(width=320, height=256, frames=2)
@@ -59,7 +58,7 @@ def main() -> None:
     surgt = arguments.data / "surgt_raw"
     clip = thinned(_rectified(surgt / "video.mp4", surgt / "calibration.yaml", None), every)
     depth = _timed("surgt_raw", clip, matched, arguments.repeats)
-    _print_rows(clip, depth.measurements["vertical_misalignment_px"])
+    _print_rows(clip)
 
 
 def _print_truth(matched: Callable[[RectifiedClip], DepthClip]) -> None:
@@ -133,21 +132,17 @@ def _print_agreement(depth: DepthClip, reference: DepthClip, every: int) -> None
     print(f"  valid on {np.mean(valid):.1%} of tissue (target 90 %)")
 
 
-def _print_rows(clip: RectifiedClip, correction_px: float) -> None:
-    """Median |dy| of inlier matches after rectification, before and after the correction that the stage applies."""
+def _print_rows(clip: RectifiedClip) -> None:
+    """Median |dy| of inlier matches after rectification; vertical_residual_px is that after what the stage corrects."""
     step = max(1, clip.frame_count // ROW_CHECKED_PAIRS)
-    pairs = [pair for i, pair in enumerate(clip.pairs()) if i % step == 0]
-    for label, shift_px in (("rectified", 0.0), ("corrected", correction_px)):
-        found = []
-        for left, right in pairs:
-            greys = [cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in (left, right)]
-            eyes = (greys[0], shift_rows(greys[1], shift_px))
-            found.append(match_features(*(find_features(eye, max_width_px=left.shape[1]) for eye in eyes)))
-        matches = np.concatenate(found)
-        shift: RowShift = measure_row_shift(matches, clip.disparity_offset_px)
-        dy = np.abs(matches[:, 3] - matches[:, 1])
-        inliers = np.abs(matches[:, 3] - matches[:, 1] - shift.shift_px) < 2.0
-        print(f"  median |dy| {label}: {np.median(dy[inliers]):.3f} px (target 0.5) over {inliers.sum()} matches")
+    found = []
+    for left, right in (pair for i, pair in enumerate(clip.pairs()) if i % step == 0):
+        greys = [cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in (left, right)]
+        found.append(match_features(*(find_features(eye, max_width_px=left.shape[1]) for eye in greys)))
+    matches = np.concatenate(found)
+    off_px = matches[:, 3] - matches[:, 1]
+    inliers = np.abs(off_px - measure_row_shift(matches, clip.disparity_offset_px).shift_px) < 2.0
+    print(f"  median |dy| rectified: {np.median(np.abs(off_px[inliers])):.3f} px over {inliers.sum()} matches")
 
 
 if __name__ == "__main__":

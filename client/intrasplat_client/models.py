@@ -72,6 +72,8 @@ class NoticeCode(StrEnum):
     DEPTH_JUMPS = "depth_jumps"
     DEPTH_OUT_OF_RANGE = "depth_out_of_range"
     DEPTH_UNUSUAL = "depth_unusual"
+    EYES_COLOURED_APART = "eyes_coloured_apart"
+    EYES_DISAGREE = "eyes_disagree"
     FEW_FRAMES = "few_frames"
     FRAMES_WITHOUT_TISSUE = "frames_without_tissue"
     FRAME_COUNT_UNKNOWN = "frame_count_unknown"
@@ -251,6 +253,8 @@ class Report(Model):
     """what to distrust; empty if nothing was found"""
     assumptions: tuple[Notice, ...]
     """what was taken for granted about the input"""
+    right_eye: RightEye | None = None
+    """how it was registered; None for a clip of one eye"""
     measurements: dict[str, float] = Field(default={})
     """measured on the input, such as misalignment in px"""
     preset: str
@@ -274,6 +278,41 @@ class Report(Model):
     repeated: tuple[int, ...]
     """frames in neither set, because they repeat a held-out one"""
     frame_times_s: tuple[float, ...]
+
+
+class RightEye(Model):
+    """What the right eye differs by from its calibration and from the left eye, measured on training frames.
+
+    Its camera was corrected by the turn, its pictures by the colours. What an error of the calibration does
+    along the rows looks like depth, and is not known.
+    """
+
+    moved_px: float
+    """how far the turn moves that point of the picture that it moves farthest"""
+    lower_px: float
+    """rows by which the right picture lies lower in its middle"""
+    pitch_deg: float
+    """rotation about the right eye's x axis; of its axes seen from the left eye"""
+    yaw_deg: float
+    """about its y axis; the middle pixel keeps its column"""
+    roll_deg: float
+    """about its z axis"""
+    zoom: float
+    """by which its focal length is longer, as a share"""
+    left_from_right: tuple[float, ...]
+    """4x4, row-major, mm: its pose seen from the left eye"""
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    residual_px: float
+    """median distance of the rows of matching features after that"""
+    gain: tuple[float, ...]
+    """right = gain * left + offset, by channel; 1 and 0: nothing was corrected"""
+    offset: tuple[float, ...]
+    """in levels of 255"""
+    colour_correlation: float | None
+    """of the eyes where they match, the least of channels; None: too little matches"""
 
 
 TERMINAL_STATES = frozenset({JobState.CANCELLED, JobState.DONE, JobState.FAILED})

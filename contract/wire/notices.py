@@ -48,6 +48,8 @@ class NoticeCode(StrEnum):
     DEPTH_JUMPS = "depth_jumps"
     DEPTH_OUT_OF_RANGE = "depth_out_of_range"
     DEPTH_UNUSUAL = "depth_unusual"
+    EYES_COLOURED_APART = "eyes_coloured_apart"
+    EYES_DISAGREE = "eyes_disagree"
     FEW_FRAMES = "few_frames"
     FRAMES_WITHOUT_TISSUE = "frames_without_tissue"
     FRAME_COUNT_UNKNOWN = "frame_count_unknown"

@@ -28,6 +28,40 @@ class FrameScore(BaseModel):
     psnr_right_db: float | None = Field(default=None, description="None for a clip of one eye, too")
 
 
+class RightEye(BaseModel):
+    """What the right eye differs by from its calibration and from the left eye, measured on training frames.
+
+    Its camera was corrected by the turn, its pictures by the colours. What an error of the calibration does along the
+    rows looks like depth, and is not known.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    moved_px: float = Field(ge=0, description="how far the turn moves that point of the picture that it moves farthest")
+    lower_px: float = Field(description="rows by which the right picture lies lower in its middle")
+    pitch_deg: float = Field(description="rotation about the right eye's x axis; of its axes seen from the left eye")
+    yaw_deg: float = Field(description="about its y axis; the middle pixel keeps its column")
+    roll_deg: float = Field(description="about its z axis")
+    zoom: float = Field(gt=-1, description="by which its focal length is longer, as a share")
+    left_from_right: tuple[float, ...] = Field(
+        min_length=16, max_length=16, description="4x4, row-major, mm: its pose seen from the left eye"
+    )
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    residual_px: float = Field(ge=0, description="median distance of the rows of matching features after that")
+    gain: tuple[float, ...] = Field(
+        min_length=3,
+        max_length=3,
+        description="right = gain * left + offset, by channel; 1 and 0: nothing was corrected",
+    )
+    offset: tuple[float, ...] = Field(min_length=3, max_length=3, description="in levels of 255")
+    colour_correlation: float | None = Field(
+        ge=-1.001, le=1.001, description="of the eyes where they match, the least of channels; None: too little matches"
+    )
+
+
 class Report(BaseModel):
     """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why.
 
@@ -64,6 +98,7 @@ class Report(BaseModel):
 
     warnings: tuple[Notice, ...] = Field(description="what to distrust; empty if nothing was found")
     assumptions: tuple[Notice, ...] = Field(description="what was taken for granted about the input")
+    right_eye: RightEye | None = Field(default=None, description="how it was registered; None for a clip of one eye")
     measurements: dict[str, float] = Field(default={}, description="measured on the input, such as misalignment in px")
 
     preset: str

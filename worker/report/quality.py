@@ -165,6 +165,7 @@ def build_report(
         frames=_frame_scores(held_out, right, baselines),
         warnings=tuple(dict.fromkeys(found)),
         assumptions=tuple(dict.fromkeys((*clip.assumptions, *training.assumptions))),
+        right_eye=clip.registration,
         measurements={**clip.measurements, **training.measurements},
         **{name: value for name, value in vars(training).items() if name not in _MERGED_FIELDS},
         width=clip.intrinsics.width,

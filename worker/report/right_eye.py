@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import TrainingDiverged
+from worker.input.camera import to_camera, unproject
 from worker.input.clip import DepthClip
 from worker.model.metrics import Image, clear_of_highlights, psnr_tissue
 from worker.stereo.right_eye import nearest_known
@@ -65,14 +66,11 @@ def warped_left(clip: DepthClip, index: int) -> NDArray[np.uint8]:
     right, left_k = clip.right, clip.intrinsics
     found_mm = nearest_known(right.depth_mm[index], right.depth_mm[index] > 0)
     depth_mm = np.where(found_mm > 0, found_mm, np.float32(FAR_MM))  # no pixel has any
-    baseline_mm = np.linalg.norm(right.world_from_camera[index][:3, 3] - clip.world_from_camera[index][:3, 3])
-    height, width = depth_mm.shape
-    disparity_px = left_k.fx * float(baseline_mm) / depth_mm + left_k.cx - right.intrinsics.cx
-    x = np.arange(width, dtype=np.float32) + disparity_px.astype(np.float32)
-    y = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, axis=1) + np.float32(
-        left_k.cy - right.intrinsics.cy
-    )
-    warped = cv2.remap(clip.rgb[index], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    points_mm = unproject(np.arange(depth_mm.size), depth_mm.ravel(), right.intrinsics, right.world_from_camera[index])
+    x, y, z = to_camera(points_mm, clip.world_from_camera[index]).T.reshape(3, *depth_mm.shape)
+    column, row = left_k.fx * x / z + left_k.cx - 0.5, left_k.fy * y / z + left_k.cy - 0.5
+    there = column.astype(np.float32), row.astype(np.float32)
+    warped = cv2.remap(clip.rgb[index], *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(warped, np.uint8)
 
 

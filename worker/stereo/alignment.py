@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
-from worker.stereo.matching import Grey, Image, evidence, semi_global, shift_rows
+from worker.stereo.matching import Grey, Image, evidence, semi_global
 
 Agreed = Callable[[NDArray[np.uint8], NDArray[np.uint8], int, int], tuple[Image, NDArray[np.bool_]]]
 """The signature of agreed_disparities, which another device may implement."""
@@ -23,7 +23,6 @@ FEATURES = 1500
 RATIO = 0.8  # Lowe's ratio test
 MAX_MATCH_DY_PX = 48.0  # matches farther apart in y are wrong
 MIN_MATCHES = 20
-MIN_CORRECTION_PX = 0.2  # resampling for less blurs more than it corrects
 MAX_CORRECTION_PX = 8.0  # beyond it the calibration belongs to other frames
 MAX_EQUAL_ROWS_PX = 1.0  # row difference of frames that are rectified already
 SWAPPED_SHARE = 0.8
@@ -42,12 +41,6 @@ class RowShift:
     shift_px: float
     residual_px: float
     matches: int
-
-    @property
-    def correction_px(self) -> float:
-        """Shift to apply to the right eye's rows; 0 if it is below MIN_CORRECTION_PX or has too few matches."""
-        needed = self.matches >= MIN_MATCHES and abs(self.shift_px) >= MIN_CORRECTION_PX
-        return self.shift_px if needed else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,13 +114,12 @@ def measure_row_shift(matches: NDArray[np.float64], infinity_px: float, equal_ro
 
 def choose_range(
     pairs: Sequence[tuple[Grey, Grey]],
-    row_shift_px: float,
     infinity_px: float,
     focal_baseline_px_mm: float,
     depth_range_mm: tuple[float, float],
     agreed: Agreed,
 ) -> tuple[float, float]:
-    """The disparity range (low, high) of the clip in px, from a coarse search of all that its depths may have.
+    """The disparity range (low, high) in px of rectified pairs, from a coarse search of all that their depths may have.
 
     Only textured pixels count on which both matching directions agree.
 
@@ -142,7 +134,7 @@ def choose_range(
     low = int(np.floor(farthest * scale))
     count = 16 * max(1, int(np.ceil((nearest * scale - low) / 16)))
     lefts = np.stack([_resized(left, size) for left, _ in pairs])
-    rights = np.stack([_resized(shift_rows(right, row_shift_px), size) for _, right in pairs])
+    rights = np.stack([_resized(right, size) for _, right in pairs])
     found, both_agree = agreed(lefts, rights, low, count)
     textured = np.stack([cv2.boxFilter(np.abs(cv2.Sobel(left, cv2.CV_32F, 1, 0)), -1, (5, 5)) for left in lefts])
     within = (found >= farthest * scale) & (found <= nearest * scale)

@@ -23,7 +23,6 @@ from worker.machine.cores import cores
 from worker.machine.hooks import Hooks, Progress
 from worker.machine.opencv import one_opencv_thread
 from worker.stereo.alignment import (
-    RowShift,
     agreed_disparities,
     choose_range,
     find_features,
@@ -32,6 +31,7 @@ from worker.stereo.alignment import (
     outside_share,
 )
 from worker.stereo.matching import MIN_CONFIDENCE, Grey, MatchPlan, match
+from worker.stereo.registration import MatchedPair, Registration
 from worker.stereo.right_eye import moved_depth, moved_tissue, painted_over
 
 if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
@@ -42,8 +42,7 @@ COMPILATION = "compile"
 """The stage until the GPU's kernels have run once: the first run may compile them."""
 DECODING_SHARE, MEASURING_SHARE = 0.15, 0.05  # of the stage's progress
 RANGE_PAIRS, ALIGNMENT_PAIRS = 7, 3
-"""Pairs, spread over the measured frames. A pair costs 10 ms for the range and 100 ms for the alignment."""
-WARN_SHIFT_PX = 0.5
+"""Pairs, spread over the measured frames. A pair costs 10 ms for the range and 300 ms for the alignment."""
 WARN_OUTSIDE_SHARE = 0.1
 WARN_SURE_SHARE = 0.5
 SURE, MIN_SURE_SHARE = 128, 0.005
@@ -60,11 +59,11 @@ def estimate_depth(
     device: Literal["cpu", "cuda"] = "cpu",
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
 ) -> DepthClip:
-    """Depth and confidence of every frame. A row shift between the eyes of up to 8 px is measured and corrected.
+    """Depth and confidence of every frame. How the eyes differ in turn, rows (up to 8 px) and colour is corrected.
 
-    Row shift and disparity range are common to all frames. They are measured on measured_frames alone (None: on all);
-    for the rest, a frame's depth depends on its own pair only. So frames outside measured_frames do not change the
-    depth of others. On "cuda" another matcher (worker/stereo/cuda, needs triton) matches many pairs at once.
+    What the eyes differ by and the disparity range are common to all frames. They are measured on measured_frames alone
+    (None: on all); for the rest, a frame's depth depends on its own pair only. So frames outside measured_frames do not
+    change the depth of others. On "cuda" another matcher (worker/stereo/cuda, needs triton) matches many pairs at once.
 
     `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| left after the correction),
     min_disparity_px and max_disparity_px (the range searched), depth_valid_share (of tissue pixels) and
@@ -84,12 +83,13 @@ def estimate_depth(
     if device == "cuda":
         hooks.on_progress(Progress(COMPILATION, 0.0))
     with one_opencv_thread(), _pool() as pool:
-        shift, plan, outside = _plan(clip, rgb, right_rgb, measured, pool, device, depth_range_mm)
+        registration, plan, outside = _plan(clip, rgb, right_rgb, measured, pool, device, depth_range_mm)
+        registration.recolour(right_rgb)
         if device == "cuda":
-            depth_mm, confidence = _match_on_device(clip, rgb, right_rgb, plan, hooks)
+            depth_mm, confidence = _match_on_device(clip, rgb, right_rgb, plan, registration, hooks)
         else:
-            depth_mm, confidence = _match_all(clip, rgb, right_rgb, plan, pool, hooks)
-        right = _right_eye(clip, rgb, right_rgb, depth_mm, confidence, plan, measured, hooks)
+            depth_mm, confidence = _match_all(clip, rgb, right_rgb, plan, registration, pool, hooks)
+        right = _right_eye(clip, rgb, right_rgb, depth_mm, confidence, registration, measured, hooks)
     for tissue, depths_mm, trust in (
         (clip.tissue, depth_mm, confidence),
         (right.tissue, right.depth_mm, right.depth_confidence),
@@ -106,12 +106,16 @@ def estimate_depth(
         world_from_camera=np.tile(np.eye(4), (clip.frame_count, 1, 1)),
         frame_times_s=clip.frame_times_s,
         right=right,
+        registration=registration.told,
         assumptions=(*clip.assumptions, _scale_assumption(clip)),
-        warnings=clip.warnings + _warnings(shift, sure_share) + _range_warnings(outside, depth_range_mm),
+        warnings=clip.warnings
+        + registration.notices
+        + _warnings(sure_share)
+        + _range_warnings(outside, depth_range_mm),
         measurements={
-            "vertical_misalignment_px": shift.shift_px,
-            "vertical_residual_px": shift.residual_px,
-            "vertical_matches": float(shift.matches),
+            "vertical_misalignment_px": registration.turn.lower_px,
+            "vertical_residual_px": registration.residual_px,
+            "vertical_matches": float(registration.matches),
             "min_disparity_px": plan.min_disparity_px,
             "max_disparity_px": plan.max_disparity_px,
             "depth_valid_share": valid_share,
@@ -145,25 +149,25 @@ def _plan(
     pool: ThreadPoolExecutor,
     device: str,
     depth_range_mm: tuple[float, float],
-) -> tuple[RowShift, MatchPlan, float]:
-    """Row shift and disparity range, from a few pairs spread over the measured frames; and outside_share."""
-
-    def some_pairs(count: int) -> list[tuple[Grey, Grey]]:
-        return [(_grey(rgb[index]), _grey(right[index])) for index in spread(measured, count)]
-
-    features = list(pool.map(find_features, [eye for pair in some_pairs(ALIGNMENT_PAIRS) for eye in pair]))
+) -> tuple[Registration, MatchPlan, float]:
+    """How the eyes differ, and the disparity range, from a few pairs spread over the measured frames; outside_share."""
+    aligned = spread(measured, ALIGNMENT_PAIRS)
+    features = list(pool.map(find_features, [_grey(eye[index]) for index in aligned for eye in (rgb, right)]))
     matches = np.concatenate(list(pool.map(match_features, features[::2], features[1::2])))
     shift = measure_row_shift(matches, clip.disparity_offset_px, clip.equal_rows_px)
     agreed = agreed_disparities
     if device == "cuda":
         from worker.stereo.cuda import agreed_disparities as agreed
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
-    pairs = some_pairs(RANGE_PAIRS)
     outside = outside_share(matches, shift, clip.disparity_offset_px, focal_baseline, depth_range_mm)
-    low, high = choose_range(
-        pairs, shift.correction_px, clip.disparity_offset_px, focal_baseline, depth_range_mm, agreed
+    calibrated = replace(clip.intrinsics, cx=clip.intrinsics.cx - clip.disparity_offset_px)
+    coarse = Registration.of_matches(matches, shift, calibrated, clip.baseline_mm)
+    pairs = [(_grey(rgb[index]), coarse.rectified(_grey(right[index]))) for index in spread(measured, RANGE_PAIRS)]
+    plan = MatchPlan(
+        *choose_range(pairs, clip.disparity_offset_px, focal_baseline, depth_range_mm, agreed), depth_range_mm
     )
-    return shift, MatchPlan(low, high, shift.correction_px, depth_range_mm), outside
+    found = pool.map(lambda i: MatchedPair.of(rgb[i], coarse.rectified(right[i]), clip.tissue[i], plan), aligned)
+    return coarse.refined(list(found), matches), plan, outside
 
 
 def _match_all(
@@ -171,6 +175,7 @@ def _match_all(
     rgb: NDArray[np.uint8],
     right: NDArray[np.uint8],
     plan: MatchPlan,
+    registration: Registration,
     pool: ThreadPoolExecutor,
     hooks: Hooks,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -180,7 +185,8 @@ def _match_all(
     confidence = np.zeros(right.shape[:3], np.uint8)
 
     def work(i: int) -> None:
-        disparity, trust = match(_grey(rgb[i]), _grey(right[i]), plan, clip.tissue[i])
+        grey = registration.rectified(_grey(right[i]))
+        disparity, trust = match(_grey(rgb[i]), grey, plan, clip.tissue[i])
         beyond_infinity_px = disparity - np.float32(clip.disparity_offset_px)
         depth_mm[i], confidence[i] = _to_depth(beyond_infinity_px, trust, focal_baseline, plan.depth_range_mm)
 
@@ -197,7 +203,12 @@ def _match_all(
 
 
 def _match_on_device(
-    clip: RectifiedClip, rgb: NDArray[np.uint8], right: NDArray[np.uint8], plan: MatchPlan, hooks: Hooks
+    clip: RectifiedClip,
+    rgb: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    plan: MatchPlan,
+    registration: Registration,
+    hooks: Hooks,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """As _match_all, with as many pairs at once as their cost volumes fit into memory."""
     from worker.stereo.cuda import depth_of, frames_at_once
@@ -210,10 +221,10 @@ def _match_on_device(
     for first in range(0, len(right), at_once):
         _check_stop(hooks)
         some = slice(first, first + at_once)
-        left, other = (np.stack([_grey(frame) for frame in eye[some]]) for eye in (rgb, right))
-        depth_mm[some], confidence[some] = depth_of(
-            left, other, np.ascontiguousarray(clip.tissue[some]), plan, focal_baseline, clip.disparity_offset_px
-        )
+        left = np.stack([_grey(frame) for frame in rgb[some]])
+        other = np.stack([registration.rectified(_grey(frame)) for frame in right[some]])
+        tissue = np.ascontiguousarray(clip.tissue[some])
+        depth_mm[some], confidence[some] = depth_of(left, other, tissue, plan, focal_baseline, clip.disparity_offset_px)
         left_over = max(len(right) - first - at_once, 0) / len(right)
         hooks.on_progress(Progress(STAGE, 1 - (1 - DECODING_SHARE - MEASURING_SHARE) * left_over))
     return depth_mm, confidence
@@ -225,11 +236,11 @@ def _right_eye(
     right_rgb: NDArray[np.uint8],
     depth_mm: NDArray[np.float32],
     confidence: NDArray[np.uint8],
-    plan: MatchPlan,
+    registration: Registration,
     measured: Sequence[int],
     hooks: Hooks,
 ) -> Eye:
-    """The right eye with the left one's depth. Its camera lies on the calibrated baseline, lowered by the row shift.
+    """The right eye with the left one's depth. It lies on the calibrated baseline, turned as it was measured.
 
     Labels are found in the measured frames alone.
     """
@@ -240,9 +251,11 @@ def _right_eye(
     label = painted_over(rgb[middle], right_rgb[middle], never_tissue)
 
     def work(i: int) -> None:
-        there_mm[i], trust[i] = moved_depth(depth_mm[i], confidence[i], focal_baseline, offset_px)
+        moved_mm, moved_trust = moved_depth(depth_mm[i], confidence[i], focal_baseline, offset_px)
+        there_mm[i], trust[i] = registration.recorded_depth(moved_mm), registration.recorded(moved_trust)
         if clip.tissue_right is None:
-            tissue[i] = moved_tissue(clip.tissue[i] | label, depth_mm[i], focal_baseline, offset_px) & ~label
+            shown = moved_tissue(clip.tissue[i] | label, depth_mm[i], focal_baseline, offset_px)
+            tissue[i] = (registration.recorded((~shown).astype(np.uint8)) == 0) & ~label
 
     with _pool() as pool:
         try:
@@ -250,16 +263,13 @@ def _right_eye(
                 _check_stop(hooks)
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-    k = clip.intrinsics
-    pose = np.eye(4)
-    pose[0, 3] = clip.baseline_mm
     return Eye(
         rgb=right_rgb,
         tissue=tissue,
         depth_mm=there_mm,
         depth_confidence=trust,
-        intrinsics=replace(k, cx=k.cx - offset_px, cy=k.cy + plan.row_shift_px),
-        world_from_camera=np.tile(pose, (clip.frame_count, 1, 1)),
+        intrinsics=registration.camera,
+        world_from_camera=np.tile(registration.left_from_right, (clip.frame_count, 1, 1)),
     )
 
 
@@ -314,27 +324,11 @@ def _range_warnings(outside: float, depth_range_mm: tuple[float, float]) -> tupl
     return (Notice.warning(NoticeCode.DEPTH_OUT_OF_RANGE, text),)
 
 
-def _warnings(shift: RowShift, sure_share: float) -> tuple[Notice, ...]:
-    found = []
-    if shift.matches == 0:
-        found.append(
-            Notice.warning(
-                NoticeCode.ALIGNMENT_UNKNOWN,
-                "too few matching features to measure the vertical misalignment of the eyes: taken as 0",
-            )
-        )
-    elif abs(shift.shift_px) >= WARN_SHIFT_PX:
-        found.append(
-            Notice.warning(
-                NoticeCode.ROWS_MISALIGNED,
-                f"rows of left and right differed by {shift.shift_px:+.2f} px (corrected, {shift.residual_px:.2f} px "
-                "remain): the calibration does not fit this recording exactly",
-            )
-        )
-    if sure_share < WARN_SURE_SHARE:
-        text = f"only {sure_share:.0%} of tissue has stereo depth to rely on"
-        found.append(Notice.warning(NoticeCode.LITTLE_STEREO_DEPTH, text))
-    return tuple(found)
+def _warnings(sure_share: float) -> tuple[Notice, ...]:
+    if sure_share >= WARN_SURE_SHARE:
+        return ()
+    text = f"only {sure_share:.0%} of tissue has stereo depth to rely on"
+    return (Notice.warning(NoticeCode.LITTLE_STEREO_DEPTH, text),)
 
 
 def _scale_assumption(clip: RectifiedClip) -> Notice:

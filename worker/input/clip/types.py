@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.notices import Notice
+from contract.wire.report import RightEye
 from worker.input.camera import Intrinsics
 
 RgbFrame = NDArray[np.uint8]  # [H, W, 3]
@@ -78,10 +79,12 @@ class DepthClip(Eye):
 
     frame_times_s    [T]          float64, seconds from frame 0
     right            the same moments and size; None for a clip of one eye
+    registration     what the right eye's camera and colours were corrected by; None for a clip of one eye
     """
 
     frame_times_s: NDArray[np.float64]
     right: Eye | None = None
+    registration: RightEye | None = None
     assumptions: tuple[Notice, ...] = ()
     warnings: tuple[Notice, ...] = ()
     measurements: dict[str, float] = field(default_factory=dict)  # e.g. vertical misalignment in px, for the report

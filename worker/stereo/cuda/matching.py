@@ -115,7 +115,6 @@ def match_frames(left: Tensor, right: Tensor, plan: MatchPlan, tissue: Tensor | 
 
     tissue: bool [F, H, W], of the left eye; None: all is tissue.
     """
-    right = shift_rows(right, plan.row_shift_px)
     height, width = left.shape[1:]
     size, low, count = _reduced(height, width, plan)
     small_left, small_right = _resized(left, size), _resized(right, size)
@@ -209,16 +208,6 @@ def _reduced(height: int, width: int, plan: MatchPlan) -> tuple[tuple[int, int],
     scale = size[1] / width
     low = math.floor(plan.min_disparity_px * scale)
     return size, low, math.ceil(plan.max_disparity_px * scale) - low + 1
-
-
-def shift_rows(image: Tensor, shift_px: float) -> Tensor:
-    """As matching.shift_rows, of [F, H, W]."""
-    if shift_px == 0:
-        return image
-    row = (torch.arange(image.shape[1], device=image.device) + shift_px).clamp(0, image.shape[1] - 1)
-    above = row.long().clamp_max(image.shape[1] - 2)
-    share = (row - above)[:, None]
-    return (image[:, above] * (1 - share) + image[:, above + 1] * share).round().to(torch.uint8)
 
 
 def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
