@@ -53,9 +53,20 @@ NOT_YET_RETRY_S = "1"
 ModelTime = Annotated[
     float, Field(ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip")
 ]
-Pixels = Annotated[int | None, Field(ge=8, le=8192)]
-FocalLength = Annotated[float | None, Field(gt=0, le=1e5, allow_inf_nan=False)]
-Centre = Annotated[float | None, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
+Pixels = Annotated[int | None, Field(ge=8, le=8192, description="of the image, in pixels; default: the clip's")]
+FocalLength = Annotated[
+    float | None,
+    Field(gt=0, le=1e5, allow_inf_nan=False, description="focal length, in pixels; default: the clip's"),
+]
+Centre = Annotated[
+    float | None,
+    Field(
+        ge=-1e5,
+        le=1e5,
+        allow_inf_nan=False,
+        description="where the optical axis is, in pixels from the left (cx) or upper (cy) edge; default: the clip's",
+    ),
+]
 
 
 class RenderQuery(BaseModel):
@@ -78,18 +89,22 @@ class RenderQuery(BaseModel):
     fy: FocalLength = None
     cx: Centre = None
     cy: Centre = None
-    layer: Layer = Layer.RGB
-    format: ImageFormat = ImageFormat.PNG
+    layer: Layer = Field(default=Layer.RGB, description="depth is along the camera's z; confidence is in [0, 1]")
+    format: ImageFormat = Field(
+        default=ImageFormat.PNG,
+        description="png and npy are exact (depth: 16-bit png in 0.01 mm, npy in mm, 0 invalid); jpeg and webp are for "
+        "eyes, depth and confidence in false colour",
+    )
     quality: int = Field(default=90, ge=1, le=100, description="quality of a jpeg or webp image")
     unseen: Unseen = Field(
         default=Unseen.MARK,
-        description="what to show where no training frame saw anything: mark: a hatch, transparent in png and webp, "
-        "and depth and confidence 0; guess: what the model draws there",
+        description="what to show where no training frame saw anything. mark: a hatch, transparent in png and webp; "
+        "depth and confidence 0. guess: what the model draws there",
     )
     highlights: Highlights = Field(
         default=Highlights.ON,
-        description="in layer rgb; off: colours without the highlights that the eyes of a stereo clip told apart. A "
-        "scene that one eye taught knows none: it is shown as it is, with the notice highlights_unknown",
+        description="off: colours without the highlights that the eyes of a stereo clip saw differently. A scene that "
+        "one eye taught knows none: it is shown as it is, with the notice highlights_unknown. Changes layer rgb alone",
     )
 
 

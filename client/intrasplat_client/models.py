@@ -159,7 +159,7 @@ class JobOptions(Model):
     preset: str = "fast"
     """instant, fast, quality and small are ours; paper is the method as published"""
     eyes: str = "both"
-    """the eyes of a stereo clip to train on; with left, the right eye only judges"""
+    """the eyes of a stereo clip that our presets train on; with left, the right eye only judges"""
     min_depth_mm: float = 10.0
     """nearest depth that stereo may find, in mm"""
     max_depth_mm: float = 300.0
@@ -349,7 +349,7 @@ class GivenOptions(TypedDict, total=False):
     ]
     """instant, fast, quality and small are ours; paper is the method as published"""
     eyes: Literal["left", "both"]
-    """the eyes of a stereo clip to train on; with left, the right eye only judges"""
+    """the eyes of a stereo clip that our presets train on; with left, the right eye only judges"""
     min_depth_mm: Annotated[float, Field(gt=0)]
     """nearest depth that stereo may find, in mm"""
     max_depth_mm: Annotated[float, Field(gt=0)]

@@ -56,7 +56,8 @@ class ReconstructionOptions(ClipOptions):
         default="fast", description="instant, fast, quality and small are ours; paper is the method as published"
     )
     eyes: Eyes = Field(
-        default="both", description="the eyes of a stereo clip to train on; with left, the right eye only judges"
+        default="both",
+        description="the eyes of a stereo clip that our presets train on; with left, the right eye only judges",
     )
     min_depth_mm: float = Field(default=MIN_DEPTH_MM, gt=0, description="nearest depth that stereo may find, in mm")
     max_depth_mm: float = Field(

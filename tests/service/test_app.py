@@ -51,6 +51,17 @@ def test_the_api_describes_itself_with_stable_operation_ids(service: ServiceUnde
     assert "HTTPValidationError" not in document["components"]["schemas"]
 
 
+def test_the_api_describes_every_choice_of_a_render_and_of_a_reconstruction(service: ServiceUnderTest) -> None:
+    paths = service.http.get("/openapi.json").json()["paths"]
+    render = {each["name"]: each for each in paths["/render"]["get"]["parameters"] if each["in"] == "query"}
+    form = paths["/reconstruct"]["post"]["requestBody"]["content"]["multipart/form-data"]["schema"]
+    options = form["properties"]["options"]["properties"]
+    assert {"unseen", "highlights"} <= render.keys()
+    assert "eyes" in options
+    for name, described in (render | options).items():
+        assert len(described["description"].split()) >= 3, name
+
+
 def test_the_service_tells_its_limits_in_numbers(service: ServiceUnderTest) -> None:
     info = service.http.get("/info").json()
     assert "Not a medical device" in info["notice"]
