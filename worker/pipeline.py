@@ -24,6 +24,7 @@ from worker.input.camera import to_camera
 from worker.input.clip import DepthClip, StereoClip, held_out_frames, split_frames
 from worker.input.decode import decode_clip
 from worker.machine.hooks import Hooks
+from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from worker.machine.timing import Timings
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
@@ -42,7 +43,7 @@ from worker.train.hooks import RenderedFrame, TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import preset_named
-from worker.train.rate_distortion import QuantizedScene, quantize_scene
+from worker.train.rate_distortion import QuantizedScene, quantize_model
 from worker.train.request import ReconstructionRequest
 from worker.train.resume import resume, save_run
 from worker.train.run import Run, write_curve
@@ -82,12 +83,14 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHo
 def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Setup:
     """The clip with depth, its split, its preset, the device and compiled kernels; then the clock starts."""
     accepted_at_s, timings = request.accepted_at_s or time.time(), Timings()
+    keep_free_memory(USUAL_BYTES)
     options = request.options
     preset = request.own_preset or preset_named(options.preset, options.budget_s)
     device = device_for(preset.deformation, request.device)
     out_dir.mkdir(parents=True, exist_ok=True)
     clip = open_with_depth(request, hooks, timings, device)
     split = split_frames(clip, options.holdout)
+    keep_free_memory(USUAL_BYTES)
     timings.add("compile_s", compile_coder())
     if device == CPU:
         timings.add("compile_s", compile_kernels(partial(hooks.report_stage, "compile")))
@@ -149,6 +152,7 @@ def optimise(run: Run) -> None:
     clock, started_s = run.setup.clock, run.setup.clock.elapsed_s
     train(run, clock, lambda: held_out_score(run), run.setup.hooks, copy_scene=lambda: snapshot_of(run))
     run.setup.timings.seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
+    keep_free_memory(LITTLE_BYTES)
 
 
 def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
@@ -156,9 +160,14 @@ def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
     run.setup.hooks.on_progress(run.progress("finish", 0.0))
     with run.setup.timings.measure("finish_s"):
         scene = scene_of(run)
+        still = scene.deformation.select(torch.zeros(0, dtype=torch.int64))
+        scene = dataclasses.replace(scene, deformation=still)  # the model has the weights, and they take much memory
     with run.setup.timings.measure("shrink_s"):
-        quantized = quantize_scene(scene, run.eyes, device=run.device)
-    return (quantized.scene if quantized else scene), quantized
+        quantized = quantize_model(run.model, scene, run.eyes, device=run.device)
+    keep_free_memory(LITTLE_BYTES)
+    if quantized is None:
+        return dataclasses.replace(scene, deformation=run.model.export()[1]), None
+    return quantized.scene, quantized
 
 
 def scene_of(run: Run) -> Scene:

@@ -31,7 +31,7 @@ HIDDEN_LOGIT = -30.0
 
 def drop_strays(model: Model, eyes: Sequence[TrainingFrames]) -> int:
     """Take Gaussians out of model that lay on tissue in no training frame, grew wide, and are not missed there; returns
-    how many.
+    how many. Adam's moments go with them, for the model is trained.
 
     Where an instrument never leaves, nothing holds a Gaussian in place but its tail on the tissue beside it. A few are
     pulled wide at the times nobody sees them, and from another pose they hang over the tissue like a veil. Of few and
@@ -41,10 +41,10 @@ def drop_strays(model: Model, eyes: Sequence[TrainingFrames]) -> int:
     sampled = spread(eyes[0].indices, SAMPLED_FRAMES)
     widest = _widest(model, unseen, [float(eyes[0].t[index]) for index in sampled])
     strays = _not_missed(model, eyes, unseen[widest > MAX_UNSEEN_WIDTH])
-    if not 0 < len(strays) < model.count:
-        return 0
+    if len(strays) == model.count:
+        strays = strays[:0]
     kept = np.setdiff1d(np.arange(model.count), strays)
-    model.take(kept.astype(np.int64), np.zeros(len(kept), np.bool_))
+    model.take(kept.astype(np.int64), np.ones(len(kept), np.bool_))  # as if all were fresh: moments of 0 take no memory
     return len(strays)
 
 
@@ -87,6 +87,8 @@ def _ever_on_tissue(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.
 
 def _widest(model: Model, chosen: NDArray[np.intp], times: Sequence[float]) -> NDArray[np.float32]:
     """The largest scale of each chosen Gaussian at any of the times, in units."""
+    if not len(chosen):
+        return np.zeros(0, np.float32)
     everything, deformation = model.export()
     rows = torch.from_numpy(chosen)
     gaussians = Gaussians(*(getattr(everything, each.name)[rows] for each in dataclasses.fields(Gaussians)))

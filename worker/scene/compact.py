@@ -11,6 +11,7 @@ describes the file for other readers.
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -63,26 +64,30 @@ def state_rows(channels: int) -> list[int]:
 
 
 @dataclass(frozen=True, eq=False)
-class Compact:
-    """A scene in whole numbers.
+class Numbers(ABC):
+    """A scene in whole numbers, wherever they come from.
 
-    table    [N, K] int32     columns: the state's, then R motion coefficients per channel, then the 3 powers, then seen
     step     [S] float32      of the state at power 0; S = 15, or 14 where the motion has no channel of the gloss
     pattern  [C, R, B] float32  weights of one unit of a motion coefficient at power 0
     centre, width  [B] float32  of the bases
     """
 
-    table: NDArray[np.int32]
     step: NDArray[np.float32]
     pattern: NDArray[np.float32]
     centre: Tensor
     width: Tensor
 
-    def model(self) -> tuple[Gaussians, SharedBasis, Tensor]:
-        """Gaussians, motion and seen [N], as floats."""
-        weight = torch.from_numpy(self._motion(self.pattern))
-        share = torch.from_numpy(self.table[:, -1].astype(np.float32) / np.float32(SEEN_LEVELS))
-        return _gaussians_of(self._state()), SharedBasis(weight, self.centre, self.width), share
+    @abstractmethod
+    def at_rest(self) -> NDArray[np.int32]:
+        """[N, S] of the state."""
+
+    @abstractmethod
+    def coefficients(self, first: int, last: int) -> NDArray[np.int32]:
+        """[N, (last - first) R] of the motion in these channels."""
+
+    @abstractmethod
+    def powers(self) -> NDArray[np.integer]:
+        """[N, 3] of place, shape and colour."""
 
     def at(self, times: Sequence[float]) -> Iterator[Gaussians]:
         """The Gaussians at each model time, as model()'s deformation would give them but without its large weights."""
@@ -96,25 +101,24 @@ class Compact:
 
     def _scale(self, group: int) -> Floats:
         """[N] 2**-power of a group."""
-        return np.exp2(-self.table[:, -4 + group].astype(np.float32))  # exact
+        return np.exp2(-self.powers()[:, group].astype(np.float32))  # exact
 
     def _state(self) -> Floats:
         """[N, VALUES] numbers at rest, colour as red, green and blue."""
-        scales = [self._scale(group) for group in range(PLAIN)]
-        state = np.zeros((len(self.table), VALUES), np.float32)
+        scales, numbers = [self._scale(group) for group in range(PLAIN)], self.at_rest()
+        state = np.zeros((len(numbers), VALUES), np.float32)
         for column, row in enumerate(state_rows(self.pattern.shape[0])):
-            state[:, row] = self.table[:, column] * (scales[GROUP_OF[row]] * self.step[column])
+            state[:, row] = numbers[:, column] * (scales[GROUP_OF[row]] * self.step[column])
         state[:, COLOUR] = state[:, COLOUR] @ OPPONENT.astype(np.float32)
         return state
 
     def _motion(self, pattern: Floats) -> Floats:
         """[N, C, X] motion coefficients times patterns [C, R, X], colour as red, green and blue."""
         channels, patterns, columns = pattern.shape
-        motion = np.empty((len(self.table), channels, columns), np.float32)
-        at_rest = len(self.step)
+        motion = np.empty((len(self.powers()), channels, columns), np.float32)
 
         def coefficients(first: int, last: int) -> Floats:
-            block = self.table[:, at_rest + first * patterns : at_rest + last * patterns].astype(np.float32)
+            block = self.coefficients(first, last).astype(np.float32)
             block *= self._scale(GROUP_OF[first])[:, None]
             return block
 
@@ -127,6 +131,32 @@ class Compact:
         if channels > COLOUR_CHANNELS:
             motion[:, GLOSS_ROW] = coefficients(GLOSS_ROW, ROWS) @ pattern[GLOSS_ROW]
         return motion
+
+
+@dataclass(frozen=True, eq=False)
+class Compact(Numbers):
+    """A scene in whole numbers that lie in one table.
+
+    table    [N, K] int32     columns: the state's, then R motion coefficients per channel, then the 3 powers, then seen
+    """
+
+    table: NDArray[np.int32]
+
+    def at_rest(self) -> NDArray[np.int32]:
+        return self.table[:, : len(self.step)]
+
+    def coefficients(self, first: int, last: int) -> NDArray[np.int32]:
+        patterns = self.pattern.shape[1]
+        return self.table[:, len(self.step) + first * patterns : len(self.step) + last * patterns]
+
+    def powers(self) -> NDArray[np.int32]:
+        return self.table[:, -4:-1]
+
+    def model(self) -> tuple[Gaussians, SharedBasis, Tensor]:
+        """Gaussians, motion and seen [N], as floats."""
+        weight = torch.from_numpy(self._motion(self.pattern))
+        share = torch.from_numpy(self.table[:, -1].astype(np.float32) / np.float32(SEEN_LEVELS))
+        return _gaussians_of(self._state()), SharedBasis(weight, self.centre, self.width), share
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensors of scene.safetensors: the table, differenced where that helps, then coded; the rest as it is."""
@@ -174,7 +204,7 @@ def unpack(tensors: Mapping[str, Tensor]) -> Compact:
     table[coding_order(rows)] = decode(codes, rows, columns)
     _undo_differences(table, shared.numpy().astype(bool), pattern.shape)
     _check_numbers(table, step.numpy())
-    return Compact(table, step.numpy(), pattern.numpy(), centre, width)
+    return Compact(step.numpy(), pattern.numpy(), centre, width, table)
 
 
 def compile_coder() -> float:
@@ -182,7 +212,7 @@ def compile_coder() -> float:
     start = time.perf_counter()
     table = np.ones((2, VALUES + 4), np.int32)
     still = np.zeros((ROWS, 0, 1), np.float32)
-    unpack(Compact(table, np.ones(VALUES, np.float32), still, torch.zeros(1), torch.ones(1)).tensors())
+    unpack(Compact(np.ones(VALUES, np.float32), still, torch.zeros(1), torch.ones(1), table).tensors())
     return time.perf_counter() - start
 
 

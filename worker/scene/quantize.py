@@ -12,12 +12,12 @@ Symbols: N Gaussians, C channels (10, 13 with colour, 14 with gloss), B bases, R
 4. Every number is divided by its step and rounded. The step is the channel's own, so that all channels' errors weigh
    the same in the picture, times a power of two for each Gaussian's place, shape and colour.
 
-prepare() does steps 1 to 3, round_to() step 4.
+prepare() does steps 1 to 3, rounding() step 4.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,11 +27,22 @@ from torch import Tensor
 
 from worker.model.deformation import SharedBasis
 from worker.model.gaussians import Gaussians
-from worker.model.layout import CHANNELS, COLOUR, COLOUR_ROW, MEAN, QUATERNION, QUATERNION_ROW
-from worker.scene.compact import GROUP_OF, MIN_POWER, OPPONENT, SEEN_LEVELS, Compact, Whole, check_size, state_rows
+from worker.model.layout import COLOUR, COLOUR_ROW, GLOSS, LOG_SCALE, MEAN, QUATERNION, QUATERNION_ROW
+from worker.scene.compact import (
+    GROUP_OF,
+    MIN_POWER,
+    OPPONENT,
+    SEEN_LEVELS,
+    Compact,
+    Numbers,
+    Whole,
+    check_size,
+    state_rows,
+)
 from worker.scene.differences import MAX_POWER, MAX_STORED
 
 Reals = NDArray[np.float64]
+Floats = NDArray[np.float32]
 
 SHAPE = slice(QUATERNION_ROW, COLOUR_ROW)
 """Quaternion and log-scale, whose precision is one power."""
@@ -57,7 +68,7 @@ class Prepared:
     power    [N, 3]      precision of place, shape and colour, as powers of two
     effect   [S]         RMS change of the picture when all Gaussians are off by 2**-power
     seen     [N]         in [0, 1]
-    basis                of the motion; only its centre and width are read
+    basis                of the motion, without weights
     """
 
     state: Reals
@@ -81,66 +92,103 @@ def prepare(
     """
     order = np.argsort(_along_curve(gaussians.mean.double().numpy()), kind="stable")
     state = _state_of(gaussians)[order]
-    weight = deformation.weight.numpy()[order]
+    weight = deformation.weight.numpy()
     effect = effect[:, order].copy()
     channels = weight.shape[1]
     values = np.stack([deformation.basis(t).double().numpy() for t in trained_t])  # [T, B]
-    mean = weight @ values.mean(0).astype(np.float32)
+    mean = (weight @ values.mean(0).astype(np.float32))[order]
     state[:, :channels] += mean
-    weight -= mean[:, :, None]  # the bases sum to 1
     length = np.linalg.norm(state[:, QUATERNION], axis=1)
     state[length == 0, QUATERNION_ROW], length[length == 0] = 1, 1  # zeros are not a rotation
     state[:, QUATERNION] /= length[:, None]
-    weight[:, QUATERNION] /= length[:, None, None].astype(np.float32)
     effect[QUATERNION] *= length**2
     state[:, COLOUR] = state[:, COLOUR] @ OPPONENT.T
     effect[COLOUR] = effect[COLOUR].mean(0)
-    if channels > CHANNELS:
-        weight[:, COLOUR] = OPPONENT.astype(np.float32) @ weight[:, COLOUR]
 
     power = np.stack([_power(effect[group]) for group in (MEAN, SHAPE, COLOUR)], axis=1)
     rows = state_rows(channels)
     state, effect, scale = state[:, rows], effect[rows], np.exp2(power)[:, GROUP_OF[rows]]
     root = np.maximum(np.sqrt(effect.sum(1) / (scale**2).sum(0)), MIN_EFFECT)
-    motion, pattern = _patterns(weight, values, scale)
+    weights = _channels(weight, order, mean, length.astype(np.float32))
+    motion, pattern = _patterns(weights, channels, values, scale)
     share = np.clip(seen.double().numpy(), 0, 1)[order]
-    return Prepared(state, motion, pattern, power, root, share, deformation)
+    basis = deformation.select(torch.zeros(0, dtype=torch.int64))
+    return Prepared(state, motion, pattern, power, root, share, basis)
 
 
-def round_to(prepared: Prepared, step: float) -> Compact:
+@dataclass(frozen=True, eq=False)
+class Rounding(Numbers):
+    """A prepared scene as it is when rounded, number by number as they are asked for: its table would take as much
+    memory as the scene.
+
+    step     [S] as in Numbers
+    per_unit [N, S] float64, of the state and of its channels' motion: whole numbers a unit
+    """
+
+    prepared: Prepared
+    per_unit: Reals
+
+    def at_rest(self) -> NDArray[np.int32]:
+        return _whole(self.prepared.state * self.per_unit)
+
+    def coefficients(self, first: int, last: int) -> NDArray[np.int32]:
+        units = self.per_unit[:, first:last].astype(np.float32)
+        return np.concatenate(
+            [_whole(self.prepared.motion[c] * units[:, c - first, None]) for c in range(first, last)], axis=1
+        )
+
+    def powers(self) -> Whole:
+        return self.prepared.power
+
+    def compact(self) -> Compact:
+        """The same in one table."""
+        channels, count, patterns = self.prepared.motion.shape
+        first = len(self.step)
+        table: NDArray[np.int32] = np.empty((count, first + channels * patterns + 4), np.int32)
+        table[:, :first] = self.at_rest()
+        for channel in range(channels):
+            table[:, first : first + patterns] = self.coefficients(channel, channel + 1)
+            first += patterns
+        table[:, -4:-1] = self.powers()
+        # What was seen at all stays so: a render marks what was not.
+        seen = self.prepared.seen
+        table[:, -1] = np.maximum(np.rint(seen * SEEN_LEVELS), seen > 0)
+        return Compact(self.step, self.pattern, self.centre, self.width, table)
+
+
+def rounding(prepared: Prepared, step: float) -> Rounding:
     """The scene with every number rounded to a multiple of its step.
+
+    What it gives raises ValueError where a number would exceed MAX_STORED.
 
     Args:
         step: change of the picture (1 is black to white) when all Gaussians' numbers of one kind are off by one step.
 
     Raises:
-        ValueError: a number would exceed MAX_STORED, or there would be more than MAX_NUMBERS.
+        ValueError: there would be more than MAX_NUMBERS.
     """
     channels, count, patterns = prepared.motion.shape
     rows = state_rows(channels)
-    columns = len(rows) + channels * patterns + 4
-    check_size(count, columns)
+    check_size(count, len(rows) + channels * patterns + 4)
     steps = step / prepared.effect
     steps[QUATERNION] = np.minimum(steps[QUATERNION], MAX_ROTATION_STEP)
-    table: NDArray[np.int32] = np.empty((count, columns), np.int32)
-
-    def fill(first: int, numbers: NDArray[np.floating]) -> None:
-        largest = max(-float(numbers.min(initial=0)), float(numbers.max(initial=0)))
-        if not largest <= MAX_STORED:
-            raise ValueError(f"a step of {step:g} makes numbers as large as {largest:g}")
-        table[:, first : first + numbers.shape[1]] = np.rint(numbers, out=numbers)
-
-    units = np.exp2(prepared.power)[:, GROUP_OF[rows]] / steps  # [N, S]
-    fill(0, prepared.state * units)
-    for channel, motion in enumerate(prepared.motion):
-        fill(len(rows) + channel * patterns, motion * units[:, channel, None].astype(np.float32))
-    table[:, -4:-1] = prepared.power
-    # What was seen at all stays so: a render marks what was not.
-    levels = np.maximum(np.rint(prepared.seen * SEEN_LEVELS), prepared.seen > 0)
-    fill(columns - 1, levels[:, None])
     pattern = np.ascontiguousarray(prepared.pattern * steps[:channels, None, None], np.float32)
+    per_unit = np.exp2(prepared.power)[:, GROUP_OF[rows]] / steps
     basis = prepared.basis
-    return Compact(table, steps.astype(np.float32), pattern, basis.centre, basis.width)
+    return Rounding(steps.astype(np.float32), pattern, basis.centre, basis.width, prepared, per_unit)
+
+
+def _whole(numbers: NDArray[np.floating]) -> NDArray[np.int32]:
+    """The numbers rounded, which are overwritten.
+
+    Raises:
+        ValueError: one would exceed MAX_STORED.
+    """
+    largest = max(-float(numbers.min(initial=0)), float(numbers.max(initial=0)))
+    if not largest <= MAX_STORED:
+        raise ValueError(f"the step is so fine that a number becomes {largest:g}")
+    whole: NDArray[np.int32] = np.rint(numbers, out=numbers).astype(np.int32)
+    return whole
 
 
 def _state_of(gaussians: Gaussians) -> Reals:
@@ -165,8 +213,23 @@ def _power(effect: Reals) -> Whole:
     return power
 
 
-def _patterns(weight: NDArray[np.float32], values: Reals, scale: Reals) -> tuple[NDArray[np.float32], Reals]:
-    """Coefficients [C, N, R] and patterns [C, R, B] of weights [N, C, B] whose mean over the times is 0.
+def _channels(weight: Floats, order: Whole, mean: Floats, length: Floats) -> Iterator[Floats]:
+    """Each channel's weights [N, B] in the new coordinates and order; a copy of all of them would take much memory.
+
+    weight [N, C, B] as it was; mean [N, C] over the trained times and length [N] of the quaternions, in the new order.
+    """
+    for rows in (MEAN, QUATERNION, LOG_SCALE, COLOUR, GLOSS):
+        some = weight[order, rows]  # no channels where the motion has none
+        some -= mean[:, rows, None]  # the bases sum to 1
+        if rows is QUATERNION:
+            some /= length[:, None, None]
+        elif rows is COLOUR and some.size:
+            some = OPPONENT.astype(np.float32) @ some
+        yield from some.transpose(1, 0, 2)
+
+
+def _patterns(weights: Iterable[Floats], channels: int, values: Reals, scale: Reals) -> tuple[Floats, Reals]:
+    """Coefficients [C, N, R] and patterns [C, R, B] of the C channels' weights [N, B], whose mean over the times is 0.
 
     values [T, B] of the bases at the trained times; scale [N, C or more], precision of each Gaussian's channel.
     """
@@ -174,10 +237,10 @@ def _patterns(weight: NDArray[np.float32], values: Reals, scale: Reals) -> tuple
     strength = values.T @ values / len(values)
     strength += RIDGE * np.trace(strength) / bases * np.eye(bases)
     root = np.linalg.cholesky(strength)  # in these coordinates equal errors weigh the same over the trained times
-    coefficients = np.empty((weight.shape[1], len(weight), bases - 1), np.float32)
-    patterns = np.empty((weight.shape[1], bases - 1, bases))
-    for channel in range(weight.shape[1]):
-        seen = weight[:, channel] @ root.astype(np.float32)
+    coefficients = np.empty((channels, len(scale), bases - 1), np.float32)
+    patterns = np.empty((channels, bases - 1, bases))
+    for channel, weight in enumerate(weights):
+        seen = weight @ root.astype(np.float32)
         scaled = seen * scale[:, channel, None].astype(np.float32)
         _, components = np.linalg.eigh((scaled.T @ scaled).astype(np.float64))
         kept = components[:, :0:-1]  # the weakest is 0, because the mean over time is taken out

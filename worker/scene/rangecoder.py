@@ -62,7 +62,7 @@ def encode(table: Table) -> list[bytes]:
 
     def coded(part: Table) -> bytes:
         out = np.zeros(64 + part.size * max_bits // 8, np.uint8)  # untouched pages take no memory
-        return out[: _encode(np.ascontiguousarray(part), out)].tobytes()
+        return out[: _encode(part, out)].tobytes()
 
     with ThreadPoolExecutor(PARTS) as pool:
         return list(pool.map(coded, np.array_split(table, PARTS, axis=1)))

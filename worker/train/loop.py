@@ -10,13 +10,12 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import torch
 
 from contract.wire.errors import Cancelled, TrainingDiverged
 from worker.machine.timing import Stopwatch
 from worker.model.optimize import rates_at
 from worker.raster.step import StepSums
-from worker.scene.scene import Scene
+from worker.scene.scene import Scene, is_finite
 from worker.train.hooks import TrainingHooks
 from worker.train.run import CurvePoint, Run, frames_at
 from worker.train.schedule import validation_frames
@@ -130,7 +129,7 @@ def _validation_psnr(run: Run) -> float:
 
 def _check_finite(run: Run) -> None:
     """Check the parameters themselves: a Gaussian that is not a number is not drawn, so the loss does not show it."""
-    broken = [name for name, values in run.model.arrays().items() if not bool(torch.isfinite(values).all())]
+    broken = [name for name, values in run.model.arrays().items() if not is_finite(values)]
     if broken:
         raise TrainingDiverged(f"After {run.iteration} iterations {', '.join(broken)} hold values that are not finite.")
 

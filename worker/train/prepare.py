@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from worker.fusion import fuse
+from worker.machine.memory import LITTLE_BYTES, keep_free_memory
 from worker.model.deformation import SharedBasis
 from worker.motion.tracks import Tracks, moved_along, track
 from worker.raster.backend import CPU, examine
@@ -53,6 +54,7 @@ def prepare(setup: Setup) -> Run:
     if setup.device != CPU:
         with setup.clock.paused():
             timings.add("compile_s", warm_up(run, partial(setup.hooks.report_stage, "compile")))
+    keep_free_memory(LITTLE_BYTES)
     run.schedule, run.asked = _schedule(run)
     return run
 
@@ -63,7 +65,9 @@ def _tracks(setup: Setup) -> Tracks | None:
     if not setup.preset.tracks or setup.preset.deformation != SharedBasis.kind or len(train) < 2:
         return None
     with setup.timings.measure("motion_s"):
-        return track(setup.clip, train, partial(setup.hooks.report_stage, "motion"))
+        tracks = track(setup.clip, train, partial(setup.hooks.report_stage, "motion"))
+    keep_free_memory(LITTLE_BYTES)
+    return tracks
 
 
 def _schedule(run: Run) -> tuple[Schedule, str]:

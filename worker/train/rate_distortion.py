@@ -20,9 +20,9 @@ from worker.model.deformation import SharedBasis
 from worker.model.layout import VALUES
 from worker.raster.backend import CPU, Device
 from worker.raster.model import Model
-from worker.scene.compact import Compact
+from worker.scene.compact import Compact, Numbers
 from worker.scene.model import model_of
-from worker.scene.quantize import prepare, round_to
+from worker.scene.quantize import Prepared, prepare, rounding
 from worker.scene.scene import Scene
 from worker.train.targets import TrainingFrames
 
@@ -79,48 +79,67 @@ class QuantizedScene:
 
 
 def quantize_scene(
+    scene: Scene, eyes: Sequence[TrainingFrames], tolerance_db: float = TOLERANCE_DB, device: Device = CPU
+) -> QuantizedScene | None:
+    """The scene in whole numbers; None for a model that is stored as floats, or if no trial kept the tolerance."""
+    return quantize_model(model_of(scene, device), scene, eyes, tolerance_db, device)
+
+
+def quantize_model(
+    model: Model,
     scene: Scene,
     eyes: Sequence[TrainingFrames],
     tolerance_db: float = TOLERANCE_DB,
     device: Device = CPU,
 ) -> QuantizedScene | None:
-    """The scene in whole numbers; None for a model that is stored as floats, or if no trial kept the tolerance."""
+    """The model in whole numbers, likewise, and what else the scene holds. The scene's motion needs no weights."""
     pictures = [(frames, index) for index in eyes[0].indices for frames in eyes if frames.eye.tissue[index].any()]
     if not isinstance(scene.deformation, SharedBasis) or scene.gaussians.sh_degree > 0 or not pictures:
         return None
-    model, scored = model_of(scene, device), _spread(pictures, SCORED_FRAMES)
+    scored = _spread(pictures, SCORED_FRAMES)
     exact_db = _mean_db((model.render(frames.cameras[i], float(frames.t[i])) for frames, i in scored), scored)
     if not math.isfinite(exact_db):
         return None
     sensitivity = _sensitivity(model, pictures, len(scene.deformation.centre))
     times = [float(eyes[0].t[index]) for index in eyes[0].indices]
-    prepared = prepare(scene.gaussians, scene.deformation, scene.seen, sensitivity, times)
 
-    def trial(step: float) -> tuple[Compact, float]:
-        compact = round_to(prepared, step)
-        return compact, exact_db - _mean_db(_renders(compact, scene, scored, device), scored)
+    def loss_db(numbers: Numbers) -> float:
+        return exact_db - _mean_db(_renders(numbers, scene, scored, device), scored)
 
-    found = _coarsest(trial, tolerance_db)
+    found = _rounded(_prepared(model, scene, sensitivity, times), loss_db, tolerance_db)
     return None if found is None else _stored(scene, *found, len(scored))
 
 
-def _coarsest(
-    trial: Callable[[float], tuple[Compact, float]], tolerance_db: float
+def _prepared(model: Model, scene: Scene, sensitivity: NDArray[np.float64], times: Sequence[float]) -> Prepared:
+    """The model ready for rounding. The copy of its weights ends here."""
+    gaussians, deformation = model.export()
+    assert isinstance(deformation, SharedBasis)
+    return prepare(gaussians, deformation, scene.seen, sensitivity, times)
+
+
+def _rounded(
+    prepared: Prepared, loss_of: Callable[[Numbers], float], tolerance_db: float
 ) -> tuple[Compact, float, float] | None:
-    """The coarsest step tried that kept the tolerance: what it stores, its loss in dB, the step.
+    """The coarsest rounding tried that kept the tolerance: what it stores, its step, its loss in dB."""
+    found = _coarsest(lambda step: loss_of(rounding(prepared, step)), tolerance_db)
+    return None if found is None else (rounding(prepared, found[0]).compact(), *found)
+
+
+def _coarsest(loss_of: Callable[[float], float], tolerance_db: float) -> tuple[float, float] | None:
+    """The coarsest step tried that kept the tolerance, and its loss in dB.
 
     Each trial predicts the step that should just keep the tolerance.
     """
     step, good, bad, best = FIRST_STEP, MIN_STEP, math.inf, None
     for _ in range(MAX_TRIALS):
         try:
-            compact, loss_db = trial(step)
+            loss_db = loss_of(step)
         except ValueError:  # finer than whole numbers of this size can be
             loss_db = math.inf
         if not loss_db <= tolerance_db:
             bad = min(bad, step)
         elif step > good:
-            good, best = step, (compact, loss_db, step)
+            good, best = step, (step, loss_db)
             if loss_db >= ENOUGH * tolerance_db:
                 break
         allowed = _added_error(tolerance_db)
@@ -129,11 +148,11 @@ def _coarsest(
     return best
 
 
-def _stored(scene: Scene, compact: Compact, loss_db: float, step: float, frames: int) -> QuantizedScene:
-    gaussians, deformation, seen = compact.model()
+def _stored(scene: Scene, compact: Compact, step: float, loss_db: float, frames: int) -> QuantizedScene:
     stored = compact.tensors()
+    gaussians, deformation, seen = compact.model()
     small = dataclasses.replace(scene, gaussians=gaussians, deformation=deformation, seen=seen, stored=stored)
-    return QuantizedScene(small, step, loss_db, frames, scene.byte_count)
+    return QuantizedScene(small, step, loss_db, frames, small.byte_count)
 
 
 def _added_error(loss_db: float) -> float:
@@ -151,14 +170,15 @@ def _mean_db(images: Iterable[NDArray[np.float32]], scored: Sequence[Picture]) -
 
 
 def _renders(
-    compact: Compact, scene: Scene, scored: Sequence[Picture], device: Device
+    numbers: Numbers, scene: Scene, scored: Sequence[Picture], device: Device
 ) -> Iterator[NDArray[np.float32]]:
-    """The scored frames, rendered from what is stored. Decodes the Gaussians at their times only, not all weights."""
+    """The scored frames, rendered from what would be stored. Only the Gaussians at their times are decoded."""
     rest = SharedBasis.initial(len(scene.gaussians), bases=1)
     times = [float(frames.t[index]) for frames, index in scored]
-    for (frames, index), gaussians in zip(scored, compact.at(times), strict=True):
+    for (frames, index), gaussians in zip(scored, numbers.at(times), strict=True):
         still = model_of(dataclasses.replace(scene, gaussians=gaussians, deformation=rest), device)
         yield still.render(frames.cameras[index], 0.0)
+        del still  # before the next one is made
 
 
 def _sensitivity(model: Model, pictures: Sequence[Picture], bases: int) -> NDArray[np.float64]:

@@ -29,7 +29,7 @@ from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_
 from worker.scene.compact import MIN_POWER, Compact, state_rows, unpack
 from worker.scene.differences import MAX_STORED
 from worker.scene.model import model_of
-from worker.scene.quantize import prepare, round_to
+from worker.scene.quantize import prepare, rounding
 from worker.scene.scene import Scene
 from worker.train.rate_distortion import SCORED_FRAMES, TOLERANCE_DB, quantize_scene
 from worker.train.targets import TrainingFrames
@@ -49,7 +49,7 @@ def shared(scene: Scene) -> SharedBasis:
 
 def rounded(scene: Scene, step: float = 1e-3, effect: NDArray[np.float64] | None = None) -> Compact:
     chosen = effect_of(len(scene.gaussians)) if effect is None else effect
-    return round_to(prepare(scene.gaussians, shared(scene), scene.seen, chosen, TIMES), step)
+    return rounding(prepare(scene.gaussians, shared(scene), scene.seen, chosen, TIMES), step).compact()
 
 
 def compacted(scene: Scene, step: float = 1e-3) -> Scene:

@@ -51,7 +51,11 @@ class Motion(Protocol):
 
 def kept_where_old(moments: Floats, columns: np.ndarray, fresh: np.ndarray) -> Floats:
     """These columns of Adam's moments, 0 where fresh. Contiguous by rows, which indexing alone is not."""
-    return np.ascontiguousarray(np.where(fresh, np.float32(0), moments[..., columns]))
+    if fresh.all():  # zeros that nothing reads take no memory
+        return np.zeros((*moments.shape[:-1], len(columns)), np.float32)
+    kept = np.take(moments, columns, axis=-1)
+    kept[..., fresh] = 0
+    return kept
 
 
 def _channel_rates(rates: StepRates) -> Floats:
@@ -73,7 +77,8 @@ class LinearMotion:
 
     def __init__(self, deformation: LinearDeformation, columns: int) -> None:
         count, channels, bases = deformation.weight.shape
-        self._deformation = deformation
+        # for its bases, not its weights
+        self._form = dataclasses.replace(deformation, weight=torch.zeros(0, channels, bases))
         self.weight = np.zeros((bases, channels, columns), np.float32)
         self.weight[:, :, :count] = deformation.weight.permute(2, 1, 0).numpy()
         # zeros, not zeros_like: a model that is only rendered never touches these, and so they take no memory
@@ -81,7 +86,7 @@ class LinearMotion:
         self.steps = np.zeros(bases, np.int64)
 
     def _alive(self, t: float) -> tuple[Floats, int, int]:
-        values = self._deformation.basis(t).numpy()
+        values = self._form.basis(t).numpy()
         alive = np.flatnonzero(np.abs(values) >= NEGLIGIBLE)
         return (values, int(alive[0]), int(alive[-1]) + 1) if alive.size else (values, 0, 0)
 
@@ -108,8 +113,10 @@ class LinearMotion:
         )  # fmt: skip
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
-        self.weight = np.ascontiguousarray(self.weight[:, :, columns])
-        self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
+        # one after the other, so that the old ones do not all wait for the new ones
+        self.first = kept_where_old(self.first, columns, fresh)
+        self.second = kept_where_old(self.second, columns, fresh)
+        self.weight = np.take(self.weight, columns, axis=-1)
 
     def parameters(self, count: int) -> dict[str, Tensor]:
         return _views(self, ("weight",), count)
@@ -119,7 +126,7 @@ class LinearMotion:
 
     def export(self, count: int) -> LinearDeformation:
         weight = torch.from_numpy(np.ascontiguousarray(self.weight[:, :, :count].transpose(2, 1, 0)))
-        return dataclasses.replace(self._deformation, weight=weight)
+        return dataclasses.replace(self._form, weight=weight)
 
 
 class FdmMotion:
@@ -148,8 +155,9 @@ class FdmMotion:
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         for name in ("weight", "centre", "width"):
-            setattr(self, name, np.ascontiguousarray(getattr(self, name)[..., columns]))
-        self.first, self.second = (kept_where_old(each, columns, fresh) for each in (self.first, self.second))
+            setattr(self, name, np.take(getattr(self, name), columns, axis=-1))
+        self.first = kept_where_old(self.first, columns, fresh)
+        self.second = kept_where_old(self.second, columns, fresh)
 
     def parameters(self, count: int) -> dict[str, Tensor]:
         return _views(self, ("weight", "centre", "width"), count)

@@ -138,7 +138,8 @@ class LinearMotion:
 
     def __init__(self, deformation: LinearDeformation, columns: int, device: torch.device) -> None:
         count, self._channels, self._bases = deformation.weight.shape
-        self._form = dataclasses.replace(deformation, weight=deformation.weight[:0])  # for its bases, not its weights
+        # for its bases, not its weights, which a view would keep in memory
+        self._form = dataclasses.replace(deformation, weight=torch.zeros(0, self._channels, self._bases))
         self.weight = torch.zeros(self._bases, self._channels, columns, device=device)
         self.weight[:, :, :count] = deformation.weight.permute(2, 1, 0).to(device)
         self._moments = Moments(tuple(self.weight.shape), device)
