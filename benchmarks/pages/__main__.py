@@ -3,7 +3,7 @@
     python -m benchmarks.pages
 
 Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
-stability`), {two-eyes,ablation,raster,service}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of
+stability`), {two-eyes,ablation,raster,service,memory}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of
 bm_soak.py); what is missing is left out.
 """
 
@@ -64,6 +64,13 @@ idle and while a clip trains, in one run; viewers, service, queue and worker sha
 _UPLOADS = """
 Uploads, the service's resident memory before and at its peak:
 """
+_MEMORY = """
+## Memory of a reconstruction
+
+`python benchmarks/bm_memory.py --csv docs/results/memory.csv` ([memory.csv](memory.csv)): the peak of the process's
+resident memory in each stage, for a clip of both eyes as recorded. `import` is with all libraries loaded, before the
+clip; another process decodes ([decision 033](../decisions/033-memory.md)).
+"""
 _CHAOS = """
 ## What survives what
 
@@ -95,6 +102,8 @@ def main() -> None:
         parts += [_STEREO, f"\n```\n{(RESULTS / 'stereo.txt').read_text().strip()}\n```\n"]
     if rows := _read("service.csv"):
         parts += [_SERVICE, *_service_tables(rows)]
+    if rows := _read("memory.csv"):
+        parts += [_MEMORY, _memory_table(rows), origin(rows)]
     if (RESULTS / "chaos.md").exists():
         parts.append(_CHAOS)
     if (RESULTS / "soak.txt").exists():
@@ -168,6 +177,12 @@ def _service_tables(rows: list[Row]) -> list[str]:
         tables += [_UPLOADS, table(["", "seconds", "before, MiB", "peak, MiB"], uploads)]
     first = rows[0]
     return [*tables, f"\n{first['machine']}, commit {first['commit']}.\n"]
+
+
+def _memory_table(rows: list[Row]) -> str:
+    header = ["clip", "preset", "limit", "Gaussians", "bases", "stage", "peak, MiB", "at its end", "decoding process"]
+    names = ("clip", "preset", "limit", "gaussians", "bases", "stage", "peak_mib", "end_mib", "decoder_mib")
+    return table(header, [[row[name] or "–" for name in names] for row in rows])
 
 
 if __name__ == "__main__":

@@ -6,12 +6,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from tests.worker.clips import plane_clip
 from tests.worker.phantoms import prepared
 from worker.input.clip import DepthClip
 from worker.report.trust import trust
 from worker.report.visibility import MAX_UNSEEN_WIDTH, drop_strays
+from worker.train.loop import step
 from worker.train.run import Run
 from worker.train.targets import TrainingFrames
 
@@ -51,6 +53,19 @@ def test_what_was_seen_may_be_wide_and_what_is_narrow_may_be_unseen(clip: DepthC
     run.model.canonical[LOG_SCALE, int(seen.argmax())] = np.log(2 * MAX_UNSEEN_WIDTH)
     assert drop_strays(run.model, [run.frames]) == 0
     assert run.model.count == count
+
+
+@pytest.mark.parametrize("preset", ["fast", "paper", "hexplane"])
+def test_adams_moments_go_and_the_model_stays(preset: str, clip: DepthClip) -> None:
+    run = prepared(clip, preset, holdout="none")[0]
+    step(run, 1)
+    trained = {name: values.clone() for name, values in run.model.parameters().items()}
+    drop_strays(run.model, [run.frames])
+    left = run.model.parameters()
+    assert all(torch.equal(values, left[name]) for name, values in trained.items())
+    moments = {name: each for name, each in run.model.arrays().items() if name.startswith("moments.")}
+    assert moments
+    assert not any(bool(each.any()) for each in moments.values())
 
 
 def test_a_wide_gaussian_that_alone_shows_the_tissue_around_it_stays(clip: DepthClip) -> None:
