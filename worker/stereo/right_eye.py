@@ -25,6 +25,8 @@ CLOSED_SHARE, GROWN_SHARE = 0.03, 0.014
 """Of the width: gaps of a moved instrument mask that are closed, and how far it grows. Matching blurs its outline."""
 ROWS_AT_ONCE = 64
 """Rows that are moved at once: few enough to stay in the processor's cache, which halves the time."""
+DIRECTION_SHARE, MIN_DIRECTION_PX, MAX_SLOPE, BORDER_PX = 0.06, 6, 3.0, 8
+"""Of the width: how much of an instrument at the picture's border tells its direction, if it is so many px at least."""
 MAX_OVERLAY_LEVELS = 8.0
 """Median difference of the eyes, of 255, at equal pixels of what is painted into both, such as a label."""
 
@@ -58,7 +60,7 @@ def moved_tissue(tissue: Mask, depth_mm: Image, focal_baseline: float, offset_px
     """Tissue [H, W] of the right eye: where the left eye's instruments are not.
 
     An instrument's pixels without depth take that of its nearest pixel with one. One that leaves the left picture on
-    the right goes on in the strip that only the right eye sees.
+    the right goes on in its direction in the strip that only the right eye sees.
     """
     tool = ~tissue
     if not tool.any():
@@ -70,12 +72,43 @@ def moved_tissue(tissue: Mask, depth_mm: Image, focal_baseline: float, offset_px
     box = slice(top, top + down), slice(left, left + across)  # holds all that is asked for, and all that is known
     disparity[box] = nearest_known(disparity[box], (found & tool)[box], (~found & tool)[box])
     moved = _moved(disparity, tool, tool.astype(np.uint8))
-    rows = np.flatnonzero(tool[:, -2:].any(axis=1))
-    largest_px = np.where(tool[rows], disparity[rows], -np.inf).max(axis=1)
-    moved[rows] |= np.arange(width) >= np.trunc(width - 2 - largest_px)[:, None]
+    for run in _runs(np.asarray(tool[:, -2:].any(axis=1))):
+        _go_on(moved, tool, disparity, run)
     closed = cv2.morphologyEx(moved, cv2.MORPH_CLOSE, _box(CLOSED_SHARE * width))
     grown: Mask = cv2.dilate(closed, _box(GROWN_SHARE * width)) == 0
     return grown
+
+
+def _runs(chosen: Mask) -> list[slice]:
+    """The stretches of a column [H] that are chosen."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]))).tolist()
+    return [slice(first, end) for first, end in zip(ends[::2], ends[1::2], strict=True)]
+
+
+def _go_on(moved: NDArray[np.uint8], tool: Mask, disparity: Image, run: slice) -> None:
+    """Draw into the right eye's instruments [H, W] how that in rows `run` of the left picture's right border goes on.
+
+    Its upper and lower edge go on as straight as they come; an edge at the picture's own stays there.
+    """
+    height, width = tool.shape
+    edges, here = [(run.start, run.stop)], run
+    for column in range(width - 3, width - 3 - round(DIRECTION_SHARE * width), -1):
+        touching = [each for each in _runs(tool[:, column]) if each.start <= here.stop and each.stop >= here.start]
+        if not touching:
+            break
+        here = max(touching, key=lambda each: min(each.stop, here.stop) - max(each.start, here.start))
+        edges.append((here.start, here.stop))
+    slopes = np.polyfit(-np.arange(len(edges)), edges, 1)[0] if len(edges) >= MIN_DIRECTION_PX else np.zeros(2)
+    slopes = np.clip(slopes, -MAX_SLOPE, MAX_SLOPE)
+    at_border = np.where(tool[run], disparity[run], -np.inf)[:, -BORDER_PX:]
+    if not np.isfinite(at_border).any():
+        return
+    nearest_px = float(at_border.max())
+    top = 0.0 if run.start == 0 else slopes[0] * nearest_px
+    bottom = 0.0 if run.stop == height else slopes[1] * nearest_px
+    first = max(int(width - 2 - nearest_px), 0)
+    corners = [(first, run.start), (width, run.start + top), (width, run.stop - 1 + bottom), (first, run.stop - 1)]
+    cv2.fillPoly(moved, [np.rint(corners).astype(np.int32)], 1)
 
 
 def painted_over(left: NDArray[np.uint8], right: NDArray[np.uint8], never_tissue: Mask) -> Mask:

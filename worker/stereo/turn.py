@@ -18,7 +18,7 @@ from worker.input.camera import Intrinsics
 Rgb = NDArray[np.uint8]  # [H, W, 3] or grey [H, W]
 AnyImage = NDArray[Any]  # [H, W]
 
-MIN_CORRECTION_PX = 0.2  # resampling for less blurs more than it corrects
+MIN_CORRECTION_PX = 0.05  # less is within the error of measuring
 MIN_MOVED_PX = 0.5  # by less, no whole pixel moves
 
 

@@ -79,6 +79,19 @@ def test_an_instrument_that_leaves_the_left_picture_goes_on_in_the_strip_of_the_
     assert moved[:6, 44:].all()
 
 
+def test_an_instrument_goes_on_in_the_direction_in_which_it_leaves_the_left_picture() -> None:
+    height, width, disparity_px = 96, 160, 32.0
+    y, x = np.mgrid[:height, :width]
+    tissue = (np.abs(y - 0.8 * (x - 80)) >= 8) | (x <= 80)  # goes down to the right, and on beyond the border
+    depth_mm = np.full((height, width), FOCAL_BASELINE / disparity_px, np.float32)
+    moved = moved_tissue(tissue, depth_mm, FOCAL_BASELINE, 0.0)
+    truth = (np.abs(y - 0.8 * (x + disparity_px - 80)) < 8) & (x + disparity_px > 80)
+    assert not moved[truth].any()
+    assert (~moved & ~truth).sum() < 0.6 * truth.sum()
+    below = (y < 60 + 0.5 * (width - x)) | (x < width - 40)  # a part at the picture's lower border stays there
+    assert not moved_tissue(below, depth_mm, FOCAL_BASELINE, 0.0)[64:, width - 30 :].any()
+
+
 def test_a_clip_without_instruments_has_none_in_the_right_eye() -> None:
     assert moved_tissue(np.ones((HEIGHT, WIDTH), np.bool_), step_mm(), FOCAL_BASELINE, 0.0).all()
 
