@@ -68,12 +68,21 @@ def main() -> None:
     recording = phantom.stereo_recording()
     clip = rectify(recording.clip, recording.calibration)
     pairs = list(clip.pairs())
+    _print_masks(clip, recording.tissue_right)
     print(f"{'right eye':28}{'corrects':>10}{'moved':>7}{'depth':>7}{'left':>7}{'right':>7}  notices")
     for name, change in _cases(clip).items():
         spoilt = dataclasses.replace(clip, pairs=partial(iter, [(left, change(right)) for left, right in pairs]))
         for corrects, kind in (("rows", RowsAlone), ("all", Registration)):
             with patch.object(depth, "Registration", kind):
                 _print(f"{name:28}{corrects:>10}", phantom, spoilt, [right for _, right in pairs], options.iterations)
+
+
+def _print_masks(clip: RectifiedClip, truth: NDArray[np.bool_] | None) -> None:
+    right = estimate_depth(clip).right
+    assert right is not None
+    assert truth is not None
+    missed, lost = right.tissue[~truth].mean(), (~right.tissue[truth]).mean()
+    print(f"moved masks: {missed:.2%} of the instrument is taken for tissue, {lost:.2%} of the tissue for instrument")
 
 
 def _cases(clip: RectifiedClip) -> dict[str, Callable[[Picture], Picture]]:
