@@ -14,7 +14,7 @@ from worker.input.clip import DepthClip
 from worker.phantom import PhantomSettings
 
 CLEAN_FRAMES = 12
-OF_THE_SAME_CLIP = [name for name in CONDITIONS if name not in ("tiny", "large", "cutting", "fast_pull")]
+OF_THE_SAME_CLIP = [name for name in CONDITIONS if not name.startswith(("tiny", "large", "cutting", "fast_pull"))]
 SLOW = ("large", "tiny")  # a phantom of its own for each severity
 
 

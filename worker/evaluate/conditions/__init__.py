@@ -97,6 +97,14 @@ def _conditions() -> dict[str, Condition]:
         Condition("duplicated_frames", "frames repeated, share", timing.duplicated_frames, (0.1, 0.25, 0.4, 0.55, 0.7)),
         Condition("fast_pull", "fast pull, px a frame", scenes.fast_pull, (10, 20, 40, 60, 80), calm=2),
         Condition("cutting", "cut opens within frames", scenes.cutting, (128, 64, 32, 16, 8), calm=1024),
+        Condition(
+            "fast_pull_stereo", "fast pull seen by both eyes, px a frame", scenes.fast_pull_stereo,
+            (10, 20, 40, 60, 80), True, calm=2,
+        ),
+        Condition(
+            "cutting_stereo", "cut seen by both eyes, within frames", scenes.cutting_stereo, (128, 64, 32, 16, 8), True,
+            calm=1024,
+        ),
         Condition("moving_camera", "camera swings, poses right, degrees", scenes.moving_camera, (2, 5, 10, 15, 20)),
         Condition("noisy_poses", "camera swings, poses wrong, mm", scenes.noisy_poses, (0.1, 0.25, 0.5, 1, 2)),
         Condition("no_texture", "texture lost, share", scenes.no_texture, (0.5, 0.75, 0.9, 0.97, 1), True),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from worker.evaluate.conditions.clean import CleanClip, Given, clean_clip, clean_of, given
 from worker.evaluate.conditions.recording import recording_of
-from worker.phantom import Phantom, PhantomFrame, make_phantom, orbit_pose
+from worker.phantom import Phantom, PhantomFrame, PhantomSettings, make_phantom, orbit_pose
 from worker.phantom.motion import Pull
 from worker.phantom.surface import MEAN_DEPTH_MM, Surface
 
@@ -49,17 +49,38 @@ class ScaledPull(Pull):
 def fast_pull(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
     """A grasper pulls a fold and lets it go; its fastest point moves about `level` px from one frame to the next."""
     del random
-    phantom = make_phantom(dataclasses.replace(clean.phantom.settings, motion="pull", period_frames=PULL_FRAMES))
-    whole = dataclasses.replace(phantom, surface=_pulled(phantom.surface, 1.0))
-    gain = level * clean.px / max(_fastest_px(whole), 1e-9)
-    return given(clean_of(dataclasses.replace(phantom, surface=_pulled(phantom.surface, gain))))
+    return given(clean_of(_fast_pull(clean, level)))
+
+
+def fast_pull_stereo(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
+    """Stereo files of the same."""
+    del random
+    pulled = clean_of(_fast_pull(clean, level))
+    return given(pulled, recording_of(pulled.phantom))
 
 
 def cutting(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
     """The surface splits and opens to 13 mm within `level` frames."""
     del random
-    settings = dataclasses.replace(clean.phantom.settings, motion="cut", period_frames=level / 2)
-    return given(clean_clip(settings))
+    return given(clean_clip(_cut(clean, level)))
+
+
+def cutting_stereo(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
+    """Stereo files of the same."""
+    del random
+    cut = clean_clip(_cut(clean, level))
+    return given(cut, recording_of(cut.phantom))
+
+
+def _fast_pull(clean: CleanClip, level: float) -> Phantom:
+    phantom = make_phantom(dataclasses.replace(clean.phantom.settings, motion="pull", period_frames=PULL_FRAMES))
+    whole = dataclasses.replace(phantom, surface=_pulled(phantom.surface, 1.0))
+    gain = level * clean.px / max(_fastest_px(whole), 1e-9)
+    return dataclasses.replace(phantom, surface=_pulled(phantom.surface, gain))
+
+
+def _cut(clean: CleanClip, level: float) -> PhantomSettings:
+    return dataclasses.replace(clean.phantom.settings, motion="cut", period_frames=level / 2)
 
 
 def moving_camera(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
