@@ -1,4 +1,4 @@
-"""Measure what both eyes of a stereo clip teach, judged by the left and by the right eye.
+"""Measure what both eyes of a stereo clip teach, judged by the left eye, by the right, and by a synthetic clip's truth.
 
     python benchmarks/bm_two_eyes.py [--clips d4d_stereo ...] [--holdout every8 blocks8] [--eyes left both]
         [--budget-s 15 60 | --iterations N ...] [--seeds 0 1 2] [--csv docs/results/two-eyes.csv]
@@ -23,20 +23,21 @@ from typing import get_args
 from contract.wire.names import Eyes
 from worker.evaluate.cells import DEFAULT_HOLDOUTS, plan
 from worker.evaluate.measure import Bench
-from worker.evaluate.rows import KEY, ORIGIN, RUN_FIELDS, adding_alone, key_of, read_rows, texts_of, write_rows
+from worker.evaluate.rows import KEY, ORIGIN, RUN_FIELDS, TRUTH, adding_alone, key_of, read_rows, texts_of, write_rows
 from worker.evaluate.sources import DATA_VARIABLE, source_of
 from worker.evaluate.summary import Group, groups_of
 from worker.train.hooks import TrainingHooks
 
 FIELDS = (
     *KEY, "psnr_tissue_db", "psnr_right_db", "warp_db", "psnr_clear_db", "psnr_right_clear_db", "warp_clear_db",
-    "train_psnr_tissue_db", "iterations", "gaussians", "step_ms", "t_train_s", "t_post_s", "scene_bytes", "load_1min",
-    *ORIGIN,
+    "train_psnr_tissue_db", *TRUTH, "iterations", "gaussians", "step_ms", "t_train_s", "t_post_s", "scene_bytes",
+    "load_1min", *ORIGIN,
 )  # fmt: skip
 """Names and meaning are those of runs.csv."""
 COLUMNS = {
     "psnr_tissue_db": ("left", 2), "psnr_right_db": ("right", 2), "warp_db": ("warp", 2),
     "psnr_clear_db": ("l.clear", 2), "psnr_right_clear_db": ("r.clear", 2), "warp_clear_db": ("w.clear", 2),
+    "psnr_view10_db": ("10 deg", 2), "psnr_view15_db": ("15 deg", 2),
     "iterations": ("steps", 0), "step_ms": ("ms/step", 1), "t_train_s": ("train s", 1), "t_post_s": ("post s", 1),
     "scene_bytes": ("bytes", 0),
 }  # fmt: skip

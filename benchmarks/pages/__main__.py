@@ -3,8 +3,8 @@
     python -m benchmarks.pages
 
 Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
-stability`), {two-eyes,ablation,raster,service,memory}.csv, stereo.txt (the output of bm_stereo.py) and soak.txt (of
-bm_soak.py); what is missing is left out.
+stability`), {two-eyes,stereo_truth,confidence,ablation,raster,service,memory}.csv, off-axis.jpg, stereo.txt (the output
+of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from benchmarks.pages.gpu import gpu_sections
 from benchmarks.pages.markdown import origin, table
 from benchmarks.pages.right_eye import two_eyes_sections
 from benchmarks.pages.stability import stability_sections
+from benchmarks.pages.truth import confidence_sections, off_axis_sections, stereo_truth_sections
 from worker.evaluate.stability import STABILITY
 
 RESULTS = Path(__file__).resolve().parent.parent.parent / "docs" / "results"
@@ -88,7 +89,8 @@ while a clip has nothing to show yet, NotFound and Conflict once it is purged or
 
 
 def main() -> None:
-    parts = [_INTRODUCTION, *sections(RESULTS), *two_eyes_sections(RESULTS), *stability_sections(RESULTS)]
+    parts = [_INTRODUCTION, *sections(RESULTS), *two_eyes_sections(RESULTS), *off_axis_sections(RESULTS)]
+    parts += [*confidence_sections(RESULTS), *stability_sections(RESULTS)]
     if rows := _read(STABILITY):
         parts.append(origin(rows))
     if rows := _latest(_read("ablation.csv"), "change", "clip", "holdout", "seed"):
@@ -100,6 +102,7 @@ def main() -> None:
     parts += gpu_sections(RESULTS)
     if (RESULTS / "stereo.txt").exists():
         parts += [_STEREO, f"\n```\n{(RESULTS / 'stereo.txt').read_text().strip()}\n```\n"]
+    parts += stereo_truth_sections(RESULTS)
     if rows := _read("service.csv"):
         parts += [_SERVICE, *_service_tables(rows)]
     if rows := _read("memory.csv"):

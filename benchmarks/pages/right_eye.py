@@ -20,6 +20,12 @@ _TWO_EYES = """
 left eye or on both, judged at held-out moments by the left eye and by the right; medians over seeds. `warp` is what the
 left eye's picture scores in the right eye, warped by stereo depth ([conventions](../conventions.md#scores)).
 """
+_TRUTH = """
+Synthetic clips have a truth for every pose. 10 and 15 degrees: views so far beside the endoscope, in dB; bound: what a
+perfect model scores whose highlights are painted onto the tissue. empty: the share of pixels in which the model draws
+nothing solid in front of the true surface, or where there is none. seen: of the pixels that some frame of either eye
+showed as tissue, the share that the model covers.
+"""
 RIGHT_EYE_CHARTS = {
     "curves-eyes": """
 ### Left and right eye
@@ -44,6 +50,12 @@ _COLUMNS = {
     "t_train_s": ("t_train_s", 1), "t_post_s": ("t_post_s", 1),
 }  # fmt: skip
 
+_TRUTH_COLUMNS = {
+    "psnr_view10_db": ("10 degrees", 1), "bound10_db": ("bound", 1), "psnr_view15_db": ("15 degrees", 1),
+    "bound15_db": ("bound", 1), "empty_ok": ("empty", 4), "seen_ok": ("seen", 4),
+    "depth_error_mm": ("depth error, mm", 2), "motion_error_mm": ("motion error, mm", 2),
+}  # fmt: skip
+
 
 def both_eyes(groups: Sequence[Group]) -> str:
     """What `fast` reaches, and a row a group whose right eye was scored; empty without any."""
@@ -65,7 +77,19 @@ def two_eyes(folder: Path) -> list[Group]:
 def two_eyes_sections(folder: Path) -> list[str]:
     """The section of bm_two_eyes.py; nothing without rows."""
     groups = two_eyes(folder)
-    return [_TWO_EYES, both_eyes(groups), origin(read_rows(folder / TWO_EYES))] if groups else []
+    return [_TWO_EYES, both_eyes(groups), *_truth(groups), origin(read_rows(folder / TWO_EYES))] if groups else []
+
+
+def _truth(groups: Sequence[Group]) -> list[str]:
+    """What the truth of synthetic clips says of other poses; nothing without any."""
+    rows = [
+        [*group.place, group.series, group.limit, str(len(group.rows))]
+        + [number(group.median(name), digits) for name, (_, digits) in _TRUTH_COLUMNS.items()]
+        for group in groups
+        if not math.isnan(group.median("psnr_view10_db"))
+    ]
+    header = ["clip", "held out", "series", "limit", "seeds", *(name for name, _ in _TRUTH_COLUMNS.values())]
+    return [_TRUTH, table(header, rows)] if rows else []
 
 
 def right_eye_claim(groups: Sequence[Group]) -> str:

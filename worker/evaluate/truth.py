@@ -178,6 +178,11 @@ class Truth:
         )
 
     @property
+    def off_axis(self) -> dict[float, list[Expected]]:
+        """The views by their angle in degrees."""
+        return self._views
+
+    @property
     def expected(self) -> dict[str, list[Expected]]:
         """The views `off-axis`, and those of the `right` eye."""
         return {"off-axis": [each for views in self._views.values() for each in views], "right": self._right}
@@ -260,9 +265,11 @@ def _seen_by(
     train: Sequence[int],
     tissue: NDArray[np.bool_],
     tissue_right: NDArray[np.bool_] | None,
+    *,
+    eroded: bool = True,
 ) -> tuple[NDArray[np.bool_], float]:
     """Which squares of the tissue's texture some training frame of an eye shows as tissue, and the left eye's median
-    over training frames of the median depth of tissue, mm."""
+    over training frames of the median depth of tissue, mm. eroded: only those whose neighbours show, too."""
     rows, columns = (size // SEEN_CELL_TEXELS + 1 for size in phantom.surface.atlas.shape)
     seen = np.zeros((rows, columns), np.bool_)
     medians_mm = []
@@ -278,8 +285,17 @@ def _seen_by(
             seen[row[visible], column[visible]] = True
     # Where the tissue lies obliquely, neighbouring pixels are more than a square apart: first such gaps are closed.
     closed = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    inner = cv2.erode(closed, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    inner = closed if not eroded else cv2.erode(closed, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     return np.asarray(inner, np.bool_), float(np.median(medians_mm))
+
+
+def seen_now(
+    phantom: Phantom, view: Expected, tissue: NDArray[np.bool_], tissue_right: NDArray[np.bool_] | None
+) -> NDArray[np.bool_]:
+    """[H, W] whether an eye shows what the view's pixels show in the view's own frame; tissue [T, H, W] of each eye."""
+    seen, _ = _seen_by(phantom, [view.frame], tissue, tissue_right, eroded=False)
+    row, column, shows = _cells(phantom.surface_pixels(view.frame, view.pose).atlas_xy)
+    return np.asarray(shows & seen[row, column])
 
 
 def _is_clear(shown: ShownView, expected: Expected) -> NDArray[np.bool_]:
