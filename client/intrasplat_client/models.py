@@ -68,6 +68,7 @@ class NoticeCode(StrEnum):
     BLOOD = "blood"
     BLURRED_FRAMES = "blurred_frames"
     BRIGHTNESS_CHANGES = "brightness_changes"
+    COLOURS_UNKNOWN = "colours_unknown"
     COLOUR_CHANGES = "colour_changes"
     DEPTH_JUMPS = "depth_jumps"
     DEPTH_OUT_OF_RANGE = "depth_out_of_range"
@@ -254,7 +255,7 @@ class Report(Model):
     assumptions: tuple[Notice, ...]
     """what was taken for granted about the input"""
     right_eye: RightEye | None = None
-    """how it was registered; None for a clip of one eye"""
+    """how it was registered; None for a clip of one eye, or whose depth was given"""
     measurements: dict[str, float] = Field(default={})
     """measured on the input, such as misalignment in px"""
     preset: str
@@ -288,23 +289,31 @@ class RightEye(Model):
     """
 
     moved_px: float
-    """how far the turn moves that point of the picture that it moves farthest"""
+    """largest shift of any pixel by the turn and the zoom"""
     lower_px: float
-    """rows by which the right picture lies lower in its middle"""
+    """rows by which the right picture lies lower at its principal point"""
     pitch_deg: float
-    """rotation about the right eye's x axis; of its axes seen from the left eye"""
+    """rotation of the right eye about its x axis, as the left eye sees it"""
     yaw_deg: float
-    """about its y axis; the middle pixel keeps its column"""
+    """about its y axis; the principal point keeps its column"""
     roll_deg: float
     """about its z axis"""
     zoom: float
-    """by which its focal length is longer, as a share"""
+    """focal length over the calibrated one, minus 1"""
     left_from_right: tuple[float, ...]
     """4x4, row-major, mm: its pose seen from the left eye"""
     fx_px: float
+    """focal length of the corrected camera, in columns"""
     fy_px: float
+    """and in rows"""
     cx_px: float
+    """column of its principal point"""
     cy_px: float
+    """and its row"""
+    matches: int | None = None
+    """features by which the turn was measured. 0: nothing was measured, and turn and zoom are 0; fewer than 150:
+    lower_px alone. None: a report of before they were counted
+    """
     residual_px: float
     """median distance of the rows of matching features after that"""
     gain: tuple[float, ...]

@@ -37,19 +37,25 @@ class RightEye(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    moved_px: float = Field(ge=0, description="how far the turn moves that point of the picture that it moves farthest")
-    lower_px: float = Field(description="rows by which the right picture lies lower in its middle")
-    pitch_deg: float = Field(description="rotation about the right eye's x axis; of its axes seen from the left eye")
-    yaw_deg: float = Field(description="about its y axis; the middle pixel keeps its column")
+    moved_px: float = Field(ge=0, description="largest shift of any pixel by the turn and the zoom")
+    lower_px: float = Field(description="rows by which the right picture lies lower at its principal point")
+    pitch_deg: float = Field(description="rotation of the right eye about its x axis, as the left eye sees it")
+    yaw_deg: float = Field(description="about its y axis; the principal point keeps its column")
     roll_deg: float = Field(description="about its z axis")
-    zoom: float = Field(gt=-1, description="by which its focal length is longer, as a share")
+    zoom: float = Field(gt=-1, description="focal length over the calibrated one, minus 1")
     left_from_right: tuple[float, ...] = Field(
         min_length=16, max_length=16, description="4x4, row-major, mm: its pose seen from the left eye"
     )
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
+    fx_px: float = Field(description="focal length of the corrected camera, in columns")
+    fy_px: float = Field(description="and in rows")
+    cx_px: float = Field(description="column of its principal point")
+    cy_px: float = Field(description="and its row")
+    matches: int | None = Field(
+        default=None,
+        ge=0,
+        description="features by which the turn was measured. 0: nothing was measured, and turn and zoom are 0; fewer "
+        "than 150: lower_px alone. None: a report of before they were counted",
+    )
     residual_px: float = Field(ge=0, description="median distance of the rows of matching features after that")
     gain: tuple[float, ...] = Field(
         min_length=3,
@@ -98,7 +104,9 @@ class Report(BaseModel):
 
     warnings: tuple[Notice, ...] = Field(description="what to distrust; empty if nothing was found")
     assumptions: tuple[Notice, ...] = Field(description="what was taken for granted about the input")
-    right_eye: RightEye | None = Field(default=None, description="how it was registered; None for a clip of one eye")
+    right_eye: RightEye | None = Field(
+        default=None, description="how it was registered; None for a clip of one eye, or whose depth was given"
+    )
     measurements: dict[str, float] = Field(default={}, description="measured on the input, such as misalignment in px")
 
     preset: str

@@ -84,12 +84,14 @@ def estimate_depth(
         hooks.on_progress(Progress(COMPILATION, 0.0))
     with one_opencv_thread(), _pool() as pool:
         registration, plan, outside = _plan(clip, rgb, right_rgb, measured, pool, device, depth_range_mm)
+        middle, never_tissue = measured[len(measured) // 2], np.asarray(~clip.tissue[measured].any(axis=0))
+        label = painted_over(rgb[middle], right_rgb[middle], never_tissue)  # as recorded
         registration.recolour(right_rgb)
         if device == "cuda":
             depth_mm, confidence = _match_on_device(clip, rgb, right_rgb, plan, registration, hooks)
         else:
             depth_mm, confidence = _match_all(clip, rgb, right_rgb, plan, registration, pool, hooks)
-        right = _right_eye(clip, rgb, right_rgb, depth_mm, confidence, registration, measured, hooks)
+        right = _right_eye(clip, right_rgb, depth_mm, confidence, registration, label, hooks)
     for tissue, depths_mm, trust in (
         (clip.tissue, depth_mm, confidence),
         (right.tissue, right.depth_mm, right.depth_confidence),
@@ -232,23 +234,20 @@ def _match_on_device(
 
 def _right_eye(
     clip: RectifiedClip,
-    rgb: NDArray[np.uint8],
     right_rgb: NDArray[np.uint8],
     depth_mm: NDArray[np.float32],
     confidence: NDArray[np.uint8],
     registration: Registration,
-    measured: Sequence[int],
+    label: NDArray[np.bool_],
     hooks: Hooks,
 ) -> Eye:
     """The right eye with the left one's depth. It lies on the calibrated baseline, turned as it was measured.
 
-    Labels are found in the measured frames alone.
+    label: pixels [H, W] that show a label in both eyes.
     """
     focal_baseline, offset_px = clip.intrinsics.fx * clip.baseline_mm, clip.disparity_offset_px
     there_mm, trust = np.empty_like(depth_mm), np.empty_like(confidence)
     tissue = np.ones(depth_mm.shape, np.bool_) if clip.tissue_right is None else clip.tissue_right
-    middle, never_tissue = measured[len(measured) // 2], np.asarray(~clip.tissue[measured].any(axis=0))
-    label = painted_over(rgb[middle], right_rgb[middle], never_tissue)
 
     def work(i: int) -> None:
         moved_mm, moved_trust = moved_depth(depth_mm[i], confidence[i], focal_baseline, offset_px)

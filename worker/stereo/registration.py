@@ -33,12 +33,14 @@ MIN_TURN_MATCHES = 150
 """Fewer, such as flat tissue has, tell no more than the rows' shift: many of them are wrong alike."""
 FINE_STEPS, COLOUR_STEPS = 3, 6
 MAX_FINE_PX = 1.0
-"""The fine measurement linearises pictures: where it differs from the coarse one by more, it is not to be trusted."""
+"""Of pictures as wide as features are searched in. The fine measurement linearises pictures: where it differs from the
+coarse one by more, it is not to be trusted."""
 SURE = 128  # of 255: the least confidence of a match that counts
 BORDER_PX, HIGH_PASS_PX, COLOUR_PX, HIGHLIGHT_PX = 8, 15, 5, 9
 MIN_SAMPLE = 500  # pixels that tell something
 CENTRAL_SHARE = 0.7  # of the picture's half width and height
 BRIGHTEST = 240  # levels; beyond them colours are cut off
+MIN_GAIN = 0.5  # of a channel, or one over it: less is no camera's setting
 MIN_COLOUR_LEVELS = 5.0  # of 255: eyes that differ by less keep their colours; highlights feign as much
 WARN_MOVED_PX, WARN_COLOUR_LEVELS = 0.5, 8.0
 MAX_RESIDUAL_PX, MIN_CORRELATION = 0.25, 0.965
@@ -135,8 +137,11 @@ class Registration:
 
     @property
     def recolours(self) -> bool:
-        """Whether the right eye's colours differ by enough to be corrected."""
-        return self.colours.largest_levels >= MIN_COLOUR_LEVELS
+        """Whether the right eye's colours differ by enough to be corrected, and by no more than a camera's can."""
+        colours = self.colours
+        is_line = colours.correlation is not None and colours.correlation >= MIN_CORRELATION
+        is_usual = all(MIN_GAIN <= gain <= 1 / MIN_GAIN for gain in colours.gain)
+        return is_line and is_usual and colours.largest_levels >= MIN_COLOUR_LEVELS
 
     def recolour(self, right: Rgb) -> None:
         """Give the right pictures [T, H, W, 3] the left eye's colours, in place."""
@@ -160,6 +165,7 @@ class Registration:
             fy_px=camera.fy,
             cx_px=camera.cx,
             cy_px=camera.cy,
+            matches=self.matches,
             residual_px=self.residual_px,
             gain=colours.gain,
             offset=colours.offset,
@@ -171,7 +177,10 @@ class Registration:
         """What to distrust."""
         found, moved_px = [], self.turn.moved_px(self.calibrated)
         if self.matches == 0:
-            text = "too few matching features to measure the vertical misalignment of the eyes: taken as 0"
+            text = (
+                "too few matching features to measure how the right eye is turned: the calibration is taken as it is; "
+                "check focus, and that both eyes show the same"
+            )
             found.append(Notice.warning(NoticeCode.ALIGNMENT_UNKNOWN, text))
         elif moved_px >= WARN_MOVED_PX:
             text = (
@@ -180,7 +189,10 @@ class Registration:
                 "this recording exactly"
             )
             found.append(Notice.warning(NoticeCode.ROWS_MISALIGNED, text))
-        if self.colours.largest_levels >= WARN_COLOUR_LEVELS:
+        if self.colours.correlation is None:
+            text = "too few pixels of the eyes match to compare their colours: taken as equal"
+            found.append(Notice.warning(NoticeCode.COLOURS_UNKNOWN, text))
+        if self.recolours and self.colours.largest_levels >= WARN_COLOUR_LEVELS:
             gains, offsets = (
                 ", ".join(f"{each:.2f}" for each in numbers) for numbers in (self.colours.gain, self.colours.offset)
             )
@@ -260,7 +272,7 @@ def turn_of_pictures(pairs: Sequence[MatchedPair], turn: Turn, camera: Intrinsic
         if len(missing) < MIN_SAMPLE:
             return turn
         numbers = numbers + _step(slopes, missing, numbers)
-    if Turn(*numbers.tolist()).moved_px(camera) > MAX_FINE_PX:
+    if Turn(*numbers.tolist()).moved_px(camera) > MAX_FINE_PX * max(camera.width / FEATURE_WIDTH, 1.0):
         return turn
     return Turn(*(np.array(astuple(turn)) + numbers).tolist())
 
@@ -270,7 +282,8 @@ def colours_of(pairs: Sequence[MatchedPair]) -> Colours:
     found = [_colour_samples(pair) for pair in pairs]
     left, right = (np.concatenate(each).astype(np.float64) for each in zip(*found, strict=True))
     if len(left) < MIN_SAMPLE:
-        return Colours(correlation=0.0 if sum(int(pair.sure.sum()) for pair in pairs) > 40 * MIN_SAMPLE else None)
+        matched = sum(int((pair.sure & _central(pair.x)).sum()) for pair in pairs)
+        return Colours(correlation=0.0 if matched > 40 * MIN_SAMPLE else None)
     lines = [_line(*channels) for channels in zip(left.T, right.T, strict=True)]
     gain, offset, correlation = zip(*lines, strict=True)
     return Colours(gain, offset, min(correlation))

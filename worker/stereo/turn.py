@@ -24,7 +24,7 @@ MIN_MOVED_PX = 0.5  # by less, no whole pixel moves
 
 @dataclass(frozen=True)
 class Turn:
-    """The right eye's camera against the calibrated one. Its middle pixel keeps its column, which depth was made of.
+    """The right eye's camera against the calibrated one. Its principal point keeps its column, which depth was made of.
 
     lower_px     rows by which its picture lies lower than the left one's
     pitch_rad, yaw_rad, roll_rad  rotation about its own x, y, z axes

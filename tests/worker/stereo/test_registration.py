@@ -18,6 +18,7 @@ from worker.input.camera import to_camera, unproject_at
 from worker.input.clip import DepthClip
 from worker.phantom import PhantomSettings, make_phantom
 from worker.stereo import estimate_depth
+from worker.stereo.registration import Colours, MatchedPair, Registration, colours_of
 from worker.stereo.turn import Turn
 
 Picture = NDArray[np.uint8]
@@ -160,6 +161,33 @@ def of_another_lens(right: Picture, _: int) -> Picture:
 @pytest.mark.parametrize("change", [swapped_channels, burnt_out, of_another_lens])
 def test_eyes_that_fit_no_calibration_are_told(change: Callable[[Picture, int], Picture]) -> None:
     assert NoticeCode.EYES_DISAGREE in codes(estimate_depth(with_right(change)))
+
+
+def dead_red(right: Picture, _: int) -> Picture:
+    return np.ascontiguousarray(right * np.array([0, 1, 1], np.uint8))
+
+
+@pytest.mark.parametrize("change", [swapped_channels, dead_red])
+def test_colours_that_do_not_follow_each_other_are_left_alone(change: Callable[[Picture, int], Picture]) -> None:
+    given = with_right(change)
+    clip = estimate_depth(given)
+    assert codes(clip) == [NoticeCode.EYES_DISAGREE]
+    assert clip.registration is not None
+    assert clip.registration.gain == (1.0, 1.0, 1.0)
+    assert clip.right is not None
+    for shown, (_, recorded) in zip(clip.right.rgb, given.pairs(), strict=True):
+        np.testing.assert_array_equal(shown, recorded)
+
+
+def test_too_little_to_compare_colours_by_is_told() -> None:
+    assert colours_of([dataclasses.replace(pair, sure=np.zeros_like(pair.sure)) for pair in [matched()]]) == Colours()
+    unknown = Registration(drawn().intrinsics, 4.0, matches=200)
+    assert [notice.code for notice in unknown.notices] == [NoticeCode.COLOURS_UNKNOWN]
+
+
+def matched() -> MatchedPair:
+    left, right = next(iter(drawn().pairs()))
+    return MatchedPair(left, right, np.zeros(left.shape[:2], np.float32), np.ones(left.shape[:2], np.bool_))
 
 
 def test_few_matches_tell_the_rows_and_no_turn() -> None:

@@ -150,6 +150,24 @@ def test_both_eyes_see_a_point_at_their_own_pixels() -> None:
     assert np.median(np.abs(there_mm - z[inside])[seen]) == pytest.approx(0, abs=0.2)
 
 
+def test_a_label_is_found_though_the_eyes_colours_differ() -> None:
+    phantom, _ = drawn()
+    recording = phantom.stereo_recording()
+    clip = rectify(recording.clip, recording.calibration)
+    label = np.s_[:20, 100:140]
+    tissue = clip.tissue.copy()
+    tissue[:, :20, 100:140] = False
+    pairs = [(left.copy(), np.clip(1.15 * right + 6, 0, 255).astype(np.uint8)) for left, right in clip.pairs()]
+    for left, right in pairs:
+        left[label] = right[label] = 250
+    found = estimate_depth(dataclasses.replace(clip, tissue=tissue, pairs=partial(iter, pairs)))
+    assert found.registration is not None
+    assert found.registration.gain[1] == pytest.approx(1.15, abs=0.03)
+    assert found.right is not None
+    assert not found.right.tissue[:, :20, 100:140].any()
+    assert found.right.tissue[:, 30:, 100:140].mean() > 0.9
+
+
 def test_frames_that_are_not_measured_do_not_change_the_right_eye_of_others() -> None:
     """A label is found in the measured frames alone, whatever the held-out ones show."""
     phantom, _ = drawn()
