@@ -46,7 +46,7 @@ def colour_from_gloss(thread, threads, camera, state, colour):  # type: ignore[n
 def colour_from_gloss_backward(  # type: ignore[no-untyped-def]
     thread, threads, camera, state, colour, v_colour, adds, v_state
 ):
-    """Write v_state[COLOUR] and v_state[GLOSS], or add to them; v_colour becomes 0 where the colour was held at 0."""
+    """Write v_state[COLOUR] and v_state[GLOSS], or add to them. A colour that was held at 0 gives nothing."""
     zero, one = splat(_ZERO), splat(_ONE)
     side, dim = splat(np.float32(camera[SIDE])), splat(np.float32(camera[DIM]))
     vectors = state.shape[1] // LANES

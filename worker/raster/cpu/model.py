@@ -27,7 +27,6 @@ from worker.model.layout import (
     GLOSS_ROW,
     LOG_SCALE,
     MEAN,
-    POSE,
     QUATERNION,
     QUATERNION_ROW,
     ROWS,
@@ -37,7 +36,7 @@ from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu import harmonics, update
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
-from worker.raster.cpu.rasterizer import Floats, Gradients, Order, Rasterizer, padded
+from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, padded
 from worker.raster.cpu.threads import run
 from worker.raster.model import put_back
 from worker.raster.step import StepSums, TrainingFrame, camera_centre, image_size
@@ -119,14 +118,14 @@ class CpuModel:
         self.motion.deform(self.canonical, t, self.state)
         self._project_state(camera, sh_degree)
 
-    def _project_state(self, camera: NDArray[np.float64], sh_degree: int, order: Order = Order.OF_ITS_OWN) -> None:
+    def _project_state(self, camera: NDArray[np.float64], sh_degree: int) -> None:
         """The Gaussians of the state on this camera's image."""
         self.rasterizer = self._rasterizer(*image_size(camera))
         if sh_degree == 0:
             run(harmonics.colour_from_gloss, camera, self.state, self.colour)
         else:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
-        self.rasterizer.project(camera, self.state, self.opacity_logit, self.colour, order)
+        self.rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
         """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
@@ -179,14 +178,13 @@ class CpuModel:
     ) -> list[NDArray[np.float64]]:
         """Add the gradients of the losses of all frames of a moment to those of the step; the losses' sums (StepSums).
 
-        place: of the moment among those of the step. They share its state, and its depth order if their cameras do.
+        place: of the moment among those of the step. They share its state.
         """
         gradients, sums = self._gradients[place], []
         self.motion.deform(self.canonical, t, self.state, trains=True)
-        orders = _orders(frames)
-        for k, (frame, order) in enumerate(zip(frames, orders, strict=True)):
+        for k, frame in enumerate(frames):
             adds, adds_state = place + k > 0, k > 0
-            self._project_state(frame.camera, sh_degree, order)
+            self._project_state(frame.camera, sh_degree)
             self.rasterizer.loss_backward(
                 frame.target, frame.loss_settings(loss), gradients, adds=adds, adds_state=adds_state
             )
@@ -269,14 +267,6 @@ class CpuModel:
             torch.from_numpy(self.canonical[GLOSS_ROW, : self.count].copy()),
         )
         return gaussians, self.motion.export(self.count)
-
-
-def _orders(frames: Sequence[TrainingFrame]) -> list[Order]:
-    """The depth order of each frame of a moment: one for all if every camera sees all points at the same depth."""
-    depth_axes = [frame.camera[POSE + 8 : POSE + 12] for frame in frames]
-    if len(frames) > 1 and all(np.array_equal(each, depth_axes[0]) for each in depth_axes):
-        return [Order.FOR_THE_NEXT, *[Order.OF_THE_LAST] * (len(frames) - 1)]
-    return [Order.OF_ITS_OWN] * len(frames)
 
 
 def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, rates: StepRates, iteration: int) -> None:

@@ -6,7 +6,6 @@ N Gaussians (a multiple of LANES, see padded), M slots, H W pixels. All arrays a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,14 +31,6 @@ def _aligned(rows: int, columns: int) -> Floats:
 def padded(count: int) -> int:
     """The next multiple of LANES: rows of N are processed LANES at a time."""
     return -(-count // LANES) * LANES
-
-
-class Order(Enum):
-    """Which depth order the splats are sorted by: those of a moment are as far from every camera of one depth axis."""
-
-    OF_ITS_OWN = auto()
-    FOR_THE_NEXT = auto()  # of all that the next camera, too, may draw
-    OF_THE_LAST = auto()  # made by FOR_THE_NEXT, of the same state and depth axis
 
 
 @dataclass
@@ -94,7 +85,6 @@ class Rasterizer:
         self._homes = np.zeros((count, 4), np.int32)
         self._order = np.zeros((2, count), np.int32)
         self._keys = np.zeros((2, count), np.uint32)
-        self._sorted = self._order[0]
         self.gradients = Gradients.room(np.zeros((ROWS, count), np.float32))
 
     def _allocate_slots(self, slots: int, homes: int) -> None:
@@ -102,18 +92,11 @@ class Rasterizer:
         self._slot_info, self._entries = np.zeros((2, self.threads * slots), np.uint32)
         self._sums = np.zeros(self.threads * homes * bins.GRADIENT, np.float32)
 
-    def project(
-        self,
-        camera: NDArray[np.float64],
-        state: Floats,
-        opacity_logit: Floats,
-        colour: Floats,
-        order: Order = Order.OF_ITS_OWN,
-    ) -> None:
+    def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
         """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N]."""
         self.place(camera, state, opacity_logit, colour)
         self.bin()
-        self.sort(order)
+        self.sort()
 
     def place(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
         """First third of project: the splats on the image."""
@@ -149,15 +132,12 @@ class Rasterizer:
         """Slots and homes of the thread that has most."""
         return np.asarray((self._region_end - self._regions() * np.arange(self.threads)[:, None]).max(0))
 
-    def sort(self, order: Order = Order.OF_ITS_OWN) -> None:
+    def sort(self) -> None:
         """Last third: the slots of every tile, nearest first."""
-        if order is not Order.OF_THE_LAST:
-            drawn = self.radius2 if order is Order.OF_ITS_OWN else np.ascontiguousarray(self.splats[:, 9])
-            ranks, keys = self._order, self._keys
-            count, is_first = bins.depth_order(self.splats, drawn, ranks[0], keys[0], ranks[1], keys[1])
-            self._sorted = ranks[0 if is_first else 1, :count]
+        ranks, keys = self._order, self._keys
+        count, is_first = bins.depth_order(self.splats, self.radius2, ranks[0], keys[0], ranks[1], keys[1])
         bins.sort_into_tiles(
-            self._sorted, len(self._sorted), self.slot_start, self._slot_count, self._slot_info, self._region_end,
+            ranks[0 if is_first else 1], count, self.slot_start, self._slot_count, self._slot_info, self._region_end,
             self._tile_start, self._entries,
         )  # fmt: skip
 
