@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cells = plan(*places, budgets_s, iterations, options.eyes)
     bench, failed, measured = Bench(sources, options.device), 0, 0
     with adding_alone(options.csv.parent):
-        rows = read_rows(options.csv)
+        rows = [texts_of(row, FIELDS) for row in read_rows(options.csv)]
         if options.again:
             asked = {cell.key for cell in cells}
             rows = [row for row in rows if key_of(row) not in asked]

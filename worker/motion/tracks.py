@@ -63,7 +63,8 @@ POINTS_AT_ONCE = 4096
 class Tracks:
     """Displacement of reference pixels to every training frame, and how their colour changed on the way.
 
-    displacement_mm [K, h, w, 3]  world axes, mm; mean of the trusted neighbours; 0 in a frame without any
+    displacement_mm [K, h, w, 3]  world axes, mm; mean of the trusted neighbours, 0 without any; a lost one ends on
+                                  the frame's surface
     colour          [K, h, w, 3]  colour there minus colour in the reference, RGB in [0, 1]; mean likewise
     confidence      [K, h, w]     in [0, 1]; 0 where the track is lost, hidden or without depth
     step_px                       clip pixels between neighbouring cells of the grid

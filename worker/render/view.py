@@ -113,7 +113,7 @@ def render_frame(
 ) -> Frame:
     """The scene at model time t (held within the clip) from a pose (mm; None: the endoscope's) through a camera.
 
-    highlights: as the endoscope's eyes saw them, fading away from both; False: without.
+    highlights: as the endoscope's eyes saw them, and away from both their mean; False: without.
     """
     last = (scene.frame_count - 1) / scene.frame_count
     shown = min(max(t, 0.0), last)

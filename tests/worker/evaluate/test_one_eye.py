@@ -17,7 +17,9 @@ def test_a_line_is_printed_for_every_bound_and_run(capsys: pytest.CaptureFixture
     lines = capsys.readouterr().out.splitlines()[1:]
     assert [line[:16].strip() for line in lines] == LINES
     right = {line[:16].strip(): float(line[16:].split()[2]) for line in lines}
-    assert all(math.isfinite(score) and score > 10 for score in right.values())
+    assert all(math.isfinite(score) for score in right.values())
+    assert right["warp by flow"] >= right["warp"]  # the flow has seen the picture
+    assert right["both eyes"] > right["left eye"]
 
 
 def test_a_clip_of_one_eye_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
