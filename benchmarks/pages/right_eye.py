@@ -86,15 +86,16 @@ def _truth(groups: Sequence[Group]) -> list[str]:
         [*group.place, group.series, group.limit, str(len(group.rows))]
         + [number(group.median(name), digits) for name, (_, digits) in _TRUTH_COLUMNS.items()]
         for group in groups
-        if not math.isnan(group.median("psnr_view10_db"))
+        if _is_synthetic(group)
     ]
     header = ["clip", "held out", "series", "limit", "seeds", *(name for name, _ in _TRUTH_COLUMNS.values())]
     return [_TRUTH, table(header, rows)] if rows else []
 
 
 def right_eye_claim(groups: Sequence[Group]) -> str:
-    """What `fast` scores in both eyes of each stereo clip, in its usual time; empty without such rows."""
-    fast = [group for group in groups if group.series == "fast" and not math.isnan(group.median("psnr_right_db"))]
+    """What `fast` scores in both eyes of each recorded stereo clip, in its usual time; empty without such rows."""
+    judged = [group for group in groups if not math.isnan(group.median("psnr_right_db")) and not _is_synthetic(group)]
+    fast = [group for group in judged if group.series == "fast"]
     usual = [group for group in fast if group.limit == f"{PRESETS['fast'].budget_s:g} s"]
     return " ".join(
         f"In {group.limit}, `fast` scores {group.median('psnr_tissue_db'):.1f} dB in the left eye of "
@@ -102,3 +103,7 @@ def right_eye_claim(groups: Sequence[Group]) -> str:
         f"picture, warped, scores {group.median('warp_db'):.1f} dB there."
         for group in usual or fast
     )
+
+
+def _is_synthetic(group: Group) -> bool:
+    return not math.isnan(group.median("psnr_view10_db"))
