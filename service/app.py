@@ -40,13 +40,14 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(_kept_up(run)) for run in (deps.sweep.run, deps.retention.run)]
+        tasks = [asyncio.create_task(_kept_up(run)) for run in (deps.sweep.run, deps.retention.run, renderer.run)]
         yield
         deps.feeds.end()
         for task in tasks:
             task.cancel()
         await asyncio.wait(tasks)
         await renderer.close()
+        deps.done.close()
         queue.close()
 
     app = DescribedApp(

@@ -111,7 +111,7 @@ def owned_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:
 
 
 def owned_scene(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
-    """As owned_job(), of a scene, or of the job that is to become one; of a done job also while the queue is away."""
+    """As owned_job(), of a scene, or of the job that is to become one; of a finished scene also without the queue."""
     record = services.done.record(scene_id) if is_job_id(scene_id) else None
     if record is not None and caller.owns(record):
         return record

@@ -23,6 +23,10 @@ WORKER_REMEDY = (
 )
 ADDRESSES_VALID_S = 1.0
 """How long the list of live workers is used before the queue is asked again, while renders go on."""
+KNOWN_PERIOD_S = 5.0
+"""How often the list is read while nobody asks for a render, so that it is known when the queue goes away."""
+READ_PATIENCE_S = 0.5
+"""How long a render waits for a newer list where the known one is older than an announcement lasts."""
 
 logger = logging.getLogger("intrasplat.service")
 
@@ -32,6 +36,10 @@ class Renderer(Protocol):
 
     async def ask(self, request: RenderRequest | ExportRequest) -> Answer:
         """The answer; raises UnavailableError if no worker gives one in time."""
+        ...
+
+    async def run(self) -> None:
+        """Keep knowing whom to ask, until cancelled."""
         ...
 
     async def close(self) -> None:
@@ -82,6 +90,12 @@ class ZmqRenderer:
         connection = await self._connection(address)
         return await connection.ask(request, patiently=patiently)
 
+    async def run(self) -> None:
+        while True:
+            await asyncio.sleep(KNOWN_PERIOD_S)
+            with contextlib.suppress(UnavailableError):
+                await self._live()
+
     async def close(self) -> None:
         if self._reading is not None:
             await self._reading
@@ -120,13 +134,19 @@ class ZmqRenderer:
         return self._connections[endpoint]
 
     async def _live(self, *, reread: bool = False) -> list[WorkerAddress]:
-        """The live workers. Renders wait for the queue only if the list is too old or must be read again."""
+        """The live workers, or those that were known when the queue went away.
+
+        A render waits for the queue if no worker is known or the list must be read again. If the list is too old, it
+        waits READ_PATIENCE_S.
+        """
         age_s = time.monotonic() - self._read_s
         if age_s > ADDRESSES_VALID_S or reread or not self._addresses:
             if self._reading is None or self._reading.done():
                 self._reading = asyncio.create_task(self._read_addresses())
-            if age_s > WORKER_TTL_S or reread or not self._addresses:
+            if reread or not self._addresses:
                 await asyncio.shield(self._reading)
+            elif age_s > WORKER_TTL_S:
+                await asyncio.wait({self._reading}, timeout=READ_PATIENCE_S)
         if not self._addresses:
             raise UnavailableError("No worker is ready.", WORKER_REMEDY)
         return self._addresses
@@ -135,9 +155,10 @@ class ZmqRenderer:
         try:
             addresses = await run_in_threadpool(self._queue.workers)
         except UnavailableError as error:
-            # Renders do not need the queue: go on with the workers that were known.
+            # Renders do not need the queue. Whether a worker still lives shows when it is asked.
             logger.warning("the queue does not answer; using the workers known before: %s", error.problem)
-            addresses = []
+            self._read_s = self._heard_s = time.monotonic()
+            return
         now_s = self._read_s = time.monotonic()
         # A queue that was away knows of no worker either until they have spoken again.
         if addresses or now_s - self._heard_s > WORKER_TTL_S:

@@ -29,11 +29,22 @@ TIMEOUT_S = 5.0
 Result = TypeVar("Result")
 
 
+class LeavingQueue(MemoryQueue):
+    """Goes away when it is told to; when it is back, it knows of no worker until they speak again."""
+
+    is_away = False
+
+    def workers(self) -> list[WorkerAddress]:
+        if self.is_away:
+            raise UnavailableError("The queue does not answer.", "Start it.")
+        return super().workers()
+
+
 class Workers:
     """Workers that answer with their name, and the queue that lists them."""
 
     def __init__(self, folder: Path) -> None:
-        self.queue = MemoryQueue()
+        self.queue = LeavingQueue()
         self.asked: Counter[str] = Counter()
         self._folder = folder
         self._stack = ExitStack()
@@ -93,6 +104,28 @@ def answer_to(workers: Workers, request: RenderRequest, timeout_s: float = TIMEO
         return await renderer.ask(request)
 
     return asking(workers, ask, timeout_s=timeout_s)
+
+
+def test_the_workers_that_were_known_are_asked_for_as_long_as_the_queue_is_away(
+    workers: Workers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.renderer.ADDRESSES_VALID_S", 0.0)
+    monkeypatch.setattr("service.renderer.WORKER_TTL_S", 0.05)
+    workers.start("worker-1", job_id=SCENES[1])
+
+    async def ask(renderer: ZmqRenderer) -> list[bytes]:
+        running = RenderRequest(scene_id=SCENES[1], t=0)
+        answers = [await renderer.ask(scene(SCENES[0]))]
+        workers.queue.is_away = True
+        for request in (scene(SCENES[0]), scene(SCENES[2]), running):
+            await asyncio.sleep(0.1)
+            answers.append(await renderer.ask(request))
+        workers.queue.withdraw("worker-1")
+        workers.queue.is_away = False
+        answers.append(await renderer.ask(scene(SCENES[2])))  # the worker has not spoken to the new queue yet
+        return [answer.body for answer in answers]
+
+    assert asking(workers, ask) == [b"worker-1"] * 5
 
 
 def test_a_running_job_is_asked_of_the_worker_that_runs_it(workers: Workers) -> None:
