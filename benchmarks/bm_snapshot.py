@@ -34,6 +34,7 @@ from worker.machine.timing import Stopwatch
 from worker.phantom import PhantomSettings, make_phantom
 from worker.pipeline import snapshot_of
 from worker.raster.cpu import compile_kernels
+from worker.raster.cpu.threads import cpu_time_s, thread_count
 from worker.scene.scene import Scene
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
@@ -65,7 +66,11 @@ def main() -> None:
     clip = make_phantom(CLIP).depth_clip()
     compile_kernels()
     trained(clip, 10, None)  # the first run reads what the others find in caches
-    paces: dict[str, Callable[[], Pace] | None] = {"alone": None, "unpaced": _Unpaced, "paced": Pace}
+    paces: dict[str, Callable[[], Pace] | None] = {
+        "alone": None,
+        "unpaced": _Unpaced,
+        "paced": lambda: Pace(thread_count()),
+    }
     runs: dict[str, list[Figures]] = {name: [] for name in paces}
     for _ in range(arguments.rounds):
         for name, pace in paces.items():
@@ -126,14 +131,15 @@ def trained(clip: DepthClip, iterations: int, pace: Pace | None) -> Figures:
 def watch(snapshots: Snapshots, pace: Pace, figures: Figures, began: float, end: threading.Event) -> None:
     """Ask for one view after the other, and rest in between as a worker does."""
     with tempfile.TemporaryDirectory() as folder:
-        views = Views(Store(Path(folder)), snapshots, pace=pace)
+        views = Views(Store(Path(folder)), snapshots)
         while not end.wait(pace.rest_s()):
-            start = time.perf_counter()
+            start, start_cpu_s = time.perf_counter(), cpu_time_s()
             try:
                 views.answer(RenderRequest(scene_id=JOB, t=(start - began) % 1, format=ImageFormat.JPEG))
             except NotYetError:
                 end.wait(0.01)
                 continue
+            pace.charge(cpu_time_s() - start_cpu_s)
             figures.view_ms.append((time.perf_counter() - start) * 1e3)
             if figures.first_view_s is None:
                 figures.first_view_s = time.perf_counter() - began

@@ -17,13 +17,10 @@ from zmq.utils.monitor import parse_monitor_message
 
 from contract.access.render_keys import service_keys, worker_keys
 from contract.wire.errors import UnavailableError
-from contract.wire.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
+from contract.wire.rendering import CancelRequest, ExportRequest, RenderRequest, WorkerReply, WorkerRequest
 
 CONNECT_TIMEOUT_S = 2.0
 """A worker that listens is connected to in milliseconds; one that has just died is tried for no longer than this."""
-
-IN_FLIGHT = 2
-"""Requests handed to a worker at a time: it has the next one at hand. Who gives up waiting here is not rendered for."""
 
 LAST_ANSWERS_S = 0.05
 
@@ -69,9 +66,9 @@ class Connection:
             raise UnavailableError(problem, "Set INTRASPLAT_RENDER_SECRET to the one that the worker has.")
         self.state = Reached.TRYING
         self._changed = asyncio.Event()
-        self._turns = asyncio.Semaphore(IN_FLIGHT)
         self._ids = itertools.count()
         self._waiting: dict[bytes, asyncio.Future[Answer]] = {}
+        self._cancelling: set[asyncio.Task[None]] = set()
         self._socket = context.socket(zmq.DEALER)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
@@ -88,21 +85,27 @@ class Connection:
     async def ask(self, request: RenderRequest | ExportRequest, *, patiently: bool = True) -> Answer:
         """The worker's answer. patiently: wait a moment for a worker that is down, for there is no other.
 
+        The worker has all requests at once and chooses their order. If this is cancelled, so is the request.
+
         Raises:
             WorkerGoneError: there will be none.
             UnavailableError: it is not one that this version can read.
         """
         document = WorkerRequest(request=request).model_dump_json().encode()
-        async with self._turns:
-            await self._reach(patiently)
-            request_id = next(self._ids).to_bytes(8, "big")
-            future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
-            self._waiting[request_id] = future
-            try:
-                await self._socket.send_multipart([request_id, document])
-                return await future
-            finally:
-                del self._waiting[request_id]
+        await self._reach(patiently)
+        request_id = next(self._ids).to_bytes(8, "big")
+        future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._waiting[request_id] = future
+        try:
+            await self._socket.send_multipart([request_id, document])
+            return await future
+        except asyncio.CancelledError:
+            task = asyncio.create_task(self._cancel(request_id))
+            self._cancelling.add(task)
+            task.add_done_callback(self._cancelling.discard)
+            raise
+        finally:
+            del self._waiting[request_id]
 
     @property
     def is_idle(self) -> bool:
@@ -111,7 +114,7 @@ class Connection:
 
     async def close(self) -> None:
         """End the connection. Callers that still wait get the error that the worker is gone."""
-        for task in self._tasks:
+        for task in [*self._tasks, *self._cancelling]:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task
@@ -119,6 +122,12 @@ class Connection:
         self._socket.disable_monitor()
         self._monitor.close()
         self._socket.close()
+
+    async def _cancel(self, request_id: bytes) -> None:
+        """Tell the worker that nobody waits for this answer any more."""
+        if self.state is Reached.UP:
+            document = WorkerRequest(request=CancelRequest()).model_dump_json().encode()
+            await self._socket.send_multipart([request_id, document])
 
     async def _reach(self, patiently: bool) -> None:
         hopeless = {Reached.REFUSED} if patiently else {Reached.REFUSED, Reached.DOWN}

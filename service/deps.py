@@ -29,6 +29,7 @@ from service.limits import Limiter
 from service.metrics import Metrics
 from service.problems import SCENES_REMEDY, Problem
 from service.purge import Purger
+from service.render_limits import RenderLimits
 from service.renderer import Renderer
 from service.retention import Retention
 from service.sweep import Sweep
@@ -48,6 +49,7 @@ class Deps:
         # who may do what, and what is known of it afterwards
         self.access = Access(settings)
         self.limiter = Limiter(settings.requests_per_s)
+        self.render_limits = RenderLimits(settings)
         self.audit = Audit(AuditLog(settings.data_dir))
         self.metrics = Metrics(queue, store)
         # how a clip comes in, how callers follow its job, and how all of it is removed

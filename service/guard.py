@@ -1,8 +1,9 @@
 """What every request and answer passes: no foreign page may use a service that trusts the loopback interface.
 
 A page from elsewhere that is open in a browser on this machine could reach a service that asks for no key; it is
-refused by its Origin, and a name that was rebound to 127.0.0.1 by its Host. WebSockets are asked the same, since
-browsers let any page open one. HTTPS, and the header that insists on it, are the proxy's.
+refused by its Origin, or by Sec-Fetch-Site where browsers tell no Origin, as of images. A name that was rebound to
+127.0.0.1 is refused by its Host. WebSockets are asked the same, since browsers let any page open one. HTTPS, and the
+header that insists on it, are the proxy's.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ EXPOSED_HEADERS = (
     *(f"X-Intrasplat-{name}" for name in ("Scene", "State", "T", "Iteration", "Unseen", "Warning", "Warning-Codes")),
 )
 """What a page from elsewhere may read of an answer."""
+FOREIGN_SITES = frozenset({"cross-site", "same-site"})
+"""How a browser says that another page asks; of images and the like it tells no Origin. Links may lead here."""
 CORS_METHODS = ("GET", "HEAD", "POST", "PATCH", "DELETE")
 
 
@@ -83,6 +86,10 @@ class Guard:
         if origin is not None and origin not in self._origins and _split(origin).netloc != host:
             remedy = "Whoever runs the service admits pages from elsewhere with INTRASPLAT_CORS_ORIGINS."
             return Problem(403, f"Pages from {origin[:80]!r} may not use this service.", field="Origin", remedy=remedy)
+        is_foreign = origin is None and headers.get("sec-fetch-site") in FOREIGN_SITES
+        if is_foreign and headers.get("sec-fetch-dest") != "document":
+            remedy = "Whoever runs the service admits pages from elsewhere with INTRASPLAT_CORS_ORIGINS."
+            return Problem(403, "Pages from elsewhere may not use this service.", field="Sec-Fetch-Site", remedy=remedy)
         if "transfer-encoding" in headers and "content-length" in headers:  # RFC 9112, 6.1: how requests are smuggled
             close = {"Connection": "close"}
             detail = "The request gives its body's length in two ways."

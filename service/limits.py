@@ -59,10 +59,9 @@ class Limiter:
     def _too_often(self, wait_s: float) -> Problem:
         seconds = max(1, math.ceil(wait_s))
         headers = {
-            "Retry-After": str(seconds),
             # draft-ietf-httpapi-ratelimit-headers: quota and window of the policy; what remains and until when
             "RateLimit-Policy": f'"requests";q={math.floor(self._burst)};w={math.ceil(self._burst / self._rate_per_s)}',
             "RateLimit": f'"requests";r=0;t={seconds}',
         }
         detail = f"More than {self._rate_per_s:g} requests a second came from here."
-        return Problem(429, detail, remedy=f"Wait {seconds} s.", headers=headers)
+        return Problem(429, detail, remedy=f"Wait {seconds} s.", headers=headers, retry_after_s=wait_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -48,7 +49,7 @@ class Problem(Exception):
     """An answer other than the one asked for; raised anywhere below a route.
 
     remedy has no default, so that nobody forgets it. `extensions` are further members of the document, such as the job
-    it speaks of.
+    it speaks of. retry_after_s: when the same will be answered; in the document too, for those who see no headers.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class Problem(Exception):
         remedy: str | None,
         headers: Mapping[str, str] | None = None,
         extensions: Mapping[str, object] | None = None,
+        retry_after_s: float | None = None,
     ) -> None:
         super().__init__(detail)
         self.status = status
@@ -68,6 +70,9 @@ class Problem(Exception):
         self.remedy = remedy
         self.headers = dict(headers or {})
         self.extensions = dict(extensions or {})
+        if retry_after_s is not None:
+            self.extensions["retry_after_s"] = retry_after_s
+            self.headers["Retry-After"] = str(max(1, math.ceil(retry_after_s)))
         if status in (423, 429, 503):
             self.headers.setdefault("Retry-After", str(RETRY_AFTER_S))
 

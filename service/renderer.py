@@ -51,7 +51,7 @@ class ZmqRenderer:
     """Asks the live workers that the queue lists.
 
     A running job is shown by the worker that runs it. A finished scene any worker can show: one that holds it is asked,
-    or else always the same one, which will; and if that one is gone or mute, another, once.
+    or else always the same one, which will; and if that one is gone, mute or busy, another, once.
     """
 
     def __init__(self, queue: Queue, timeout_s: float, render_secret: str | None = None) -> None:
@@ -74,7 +74,9 @@ class ZmqRenderer:
         first, *others = workers
         if others:
             with contextlib.suppress(WorkerGoneError, TimeoutError):
-                return await asyncio.wait_for(self._ask(first, request, patiently=False), self._timeout_s / 2)
+                answer = await asyncio.wait_for(self._ask(first, request, patiently=False), self._timeout_s / 2)
+                if answer.head.error is None or answer.head.error.kind != "busy":
+                    return answer
             first = others[0]
         try:
             return await asyncio.wait_for(self._ask(first, request), until_s - time.monotonic())

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import time
+from collections.abc import Coroutine
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
@@ -47,8 +49,12 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
     },
     304: {"description": "it is the one that the caller has"},
 }
-STATUS_OF_REPLY = {"input": 422, "scene": 404, "not-yet": 503, "internal": 500}
+STATUS_OF_REPLY = {"input": 422, "scene": 404, "not-yet": 503, "busy": 503, "internal": 500}
 NOT_YET_RETRY_S = "1"
+GONE = 499
+"""For the log alone: the caller left before it was answered."""
+
+Result = TypeVar("Result")
 
 ModelTime = Annotated[
     float, Field(ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip")
@@ -125,6 +131,7 @@ async def render(
     services: Services,
     caller: AnyCaller,
     query: Annotated[RenderQuery, Query()],
+    http_request: Request,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """An image at time t from a pose, without the instruments; while the job runs, from its newest snapshot."""
@@ -134,7 +141,10 @@ async def render(
     tag = tag_of(request)
     if shown.attempt is not None and matches(if_none_match, tag):
         return Response(status_code=304, headers=cache_headers(shown, tag))
-    shown, answer = await answer_to(services, caller, request, shown)
+    answered = await unless_gone(http_request, answer_to(services, caller, request, shown))
+    if answered is None:
+        return Response(status_code=GONE)
+    shown, answer = answered
     if shown.attempt != request.attempt:  # the job has ended meanwhile
         tag = tag_of(request.model_copy(update={"attempt": shown.attempt}))
     response = image_response(shown.scene_id, answer)
@@ -180,13 +190,37 @@ def _only(services: Deps, caller: Caller) -> Shown:
     return Shown(there[0].job_id, there[0].attempt)
 
 
+async def unless_gone(http_request: Request, work: Coroutine[Any, Any, Result]) -> Result | None:
+    """The result of the work; None, and the work is cancelled, if the caller hangs up before."""
+    done, left = asyncio.create_task(work), asyncio.create_task(_left(http_request))
+    try:
+        await asyncio.wait({done, left}, return_when=asyncio.FIRST_COMPLETED)
+        return done.result() if done.done() else None
+    finally:
+        for task in (done, left):
+            task.cancel()
+
+
+async def _left(http_request: Request) -> None:
+    """Return when the caller has hung up."""
+    while (await http_request.receive())["type"] != "http.disconnect":
+        pass
+
+
 async def answer_to(services: Deps, caller: Caller, request: RenderRequest, shown: Shown) -> tuple[Shown, Answer]:
-    """The worker's answer, and what it shows: the finished scene if the job has just ended."""
-    answer = await services.renderer.ask(request)
-    if answer.head.error is not None and answer.head.error.kind == "not-yet":
-        shown = await find_shown(services, caller, shown.scene_id)
-        if shown.attempt is not None:
-            answer = await services.renderer.ask(request.model_copy(update={"attempt": shown.attempt}))
+    """The worker's answer, and what it shows: the finished scene if the job has just ended.
+
+    Raises:
+        Problem: 429: the caller or its tenant has asked for too much that is not answered yet.
+        UnavailableError: no worker answers in time.
+    """
+    with services.render_limits.admitted(caller, request):
+        answer = await services.renderer.ask(request)
+        if answer.head.error is not None and answer.head.error.kind == "not-yet":
+            shown = await find_shown(services, caller, shown.scene_id)
+            if shown.attempt is not None:
+                answer = await services.renderer.ask(request.model_copy(update={"attempt": shown.attempt}))
+    services.render_limits.learn(shown.scene_id, answer.head)
     if answer.head.error is None:
         services.metrics.rendered(shown.state.value, answer.head.render_ms)
     return shown, answer
@@ -232,8 +266,14 @@ def image_response(scene_id: str, answer: Answer) -> Response:
 def problem_of_reply(error: ReplyError) -> Problem:
     """What a worker's error is over HTTP."""
     headers = {"Retry-After": NOT_YET_RETRY_S} if error.kind == "not-yet" else None
-    status = STATUS_OF_REPLY[error.kind]
-    return Problem(status, error.problem, field=error.field, remedy=error.remedy, headers=headers)
+    return Problem(
+        STATUS_OF_REPLY[error.kind],
+        error.problem,
+        field=error.field,
+        remedy=error.remedy,
+        headers=headers,
+        retry_after_s=error.retry_after_s,
+    )
 
 
 def tag_of(request: RenderRequest) -> str:

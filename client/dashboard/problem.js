@@ -2,7 +2,8 @@
 
 /**
  * A problem document (RFC 9457) as the service sends it.
- * @typedef {{status?: number, detail?: string, field?: string, remedy?: string, job_id?: string}} ProblemDocument
+ * @typedef {{status?: number, detail?: string, field?: string, remedy?: string, job_id?: string,
+ *   retry_after_s?: number}} ProblemDocument
  */
 
 /** Words for answers that come without any, from a proxy for instance. */
@@ -30,6 +31,11 @@ export class Problem extends Error {
     this.status = status;
     this.document = document;
     this.retryAfterS = retryAfterS;
+  }
+
+  /** @returns {number} seconds until it is our turn, where the service is only busy with others; else 0 */
+  get turnInS() {
+    return this.document.retry_after_s ?? 0;
   }
 
   /** Whether the same may succeed a little later. */

@@ -33,6 +33,7 @@ export class Screen {
     this.scene = scene;
     this.shown = null;
     this.shownAt = 0;
+    this.awaitedUntil = 0;
     this.trouble = "";
     this.words = words;
     this.canvas.width = this.canvas.height = 0; // its pixels are gone, not only hidden
@@ -48,6 +49,14 @@ export class Screen {
     this.canvas.setAttribute("aria-label", name);
     this.shown = picture;
     this.shownAt = Date.now();
+    this.awaitedUntil = 0;
+    this.trouble = "";
+    this.#look();
+  }
+
+  /** @param {number} seconds until the service shows the next picture: it lives, and serves others first */
+  waitFor(seconds) {
+    this.awaitedUntil = Date.now() + seconds * 1000 + STALE_AFTER_MS;
     this.trouble = "";
     this.#look();
   }
@@ -73,7 +82,7 @@ export class Screen {
   #state() {
     if (this.scene === null) return ["none", "", this.words];
     if (this.shown === null) return ["waiting", "NO PICTURE", this.words];
-    if (this.trouble || Date.now() - this.shownAt > STALE_AFTER_MS) {
+    if (this.trouble || Date.now() > Math.max(this.shownAt + STALE_AFTER_MS, this.awaitedUntil)) {
       const reason = this.trouble || "The service does not answer.";
       return ["stale", "STALE", `Last picture ${clockTime(this.shownAt)}. ${reason} Reconnecting.`];
     }

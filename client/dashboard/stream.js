@@ -74,7 +74,7 @@ export class Stream {
   #take(data, key) {
     if (typeof data === "string") {
       const document = JSON.parse(data);
-      const problem = new Problem(document.status, document);
+      const problem = new Problem(document.status, document, document.retry_after_s);
       if (problem.status === 401 && key === currentKey()) askForKey(problem.message);
       if (document.id === undefined || document.id === null || document.id === this.pending?.id) this.#fail(problem);
       return;

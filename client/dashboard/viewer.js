@@ -82,8 +82,9 @@ export class Viewer {
       this.#tell(name, picture, performance.now() - began);
     } catch (error) {
       if (visit !== this.visit) return;
-      this.#fail(error);
-      await pause(AFTER_TROUBLE_MS);
+      if (error.turnInS && this.screen.hasPicture) this.screen.waitFor(error.turnInS);
+      else this.#fail(error);
+      await pause(Math.max(AFTER_TROUBLE_MS, (error.turnInS ?? 0) * 1000));
     }
   }
 

@@ -188,7 +188,7 @@ def error_of_document(
         field=document.get("field"),
         remedy=str(document.get("remedy") or ""),
         request_id=request_id,
-        retry_after_s=retry_after_s,
+        retry_after_s=_number(document.get("retry_after_s")) or retry_after_s,
         job_id=document.get("job_id"),
     )
     if refusal.status == HTTPStatus.TOO_MANY_REQUESTS:
@@ -198,6 +198,10 @@ def error_of_document(
     if refusal.status >= HTTPStatus.INTERNAL_SERVER_ERROR and refusal.status != HTTPStatus.INSUFFICIENT_STORAGE:
         return ServiceFault(refusal)
     return REFUSED.get(refusal.status, RequestRefused)(refusal)
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) else None
 
 
 def _seconds(retry_after: str | None) -> float | None:

@@ -2,7 +2,8 @@
 
 Wire, service (DEALER) to worker (ROUTER):  [request id, WorkerRequest as JSON]
 Wire, worker to service:                    [request id, WorkerReply as JSON, body]
-The body is the encoded image or file; requests on one connection may be answered in any order.
+The body is the encoded image or file; requests on one connection may be answered in any order. A CancelRequest has the
+id of the request that it gives up, and gets no answer.
 """
 
 from __future__ import annotations
@@ -60,6 +61,10 @@ MEDIA_TYPES = {
 }
 
 
+GAUSSIAN_PIXELS = 100_000
+"""So many pixels take as long as moving and projecting the Gaussians (estimated from bm_raster)."""
+
+
 ExportName: TypeAlias = Literal["ply"]
 """What GET /scenes/{id}/export offers: the names of worker/scene/export, which the service must not import."""
 
@@ -78,6 +83,16 @@ class IntrinsicsOverride(BaseModel):
     fy: float | None = Field(default=None, gt=0, le=1e5)
     cx: float | None = Field(default=None, ge=-1e5, le=1e5)
     cy: float | None = Field(default=None, ge=-1e5, le=1e5)
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height in pixels of the image of a clip of width x height."""
+        if self.width is not None and self.height is not None:
+            return self.width, self.height
+        if self.width is not None:
+            return self.width, max(1, round(self.width * height / width))
+        if self.height is not None:
+            return max(1, round(self.height * width / height)), self.height
+        return width, height
 
 
 class RenderRequest(BaseModel):
@@ -115,20 +130,30 @@ class ExportRequest(BaseModel):
     format: str = Field(default="ply", max_length=32)
 
 
+class CancelRequest(BaseModel):
+    """Nobody waits any more for the answer to the request of the same id."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["cancel"] = "cancel"
+
+
 class WorkerRequest(BaseModel):
     """The envelope: one of the requests above."""
 
-    request: RenderRequest | ExportRequest = Field(discriminator="kind")
+    request: RenderRequest | ExportRequest | CancelRequest = Field(discriminator="kind")
 
 
 class ReplyError(BaseModel):
     """A request that could not be answered; `kind` decides the HTTP status."""
 
-    kind: Literal["input", "scene", "not-yet", "internal"]
-    """not-yet: the job runs here and has no snapshot so far."""
+    kind: Literal["input", "scene", "not-yet", "busy", "internal"]
+    """not-yet: the job runs here and has no snapshot so far. busy: ask again after retry_after_s."""
     problem: str
     field: str | None = None
     remedy: str | None = None
+    retry_after_s: float | None = None
+    """When the request will probably be answered, in seconds from now."""
 
 
 class WorkerReply(BaseModel):
@@ -143,6 +168,15 @@ class WorkerReply(BaseModel):
     unseen: float = 0.0
     """Share of a render's pixels that no training frame saw, in [0, 1]."""
     render_ms: float = 0.0
+    gaussians: int = 0
+    """Of the scene that is shown; 0: not known."""
+    clip_size: tuple[int, int] | None = None
+    """Width and height of the clip in pixels: the image's where the request names none."""
+
+
+def render_cost(pixels: int, gaussians: int) -> float:
+    """What a render takes, in pixels x Gaussians. Work on each Gaussian counts as GAUSSIAN_PIXELS more pixels."""
+    return float(pixels + GAUSSIAN_PIXELS) * gaussians
 
 
 class WorkerAddress(BaseModel):

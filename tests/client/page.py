@@ -38,10 +38,12 @@ from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
 from tests.reports import REPORT_OF_A_SCENE, a_warning
+from worker.daemon.pace import Pace
 from worker.daemon.serve import Reply, RequestServer
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 WAIT_S = 15.0
+MAX_WAIT_S = 1.0
 LOOK_S = 0.05
 WORKER = "worker-1"
 SNAPSHOT_ITERATION = 40
@@ -111,8 +113,8 @@ class Painter:
 class Site:
     """A service with its page on a port that stays; queue, store and worker outlive it."""
 
-    def __init__(self, data_dir: Path, endpoint: str, painter: Painter, **changes: Any) -> None:
-        self.queue, self.store, self.painter = MemoryQueue(), Store(data_dir), painter
+    def __init__(self, data_dir: Path, endpoint: str, painter: Painter, pace: Pace, **changes: Any) -> None:
+        self.queue, self.store, self.painter, self.pace = MemoryQueue(), Store(data_dir), painter, pace
         self._endpoint = endpoint
         with contextlib.closing(socket.socket()) as probe:
             probe.bind(("127.0.0.1", 0))
@@ -178,8 +180,9 @@ class Site:
 def site_at(data_dir: Path, **changes: Any) -> Iterator[Site]:
     painter = Painter()
     endpoint = f"ipc://{short_socket_path(Store(data_dir).run_dir, 'worker-1.sock')}"
-    with RequestServer(endpoint, painter.answer):
-        site = Site(data_dir, endpoint, painter, **changes)
+    pace = Pace()
+    with RequestServer(endpoint, painter.answer, pace=pace, max_wait_s=MAX_WAIT_S):
+        site = Site(data_dir, endpoint, painter, pace, **changes)
         try:
             yield site
         finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from contract.wire.job import JobError, JobState
 from contract.wire.rendering import Highlights, Unseen
 from tests.client.local_service import CLIP
 from tests.client.page import FAR, HIGHLIGHTS_STAY, UNSEEN, Page, Site, browser, grey_of, site_at
+from worker.daemon.pace import MAX_SAVED_S, SHARE
 
 POINTS = "return document.querySelector(`#curve polyline.${arguments[0]}`)?.points ?? []"
 
@@ -336,3 +338,20 @@ def test_the_viewer_fits_the_screen(site: Site, page: Page, width: int) -> None:
     assert page.script("return document.documentElement.scrollWidth") <= width
     assert page.find(".notice").is_displayed()
     page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_while_the_worker_has_no_time_left_the_last_picture_stays_and_is_not_stale(site: Site, page: Page) -> None:
+    site.queued_job()
+    claim = site.claim()
+    site.train(claim, 20, 24.0)
+    page.press(claim.job_id, "Watch")
+    page.until_state("training")
+    with site.pace.training():
+        site.pace.charge(MAX_SAVED_S + 9.0 * SHARE)
+        until_s, states = time.monotonic() + 7.0, set[str]()  # a picture is stale after 5 s
+        while time.monotonic() < until_s:
+            states.add(page.state)
+            time.sleep(0.1)
+        assert states == {"training"}
+    shown = page.text("#readout")
+    page.until(lambda: page.text("#readout") != shown)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx
 
+from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
 from contract.queue.embedded import short_socket_path
 from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue
@@ -129,3 +130,9 @@ def assert_problem(response: httpx.Response, status: int, field: str | None = No
     assert problem.get("remedy") or status == 500  # of a fault of the worker there is none
     assert problem.get("field") == field
     return problem
+
+
+def bearer(service: ServiceUnderTest, tenant: str, scopes: Collection[KeyScope] = DEFAULT_SCOPES) -> dict[str, str]:
+    """The headers of a tenant with a new key."""
+    _, text = KeyFile(service.store.data_dir).create(tenant, scopes)
+    return {"Authorization": f"Bearer {text}"}

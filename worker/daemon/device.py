@@ -37,6 +37,7 @@ from worker.machine.hooks import Progress
 from worker.pipeline import reconstruct
 from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lost
 from worker.raster.cpu import compile_kernels
+from worker.raster.cpu.threads import cpu_time_s, thread_count
 from worker.scene.compact import compile_coder
 from worker.scene.resume_file import RESUME_FILE
 from worker.train.hooks import TrainingHooks
@@ -44,6 +45,9 @@ from worker.train.request import ReconstructionRequest
 
 REPORT_PERIOD_S = 0.1
 """Minimum time between two reports of one stage."""
+
+MAX_WAIT_SHARE = 0.4
+"""Of the time after which the service gives up a render: who would wait longer is told when to come back."""
 
 LAST_SNAPSHOT_S = 10.0
 """How long the last snapshot of a finished job is still shown: until the service knows of the scene."""
@@ -73,7 +77,8 @@ def run_device(settings: Settings) -> None:
 
 def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     device = choose_device(settings.device, cpu_by=CPU_BY_VARIABLE)
-    store, snapshots, pace = open_store(settings), Snapshots(), Pace()
+    store, snapshots = open_store(settings), Snapshots()
+    pace = Pace(thread_count()) if device == CPU else Pace()
     # Clips are unpacked inside the data directory, in a folder that the next start empties.
     tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
     started_s = time.monotonic()
@@ -81,16 +86,25 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
         compile_kernels()
     compile_coder()
     logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
-    views = Views(store, snapshots, settings.hot_bytes, pace, device)
+    views = Views(store, snapshots, settings.hot_bytes, device)
 
     def report_held_scenes() -> None:
         views.forget_purged()
         channel.send_if_new(Holding(scenes=views.held))
 
     endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
-    with RequestServer(
-        endpoint, views.answer, between=report_held_scenes, rest_s=pace.rest_s, render_secret=settings.render_secret
-    ):
+    server = RequestServer(
+        endpoint,
+        views.answer,
+        cost=views.cost,
+        between=report_held_scenes,
+        pace=pace,
+        spent_s=cpu_time_s if device == CPU else time.perf_counter,  # while a GPU renders, this thread waits for it
+        max_wait_s=settings.render_timeout_s * MAX_WAIT_SHARE,
+        render_secret=settings.render_secret,
+    )
+    views.pause = server.pause
+    with server:
         channel.send(Ready(endpoint=endpoint, device=str(device)))
         logger.info("the device process is ready on %s", device)
         shown = ""

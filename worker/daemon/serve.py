@@ -1,13 +1,16 @@
 """Answer render and export requests: a ZeroMQ ROUTER in a thread during training (contract/wire/rendering.py).
 
-The thread answers one request at a time, in order of arrival. Rendering shares the cores with training and waits when
-it has used its share (worker/daemon/pace.py). The folder of a unix socket protects it. TCP is encrypted, and only
-callers who know the installation's secret are answered.
+The thread reads all that has come and answers one request at a time, small ones first (worker/daemon/turns.py). Those
+who ask the same at the same time share one answer. Between the parts of a large answer small ones are given, and it
+ends when its caller gives up. Rendering shares the cores with training and waits when it has used its share
+(worker/daemon/pace.py); whose turn is too far off is told when to come back. The folder of a unix socket protects it.
+TCP is encrypted, and only callers who know the installation's secret are answered.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 import traceback
@@ -22,7 +25,16 @@ from zmq.auth.thread import ThreadAuthenticator
 from contract.access.render_keys import service_keys, worker_keys
 from contract.wire.errors import ErrorCode, InputError, IntrasplatError, SceneError, UnavailableError
 from contract.wire.notices import Notice
-from contract.wire.rendering import ExportRequest, RenderRequest, ReplyError, WorkerReply, WorkerRequest
+from contract.wire.rendering import (
+    CancelRequest,
+    ExportRequest,
+    RenderRequest,
+    ReplyError,
+    WorkerReply,
+    WorkerRequest,
+)
+from worker.daemon.pace import Pace
+from worker.daemon.turns import Turn, Turns
 
 POLL_MS = 50
 """How soon the thread notices that it shall end."""
@@ -31,6 +43,15 @@ MAX_REQUEST_BYTES = 64 * 1024
 """Of one part of a message; a request has some hundred bytes. A caller who sends more loses the connection."""
 
 BETWEEN_PERIOD_S = 1.0
+
+MAX_READ = 1000
+"""Messages read in one go, so that whoever floods the worker keeps nobody else from being answered."""
+
+SMALL_SHARE = 0.25
+"""An answer that takes less than this share of a larger one's time is given between the parts of that one."""
+
+MIN_CHARGE_S = 0.002
+"""Counted for each answer while a job trains: service and viewer have work with it, too."""
 
 logger = logging.getLogger("intrasplat.worker")
 
@@ -41,12 +62,17 @@ class NotYetError(IntrasplatError):
     code = ErrorCode.NOT_YET
 
 
+class GivenUpError(Exception):
+    """Nobody waits any more for the answer that is being made."""
+
+
 @dataclass(frozen=True)
 class Reply:
     """The answer to a request: encoded bytes, the model time that they show (clamped), and warnings.
 
     iteration: of the snapshot that is shown; None: the scene is finished.
     unseen: share of a render's pixels that no training frame saw.
+    gaussians, clip_size: of the scene, as in WorkerReply.
     """
 
     body: bytes
@@ -55,16 +81,21 @@ class Reply:
     warnings: tuple[Notice, ...] = ()
     iteration: int | None = None
     unseen: float = 0.0
+    gaussians: int = 0
+    clip_size: tuple[int, int] | None = None
 
 
 class RequestServer:
     """A context manager that answers requests at `endpoint`.
 
     Args:
-        answer: makes the reply. The caller is told of its InputError, SceneError or NotYetError; any other error is
-            logged and told as a fault.
+        answer: makes the reply, and calls pause() between the parts of a large one. The caller is told of its
+            InputError, SceneError or NotYetError; any other error is logged and told as a fault.
+        cost: what an answer will take, in pixels x Gaussians.
         between: called about once a second, in the same thread.
-        rest_s: how long to answer nobody.
+        pace: how much of the time answers may take.
+        spent_s: CPU seconds that this thread has used.
+        max_wait_s: whose turn is farther off is told so at once.
         render_secret: needed for tcp:// alone.
     """
 
@@ -73,8 +104,11 @@ class RequestServer:
         endpoint: str,
         answer: Callable[[RenderRequest | ExportRequest], Reply],
         *,
+        cost: Callable[[RenderRequest | ExportRequest], float] = lambda request: 0.0,
         between: Callable[[], None] | None = None,
-        rest_s: Callable[[], float] = lambda: 0.0,
+        pace: Pace | None = None,
+        spent_s: Callable[[], float] = time.thread_time,
+        max_wait_s: float = math.inf,
         render_secret: str | None = None,
     ) -> None:
         if endpoint.startswith("tcp:") and render_secret is None:
@@ -87,7 +121,13 @@ class RequestServer:
         self._answer = answer
         self._between = between
         self._between_at_s = 0.0
-        self._rest_s = rest_s
+        self._cost = cost
+        self._pace = pace or Pace()
+        self._spent_s = spent_s
+        self._charged_s = 0.0
+        self._max_wait_s = max_wait_s
+        self._turns = Turns()
+        self._begun: list[Turn] = []
         self._render_secret = render_secret
         self._end = threading.Event()
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -126,19 +166,102 @@ class RequestServer:
         assert self._socket is not None
         while not self._end.is_set():
             self._do_between()
-            if (rest_s := self._rest_s()) > 0.0:
-                self._end.wait(min(rest_s, POLL_MS / 1e3))
-                continue
-            if not self._socket.poll(POLL_MS):
-                continue
-            frames = self._socket.recv_multipart()
-            if len(frames) != 3:
-                logger.warning("a message of %d parts was ignored", len(frames))
-                continue
-            caller, request_id, document = frames
-            head, body = self._reply(document)
-            self._socket.send_multipart([caller, request_id, head.model_dump_json().encode(), body])
+            longest_s = POLL_MS / 1e3
+            self._read(min(self._pace.rest_s(), longest_s) if len(self._turns) else longest_s)
+            if self._pace.rest_s() == 0.0 and (turn := self._turns.take()) is not None:
+                self._give(turn)
         self._socket.close()
+
+    def pause(self) -> None:
+        """Let others have a turn between two parts of an answer: small ones, for as long as the last part took.
+
+        Raises:
+            GivenUpError: nobody waits for this answer any more.
+        """
+        turn = self._begun[-1]
+        left_s = self._charge()
+        self._do_between()
+        self._read(0.0)
+        while True:
+            if turn.is_given_up or self._end.is_set():
+                raise GivenUpError
+            if (rest_s := self._pace.rest_s()) > 0.0:
+                self._read(min(rest_s, POLL_MS / 1e3))
+                continue
+            small = self._turns.take(SMALL_SHARE * turn.seconds) if left_s > 0.0 else None
+            if small is None:
+                return
+            self._give(small)
+            left_s -= small.spent_s
+
+    def _read(self, wait_s: float) -> None:
+        """Take in what has come; wait so long if nothing has."""
+        assert self._socket is not None
+        if not self._socket.poll(math.ceil(wait_s * 1e3)):
+            return
+        for _ in range(MAX_READ):
+            try:
+                frames = self._socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            if len(frames) == 3:
+                self._take_in(*frames)
+            else:
+                logger.warning("a message of %d parts was ignored", len(frames))
+
+    def _take_in(self, caller: bytes, request_id: bytes, document: bytes) -> None:
+        try:
+            request = WorkerRequest.model_validate_json(document).request
+        except ValidationError as error:
+            problem = f"The request does not fit: {error.errors()[0]['msg']}."
+            self._send(caller, request_id, WorkerReply(error=ReplyError(kind="internal", problem=problem)))
+            return
+        if isinstance(request, CancelRequest):
+            self._turns.give_up(caller, request_id)
+            for begun in self._begun:
+                begun.is_given_up |= (begun.caller, begun.request_id) == (caller, request_id)
+            return
+        cost = self._cost(request)
+        turn = Turn(caller, request_id, request, cost, self._turns.seconds(cost), time.monotonic())
+        if (wait_s := self._wait_s(turn)) > self._max_wait_s:
+            self._send(caller, request_id, WorkerReply(error=_busy(wait_s)))
+        else:
+            self._turns.add(turn)
+
+    def _wait_s(self, turn: Turn) -> float:
+        """Seconds until its turn, as far as known."""
+        larger = [each for each in self._begun if turn.seconds >= SMALL_SHARE * each.seconds]
+        before_s = self._turns.seconds_before(turn) + sum(max(0.0, each.seconds - each.spent_s) for each in larger)
+        return self._pace.rest_s() + before_s / self._pace.rate
+
+    def _give(self, turn: Turn) -> None:
+        """Answer it, and all who wait for the same."""
+        self._begun.append(turn)
+        self._charged_s = self._spent_s()
+        try:
+            head, body = self._reply(turn.request)
+        except GivenUpError:
+            return
+        finally:
+            self._charge()
+            self._begun.pop()
+        self._pace.charge(max(0.0, MIN_CHARGE_S - turn.spent_s))
+        if head.error is None:
+            self._turns.learn(turn)
+        for each in (turn, *self._turns.take_same(turn.request)):
+            self._send(each.caller, each.request_id, head, body)
+
+    def _charge(self) -> float:
+        """Count the CPU seconds since this was last done for the answer that is being made; how many they are."""
+        now_s = self._spent_s()
+        spent_s, self._charged_s = now_s - self._charged_s, now_s
+        self._begun[-1].spent_s += spent_s
+        self._pace.charge(spent_s)
+        return spent_s
+
+    def _send(self, caller: bytes, request_id: bytes, head: WorkerReply, body: bytes = b"") -> None:
+        assert self._socket is not None
+        self._socket.send_multipart([caller, request_id, head.model_dump_json().encode(), body])
 
     def _do_between(self) -> None:
         if self._between is None or time.monotonic() < self._between_at_s:
@@ -149,15 +272,12 @@ class RequestServer:
             logger.error("between two requests: %s", type(error).__name__)
         self._between_at_s = time.monotonic() + BETWEEN_PERIOD_S
 
-    def _reply(self, document: bytes) -> tuple[WorkerReply, bytes]:
-        try:
-            request = WorkerRequest.model_validate_json(document).request
-        except ValidationError as error:
-            problem = f"The request does not fit: {error.errors()[0]['msg']}."
-            return WorkerReply(error=ReplyError(kind="internal", problem=problem)), b""
+    def _reply(self, request: RenderRequest | ExportRequest) -> tuple[WorkerReply, bytes]:
         start = time.perf_counter()
         try:
             view = self._answer(request)
+        except GivenUpError:
+            raise
         except Exception as error:
             return WorkerReply(error=_reply_error(error)), b""
         head = WorkerReply(
@@ -166,9 +286,18 @@ class RequestServer:
             warnings=view.warnings,
             iteration=view.iteration,
             unseen=view.unseen,
+            gaussians=view.gaussians,
+            clip_size=view.clip_size,
             render_ms=(time.perf_counter() - start) * 1e3,
         )
         return head, view.body
+
+
+def _busy(wait_s: float) -> ReplyError:
+    """The answer to who would wait too long."""
+    retry_after_s = round(wait_s, 1)
+    problem, remedy = "The worker has other pictures to make first.", f"Ask again in {math.ceil(wait_s)} s."
+    return ReplyError(kind="busy", problem=problem, remedy=remedy, retry_after_s=retry_after_s)
 
 
 def _reply_error(error: Exception) -> ReplyError:

@@ -80,5 +80,10 @@ class Snapshots:
                 self._answers = self._changed.wait_for(lambda: self._newest is not shown, self._patience_s)
             return self._newest if self._job_id == job_id else None
 
+    def shown(self, job_id: str) -> Snapshot | None:
+        """The newest copy of the job's model, or None; asks for nothing."""
+        with self._changed:
+            return self._newest if self._job_id == job_id else None
+
     def _is_due(self, snapshot: Snapshot) -> bool:
         return time.monotonic() - snapshot.taken_s >= self._period_s

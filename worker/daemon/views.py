@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import OrderedDict
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +17,14 @@ from contract.store.store import Store
 from contract.wire.errors import InputError, LimitError
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import MatrixPose, OrbitPose, world_from_camera
-from contract.wire.rendering import MEDIA_TYPES, ExportRequest, IntrinsicsOverride, RenderRequest
-from worker.daemon.pace import Pace
+from contract.wire.rendering import MEDIA_TYPES, ExportRequest, IntrinsicsOverride, RenderRequest, render_cost
+from worker.daemon.kept import KeptReplies
 from worker.daemon.serve import NotYetError, Reply
-from worker.daemon.snapshot import Snapshots
+from worker.daemon.snapshot import Snapshot, Snapshots
 from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
 from worker.render.encode import encode_layer
-from worker.render.view import ROUNDING, render_frame
+from worker.render.view import ROUNDING, Frame, no_pause, render_frame
 from worker.scene.checkpoint import load_scene
 from worker.scene.export import EXPORTS
 from worker.scene.scene import Scene
@@ -36,11 +37,15 @@ COPIES = 3
 MAX_HELD_SCENES = 64
 """However small they are: each announcement of the worker names all of them."""
 
+UNKNOWN_GAUSSIANS, UNKNOWN_SIZE = 50_000, (640, 512)
+"""What a scene that is not in memory is taken to have, when it is estimated how long it will take."""
+
 
 class Views:
     """Answers render and export requests from the scenes of a store and the snapshots of a job; for one thread.
 
-    `held` names the scenes in memory, the last used one at the end; other threads may read it.
+    `held` names the scenes in memory, the last used one at the end; other threads may read it. `pause` is called
+    between the parts of a large render; it may ask for other answers meanwhile.
     """
 
     def __init__(
@@ -48,16 +53,18 @@ class Views:
         store: Store,
         snapshots: Snapshots | None = None,
         hot_bytes: int = 2 * GIB,
-        pace: Pace | None = None,
         device: Device = CPU,
     ) -> None:
         self._store = store
         self._snapshots = snapshots or Snapshots()
-        self._pace = pace or Pace()
         self._hot_bytes = hot_bytes
         self._device = device
         self._scenes: OrderedDict[tuple[str, int], Scene] = OrderedDict()
+        self._kept = KeptReplies()
+        self._snapshot: Snapshot | None = None  # the last that was shown, of the job
+        self._job_id = ""
         self.held: tuple[str, ...] = ()
+        self.pause: Callable[[], None] = no_pause
 
     def answer(self, request: RenderRequest | ExportRequest) -> Reply:
         """The encoded image or file.
@@ -69,21 +76,55 @@ class Views:
             InputError: the export format does not exist.
         """
         if isinstance(request, ExportRequest):
-            with self._pace.rendering():
-                return _export(self._stored(request.scene_id, request.attempt), request)
+            return _export(self._stored(request.scene_id, request.attempt), request)
         if request.attempt is not None:
-            with self._pace.rendering():
-                return _render(self._stored(request.scene_id, request.attempt), request, self._device)
-        snapshot = self._snapshots.newest(request.scene_id)  # may wait for training, without slowing it
-        if snapshot is None:
-            raise NotYetError(f"Job {request.scene_id} has nothing to show yet.")
-        with self._pace.rendering():
-            return _render(snapshot.scene, request, self._device, snapshot.iteration)
+            scene, iteration = self._stored(request.scene_id, request.attempt), None
+        else:
+            scene, iteration = self._trained(request.scene_id)
+        reply = self._kept.get(request)
+        if reply is None:
+            reply = self._render(scene, request, iteration)
+            if iteration is None or self._is_newest(scene):
+                self._kept.keep(request, reply)
+        return reply
+
+    def cost(self, request: RenderRequest | ExportRequest) -> float:
+        """What the answer will take, in pixels x Gaussians; 0 if it is kept."""
+        if isinstance(request, RenderRequest) and request in self._kept:
+            return 0.0
+        if request.attempt is not None:
+            scene = self._scenes.get((request.scene_id, request.attempt))
+        else:
+            snapshot = self._snapshots.shown(request.scene_id)
+            scene = snapshot.scene if snapshot is not None else None
+        gaussians = len(scene.gaussians) if scene is not None else UNKNOWN_GAUSSIANS
+        if isinstance(request, ExportRequest):
+            return render_cost(0, gaussians)
+        size = (scene.intrinsics.width, scene.intrinsics.height) if scene is not None else UNKNOWN_SIZE
+        width, height = request.camera.size(*size)
+        return render_cost(width * height, gaussians)
 
     def forget_purged(self) -> None:
-        """Drop scenes whose folders are gone. Call it now and then."""
+        """Drop scenes whose folders are gone, and jobs that have ended. Call it now and then."""
         for key in [key for key in self._scenes if not self._store.has_scene(*key)]:
             self._forget(key)
+        if self._snapshot is not None and self._snapshots.shown(self._job_id) is not self._snapshot:
+            self._kept.drop(lambda request: request.attempt is None)
+            self._snapshot = None
+
+    def _trained(self, job_id: str) -> tuple[Scene, int]:
+        """The newest snapshot and its iteration; may wait for training, without slowing it."""
+        snapshot = self._snapshots.newest(job_id)
+        if snapshot is None:
+            raise NotYetError(f"Job {job_id} has nothing to show yet.")
+        if snapshot is not self._snapshot:
+            self._kept.drop(lambda request: request.attempt is None)
+            self._snapshot, self._job_id = snapshot, job_id
+        return snapshot.scene, snapshot.iteration
+
+    def _is_newest(self, scene: Scene) -> bool:
+        """Whether no newer snapshot has been shown while this one was rendered."""
+        return self._snapshot is not None and self._snapshot.scene is scene
 
     def _stored(self, scene_id: str, attempt: int) -> Scene:
         key = (scene_id, attempt)
@@ -96,23 +137,28 @@ class Views:
             self._scenes[key] = load_scene(folder)
         self._scenes.move_to_end(key)
         while len(self._scenes) > MAX_HELD_SCENES or (len(self._scenes) > 1 and self._byte_count() > self._hot_bytes):
-            self._scenes.popitem(last=False)
+            self._forget(next(iter(self._scenes)))
         self.held = tuple(name for name, _ in self._scenes)
         return self._scenes[key]
 
+    def _render(self, scene: Scene, request: RenderRequest, iteration: int | None) -> Reply:
+        """One render; iteration: of a snapshot, None for a finished scene."""
+        camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
+        pose, highlights = pose_of(scene, request.pose), request.highlights.shown_in(request.layer)
+        frame = render_frame(scene, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
+        return _reply(scene, frame, request, iteration)
+
     def _forget(self, key: tuple[str, int]) -> None:
         self._scenes.pop(key, None)
+        self._kept.drop(lambda request: (request.scene_id, request.attempt) == key)
         self.held = tuple(name for name, _ in self._scenes)
 
     def _byte_count(self) -> int:
         return COPIES * sum(scene.byte_count for scene in self._scenes.values())
 
 
-def _render(scene: Scene, request: RenderRequest, device: Device, iteration: int | None = None) -> Reply:
-    """One render; iteration: of a snapshot, None for a finished scene."""
-    intrinsics = camera_of(scene.intrinsics, request.camera, request.max_pixels)
-    highlights = request.highlights.shown_in(request.layer)
-    frame = render_frame(scene, request.t, pose_of(scene, request.pose), intrinsics, device, highlights=highlights)
+def _reply(scene: Scene, frame: Frame, request: RenderRequest, iteration: int | None) -> Reply:
+    """A frame as it is sent."""
     body = encode_layer(frame, request.layer, request.format, request.quality, request.unseen)
     warnings = frame.warnings
     if iteration is not None:
@@ -121,7 +167,9 @@ def _render(scene: Scene, request: RenderRequest, device: Device, iteration: int
         goes_on = Notice.warning(NoticeCode.TRAINING_GOES_ON, text)
         warnings = (goes_on, *(each for each in warnings if each.code is not NoticeCode.HARDLY_SEEN))
     shown = shown_time(scene, request.t)
-    return Reply(body, MEDIA_TYPES[request.format], shown, warnings, iteration, frame.unseen_share)
+    clip_size = scene.intrinsics.width, scene.intrinsics.height
+    media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
+    return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size)
 
 
 def _export(scene: Scene, request: ExportRequest) -> Reply:
@@ -153,14 +201,7 @@ def camera_of(clip: Intrinsics, wanted: IntrinsicsOverride, max_pixels: int) -> 
     Raises:
         LimitError: it has more than max_pixels.
     """
-    width, height = wanted.width, wanted.height
-    if width is None and height is None:
-        width, height = clip.width, clip.height
-    elif height is None:
-        assert width is not None
-        height = max(1, round(width * clip.height / clip.width))
-    elif width is None:
-        width = max(1, round(height * clip.width / clip.height))
+    width, height = wanted.size(clip.width, clip.height)
     if width * height > max_pixels:
         problem = f"{width} x {height} is more than {max_pixels} pixels."
         raise LimitError("width", problem, "Ask for a smaller image.")

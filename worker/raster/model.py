@@ -12,7 +12,7 @@ is a number and whether any Gaussian was in view.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -74,10 +74,18 @@ class Model(Protocol):
         faint."""
         ...
 
-    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
+    def render(
+        self,
+        camera: NDArray[np.float64],
+        t: float,
+        values: Floats | None = None,
+        pause: Callable[[], None] | None = None,
+    ) -> Floats:
         """R G B Z A, [5, H, W], Z = sum(w z) in units; a view that the next render overwrites.
 
-        With values [N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them.
+        With values [N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them. pause is
+        called between the parts of a large render, if the device makes it in parts. It may render another size, and
+        end the render by an exception.
         """
         ...
 

@@ -9,7 +9,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from threading import Lock
+from threading import Lock, RLock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,10 @@ MAX_UNSEEN_SHARE = 0.05
 HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not known apart: they stay."
 ROUNDING = 1e-6
 """Model time by which t may exceed the last frame's without a warning: a decimal fraction may round i / T."""
+
+
+def no_pause() -> None:
+    """What a render does between its parts if nobody waits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,23 +73,29 @@ class Frame:
 
 
 class SceneRenderer:
-    """A scene ready to be rendered on a device. Serialises its callers: the kernels share buffers."""
+    """A scene ready to be rendered on a device. Serialises its threads: the kernels share buffers."""
 
     def __init__(self, scene: Scene, device: Device = CPU) -> None:
         self._scene = weakref.ref(scene)
         self._model = model_of(scene, device)
         self._values = blended_values(scene.seen.numpy())
-        self._lock = Lock()
+        self._lock = RLock()  # who pauses a large render may make a small one
 
     def layers(
-        self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics, *, highlights: bool = True
+        self,
+        t: float,
+        world_from_camera: NDArray[np.float64],
+        intrinsics: Intrinsics,
+        *,
+        highlights: bool = True,
+        pause: Callable[[], None] = no_pause,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """R G B Z A [5, H, W], Z unnormalised in units, and blended_values as they are blended [H, W], as copies."""
         scene = self._scene()
         assert scene is not None
         camera = view_camera(scene, t, world_from_camera, intrinsics, highlights=highlights)
         with self._lock:
-            image = self._model.render(camera, t, self._values).copy()
+            image = self._model.render(camera, t, self._values, pause).copy()
         return image[:5], None if self._values is None else image[5]
 
 
@@ -110,22 +120,27 @@ def render_frame(
     device: Device = CPU,
     *,
     highlights: bool = True,
+    pause: Callable[[], None] = no_pause,
 ) -> Frame:
     """The scene at model time t (held within the clip) from a pose (mm; None: the endoscope's) through a camera.
 
     highlights: as the endoscope's eyes saw them, and away from both their mean; False: without.
+    pause: called between the parts of the work (worker/raster/model.py).
     """
     last = (scene.frame_count - 1) / scene.frame_count
     shown = min(max(t, 0.0), last)
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
     camera = (intrinsics or scene.intrinsics, pose)
-    image, blended = renderer_of(scene, device).layers(shown, pose, camera[0], highlights=highlights)
+    image, blended = renderer_of(scene, device).layers(shown, pose, camera[0], highlights=highlights, pause=pause)
+    pause()
     alpha = image[4]
     solid = alpha >= COVERED_ALPHA
     unseen = unseen_pixels(solid, blended)
     # Of a snapshot nothing is known yet: nothing is blended, and 0 is shown.
     trust = np.zeros_like(alpha) if blended is None else np.clip(blended / np.where(solid, alpha, 1), 0, 1) * solid
+    pause()
     rgb = np.clip(image[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255).astype(np.uint8)
+    pause()
     in_clip = 0.0 <= t <= last + ROUNDING
     warnings = () if in_clip else (_warning_of_time(t, shown),)
     warnings = (*warnings, *_warnings_of_pose(_distance_from_trained(scene, pose), trust, unseen))

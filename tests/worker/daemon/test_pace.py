@@ -27,8 +27,8 @@ def views_within(seconds: float, view_s: float, clock: Clock, pace: Pace) -> int
         rest_s = pace.rest_s()
         clock.now_s += rest_s
         if rest_s < ROUNDING_S:
-            with pace.rendering():
-                clock.now_s += view_s
+            clock.now_s += view_s
+            pace.charge(view_s)
             made += 1
     return made
 
@@ -36,7 +36,7 @@ def views_within(seconds: float, view_s: float, clock: Clock, pace: Pace) -> int
 @pytest.mark.parametrize("view_s", [0.004, 0.05, 2.0])
 def test_views_without_pause_take_their_share_of_the_time_and_what_was_saved(view_s: float) -> None:
     clock = Clock()
-    pace, seconds = Pace(clock), 100.0
+    pace, seconds = Pace(clock=clock), 100.0
     with pace.training():
         spent_s = view_s * views_within(seconds, view_s, clock, pace)
     assert spent_s == pytest.approx(SHARE * seconds + MAX_SAVED_S, abs=2 * view_s)
@@ -44,19 +44,19 @@ def test_views_without_pause_take_their_share_of_the_time_and_what_was_saved(vie
 
 def test_a_lone_view_is_made_at_once_and_the_next_after_a_rest() -> None:
     clock = Clock()
-    pace = Pace(clock)
+    pace = Pace(clock=clock)
     with pace.training():
         for _ in range(3):
             assert pace.rest_s() == 0.0
-            with pace.rendering():
-                clock.now_s += MAX_SAVED_S + VIEW_S
+            clock.now_s += MAX_SAVED_S + VIEW_S
+            pace.charge(MAX_SAVED_S + VIEW_S)
             assert 0.0 < pace.rest_s() < VIEW_S / SHARE
             clock.now_s += (MAX_SAVED_S + VIEW_S) / SHARE
 
 
 def test_renders_are_not_rationed_while_nothing_trains() -> None:
     clock = Clock()
-    pace = Pace(clock)
+    pace = Pace(clock=clock)
     with pace.training():
         views_within(1.0, VIEW_S, clock, pace)
     assert views_within(1.0, VIEW_S, clock, pace) == pytest.approx(1.0 / VIEW_S, abs=1)
@@ -64,7 +64,7 @@ def test_renders_are_not_rationed_while_nothing_trains() -> None:
 
 def test_what_was_rendered_before_a_job_is_not_held_against_those_who_watch_it() -> None:
     clock = Clock()
-    pace = Pace(clock)
+    pace = Pace(clock=clock)
     views_within(5.0, VIEW_S, clock, pace)
     with pace.training():
         assert pace.rest_s() == 0.0
@@ -72,13 +72,26 @@ def test_what_was_rendered_before_a_job_is_not_held_against_those_who_watch_it()
 
 def test_rations_end_with_a_job_that_fails() -> None:
     clock = Clock()
-    pace = Pace(clock)
+    pace = Pace(clock=clock)
 
     def fail() -> None:
-        with pace.training(), pace.rendering():
-            clock.now_s += 10.0
+        with pace.training():
+            pace.charge(10.0)
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
         fail()
     assert pace.rest_s() == 0.0
+
+
+def test_every_core_gives_its_share_and_waiting_for_one_costs_nothing() -> None:
+    clock = Clock()
+    pace = Pace(4, clock)
+    assert pace.rate == 4
+    with pace.training():
+        assert pace.rate == pytest.approx(4 * SHARE)
+        clock.now_s += 10.0
+        pace.charge(0.05)  # of a render that waited for a core all the time
+        assert pace.rest_s() == 0.0
+        pace.charge(MAX_SAVED_S + 0.08)
+        assert pace.rest_s() == pytest.approx(0.08 / (4 * SHARE))

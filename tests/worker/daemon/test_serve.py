@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import socket as socket_module
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zmq
@@ -15,9 +17,11 @@ import zmq
 from contract.access.render_keys import RenderKeys, service_keys, worker_keys
 from contract.queue.embedded import short_socket_path
 from contract.wire.errors import InputError, SceneError, UnavailableError
-from contract.wire.rendering import ExportRequest, RenderRequest, WorkerReply, WorkerRequest
+from contract.wire.rendering import CancelRequest, ExportRequest, RenderRequest, WorkerReply, WorkerRequest
 from tests.reports import a_warning
+from worker.daemon.pace import MAX_SAVED_S, SHARE, Pace
 from worker.daemon.serve import MAX_REQUEST_BYTES, NotYetError, Reply, RequestServer
+from worker.daemon.turns import FIRST_SPEED
 
 SCENE = "0" * 32
 SECRET = "a secret of at least 32 characters"
@@ -187,12 +191,107 @@ def test_keys_follow_from_the_secret_and_each_side_has_its_own() -> None:
 
 
 def test_who_asks_while_the_worker_rests_is_answered_afterwards(endpoint: str) -> None:
-    rests = [0.01, 0.02, 0.0]
-    with RequestServer(endpoint, answer, rest_s=lambda: rests.pop(0) if rests else 0.0), connected(endpoint) as socket:
-        document = WorkerRequest(request=RenderRequest(scene_id=SCENE, t=0.25)).model_dump_json().encode()
-        _, body = ask(socket, document)
-    assert body == b"image"
-    assert not rests
+    pace = Pace()
+    with RequestServer(endpoint, answer, pace=pace), connected(endpoint) as socket, pace.training():
+        pace.charge(MAX_SAVED_S + 0.1 * SHARE)
+        start_s = time.monotonic()
+        assert ask(socket, request(0.25))[1] == b"image"
+        assert time.monotonic() - start_s > 0.08
+
+
+class Studio:
+    """Renders whose cost is their t, each in parts that are made when they are let go."""
+
+    def __init__(self, endpoint: str, **settings: Any) -> None:
+        self.server = RequestServer(endpoint, self.answer, cost=lambda each: each.t * FIRST_SPEED, **settings)
+        self.begun: list[float] = []
+        self.has_begun = threading.Event()
+        self.parts = threading.Semaphore(0)
+
+    def answer(self, request: RenderRequest | ExportRequest) -> Reply:
+        self.begun.append(request.t)
+        self.has_begun.set()
+        for _ in range(2 if request.t >= 1 else 0):
+            assert self.parts.acquire(timeout=5)
+            spin_s = time.thread_time() + 0.01
+            while time.thread_time() < spin_s:
+                pass
+            self.server.pause()
+        return Reply(str(request.t).encode(), "image/png", request.t)
+
+
+def send(socket: zmq.Socket[bytes], number: int, t: float) -> None:
+    socket.send_multipart([bytes([number]), request(t)])
+
+
+def give_up(socket: zmq.Socket[bytes], number: int) -> None:
+    socket.send_multipart([bytes([number]), WorkerRequest(request=CancelRequest()).model_dump_json().encode()])
+
+
+def test_small_renders_are_made_between_the_parts_of_a_large_one_and_before_other_large_ones(endpoint: str) -> None:
+    studio = Studio(endpoint)
+    with studio.server, connected(endpoint) as socket:
+        send(socket, 1, 8.0)
+        assert studio.has_begun.wait(5)
+        for number, t in ((2, 7.0), (3, 0.25), (4, 6.0), (5, 0.125)):
+            send(socket, number, t)
+        time.sleep(0.1)
+        studio.parts.release(6)
+        answered = [socket.recv_multipart()[0][0] for _ in range(5)]
+    assert set(answered[:2]) == {3, 5}
+    assert answered[2] == 1
+    assert sorted(answered[3:]) == [2, 4]
+
+
+def test_what_its_caller_gives_up_is_not_begun_or_ends_after_its_part(endpoint: str) -> None:
+    studio = Studio(endpoint)
+    with studio.server, connected(endpoint) as socket:
+        send(socket, 1, 8.0)
+        assert studio.has_begun.wait(5)
+        send(socket, 2, 9.0)
+        send(socket, 3, 10.0)
+        give_up(socket, 2)
+        give_up(socket, 1)
+        time.sleep(0.1)
+        studio.parts.release(3)  # one for the first, two for the third
+        assert socket.recv_multipart()[0] == bytes([3])
+    assert studio.begun == [8.0, 10.0]
+
+
+def test_who_asks_the_same_at_the_same_time_shares_one_answer(endpoint: str) -> None:
+    studio = Studio(endpoint)
+    with studio.server, connected(endpoint) as socket, connected(endpoint) as other:
+        send(socket, 1, 2.0)
+        assert studio.has_begun.wait(5)
+        send(socket, 2, 3.0)
+        send(other, 3, 3.0)
+        send(other, 4, 2.0)
+        time.sleep(0.1)
+        studio.parts.release(4)
+        assert [socket.recv_multipart()[0][0] for _ in range(2)] == [1, 2]
+        assert {other.recv_multipart()[0][0] for _ in range(2)} == {3, 4}
+    assert studio.begun == [2.0, 3.0]
+
+
+def test_whose_turn_is_too_far_off_is_told_when_to_come_back_and_small_renders_are_not(endpoint: str) -> None:
+    studio = Studio(endpoint, max_wait_s=10.0)
+    with studio.server, connected(endpoint) as socket:
+        send(socket, 1, 8.0)
+        assert studio.has_begun.wait(5)
+        send(socket, 2, 7.0)
+        send(socket, 3, 7.5)
+        time.sleep(0.1)
+        studio.parts.release(1)
+        number, head, _ = socket.recv_multipart()
+        error = WorkerReply.model_validate_json(head).error
+        assert number == bytes([3])
+        assert error is not None
+        assert error.kind == "busy"
+        assert error.retry_after_s == pytest.approx(15.0, abs=0.5)
+        send(socket, 4, 0.5)
+        time.sleep(0.1)
+        studio.parts.release(3)
+        assert [socket.recv_multipart()[0][0] for _ in range(3)] == [4, 1, 2]
 
 
 def test_an_address_that_is_taken_is_an_error_with_a_remedy(tcp_endpoint: str) -> None:

@@ -25,7 +25,7 @@ from contract.wire.rendering import (
     RenderRequest,
     Unseen,
 )
-from worker.daemon.serve import NotYetError
+from worker.daemon.serve import GivenUpError, NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import COPIES, Views, camera_of, pose_of, shown_time
 from worker.input.camera import Intrinsics
@@ -252,3 +252,45 @@ def test_focal_length_and_centre_are_taken_as_given() -> None:
 def test_an_image_over_the_limit_is_refused() -> None:
     with pytest.raises(LimitError, match="more than 10000 pixels"):
         camera_of(CLIP, IntrinsicsOverride(width=200), MAX_PIXELS)
+
+
+def test_who_asks_the_same_again_gets_the_same_answer_until_the_scene_or_the_snapshot_is_another(
+    store: Store, scene_id: str
+) -> None:
+    snapshots = Snapshots(period_s=0.0, patience_s=0.0)
+    views, running = Views(store, snapshots), new_job_id()
+    snapshots.begin(running)
+    for request in (request_of(scene_id), request_of(running, attempt=None)):
+        snapshots.offer(scene(), 40)
+        first = views.answer(request)
+        assert views.answer(request) is first
+        assert views.cost(request) == 0
+    snapshots.offer(scene(), 41)
+    assert views.answer(request).iteration == 41
+    store.purge(scene_id)
+    with pytest.raises(SceneError):
+        views.answer(request_of(scene_id))
+    assert views.cost(request_of(scene_id)) > 0
+
+
+def test_a_large_render_can_be_paused_for_a_small_one_of_the_same_scene_and_ended(store: Store, scene_id: str) -> None:
+    small = request_of(scene_id, t=0.5)
+    large = request_of(scene_id).model_copy(update={"camera": IntrinsicsOverride(width=1600, height=1200)})
+    alone = [Views(store).answer(each).body for each in (large, small)]
+    views, pauses, between = Views(store), list[None](), list[bytes]()
+
+    def pause() -> None:
+        pauses.append(None)
+        if len(pauses) == 2:
+            between.append(views.answer(small).body)
+
+    views.pause = pause
+    assert [views.answer(large).body, *between] == alone
+    assert len(pauses) > 8
+
+    def give_up() -> None:
+        raise GivenUpError
+
+    views.pause = give_up
+    with pytest.raises(GivenUpError):
+        views.answer(large.model_copy(update={"t": 0.25}))

@@ -127,10 +127,16 @@ class CpuModel:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
         self.rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
 
-    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
+    def render(
+        self,
+        camera: NDArray[np.float64],
+        t: float,
+        values: Floats | None = None,
+        pause: Callable[[], None] | None = None,
+    ) -> Floats:
         """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
         self.project(camera, t, self.sh_degree)
-        return self.rasterizer.render(values)
+        return self.rasterizer.render(values, pause)
 
     def blend_values(self, values: Floats) -> Floats:
         """Further values [N], blended as colour was in the last render: [H, W]; a view."""

@@ -5,6 +5,7 @@ N Gaussians (a multiple of LANES, see padded), M slots, H W pixels. All arrays a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ from worker.raster.step import Target
 
 Floats = NDArray[np.float32]
 _NO_LOSS = np.zeros(5, np.float32)
+PART_PIXELS = 1 << 19
+"""A render may pause after so many pixels are blended: some tens of milliseconds."""
 
 
 def _aligned(rows: int, columns: int) -> Floats:
@@ -156,26 +159,37 @@ class Rasterizer:
         for thread, (_, end) in enumerate(self._region_end):
             self._sums[thread * region * bins.GRADIENT : end * bins.GRADIENT] = 0
 
-    def blend(self, mode: int, target: Target, loss_settings: Floats, image: Floats) -> None:
-        """The kernel in one of its modes (blend.py)."""
+    def blend(
+        self, mode: int, target: Target, loss_settings: Floats, image: Floats, bands: tuple[int, int] | None = None
+    ) -> None:
+        """The kernel in one of its modes (blend.py). bands: first and end of the rows of tiles; None: all."""
         self._reserve()
         if mode != RENDER:
             self._empty_homes()
-        self._next_block[0] = 0
+        first, end = bands or (0, self.tiles // self.tiles_x)
+        self._next_block[0] = first * -(-self.tiles_x // bins.BLOCK_TILES)
         run(
-            blend, self._next_block, mode, self.width, self.height, self.tiles_x, self.splats, self._tile_start,
-            self._entries, self._homes, self._records, self._spans, self._trail, self._planes, self._sums,
-            self.statistics, target.rgb, target.weight, target.inverse_depth, loss_settings, image,
+            blend, self._next_block, mode, self.width, self.height, self.tiles_x, self.splats,
+            self._tile_start[: end * self.tiles_x + 1], self._entries, self._homes, self._records, self._spans,
+            self._trail, self._planes, self._sums, self.statistics, target.rgb, target.weight, target.inverse_depth,
+            loss_settings, image,
         )  # fmt: skip
 
-    def render(self, values: Floats | None = None) -> Floats:
+    def render(self, values: Floats | None = None, pause: Callable[[], None] | None = None) -> Floats:
         """R G B Z A of the projected splats, [5, H, W]; a view of a buffer the next render overwrites.
 
-        With values [<= N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them.
+        With values [<= N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them. pause is
+        called after every PART_PIXELS but the last; it may use other rasterizers, and end the render by an exception.
         """
         if values is not None:
             self.splats[: len(values), 11] = values
-        self.blend(RENDER, self._no_target, _NO_LOSS, self.image)
+        bands = self.tiles // self.tiles_x
+        part = bands if pause is None else max(1, PART_PIXELS // (self.stride * bins.TILE_ROWS))
+        for first in range(0, bands, part):
+            if pause is not None and first > 0:
+                pause()
+            end = min(first + part, bands)
+            self.blend(RENDER, self._no_target, _NO_LOSS, self.image, (first, end))
         planes = 5 if values is None else 6
         return self.image.reshape(6, self.height, self.stride)[:planes, :, : self.width]
 

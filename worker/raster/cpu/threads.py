@@ -10,6 +10,8 @@ starts a kernel; each caller works on its own first share meanwhile.
 from __future__ import annotations
 
 import os
+import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
@@ -17,6 +19,8 @@ from functools import cache
 from contract.wire.errors import InputError
 
 THREADS_VARIABLE = "INTRASPLAT_THREADS"
+
+_elsewhere = threading.local()
 
 
 def _available_cores() -> int:
@@ -48,10 +52,21 @@ def _pool(process_id: int) -> ThreadPoolExecutor:
 def run(kernel: Callable[..., object], *args: object) -> None:
     """Call kernel(thread, threads, *args) once a thread and wait for all; an error in any is raised here."""
     threads = thread_count()
-    others = [_pool(os.getpid()).submit(kernel, thread, threads, *args) for thread in range(1, threads)]
+    others = [_pool(os.getpid()).submit(_timed, kernel, thread, threads, *args) for thread in range(1, threads)]
     try:
         kernel(0, threads, *args)
     finally:
         wait(others)  # they write into the caller's arrays
-    for other in others:
-        other.result()
+    _elsewhere.s = getattr(_elsewhere, "s", 0.0) + sum(other.result() for other in others)
+
+
+def cpu_time_s() -> float:
+    """CPU seconds that this thread has used so far, with what its kernels used on other threads."""
+    return time.thread_time() + float(getattr(_elsewhere, "s", 0.0))
+
+
+def _timed(kernel: Callable[..., object], *args: object) -> float:
+    """Call the kernel; the CPU seconds that it took."""
+    start_s = time.thread_time()
+    kernel(*args)
+    return time.thread_time() - start_s

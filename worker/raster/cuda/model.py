@@ -17,7 +17,7 @@ for its picture; the first use of a frame, for its copy; when buffers grow.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -285,8 +285,15 @@ class CudaModel:
         self._project(view, self.sh_degree)
         view.images[with_values] = view.rasterizer.render(view.values if with_values else None)
 
-    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
+    def render(
+        self,
+        camera: NDArray[np.float64],
+        t: float,
+        values: Floats | None = None,
+        pause: Callable[[], None] | None = None,
+    ) -> Floats:
         """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
+        del pause  # a GPU makes a render in one part
         image: Floats = self.render_times(camera, [t], values)[0].cpu().numpy()
         return image
 

@@ -1,0 +1,93 @@
+"""How much rendering a caller and a tenant may ask for at a time, by what it costs: pixels x Gaussians.
+
+Small renders are not counted: they are answered between the parts of large ones, and service/limits.py counts requests.
+Each process counts for itself.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import OrderedDict, defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from contract.runtime.settings import Settings
+from contract.wire.rendering import RenderRequest, WorkerReply, render_cost
+from service.access import Caller
+from service.problems import Problem
+
+TYPICAL_GAUSSIANS, TYPICAL_SIZE = 50_000, (640, 512)
+"""Of a scene that has not been shown yet."""
+
+OF_CALLER, OF_TENANT = 2, 4
+"""How many renders of the most pixels, of a typical scene, may wait or be made at a time."""
+
+SMALL_SHARE = 1 / 8
+"""A render that costs less than this share of one of the most pixels is small."""
+
+SCENES_KEPT = 1_000
+
+FIRST_SPEED = 1e11
+"""Cost answered in a second, until large renders have been timed."""
+LEARNING = 0.3
+"""Share of the newest render in what is known of the speed."""
+
+
+class RenderLimits:
+    """What is asked for and not answered yet; from the event loop alone, so it needs no lock."""
+
+    def __init__(self, settings: Settings) -> None:
+        largest = render_cost(settings.max_render_pixels, TYPICAL_GAUSSIANS)
+        self._most = {"caller": OF_CALLER * largest, "tenant": OF_TENANT * largest}
+        self._small = SMALL_SHARE * largest
+        self._in_hand: defaultdict[tuple[str, str], float] = defaultdict(float)
+        self._scenes: OrderedDict[str, tuple[int, tuple[int, int]]] = OrderedDict()
+        self._speed = FIRST_SPEED
+
+    def cost(self, request: RenderRequest) -> float:
+        """What a render costs, as far as its scene is known."""
+        gaussians, size = self._scenes.get(request.scene_id, (TYPICAL_GAUSSIANS, TYPICAL_SIZE))
+        width, height = request.camera.size(*size)
+        return render_cost(min(width * height, request.max_pixels), gaussians)
+
+    @contextmanager
+    def admitted(self, caller: Caller, request: RenderRequest) -> Iterator[None]:
+        """The time in which a render is asked for; Problem 429 if the caller or its tenant has too much in hand.
+
+        Who has nothing in hand is never refused.
+        """
+        cost = self.cost(request)
+        if cost <= self._small:
+            yield
+            return
+        names = [("caller", caller.key_id or caller.address), ("tenant", caller.tenant)]
+        for name in names:
+            in_hand = self._in_hand.get(name, 0.0)
+            if in_hand and in_hand + cost > self._most[name[0]]:
+                raise self._too_much(name[0], in_hand + cost - self._most[name[0]])
+        for name in names:
+            self._in_hand[name] += cost
+        start_s = time.monotonic()
+        try:
+            yield
+            self._speed += LEARNING * (cost / max(1e-3, time.monotonic() - start_s) - self._speed)
+        finally:
+            for name in names:
+                self._in_hand[name] -= cost
+                if self._in_hand[name] < 1:
+                    del self._in_hand[name]
+
+    def learn(self, scene_id: str, head: WorkerReply) -> None:
+        """Remember how large a scene is."""
+        if head.gaussians and head.clip_size is not None:
+            self._scenes[scene_id] = head.gaussians, head.clip_size
+            self._scenes.move_to_end(scene_id)
+            if len(self._scenes) > SCENES_KEPT:
+                self._scenes.popitem(last=False)
+
+    def _too_much(self, whose: str, excess: float) -> Problem:
+        wait_s = max(1.0, excess / self._speed)
+        detail = f"This {whose} has asked for as many large renders as may be made at a time."
+        remedy = f"Ask again in {math.ceil(wait_s)} s, or for fewer pixels."
+        return Problem(429, detail, field="width", remedy=remedy, retry_after_s=wait_s)

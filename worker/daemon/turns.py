@@ -1,0 +1,88 @@
+"""The requests that wait at a worker, and whose turn it is: small ones come first, and none waits for ever."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from contract.wire.rendering import ExportRequest, RenderRequest
+
+PATIENCE = 4.0
+"""A request may wait so many times the seconds that it takes, before those that came later are answered first."""
+
+FIRST_SPEED = 3e11
+"""Pixels x Gaussians rendered in a CPU second, until the first render has been timed (bm_service, on two cores)."""
+LEARNING = 0.2
+"""Share of the newest render in what is known of the speed."""
+
+
+@dataclass(eq=False)
+class Turn:
+    """A request that waits or is being answered.
+
+    cost       pixels x Gaussians
+    seconds    CPU seconds that it will take, as far as known; spent_s: that it has taken
+    arrived_s  monotonic
+    """
+
+    caller: bytes
+    request_id: bytes
+    request: RenderRequest | ExportRequest
+    cost: float
+    seconds: float
+    arrived_s: float
+    spent_s: float = 0.0
+    is_given_up: bool = False
+
+    @property
+    def due_s(self) -> float:
+        """The order of the answers."""
+        return self.arrived_s + PATIENCE * self.seconds
+
+
+class Turns:
+    """All that wait, and how fast they are answered; for one thread."""
+
+    def __init__(self) -> None:
+        self._waiting: list[Turn] = []
+        self._speed = FIRST_SPEED
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def seconds(self, cost: float) -> float:
+        """CPU seconds that a request of this cost takes."""
+        return cost / self._speed
+
+    def learn(self, turn: Turn) -> None:
+        """Remember how long the answer took."""
+        if turn.cost > 0 and turn.spent_s > 0:
+            self._speed += LEARNING * (turn.cost / turn.spent_s - self._speed)
+
+    def add(self, turn: Turn) -> None:
+        """Let it wait."""
+        self._waiting.append(turn)
+
+    def give_up(self, caller: bytes, request_id: bytes) -> None:
+        """Forget a request that nobody waits for any more."""
+        self._waiting = [each for each in self._waiting if (each.caller, each.request_id) != (caller, request_id)]
+
+    def take(self, below_s: float = math.inf) -> Turn | None:
+        """The next one to answer, of those that take less than below_s."""
+        turn = min(
+            (each for each in self._waiting if each.seconds < below_s), key=lambda each: each.due_s, default=None
+        )
+        if turn is not None:
+            self._waiting.remove(turn)
+        return turn
+
+    def take_same(self, request: RenderRequest | ExportRequest) -> list[Turn]:
+        """All who wait for the same answer."""
+        same = [each for each in self._waiting if each.request == request]
+        self._waiting = [each for each in self._waiting if each.request != request]
+        return same
+
+    def seconds_before(self, turn: Turn) -> float:
+        """CPU seconds of all that are answered before this one; 0 if one of them has the same answer."""
+        before = [each for each in self._waiting if each.due_s <= turn.due_s]
+        return 0.0 if any(each.request == turn.request for each in before) else sum(each.seconds for each in before)
