@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from worker.input.clip import StereoClip, open_clip
-from worker.input.decode import decode_clip
+from worker.input.decode import StereoRecording, decode_clip
 
 
 def main() -> None:
@@ -36,7 +36,7 @@ def main() -> None:
         if not clip.exists():
             print(f"nothing measured: {clip} is not there")
             continue
-        here, contained = partial(_read_here, clip), partial(decode_clip, clip, calibration=calibration)
+        here, contained = partial(_read_here, clip), partial(_read_contained, clip, calibration)
         runs = [(_seconds(here), _seconds(contained)) for _ in range(arguments.repeats)]
         for kind, name in enumerate(("wall", "processor")):
             here_s, contained_s = (min(run[side][kind] for run in runs) for side in (0, 1))
@@ -49,6 +49,13 @@ def _read_here(clip: Path) -> None:
     opened = open_clip(clip)
     if isinstance(opened, StereoClip):
         for _ in opened.pairs():
+            pass
+
+
+def _read_contained(clip: Path, calibration: Path | None) -> None:
+    decoded = decode_clip(clip, calibration=calibration)
+    if isinstance(decoded, StereoRecording):
+        for _ in decoded.clip.pairs():
             pass
 
 

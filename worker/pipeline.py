@@ -6,6 +6,7 @@ import dataclasses
 import json
 import platform
 import time
+from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
@@ -21,7 +22,7 @@ from contract.wire.report import Report
 from worker.input.calibration import rectify
 from worker.input.calibration.types import StereoCalibration
 from worker.input.camera import to_camera
-from worker.input.clip import DepthClip, StereoClip, held_out_frames, split_frames
+from worker.input.clip import DepthClip, StereoClip, split_frames, training_frames
 from worker.input.decode import decode_clip
 from worker.machine.hooks import Hooks
 from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
@@ -113,11 +114,12 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
             limits=request.limits,
             hooks=hooks,
         )
+    options = request.options
     if isinstance(decoded, DepthClip):
         return decoded
-    options = request.options
     depth_range_mm = options.min_depth_mm, options.max_depth_mm
-    return match_eyes(decoded.clip, decoded.calibration, options.holdout, hooks, timings, device, depth_range_mm)
+    with closing(decoded):
+        return match_eyes(decoded.clip, decoded.calibration, options.holdout, hooks, timings, device, depth_range_mm)
 
 
 def match_eyes(
@@ -136,12 +138,11 @@ def match_eyes(
         Cancelled: hooks.should_stop said so.
     """
     rectified = rectify(clip, calibration)
-    held_out = set(held_out_frames(clip.frame_count, holdout))
-    measured = [i for i in range(clip.frame_count) if i not in held_out]
+    measured = training_frames(clip.frame_count, holdout)
     if device != CPU:  # before it matches anything
         hooks.report_stage("compile", 0.0)
         timings.add("compile_s", examine(device))
-    with timings.measure("stereo_s"):
+    with timings.measure("stereo_s"):  # from the first frame on, while later ones are decoded
         return estimate_depth(
             rectified, hooks, measured_frames=measured, device=device.kind, depth_range_mm=depth_range_mm
         )

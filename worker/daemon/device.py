@@ -33,6 +33,7 @@ from worker.daemon.pace import Pace
 from worker.daemon.serve import RequestServer
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
+from worker.input.decode import keep_decoder_ready
 from worker.machine.hooks import Progress
 from worker.pipeline import reconstruct
 from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lost
@@ -109,6 +110,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
         logger.info("the device process is ready on %s", device)
         shown = ""
         while True:
+            keep_decoder_ready()
             task = orders.next(LAST_SNAPSHOT_S)
             if task is None:
                 snapshots.drop(shown)

@@ -21,7 +21,7 @@ from tests.worker.input.clip.conftest import Studio
 from worker.input.calibration import load_calibration, rectify
 from worker.input.clip import ClipLimits, DepthClip, open_clip
 from worker.input.decode import StereoRecording, decode_clip
-from worker.input.decode.contained import Patience, private_folder, run_contained
+from worker.input.decode.contained import Patience, keep_decoder_ready, run_contained
 from worker.input.decode.guard import PROTECTIONS, Allowance
 from worker.input.decode.handover import map_array
 from worker.machine.hooks import Hooks, Progress
@@ -80,6 +80,41 @@ def test_a_stereo_clip_comes_out_of_the_process_bit_for_bit(studio: Studio, scra
     assert decoded.calibration == load_calibration(calibration, eye_width=96, eye_height=80)
     assert list(scratch.iterdir()) == []
     assert len(list(decoded.clip.pairs())) == 6  # what is mapped outlives its files, and can be read again
+
+
+def test_a_clip_is_there_before_its_frames_and_their_error_when_they_are_read(studio: Studio, scratch: Path) -> None:
+    for eye, frames in zip(("left", "right"), studio.eyes(), strict=True):
+        studio.images(f"clip/{eye}/{{}}.png", frames)
+    (studio.root / "clip/calibration.json").write_text(CALIBRATION)
+    last = max((studio.root / "clip/right").iterdir())
+    last.write_bytes(last.read_bytes()[:200] + last.read_bytes()[-100:])
+    decoded = decode_clip(studio.root / "clip")
+    assert isinstance(decoded, StereoRecording)
+    with pytest.raises(InputError, match="damaged"):
+        list(decoded.clip.pairs())
+    assert list(scratch.iterdir()) == []
+
+
+def test_a_recording_that_nobody_reads_ends_its_process(studio: Studio, scratch: Path) -> None:
+    decoded = decode_clip(side_by_side(studio), calibration=calibrated(studio))
+    assert isinstance(decoded, StereoRecording)
+    decoded.close()
+    assert list(scratch.iterdir()) == []
+
+
+def test_a_process_that_was_started_ahead_reads_one_clip(studio: Studio, scratch: Path) -> None:
+    keep_decoder_ready()
+    keep_decoder_ready()
+    (waiting,) = scratch.iterdir()
+    clip, calibration = side_by_side(studio), calibrated(studio)
+    first = decode_clip(clip, calibration=calibration)
+    assert list(scratch.iterdir()) == [waiting]
+    second = decode_clip(clip, calibration=calibration)
+    assert len(list(scratch.iterdir())) == 2
+    for decoded in (first, second):
+        assert isinstance(decoded, StereoRecording)
+        assert len(list(decoded.clip.pairs())) == 6
+    assert list(scratch.iterdir()) == []
 
 
 def test_masks_of_both_eyes_come_out_of_the_process(studio: Studio, scratch: Path) -> None:
@@ -183,9 +218,8 @@ def run_stand_in(tmp_path: Path, work: str, **more: Any) -> dict[str, Any]:
         f"def work(request, folder, reports):\n    {lines}\n    return {{}}\n"
         "serve(lambda: work)\n"
     )
-    with private_folder() as folder:
-        request = {"readable": more.pop("readable", [])}
-        return run_contained(request, more.pop("allowance", ALLOWANCE), folder, program=(str(script),), **more)
+    request = {"readable": more.pop("readable", [])}
+    return run_contained(request, more.pop("allowance", ALLOWANCE), program=(str(script),), **more)
 
 
 @pytest.mark.parametrize(
@@ -201,8 +235,8 @@ def run_stand_in(tmp_path: Path, work: str, **more: Any) -> dict[str, Any]:
         ("import os; os.write(3, b'x' * (5 << 20))", "the decoder talks nonsense"),
         ("import os; os.write(3, b'[' * 100_000 + b'\\n')", "the decoder talks nonsense"),
         ('import os; os.write(3, b\'{"pictures": Infinity, "share": 0}\\n\')', "the decoder talks nonsense"),
-        ("reports.end({'result': 3})", "the decoder talks nonsense"),
-        ("reports.end({'error': {'kind': 'input'}})", "the decoder talks nonsense"),
+        ("reports._send({'result': 3})", "the decoder talks nonsense"),
+        ("reports.fail({'kind': 'input'})", "the decoder talks nonsense"),
     ],
 )
 def test_a_decoder_that_misbehaves_is_an_error_of_its_clip(tmp_path: Path, work: str, problem: str) -> None:
@@ -301,7 +335,7 @@ def test_a_decoder_of_roots_is_not_root(tmp_path: Path) -> None:
 
 
 def test_a_decoder_that_stays_after_its_answer_is_ended(tmp_path: Path) -> None:
-    work = "import os, time\nreports.end({'result': {'pid': os.getpid()}})\ntime.sleep(60)"
+    work = "import os, time\nreports.end({'pid': os.getpid()})\ntime.sleep(60)"
     pid = run_stand_in(tmp_path, work, patience=Patience(max_exit_s=0.3))["pid"]
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)

@@ -2,7 +2,7 @@
 
 from contract.intake.limits import ClipLimits
 from worker.input.clip.opening import find_calibration, open_clip
-from worker.input.clip.split import FrameSplit, held_out_frames, split_frames, spread
+from worker.input.clip.split import FrameSplit, held_out_frames, split_frames, spread, training_frames
 from worker.input.clip.types import DepthClip, Eye, StereoClip
 
 __all__ = [
@@ -16,4 +16,5 @@ __all__ = [
     "open_clip",
     "split_frames",
     "spread",
+    "training_frames",
 ]

@@ -71,6 +71,12 @@ def held_out_frames(frame_count: int, holdout: str) -> list[int]:
     return sorted(wanted) if frame_count >= MIN_FRAMES else []
 
 
+def training_frames(frame_count: int, holdout: str) -> list[int]:
+    """The frames that are not held out, rising, those that repeat a held-out one among them. InputError likewise."""
+    held_out = set(held_out_frames(frame_count, holdout))
+    return [index for index in range(frame_count) if index not in held_out]
+
+
 def check_holdout(holdout: str) -> None:
     """Refuse what is neither a rule of split_frames nor a list of frames. It does not know the clip's frames.
 

@@ -1,7 +1,8 @@
 """`python -m worker.input.decode.child`: the process that reads files from outside.
 
-It reads one request as JSON from its input, confines itself, and only then loads the decoders. It answers in lines of
-JSON: any number of {"pictures": ..., "share": ..., "field": ...}, then one {"result": ...} or {"error": ...}.
+It loads the decoders, reads one request as JSON from its input, confines itself, and only then opens files from
+outside. It answers in lines of JSON: any number of {"pictures": ..., "frames": ..., "share": ..., "field": ...}; for a
+stereo clip one {"opened": ...} before its first frame; then one {"result": ...} or {"error": ...}.
 """
 
 from __future__ import annotations
@@ -23,19 +24,26 @@ Work = Callable[[dict[str, Any], Path, Reports], dict[str, Any]]
 
 
 def serve(work_of: Callable[[], Work]) -> None:
-    """Read the request, confine this process, work, answer. work_of imports what the work needs."""
+    """Import what the work needs, by work_of, read the request, confine this process, work, answer.
+
+    It may be started long before there is a request, and ends without one when its parent does.
+    """
     with os.fdopen(os.dup(1), "wb") as stream:
         os.dup2(2, 1)  # output of libraries must not mix with the answer
-        request = json.loads(sys.stdin.buffer.readline())
-        reports = Reports(stream)
+        work = work_of()
+        line = sys.stdin.buffer.readline()
+        if not line:
+            return
+        request = json.loads(line)
         folder = Path.cwd()
         granted = lock_in(Allowance(**request["allowance"]), [Path(each) for each in request["readable"]], folder)
         if os.getppid() != request["parent"]:  # it ended before lock_in could ask the kernel to watch it
             return
+        reports = Reports(stream, granted)
         try:
-            reports.end({"result": work_of()(request, folder, reports) | {"granted": granted}})
+            reports.end(work(request, folder, reports))
         except Exception as error:
-            reports.end({"error": _described(error)})
+            reports.fail(_described(error))
 
 
 def _described(error: Exception) -> dict[str, Any]:

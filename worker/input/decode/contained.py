@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import logging
@@ -13,8 +14,9 @@ import subprocess
 import sys
 import tempfile
 import time
+import weakref
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,8 @@ MAX_TOTAL_S = 1800.0  # the largest clip allowed takes minutes
 MAX_ANSWER_BYTES = 4 << 20  # a line of the answer; it grows with warnings, not with frames
 POLL_S = 0.1  # a stop is noticed within this time
 MAX_EXIT_S = 5.0  # between answer and exit; a process that lives on could change the arrays that the worker maps
+MAX_DEATH_S = 0.5  # between the end of its output and its exit, if it gave no answer
+END = b"\n"  # of the output; no line is one
 
 PROGRAM = ("-m", "worker.input.decode.child")
 NONSENSE = "the decoder talks nonsense"
@@ -49,141 +53,209 @@ class Patience:
     max_exit_s: float = MAX_EXIT_S
 
 
-@contextmanager
-def private_folder() -> Iterator[Path]:
-    """A new folder that only this user may enter; removed with all that is in it."""
-    folder = Path(tempfile.mkdtemp(prefix="intrasplat-")).resolve()
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+class Decoder:
+    """A decoding process with a folder of its own, from its start to its end. It answers one request.
+
+    folder   where it writes its arrays; only this user may enter it, and it is removed with the process
+    opened   what it told of the clip before the first frame; None until then
+    frames   how many frames of both eyes are complete in its files
+    result   its last words; None until then
+    """
+
+    def __init__(self, program: Sequence[str] = PROGRAM) -> None:
+        """Start the process. Until it is asked it only loads its libraries.
+
+        The kernel ends it with the thread that calls this: call it from one that lives as long as the process.
+        """
+        self.folder = Path(tempfile.mkdtemp(prefix="intrasplat-")).resolve()
+        self.opened: dict[str, Any] | None = None
+        self.frames = 0
+        self.result: dict[str, Any] | None = None
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", *program],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                cwd=self.folder,
+                env=_environment(self.folder),
+                umask=0o077,
+                start_new_session=True,  # Ctrl-C is for the parent to answer
+            )
+        except BaseException:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            raise
+        self.close: Callable[[], None] = weakref.finalize(self, _end_and_remove, self._process, self.folder)
+        """End the process, if it still runs, and remove its folder."""
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.poll() is None
+
+    def ask(
+        self,
+        request: dict[str, Any],
+        allowance: Allowance,
+        on_report: OnReport = lambda share: None,
+        should_stop: Callable[[], bool] = lambda: False,
+        patience: Patience = Patience(),
+    ) -> None:
+        """Give the process its request. While this process waits for it, on_report gets the share done until the clip
+        is opened, and should_stop is called at least every POLL_S."""
+        self._allowance, self._on_report, self._should_stop, self._patience = (
+            allowance,
+            on_report,
+            should_stop,
+            patience,
+        )
+        self._field, self._pictures = "clip", -1
+        self._advanced_s = time.monotonic()
+        self._end_s = self._advanced_s + patience.max_total_s
+        self._lines = _lines(self._process)
+        assert self._process.stdin is not None
+        asked = request | {"allowance": asdict(allowance), "parent": os.getpid()}
+        with contextlib.suppress(BrokenPipeError), self._process.stdin as stdin:  # until_ended() tells why
+            stdin.write(json.dumps(asked).encode() + b"\n")
+
+    def until_opened(self) -> None:
+        """Wait until `opened` or `result` is there. Raises what until_ended raises."""
+        self._wait(lambda: self.opened is not None)
+
+    def until_frame(self, index: int) -> None:
+        """Wait until frame `index` is complete in the files, or `result` is there. Raises what until_ended raises."""
+        self._wait(lambda: self.frames > index)
+
+    def until_ended(self) -> dict[str, Any]:
+        """Wait for the result. An error closes this.
+
+        Raises:
+            InputError, LimitError: as the process raised them; or it crashed, hung, or exceeded its allowance.
+            Cancelled: should_stop said so.
+            UnavailableError: the disk is full.
+        """
+        self._wait(lambda: False)
+        assert self.result is not None
+        return self.result
+
+    def _wait(self, enough: Callable[[], bool]) -> None:
+        try:
+            while self.result is None and not enough():
+                self._take(next(self._lines, END))
+                self._check()
+        except MALFORMED:
+            self.close()
+            raise _undecodable(self._field, NONSENSE) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def _take(self, line: bytes | None) -> None:
+        """Note a line, or that there was none for a while."""
+        if line is None:
+            return
+        told = json.loads(line) if line != END else {}
+        if line == END or "result" in told or "error" in told:
+            self.result = self._ended(dict(told))
+        elif "opened" in told:
+            self.opened = self.opened or dict(told["opened"])
+        else:
+            self._note(told)
+
+    def _note(self, told: dict[str, Any]) -> None:
+        self._field = "calibration" if told.get("field") == "calibration" else "clip"
+        if int(told["pictures"]) > self._pictures:
+            self._pictures, self._advanced_s = int(told["pictures"]), time.monotonic()
+        self.frames = max(self.frames, int(told["frames"]))
+        if self.opened is None:
+            self._on_report(min(1.0, max(0.0, float(told["share"]))))
+
+    def _check(self) -> None:
+        if self.result is not None:
+            return
+        if self._should_stop():
+            raise Cancelled("Stopped during stage 'decode'.")
+        now_s = time.monotonic()
+        if now_s - self._advanced_s > self._patience.max_silence_s:
+            raise _undecodable(self._field, f"the decoder made no progress for {self._patience.max_silence_s:g} s")
+        if now_s > self._end_s:
+            raise _undecodable(self._field, f"the decoder took more than {self._patience.max_total_s:g} s")
+
+    def _ended(self, answer: dict[str, Any]) -> dict[str, Any]:
+        """The result that the process's last line, empty if it had none, and its exit give."""
+        try:
+            self._process.wait(self._patience.max_exit_s if answer else MAX_DEATH_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        return _result(answer or None, self._process.returncode, self._field, self._allowance)
+
+
+_ready: list[Decoder] = []
+"""A process that has loaded its libraries and waits for its request."""
+
+
+def keep_decoder_ready() -> None:
+    """Start the next clip's decoding process now, if none waits. Call it from the thread that will decode."""
+    if not _ready:
+        _ready.append(Decoder())
+
+
+def take_decoder() -> Decoder:
+    """The process that waits, or a new one."""
+    decoder = _ready.pop() if _ready else Decoder()
+    return decoder if decoder.is_alive else Decoder()
 
 
 def run_contained(
     request: dict[str, Any],
     allowance: Allowance,
-    folder: Path,
     on_report: OnReport = lambda share: None,
     should_stop: Callable[[], bool] = lambda: False,
     program: Sequence[str] = PROGRAM,
     patience: Patience = Patience(),
 ) -> dict[str, Any]:
-    """The result of the decoding process, which writes its arrays into `folder`.
-
-    on_report gets the share done. should_stop is called at least every POLL_S.
-
-    Raises:
-        InputError, LimitError: as the process raised them; or it crashed, hung, or exceeded its allowance.
-        Cancelled: should_stop said so.
-        UnavailableError: the disk is full.
-    """
-    process = subprocess.Popen(
-        [sys.executable, "-P", *program],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        cwd=folder,
-        env=_environment(folder),
-        umask=0o077,
-        start_new_session=True,  # Ctrl-C is for the parent to answer
-    )
-    assert process.stdin is not None
-    watch = _Watch(process, on_report, should_stop, patience)
-    try:
-        with process.stdin as stdin:
-            stdin.write(json.dumps(request | {"allowance": asdict(allowance), "parent": os.getpid()}).encode() + b"\n")
-        answer = watch.answer()
-    except BrokenPipeError:
-        answer = None
-    finally:
-        _end(process, patience.max_exit_s if watch.answered else 0.0)
-        if process.stdout is not None:
-            process.stdout.close()
-    try:
-        return _result(answer, process.returncode, watch.field, allowance)
-    except MALFORMED:
-        raise _undecodable(watch.field, NONSENSE) from None
+    """The result of a decoding process. Raises what Decoder.until_ended raises."""
+    with closing(Decoder(program)) as decoder:
+        decoder.ask(request, allowance, on_report, should_stop, patience)
+        return decoder.until_ended()
 
 
-def _end(process: subprocess.Popen[bytes], max_exit_s: float) -> None:
-    """Wait max_exit_s for the process to exit, then kill it."""
-    try:
-        process.wait(max_exit_s)
-    except subprocess.TimeoutExpired:
+def _end_and_remove(process: subprocess.Popen[bytes], folder: Path) -> None:
+    if process.poll() is None:
         process.kill()
         process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with contextlib.suppress(BrokenPipeError):
+                pipe.close()
+    shutil.rmtree(folder, ignore_errors=True)
 
 
-class _Watch:
-    """Reads a process's lines. Raises if it is silent, slow or malformed, or if the caller wants to stop."""
+def _lines(process: subprocess.Popen[bytes]) -> Iterator[bytes | None]:
+    """Whole lines as they arrive; None after POLL_S without a whole line.
 
-    def __init__(
-        self,
-        process: subprocess.Popen[bytes],
-        on_report: OnReport,
-        should_stop: Callable[[], bool],
-        patience: Patience,
-    ) -> None:
-        self._process, self._on_report, self._should_stop = process, on_report, should_stop
-        self._patience = patience
-        self._pictures = -1
-        self.field = "clip"
-        self.answered = False
-
-    def answer(self) -> dict[str, Any] | None:
-        """The last line; None if the process exited without one."""
-        end_s = time.monotonic() + self._patience.max_total_s
-        self._advanced_s = time.monotonic()
-        for line in self._lines():
-            if line is None:
-                self._check(end_s)
-                continue
-            try:
-                told = json.loads(line)
-                if "result" in told or "error" in told:
-                    self.answered = True
-                    return dict(told)
-                self._note(told)
-            except MALFORMED:
-                raise _undecodable(self.field, NONSENSE) from None
-            self._check(end_s)
-        return None
-
-    def _note(self, told: dict[str, Any]) -> None:
-        self.field = "calibration" if told.get("field") == "calibration" else "clip"
-        if int(told["pictures"]) > self._pictures:
-            self._pictures, self._advanced_s = int(told["pictures"]), time.monotonic()
-        self._on_report(min(1.0, max(0.0, float(told["share"]))))
-
-    def _check(self, end_s: float) -> None:
-        if self._should_stop():
-            raise Cancelled("Stopped during stage 'decode'.")
-        now_s = time.monotonic()
-        if now_s - self._advanced_s > self._patience.max_silence_s:
-            raise _undecodable(self.field, f"the decoder made no progress for {self._patience.max_silence_s:g} s")
-        if now_s > end_s:
-            raise _undecodable(self.field, f"the decoder took more than {self._patience.max_total_s:g} s")
-
-    def _lines(self) -> Iterator[bytes | None]:
-        """Whole lines as they arrive; None after POLL_S without a whole line."""
-        assert self._process.stdout is not None
-        descriptor = self._process.stdout.fileno()
-        poll = select.poll()
-        poll.register(descriptor, select.POLLIN | select.POLLHUP)
-        rest = b""
-        while True:
-            if not poll.poll(POLL_S * 1000):
-                yield None
-                continue
-            piece = os.read(descriptor, 1 << 16)
-            if not piece:
-                return
-            *lines, rest = (rest + piece).split(b"\n")
-            yield from lines
-            if not lines:
-                yield None
-            if len(rest) > MAX_ANSWER_BYTES:
-                raise _undecodable(self.field, NONSENSE)
+    Raises:
+        ValueError: a line is longer than MAX_ANSWER_BYTES.
+    """
+    assert process.stdout is not None
+    descriptor = process.stdout.fileno()
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN | select.POLLHUP)
+    rest = b""
+    while True:
+        if not poll.poll(POLL_S * 1000):
+            yield None
+            continue
+        piece = os.read(descriptor, 1 << 16)
+        if not piece:
+            return
+        *lines, rest = (rest + piece).split(b"\n")
+        yield from lines
+        if not lines:
+            yield None
+        if len(rest) > MAX_ANSWER_BYTES:
+            raise ValueError("a line without an end")
 
 
 def _environment(folder: Path) -> dict[str, str]:

@@ -6,7 +6,7 @@ Symbols: T frames, H W pixels of one eye.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,9 @@ from worker.input.clip import ClipLimits, DepthClip, StereoClip
 from worker.input.clip.files import MAX_FOLDER_DEPTH
 from worker.input.clip.layouts import registered_files
 from worker.input.clip.types import RgbFrame
-from worker.input.decode.contained import MALFORMED, REMEDY, private_folder, run_contained
+from worker.input.decode.contained import MALFORMED, REMEDY, Decoder, take_decoder
 from worker.input.decode.guard import LIMITED_MEMORY, PROTECTIONS, Allowance
-from worker.input.decode.handover import DEPTH, MASKS, map_array
+from worker.input.decode.handover import EYES, MASKS, ArrayFile, map_array
 from worker.machine.hooks import Hooks, Progress
 
 STAGE = "decode"
@@ -36,21 +36,39 @@ MAX_CPU_S = 1800  # of all cores together; the same as MAX_TOTAL_S of one core
 
 @dataclass(frozen=True)
 class StereoRecording:
-    """A stereo clip, whose decoded frames are mapped into memory, and its calibration."""
+    """A stereo clip, whose frames arrive while they are decoded, and its calibration.
+
+    clip.pairs waits for each frame, and raises what decode_clip raises when decoding fails on the way. It can be read
+    again. close() ends decoding; a recording that was read to its end, or that nobody holds any more, is closed.
+    """
 
     clip: StereoClip
     calibration: StereoCalibration
+    close: Callable[[], None]
 
 
-@dataclass(frozen=True)
-class _MappedPairs:
-    """Left and right frames [T, H, W, 3]; each call starts again from frame 0."""
+class _ArrivingPairs:
+    """Left and right frames [H, W, 3] out of the files of a process that may still write them; the same again later.
 
-    left: NDArray[np.uint8]
-    right: NDArray[np.uint8]
+    They are read, not mapped: nothing that the process does to its files harms who reads them.
+    """
+
+    def __init__(self, decoder: Decoder, size: tuple[int, int, int]) -> None:
+        self._decoder, self._size = decoder, size
+        self._files: dict[str, ArrayFile] = {}
 
     def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]:
-        return zip(self.left, self.right, strict=True)
+        for index in range(self._size[0]):
+            self._decoder.until_frame(index)
+            try:
+                self._files = self._files or {eye: ArrayFile(self._decoder.folder, eye, self._size) for eye in EYES}
+                left, right = (self._files[eye].frame(index) for eye in EYES)
+            except (ValueError, OSError) as error:
+                raise _unfit(error) from error
+            if index + 1 == self._size[0]:
+                self._decoder.until_ended()
+                self._decoder.close()
+            yield left, right
 
 
 def decode_clip(
@@ -67,7 +85,8 @@ def decode_clip(
 
     Another process decodes every frame into a private folder below tempfile.gettempdir(). Its memory and time are
     limited; if the kernel allows it, it has no network and can read only these files. `assumptions` list the
-    protections that were in force. The folder is removed before this returns; its mapped arrays live with the clip.
+    protections that were in force. A clip with depth is whole when this returns; of a stereo clip the process goes on
+    decoding the frames. The folder is removed with the process; arrays and open files live with the clip.
 
     Raises:
         InputError, LimitError: as open_clip and load_calibration raise them; or the stereo clip has no calibration; or
@@ -87,19 +106,25 @@ def decode_clip(
         "limits": limits.numbers(),
     }
     allowance = Allowance(LIBRARIES_BYTES + limits.decoded_bytes, limits.decoded_bytes, MAX_CPU_S)
-    with private_folder() as folder:
-        told = run_contained(
-            request,
-            allowance,
-            folder,
-            on_report=lambda share: hooks.on_progress(Progress(STAGE, share)),
-            should_stop=hooks.should_stop,
-        )
-        try:
-            return _received(told, folder, allowance)
-        except (*MALFORMED, OSError) as error:
-            problem = f"it cannot be decoded: the decoder's answer does not fit ({type(error).__name__})."
-            raise InputError("clip", problem, REMEDY) from error
+    decoder = take_decoder()
+    decoder.ask(
+        request,
+        allowance,
+        on_report=lambda share: hooks.on_progress(Progress(STAGE, share)),
+        should_stop=hooks.should_stop,
+    )
+    decoder.until_opened()
+    try:
+        return _received(decoder, allowance)
+    except (*MALFORMED, OSError) as error:
+        decoder.close()
+        raise _unfit(error) from error
+
+
+def _unfit(error: Exception) -> InputError:
+    return InputError(
+        "clip", f"it cannot be decoded: the decoder's answer does not fit ({type(error).__name__}).", REMEDY
+    )
 
 
 def _reached(path: str) -> list[str]:
@@ -113,18 +138,19 @@ def _reached(path: str) -> list[str]:
     return found
 
 
-def _received(told: dict[str, Any], folder: Path, allowance: Allowance) -> StereoRecording | DepthClip:
+def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | DepthClip:
+    told, folder = decoder.opened or decoder.result or {}, decoder.folder
     frames, height, width = (int(each) for each in told["size"])
     size = (frames, height, width)
     if min(size) < 1 or frames * height * width > allowance.file_bytes:
         raise ValueError(f"a clip of {size}")
-    frame_times_s = map_array(folder, "frame_times_s", size).copy()
+    frame_times_s = ArrayFile(folder, "frame_times_s", size).whole()
     if not np.isfinite(frame_times_s).all():
         raise ValueError("frame times that are not finite")
     assumptions = (*_notices(told["assumptions"]), _protection(told["granted"], allowance))
     warnings = _notices(told["warnings"])
-    if told["kind"] == DEPTH:
-        return DepthClip(
+    if decoder.opened is None:
+        whole = DepthClip(
             rgb=map_array(folder, "rgb", size),
             tissue=map_array(folder, "tissue", size) != 0,
             depth_mm=_checked_depth(map_array(folder, "depth_mm", size)),
@@ -135,10 +161,19 @@ def _received(told: dict[str, Any], folder: Path, allowance: Allowance) -> Stere
             assumptions=assumptions,
             warnings=warnings,
         )
-    pairs = _MappedPairs(map_array(folder, "left", size), map_array(folder, "right", size))
-    tissue, tissue_right = (map_array(folder, n, size) != 0 if n in told["masked"] else None for n in MASKS)
+        decoder.close()
+        return whole
+    tissue, tissue_right = (_tissue(folder, name, size) if name in told["masked"] else None for name in MASKS)
+    pairs = _ArrivingPairs(decoder, size)
     clip = StereoClip(frames, height, width, pairs, tissue, frame_times_s, assumptions, warnings, tissue_right)
-    return StereoRecording(clip, _calibration(told["calibration"]))
+    return StereoRecording(clip, _calibration(told["calibration"]), decoder.close)
+
+
+def _tissue(folder: Path, name: str, size: tuple[int, int, int]) -> NDArray[np.bool_]:
+    file, tissue = ArrayFile(folder, name, size), np.empty(size, np.bool_)
+    for index, mask in enumerate(tissue):
+        np.not_equal(file.frame(index), 0, out=mask)
+    return tissue
 
 
 def _notices(told: Any) -> tuple[Notice, ...]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import stat
+import weakref
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-STEREO, DEPTH = "stereo", "depth"
+EYES = ("left", "right")
 MASKS = ("tissue", "tissue_right")
 """The arrays that a stereo clip may lack."""
 
@@ -50,25 +51,69 @@ def write_arrays(folder: Path, arrays: Iterable[tuple[str, NDArray[Any]]]) -> No
             if name not in files:
                 files[name] = (folder / name).open("xb")
             files[name].write(np.ascontiguousarray(array, dtype=_TYPES[name]).data)
+            files[name].flush()  # before more is asked for
     finally:
         for file in files.values():
             file.close()
 
 
+class ArrayFile:
+    """An array's file in the folder of a process that may still write it: frames are read out of it.
+
+    Raises:
+        ValueError: it is not a regular file.
+        OSError: there is no such file.
+    """
+
+    def __init__(self, folder: Path, name: str, size: tuple[int, int, int]) -> None:
+        """size: T, H, W of the clip."""
+        self._name, self._shape, self._dtype = name, _SHAPES[name](*size), np.dtype(_TYPES[name])
+        self._descriptor = _open(folder, name)
+        weakref.finalize(self, os.close, self._descriptor)
+
+    def frame(self, index: int) -> NDArray[Any]:
+        """One frame's part of the array. ValueError if the file does not reach so far."""
+        return self._read(self._shape[1:], index)
+
+    def whole(self) -> NDArray[Any]:
+        """The whole array. ValueError if the file has another size."""
+        if os.fstat(self._descriptor).st_size != int(np.prod(self._shape)) * self._dtype.itemsize:
+            raise ValueError(f"{self._name} has another size than {self._shape}")
+        return self._read(self._shape, 0)
+
+    def _read(self, shape: tuple[int, ...], index: int) -> NDArray[Any]:
+        values = np.empty(shape, self._dtype)
+        left = values.reshape(-1).view(np.uint8).data
+        place = index * len(left)
+        while left:
+            read = os.preadv(self._descriptor, [left], place)
+            if not read:
+                raise ValueError(f"{self._name} ends at byte {place}")
+            left, place = left[read:], place + read
+        return values
+
+
 def map_array(folder: Path, name: str, size: tuple[int, int, int]) -> NDArray[Any]:
     """The array of that name in a clip of `size` (T, H, W), mapped into memory. Writing to it changes no file.
 
-    The file may be removed at once; the mapping lives as long as the array.
+    The process that wrote it has ended. The file may be removed at once; the mapping lives as long as the array.
 
     Raises:
         ValueError: it is not a regular file, or its size is not the array's.
         OSError: there is no such file.
     """
     shape, dtype = _SHAPES[name](*size), np.dtype(_TYPES[name])
-    descriptor = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    with open(descriptor, "rb") as file:
-        found = os.fstat(descriptor)
-        wanted_bytes = int(np.prod(shape)) * dtype.itemsize
-        if not stat.S_ISREG(found.st_mode) or found.st_size != wanted_bytes:
-            raise ValueError(f"{name} has {found.st_size} bytes, not {wanted_bytes}")
+    with open(_open(folder, name), "rb") as file:
+        found_bytes, wanted_bytes = os.fstat(file.fileno()).st_size, int(np.prod(shape)) * dtype.itemsize
+        if found_bytes != wanted_bytes:
+            raise ValueError(f"{name} has {found_bytes} bytes, not {wanted_bytes}")
         return np.asarray(np.memmap(file, dtype=dtype, mode="c", shape=shape))
+
+
+def _open(folder: Path, name: str) -> int:
+    """The descriptor of an array's file."""
+    descriptor = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise ValueError(f"{name} is not a regular file")
+    return descriptor

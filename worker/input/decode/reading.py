@@ -1,5 +1,7 @@
 """What the decoding process does: open the clip, read its calibration, write down every frame.
 
+A stereo clip is told of before its frames are read, so that the parent can work on those that are there.
+
 Symbols: T frames, H W pixels of one eye.
 """
 
@@ -16,14 +18,15 @@ from contract.wire.options import ClipOptions
 from worker.input.calibration import load_calibration
 from worker.input.clip import ClipLimits, DepthClip, StereoClip, find_calibration, open_clip
 from worker.input.clip.layouts import register_layout
-from worker.input.decode.handover import DEPTH, MASKS, STEREO, write_arrays
+from worker.input.decode.handover import MASKS, write_arrays
 from worker.input.decode.reports import Reports
 
 _OPENING_SHARE = 0.5  # of the stage; a video is walked once to count its frames, and once to hand them over
 
 
 def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[str, Any]:
-    """Write the clip's arrays into `folder`. Returns the rest of the clip, for JSON."""
+    """Write the clip's arrays into `folder`. Returns the rest of a clip with depth, for JSON; a stereo clip's is told
+    when it is opened, and masks and times are complete by then."""
     max_frames = request["limits"]["frames"]
     opened = 0
 
@@ -48,14 +51,16 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
     }
     if isinstance(clip, DepthClip):
         write_arrays(folder, _depth_arrays(clip, reports))
-        return told | {"kind": DEPTH, "intrinsics": clip.intrinsics.numbers()}
+        return told | {"intrinsics": clip.intrinsics.numbers()}
     reports.reading("calibration")
     path = given_calibration or find_calibration(paths["path"], folder, limits)
     calibration = _calibration(path, clip)
     reports.reading("clip")
-    write_arrays(folder, _stereo_arrays(clip, reports))
     masked = [name for name in MASKS if getattr(clip, name) is not None]
-    return told | {"kind": STEREO, "masked": masked, "calibration": calibration}
+    write_arrays(folder, [("frame_times_s", clip.frame_times_s), *((name, getattr(clip, name)) for name in masked)])
+    reports.opened(told | {"masked": masked, "calibration": calibration})
+    write_arrays(folder, _stereo_frames(clip, reports))
+    return {}
 
 
 def _depth_arrays(clip: DepthClip, reports: Reports) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -70,19 +75,15 @@ def _depth_arrays(clip: DepthClip, reports: Reports) -> Iterator[tuple[str, NDAr
             yield name, frame
 
 
-def _stereo_arrays(clip: StereoClip, reports: Reports) -> Iterator[tuple[str, NDArray[Any]]]:
-    yield "frame_times_s", clip.frame_times_s
-    for name in MASKS:
-        if (tissue := getattr(clip, name)) is not None:
-            yield name, tissue
+def _stereo_frames(clip: StereoClip, reports: Reports) -> Iterator[tuple[str, NDArray[Any]]]:
     found = 0
     for found, (left, right) in enumerate(clip.pairs(), start=1):
         if found > clip.frame_count:
             break
-        reports.share = max(reports.share, _OPENING_SHARE + (1 - _OPENING_SHARE) * found / clip.frame_count)
-        reports.picture()
         yield "left", left
         yield "right", right
+        reports.frames = found  # write_arrays asks for more when it has written these
+        reports.picture()
     if found < clip.frame_count:
         raise InputError("clip", f"it ended after {found} of {clip.frame_count} frames.", "Give the whole recording.")
 

@@ -7,19 +7,22 @@ import threading
 import time
 from typing import Any, BinaryIO
 
-REPORT_PERIOD_S = 0.05
+REPORT_PERIOD_S = 0.02
 
 
 class Reports:
     """Reports progress to the parent, at most once every REPORT_PERIOD_S. Any thread may call it."""
 
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
+    def __init__(self, stream: BinaryIO, granted: list[str]) -> None:
+        """granted: the protections in force, which are told with the clip."""
+        self._stream, self._granted = stream, granted
         self._lock = threading.Lock()
         self._pictures = 0
         self._next_s = 0.0
         self.field = "clip"
         self.share = 0.0
+        self.frames = 0
+        """Frames of both eyes that are complete in the files."""
 
     def picture(self) -> None:
         """Count another decoded picture."""
@@ -27,18 +30,32 @@ class Reports:
             self._pictures += 1
             if time.monotonic() >= self._next_s:
                 self._next_s = time.monotonic() + REPORT_PERIOD_S
-                self._send({"pictures": self._pictures, "share": self.share, "field": self.field})
+                self._report()
 
     def reading(self, field: str) -> None:
         """Say that this input is read from now on."""
         with self._lock:
             self.field = field
-            self._send({"pictures": self._pictures, "share": self.share, "field": field})
+            self._report()
 
-    def end(self, answer: dict[str, Any]) -> None:
-        """Send the last line."""
+    def opened(self, told: dict[str, Any]) -> None:
+        """Tell of the clip before its first frame."""
         with self._lock:
-            self._send(answer)
+            self._send({"opened": told | {"granted": self._granted}})
+
+    def end(self, result: dict[str, Any]) -> None:
+        """Send the last line: the result."""
+        with self._lock:
+            self._send({"result": result | {"granted": self._granted}})
+
+    def fail(self, error: dict[str, Any]) -> None:
+        """Send the last line: what went wrong."""
+        with self._lock:
+            self._send({"error": error})
+
+    def _report(self) -> None:
+        told = {"pictures": self._pictures, "frames": self.frames, "share": self.share, "field": self.field}
+        self._send(told)
 
     def _send(self, line: dict[str, Any]) -> None:
         self._stream.write(json.dumps(line, allow_nan=False).encode() + b"\n")

@@ -25,9 +25,18 @@ def decoded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Futu
     """What becomes of every file of the corpus."""
     with ThreadPoolExecutor(AT_ONCE) as threads:
         yield {
-            name: threads.submit(decode_clip, **given(tmp_path_factory.mktemp("hostile"), hostile))
+            name: threads.submit(read_whole, **given(tmp_path_factory.mktemp("hostile"), hostile))
             for name, hostile in CORPUS.items()
         }
+
+
+def read_whole(**files: Path) -> StereoRecording | DepthClip:
+    """The clip, after its last frame."""
+    decoded = decode_clip(**files)
+    if isinstance(decoded, StereoRecording):
+        for _ in decoded.clip.pairs():
+            pass
+    return decoded
 
 
 def given(tmp_path: Path, hostile: Hostile) -> dict[str, Path]:
