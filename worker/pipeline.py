@@ -116,6 +116,7 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
         )
     options = request.options
     if isinstance(decoded, DepthClip):
+        hooks.on_first_moment(decoded.moment(training_frames(decoded.frame_count, options.holdout)[0]))
         return decoded
     depth_range_mm = options.min_depth_mm, options.max_depth_mm
     with closing(decoded):

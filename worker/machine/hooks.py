@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from contract.wire.errors import Cancelled
 
@@ -36,10 +37,15 @@ def never() -> bool:
 
 @dataclass(frozen=True)
 class Hooks:
-    """The caller's callbacks: on_progress is called at least once a second during work, should_stop between steps."""
+    """The caller's callbacks: on_progress is called at least once a second during work, should_stop between steps.
+
+    on_first_moment gets a DepthClip of one frame (worker/input/clip/types.py), as soon as a training frame has depth:
+    long before the others have. It is called at most once, by the thread that calls the stage.
+    """
 
     on_progress: Callable[[Progress], None] = ignore
     should_stop: Callable[[], bool] = never
+    on_first_moment: Callable[[Any], None] = ignore
 
     def report_stage(self, stage: str, fraction: float) -> None:
         """Report how far a stage has come.

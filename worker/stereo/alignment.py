@@ -5,8 +5,9 @@ Symbols: H W pixels of one eye; d disparity, x_left - x_right in px; dy = y_righ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,9 @@ from worker.stereo.matching import Grey, Image, evidence, semi_global
 
 Agreed = Callable[[NDArray[np.uint8], NDArray[np.uint8], int, int], tuple[Image, NDArray[np.bool_]]]
 """The signature of agreed_disparities, which another device may implement."""
+
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""The signature of `map` for one argument."""
 
 FEATURE_WIDTH = 400  # px; images are reduced to it: the median over pairs is as good, in a third of the time
 FEATURES = 1500
@@ -199,14 +203,19 @@ def _check_eyes(beyond_infinity_px: NDArray[np.float64]) -> None:
 
 
 def agreed_disparities(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, count: int
+    left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, count: int, each: Map = map
 ) -> tuple[Image, NDArray[np.bool_]]:
-    """Disparities [F, h, w] of pairs, with low <= d < low + count, and where both matching directions agree."""
-    disparity, agreed = np.empty(left.shape, np.float32), np.empty(left.shape, np.bool_)
-    for i, pair in enumerate(zip(left, right, strict=True)):
-        disparity[i], both = semi_global(*pair, low, count)
-        agreed[i] = evidence(disparity[i], both, pair[0]) > MIN_EVIDENCE
-    return disparity, agreed
+    """Disparities [F, h, w] of pairs, with low <= d < low + count, and where both matching directions agree.
+
+    each: a pool's map does pairs side by side.
+    """
+
+    def of_pair(pair: tuple[Grey, Grey]) -> tuple[Image, NDArray[np.bool_]]:
+        disparity, both = semi_global(*pair, low, count)
+        return disparity, evidence(disparity, both, pair[0]) > MIN_EVIDENCE
+
+    disparity, agreed = zip(*each(of_pair, zip(left, right, strict=True)), strict=True)
+    return np.stack(disparity), np.stack(agreed)
 
 
 def _resized(image: Grey, size: tuple[int, int]) -> Grey:

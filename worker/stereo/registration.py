@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import RightEye
 from worker.input.camera import Intrinsics
-from worker.stereo.alignment import FEATURE_WIDTH, RowShift
+from worker.stereo.alignment import FEATURE_WIDTH, Map, RowShift
 from worker.stereo.matching import SATURATED_LEVEL, Image, MatchPlan, match
 from worker.stereo.turn import AnyImage, Rgb, Turn
 
@@ -102,13 +103,16 @@ class Registration:
             turn = turn_of_matches(matches, shift.shift_px, calibrated)
         return cls(calibrated, baseline_mm, turn, Colours(), shift.matches, _residual_px(matches, turn, calibrated))
 
-    def refined(self, pairs: Sequence[MatchedPair], matches: NDArray[np.float64]) -> Registration:
-        """The finer turn, and the colours, from pairs that were rectified by this one."""
+    def refined(self, pairs: Sequence[MatchedPair], matches: NDArray[np.float64], each: Map = map) -> Registration:
+        """The finer turn, and the colours, from pairs that were rectified by this one.
+
+        each: a pool's map does pairs side by side.
+        """
         turn = self.turn
         if self.matches >= MIN_TURN_MATCHES:
-            turn = turn_of_pictures(pairs, self.turn, self.calibrated)
+            turn = turn_of_pictures(pairs, self.turn, self.calibrated, each)
         residual_px = _residual_px(matches, turn, self.calibrated) if self.matches else 0.0
-        return replace(self, turn=turn, colours=colours_of(pairs), residual_px=residual_px)
+        return replace(self, turn=turn, colours=colours_of(pairs, each), residual_px=residual_px)
 
     @property
     def camera(self) -> Intrinsics:
@@ -143,11 +147,9 @@ class Registration:
         is_usual = all(MIN_GAIN <= gain <= 1 / MIN_GAIN for gain in colours.gain)
         return is_line and is_usual and colours.largest_levels >= MIN_COLOUR_LEVELS
 
-    def recolour(self, right: Rgb) -> None:
-        """Give the right pictures [T, H, W, 3] the left eye's colours, in place."""
-        if self.recolours:
-            for i, picture in enumerate(right):
-                right[i] = self.colours.corrected(picture)
+    def recoloured(self, right: Rgb) -> Rgb:
+        """The right picture [H, W, 3] in the left eye's colours; as it is where they hardly differ."""
+        return self.colours.corrected(right) if self.recolours else right
 
     @property
     def told(self) -> RightEye:
@@ -260,15 +262,15 @@ class MatchedPair:
         return np.asarray(moved, np.float32)
 
 
-def turn_of_pictures(pairs: Sequence[MatchedPair], turn: Turn, camera: Intrinsics) -> Turn:
+def turn_of_pictures(pairs: Sequence[MatchedPair], turn: Turn, camera: Intrinsics, each: Map = map) -> Turn:
     """A finer turn, from pairs that were rectified by `turn`: after matching along rows only rows are left to fit.
 
     One step of Gauss and Newton is repeated FINE_STEPS times on pictures without their coarse brightness.
     """
     numbers = np.zeros(len(astuple(turn)))
     for _ in range(FINE_STEPS):
-        found = [_row_errors(pair, numbers, camera) for pair in pairs]
-        slopes, missing = (np.concatenate(each) for each in zip(*found, strict=True))
+        found = each(partial(_row_errors, numbers=numbers, camera=camera), pairs)
+        slopes, missing = (np.concatenate(parts) for parts in zip(*found, strict=True))
         if len(missing) < MIN_SAMPLE:
             return turn
         numbers = numbers + _step(slopes, missing, numbers)
@@ -277,14 +279,14 @@ def turn_of_pictures(pairs: Sequence[MatchedPair], turn: Turn, camera: Intrinsic
     return Turn(*(np.array(astuple(turn)) + numbers).tolist())
 
 
-def colours_of(pairs: Sequence[MatchedPair]) -> Colours:
+def colours_of(pairs: Sequence[MatchedPair], each: Map = map) -> Colours:
     """The eyes' gain and offset where they match, without highlights; none where too little matches."""
-    found = [_colour_samples(pair) for pair in pairs]
-    left, right = (np.concatenate(each).astype(np.float64) for each in zip(*found, strict=True))
+    found = each(_colour_samples, pairs)
+    left, right = (np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True))
     if len(left) < MIN_SAMPLE:
         matched = sum(int((pair.sure & _central(pair.x)).sum()) for pair in pairs)
         return Colours(correlation=0.0 if matched > 40 * MIN_SAMPLE else None)
-    lines = [_line(*channels) for channels in zip(left.T, right.T, strict=True)]
+    lines = each(lambda channels: _line(*channels), zip(left.T, right.T, strict=True))
     gain, offset, correlation = zip(*lines, strict=True)
     return Colours(gain, offset, min(correlation))
 

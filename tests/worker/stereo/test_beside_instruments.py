@@ -10,7 +10,7 @@ from tests.worker.stereo.test_stereo import BASELINE_MM, FX_PX, OFFSET_PX, clip_
 from worker.input.calibration import rectify
 from worker.phantom import PhantomSettings, make_phantom
 from worker.stereo import estimate_depth
-from worker.stereo.depth import BESIDE_PX
+from worker.stereo.frames import BESIDE_PX
 
 
 def test_tissue_beside_an_instrument_has_no_depth_and_the_rest_keeps_its_own() -> None:

@@ -317,8 +317,8 @@ def test_progress_rises_to_one_and_names_its_stage() -> None:
 
 @pytest.mark.parametrize(
     "asked",
-    [0, 3, 5, 9],
-    ids=["while decoding", "at the end of decoding", "while matching", "while the right eye's depth is moved"],
+    [0, 3, 5],
+    ids=["while decoding", "at the end of decoding", "while matching"],
 )
 def test_a_stop_is_obeyed_in_every_part(asked: int) -> None:
     questions: list[None] = []

@@ -6,8 +6,8 @@ Symbols of the whole worker: T frames, H W pixels (rows, columns), N Gaussians, 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,11 @@ class Eye:
         """Model time of each frame, t_i = i / T, in [0, 1)."""
         return np.arange(self.frame_count) / self.frame_count
 
+    def arrays_at(self, frames: slice) -> dict[str, Any]:
+        """The eye's arrays by name, of some frames alone: views."""
+        names = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera")
+        return {name: getattr(self, name)[frames] for name in names}
+
 
 @dataclass(frozen=True)
 class DepthClip(Eye):
@@ -93,3 +98,9 @@ class DepthClip(Eye):
     def eyes(self) -> tuple[Eye, ...]:
         """Left, and right if there is one."""
         return (self,) if self.right is None else (self, self.right)
+
+    def moment(self, index: int) -> DepthClip:
+        """A clip of one frame of both eyes, which views this one's arrays."""
+        only = slice(index, index + 1)
+        right = None if self.right is None else replace(self.right, **self.right.arrays_at(only))
+        return replace(self, right=right, frame_times_s=self.frame_times_s[only], **self.arrays_at(only))
