@@ -203,6 +203,7 @@ class _Coarse:
         self.points_mm: Floats = (grid.rays * self.depth_mm[..., None]) @ self.axes.T + self.place_mm
         confidence = grid.sample(clip.depth_confidence[index]) / np.float32(255)
         self.trust = np.where(usable, confidence, np.float32(0))
+        clip.let_go(index)
 
 
 def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats) -> tuple[Floats, Floats, Floats]:

@@ -22,6 +22,7 @@ from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip
 from worker.machine.cores import cores
 from worker.machine.hooks import Hooks, Progress
+from worker.machine.mapped import let_go, mapped_zeros
 from worker.machine.opencv import one_opencv_thread
 from worker.stereo.alignment import (
     Agreed,
@@ -125,14 +126,16 @@ def _receive(
     Features are searched while later frames arrive.
     """
     shape = (clip.frame_count, clip.intrinsics.height, clip.intrinsics.width, 3)
-    rgb, right = (np.empty(shape, np.uint8) for _ in range(2))
+    rgb, right = (mapped_zeros(shape, np.uint8) for _ in range(2))
     features: list[Future[Features]] = []
     decoded = 0
     for i, (left_frame, right_frame) in enumerate(clip.pairs()):
         if i >= clip.frame_count:
             break
         _check_stop(hooks)
-        rgb[i], right[i] = left_frame, right_frame
+        for frames, frame in ((rgb, left_frame), (right, right_frame)):
+            frames[i] = frame
+            let_go(frames[i])
         if i in aligned:
             features += [pool.submit(find_features, grey_of(eye)) for eye in (left_frame, right_frame)]
         decoded = i + 1

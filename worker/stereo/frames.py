@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.input.clip.types import DepthClip, Eye
+from worker.machine.mapped import let_go, mapped_zeros
 from worker.stereo.matching import MIN_CONFIDENCE, Grey, MatchPlan, match
 from worker.stereo.registration import Registration
 from worker.stereo.right_eye import moved_depth, moved_tissue, painted_over
@@ -68,21 +69,24 @@ class FrameWork:
         Labels are found in the measured frames alone.
         """
         count, shape = clip.frame_count, rgb.shape[:3]
-        middle, never_tissue = measured[len(measured) // 2], np.asarray(~clip.tissue[measured].any(axis=0))
-        label = painted_over(rgb[middle], right_rgb[middle], never_tissue)  # as recorded
+        middle, sometime_tissue = measured[len(measured) // 2], np.zeros(shape[1:], np.bool_)
+        for i in measured:
+            sometime_tissue |= clip.tissue[i]
+            let_go(clip.tissue[i])
+        label = painted_over(rgb[middle], right_rgb[middle], ~sometime_tissue)  # as recorded
         right = Eye(
             rgb=right_rgb,
-            tissue=np.ones(shape, np.bool_) if clip.tissue_right is None else clip.tissue_right,
-            depth_mm=np.empty(shape, np.float32),
-            depth_confidence=np.empty(shape, np.uint8),
+            tissue=mapped_zeros(shape, np.bool_) if clip.tissue_right is None else clip.tissue_right,
+            depth_mm=mapped_zeros(shape, np.float32),
+            depth_confidence=mapped_zeros(shape, np.uint8),
             intrinsics=registration.camera,
             world_from_camera=np.tile(registration.left_from_right, (count, 1, 1)),
         )
         matched = DepthClip(
             rgb=rgb,
-            tissue=np.ascontiguousarray(clip.tissue),
-            depth_mm=np.empty(shape, np.float32),
-            depth_confidence=np.empty(shape, np.uint8),
+            tissue=clip.tissue if clip.tissue.flags.writeable else mapped_zeros(shape, np.bool_),
+            depth_mm=mapped_zeros(shape, np.float32),
+            depth_confidence=mapped_zeros(shape, np.uint8),
             intrinsics=clip.intrinsics,
             world_from_camera=np.tile(np.eye(4), (count, 1, 1)),
             frame_times_s=clip.frame_times_s,
@@ -116,10 +120,14 @@ class FrameWork:
         if self.clip.tissue_right is None:
             shown = moved_tissue(self.clip.tissue[i] | self.label, left.depth_mm[i], focal_baseline, offset_px)
             right.tissue[i] = (registration.recorded((~shown).astype(np.uint8)) == 0) & ~self.label
+        if left.tissue is not self.clip.tissue:
+            left.tissue[i] = self.clip.tissue[i]
         for eye in (left, right):
             drop_beside_instruments(eye.tissue[i], eye.depth_mm[i], eye.depth_confidence[i])
         trust = left.depth_confidence[i][left.tissue[i]]
         self.counts[i] = trust.size, np.count_nonzero(trust), np.count_nonzero(trust >= SURE)
+        for eye in (left, right):
+            eye.let_go(i)
 
 
 def to_depth(

@@ -31,7 +31,10 @@ def units_per_mm(clip: DepthClip, train: Sequence[int]) -> float:
     Raises:
         InputError: no training frame has valid depth on tissue.
     """
-    sampled = [clip.depth_mm[i][::4, ::4][clip.tissue[i][::4, ::4]] for i in train]
+    sampled = []
+    for i in train:
+        sampled.append(clip.depth_mm[i][::4, ::4][clip.tissue[i][::4, ::4]])
+        clip.let_go(i)
     depths = np.concatenate([values[values > 0] for values in sampled])
     if depths.size == 0:
         depths = np.concatenate([clip.depth_mm[i][clip.tissue[i] & (clip.depth_mm[i] > 0)] for i in train])
@@ -82,6 +85,7 @@ class TrainingFrames:
 
     def _frame(self, index: int) -> TrainingFrame:
         counts = int(self.eye.tissue[index].sum()), int(self._measured(index).sum())
+        self.eye.let_go(index)
         return TrainingFrame(self.cameras[index], float(self.t[index]), partial(self._target, index), *counts)
 
     def _measured(self, index: int) -> NDArray[np.bool_]:

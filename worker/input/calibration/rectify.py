@@ -18,6 +18,7 @@ from worker.input.calibration.check import FIELD, check_calibration
 from worker.input.calibration.types import RawCalibration, RawEye, RectifiedCalibration, StereoCalibration
 from worker.input.camera import Intrinsics
 from worker.input.clip.types import PairSource, RgbFrame, StereoClip
+from worker.machine.mapped import let_go, mapped_zeros
 
 OPENCV_PIXEL_CENTRE = 0.5  # OpenCV puts pixel centres at whole numbers, this project at +0.5 (docs/conventions.md)
 WARN_ZOOM, MAX_ZOOM = 1.2, 2.0  # of the focal length; a sound endoscope calibration stays below 1.1
@@ -164,9 +165,11 @@ def _matrix(eye: RawEye) -> NDArray[np.float64]:
 
 def _warp_tissue(tissue: NDArray[np.bool_], maps: Maps) -> NDArray[np.bool_]:
     """Tissue in rectified pixels, nearest neighbour; beyond the recorded image there is none."""
-    warped = np.empty(tissue.shape, dtype=np.bool_)
+    warped = mapped_zeros(tissue.shape, np.bool_)
     for i, mask in enumerate(tissue):
         warped[i] = cv2.remap(mask.astype(np.uint8), *maps, cv2.INTER_NEAREST, borderValue=0) > 0
+        let_go(warped[i])
+        let_go(mask)
     return warped
 
 

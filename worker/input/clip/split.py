@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import InputError
 from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip.types import DepthClip
+from worker.machine.mapped import let_go
 
 MIN_FRAMES = 9  # shorter clips hold out no frame
 REPEAT_LEVELS = 0.2  # mean |difference| in 8-bit levels; two frames below it are the same picture
@@ -101,7 +102,10 @@ def find_repeats(rgb: NDArray[np.uint8], train: list[int], held_out: list[int]) 
     """
     values_per_frame = float(np.prod(rgb.shape[1:]))
     limit = REPEAT_LEVELS * values_per_frame
-    column_sums = {index: _column_sums(rgb[index]) for index in (*train, *held_out)}
+    column_sums = {}
+    for index in (*train, *held_out):
+        column_sums[index] = _column_sums(rgb[index])
+        let_go(rgb[index])
     held_sums = np.stack([column_sums[index] for index in held_out])
     repeats = []
     for index in train:

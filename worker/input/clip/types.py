@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 from contract.wire.notices import Notice
 from contract.wire.report import RightEye
 from worker.input.camera import Intrinsics
+from worker.machine.mapped import let_go
+
+PIXELS = ("rgb", "tissue", "depth_mm", "depth_confidence")
+"""Names of an eye's arrays [T, H, W, ...]. They may lie in files (worker/machine/mapped.py)."""
 
 RgbFrame = NDArray[np.uint8]  # [H, W, 3]
 
@@ -72,10 +76,14 @@ class Eye:
         """Model time of each frame, t_i = i / T, in [0, 1)."""
         return np.arange(self.frame_count) / self.frame_count
 
+    def let_go(self, index: int) -> None:
+        """Take a frame's pixels out of memory, as far as they lie in files. They come back when they are asked for."""
+        for name in PIXELS:
+            let_go(getattr(self, name)[index])
+
     def arrays_at(self, frames: slice) -> dict[str, Any]:
         """The eye's arrays by name, of some frames alone: views."""
-        names = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera")
-        return {name: getattr(self, name)[frames] for name in names}
+        return {name: getattr(self, name)[frames] for name in (*PIXELS, "world_from_camera")}
 
 
 @dataclass(frozen=True)

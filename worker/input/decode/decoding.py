@@ -28,6 +28,7 @@ from worker.input.decode.contained import MALFORMED, REMEDY, Decoder, take_decod
 from worker.input.decode.guard import LIMITED_MEMORY, PROTECTIONS, Allowance
 from worker.input.decode.handover import EYES, MASKS, ArrayFile, map_array
 from worker.machine.hooks import Hooks, Progress
+from worker.machine.mapped import let_go, mapped_zeros
 
 STAGE = "decode"
 LIBRARIES_BYTES = 2 * 2**30  # address space of Python, NumPy, OpenCV and a decoder's threads
@@ -152,7 +153,7 @@ def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | Depth
     if decoder.opened is None:
         whole = DepthClip(
             rgb=map_array(folder, "rgb", size),
-            tissue=map_array(folder, "tissue", size) != 0,
+            tissue=_tissue(folder, "tissue", size),
             depth_mm=_checked_depth(map_array(folder, "depth_mm", size)),
             depth_confidence=map_array(folder, "depth_confidence", size),
             intrinsics=Intrinsics.parsed(told["intrinsics"]),
@@ -170,9 +171,10 @@ def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | Depth
 
 
 def _tissue(folder: Path, name: str, size: tuple[int, int, int]) -> NDArray[np.bool_]:
-    file, tissue = ArrayFile(folder, name, size), np.empty(size, np.bool_)
+    file, tissue = ArrayFile(folder, name, size), mapped_zeros(size, np.bool_)
     for index, mask in enumerate(tissue):
         np.not_equal(file.frame(index), 0, out=mask)
+        let_go(mask)
     return tissue
 
 

@@ -1,0 +1,55 @@
+"""Large arrays in files without a name, mapped: the system keeps as much of them in memory as it has room for.
+
+A process's resident memory counts the pages of such an array that it has touched, until it lets go of them. They stay
+in the system's page cache, which gives way to whatever needs the memory.
+"""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+import tempfile
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from contract.wire.errors import UnavailableError
+
+
+def mapped_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Zeros in a file in tempfile.gettempdir(), which is gone with the last array that views it.
+
+    Raises:
+        UnavailableError: the disk is full.
+    """
+    needed_bytes = max(int(np.prod(shape)) * np.dtype(dtype).itemsize, 1)
+    with tempfile.TemporaryFile(prefix="intrasplat-") as file:
+        try:
+            if hasattr(os, "posix_fallocate"):  # else a full disk would end the process when it writes
+                os.posix_fallocate(file.fileno(), 0, needed_bytes)
+            else:
+                file.truncate(needed_bytes)
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            problem = f"The disk is full: {needed_bytes >> 20} MiB of a clip's frames found no room."
+            raise UnavailableError(problem, f"Make room in {tempfile.gettempdir()}.") from error
+        return np.asarray(np.memmap(file, dtype, "r+", shape=shape))
+
+
+def let_go(array: NDArray[Any]) -> None:
+    """Take what a contiguous array views of a file out of this process's memory. It comes back when it is asked for.
+
+    Does nothing to an array that is not of mapped_zeros.
+    """
+    base: Any = array
+    while base is not None and not isinstance(base, np.memmap):
+        base = getattr(base, "base", None)
+    pages: Any = getattr(base, "_mmap", None)
+    if not isinstance(base, np.memmap) or base.mode != "r+" or not hasattr(pages, "madvise"):
+        return
+    start = array.ctypes.data - base.ctypes.data
+    first = start // mmap.PAGESIZE * mmap.PAGESIZE
+    pages.madvise(mmap.MADV_DONTNEED, first, start + array.nbytes - first)
