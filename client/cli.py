@@ -1,6 +1,6 @@
 """The `intrasplat` command.
 
-reconstruct, render, phantom, evaluate, stability and doctor run the worker's program on this machine
+reconstruct, render, phantom, evaluate, stability, doctor and worker run the worker's program on this machine
 (`python -m worker ...`). up starts a service, keys manages its API keys. submit, watch, fetch, jobs, cancel, retry and
 delete talk to a service.
 """
@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from client.keys import add_keys
 from client.remote import add_remote
-from contract.runtime.arguments import LOCAL_COMMANDS, Commands, add_command, count
+from contract.runtime.arguments import LOCAL_COMMANDS, WORKER_SUMMARY, Commands, add_command, count
 from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
 from contract.runtime.settings import Settings, default_data_dir
 from contract.wire.errors import InputError, IntrasplatError
@@ -40,6 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments and arguments[0] in LOCAL_COMMANDS:
         return _run_local(arguments)
+    if arguments and arguments[0] == "worker":
+        return _run_local(["consume", *arguments[1:]])
     options = _parser().parse_args(arguments)
     command: Callable[[argparse.Namespace], int] = options.command
     try:
@@ -76,6 +78,7 @@ def _parser() -> argparse.ArgumentParser:
     for name, summary in LOCAL_COMMANDS.items():
         commands.add_parser(name, help=summary, add_help=False)  # the worker parses its options
     _add_up(commands)
+    commands.add_parser("worker", help=WORKER_SUMMARY, add_help=False)
     add_remote(commands)
     add_keys(commands)
     return parser

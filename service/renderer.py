@@ -50,8 +50,8 @@ class Renderer(Protocol):
 class ZmqRenderer:
     """Asks the live workers that the queue lists.
 
-    A running job is shown by the worker that runs it. A finished scene any worker can show: one that holds it is asked,
-    or else always the same one, which will; and if that one is gone, mute or busy, another, once.
+    A running job is shown by the worker that runs it. A finished scene any worker can show: one that trains nothing
+    and holds it is asked, or else always the same one, which will. If that one is gone, mute or busy, another is, once.
     """
 
     def __init__(self, queue: Queue, timeout_s: float, render_secret: str | None = None) -> None:
@@ -119,12 +119,12 @@ class ZmqRenderer:
         running = [address for address in addresses if address.job_id == request.scene_id]
         return running or [each for each in await self._live(reread=True) if each.job_id == request.scene_id]
 
-    def _preference(self, address: WorkerAddress, scene_id: str) -> tuple[bool, bool, bytes]:
-        """Rather one that answers, and holds the scene; of several always the same (rendezvous hashing)."""
+    def _preference(self, address: WorkerAddress, scene_id: str) -> tuple[bool, bool, bool, bool, bytes]:
+        """Rather one that answers, trains nothing, holds the scene; of several always the same (rendezvous hashing)."""
         connection = self._connections.get(address.endpoint)
         place = hashlib.sha256(f"{scene_id} {address.name}".encode()).digest()
         is_down = connection is not None and connection.state in (Reached.DOWN, Reached.REFUSED)
-        return not is_down, scene_id in address.scenes, place
+        return not is_down, address.job_id is None, scene_id in address.scenes, address.renders_only, place
 
     async def _connection(self, address: WorkerAddress) -> Connection:
         endpoint = address.endpoint

@@ -11,6 +11,7 @@ from starlette.responses import JSONResponse, Response
 
 from contract import CONTRACT_VERSION
 from contract.access.keys import KeyScope
+from contract.queue.interface import trainers
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ImageFormat, Layer
 from service.deps import AnyCaller, Deps, Services
@@ -31,7 +32,7 @@ LIMITS = (
 
 
 class Readiness(BaseModel):
-    """What a ready service has."""
+    """What a ready service has; workers that only render are not counted."""
 
     ready: bool = True
     workers: list[str]
@@ -51,7 +52,7 @@ def readyz(services: Services) -> Readiness | JSONResponse:
     trouble = _trouble(services)
     if trouble is not None:
         return trouble.response()
-    workers = services.queue.workers()
+    workers = [worker for worker in services.queue.workers() if not worker.renders_only]
     return Readiness(
         workers=[worker.name for worker in workers],
         devices=[worker.device for worker in workers],
@@ -89,7 +90,7 @@ def _trouble(services: Deps) -> Problem | None:
         workers = services.queue.workers()
     except UnavailableError as error:
         return Problem(503, error.problem, field="queue", remedy=error.remedy)
-    if not workers:
+    if not trainers(workers):
         return Problem(503, "No worker is ready yet.", field="worker", remedy=f"Wait for it. {WORKER_REMEDY}")
     if services.store.free_bytes() < services.settings.min_free_bytes:
         return Problem(503, "The disk is nearly full.", field="disk", remedy=ROOM_REMEDY)

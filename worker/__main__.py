@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
-from contract.runtime.arguments import LOCAL_COMMANDS, add_command
+from contract.runtime.arguments import LOCAL_COMMANDS, WORKER_SUMMARY, add_command
 from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, end_by
 from contract.runtime.logs import configure
 from contract.runtime.processes import told_to_end
@@ -54,7 +54,10 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
             module.add_cli_arguments(add_command(commands, name, LOCAL_COMMANDS[name], module.run_cli))
         else:
             add_command(commands, name, LOCAL_COMMANDS[name], _not_chosen)
-    add_command(commands, "consume", "claim jobs from the queue and serve renders, until a signal ends it", _consume)
+    consume = add_command(commands, "consume", WORKER_SUMMARY, _consume)
+    consume.add_argument(
+        "--renders-only", action="store_true", help="claim no jobs, only answer renders of finished scenes"
+    )
     add_command(commands, "device", "what consume starts for itself: train and render as it is told on stdin", _device)
     add_command(commands, "doctor", LOCAL_COMMANDS["doctor"], _doctor)
     return parser
@@ -77,7 +80,7 @@ def _consume(options: argparse.Namespace) -> int:
         raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
     from worker.daemon.supervisor import run_supervisor
 
-    run_supervisor(settings, told_to_end())
+    run_supervisor(settings, told_to_end(), renders_only=options.renders_only)
     return ExitCode.OK
 
 

@@ -285,6 +285,11 @@ def _estimate_s(
     return (left_s + position * usual_s) / workers + usual_s
 
 
+def trainers(workers: list[WorkerAddress]) -> int:
+    """How many of the workers claim jobs."""
+    return sum(not worker.renders_only for worker in workers)
+
+
 def event_order(number: str) -> tuple[int, int]:
     """The key by which event numbers are compared; text that is not an event number comes first."""
     parts = EVENT_NUMBER.fullmatch(number)

@@ -24,6 +24,7 @@ from contract.queue.interface import (
     check_admission,
     estimate_forecast,
     event_order,
+    trainers,
     worker_died,
 )
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, Forecast, JobError, JobProgress, JobRecord, JobState
@@ -156,7 +157,7 @@ class MemoryQueue:
             ran_s = {each.job_id: now_s - (each.started_at_s or now_s) for each in self._in(JobState.RUNNING)}
             waiting = [other.job_id for other in self._waiting()]
             position = waiting.index(job_id) if job_id in waiting else None
-            return estimate_forecast(record, position, list(self._durations_s), ran_s, len(self.workers()))
+            return estimate_forecast(record, position, list(self._durations_s), ran_s, trainers(self.workers()))
 
     def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
         with self._changed:

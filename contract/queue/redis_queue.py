@@ -63,6 +63,7 @@ from contract.queue.interface import (
     check_admission,
     estimate_forecast,
     event_order,
+    trainers,
 )
 from contract.queue.lua import UNREADABLE, Scripts
 from contract.queue.redis_client import connect, reachable
@@ -173,7 +174,7 @@ class RedisQueue:
         running = self._get_all(held)
         ran_s = {other: clock_s - (of.started_at_s or clock_s) for other, of in running.items()}
         durations_s = [float(duration) for duration in durations]
-        return estimate_forecast(record, position, durations_s, ran_s, len(self.workers()))
+        return estimate_forecast(record, position, durations_s, ran_s, trainers(self.workers()))
 
     def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
         index = INDEX if tenant is None else f"{PREFIX}tenant:{tenant}:index"

@@ -21,6 +21,9 @@ LOCAL_COMMANDS = {
 }
 """What `intrasplat` and `python -m worker` do without a service: summaries by command."""
 
+WORKER_SUMMARY = "claim jobs from the queue of REDIS_URL and serve renders, until a signal ends it"
+"""What `intrasplat worker` does, which is `python -m worker consume`."""
+
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """What ArgumentParser.add_subparsers returns."""
 

@@ -189,3 +189,5 @@ class WorkerAddress(BaseModel):
     """The job it runs."""
     scenes: tuple[str, ...] = ()
     """Scenes it holds in memory."""
+    renders_only: bool = False
+    """It claims no jobs."""

@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Event
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 import zmq
@@ -52,18 +52,20 @@ class Workers:
     def endpoint(self, name: str) -> str:
         return f"ipc://{short_socket_path(self._folder, f'{name}.sock')}"
 
-    def start(self, name: str, *, job_id: str | None = None, scenes: tuple[str, ...] = ()) -> RequestServer:
+    def start(self, name: str, **about: Any) -> RequestServer:
+        """about: of its WorkerAddress."""
+
         def answer(request: RenderRequest | ExportRequest) -> Reply:
             self.asked[name] += 1
             return Reply(name.encode(), "image/png", request.t)
 
         server = RequestServer(self.endpoint(name), answer)
         self._stack.enter_context(server)
-        self.announce(name, self.endpoint(name), job_id=job_id, scenes=scenes)
+        self.announce(name, self.endpoint(name), **about)
         return server
 
-    def announce(self, name: str, endpoint: str, *, job_id: str | None = None, scenes: tuple[str, ...] = ()) -> None:
-        self.queue.announce(WorkerAddress(name=name, endpoint=endpoint, device="cpu", job_id=job_id, scenes=scenes))
+    def announce(self, name: str, endpoint: str, **about: Any) -> None:
+        self.queue.announce(WorkerAddress(name=name, endpoint=endpoint, device="cpu", **about))
 
     def close(self) -> None:
         self._stack.close()
@@ -149,6 +151,18 @@ def test_a_scene_is_asked_of_who_holds_it(workers: Workers) -> None:
         workers.start(f"worker-{number}", scenes=(SCENES[number],))
     for number in range(3):
         assert answer_to(workers, scene(SCENES[number])).body == f"worker-{number}".encode()
+
+
+def test_a_scene_is_asked_of_a_worker_that_trains_only_if_no_other_is_there(workers: Workers) -> None:
+    workers.start("trains", job_id=SCENES[1], scenes=(SCENES[0],))
+    workers.start("idle", scenes=(SCENES[2],))
+    workers.start("renders", renders_only=True)
+    assert answer_to(workers, scene(SCENES[0])).body == b"renders"
+    assert answer_to(workers, scene(SCENES[2])).body == b"idle"
+    workers.queue.withdraw("renders")
+    assert answer_to(workers, scene(SCENES[0])).body == b"idle"
+    workers.queue.withdraw("idle")
+    assert answer_to(workers, scene(SCENES[0])).body == b"trains"
 
 
 def test_scenes_that_nobody_holds_are_spread_and_stay_where_they_were_when_another_worker_goes(

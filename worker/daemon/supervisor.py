@@ -35,11 +35,18 @@ DEVICE_COMMAND = (sys.executable, "-m", "worker", "device")
 logger = logging.getLogger("intrasplat.worker")
 
 
-def run_supervisor(settings: Settings, end: threading.Event, child_command: Sequence[str] | None = None) -> None:
+def run_supervisor(
+    settings: Settings,
+    end: threading.Event,
+    child_command: Sequence[str] | None = None,
+    *,
+    renders_only: bool = False,
+) -> None:
     """Work until `end` is set; wait while the queue cannot be reached.
 
     Args:
         child_command: the program to run instead of `python -m worker device`; it must obey worker/daemon/orders.py.
+        renders_only: claim no jobs; answer renders of finished scenes.
 
     Raises:
         UnavailableError: a worker of this name already works on this data directory, or the child cannot work here.
@@ -57,22 +64,36 @@ def run_supervisor(settings: Settings, end: threading.Event, child_command: Sequ
     # The owner's name is new at each start, so claims of an earlier process of this name simply run out.
     consumer = Consumer(queue, store, keeper, f"{name}.{secrets.token_hex(4)}", end)
     try:
-        with announced(queue, name, lambda: address_of(name, keeper, consumer)), kept_tidy(store):
-            consumer.run()
+        with announced(queue, name, lambda: address_of(name, keeper, consumer, renders_only)), kept_tidy(store):
+            if renders_only:
+                keep_rendering(keeper, end)
+            else:
+                consumer.run()
     finally:
         keeper.stop()
         queue.close()
         lock.release()
 
 
-def address_of(name: str, keeper: Keeper, consumer: Consumer) -> WorkerAddress | None:
+def keep_rendering(keeper: Keeper, end: threading.Event) -> None:
+    """Keep the child running, which answers renders, until `end` is set; raises as Keeper.child."""
+    while keeper.child(end) is not None and not end.wait(LOOK_PERIOD_S):
+        pass
+
+
+def address_of(name: str, keeper: Keeper, consumer: Consumer, renders_only: bool) -> WorkerAddress | None:
     """The address that a worker announces now; None while its child is not ready."""
     child = keeper.live
     if child is None or child.ready is None:
         return None
     ready = child.ready
     return WorkerAddress(
-        name=name, endpoint=ready.endpoint, device=ready.device, job_id=consumer.job_id, scenes=child.scenes
+        name=name,
+        endpoint=ready.endpoint,
+        device=ready.device,
+        job_id=consumer.job_id,
+        scenes=child.scenes,
+        renders_only=renders_only,
     )
 
 

@@ -164,6 +164,25 @@ def test_a_worker_that_slept_through_its_lease_publishes_nothing(bench: WorkerPr
             assert bench.record(job_id).state is JobState.RUNNING
 
 
+def test_a_worker_for_renders_alone_is_announced_and_claims_nothing(bench: WorkerProcesses) -> None:
+    end = threading.Event()
+    settings, command = bench.settings("renders"), [sys.executable, str(STANDIN)]
+    worker = threading.Thread(target=run_supervisor, args=(settings, end, command), kwargs={"renders_only": True})
+    worker.start()
+    try:
+        eventually(lambda: [each.renders_only for each in bench.queue.workers()] == [True])
+        job_id = bench.submit("publish")
+        assert bench.queue.forecast(job_id).eta_s is None
+        time.sleep(1.0)  # CLAIM_TIMEOUT_S of a worker that claims
+        record = bench.queue.get(job_id)
+        assert record is not None
+        assert record.state is JobState.QUEUED
+    finally:
+        end.set()
+        worker.join()
+    assert bench.queue.workers() == []
+
+
 def test_a_second_worker_of_one_name_is_refused(bench: WorkerProcesses) -> None:
     with bench.worker():
         eventually(lambda: bool(bench.queue.workers()))
