@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
@@ -15,7 +15,7 @@ from contract.queue.interface import MAX_LISTED
 from contract.store.shelf import is_job_id
 from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
-from contract.wire.names import CURVE, REPORT
+from contract.wire.names import CURVE
 from contract.wire.rendering import ExportName, ExportRequest
 from contract.wire.report import Report
 from service.access import Caller
@@ -28,9 +28,13 @@ router = APIRouter(prefix="/scenes", tags=["scenes"])
 
 
 class SceneSummary(BaseModel):
-    """A scene in the list; `error` says why its report, and so its quality, cannot be read."""
+    """A scene in the list; `error` says why its report, and so its quality, cannot be read.
+
+    scored: False while its scores are still being measured.
+    """
 
     id: str
+    scored: bool = True
     psnr_tissue_db: float | None = None
     error: str | None = None
     links: dict[str, str]
@@ -51,7 +55,7 @@ async def get_scene(scene_id: str, services: Services, caller: AnyCaller) -> Rep
     caller.require(KeyScope.VIEW)
     record = await run_in_threadpool(finished_job, services, caller, scene_id)
     await services.audit.viewed(caller, scene_id)
-    return await run_in_threadpool(_report, services, record)
+    return await run_in_threadpool(services.store.newest_report, scene_id, record.attempt)
 
 
 @router.get("/{scene_id}/curve", operation_id="get_curve", response_class=FileResponse)
@@ -122,14 +126,7 @@ def _summary(services: Deps, record: JobRecord) -> SceneSummary:
     scene_id = record.job_id
     links = {"report": f"/scenes/{scene_id}", "render": f"/render?scene={scene_id}"}
     try:
-        return SceneSummary(id=scene_id, psnr_tissue_db=_report(services, record).psnr_tissue_db, links=links)
+        report = services.store.newest_report(scene_id, record.attempt)
+        return SceneSummary(id=scene_id, scored=report.scored, psnr_tissue_db=report.psnr_tissue_db, links=links)
     except SceneError as error:
         return SceneSummary(id=scene_id, error=str(error), links=links)
-
-
-def _report(services: Deps, record: JobRecord) -> Report:
-    path = services.store.scene_folder(record.job_id, record.attempt) / REPORT
-    try:
-        return Report.model_validate_json(path.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise SceneError(f"The report of scene {record.job_id} cannot be read ({type(error).__name__}).") from error

@@ -7,14 +7,15 @@ import json
 import platform
 import time
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
 import torch
 
-from contract.wire.errors import Cancelled
+from contract.store.results import add_scores, without_scores
+from contract.wire.errors import Cancelled, TrainingDiverged
 from contract.wire.names import CURVE, REPORT
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM
@@ -22,25 +23,23 @@ from contract.wire.report import Report
 from worker.input.calibration import rectify
 from worker.input.calibration.types import StereoCalibration
 from worker.input.camera import to_camera
-from worker.input.clip import DepthClip, StereoClip, split_frames, training_frames
+from worker.input.clip import DepthClip, FrameSplit, StereoClip, split_frames, training_frames
 from worker.input.decode import decode_clip
 from worker.machine.hooks import Hooks
 from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from worker.machine.timing import Timings
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
-from worker.report.baselines import copy_baselines
-from worker.report.quality import Training, build_report, measure
-from worker.report.right_eye import measure_right
+from worker.report.judge import judged
+from worker.report.quality import Training, first_report
 from worker.report.trust import trust
 from worker.report.visibility import drop_strays
-from worker.scene.checkpoint import save_scene
+from worker.scene.checkpoint import load_scene, save_scene
 from worker.scene.compact import compile_coder
-from worker.scene.model import model_of
 from worker.scene.resume_file import RESUME_FILE
 from worker.scene.scene import Scene
 from worker.stereo import estimate_depth
-from worker.train.hooks import RenderedFrame, TrainingHooks
+from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import preset_named
@@ -48,11 +47,22 @@ from worker.train.rate_distortion import QuantizedScene, quantize_model
 from worker.train.request import ReconstructionRequest
 from worker.train.resume import resume, save_run
 from worker.train.run import Run, write_curve
-from worker.train.scoring import FrameRenderer, frame_renderer, held_out_score, sample_frames
+from worker.train.scoring import held_out_score
 from worker.train.setup import Setup
 
 VERSIONED = ("intrasplat", "torch", "numba")
 """What decides a scene's numbers; the report names their versions."""
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A scene that is finished, and all that judging it needs."""
+
+    clip: DepthClip
+    split: FrameSplit
+    scene: Scene
+    report: Report
+    device: Device
 
 
 def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Report:
@@ -63,9 +73,21 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHo
     Raises:
         InputError: the clip, its calibration, masks or an option cannot be used.
         UnavailableError: the device is not there, or something it takes.
-        TrainingDiverged: training left the finite numbers; nothing is written.
-        Cancelled: hooks.should_stop said so.
+        TrainingDiverged: training left the finite numbers.
+        Cancelled: hooks.should_stop said so. While scoring it leaves the finished scene, without scores.
     """
+    made = make(request, out_dir, hooks)
+    try:
+        report = judge(made, hooks)
+    except (Cancelled, TrainingDiverged) as error:
+        add_scores(out_dir, without_scores(made.report, error.code))
+        raise
+    add_scores(out_dir, report)
+    return report
+
+
+def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Made:
+    """As reconstruct, without the scores: the scene in out_dir is whole and can be viewed."""
     setup = begin(request, out_dir, hooks)
     run = prepare(setup)
     if (resumed_s := resume(out_dir, run)) is not None:
@@ -73,12 +95,35 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHo
     try:
         optimise(run)
         scene, quantized = finish(run)
-        report = assess(run, scene, quantized)
     except Cancelled:
         save_run(out_dir, run, setup.timings.seconds.get("t_train_s", setup.clock.elapsed_s))
         raise
-    publish(out_dir, run, scene, report)
-    return report
+    report = publish(out_dir, run, scene, quantized)
+    return Made(setup.clip, setup.split, scene, report, setup.device)
+
+
+def judge(made: Made, hooks: Hooks) -> Report:
+    """The report with the scores of the scene as it is kept.
+
+    Raises:
+        TrainingDiverged: a render holds NaN or infinity.
+        Cancelled: hooks.should_stop said so.
+    """
+    return judged(made.report, made.clip, made.split.train, made.scene, hooks, made.device)
+
+
+def judge_again(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:
+    """As judge, of the finished scene in a directory: its clip is opened anew.
+
+    Raises:
+        InputError: the clip, its calibration, masks or an option cannot be used.
+        SceneError: the scene is missing or damaged.
+    """
+    device = device_for(preset_named(request.options.preset).deformation, request.device)
+    clip = open_with_depth(request, hooks, Timings(), device)
+    split = split_frames(clip, request.options.holdout)
+    report = Report.model_validate_json((directory / REPORT).read_bytes())
+    return judge(Made(clip, split, load_scene(directory), report, device), hooks)
 
 
 def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Setup:
@@ -151,9 +196,10 @@ def match_eyes(
 
 def optimise(run: Run) -> None:
     """Train run to its last iteration; score held-out frames and offer snapshots on the way."""
-    clock, started_s = run.setup.clock, run.setup.clock.elapsed_s
+    clock, started_s, timings = run.setup.clock, run.setup.clock.elapsed_s, run.setup.timings
+    timings.seconds["t_first_view_s"] = time.time() - run.setup.accepted_at_s
     train(run, clock, lambda: held_out_score(run), run.setup.hooks, copy_scene=lambda: snapshot_of(run))
-    run.setup.timings.seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
+    timings.seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
     keep_free_memory(LITTLE_BYTES)
 
 
@@ -211,44 +257,6 @@ def _right_eye_mm(run: Run) -> tuple[float, float, float] | None:
     return x, y, z
 
 
-def assess(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Report:
-    """Score the held-out frames and the copy baselines, and say what to distrust.
-
-    The curve's last point becomes the score over all held-out frames of the scene as it is kept; the points before it
-    are over at most sixteen of them.
-    """
-    clip, split, timings = run.setup.clip, run.setup.split, run.setup.timings
-    model = model_of(scene, run.setup.device) if quantized else run.model
-    render = _reporting(run, frame_renderer(run, model))
-    with timings.measure("score_s"):
-        held_out = measure(clip, split.held_out, render)
-        right = measure_right(clip, split.held_out, frame_renderer(run, model, clip.right))
-        trained = measure(clip, sample_frames(split.train), render)
-        baselines = copy_baselines(clip, split.train, split.held_out)
-    timings.seconds["t_post_s"] = time.time() - run.setup.accepted_at_s
-    report = build_report(clip, split, held_out, right, trained, baselines, _training(run, scene, quantized))
-    if report.psnr_tissue_db is not None and run.curve:
-        left_db, right_db = report.psnr_tissue_db, report.psnr_right_db
-        run.curve[-1] = dataclasses.replace(run.curve[-1], psnr_tissue_db=left_db, psnr_right_db=right_db)
-    run.setup.hooks.on_progress(run.progress("score", 1.0))
-    return report
-
-
-def _reporting(run: Run, render: FrameRenderer) -> FrameRenderer:
-    """The renderer, which reports the progress of scoring at each frame."""
-    total, done = len(run.setup.split.held_out) + len(sample_frames(run.setup.split.train)), 0
-
-    def reported(index: int) -> RenderedFrame:
-        nonlocal done
-        run.setup.hooks.on_progress(run.progress("score", done / total))
-        if run.setup.hooks.should_stop():
-            raise Cancelled("Stopped while scoring.")
-        done += 1
-        return render(index)
-
-    return reported
-
-
 def _training(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Training:
     """What the report repeats of the run: what it was made of, what it chose, how long it took."""
     return Training(
@@ -261,7 +269,7 @@ def _training(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Train
         bases=scene.deformation.bases,
         scene_bytes=scene.file_bytes,
         units_per_mm=scene.units_per_mm,
-        seconds=run.setup.timings.seconds,
+        seconds=dict(run.setup.timings.seconds),
         assumptions=(*run.chosen, *run.schedule.notices, *(quantized.notices if quantized else ())),
         measurements=quantized.measurements if quantized else {},
         warnings=_warnings(run),
@@ -281,9 +289,13 @@ def _warnings(run: Run) -> tuple[Notice, ...]:
     return tuple(found)
 
 
-def publish(out_dir: Path, run: Run, scene: Scene, report: Report) -> None:
-    """Write the report, the curve and the scene; remove the state of a stopped run."""
+def publish(out_dir: Path, run: Run, scene: Scene, quantized: QuantizedScene | None) -> Report:
+    """Write the report, the curve and the scene; remove the state of a stopped run. The report has no scores yet."""
+    setup = run.setup
+    setup.timings.seconds["t_post_s"] = time.time() - setup.accepted_at_s
+    report = first_report(setup.clip, setup.split, _training(run, scene, quantized))
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)
-    save_scene(out_dir, scene, beside=(REPORT, CURVE))
+    save_scene(out_dir, scene)
     (out_dir / RESUME_FILE).unlink(missing_ok=True)
+    return report

@@ -6,6 +6,7 @@ import { ClipForm } from "./form.js";
 import { JobList } from "./joblist.js";
 import { Jobs } from "./jobs.js";
 import { currentKey, keyEvents, showKeyForm } from "./key.js";
+import { pause } from "./pause.js";
 import { baselinesOf, showReport } from "./report.js";
 import { Viewer } from "./viewer.js";
 
@@ -31,6 +32,8 @@ const viewer = new Viewer({
 
 /** @type {string | null} the job that opens by itself as soon as there is something to see of it */
 let awaited = null;
+/** The scores of a scene follow within seconds. */
+const UNSCORED_PAUSE_MS = 1000;
 /** @type {string | null} the scene whose report and final curve are shown */
 let reported = null;
 
@@ -55,7 +58,11 @@ async function report(id) {
     if (!isStill()) return;
     showReport(get("report"), id, found);
     const csv = await getCurve(id).catch(() => "");
-    if (isStill()) drawCurve(get("curve"), pointsOfCsv(csv), baselinesOf(found));
+    if (!isStill()) return;
+    drawCurve(get("curve"), pointsOfCsv(csv), baselinesOf(found));
+    if (found.scored) return;
+    await pause(UNSCORED_PAUSE_MS);
+    if (isStill()) report(id);
   } catch (error) {
     if (!isStill()) return;
     say(error.message);

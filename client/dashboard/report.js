@@ -48,6 +48,7 @@ function rightEye({ psnr_right_db: right, baseline_warp_db: warped, psnr_clear_d
 /** The one sentence to read first. */
 function verdict(report) {
   const best = Math.max(...baselinesOf(report).map(({ db }) => db));
+  if (report.scored === false) return "It can be viewed. How good it is, is still being measured.";
   if (!Number.isFinite(report.psnr_tissue_db)) return "Its quality could not be measured: do not rely on it.";
   if (report.psnr_tissue_db <= best) return "Between the frames it is not better than copying them.";
   const count = report.warnings.filter(isWarning).length;

@@ -4,6 +4,7 @@
 /**
  * @typedef {{
  *   frame: number,
+ *   scored?: boolean,
  *   psnr_tissue_db: number | null,
  *   psnr_paper_db: number | null,
  *   ssim: number | null,
@@ -70,12 +71,13 @@
  *   text: string,
  * }} Notice
  */
-/** @typedef {"baseline"|"calibration"|"decoding"|"depth_unit"|"frame_times"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"poses"|"rectification"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"colours_unknown"|"colour_changes"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"few_frames"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"mask_gaps"|"no_instrument_masked"|"no_texture"|"out_of_focus"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
+/** @typedef {"baseline"|"calibration"|"decoding"|"depth_unit"|"frame_times"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"poses"|"rectification"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"colours_unknown"|"colour_changes"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"few_frames"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"mask_gaps"|"no_instrument_masked"|"no_texture"|"out_of_focus"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
 /**
  * @typedef {{
  *   report_version?: number,
  *   notice?: string,
  *   versions?: Record<string, string>,
+ *   scored?: boolean,
  *   psnr_tissue_db: number | null,
  *   psnr_paper_db: number | null,
  *   psnr_clear_db?: number | null,

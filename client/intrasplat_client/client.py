@@ -11,7 +11,7 @@ import httpx
 from typing_extensions import Unpack
 
 from intrasplat_client.connection import DEFAULT_URL, BlockingConnection, http_settings, iterate, run
-from intrasplat_client.core import Core
+from intrasplat_client.core import SCORES_WITHIN_S, Core
 from intrasplat_client.models import GivenOptions, JobState, JobView, Report
 from intrasplat_client.session import DEFAULT_PATIENCE_S
 from intrasplat_client.submission import OnUpload
@@ -169,9 +169,9 @@ class Client:
         """Finished scenes, newest first."""
         return run(self._core.scenes(limit))
 
-    def report(self, scene: str) -> Report:
-        """The scene's quality report."""
-        return run(self._core.report(scene))
+    def report(self, scene: str, scores_within_s: float = SCORES_WITHIN_S) -> Report:
+        """The scene's quality report. Waits at most so long for its scores, which follow a job's end within seconds."""
+        return run(self._core.report(scene, scores_within_s))
 
     def curve(self, scene: str) -> str:
         """Held-out psnr_tissue over seconds of training, as CSV."""

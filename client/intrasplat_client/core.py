@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,9 @@ from intrasplat_client.views import Image, view_query
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+SCORES_WITHIN_S, LOOK_PERIOD_S = 30.0, 0.3
+"""Another scene may have to be scored first."""
 
 
 class Core:
@@ -146,10 +150,18 @@ class Core:
         scenes: list[dict[str, Any]] = _json_of(await self._get("scenes", limit=limit))
         return scenes
 
-    async def report(self, scene: str) -> Report:
-        """The scene's quality report."""
-        response = await self._get("scenes", scene)
-        return parsed(response, Report.model_validate_json, response.content)
+    async def report(self, scene: str, scores_within_s: float = SCORES_WITHIN_S) -> Report:
+        """The scene's quality report. Waits at most so long for its scores, which follow a job's end within seconds.
+
+        `scored` is False in a report without them.
+        """
+        until_s = time.monotonic() + scores_within_s
+        while True:
+            response = await self._get("scenes", scene)
+            report = parsed(response, Report.model_validate_json, response.content)
+            if report.scored or time.monotonic() > until_s:
+                return report
+            await self._session.sleep(LOOK_PERIOD_S)
 
     async def curve(self, scene: str) -> str:
         """Held-out psnr_tissue over seconds of training, as CSV."""

@@ -93,6 +93,8 @@ class NoticeCode(StrEnum):
     ROWS_MISALIGNED = "rows_misaligned"
     STEREO_UNSURE = "stereo_unsure"
     VEILED = "veiled"
+    SCORES_FAILED = "scores_failed"
+    SCORES_PENDING = "scores_pending"
     COPYING_SCORES_MORE = "copying_scores_more"
     DEPTH_DISAGREES = "depth_disagrees"
     DEPTH_NOT_COMPARED = "depth_not_compared"
@@ -127,6 +129,8 @@ class FrameScore(Model):
     """One held-out frame: the model's scores and those of copying its neighbours. None: no tissue to judge."""
 
     frame: int
+    scored: bool = True
+    """False: the scores, and what they warn of, are still being measured; ask again"""
     psnr_tissue_db: float | None
     psnr_paper_db: float | None
     ssim: float | None
@@ -215,7 +219,8 @@ class Notice(Model):
 
 
 class Report(Model):
-    """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why.
+    """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why;
+    or while `scored` is False: a scene is finished before its scores are.
 
     Scores are means over the held-out frames, which took no part in training (docs/conventions.md, "Scores").
     psnr_tissue_db is the one to go by; psnr_paper_db is what papers print, and higher. When psnr_tissue_db does
@@ -226,6 +231,8 @@ class Report(Model):
     notice: str = "Research use only. Not a medical device; it must not guide treatment."
     versions: dict[str, str] = Field(default={})
     """versions of intrasplat and of what it computes with"""
+    scored: bool = True
+    """False: the scores, and what they warn of, are still being measured; ask again"""
     psnr_tissue_db: float | None
     psnr_paper_db: float | None
     psnr_clear_db: float | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 from contract.store.disk_errors import disk_errors
@@ -32,6 +33,9 @@ class LocalShelf:
         if folder != target:
             _remove_folder(target, entry.marker)
             move_folder(folder, target)
+
+    def put_files(self, entry: ShelfEntry, names: Sequence[str]) -> None:
+        """Nothing: what lies here is the entry itself."""
 
     def get(self, entry: ShelfEntry) -> Path | None:
         return self.path(entry) if self.holds(entry) else None

@@ -18,7 +18,7 @@ import importlib
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -182,6 +182,11 @@ class S3Shelf:
             raise
 
     @disk_errors()
+    def put_files(self, entry: ShelfEntry, names: Sequence[str]) -> None:
+        for name in names:
+            self._bucket.put(self._here.path(entry) / name, _key(entry) + name)
+
+    @disk_errors()
     def get(self, entry: ShelfEntry) -> Path | None:
         if not self.holds(entry):
             self._here.remove(entry.area, entry.job_id, entry.attempt)
@@ -238,6 +243,13 @@ class S3Shelf:
                         self._here.remove(entry.area, entry.job_id, entry.attempt)
 
     def _fetch(self, entry: ShelfEntry) -> None:
+        """Copy the entry to this machine; once more if it does not fit, as its scores may just have been added."""
+        try:
+            self._fetch_once(entry)
+        except SceneError:
+            self._fetch_once(entry)
+
+    def _fetch_once(self, entry: ShelfEntry) -> None:
         """Copy the entry to a folder aside, check it, and put it in its place on this machine."""
         aside = self._here.path(ShelfEntry(Area.INCOMING, new_job_id()))
         aside.mkdir(mode=0o700)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -107,6 +108,10 @@ class Shelf(Protocol):
 
         After an error the entry is not there, and the folder is where it was.
         """
+        ...
+
+    def put_files(self, entry: ShelfEntry, names: Sequence[str]) -> None:
+        """Keep these files of the entry's folder on this machine in place of the entry's own, one after the other."""
         ...
 
     def get(self, entry: ShelfEntry) -> Path | None:

@@ -6,6 +6,7 @@
     ├── work/<job>.<n>/     what attempt n has written so far
     ├── work/tmp-<name>/    what worker <name> has unpacked; emptied whenever it starts
     ├── scenes/<job>.<n>/   what attempt n has finished: manifest.json, scene.safetensors, report.json, curve.csv
+    ├── unscored/<name>/    an empty file <job>.<n> for each scene that worker <name> has finished and not scored yet
     ├── run/                sockets of live workers
     └── valkey/             the embedded queue's log
 
@@ -28,12 +29,17 @@ from pydantic import ValidationError
 
 from contract.runtime.settings import Settings
 from contract.store.disk_errors import disk_errors
+from contract.store.durable import replace_file
 from contract.store.local import LocalShelf, remove_tree
+from contract.store.results import RESULTS, add_scores
 from contract.store.s3 import S3Shelf
-from contract.store.shelf import ABANDONED_AFTER_S, Area, Removed, Shelf, ShelfEntry, is_job_id
+from contract.store.shelf import ABANDONED_AFTER_S, Area, Removed, Shelf, ShelfEntry, entry_of, is_job_id
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
-from contract.wire.names import RESUME, SUBMISSION
+from contract.wire.names import REPORT, RESUME, SUBMISSION
+from contract.wire.report import Report
+
+UNSCORED = "unscored"
 
 
 def open_store(settings: Settings) -> Store:
@@ -160,6 +166,55 @@ class Store:
             self._shelf.put(work, ShelfEntry(Area.SCENES, job_id, attempt))
         return self.scene_folder(job_id, attempt)
 
+    @disk_errors()
+    def expect_scores(self, worker_name: str, job_id: str, attempt: int) -> None:
+        """Remember that the worker is to score a scene that it publishes."""
+        folder = self.data_dir / UNSCORED / worker_name
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        replace_file(folder / ShelfEntry(Area.SCENES, job_id, attempt).name, b"")
+
+    @disk_errors()
+    def unscored(self, worker_name: str) -> list[tuple[str, int]]:
+        """Job and attempt of the scenes that the worker is to score."""
+        folder = self.data_dir / UNSCORED / worker_name
+        names = sorted(each.name for each in folder.iterdir()) if folder.is_dir() else []
+        found = (entry_of(Area.SCENES, name) for name in names)
+        return [(entry.job_id, entry.attempt) for entry in found if entry is not None and entry.attempt is not None]
+
+    def add_scores(self, worker_name: str, job_id: str, attempt: int, report: Report) -> None:
+        """Put the scored report into a published scene. One that has been removed stays so."""
+        entry = ShelfEntry(Area.SCENES, job_id, attempt)
+        if (folder := self._shelf.get(entry)) is not None:
+            with disk_errors(), contextlib.suppress(FileNotFoundError):
+                add_scores(folder, report)
+                self._shelf.put_files(entry, RESULTS)
+        self.expect_no_scores(worker_name, job_id, attempt)
+
+    @disk_errors()
+    def expect_no_scores(self, worker_name: str, job_id: str, attempt: int) -> None:
+        """Forget expect_scores()."""
+        name = ShelfEntry(Area.SCENES, job_id, attempt).name
+        (self.data_dir / UNSCORED / worker_name / name).unlink(missing_ok=True)
+
+    def newest_report(self, job_id: str, attempt: int) -> Report:
+        """The report of the attempt's finished scene.
+
+        Raises:
+            SceneError: the scene does not exist, or its report cannot be read.
+        """
+        report, entry = self._report(job_id, attempt), ShelfEntry(Area.SCENES, job_id, attempt)
+        if report.scored or any((self.data_dir / UNSCORED).glob(f"*/{entry.name}")):
+            return report
+        self._shelf.drop_copy(entry)  # another machine may have added the scores to the bucket's since it was made
+        return self._report(job_id, attempt)
+
+    def _report(self, job_id: str, attempt: int) -> Report:
+        path = self.scene_folder(job_id, attempt) / REPORT
+        try:
+            return Report.model_validate_json(path.read_bytes())
+        except (OSError, ValidationError) as error:
+            raise SceneError(f"The report of scene {job_id} cannot be read ({type(error).__name__}).") from error
+
     def scene_folder(self, job_id: str, attempt: int) -> Path:
         """The folder of the attempt's finished scene, which is downloaded if need be.
 
@@ -217,6 +272,9 @@ class Store:
         removed = Removed({}, {})
         for area in Area:
             removed += self._shelf.remove(area, job_id)
+        with disk_errors():
+            for path in (self.data_dir / UNSCORED).glob(f"*/{job_id}.*"):
+                path.unlink(missing_ok=True)
         left = sum(len(self._here.folders(area, job_id)) for area in Area)
         if left:
             raise UnavailableError(f"{left} folders of job {job_id} could not be removed.", "Purge it once more.")

@@ -70,6 +70,8 @@ class NoticeCode(StrEnum):
     STEREO_UNSURE = "stereo_unsure"
     VEILED = "veiled"
     # what the training and its scores say
+    SCORES_FAILED = "scores_failed"
+    SCORES_PENDING = "scores_pending"
     COPYING_SCORES_MORE = "copying_scores_more"
     DEPTH_DISAGREES = "depth_disagrees"
     DEPTH_NOT_COMPARED = "depth_not_compared"

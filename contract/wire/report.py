@@ -19,6 +19,9 @@ class FrameScore(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     frame: int = Field(ge=0)
+    scored: bool = Field(
+        default=True, description="False: the scores, and what they warn of, are still being measured; ask again"
+    )
     psnr_tissue_db: float | None
     psnr_paper_db: float | None
     ssim: float | None
@@ -69,7 +72,8 @@ class RightEye(BaseModel):
 
 
 class Report(BaseModel):
-    """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why.
+    """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why; or
+    while `scored` is False: a scene is finished before its scores are.
 
     Scores are means over the held-out frames, which took no part in training (docs/conventions.md, "Scores").
     psnr_tissue_db is the one to go by; psnr_paper_db is what papers print, and higher. When psnr_tissue_db does not
@@ -82,6 +86,9 @@ class Report(BaseModel):
     notice: str = RESEARCH_USE
     versions: dict[str, str] = Field(default={}, description="versions of intrasplat and of what it computes with")
 
+    scored: bool = Field(
+        default=True, description="False: the scores, and what they warn of, are still being measured; ask again"
+    )
     psnr_tissue_db: float | None
     psnr_paper_db: float | None
     psnr_clear_db: float | None = Field(default=None, description="psnr_tissue_db without highlights")

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from contract.wire.errors import UnavailableError
+from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
 from tests.chaos.deployment import Deployment, Victim
 from tests.chaos.history import ClipHistory, violations
@@ -26,6 +26,7 @@ PADDING_BYTES = 200_000
 ACCEPTED_WITHIN_S = 60.0
 ENDED_WITHIN_S = 90.0
 POINT_WITHIN_S = 40.0
+SCORED_WITHIN_S = 30.0
 SECOND_ENDING_S = 0.3
 """How long to wait before looking again at a job that has ended."""
 TIDIED_WITHIN_S = 5.0
@@ -138,8 +139,21 @@ def watch(deployment: Deployment, history: ClipHistory) -> None:
     if history.job_id is None:
         return
     record = wait_until_ended(deployment, history.job_id, ENDED_WITHIN_S)
+    if record is not None and record.state is JobState.DONE:
+        history.scored = _wait_until_scored(deployment, record)
     time.sleep(SECOND_ENDING_S if record is not None and record.state is JobState.DONE else TIDIED_WITHIN_S)
     history.events = deployment.queue.events(history.job_id)
+
+
+def _wait_until_scored(deployment: Deployment, record: JobRecord) -> bool:
+    """Whether the scene's scores came within SCORED_WITHIN_S."""
+    deadline_s = time.monotonic() + SCORED_WITHIN_S
+    while time.monotonic() < deadline_s:
+        with suppress(UnavailableError, SceneError):
+            if deployment.store.newest_report(record.job_id, record.attempt).scored:
+                return True
+        time.sleep(0.05)
+    return False
 
 
 def wait_until_ended(deployment: Deployment, job_id: str, timeout_s: float) -> JobRecord | None:

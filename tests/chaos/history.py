@@ -21,6 +21,7 @@ class ClipHistory:
     job_id         of the 202; None if the caller never got one
     cancel_heard   the service confirmed that a cancel was asked for
     killed_at_s    UNIX time of the kill; None where nothing is killed
+    scored         the scores of a job that is done were added
     restart_s      until everything that was killed answered again; counted where Valkey or all were killed
     """
 
@@ -29,6 +30,7 @@ class ClipHistory:
     cancel_heard: bool = False
     killed_at_s: float | None = None
     restart_s: float = 0.0
+    scored: bool = False
     events: list[Event] = field(default_factory=list)
 
     @property
@@ -66,6 +68,8 @@ def violations(history: ClipHistory, store: Store) -> list[str]:
     expected = [history.events[-1].record.attempt] if history.final is JobState.DONE else []
     if published != expected:
         broken.append(f"attempts {published} are published, and {expected} should be")
+    if history.final is JobState.DONE and not history.scored:
+        broken.append("it is done, and its scores never came")
     if history.final is JobState.CANCELLED and store.spool_folder(history.job_id).exists():
         broken.append("it was cancelled, and its clip is still there")
     if history.final is JobState.FAILED:

@@ -30,6 +30,7 @@ class Point(StrEnum):
     TRAINING = "training"
     PUBLISHING = "publishing"
     PUBLISHED = "after publish, before ack"
+    SCORING = "done, before its scores"
 
 
 class Points:

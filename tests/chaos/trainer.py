@@ -9,11 +9,11 @@ from pathlib import Path
 from contract.runtime.processes import die_with_parent
 from contract.runtime.settings import Settings
 from contract.wire.job import JobProgress
-from contract.wire.names import MANIFEST, REPORT
+from contract.wire.names import CURVE, MANIFEST, REPORT
 from tests.chaos.points import Point, reach
 from tests.reports import REPORT_OF_A_SCENE
 from worker.daemon.channel import Channel, Orders, Task
-from worker.daemon.orders import Advanced, Finished, Ready, Stopped
+from worker.daemon.orders import Advanced, Finished, Ready, RunJob, Scored, ScoreScene, Stopped
 
 STEPS = 10
 STEP_S = 0.05
@@ -29,10 +29,15 @@ def main() -> None:
     while True:
         task = orders.next(60.0)
         if task is not None:
-            channel.send(_train(task, channel))
+            if isinstance(task.order, RunJob):
+                end = _train(task, task.order.out, channel)
+                channel.send(end)
+            if isinstance(task.order, ScoreScene) or isinstance(end, Finished):
+                reach(Point.SCORING)
+                channel.send(Scored(report=REPORT_OF_A_SCENE))
 
 
-def _train(task: Task, channel: Channel) -> Finished | Stopped:
+def _train(task: Task, out: Path, channel: Channel) -> Finished | Stopped:
     for step in range(STEPS):
         if task.stop.is_set():
             return Stopped(checkpointed=False)
@@ -40,13 +45,15 @@ def _train(task: Task, channel: Channel) -> Finished | Stopped:
         channel.send(Advanced(progress=JobProgress(stage="train", fraction=step / STEPS, iteration=step)))
         if step == STEPS // 2:
             reach(Point.TRAINING)
-    _write_scene(task.run.out)
+    _write_scene(out)
     return Finished()
 
 
 def _write_scene(out: Path) -> None:
-    (out / REPORT).write_text(REPORT_OF_A_SCENE.model_dump_json())
-    (out / MANIFEST).write_text("{}")
+    unscored = REPORT_OF_A_SCENE.model_copy(update={"scored": False})
+    (out / REPORT).write_text(unscored.model_dump_json())
+    (out / CURVE).write_text("t_train_s,psnr_tissue_db,psnr_right_db\n1,30,\n")
+    (out / MANIFEST).write_text('{"files": {}}')
 
 
 if __name__ == "__main__":

@@ -79,12 +79,13 @@ class LocalService:
         self.announce(record.job_id)
         return Claim(record.job_id, record.attempt, "worker-1")
 
-    def finish(self, claim: Claim | None = None) -> None:
+    def finish(self, claim: Claim | None = None, *, scored: bool = True) -> None:
         claim = claim or self.claim()
+        report = REPORT_OF_A_SCENE if scored else REPORT_OF_A_SCENE.model_copy(update={"scored": False})
         folder = self.store.work_folder(claim.job_id, claim.attempt)
-        (folder / MANIFEST).write_text("{}")
-        (folder / REPORT).write_text(REPORT_OF_A_SCENE.model_dump_json())
-        (folder / CURVE).write_text("t_train_s,psnr_tissue_db\n1,30\n")
+        (folder / MANIFEST).write_text('{"files": {}}')
+        (folder / REPORT).write_text(report.model_dump_json())
+        (folder / CURVE).write_text("t_train_s,psnr_tissue_db,psnr_right_db\n1,30,\n")
         self.store.publish_scene(claim.job_id, claim.attempt)
         assert self.queue.finish(claim)
 

@@ -34,6 +34,7 @@ from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import OrbitPose
 from contract.wire.rendering import MEDIA_TYPES, ExportRequest, Highlights, RenderRequest, Unseen, WorkerAddress
+from contract.wire.report import Report
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
@@ -70,6 +71,12 @@ REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
         "seconds": {"t_train_s": 12.5},
     }
 )
+
+
+def first_report_of_the_page() -> Report:
+    """Before the scores are known."""
+    figures = [name for name in Report.model_fields if name.startswith(("psnr", "baseline"))]
+    return REPORT_OF_THE_PAGE.model_copy(update={**dict.fromkeys(figures), "scored": False})
 
 
 def grey_of(job_id: str) -> int:
@@ -160,10 +167,11 @@ class Site:
         )
         self.queue.beat(claim, progress.model_copy(update={"seconds_left": 20.0, "psnr_right_db": psnr_right_db}))
 
-    def finish(self, claim: Claim) -> str:
+    def finish(self, claim: Claim, *, scored: bool = True) -> str:
         folder = self.store.work_folder(claim.job_id, claim.attempt)
-        (folder / MANIFEST).write_text("{}")
-        (folder / REPORT).write_text(REPORT_OF_THE_PAGE.model_dump_json())
+        (folder / MANIFEST).write_text('{"files": {}}')
+        report = REPORT_OF_THE_PAGE if scored else first_report_of_the_page()
+        (folder / REPORT).write_text(report.model_dump_json())
         (folder / CURVE).write_text(CURVE_OF_THE_PAGE)
         self.store.publish_scene(claim.job_id, claim.attempt)
         assert self.queue.finish(claim)

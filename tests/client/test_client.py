@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import inspect
 import os
+import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +33,7 @@ from intrasplat_client import (
     submission,
 )
 from tests.client.local_service import SNAPSHOT_ITERATION, LocalService, line_to, local_service
+from tests.reports import REPORT_OF_A_SCENE
 
 WAIT_S = 10.0
 
@@ -52,6 +55,18 @@ def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(
     with pytest.raises(NotFound) as caught:
         client.report(job.id)
     assert caught.value.status == 404
+
+
+def test_a_report_waits_for_its_scores(service: LocalService, client: Client, clip: Path) -> None:
+    job = client.reconstruct(clip, iterations=30)
+    claim = service.claim()
+    service.finish(claim, scored=False)
+    assert not client.report(job.id, scores_within_s=0.0).scored
+    (summary,) = (scene for scene in client.scenes() if scene["id"] == job.id)
+    assert not summary["scored"]
+    add = partial(service.store.add_scores, "worker-1", job.id, claim.attempt, REPORT_OF_A_SCENE)
+    threading.Timer(0.5, add).start()
+    assert client.report(job.id).scored
 
 
 def test_a_render_comes_as_a_file_as_an_array_or_as_what_is_known(

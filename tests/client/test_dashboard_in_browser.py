@@ -16,7 +16,7 @@ from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobError, JobState
 from contract.wire.rendering import Highlights, Unseen
 from tests.client.local_service import CLIP
-from tests.client.page import FAR, HIGHLIGHTS_STAY, UNSEEN, Page, Site, browser, grey_of, site_at
+from tests.client.page import FAR, HIGHLIGHTS_STAY, REPORT_OF_THE_PAGE, UNSEEN, Page, Site, browser, grey_of, site_at
 from worker.daemon.pace import MAX_SAVED_S, SHARE
 
 POINTS = "return document.querySelector(`#curve polyline.${arguments[0]}`)?.points ?? []"
@@ -67,8 +67,10 @@ def test_a_clip_is_sent_and_its_job_watched_to_the_scene(site: Site, page: Page)
     page.until(lambda: len(page.script(POINTS, "score")) == 3)
     assert len(page.script(POINTS, "beside")) == 2  # of the right eye; the first report had none
     assert "28.5 dB, right eye 26.5 dB" in page.find("#curve").get_attribute("aria-label")
-    site.finish(claim)
+    site.finish(claim, scored=False)
     page.until_state("live")
+    page.until_text("#report", "still being measured")
+    site.store.add_scores("worker-1", claim.job_id, claim.attempt, REPORT_OF_THE_PAGE)
     page.until_text("#report", "31.20 dB on frames it never saw; better than copying")
     assert "The clip is short." in page.text("#report")
     assert "28.40 dB on frames it never saw, where the left eye sees the tissue, too; no better" in page.text("#report")

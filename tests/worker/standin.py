@@ -2,7 +2,8 @@
 
 The clip's text is a list of words, one for each attempt; the last stands for all further ones.
 
-    publish    advance, write a scene, finish            wait     advance until told to stop, keep the state
+    publish    advance, write a scene, finish, score it  wait     advance until told to stop, keep the state
+    unscored   as publish, but die while scoring         scoring  as publish, but score until told to stop
     fail       fail with an InputError's fields          deaf     advance for ever
     noise      print what is no report, then publish     hang     advance once, then say nothing for ever
     slow       advance for two seconds, then publish     exit     end with status 3
@@ -23,6 +24,16 @@ from pathlib import Path
 from typing import Any
 
 STATE = "resume.safetensors"
+UNKNOWN = (
+    "psnr_paper_db", "ssim", "baseline_blend_db", "baseline_flow_db", "depth_agreement_mm", "coverage",
+    "train_psnr_tissue_db",
+)  # fmt: skip
+REPORT: dict[str, Any] = {
+    **dict.fromkeys(UNKNOWN), "psnr_tissue_db": 30.0, "warnings": [], "assumptions": [], "preset": "fast", "seed": 0,
+    "device": "cpu", "iterations": 1000, "seconds": {}, "gaussians": 1, "bases": 1, "scene_bytes": 1,
+    "units_per_mm": 1.0, "width": 8, "height": 8, "frame_count": 2, "train_count": 1, "held_out": [1], "repeated": [],
+    "frame_times_s": [0.0, 0.1],
+}  # fmt: skip
 
 
 def tell(kind: str, **fields: object) -> None:
@@ -44,8 +55,22 @@ def publish(out: Path) -> None:
     advance(500, psnr_db=30.0, psnr_right_db=28.0, seconds_left=1.0)
     steps = (out / STATE).read_text() if (out / STATE).exists() else ""
     (out / STATE).unlink(missing_ok=True)
-    (out / "manifest.json").write_text(json.dumps({"went_on_from": steps}))
+    (out / "manifest.json").write_text(json.dumps({"went_on_from": steps, "files": {}}))
+    (out / "curve.csv").write_text("psnr_tissue_db,psnr_right_db\n30,\n")
+    (out / "report.json").write_text(json.dumps(REPORT | {"scored": False}))
     tell("finished")
+
+
+def score(word: str, stop: threading.Event) -> None:
+    """What follows a finished scene."""
+    tell("advanced", progress={"stage": "score", "fraction": 0.5})
+    if word == "unscored":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if word == "scoring":
+        stop.wait()
+        tell("stopped", checkpointed=False)
+    else:
+        tell("scored", report=REPORT)
 
 
 def wait(out: Path, stop: threading.Event) -> None:
@@ -62,13 +87,14 @@ def wait(out: Path, stop: threading.Event) -> None:
 
 def run(word: str, out: Path, stop: threading.Event) -> None:
     """One attempt."""
-    if word in ("publish", "noise", "slow"):
+    if word in ("publish", "noise", "slow", "unscored", "scoring"):
         if word == "noise":
             print("a library's chatter\n{}", flush=True)
         for step in range(1, 21 if word == "slow" else 1):
             advance(step)
             time.sleep(0.1)
         publish(out)
+        score(word, stop)
     elif word == "wait":
         wait(out, stop)
     elif word == "fail":
@@ -105,6 +131,9 @@ def main() -> None:
             continue
         stop = threading.Event()
         record = order["record"]
+        if order["kind"] == "score":
+            threading.Thread(target=score, args=("publish", stop), daemon=True).start()
+            continue
         words = (Path(order["spool"]) / record["files"]["clip"]).read_text().split()
         word = words[min(record["attempt"], len(words)) - 1]
         threading.Thread(target=run, args=(word, Path(order["out"]), stop), daemon=True).start()

@@ -1,4 +1,5 @@
 """A clip on disk becomes a scene: every preset, every length of clip, stereo and depth; or an error that names why."""
+# long: the pipeline is one story, and its clips and scenes are made once for all of it
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ import pytest
 import torch
 
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
+from contract.wire.notices import NoticeCode
 from contract.wire.options import ReconstructionOptions, parse_options
 from contract.wire.report import Report
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared_on, trained, view
@@ -24,12 +26,12 @@ from worker.machine.hooks import Progress
 from worker.model.metrics import coverage, psnr_tissue
 from worker.model.optimize import Rate
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
-from worker.pipeline import reconstruct, scene_of
+from worker.pipeline import judge, judge_again, make, reconstruct, scene_of
 from worker.raster.step import camera_vector
 from worker.render.view import render_frame
 from worker.scene.checkpoint import load_scene
 from worker.scene.model import model_of
-from worker.scene.resume_file import RESUME_FILE, load_resume
+from worker.scene.resume_file import RESUME_FILE
 from worker.train.hooks import TrainingHooks
 from worker.train.presets import PRESETS, Preset
 from worker.train.rate_distortion import TOLERANCE_DB, quantize_scene
@@ -93,13 +95,17 @@ def stereo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(clip: Path, out: Path, hooks: TrainingHooks | None = None, **options: Any) -> Report:
     """Reconstruct with options and fields of the request by their names; `preset` may be a preset of one's own."""
+    return reconstruct(request(clip, **options), out, hooks or TrainingHooks())
+
+
+def request(clip: Path, **options: Any) -> ReconstructionRequest:
     options = {"iterations": ITERATIONS, **options}
     if isinstance(options.get("preset"), Preset):
         options["own_preset"] = options.pop("preset")
     fields = {field.name for field in dataclasses.fields(ReconstructionRequest)}
     of_request = {name: options.pop(name) for name in fields & options.keys()}
     asked = parse_options(ReconstructionOptions, options)
-    return reconstruct(ReconstructionRequest(clip, asked, **of_request), out, hooks or TrainingHooks())
+    return ReconstructionRequest(clip, asked, **of_request)
 
 
 def files(folder: Path) -> set[str]:
@@ -183,20 +189,31 @@ def test_a_stopped_run_goes_on_in_its_folder(name: str, clip: Path, whole: Whole
     assert (resumed.frames, resumed.iterations) == (straight.frames, straight.iterations)
 
 
-def test_a_run_stopped_while_it_is_scored_goes_on_from_there(clip: Path, whole: Whole, tmp_path: Path) -> None:
-    straight, out = whole("fast")
+def test_a_run_stopped_while_it_is_scored_leaves_its_scene(clip: Path, whole: Whole, tmp_path: Path) -> None:
+    _, out = whole("fast")
     stages: set[str] = set()
     hooks = TrainingHooks(lambda progress: stages.add(progress.stage), lambda: "score" in stages)
     with pytest.raises(Cancelled, match="scoring"):
         run(clip, tmp_path / "stopped", hooks, preset="fast")
-    assert load_resume(tmp_path / "stopped")[1]["iteration"] == ITERATIONS
-    resumed = run(clip, tmp_path / "stopped", preset="fast")
+    assert files(tmp_path / "stopped") == SCENE_FILES
     assert tensor_bits(tmp_path / "stopped") == tensor_bits(out)
-    assert resumed.frames == straight.frames
-    with (tmp_path / "stopped" / "curve.csv").open() as file:
-        scored = [int(row["iteration"]) for row in csv.DictReader(file)]
-    assert scored[-1] == ITERATIONS
-    assert scored.count(ITERATIONS) == 1  # the same score is not kept twice
+    report = Report.model_validate_json((tmp_path / "stopped" / "report.json").read_text())
+    assert report.psnr_tissue_db is None
+    assert NoticeCode.SCORES_FAILED in [each.code for each in report.warnings]
+
+
+def test_a_scene_is_whole_before_it_is_scored_and_is_scored_alike_from_disk(
+    clip: Path, whole: Whole, tmp_path: Path
+) -> None:
+    straight, out = whole("fast")
+    asked = request(clip, preset="fast")
+    made = make(asked, tmp_path, TrainingHooks())
+    assert files(tmp_path) == SCENE_FILES
+    assert tensor_bits(tmp_path) == tensor_bits(out)
+    assert not made.report.scored
+    again = judge_again(asked, tmp_path, TrainingHooks())
+    assert again.frames == judge(made, TrainingHooks()).frames == straight.frames
+    assert again.warnings == straight.warnings
 
 
 def test_a_stopped_run_with_a_budget_keeps_its_schedule(clip: Path, tmp_path: Path) -> None:

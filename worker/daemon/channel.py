@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from pydantic import ValidationError
 
-from worker.daemon.orders import DeviceReport, RunJob, line_of, read_order
+from worker.daemon.orders import DeviceReport, RunJob, ScoreScene, line_of, read_order
 
 logger = logging.getLogger("intrasplat.worker")
 
@@ -52,9 +52,9 @@ class Channel:
 
 @dataclass(frozen=True)
 class Task:
-    """A job that was ordered; `stop` is set once it shall stop."""
+    """What was ordered; `stop` is set once it shall stop."""
 
-    run: RunJob
+    order: RunJob | ScoreScene
     stop: threading.Event = field(default_factory=threading.Event)
 
 
@@ -72,7 +72,7 @@ class Orders:
         return cls(os.fdopen(os.dup(sys.stdin.fileno()), "rb"))
 
     def next(self, timeout_s: float) -> Task | None:
-        """The next job; None after timeout_s."""
+        """The next task; None after timeout_s."""
         try:
             return self._tasks.get(timeout=timeout_s)
         except queue.Empty:
@@ -86,7 +86,7 @@ class Orders:
             except ValidationError:  # of another version: a process that hears no orders would only seem to work
                 logger.error("an order cannot be read; restart the worker after updating the program")
                 os._exit(1)
-            if isinstance(order, RunJob):
+            if isinstance(order, RunJob | ScoreScene):
                 task = Task(order)
                 self._tasks.put(task)
             elif task is not None:

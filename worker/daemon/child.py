@@ -23,6 +23,7 @@ from worker.daemon.orders import (
     Finished,
     Holding,
     Ready,
+    Scored,
     Stopped,
     line_of,
     read_report,
@@ -50,7 +51,7 @@ class Ended:
     cause: str
 
 
-JobReport: TypeAlias = Advanced | Finished | Stopped | Failed
+JobReport: TypeAlias = Advanced | Finished | Scored | Stopped | Failed
 
 
 class DeviceChild:

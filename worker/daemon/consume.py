@@ -1,12 +1,15 @@
 """The job loop: claim a job, let the device process reconstruct it, settle. No torch here, so nothing can hang.
 
-A job ends in exactly one of done, failed and cancelled. If the child dies, the job is handed back and the death counts
+A job ends in exactly one of done, failed and cancelled. It is done before its scene is scored: the scores follow within
+seconds, and if the child or this process dies meanwhile, the scene is scored when there is nothing else to do. If the
+child dies before, the job is handed back and the death counts
 against it. If this process is told to end, or the job to make way, the job is handed back and a later attempt resumes
 it. If this process dies, its child dies too, the claim runs out, and any worker takes the job.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -15,14 +18,16 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from contract.queue.interface import Claim, Order, Queue
+from contract.store.results import without_scores
 from contract.store.store import Store
-from contract.wire.errors import IntrasplatError, UnavailableError
+from contract.wire.errors import IntrasplatError, SceneError, UnavailableError
 from contract.wire.job import JobProgress, JobRecord, JobState
+from contract.wire.report import Report
 from worker.daemon.child import DeviceChild, Ended, Keeper
 from worker.daemon.hang import HangDetector
 from worker.daemon.heartbeat import Heartbeat
 from worker.daemon.job_errors import describe
-from worker.daemon.orders import Advanced, Failed, Finished, RunJob, StopJob, Stopped
+from worker.daemon.orders import Advanced, Failed, Finished, RunJob, Scored, ScoreScene, StopJob, Stopped
 
 CLAIM_TIMEOUT_S = 1.0
 """How soon an idle worker notices that it should end, or that its child has."""
@@ -42,6 +47,7 @@ FETCHING = "fetch"
 PUBLISHING = "publish"
 """The first and the last stage a caller sees: the clip is fetched, the scene is published."""
 
+DONE = "done"
 UNSETTLED = "the queue cannot be reached; the lease will run out"
 
 _Result = TypeVar("_Result")
@@ -60,10 +66,11 @@ class Died:
 class Consumer:
     """Takes one job after the other. job_id names the running one and may be read from any thread."""
 
-    def __init__(self, queue: Queue, store: Store, keeper: Keeper, owner: str, end: threading.Event) -> None:
+    def __init__(self, queue: Queue, store: Store, keeper: Keeper, name: str, owner: str, end: threading.Event) -> None:
         self._queue = queue
         self._store = store
         self._keeper = keeper
+        self._name = name
         self._owner = owner
         self._end = end
         self.job_id: str | None = None
@@ -87,27 +94,99 @@ class Consumer:
             away = False
             if record is not None:
                 self.job_id = record.job_id
-                run_job(self._queue, self._store, child, record, self._end)
+                run_job(self._queue, self._store, child, record, self._name, self._end)
                 self.job_id = None
+            else:
+                score_left(self._queue, self._store, child, self._name, self._end)
 
 
-def run_job(queue: Queue, store: Store, child: DeviceChild, record: JobRecord, end: threading.Event) -> None:
-    """Run one claimed job to its end; hand it back if `end` is set first."""
+def run_job(queue: Queue, store: Store, child: DeviceChild, record: JobRecord, name: str, end: threading.Event) -> None:
+    """Run one claimed job to its end; hand it back if `end` is set first. name: the worker's."""
     assert record.owner is not None
     claim = Claim(record.job_id, record.attempt, record.owner)
     log = _log_of(claim)
     log.info("an attempt starts")
     started_s = time.monotonic()
     with Heartbeat(queue, claim) as heart:
-        job = _Job(queue, store, claim, heart, end)
+        job = _Job(queue, store, claim, heart, name, end)
         try:
             outcome = job.settle(job.work(child, record))
-        except IntrasplatError as error:  # the store failed, and the child is idle
+        except IntrasplatError as error:  # the store failed, and the job is not with the child, or no more
             outcome = job.settle(job.without_store(error))
         except Exception as error:
             child.kill()
             outcome = job.settle(Failed(error=describe(error), fault=type(error).__name__))
     log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
+    if job.is_scoring:
+        if outcome != DONE:
+            with contextlib.suppress(UnavailableError):  # else score_left() forgets it
+                store.expect_no_scores(name, claim.job_id, claim.attempt)
+        scores = Scores(store, name, claim.job_id, claim.attempt, log)
+        scores.take(child, stop=end.is_set if outcome == DONE else lambda: True)
+
+
+def score_left(queue: Queue, store: Store, child: DeviceChild, name: str, end: threading.Event) -> None:
+    """Score one scene whose scoring a death or the end of this worker cut off, until a job waits."""
+    try:
+        job_id, attempt = next(iter(store.unscored(name)), (None, 0))
+        if job_id is None:
+            return
+        record = queue.get(job_id)
+        if record is None or record.state is not JobState.DONE or record.attempt != attempt:
+            store.expect_no_scores(name, job_id, attempt)
+            return
+        spool, scene = store.fetch_clip(job_id), store.scene_folder(job_id, attempt)
+    except (UnavailableError, SceneError) as error:
+        logger.warning("a scene waits for its scores: %s", error)
+        return
+    log = _log_of(Claim(job_id, attempt, name))
+    log.info("the scores of an earlier attempt are made up for")
+    child.send(ScoreScene(record=record, spool=spool, scene=scene))
+
+    def is_to_stop() -> bool:
+        with contextlib.suppress(UnavailableError):
+            return end.is_set() or queue.figures().queued > 0
+        return end.is_set()
+
+    Scores(store, name, job_id, attempt, log).take(child, stop=is_to_stop, gives_up=True)
+
+
+class Scores:
+    """Waits for the scores of a finished scene and adds them to it."""
+
+    def __init__(
+        self, store: Store, name: str, job_id: str, attempt: int, log: logging.LoggerAdapter[logging.Logger]
+    ) -> None:
+        self._store = store
+        self._scene = name, job_id, attempt
+        self._log = log
+
+    def take(self, child: DeviceChild, stop: Callable[[], bool], *, gives_up: bool = False) -> None:
+        """Until the child has scored the scene, is stopped, hangs or dies.
+
+        gives_up: a child that hangs or dies is the scene's fault, and its report says that there will be no scores.
+        """
+        detector, asked_s = HangDetector(), None
+        while not isinstance(report := child.next_report(LOOK_PERIOD_S), Scored | Stopped | Ended):
+            if isinstance(report, Advanced):
+                detector.observe(report.progress)
+            if asked_s is None and stop():
+                child.send(StopJob())
+                asked_s = time.monotonic()
+            if detector.is_hung() or (asked_s is not None and time.monotonic() - asked_s > MAX_STOP_S):
+                child.kill()
+        if isinstance(report, Scored):
+            self._add(report.report)
+        elif isinstance(report, Ended) and asked_s is None:
+            self._log.warning("the device process %s while it scored a scene", report.cause)
+            if gives_up:
+                self._add(without_scores(self._store.newest_report(*self._scene[1:]), report.cause))
+
+    def _add(self, report: Report) -> None:
+        try:
+            self._store.add_scores(*self._scene, report)
+        except (UnavailableError, SceneError) as error:  # it is still expected, and made up for later
+            self._log.warning("the scores were not kept: %s", error)
 
 
 def _log_of(claim: Claim) -> logging.LoggerAdapter[logging.Logger]:
@@ -118,13 +197,17 @@ def _log_of(claim: Claim) -> logging.LoggerAdapter[logging.Logger]:
 class _Job:
     """One attempt at a job: work() watches the child, settle() tells the queue how it ended."""
 
-    def __init__(self, queue: Queue, store: Store, claim: Claim, heart: Heartbeat, end: threading.Event) -> None:
+    def __init__(
+        self, queue: Queue, store: Store, claim: Claim, heart: Heartbeat, name: str, end: threading.Event
+    ) -> None:
         self._queue = queue
         self._store = store
         self._claim = claim
         self._heart = heart
+        self._name = name
         self._end = end
         self._log = _log_of(claim)
+        self.is_scoring = False
 
     def work(self, child: DeviceChild, record: JobRecord) -> Finished | Stopped | Failed | Died:
         """Let the child reconstruct; stop it when the queue or `end` says so, kill it when it hangs."""
@@ -139,6 +222,7 @@ class _Job:
         while True:
             report = child.next_report(LOOK_PERIOD_S)
             if isinstance(report, Finished | Stopped | Failed):
+                self.is_scoring = isinstance(report, Finished)
                 return report
             if isinstance(report, Ended):
                 return Died(report.cause, excused=asked_s is not None)
@@ -183,7 +267,7 @@ class _Job:
     def _tell(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
         """Whether the queue accepts the end (None: it cannot be reached), and the end in words for the log."""
         if isinstance(result, Finished):
-            return self._publish(), "done"
+            return self._publish(), DONE
         if isinstance(result, Failed):
             return self._retry_queue(lambda: self._queue.fail(self._claim, result.error)), f"failed ({result.fault})"
         died = isinstance(result, Died) and not result.excused
@@ -200,6 +284,7 @@ class _Job:
         order = self._retry_queue(self._heart.beat)
         if order is None or order in (Order.CANCEL, Order.LOST):
             return None if order is None else False
+        self._retry_store(lambda: self._store.expect_scores(self._name, self._claim.job_id, self._claim.attempt))
         self._retry_store(lambda: self._store.publish_scene(self._claim.job_id, self._claim.attempt))
         return self._retry_queue(lambda: self._queue.finish(self._claim))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from contract.intake.limits import ClipLimits
@@ -15,9 +16,12 @@ from contract.queue.embedded import short_socket_path
 from contract.runtime.exits import ExitCode, leave_last_words
 from contract.runtime.processes import die_with_parent
 from contract.runtime.settings import Settings
+from contract.store.results import without_scores
 from contract.store.store import Store, open_store
 from contract.wire.errors import Cancelled, InputError, ResumeMismatch, UnavailableError
 from contract.wire.job import JobRecord
+from contract.wire.names import REPORT
+from contract.wire.report import Report
 from worker.daemon.channel import Channel, Orders, Task
 from worker.daemon.job_errors import describe
 from worker.daemon.orders import (
@@ -26,6 +30,9 @@ from worker.daemon.orders import (
     Finished,
     Holding,
     Ready,
+    RunJob,
+    Scored,
+    ScoreScene,
     Stopped,
     job_progress,
 )
@@ -35,7 +42,7 @@ from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.input.decode import keep_decoder_ready
 from worker.machine.hooks import Progress
-from worker.pipeline import reconstruct
+from worker.pipeline import Made, judge, judge_again, make
 from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lost
 from worker.raster.cpu import compile_kernels
 from worker.raster.cpu.threads import cpu_time_s, thread_count
@@ -114,38 +121,66 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
             task = orders.next(LAST_SNAPSHOT_S)
             if task is None:
                 snapshots.drop(shown)
-            else:
-                shown = task.run.record.job_id
-                with pace.training():
-                    end = work_on(task, settings.device, ClipLimits.of(settings), snapshots, channel)
-                channel.send(end)
+                continue
+            if isinstance(task.order, RunJob):
+                shown = task.order.record.job_id
+            obey(task, settings, snapshots, pace, channel)
 
 
-def work_on(
-    task: Task, device: str, limits: ClipLimits, snapshots: Snapshots, channel: Channel
-) -> Finished | Stopped | Failed:
-    """Run one job. An error ends the job; only a lost GPU ends this process too."""
-    run = task.run
-    reporter = _Reporter(channel)
+def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, channel: Channel) -> None:
+    """Do what was ordered, and report it."""
+    order, limits = task.order, ClipLimits.of(settings)
     hooks = TrainingHooks(
-        on_progress=reporter.report,
+        on_progress=_Reporter(channel).report,
         should_stop=task.stop.is_set,
         wants_snapshot=snapshots.wanted,
         on_snapshot=snapshots.offer,
     )
-    snapshots.begin(run.record.job_id)
+    if isinstance(order, ScoreScene):
+        request = request_of(order.record, order.spool, settings.device, limits)
+        channel.send(scored(lambda: judge_again(request, order.scene, hooks), order.scene / REPORT))
+        return
+    with pace.training():
+        made = work_on(order, settings.device, limits, snapshots, hooks)
+    if not isinstance(made, Made):
+        channel.send(made)
+        return
+    channel.send(Finished())
+    channel.send(scored(lambda: judge(made, hooks), made.report))
+
+
+def work_on(
+    order: RunJob, device: str, limits: ClipLimits, snapshots: Snapshots, hooks: TrainingHooks
+) -> Made | Stopped | Failed:
+    """Run one job until its scene is finished. An error ends the job; only a lost GPU ends this process too."""
+    job_id = order.record.job_id
+    snapshots.begin(job_id)
     try:
-        run_or_start_anew(request_of(run.record, run.spool, device, limits), run.out, hooks)
+        return make_or_start_anew(request_of(order.record, order.spool, device, limits), order.out, hooks)
     except Cancelled:
-        snapshots.drop(run.record.job_id)
-        return Stopped(checkpointed=(run.out / RESUME_FILE).exists())
+        snapshots.drop(job_id)
+        return Stopped(checkpointed=(order.out / RESUME_FILE).exists())
     except Exception as error:
-        snapshots.drop(run.record.job_id)
+        snapshots.drop(job_id)
         if gpu_is_lost():
             logger.error("this process has lost the GPU (%s); another takes its place", type(error).__name__)
             raise SystemExit(1) from error
         return Failed(error=describe(error), fault=type(error).__name__)
-    return Finished()
+
+
+def scored(judge: Callable[[], Report], first: Report | Path) -> Scored | Stopped:
+    """What judging comes to. An error leaves the scene without scores, and its report says so.
+
+    first: the report without scores, or its file.
+    """
+    try:
+        return Scored(report=judge())
+    except Cancelled:
+        return Stopped(checkpointed=False)
+    except Exception as error:
+        logger.error("a scene could not be scored: %s", type(error).__name__, exc_info=error)
+        report = first if isinstance(first, Report) else Report.model_validate_json(first.read_bytes())
+        return Scored(report=without_scores(report, type(error).__name__))
 
 
 class _Reporter:
@@ -180,14 +215,14 @@ def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits |
     )
 
 
-def run_or_start_anew(request: ReconstructionRequest, out: Path, hooks: TrainingHooks) -> None:
-    """Reconstruct, resuming the state in `out`; start again if that state is damaged or of another version."""
+def make_or_start_anew(request: ReconstructionRequest, out: Path, hooks: TrainingHooks) -> Made:
+    """Make the scene, resuming the state in `out`; start again if that state is damaged or of another version."""
     try:
-        reconstruct(request, out, hooks)
+        return make(request, out, hooks)
     except ResumeMismatch:
         logger.warning("the stored state cannot be resumed; training starts again")
         (out / RESUME_FILE).unlink()
-        reconstruct(request, out, hooks)
+        return make(request, out, hooks)
 
 
 def _socket_endpoint(store: Store, name: str) -> str:

@@ -1,10 +1,11 @@
 """The messages between the supervisor and its device process, one JSON document per line.
 
-    supervisor -> child   on the child's stdin    RunJob, StopJob; when stdin closes, the child ends at once
-    child -> supervisor   on the child's stdout   Ready once; Holding at any time;
-                                                  for a job any number of Advanced, then Finished, Stopped or Failed
+    supervisor -> child   on the child's stdin    RunJob, ScoreScene, StopJob; when stdin closes, the child ends at once
+    child -> supervisor   on the child's stdout   Ready once; Holding at any time; for an order any number of Advanced
+                                                  and what ends it
 
-A job begins with RunJob and ends with Finished, Stopped, Failed or the child's death. Only then may another begin.
+RunJob ends with Stopped or Failed, or with Finished and after it Scored or Stopped. ScoreScene ends with Scored or
+Stopped. The child's death ends either. Only then may another begin.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from contract.wire.job import JobError, JobProgress, JobRecord
+from contract.wire.report import Report
 from worker.machine.hooks import Progress
 
 
@@ -32,8 +34,17 @@ class RunJob(_Message):
     out: Path
 
 
+class ScoreScene(_Message):
+    """Score the finished scene in the folder `scene`, whose clip is in `spool`: its worker ended before it did."""
+
+    kind: Literal["score"] = "score"
+    record: JobRecord
+    spool: Path
+    scene: Path
+
+
 class StopJob(_Message):
-    """Stop the running job and keep its state in `out`; ignored without a job."""
+    """Stop what runs; a job that is not finished keeps its state in `out`. Ignored while nothing runs."""
 
     kind: Literal["stop"] = "stop"
 
@@ -61,13 +72,20 @@ class Advanced(_Message):
 
 
 class Finished(_Message):
-    """The scene is complete in `out`."""
+    """The scene is complete in `out`, but for its scores."""
 
     kind: Literal["finished"] = "finished"
 
 
+class Scored(_Message):
+    """The report of the finished scene, with its scores or with the reason why there are none."""
+
+    kind: Literal["scored"] = "scored"
+    report: Report
+
+
 class Stopped(_Message):
-    """The job stopped as ordered. checkpointed: training had begun, and its state is in `out`."""
+    """What ran stopped as ordered. checkpointed: training had begun, and its state is in `out`."""
 
     kind: Literal["stopped"] = "stopped"
     checkpointed: bool
@@ -82,8 +100,8 @@ class Failed(_Message):
     """The error's type, for the log. Its text may hold the names of a caller's files."""
 
 
-DeviceOrder: TypeAlias = RunJob | StopJob
-DeviceReport: TypeAlias = Ready | Holding | Advanced | Finished | Stopped | Failed
+DeviceOrder: TypeAlias = RunJob | ScoreScene | StopJob
+DeviceReport: TypeAlias = Ready | Holding | Advanced | Finished | Scored | Stopped | Failed
 
 _ORDERS: TypeAdapter[DeviceOrder] = TypeAdapter(Annotated[DeviceOrder, Field(discriminator="kind")])
 _REPORTS: TypeAdapter[DeviceReport] = TypeAdapter(Annotated[DeviceReport, Field(discriminator="kind")])

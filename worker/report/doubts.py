@@ -7,16 +7,27 @@ real and synthetic, and what harms a scene (docs/decisions/016-stability.md). He
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.notices import Notice, NoticeCode
+from worker.fusion import CLEAR_CONFIDENCE
 from worker.input.clip.split import REPEAT_LEVELS
 from worker.input.clip.types import DepthClip
+from worker.train.scoring import sample_frames
 
+MIN_FRAMES = 16
+MIN_CONFIDENT_SHARE = 0.8
+SMOOTH_LEVELS = 2.0
+"""Standard deviation in 9 x 9 pixels, of 255: below it there is only noise to match."""
+MAX_SMOOTH_SHARE = 0.4
+MIN_TISSUE_SHARE = 0.3
+MAX_BRIGHTNESS_DRIFT = 0.25
+"""Range of the median brightness over its mean; beyond it, changing light and moving tissue are hard to tell apart."""
 ANALYSED_WIDTH = 640
 """Larger pictures are shrunk to it first: 4K endoscopes are soft from pixel to pixel, and in focus all the same."""
 DARK_PERCENTILE, MAX_DARK_LEVEL = 5.0, 85.0
@@ -49,6 +60,52 @@ MAX_JITTER = 0.003
 """Of the picture's width: how far poses that jump to and fro move the tissue in it, 2 px of 640."""
 MAX_ROUGHNESS = 1.0
 """Median change of step over median step: a smooth path has far less than 1, independent errors have 1.7."""
+
+
+def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
+    """What in the clip itself makes the result doubtful; held-out frames are not looked at."""
+    sampled = sample_frames(train)
+    found = []
+    if len(train) < MIN_FRAMES:
+        found.append(
+            Notice.warning(
+                NoticeCode.FEW_FRAMES, f"Only {len(train)} frames were trained on; motion between them is guessed."
+            )
+        )
+    tissue_share = float(np.mean([clip.tissue[index].mean() for index in train]))
+    if tissue_share < MIN_TISSUE_SHARE:
+        found.append(
+            Notice.warning(
+                NoticeCode.LITTLE_TISSUE,
+                f"Only {tissue_share:.0%} of the picture counts as tissue. If the masks are inverted, "
+                "set mask_polarity.",
+            )
+        )
+    if all(clip.tissue[index].all() for index in train):
+        found.append(
+            Notice.warning(
+                NoticeCode.NO_INSTRUMENT_MASKED,
+                "No instrument is masked anywhere: an instrument in the clip is modelled as if it were tissue.",
+            )
+        )
+    confident = _share_of_tissue(clip, sampled, lambda index: clip.depth_confidence[index] >= CLEAR_CONFIDENCE)
+    if confident < MIN_CONFIDENT_SHARE:
+        found.append(
+            Notice.warning(
+                NoticeCode.STEREO_UNSURE,
+                f"Stereo depth is missing or unsure on {1 - confident:.0%} of the tissue; the shape there "
+                "is interpolated.",
+            )
+        )
+    smooth = _share_of_tissue(clip, sampled, lambda index: _roughness(clip.rgb[index]) < SMOOTH_LEVELS)
+    if smooth > MAX_SMOOTH_SHARE:
+        found.append(
+            Notice.warning(
+                NoticeCode.NO_TEXTURE,
+                f"{smooth:.0%} of the tissue has no texture, so stereo and motion are guessed there.",
+            )
+        )
+    return found + _brightness_warnings(clip, sampled) + picture_doubts(clip, sampled) + course_doubts(clip, train)
 
 
 def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
@@ -211,6 +268,37 @@ def _pixels(clip: DepthClip, index: int) -> NDArray[np.uint8]:
     rgb, tissue = clip.rgb[index], clip.tissue[index]
     sparse: NDArray[np.uint8] = rgb[::2, ::2][tissue[::2, ::2]]
     return sparse if len(sparse) else np.asarray(rgb[tissue])
+
+
+def _brightness_warnings(clip: DepthClip, sampled: Iterable[int]) -> list[Notice]:
+    medians = [float(np.median(clip.rgb[index][clip.tissue[index]])) for index in sampled if clip.tissue[index].any()]
+    mean = float(np.mean(medians)) if medians else 0.0
+    if mean == 0 or (max(medians) - min(medians)) / mean <= MAX_BRIGHTNESS_DRIFT:
+        return []
+    return [
+        Notice.warning(
+            NoticeCode.BRIGHTNESS_CHANGES,
+            f"The tissue's brightness changes from {min(medians):.0f} to {max(medians):.0f} of 255 during the clip; "
+            "the model may take changing light for motion.",
+        )
+    ]
+
+
+def _share_of_tissue(clip: DepthClip, frames: Iterable[int], holds: Callable[[int], NDArray[np.bool_]]) -> float:
+    """Share of all tissue pixels of these frames at which something holds; NaN without tissue."""
+    kept, total = 0, 0
+    for index in frames:
+        kept += int((clip.tissue[index] & holds(index)).sum())
+        total += int(clip.tissue[index].sum())
+    return kept / total if total else math.nan
+
+
+def _roughness(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Standard deviation of grey in 9 x 9 pixels, [H, W], of 255."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    mean = cv2.blur(grey, (9, 9))
+    variance = cv2.blur(grey * grey, (9, 9)) - mean * mean
+    return np.asarray(np.sqrt(np.maximum(variance, 0)), dtype=np.float32)
 
 
 def _darkest(clip: DepthClip, index: int) -> float:

@@ -7,17 +7,14 @@ sentence in the report, and what is not finite is never published.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from contract.wire.errors import TrainingDiverged
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import FrameScore, Report
-from worker.fusion import CLEAR_CONFIDENCE
 from worker.input.clip import FrameSplit
 from worker.input.clip.types import DepthClip
 from worker.model.metrics import (
@@ -30,9 +27,9 @@ from worker.model.metrics import (
     ssim,
 )
 from worker.report.baselines import CopyBaselines
-from worker.report.doubts import course_doubts, picture_doubts
+from worker.report.doubts import clip_warnings
 from worker.report.right_eye import RightScores
-from worker.train.scoring import FrameRenderer, sample_frames
+from worker.train.scoring import FrameRenderer
 
 MIN_COVERAGE = 0.98
 MIN_TRAIN_DB = 25.0
@@ -47,14 +44,6 @@ OUTLIER_DB = 6.0
 """A held-out frame this far below the mean is named."""
 MAX_DEPTH_SHARE = 0.03
 """Of the depth: beyond it model and stereo disagree by more than the stereo's own noise."""
-MIN_FRAMES = 16
-MIN_CONFIDENT_SHARE = 0.8
-SMOOTH_LEVELS = 2.0
-"""Standard deviation in 9 x 9 pixels, of 255: below it there is only noise to match."""
-MAX_SMOOTH_SHARE = 0.4
-MIN_TISSUE_SHARE = 0.3
-MAX_BRIGHTNESS_DRIFT = 0.25
-"""Range of the median brightness over its mean; beyond it, changing light and moving tissue are hard to tell apart."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +83,9 @@ class Training:
     measurements: dict[str, float] = field(default_factory=dict)
 
 
+SCORES_PENDING = Notice.info(
+    NoticeCode.SCORES_PENDING, "The scores are still being measured: ask for the report again in some seconds."
+)
 _MERGED_FIELDS = ("assumptions", "warnings", "measurements")  # the clip has them, too; the report holds both
 
 
@@ -128,41 +120,19 @@ def measure(clip: DepthClip, frames: Sequence[int], render: FrameRenderer) -> Sc
     )
 
 
-def build_report(
-    clip: DepthClip,
-    split: FrameSplit,
-    held_out: Scores,
-    right: RightScores,
-    trained: Scores,
-    baselines: CopyBaselines,
-    training: Training,
-) -> Report:
-    """The report of a finished scene.
-
-    Args:
-        held_out: measure(clip, split.held_out, ...); of no frames if none was held out.
-        right: measure_right(clip, split.held_out, ...).
-        trained: measure(clip, sample_frames(split.train), ...), for the comparison.
-        baselines: copy_baselines(clip, split.train, split.held_out).
-    """
-    found = [*clip.warnings, *split.warnings, *training.warnings]
-    found += clip_warnings(clip, split.train)
-    found += score_warnings(held_out, trained, baselines) + right_eye_warnings(held_out, right)
+def first_report(clip: DepthClip, split: FrameSplit, training: Training) -> Report:
+    """The report of a finished scene before it is scored."""
+    found = [*clip.warnings, *split.warnings, *training.warnings, *clip_warnings(clip, split.train), SCORES_PENDING]
     return Report(
-        psnr_tissue_db=_mean(held_out.psnr_tissue_db),
-        psnr_clear_db=_mean(held_out.psnr_clear_db),
-        psnr_right_db=_mean(right.psnr_db),
-        psnr_right_clear_db=_mean(right.clear_db),
-        baseline_warp_db=_mean(right.warp_db),
-        baseline_warp_clear_db=_mean(right.warp_clear_db),
-        psnr_paper_db=_mean(held_out.psnr_paper_db),
-        ssim=_mean(held_out.ssim),
-        baseline_blend_db=_mean(baselines.blend_db),
-        baseline_flow_db=_mean(baselines.flow_db),
-        depth_agreement_mm=_known(held_out.depth_agreement_mm),
-        coverage=_mean(held_out.coverage),
-        train_psnr_tissue_db=_mean(trained.psnr_tissue_db),
-        frames=_frame_scores(held_out, right, baselines),
+        scored=False,
+        psnr_tissue_db=None,
+        psnr_paper_db=None,
+        ssim=None,
+        baseline_blend_db=None,
+        baseline_flow_db=None,
+        depth_agreement_mm=None,
+        coverage=None,
+        train_psnr_tissue_db=None,
         warnings=tuple(dict.fromkeys(found)),
         assumptions=tuple(dict.fromkeys((*clip.assumptions, *training.assumptions))),
         right_eye=clip.registration,
@@ -178,50 +148,37 @@ def build_report(
     )
 
 
-def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
-    """What in the clip itself makes the result doubtful; held-out frames are not looked at."""
-    sampled = sample_frames(train)
-    found = []
-    if len(train) < MIN_FRAMES:
-        found.append(
-            Notice.warning(
-                NoticeCode.FEW_FRAMES, f"Only {len(train)} frames were trained on; motion between them is guessed."
-            )
-        )
-    tissue_share = float(np.mean([clip.tissue[index].mean() for index in train]))
-    if tissue_share < MIN_TISSUE_SHARE:
-        found.append(
-            Notice.warning(
-                NoticeCode.LITTLE_TISSUE,
-                f"Only {tissue_share:.0%} of the picture counts as tissue. If the masks are inverted, "
-                "set mask_polarity.",
-            )
-        )
-    if all(clip.tissue[index].all() for index in train):
-        found.append(
-            Notice.warning(
-                NoticeCode.NO_INSTRUMENT_MASKED,
-                "No instrument is masked anywhere: an instrument in the clip is modelled as if it were tissue.",
-            )
-        )
-    confident = _share_of_tissue(clip, sampled, lambda index: clip.depth_confidence[index] >= CLEAR_CONFIDENCE)
-    if confident < MIN_CONFIDENT_SHARE:
-        found.append(
-            Notice.warning(
-                NoticeCode.STEREO_UNSURE,
-                f"Stereo depth is missing or unsure on {1 - confident:.0%} of the tissue; the shape there "
-                "is interpolated.",
-            )
-        )
-    smooth = _share_of_tissue(clip, sampled, lambda index: _roughness(clip.rgb[index]) < SMOOTH_LEVELS)
-    if smooth > MAX_SMOOTH_SHARE:
-        found.append(
-            Notice.warning(
-                NoticeCode.NO_TEXTURE,
-                f"{smooth:.0%} of the tissue has no texture, so stereo and motion are guessed there.",
-            )
-        )
-    return found + _brightness_warnings(clip, sampled) + picture_doubts(clip, sampled) + course_doubts(clip, train)
+def scored_report(
+    first: Report, held_out: Scores, right: RightScores, trained: Scores, baselines: CopyBaselines
+) -> Report:
+    """The report with its scores.
+
+    Args:
+        first: first_report() of the scene.
+        held_out: measure(clip, first.held_out, ...); of no frames if none was held out.
+        right: measure_right(clip, first.held_out, ...).
+        trained: measure(clip, sample_frames(train), ...), for the comparison.
+        baselines: copy_baselines(clip, train, first.held_out).
+    """
+    known = [each for each in first.warnings if each.code is not NoticeCode.SCORES_PENDING]
+    found = score_warnings(held_out, trained, baselines) + right_eye_warnings(held_out, right)
+    scores = {
+        "psnr_tissue_db": _mean(held_out.psnr_tissue_db),
+        "psnr_clear_db": _mean(held_out.psnr_clear_db),
+        "psnr_right_db": _mean(right.psnr_db),
+        "psnr_right_clear_db": _mean(right.clear_db),
+        "baseline_warp_db": _mean(right.warp_db),
+        "baseline_warp_clear_db": _mean(right.warp_clear_db),
+        "psnr_paper_db": _mean(held_out.psnr_paper_db),
+        "ssim": _mean(held_out.ssim),
+        "baseline_blend_db": _mean(baselines.blend_db),
+        "baseline_flow_db": _mean(baselines.flow_db),
+        "depth_agreement_mm": _known(held_out.depth_agreement_mm),
+        "coverage": _mean(held_out.coverage),
+        "train_psnr_tissue_db": _mean(trained.psnr_tissue_db),
+        "frames": _frame_scores(held_out, right, baselines),
+    }
+    return first.model_copy(update={**scores, "scored": True, "warnings": tuple(dict.fromkeys([*known, *found]))})
 
 
 def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) -> list[Notice]:
@@ -343,37 +300,6 @@ def _bad_frames(held_out: Scores, model_db: float | None) -> list[Notice]:
     )
 
 
-def _brightness_warnings(clip: DepthClip, sampled: Iterable[int]) -> list[Notice]:
-    medians = [float(np.median(clip.rgb[index][clip.tissue[index]])) for index in sampled if clip.tissue[index].any()]
-    mean = float(np.mean(medians)) if medians else 0.0
-    if mean == 0 or (max(medians) - min(medians)) / mean <= MAX_BRIGHTNESS_DRIFT:
-        return []
-    return [
-        Notice.warning(
-            NoticeCode.BRIGHTNESS_CHANGES,
-            f"The tissue's brightness changes from {min(medians):.0f} to {max(medians):.0f} of 255 during the clip; "
-            "the model may take changing light for motion.",
-        )
-    ]
-
-
-def _share_of_tissue(clip: DepthClip, frames: Iterable[int], holds: Callable[[int], NDArray[np.bool_]]) -> float:
-    """Share of all tissue pixels of these frames at which something holds; NaN without tissue."""
-    kept, total = 0, 0
-    for index in frames:
-        kept += int((clip.tissue[index] & holds(index)).sum())
-        total += int(clip.tissue[index].sum())
-    return kept / total if total else math.nan
-
-
-def _roughness(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Standard deviation of grey in 9 x 9 pixels, [H, W], of 255."""
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    mean = cv2.blur(grey, (9, 9))
-    variance = cv2.blur(grey * grey, (9, 9)) - mean * mean
-    return np.asarray(np.sqrt(np.maximum(variance, 0)), dtype=np.float32)
-
-
 def _frame_scores(scores: Scores, right: RightScores, baselines: CopyBaselines) -> tuple[FrameScore, ...]:
     columns = {
         "psnr_tissue_db": scores.psnr_tissue_db,
@@ -385,7 +311,7 @@ def _frame_scores(scores: Scores, right: RightScores, baselines: CopyBaselines) 
         "baseline_flow_db": baselines.flow_db,
     }
     return tuple(
-        FrameScore(frame=frame, **{name: _known(column[row]) for name, column in columns.items()})
+        FrameScore.model_validate({"frame": frame} | {name: _known(each[row]) for name, each in columns.items()})
         for row, frame in enumerate(scores.frames)
     )
 

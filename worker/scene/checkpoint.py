@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +36,8 @@ MISFITS = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError
 """Errors that reading raises where a manifest's entry or a tensor has the wrong shape or type."""
 
 
-def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> None:
+def save_scene(directory: Path, scene: Scene) -> None:
     """Write the scene into a directory, which is made if need be; a scene that is there is replaced.
-
-    Args:
-        beside: names of files in the directory (report.json, curve.csv) whose hashes the manifest shall hold.
 
     Raises:
         SceneError: a number is not finite or out of its range, or the tensors do not belong together. Nothing is
@@ -50,7 +46,7 @@ def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> 
     check(scene)
     tensors = scene.file_tensors()
     directory.mkdir(parents=True, exist_ok=True)
-    files = {SCENE_FILE: scene.file_content} | {name: (directory / _plain(name)).read_bytes() for name in beside}
+    content = scene.file_content
     manifest = {
         "format": FORMAT,
         "version": FORMAT_VERSION,
@@ -67,13 +63,10 @@ def save_scene(directory: Path, scene: Scene, *, beside: Sequence[str] = ()) -> 
         "trained_t": list(scene.trained_t),
         "right_eye_mm": scene.right_eye_mm,
         "tensors": {name: {"shape": list(each.shape), "dtype": dtype_name(each)} for name, each in tensors.items()},
-        "files": {
-            name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-            for name, content in files.items()
-        },
+        "files": {SCENE_FILE: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}},
     }
     text = json.dumps(manifest, indent=1, allow_nan=False)
-    replace_file(directory / SCENE_FILE, scene.file_content, FOR_ALL)
+    replace_file(directory / SCENE_FILE, content, FOR_ALL)
     replace_file(directory / MANIFEST_FILE, text.encode(), FOR_ALL)
 
 

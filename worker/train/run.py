@@ -115,7 +115,7 @@ def frames_at(run: Run, iteration: int) -> list[int]:
 
 
 def write_curve(path: Path, run: Run) -> None:
-    """curve.csv: t_train_s, iteration, scores of the held-out frames, training frames seen by then.
+    """curve.csv: t_train_s, iteration, scores of the held-out frames in training, training frames seen by then.
 
     psnr_right_db is empty for a clip of one eye.
     """

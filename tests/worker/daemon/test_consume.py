@@ -1,4 +1,5 @@
 """The job loop with a real queue, a real store and a child process that obeys the text of the clip (standin.py)."""
+# long: every way in which a job of one worker may go, on one stand-in for its child
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ from contract.runtime import supervised
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobError, JobProgress, JobRecord, JobState
-from contract.wire.names import MANIFEST, RESUME
+from contract.wire.names import CURVE, MANIFEST, REPORT, RESUME
 from contract.wire.rendering import WorkerAddress
 from tests.worker.jobs import STANDIN, Jobs, eventually
 from worker.daemon import consume, hang
@@ -35,7 +36,7 @@ class JobLoop(Jobs):
         self.end = threading.Event()
         command = [sys.executable, str(STANDIN), *arguments]
         self.keeper = Keeper(command, last_words=self.store.run_dir / "worker-1.last-words")
-        self.consumer = Consumer(self.queue, self.store, self.keeper, "worker-1.a", self.end)
+        self.consumer = Consumer(self.queue, self.store, self.keeper, "worker-1", "worker-1.a", self.end)
         self.thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -398,3 +399,42 @@ def test_the_state_of_an_attempt_goes_to_the_next(bench: JobLoop) -> None:
     record = bench.wait_for_end(job_id)
     assert (record.state, record.attempt, record.released) == (JobState.DONE, 3, 1)
     assert bench.went_on_from(record) == "x"
+
+
+def test_a_scene_is_done_before_it_is_scored_and_its_scores_follow(bench: JobLoop) -> None:
+    record = bench.outcome("publish")
+    eventually(lambda: bench.store.newest_report(record.job_id, record.attempt).scored)
+    eventually(lambda: bench.store.unscored("worker-1") == [])
+    files = json.loads((bench.store.scene_folder(record.job_id, record.attempt) / MANIFEST).read_text())["files"]
+    assert set(files) == {REPORT, CURVE}
+
+
+@pytest.mark.parametrize("way", ["its child dies", "the worker ends"])
+def test_a_scene_that_was_not_scored_is_scored_when_nothing_else_is_to_do(bench: JobLoop, way: str) -> None:
+    record = bench.outcome("unscored" if way == "its child dies" else "scoring")
+    if way == "the worker ends":
+        assert not bench.store.newest_report(record.job_id, record.attempt).scored
+        bench.stop()
+        assert bench.store.unscored("worker-1") == [(record.job_id, record.attempt)]
+        bench.start()
+    eventually(lambda: bench.store.newest_report(record.job_id, record.attempt).scored)
+    assert bench.record(record.job_id) == record
+
+
+def test_a_waiting_job_comes_before_the_scores_of_an_earlier_scene(bench: JobLoop) -> None:
+    first = bench.outcome("scoring")
+    second = bench.submit("publish")
+    bench.stop()
+    bench.start()
+    assert bench.wait_for_end(second).state is JobState.DONE
+    eventually(lambda: bench.store.newest_report(first.job_id, first.attempt).scored)
+
+
+def test_the_scores_of_a_scene_that_was_purged_meanwhile_are_dropped(bench: JobLoop) -> None:
+    record = bench.outcome("scoring")
+    bench.stop()
+    bench.store.purge(record.job_id)
+    bench.queue.forget(record.job_id)
+    bench.start()
+    eventually(lambda: bench.store.unscored("worker-1") == [])
+    assert bench.files(record.job_id) == []

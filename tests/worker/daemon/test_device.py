@@ -20,12 +20,15 @@ from contract.store.shelf import new_job_id
 from contract.wire.errors import InputError, TrainingDiverged, UnavailableError
 from contract.wire.job import JobFiles, JobRecord
 from contract.wire.names import REPORT
+from contract.wire.notices import NoticeCode
 from contract.wire.options import JobOptions, ReconstructionOptions
+from contract.wire.report import Report
+from tests.reports import REPORT_OF_A_SCENE
 from worker.__main__ import main
 from worker.daemon.child import DeviceChild, Keeper
-from worker.daemon.device import request_of, run_or_start_anew
+from worker.daemon.device import make_or_start_anew, request_of, scored
 from worker.daemon.job_errors import describe
-from worker.daemon.orders import Advanced, Failed, Finished, RunJob, StopJob, Stopped
+from worker.daemon.orders import Advanced, Failed, Finished, RunJob, Scored, ScoreScene, StopJob, Stopped
 from worker.scene.checkpoint import load_scene
 from worker.scene.resume_file import RESUME_FILE, load_resume
 from worker.train.hooks import TrainingHooks
@@ -113,12 +116,26 @@ def end_of_job(child: DeviceChild, stop_after: int | None = None) -> tuple[objec
             stop_after = None
 
 
+def scores(child: DeviceChild) -> Report:
+    """The report that follows a finished scene."""
+    end, _ = end_of_job(child)
+    assert isinstance(end, Scored)
+    return end.report
+
+
 def test_a_stopped_job_goes_on_to_the_same_bits_and_the_process_does_any_number_of_jobs(
     device: DeviceChild, tmp_path: Path, clip: Path
 ) -> None:
     whole, out = tmp_path / "whole", tmp_path / "out"
     device.send(order(clip, whole, iterations=600))
     assert end_of_job(device)[0] == Finished()
+    first = Report.model_validate_json((whole / REPORT).read_bytes())
+    report = scores(device)
+    assert (first.scored, report.scored) == (False, True)
+    assert report.train_psnr_tissue_db is not None
+    again = ScoreScene(record=order(clip, whole, iterations=600).record, spool=clip.parent, scene=whole)
+    device.send(again)
+    assert scores(device).frames == report.frames
     device.send(order(clip, tmp_path / "no", holdout="99", iterations=3))
     failed, _ = end_of_job(device)
     assert isinstance(failed, Failed)
@@ -131,6 +148,7 @@ def test_a_stopped_job_goes_on_to_the_same_bits_and_the_process_does_any_number_
     device.send(order(clip, out, iterations=600))
     finished, advances = end_of_job(device)
     assert finished == Finished()
+    assert scores(device).frames == report.frames
     assert min(each.progress.iteration for each in advances if each.progress.stage == "train") == stopped_at
     assert tensor_bits(out) == tensor_bits(whole)
 
@@ -170,7 +188,7 @@ def is_alive(process_id: int) -> bool:
 def test_a_state_of_another_version_is_left_behind_and_training_starts_anew(tmp_path: Path, clip: Path) -> None:
     request_here = ReconstructionRequest(clip, ReconstructionOptions(iterations=3))
     (tmp_path / RESUME_FILE).write_bytes(b"of another version")
-    run_or_start_anew(request_here, tmp_path, TrainingHooks())
+    make_or_start_anew(request_here, tmp_path, TrainingHooks())
     assert (tmp_path / REPORT).exists()
     assert not (tmp_path / RESUME_FILE).exists()
 
@@ -192,11 +210,25 @@ def test_every_error_has_a_remedy_and_no_unforeseen_text_reaches_the_caller(erro
     assert "smith" not in told.model_dump_json()
 
 
+def test_a_scene_that_cannot_be_scored_says_so_in_its_report(tmp_path: Path) -> None:
+    first = REPORT_OF_A_SCENE.model_copy(update={"scored": False, "psnr_tissue_db": None})
+    (tmp_path / REPORT).write_text(first.model_dump_json())
+
+    def diverged() -> Report:
+        raise TrainingDiverged("Frame 3 renders as NaN.")
+
+    for given in (first, tmp_path / REPORT):
+        told = scored(diverged, given)
+        assert isinstance(told, Scored)
+        assert told.report.scored
+        assert [each.code for each in told.report.warnings] == [NoticeCode.SCORES_FAILED]
+
+
 def test_other_trouble_with_the_input_is_not_tried_twice(tmp_path: Path) -> None:
     (tmp_path / RESUME_FILE).write_bytes(b"kept")
     asked = ReconstructionRequest(tmp_path / "no.zip", ReconstructionOptions(iterations=3))
     with pytest.raises(InputError, match="clip"):
-        run_or_start_anew(asked, tmp_path, TrainingHooks())
+        make_or_start_anew(asked, tmp_path, TrainingHooks())
     assert (tmp_path / RESUME_FILE).read_bytes() == b"kept"
 
 

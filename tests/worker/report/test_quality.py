@@ -18,7 +18,8 @@ from worker.input.clip import FrameSplit, split_frames
 from worker.input.clip.types import DepthClip
 from worker.model.metrics import psnr_tissue
 from worker.report.baselines import CopyBaselines, copy_baselines
-from worker.report.quality import Scores, Training, build_report, clip_warnings, measure, score_warnings
+from worker.report.doubts import clip_warnings
+from worker.report.quality import Scores, Training, first_report, measure, score_warnings, scored_report
 from worker.report.right_eye import RightScores
 from worker.train.hooks import RenderedFrame
 from worker.train.scoring import sample_frames
@@ -68,9 +69,8 @@ def report_of(clip: DepthClip, holdout: str = "every8", noise: float = 0.01) -> 
     split = split_frames(clip, holdout)
     held_out = measure(clip, split.held_out, views(clip, noise))
     trained = measure(clip, sample_frames(split.train), views(clip, noise))
-    return build_report(
-        clip, split, held_out, RightScores(), trained, copy_baselines(clip, split.train, split.held_out), TRAINING
-    )
+    first, copies = first_report(clip, split, TRAINING), copy_baselines(clip, split.train, split.held_out)
+    return scored_report(first, held_out, RightScores(), trained, copies)
 
 
 def scores(psnr_db: float = 35.0, *, covered: float = 1.0, depth_agreement_mm: float = 0.5, frames: int = 3) -> Scores:
@@ -100,6 +100,23 @@ def test_a_good_model_of_a_good_clip_warns_of_nothing() -> None:
     assert report.measurements == {"vertical_px": 0.2, "steps_per_s": 40.0}
     assert (report.width, report.height, report.frame_count) == (64, 48, 24)
     assert report.seconds == TRAINING.seconds
+
+
+def test_a_report_without_scores_says_that_they_are_to_come() -> None:
+    clip = long_clip()
+    first = first_report(clip, split_frames(clip, "every8"), TRAINING)
+    assert not first.scored
+    assert (first.psnr_tissue_db, first.baseline_flow_db, first.coverage, first.frames) == (None, None, None, ())
+    assert [each.code for each in first.warnings] == [NoticeCode.SCORES_PENDING]
+    scored = report_of(clip)
+    assert scored.scored
+    kept = set(Report.model_fields) - {"scored", "warnings", "frames"}
+    assert {name for name in kept if getattr(first, name) != getattr(scored, name)} == {
+        name
+        for name in kept
+        if name.startswith(("psnr", "ssim", "baseline", "depth_a", "coverage", "train_psnr"))
+        and getattr(scored, name) is not None
+    }
 
 
 def test_means_are_over_frames_and_each_frame_is_listed() -> None:
@@ -252,7 +269,6 @@ def test_what_the_clip_and_the_split_warned_of_is_repeated_once() -> None:
     clip = dataclasses.replace(long_clip(), warnings=(info("the sound is missing"), info("the sound is missing")))
     split = FrameSplit([0, *range(2, 24)], [1], [], warnings=(info("1 frame repeats"),))
     held_out, trained = (measure(clip, frames, views(clip)) for frames in ([1], sample_frames(split.train)))
-    report = build_report(
-        clip, split, held_out, RightScores(), trained, copy_baselines(clip, split.train, [1]), TRAINING
-    )
+    first = first_report(clip, split, TRAINING)
+    report = scored_report(first, held_out, RightScores(), trained, copy_baselines(clip, split.train, [1]))
     assert [each.text for each in report.warnings] == ["the sound is missing", "1 frame repeats"]

@@ -14,7 +14,10 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
+from contract.store.results import add_scores
 from contract.wire.errors import SceneError
+from contract.wire.report import Report
+from tests.reports import REPORT_OF_A_SCENE
 from tests.worker.scenes import KINDS, random_scene
 from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
 from worker.scene.resume_file import RESUME_FILE, RESUME_VERSION, load_resume, save_resume
@@ -65,10 +68,17 @@ def test_byte_count_is_the_size_on_disk_but_for_the_header(tmp_path: Path) -> No
     assert 0 <= (tmp_path / SCENE_FILE).stat().st_size - scene.byte_count < 4096
 
 
-def test_the_manifest_holds_the_hash_of_what_lies_beside(tmp_path: Path) -> None:
-    (tmp_path / "report.json").write_text("{}")
-    save_scene(tmp_path, random_scene(), beside=["report.json"])
+def test_the_manifest_holds_the_hash_of_every_file_once_the_scores_are_known(tmp_path: Path) -> None:
+    save_scene(tmp_path, random_scene())
+    (tmp_path / "report.json").write_text(REPORT_OF_A_SCENE.model_copy(update={"scored": False}).model_dump_json())
+    (tmp_path / "curve.csv").write_text("t_train_s,psnr_tissue_db,psnr_right_db\n1,30,\n2,31,\n")
+    load_scene(tmp_path)
+    add_scores(tmp_path, REPORT_OF_A_SCENE)
+    assert Report.model_validate_json((tmp_path / "report.json").read_bytes()) == REPORT_OF_A_SCENE
+    assert (tmp_path / "curve.csv").read_text().splitlines()[1:] == ["1,30,", "2,36.2000,"]
+    load_scene(tmp_path)
     manifest = json.loads((tmp_path / MANIFEST_FILE).read_text())
+    assert set(manifest["files"]) == {SCENE_FILE, "report.json", "curve.csv"}
     for name, entry in manifest["files"].items():
         assert entry["sha256"] == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
     (tmp_path / "report.json").write_text('{"psnr": 99}')

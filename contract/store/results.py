@@ -1,0 +1,59 @@
+"""The scores of a finished scene are added to its folder when they are known.
+
+A reader finds either the scene alone, or the scene with its scores: the manifest, which is replaced last, holds hashes
+of the report and the curve from then on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+from contract.store.durable import FOR_ALL, replace_file
+from contract.wire.names import CURVE, MANIFEST, REPORT
+from contract.wire.notices import Notice, NoticeCode
+from contract.wire.report import Report
+
+RESULTS = (REPORT, CURVE, MANIFEST)
+"""The files that change, in the order in which they do."""
+
+
+def add_scores(folder: Path, report: Report) -> None:
+    """Put the scored report into a scene's folder. The curve's last point becomes the report's score.
+
+    The points before it are over at most sixteen held-out frames, and of the model in training.
+
+    Raises:
+        FileNotFoundError: the scene has been removed.
+    """
+    manifest = json.loads((folder / MANIFEST).read_bytes())
+    curve = (folder / CURVE).read_text()
+    files = {REPORT: report.model_dump_json(indent=1).encode(), CURVE: _with_score(curve, report).encode()}
+    for name, content in files.items():
+        replace_file(folder / name, content, FOR_ALL)
+        manifest["files"][name] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    replace_file(folder / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False).encode(), FOR_ALL)
+
+
+def without_scores(first: Report, reason: str) -> Report:
+    """The report of a scene whose scores will never be known.
+
+    Args:
+        first: the report before scoring.
+        reason: a type's name or a few words.
+    """
+    text = f"The scores of this scene could not be measured ({reason}): how good it is, is not known."
+    kept = (each for each in first.warnings if each.code is not NoticeCode.SCORES_PENDING)
+    failed = Notice.warning(NoticeCode.SCORES_FAILED, text)
+    return first.model_copy(update={"scored": True, "warnings": (*kept, failed)})
+
+
+def _with_score(curve: str, report: Report) -> str:
+    head, *points = curve.splitlines()
+    if points and report.psnr_tissue_db is not None:
+        last = dict(zip(head.split(","), points[-1].split(","), strict=True))
+        last["psnr_tissue_db"] = f"{report.psnr_tissue_db:.4f}"
+        last["psnr_right_db"] = "" if report.psnr_right_db is None else f"{report.psnr_right_db:.4f}"
+        points[-1] = ",".join(last.values())
+    return "\n".join([head, *points]) + "\n"

@@ -1,0 +1,64 @@
+"""The judge: a finished scene's own renders against the frames of its clip."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from contract.wire.errors import Cancelled
+from contract.wire.report import Report
+from worker.input.clip import DepthClip, Eye
+from worker.machine.hooks import Hooks, Progress
+from worker.raster.backend import CPU, Device
+from worker.render.view import renderer_of
+from worker.report.baselines import copy_baselines
+from worker.report.quality import measure, scored_report
+from worker.report.right_eye import measure_right
+from worker.scene.scene import Scene
+from worker.train.hooks import RenderedFrame
+from worker.train.scoring import FrameRenderer, sample_frames
+from worker.train.targets import solid_depth_mm
+
+STAGE = "score"
+
+
+def judged(
+    first: Report, clip: DepthClip, train: Sequence[int], scene: Scene, hooks: Hooks, device: Device = CPU
+) -> Report:
+    """The report with the scores of the scene's held-out frames, of the right eye's, and of the copy baselines.
+
+    Args:
+        first: the report of the scene before it was scored.
+        train: the frames that the scene was trained on.
+
+    Raises:
+        TrainingDiverged: a render holds NaN or infinity.
+        Cancelled: hooks.should_stop said so.
+    """
+    started_s, sampled = time.perf_counter(), sample_frames(train)
+    total, done = 2 * len(first.held_out) + len(sampled), 0
+
+    def views(eye: DepthClip | Eye) -> FrameRenderer:
+        """Renders the frame of this index from the eye's own pose."""
+        renderer = renderer_of(scene, device)
+
+        def render(index: int) -> RenderedFrame:
+            nonlocal done
+            hooks.on_progress(Progress(STAGE, done / total, first.iterations, first.iterations))
+            if hooks.should_stop():
+                raise Cancelled("Stopped while scoring.")
+            done += 1
+            image, _ = renderer.layers(float(clip.t[index]), eye.world_from_camera[index], eye.intrinsics)
+            depth_mm = solid_depth_mm(image[3], image[4], scene.units_per_mm)
+            return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
+
+        return render
+
+    held_out = measure(clip, first.held_out, views(clip))
+    right = measure_right(clip, first.held_out, views(clip.right or clip))
+    trained = measure(clip, sampled, views(clip))
+    baselines = copy_baselines(clip, train, first.held_out)
+    report = scored_report(first, held_out, right, trained, baselines)
+    made, left_db, right_db = first.iterations, report.psnr_tissue_db, report.psnr_right_db
+    hooks.on_progress(Progress(STAGE, 1.0, made, made, psnr_db=left_db, psnr_right_db=right_db))
+    return report.model_copy(update={"seconds": {**first.seconds, "score_s": time.perf_counter() - started_s}})
