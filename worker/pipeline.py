@@ -6,7 +6,6 @@ import dataclasses
 import json
 import platform
 import time
-from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import version
@@ -18,13 +17,9 @@ from contract.store.results import add_scores, without_scores
 from contract.wire.errors import Cancelled, TrainingDiverged
 from contract.wire.names import CURVE, REPORT
 from contract.wire.notices import Notice, NoticeCode
-from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM
 from contract.wire.report import Report
-from worker.input.calibration import rectify
-from worker.input.calibration.types import StereoCalibration
 from worker.input.camera import to_camera
-from worker.input.clip import DepthClip, FrameSplit, StereoClip, split_frames, training_frames
-from worker.input.decode import decode_clip
+from worker.input.clip import DepthClip, FrameSplit, split_frames
 from worker.machine.hooks import Hooks
 from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from worker.machine.timing import Timings
@@ -38,7 +33,8 @@ from worker.scene.checkpoint import load_scene, save_scene
 from worker.scene.compact import compile_coder
 from worker.scene.resume_file import RESUME_FILE
 from worker.scene.scene import Scene
-from worker.stereo import estimate_depth
+from worker.stereo import ClipPaths
+from worker.stereo import open_with_depth as open_paths
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
@@ -129,6 +125,7 @@ def judge_again(request: ReconstructionRequest, directory: Path, hooks: Training
 def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Setup:
     """The clip with depth, its split, its preset, the device and compiled kernels; then the clock starts."""
     accepted_at_s, timings = request.accepted_at_s or time.time(), Timings()
+    timings.seconds |= request.seconds
     keep_free_memory(USUAL_BYTES)
     options = request.options
     preset = request.own_preset or preset_named(options.preset, options.budget_s)
@@ -145,53 +142,19 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -
 
 
 def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
-    """Decode, and for stereo input rectify and match: the left frames with depth."""
+    """The clip of a request (worker/stereo/opening.py), its kernels examined before a GPU matches anything."""
     if isinstance(request.clip, DepthClip):
         return request.clip
-    hooks.report_stage("decode", 0.0)
-    with timings.measure("decode_s"):
-        decoded = decode_clip(
-            request.clip,
-            request.right,
-            calibration=request.calibration,
-            masks=request.masks,
-            options=request.options,
-            limits=request.limits,
-            hooks=hooks,
-        )
-    options = request.options
-    if isinstance(decoded, DepthClip):
-        hooks.on_first_moment(decoded.moment(training_frames(decoded.frame_count, options.holdout)[0]))
-        return decoded
-    depth_range_mm = options.min_depth_mm, options.max_depth_mm
-    with closing(decoded):
-        return match_eyes(decoded.clip, decoded.calibration, options.holdout, hooks, timings, device, depth_range_mm)
 
+    def examined() -> None:
+        if device != CPU:
+            hooks.report_stage("compile", 0.0)
+            timings.add("compile_s", examine(device))
 
-def match_eyes(
-    clip: StereoClip,
-    calibration: StereoCalibration,
-    holdout: str,
-    hooks: Hooks,
-    timings: Timings,
-    device: Device = CPU,
-    depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
-) -> DepthClip:
-    """Rectify a stereo clip and match its eyes: the left frames with depth.
-
-    Raises:
-        InputError: the clip, its calibration or the holdout cannot be used.
-        Cancelled: hooks.should_stop said so.
-    """
-    rectified = rectify(clip, calibration)
-    measured = training_frames(clip.frame_count, holdout)
-    if device != CPU:  # before it matches anything
-        hooks.report_stage("compile", 0.0)
-        timings.add("compile_s", examine(device))
-    with timings.measure("stereo_s"):  # from the first frame on, while later ones are decoded
-        return estimate_depth(
-            rectified, hooks, measured_frames=measured, device=device.kind, depth_range_mm=depth_range_mm
-        )
+    paths = ClipPaths(request.clip, request.right, request.calibration, request.masks)
+    return open_paths(
+        paths, request.options, hooks, timings, limits=request.limits, device=device.kind, before_matching=examined
+    )
 
 
 def optimise(run: Run) -> None:

@@ -6,17 +6,26 @@ import argparse
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
 from contract.runtime.arguments import add_options, given_options
 from contract.runtime.exits import ExitCode
 from contract.runtime.progress_bar import ProgressBar
 from contract.wire.errors import Cancelled, InputError
+from contract.wire.names import RESUME
 from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
 from worker.commands.device import add_device
+
+if TYPE_CHECKING:
+    from worker.input.clip import DepthClip
+    from worker.machine.hooks import Hooks
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,34 +57,24 @@ def run_cli(options: argparse.Namespace) -> int:
         InputError: --out holds something else, or as worker.pipeline.reconstruct.
         Cancelled: a signal came.
     """
+    accepted_at_s = time.time()
     from worker.daemon.orders import job_progress
-    from worker.pipeline import reconstruct
-    from worker.scene.resume_file import RESUME_FILE
-    from worker.train.hooks import TrainingHooks
-    from worker.train.request import ReconstructionRequest
+    from worker.machine.hooks import Hooks
 
     out: Path = options.out
-    if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= {RESUME_FILE}):
+    if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= {RESUME}):
         problem = f"{out} is there already and is neither an empty folder nor that of a stopped run."
         raise InputError("--out", problem, "Name a new folder.")
-    request = ReconstructionRequest(
-        clip=options.clip,
-        right=options.right,
-        calibration=options.calibration,
-        masks=options.masks,
-        options=given_options(options, ReconstructionOptions),
-        device=options.device,
-    )
     interrupted = threading.Event()
     is_new = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
     before = {number: signal.signal(number, _once(interrupted)) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with ProgressBar(sys.stderr) as bar:
-            hooks = TrainingHooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
-            report = reconstruct(request, out, hooks)
+            hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
+            report = _reconstruct(options, out, hooks, accepted_at_s)
     except Cancelled as error:
-        again = " The same command goes on from there." if (out / RESUME_FILE).exists() else ""
+        again = " The same command goes on from there." if (out / RESUME).exists() else ""
         raise Cancelled(f"{error}{again}") from error
     finally:
         for number, handler in before.items():
@@ -84,6 +83,40 @@ def run_cli(options: argparse.Namespace) -> int:
             out.rmdir()
     _print_report(report, out)
     return ExitCode.OK
+
+
+def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_at_s: float) -> Report:
+    """Reconstruct. torch is imported while the clip is opened, unless a GPU may match it, which torch must find."""
+    from worker.input.decode import keep_decoder_ready
+    from worker.machine.gpu import may_have_gpu
+    from worker.machine.timing import Timings
+    from worker.stereo import ClipPaths, open_with_depth
+
+    given = given_options(options, ReconstructionOptions)
+    clip: Path | DepthClip = options.clip
+    timings = Timings()
+    with ThreadPoolExecutor(1) as aside:
+        keep_decoder_ready()
+        pipeline = aside.submit(import_module, "worker.pipeline")
+        if options.device == "cpu" or not may_have_gpu():
+            paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
+            clip = open_with_depth(paths, given, hooks, timings)
+        pipeline.result()
+    from worker.pipeline import reconstruct
+    from worker.train.hooks import TrainingHooks
+    from worker.train.request import ReconstructionRequest
+
+    request = ReconstructionRequest(
+        clip=clip,
+        right=options.right,
+        calibration=options.calibration,
+        masks=options.masks,
+        options=given,
+        device=options.device,
+        accepted_at_s=accepted_at_s,
+        seconds=timings.seconds,
+    )
+    return reconstruct(request, out, TrainingHooks(hooks.on_progress, hooks.should_stop))
 
 
 def _once(event: threading.Event) -> Callable[[int, FrameType | None], None]:

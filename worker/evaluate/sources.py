@@ -25,8 +25,9 @@ from worker.input.clip import DepthClip
 from worker.machine.hooks import Hooks
 from worker.machine.timing import Timings
 from worker.phantom import MOTIONS, Phantom, PhantomSettings, make_phantom
-from worker.pipeline import match_eyes, open_with_depth
+from worker.pipeline import open_with_depth
 from worker.raster.backend import CPU, Device
+from worker.stereo import match_eyes
 from worker.train.request import ReconstructionRequest
 
 DATA_VARIABLE = "INTRASPLAT_DATA"
@@ -105,7 +106,7 @@ def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU
         if not source.stereo:
             return OpenClip(phantom.depth_clip(), phantom, {})
         drawn = phantom.stereo_recording()
-        clip = match_eyes(drawn.clip, drawn.calibration, holdout, hooks, timings, device)
+        clip = match_eyes(drawn.clip, drawn.calibration, holdout, hooks, timings, device=device.kind)
         return OpenClip(clip, phantom, timings.seconds, drawn.tissue_right)
     options, files = ReconstructionOptions(holdout=holdout, **source.options.model_dump()), source.files
     request = ReconstructionRequest(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 import sysconfig
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -65,6 +66,12 @@ class Gpu:
             yield "Triton finds no C compiler", remedy
         elif not self.has_headers:
             yield "Triton finds no Python.h for its C compiler", "Install Python's headers (`apt install python3-dev`)"
+
+
+def may_have_gpu() -> bool:
+    """Whether this machine may have an NVIDIA GPU, told without torch: False only if it surely has none."""
+    devices = Path("/dev")
+    return not sys.platform.startswith("linux") or any(devices.glob("nvidia*")) or (devices / "dxg").exists()
 
 
 def triton_range() -> str:

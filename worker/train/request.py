@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,6 +16,7 @@ class ReconstructionRequest:
     """What to reconstruct, and how.
 
     clip           a path, or a clip with depth in memory, which is neither decoded nor matched
+    seconds        by stage, what was spent on such a clip, for the report
     own_preset     trains in place of the preset that options name
     accepted_at_s  Unix time at which the clip was accepted, for t_post_s; None means now
     limits         what this machine accepts; None means what its memory allows
@@ -29,3 +31,4 @@ class ReconstructionRequest:
     device: str = "auto"
     accepted_at_s: float | None = None
     limits: ClipLimits | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
