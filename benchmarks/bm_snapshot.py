@@ -110,7 +110,7 @@ def trained(clip: DepthClip, iterations: int, pace: Pace | None) -> Figures:
 
     def copy() -> Scene:
         start = time.perf_counter()
-        scene = snapshot_of(run)
+        scene = snapshot_of(run, as_it_lies=True)
         figures.copy_ms.append((time.perf_counter() - start) * 1e3)
         return scene
 

@@ -161,7 +161,8 @@ def optimise(run: Run) -> None:
     """Train run to its last iteration; score held-out frames and offer snapshots on the way."""
     clock, started_s, timings = run.setup.clock, run.setup.clock.elapsed_s, run.setup.timings
     timings.seconds["t_first_view_s"] = time.time() - run.setup.accepted_at_s
-    train(run, clock, lambda: held_out_score(run), run.setup.hooks, copy_scene=lambda: snapshot_of(run))
+    copy = partial(snapshot_of, run, as_it_lies=True)
+    train(run, clock, lambda: held_out_score(run), run.setup.hooks, copy_scene=copy)
     timings.seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
     keep_free_memory(LITTLE_BYTES)
 
@@ -187,9 +188,12 @@ def scene_of(run: Run) -> Scene:
     return dataclasses.replace(snapshot_of(run), seen=torch.from_numpy(trust(run.model, run.eyes)))
 
 
-def snapshot_of(run: Run) -> Scene:
-    """A copy of the model as it is now. What it saw is not measured: seen is 0, and so is the confidence."""
-    gaussians, deformation = run.model.export()
+def snapshot_of(run: Run, *, as_it_lies: bool = False) -> Scene:
+    """A copy of the model as it is now. What it saw is not measured: seen is 0, and so is the confidence.
+
+    as_it_lies: for renders alone, and faster (worker/raster/model.py, export).
+    """
+    gaussians, deformation = run.model.export(as_it_lies=as_it_lies)
     clip = run.setup.clip
     return Scene(
         gaussians=gaussians,

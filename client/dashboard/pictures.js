@@ -59,7 +59,7 @@ export class Pictures {
     const picture = this.stream.isOpen ? await this.#fromStream(view) : await this.#fromRender(view);
     if (picture.scene !== view.scene) throw new Error("The service sent another scene's picture; it is not shown.");
     // What is hatched is no guess, and highlights that stay were seen: the rest of the picture is as good as ever.
-    const harmless = view.unseen === "mark" ? ["highlights_unknown", "unseen"] : ["highlights_unknown"];
+    const harmless = ["coarse", "highlights_unknown", ...(view.unseen === "mark" ? ["unseen"] : [])];
     picture.isExtrapolated = picture.codes.some((code) => !harmless.includes(code));
     return picture;
   }

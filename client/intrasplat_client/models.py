@@ -109,6 +109,7 @@ class NoticeCode(StrEnum):
     OUTLIER_FRAMES = "outlier_frames"
     TIME_TOO_SHORT = "time_too_short"
     TRAINING_SCORE_LOW = "training_score_low"
+    COARSE = "coarse"
     HARDLY_SEEN = "hardly_seen"
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"

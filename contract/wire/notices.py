@@ -87,6 +87,7 @@ class NoticeCode(StrEnum):
     TIME_TOO_SHORT = "time_too_short"
     TRAINING_SCORE_LOW = "training_score_low"
     # what to know of one render
+    COARSE = "coarse"
     HARDLY_SEEN = "hardly_seen"
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"

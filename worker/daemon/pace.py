@@ -12,8 +12,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-SHARE = 0.2
-"""Of the CPU time while a job trains: training takes a quarter longer at most."""
+SHARE = 0.15
+"""Of the CPU time while a job trains. Copies of the model, the service and its viewers take some more."""
 
 MAX_SAVED_S = 0.1
 """Enough for a few renders when a viewer opens. More would disturb the 0.3 s in which training times its steps."""
@@ -57,6 +57,17 @@ class Pace:
         with self._lock:
             self._fill()
             return max(0.0, -self._left_s / self._rate) if self._trains else 0.0
+
+    def affords(self, cpu_s: float) -> bool:
+        """Whether a render of so many CPU seconds may be made without going into debt."""
+        with self._lock:
+            self._fill()
+            return not self._trains or cpu_s <= self._left_s
+
+    @property
+    def trains(self) -> bool:
+        """Whether a job trains, so that renders are rationed."""
+        return self._trains
 
     @property
     def rate(self) -> float:

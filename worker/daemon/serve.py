@@ -50,7 +50,7 @@ MAX_READ = 1000
 SMALL_SHARE = 0.25
 """An answer that takes less than this share of a larger one's time is given between the parts of that one."""
 
-MIN_CHARGE_S = 0.002
+MIN_CHARGE_S = 0.01
 """Counted for each answer while a job trains: service and viewer have work with it, too."""
 
 logger = logging.getLogger("intrasplat.worker")
@@ -73,6 +73,7 @@ class Reply:
     iteration: of the snapshot that is shown; None: the scene is finished.
     unseen: share of a render's pixels that no training frame saw.
     gaussians, clip_size: of the scene, as in WorkerReply.
+    is_coarse: drawn at a part of the resolution, for want of time.
     """
 
     body: bytes
@@ -83,6 +84,7 @@ class Reply:
     unseen: float = 0.0
     gaussians: int = 0
     clip_size: tuple[int, int] | None = None
+    is_coarse: bool = False
 
 
 class RequestServer:
@@ -194,6 +196,12 @@ class RequestServer:
             self._give(small)
             left_s -= small.spent_s
 
+    def is_short_of_time(self) -> bool:
+        """Whether a job trains and the answer that is being made is too much for now, or others wait for theirs."""
+        turn = self._begun[-1]
+        turn.was_short = self._pace.trains and (len(self._turns) > 0 or not self._pace.affords(turn.seconds))
+        return turn.was_short
+
     def _read(self, wait_s: float) -> None:
         """Take in what has come; wait so long if nothing has."""
         assert self._socket is not None
@@ -246,7 +254,7 @@ class RequestServer:
             self._charge()
             self._begun.pop()
         self._pace.charge(max(0.0, MIN_CHARGE_S - turn.spent_s))
-        if head.error is None:
+        if head.error is None and not turn.was_short:
             self._turns.learn(turn)
         for each in (turn, *self._turns.take_same(turn.request)):
             self._send(each.caller, each.request_id, head, body)

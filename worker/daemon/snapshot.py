@@ -16,6 +16,11 @@ from worker.scene.scene import Scene
 PERIOD_S = 1.0
 """Minimum time between two copies of one job's model."""
 
+COPY_SHARE = 0.05
+"""Of the time of training: where a copy takes long, copies are made less often."""
+SLOWEST = 5
+"""Periods between two copies, at most."""
+
 PATIENCE_S = 0.3
 """How long a render waits for a copy that is due: some steps of training. Then it shows the copy that is there."""
 
@@ -40,6 +45,7 @@ class Snapshots:
         self._newest: Snapshot | None = None
         self._asked = False
         self._answers = True
+        self._wanted_s = self._copy_s = 0.0
 
     def begin(self, job_id: str) -> None:
         """A job starts: drop the copy of the one before."""
@@ -59,13 +65,15 @@ class Snapshots:
         with self._changed:
             if self._job_id is None:
                 return False
+            self._wanted_s = time.monotonic()
             return self._newest is None or (self._asked and self._is_due(self._newest))
 
     def offer(self, scene: Scene, iteration: int) -> None:
         """Show this copy from now on (TrainingHooks.on_snapshot)."""
         with self._changed:
             if self._job_id is not None:
-                self._newest = Snapshot(scene, iteration, time.monotonic())
+                now_s = time.monotonic()
+                self._newest, self._copy_s = Snapshot(scene, iteration, now_s), now_s - self._wanted_s
                 self._asked, self._answers = False, True
                 self._changed.notify_all()
 
@@ -86,4 +94,6 @@ class Snapshots:
             return self._newest if self._job_id == job_id else None
 
     def _is_due(self, snapshot: Snapshot) -> bool:
-        return time.monotonic() - snapshot.taken_s >= self._period_s
+        return time.monotonic() - snapshot.taken_s >= max(
+            self._period_s, min(self._copy_s / COPY_SHARE, SLOWEST * self._period_s)
+        )

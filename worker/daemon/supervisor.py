@@ -64,7 +64,10 @@ def run_supervisor(
     # The owner's name is new at each start, so claims of an earlier process of this name simply run out.
     consumer = Consumer(queue, store, keeper, name, f"{name}.{secrets.token_hex(4)}", end)
     try:
-        with announced(queue, name, lambda: address_of(name, keeper, consumer, renders_only)), kept_tidy(store):
+        with (
+            announced(queue, name, lambda: address_of(name, keeper, consumer, renders_only=renders_only)),
+            kept_tidy(store),
+        ):
             if renders_only:
                 keep_rendering(keeper, end)
             else:
@@ -81,7 +84,7 @@ def keep_rendering(keeper: Keeper, end: threading.Event) -> None:
         pass
 
 
-def address_of(name: str, keeper: Keeper, consumer: Consumer, renders_only: bool) -> WorkerAddress | None:
+def address_of(name: str, keeper: Keeper, consumer: Consumer, *, renders_only: bool = False) -> WorkerAddress | None:
     """The address that a worker announces now; None while its child is not ready."""
     child = keeper.live
     if child is None or child.ready is None:

@@ -22,6 +22,7 @@ class Turn:
 
     cost       pixels x Gaussians
     seconds    CPU seconds that it will take, as far as known; spent_s: that it has taken
+    was_short  there was no time for all of it
     arrived_s  monotonic
     """
 
@@ -33,6 +34,7 @@ class Turn:
     arrived_s: float
     spent_s: float = 0.0
     is_given_up: bool = False
+    was_short: bool = False
 
     @property
     def due_s(self) -> float:

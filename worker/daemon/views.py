@@ -23,7 +23,7 @@ from worker.daemon.serve import NotYetError, Reply
 from worker.daemon.snapshot import Snapshot, Snapshots
 from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
-from worker.render.encode import encode_layer
+from worker.render.encode import FOR_EYES, encode_layer
 from worker.render.view import ROUNDING, Frame, no_pause, render_frame
 from worker.scene.checkpoint import load_scene
 from worker.scene.export import EXPORTS
@@ -37,6 +37,9 @@ COPIES = 3
 MAX_HELD_SCENES = 64
 """However small they are: each announcement of the worker names all of them."""
 
+COARSENESS = 2
+"""By this a job's picture is smaller when time is short. Less would hardly be faster: each Gaussian takes its time."""
+
 UNKNOWN_GAUSSIANS, UNKNOWN_SIZE = 50_000, (640, 512)
 """What a scene that is not in memory is taken to have, when it is estimated how long it will take."""
 
@@ -45,7 +48,8 @@ class Views:
     """Answers render and export requests from the scenes of a store and the snapshots of a job; for one thread.
 
     `held` names the scenes in memory, the last used one at the end; other threads may read it. `pause` is called
-    between the parts of a large render; it may ask for other answers meanwhile.
+    between the parts of a large render; it may ask for other answers meanwhile. While is_short_of_time(), pictures of a
+    job in formats for eyes are drawn at half the resolution and enlarged.
     """
 
     def __init__(
@@ -65,6 +69,7 @@ class Views:
         self._job_id = ""
         self.held: tuple[str, ...] = ()
         self.pause: Callable[[], None] = no_pause
+        self.is_short_of_time: Callable[[], bool] = lambda: False
 
     def answer(self, request: RenderRequest | ExportRequest) -> Reply:
         """The encoded image or file.
@@ -82,8 +87,9 @@ class Views:
         else:
             scene, iteration = self._trained(request.scene_id)
         reply = self._kept.get(request)
-        if reply is None:
-            reply = self._render(scene, request, iteration)
+        is_coarse = iteration is not None and request.format in FOR_EYES and self.is_short_of_time()
+        if reply is None or (reply.is_coarse and not is_coarse):
+            reply = self._render(scene, request, iteration, is_coarse=is_coarse)
             if iteration is None or self._is_newest(scene):
                 self._kept.keep(request, reply)
         return reply
@@ -141,12 +147,15 @@ class Views:
         self.held = tuple(name for name, _ in self._scenes)
         return self._scenes[key]
 
-    def _render(self, scene: Scene, request: RenderRequest, iteration: int | None) -> Reply:
+    def _render(self, scene: Scene, request: RenderRequest, iteration: int | None, *, is_coarse: bool) -> Reply:
         """One render; iteration: of a snapshot, None for a finished scene."""
         camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
+        size = camera.width, camera.height
+        if is_coarse:
+            camera = camera.resized(-(-camera.width // COARSENESS), -(-camera.height // COARSENESS))
         pose, highlights = pose_of(scene, request.pose), request.highlights.shown_in(request.layer)
         frame = render_frame(scene, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
-        return _reply(scene, frame, request, iteration)
+        return _reply(scene, frame.enlarged(*size) if is_coarse else frame, request, iteration)
 
     def _forget(self, key: tuple[str, int]) -> None:
         self._scenes.pop(key, None)
@@ -169,7 +178,8 @@ def _reply(scene: Scene, frame: Frame, request: RenderRequest, iteration: int | 
     shown = shown_time(scene, request.t)
     clip_size = scene.intrinsics.width, scene.intrinsics.height
     media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
-    return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size)
+    is_coarse = NoticeCode.COARSE in [each.code for each in warnings]
+    return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size, is_coarse)
 
 
 def _export(scene: Scene, request: ExportRequest) -> Reply:

@@ -124,8 +124,11 @@ class Model(Protocol):
         """Put back what arrays() gave, on any device, into a model of the same size; ValueError if the sizes differ."""
         ...
 
-    def export(self) -> tuple[Gaussians, Deformation]:
-        """The Gaussians and their deformation as tensors on the host (copies)."""
+    def export(self, *, as_it_lies: bool = False) -> tuple[Gaussians, Deformation]:
+        """The Gaussians and their deformation as tensors on the host (copies).
+
+        as_it_lies: the deformation's tensors need not be contiguous, which saves time to whoever makes a model of them.
+        """
         ...
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from threading import Lock, RLock
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +35,7 @@ HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see l
 MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""
 HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not known apart: they stay."
+COARSE = "This picture was drawn at half the resolution and enlarged, because a job trains and time is short."
 ROUNDING = 1e-6
 """Model time by which t may exceed the last frame's without a warning: a decimal fraction may round i / T."""
 
@@ -65,6 +67,19 @@ class Frame:
         Computed when it is first asked for: from another pose than the endoscope's it takes a second render.
         """
         return self._confidence()
+
+    def enlarged(self, width: int, height: int) -> Frame:
+        """The frame in more pixels, with a notice that says so."""
+        size = (width, height)
+        rgb = np.asarray(cv2.resize(self.rgb, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+        depth_mm = np.asarray(cv2.resize(self.depth_mm, size, interpolation=cv2.INTER_NEAREST), np.float32)
+        unseen = cv2.resize(self.unseen.view(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
+        likely = self._confidence
+
+        def confidence() -> NDArray[np.float32]:
+            return np.asarray(cv2.resize(likely(), size, interpolation=cv2.INTER_LINEAR), np.float32)
+
+        return Frame(rgb, depth_mm, unseen, (*self.warnings, Notice.info(NoticeCode.COARSE, COARSE)), confidence)
 
     @property
     def unseen_share(self) -> float:

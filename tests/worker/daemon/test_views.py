@@ -7,6 +7,7 @@ import io
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -294,3 +295,22 @@ def test_a_large_render_can_be_paused_for_a_small_one_of_the_same_scene_and_ende
     views.pause = give_up
     with pytest.raises(GivenUpError):
         views.answer(large.model_copy(update={"t": 0.25}))
+
+
+def test_a_job_s_pictures_are_coarse_while_time_is_short_and_exact_formats_are_not(store: Store) -> None:
+    snapshots = Snapshots(period_s=1e9)
+    views, running = Views(store, snapshots), new_job_id()
+    snapshots.begin(running)
+    snapshots.offer(scene(), 40)
+    views.is_short_of_time = lambda: True
+    request = RenderRequest(scene_id=running, t=0, format=ImageFormat.JPEG)
+    coarse, exact = views.answer(request), views.answer(request_of(running, attempt=None))
+    assert NoticeCode.COARSE in [each.code for each in coarse.warnings]
+    assert NoticeCode.COARSE not in [each.code for each in exact.warnings]
+    assert views.answer(request) is coarse
+    views.is_short_of_time = lambda: False
+    sharp = views.answer(request)
+    assert NoticeCode.COARSE not in [each.code for each in sharp.warnings]
+    pictures = [cv2.imdecode(np.frombuffer(each.body, np.uint8), cv2.IMREAD_COLOR) for each in (coarse, sharp)]
+    assert pictures[0].shape == pictures[1].shape == (CLIP.height, CLIP.width, 3)
+    assert np.abs(pictures[0].astype(float) - pictures[1]).mean() < 12

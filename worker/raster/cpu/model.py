@@ -260,7 +260,7 @@ class CpuModel:
         """Put back what arrays() gave, into a model of the same size."""
         put_back(self.arrays(), stored)
 
-    def export(self) -> tuple[Gaussians, Deformation]:
+    def export(self, *, as_it_lies: bool = False) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as torch tensors (copies)."""
         canonical = torch.from_numpy(np.ascontiguousarray(self.canonical[GEOMETRY, : self.count].T))
         sh = np.concatenate([self.canonical[None, COLOUR], self.sh_rest])[:, :, : self.count]
@@ -272,7 +272,7 @@ class CpuModel:
             torch.from_numpy(np.ascontiguousarray(sh.transpose(2, 0, 1))),
             torch.from_numpy(self.canonical[GLOSS_ROW, : self.count].copy()),
         )
-        return gaussians, self.motion.export(self.count)
+        return gaussians, self.motion.export(self.count, as_it_lies=as_it_lies)
 
 
 def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, rates: StepRates, iteration: int) -> None:

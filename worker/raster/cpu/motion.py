@@ -45,8 +45,8 @@ class Motion(Protocol):
     def arrays(self, count: int) -> dict[str, Tensor]:
         """Everything that must be stored to resume, likewise."""
 
-    def export(self, count: int) -> Deformation:
-        """The first count Gaussians' deformation as torch tensors (copies)."""
+    def export(self, count: int, *, as_it_lies: bool = False) -> Deformation:
+        """The first count Gaussians' deformation as torch tensors (copies); as_it_lies as in Model.export."""
 
 
 def kept_where_old(moments: Floats, columns: np.ndarray, fresh: np.ndarray) -> Floats:
@@ -124,8 +124,8 @@ class LinearMotion:
     def arrays(self, count: int) -> dict[str, Tensor]:
         return _views(self, ("weight", "first", "second"), count) | {"motion.steps": torch.from_numpy(self.steps)}
 
-    def export(self, count: int) -> LinearDeformation:
-        weight = torch.from_numpy(np.ascontiguousarray(self.weight[:, :, :count].transpose(2, 1, 0)))
+    def export(self, count: int, *, as_it_lies: bool = False) -> LinearDeformation:
+        weight = _copied(self.weight[:, :, :count], (2, 1, 0), as_it_lies=as_it_lies)
         return dataclasses.replace(self._form, weight=weight)
 
 
@@ -165,10 +165,10 @@ class FdmMotion:
     def arrays(self, count: int) -> dict[str, Tensor]:
         return _views(self, ("weight", "centre", "width", "first", "second"), count)
 
-    def export(self, count: int) -> FlexibleDeformation:
+    def export(self, count: int, *, as_it_lies: bool = False) -> FlexibleDeformation:
         weight, centre, width = (
-            torch.from_numpy(np.ascontiguousarray(a[..., :count].transpose(2, 0, 1)))
-            for a in (self.weight, self.centre, self.width)
+            _copied(each[..., :count], (2, 0, 1), as_it_lies=as_it_lies)
+            for each in (self.weight, self.centre, self.width)
         )
         return self._form(weight, centre, width)
 
@@ -176,6 +176,13 @@ class FdmMotion:
 def _views(motion: LinearMotion | FdmMotion, names: Sequence[str], count: int) -> dict[str, Tensor]:
     """Arrays of a motion by name, the columns that only fill the last vector left out."""
     return {f"motion.{name}": torch.from_numpy(getattr(motion, name))[..., :count] for name in names}
+
+
+def _copied(values: Floats, axes: tuple[int, int, int], *, as_it_lies: bool) -> Tensor:
+    """A copy with its axes in another order, contiguous, or in memory as values are, which is fast."""
+    if as_it_lies:
+        return torch.from_numpy(values.copy()).permute(axes)
+    return torch.from_numpy(np.ascontiguousarray(values.transpose(axes)))
 
 
 def _columns_last(tensor: torch.Tensor, columns: int, fill: float) -> Floats:

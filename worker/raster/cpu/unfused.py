@@ -93,8 +93,9 @@ class AutogradMotion:
         """Parameters and moments by name; views."""
         return self.parameters(count) | {f"motion.moments.{name}": each for name, each in self._moments.items()}
 
-    def export(self, count: int) -> Deformation:
+    def export(self, count: int, *, as_it_lies: bool = False) -> Deformation:
         """The first count Gaussians' deformation as torch tensors (copies)."""
+        del as_it_lies
         copies = {name: each.detach().clone() for name, each in self._parameters.items()}
         deformation = self._deformation.from_tensors(copies | self._deformation.constants())
         return deformation.select(torch.arange(count))

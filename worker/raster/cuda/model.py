@@ -372,8 +372,9 @@ class CudaModel:
         """Put back what arrays() gave, on any device, into a model of the same size; ValueError if the sizes differ."""
         put_back(self.arrays(), stored)
 
-    def export(self) -> tuple[Gaussians, Deformation]:
+    def export(self, *, as_it_lies: bool = False) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as tensors on the host (copies)."""
+        del as_it_lies
         self._settle()
         values, sh_rest = (each[..., : self.count].cpu() for each in (self._values, self._sh_rest))
         mean, quaternion, log_scale = (
