@@ -6,6 +6,7 @@ import dataclasses
 import json
 import platform
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import version
@@ -14,7 +15,7 @@ from pathlib import Path
 import torch
 
 from contract.store.results import add_scores, without_scores
-from contract.wire.errors import Cancelled, TrainingDiverged
+from contract.wire.errors import Cancelled, InputError, TrainingDiverged
 from contract.wire.names import CURVE, REPORT
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import Report
@@ -35,6 +36,7 @@ from worker.scene.resume_file import RESUME_FILE
 from worker.scene.scene import Scene
 from worker.stereo import ClipPaths
 from worker.stereo import open_with_depth as open_paths
+from worker.train.first_picture import first_picture
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
@@ -131,7 +133,14 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -
     preset = request.own_preset or preset_named(options.preset, options.budget_s)
     device = device_for(preset.deformation, request.device)
     out_dir.mkdir(parents=True, exist_ok=True)
-    clip = open_with_depth(request, hooks, timings, device)
+
+    def show(moment: DepthClip) -> None:
+        if hooks.on_first_picture is not None:
+            with suppress(InputError):  # no depth: the stages to come say so, if no frame has any
+                hooks.on_first_picture(first_picture(moment))
+        timings.seconds["t_first_view_s"] = time.time() - accepted_at_s
+
+    clip = open_with_depth(request, dataclasses.replace(hooks, on_first_moment=show), timings, device)
     split = split_frames(clip, options.holdout)
     keep_free_memory(USUAL_BYTES)
     timings.add("compile_s", compile_coder())
@@ -160,7 +169,7 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
 def optimise(run: Run) -> None:
     """Train run to its last iteration; score held-out frames and offer snapshots on the way."""
     clock, started_s, timings = run.setup.clock, run.setup.clock.elapsed_s, run.setup.timings
-    timings.seconds["t_first_view_s"] = time.time() - run.setup.accepted_at_s
+    timings.seconds.setdefault("t_first_view_s", time.time() - run.setup.accepted_at_s)
     copy = partial(snapshot_of, run, as_it_lies=True)
     train(run, clock, lambda: held_out_score(run), run.setup.hooks, copy_scene=copy)
     timings.seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}

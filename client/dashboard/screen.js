@@ -7,6 +7,7 @@ import { clockTime } from "./element.js";
 
 const STALE_AFTER_MS = 5000;
 const LOOK_MS = 250;
+const FIRST_PICTURE = "first_picture";
 
 export class Screen {
   /**
@@ -86,6 +87,7 @@ export class Screen {
       const reason = this.trouble || "The service does not answer.";
       return ["stale", "STALE", `Last picture ${clockTime(this.shownAt)}. ${reason} Reconnecting.`];
     }
+    if (this.shown.codes?.includes(FIRST_PICTURE)) return ["training", "FIRST PICTURE, not yet a model", ""];
     if (this.shown.state === "running") return ["training", `TRAINING, iteration ${this.shown.iteration}`, ""];
     return this.shown.isExtrapolated ? ["extrapolated", "EXTRAPOLATED", ""] : ["live", "CURRENT", ""];
   }

@@ -114,6 +114,7 @@ class NoticeCode(StrEnum):
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"
     TIME_OUTSIDE_CLIP = "time_outside_clip"
+    FIRST_PICTURE = "first_picture"
     TRAINING_GOES_ON = "training_goes_on"
     UNSEEN = "unseen"
     UNCLASSIFIED = "unclassified"

@@ -92,6 +92,7 @@ class NoticeCode(StrEnum):
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"
     TIME_OUTSIDE_CLIP = "time_outside_clip"
+    FIRST_PICTURE = "first_picture"
     TRAINING_GOES_ON = "training_goes_on"
     UNSEEN = "unseen"
     # a report written before notices had codes

@@ -135,6 +135,7 @@ def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, chann
         should_stop=task.stop.is_set,
         wants_snapshot=snapshots.wanted,
         on_snapshot=snapshots.offer,
+        on_first_picture=snapshots.offer_first,
     )
     if isinstance(order, ScoreScene):
         request = request_of(order.record, order.spool, settings.device, limits)

@@ -27,11 +27,15 @@ PATIENCE_S = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The scene after `iteration` iterations, and when it was copied (monotonic)."""
+    """The scene after `iteration` iterations, and when it was copied (monotonic).
+
+    of_one_moment: it is no model yet (worker/train/first_picture.py).
+    """
 
     scene: Scene
     iteration: int
     taken_s: float
+    of_one_moment: bool = False
 
 
 class Snapshots:
@@ -65,16 +69,24 @@ class Snapshots:
         with self._changed:
             if self._job_id is None:
                 return False
-            self._wanted_s = time.monotonic()
-            return self._newest is None or (self._asked and self._is_due(self._newest))
+            self._wanted_s, newest = time.monotonic(), self._newest
+            return newest is None or newest.of_one_moment or (self._asked and self._is_due(newest))
 
     def offer(self, scene: Scene, iteration: int) -> None:
         """Show this copy from now on (TrainingHooks.on_snapshot)."""
+        self._show(Snapshot(scene, iteration, time.monotonic()))
+
+    def offer_first(self, scene: Scene) -> None:
+        """Show the scene of one moment until there is a copy (TrainingHooks.on_first_picture)."""
+        self._show(Snapshot(scene, 0, time.monotonic(), of_one_moment=True))
+
+    def _show(self, snapshot: Snapshot) -> None:
         with self._changed:
             if self._job_id is not None:
-                now_s = time.monotonic()
-                self._newest, self._copy_s = Snapshot(scene, iteration, now_s), now_s - self._wanted_s
-                self._asked, self._answers = False, True
+                self._newest = snapshot
+                if not snapshot.of_one_moment:
+                    self._copy_s = snapshot.taken_s - self._wanted_s
+                self._asked, self._answers = False, not snapshot.of_one_moment  # the next may be long in coming
                 self._changed.notify_all()
 
     def newest(self, job_id: str) -> Snapshot | None:

@@ -83,14 +83,15 @@ class Views:
         if isinstance(request, ExportRequest):
             return _export(self._stored(request.scene_id, request.attempt), request)
         if request.attempt is not None:
-            scene, iteration = self._stored(request.scene_id, request.attempt), None
+            scene, snapshot = self._stored(request.scene_id, request.attempt), None
         else:
-            scene, iteration = self._trained(request.scene_id)
+            snapshot = self._trained(request.scene_id)
+            scene = snapshot.scene
         reply = self._kept.get(request)
-        is_coarse = iteration is not None and request.format in FOR_EYES and self.is_short_of_time()
+        is_coarse = snapshot is not None and request.format in FOR_EYES and self.is_short_of_time()
         if reply is None or (reply.is_coarse and not is_coarse):
-            reply = self._render(scene, request, iteration, is_coarse=is_coarse)
-            if iteration is None or self._is_newest(scene):
+            reply = self._render(scene, request, snapshot, is_coarse=is_coarse)
+            if snapshot is None or self._is_newest(scene):
                 self._kept.keep(request, reply)
         return reply
 
@@ -118,15 +119,15 @@ class Views:
             self._kept.drop(lambda request: request.attempt is None)
             self._snapshot = None
 
-    def _trained(self, job_id: str) -> tuple[Scene, int]:
-        """The newest snapshot and its iteration; may wait for training, without slowing it."""
+    def _trained(self, job_id: str) -> Snapshot:
+        """The newest snapshot; may wait for training, without slowing it."""
         snapshot = self._snapshots.newest(job_id)
         if snapshot is None:
             raise NotYetError(f"Job {job_id} has nothing to show yet.")
         if snapshot is not self._snapshot:
             self._kept.drop(lambda request: request.attempt is None)
             self._snapshot, self._job_id = snapshot, job_id
-        return snapshot.scene, snapshot.iteration
+        return snapshot
 
     def _is_newest(self, scene: Scene) -> bool:
         """Whether no newer snapshot has been shown while this one was rendered."""
@@ -147,15 +148,15 @@ class Views:
         self.held = tuple(name for name, _ in self._scenes)
         return self._scenes[key]
 
-    def _render(self, scene: Scene, request: RenderRequest, iteration: int | None, *, is_coarse: bool) -> Reply:
-        """One render; iteration: of a snapshot, None for a finished scene."""
+    def _render(self, scene: Scene, request: RenderRequest, snapshot: Snapshot | None, *, is_coarse: bool) -> Reply:
+        """One render; snapshot: that the scene is of, None for a finished one."""
         camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
         size = camera.width, camera.height
         if is_coarse:
             camera = camera.resized(-(-camera.width // COARSENESS), -(-camera.height // COARSENESS))
         pose, highlights = pose_of(scene, request.pose), request.highlights.shown_in(request.layer)
         frame = render_frame(scene, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
-        return _reply(scene, frame.enlarged(*size) if is_coarse else frame, request, iteration)
+        return _reply(scene, frame.enlarged(*size) if is_coarse else frame, request, snapshot)
 
     def _forget(self, key: tuple[str, int]) -> None:
         self._scenes.pop(key, None)
@@ -166,15 +167,20 @@ class Views:
         return COPIES * sum(scene.byte_count for scene in self._scenes.values())
 
 
-def _reply(scene: Scene, frame: Frame, request: RenderRequest, iteration: int | None) -> Reply:
+def _reply(scene: Scene, frame: Frame, request: RenderRequest, snapshot: Snapshot | None) -> Reply:
     """A frame as it is sent."""
+    iteration = None if snapshot is None else snapshot.iteration
     body = encode_layer(frame, request.layer, request.format, request.quality, request.unseen)
     warnings = frame.warnings
-    if iteration is not None:
+    if snapshot is not None:
         # What the clip shows of each place is counted when training has ended: until then nothing is vouched for.
         text = f"Training goes on: this is iteration {iteration}, and how far to trust it is not known yet."
         goes_on = Notice.warning(NoticeCode.TRAINING_GOES_ON, text)
-        warnings = (goes_on, *(each for each in warnings if each.code is not NoticeCode.HARDLY_SEEN))
+        unknown = {NoticeCode.HARDLY_SEEN}
+        if snapshot.of_one_moment:
+            goes_on = Notice.warning(NoticeCode.FIRST_PICTURE, "First picture: one moment, not yet a model.")
+            unknown.add(NoticeCode.TIME_OUTSIDE_CLIP)  # it is shown at every time
+        warnings = (goes_on, *(each for each in warnings if each.code not in unknown))
     shown = shown_time(scene, request.t)
     clip_size = scene.intrinsics.width, scene.intrinsics.height
     media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)

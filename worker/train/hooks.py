@@ -32,10 +32,12 @@ class TrainingHooks(Hooks):
     """Hooks of a whole reconstruction. None of them changes the trained model.
 
     wants_snapshot is asked between training steps; after a yes, on_snapshot receives the scene as it is then and the
-    number of iterations that made it. on_held_out receives each held-out frame that is rendered for a score during
+    number of iterations that made it. on_first_picture receives a scene of one moment while the clip is still being
+    prepared; None: nobody wants it. on_held_out receives each held-out frame that is rendered for a score during
     training, with its index; training's clock is paused meanwhile.
     """
 
     wants_snapshot: Callable[[], bool] = never
     on_snapshot: Callable[[Scene, int], None] = ignore
+    on_first_picture: Callable[[Scene], None] | None = None
     on_held_out: Callable[[int, RenderedFrame], None] = ignore

@@ -34,10 +34,10 @@ def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
     """The preset's fusion; "fill" with the stride whose grid comes nearest to points_per_image points."""
     if preset.points_per_image is None or preset.fusion.mode != "fill":
         return preset.fusion
-    return dataclasses.replace(preset.fusion, stride=_stride_for(preset.points_per_image, intrinsics))
+    return dataclasses.replace(preset.fusion, stride=stride_for(preset.points_per_image, intrinsics))
 
 
-def _stride_for(points: int, intrinsics: Intrinsics) -> int:
+def stride_for(points: int, intrinsics: Intrinsics) -> int:
     return max(MIN_STRIDE, round(math.sqrt(intrinsics.width * intrinsics.height / points)))
 
 
@@ -61,7 +61,7 @@ def settled(
             )
         )
     elif fusion.mode == "fill":
-        finest = _stride_for(MAX_POINTS, clip.intrinsics)
+        finest = stride_for(MAX_POINTS, clip.intrinsics)
         choice = choose_stride(
             clip, train[0], finest, min((each.total for each in trials.decisive.values()), default=0.0)
         )

@@ -195,6 +195,11 @@ def test_a_running_job_is_shown_by_its_snapshot_which_vouches_for_nothing(store:
     snapshots.begin(running)
     with pytest.raises(NotYetError):
         views.answer(request_of(running, attempt=None))
+    snapshots.offer_first(dataclasses.replace(scene(), seen=torch.zeros(120)))
+    first = views.answer(request_of(running, attempt=None))
+    assert first.iteration == 0
+    assert [each.code for each in first.warnings] == [NoticeCode.FIRST_PICTURE, NoticeCode.UNSEEN]
+    assert snapshots.wanted()  # the start of training takes its place
     snapshots.offer(dataclasses.replace(scene(), seen=torch.zeros(120)), 40)
     view = views.answer(request_of(running, attempt=None))
     assert view.iteration == 40
