@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -28,6 +29,8 @@ from worker.fusion.points import (
 from worker.input.camera import Intrinsics, unproject_at
 from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip, Eye
+from worker.machine.cores import cores
+from worker.machine.opencv import one_opencv_thread
 from worker.motion.complete import complete_depth
 from worker.motion.tracks import Moved
 
@@ -67,6 +70,7 @@ def fill(
                 pixels = pixels[_shown(eye, index, pixels) >= least]
             if pixels.size:
                 parts.append(coverage.add(eye, index, pixels))
+            eye.let_go(index)
     return concatenated(parts)
 
 
@@ -91,9 +95,17 @@ def _along_tracks(clip: DepthClip, first: int, later: Sequence[int], stride: int
     """
     cells = _hidden_cells(clip, first, stride)
     unseen = cells.in_view.copy()
-    for index, chosen, pixels in _best_views(clip, spread(later, MAX_VIEWS), cells, moved):
+
+    def points_of(view: tuple[int, NDArray[np.intp], NDArray[np.intp]]) -> PointCloud:
+        index, chosen, pixels = view
         points = points_at(clip, index, pixels)
-        yield dataclasses.replace(points, reference_mm=cells.world_mm[chosen])
+        clip.let_go(index)
+        return dataclasses.replace(points, reference_mm=cells.world_mm[chosen])
+
+    views = _best_views(clip, spread(later, MAX_VIEWS), cells, moved)
+    with one_opencv_thread(), ThreadPoolExecutor(cores()) as pool:
+        yield from pool.map(points_of, views)
+    for _, chosen, _ in views:
         unseen[chosen] = False
     cells = cells.select(unseen)
     from_there = [index for index in later if same_pose(clip, index, first)]
@@ -124,6 +136,7 @@ def _best_views(
         better = shown > best[some[found]]
         chosen = some[found[better]]
         best[chosen], frame[chosen], seen_at[chosen] = shown[better], index, pixels[better]
+        clip.let_go(index)
     found_in = ((int(index), np.flatnonzero(frame == index)) for index in np.unique(frame[frame >= 0]))
     return [(index, chosen, seen_at[chosen]) for index, chosen in found_in]
 

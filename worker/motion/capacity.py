@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
 from worker.input.clip import DepthClip
+from worker.machine.cores import cores
 from worker.motion.tracks import Tracks, resting
 from worker.motion.trials import BasisValues, FitError, Trial
 
@@ -89,7 +91,8 @@ def try_bases(
         return Trials({})
     limit = _bases_limit(len(train), max_bases).count
     numbers = sorted({REST, min(limit, BASES[0]), *(each for each in BASES if each <= limit)})
-    tracked = {bases: trial.error(bases) for bases in numbers}
+    with ThreadPoolExecutor(cores()) as pool:
+        tracked = dict(zip(numbers, pool.map(trial.error, numbers), strict=True))
     if len(at_rest.places) < MIN_TRIAL_CELLS:  # instruments hide the tissue's places: rest cannot be judged
         return Trials(tracked)
     if at_rest.picture_error(numbers[-1]) > trial.picture_error(numbers[-1]) * 10 ** (MIN_GAIN_DB / 10):

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from worker.input.camera import unproject
 from worker.input.clip import DepthClip
 from worker.machine.cores import cores
+from worker.machine.mapped import let_go, mapped_zeros
 from worker.machine.opencv import one_opencv_thread
 from worker.motion.complete import complete_depth
 
@@ -75,6 +76,29 @@ class Tracks:
     confidence: Floats
     step_px: int
 
+    @classmethod
+    def empty(cls, frames: int, grid: tuple[int, ...], step_px: int) -> Tracks:
+        """Tracks of zeros, in files (worker/machine/mapped.py)."""
+        displacement_mm, colour = (mapped_zeros((frames, *grid, 3), np.float32) for _ in range(2))
+        return cls(displacement_mm, colour, mapped_zeros((frames, *grid), np.float32), step_px)
+
+    def let_go(self, place: int) -> None:
+        """Take a frame's part out of memory. It comes back when it is asked for."""
+        for values in (self.displacement_mm, self.colour, self.confidence):
+            let_go(values[place])
+
+    def at(self, cells: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
+        """Displacement and colour [K, M, 3] and confidence [K, M] of some cells (flat, [M])."""
+        frames = len(self.confidence)
+        displacement_mm, colour = np.empty((2, frames, len(cells), 3), np.float32)
+        confidence = np.empty((frames, len(cells)), np.float32)
+        for place in range(frames):
+            displacement_mm[place] = self.displacement_mm[place].reshape(-1, 3)[cells]
+            colour[place] = self.colour[place].reshape(-1, 3)[cells]
+            confidence[place] = self.confidence[place].reshape(-1)[cells]
+            self.let_go(place)
+        return displacement_mm, colour, confidence
+
     def cells(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Row and column in the coarse grid of the clip's pixels; beyond the grid's end, its last cells."""
         last_row, last_column = self.confidence.shape[1] - 1, self.confidence.shape[2] - 1
@@ -96,14 +120,15 @@ def track(
     step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // MIN_GRID_SIDE))
     grid = _Grid(clip, step)
     reference = _Coarse(clip, train[0], grid)
-    displacement, colour = np.zeros((2, len(train), *reference.grey.shape, 3), np.float32)
-    confidence = np.zeros((len(train), *reference.grey.shape), np.float32)
-    confidence[0] = reference.trust
+    tracks = Tracks.empty(len(train), reference.grey.shape, step)
+    tracks.confidence[0] = reference.trust
     followed, counting = 0, Lock()
 
     def lift(place: int, target: _Coarse, forward: Floats, backward: Floats) -> None:
         nonlocal followed
-        displacement[place], colour[place], confidence[place] = _lift(reference, target, forward, backward)
+        found = _lift(reference, target, forward, backward)
+        tracks.displacement_mm[place], tracks.colour[place], tracks.confidence[place] = found
+        tracks.let_go(place)
         with counting:
             followed += 1
             on_progress(followed / (len(train) - 1))
@@ -122,7 +147,7 @@ def track(
     chains = [range(max(first, 1), min(first + length, len(train))) for first in range(0, len(train), length)]
     with one_opencv_thread(), ThreadPoolExecutor(min(CHAINS, threads)) as pool, _Helpers(threads - CHAINS) as helped:
         list(pool.map(follow, chains))
-    return Tracks(displacement, colour, confidence, step)
+    return tracks
 
 
 class _Helpers:
@@ -278,14 +303,23 @@ def resting(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> Tracks:
 
     The confidence is the tracks' where a cell shows only tissue, else 0.
     """
-    step, colour, confidence = tracks.step_px, np.empty_like(tracks.colour), np.empty_like(tracks.confidence)
+    (frames, *grid), step = tracks.confidence.shape, tracks.step_px
+    rest = Tracks.empty(frames, tuple(grid), step)
     start = cell_means(clip.rgb[train[0]], step).astype(np.float32)
-    for place, index in enumerate(train):
+
+    def look(place: int) -> None:
+        index = train[place]
         tissue = cell_means(clip.tissue[index].astype(np.uint8) * np.uint8(255), step) == 255
-        confidence[place] = np.where(tissue, tracks.confidence[place], 0)
+        rest.confidence[place] = np.where(tissue, tracks.confidence[place], 0)
         change = (cell_means(clip.rgb[index], step) - start) / np.float32(255)
-        colour[place] = _averaged(change, confidence[place], COLOUR_SMOOTH_PX)
-    return Tracks(np.zeros_like(tracks.displacement_mm), colour, confidence, step)
+        rest.colour[place] = _averaged(change, rest.confidence[place], COLOUR_SMOOTH_PX)
+        for used in (rest, tracks):
+            used.let_go(place)
+        clip.let_go(index)
+
+    with one_opencv_thread(), ThreadPoolExecutor(cores()) as pool:
+        list(pool.map(look, range(len(train))))
+    return rest
 
 
 def fit_tracks(
@@ -316,6 +350,7 @@ def fit_tracks(
     rows, columns = (place // share_px * share_px for place in np.divmod(pixels, width))
     shared, member = np.unique(rows * width + columns, return_inverse=True)
     row, column = tracks.cells(*np.divmod(shared, width))
+    displacement_mm, colour, trusted = tracks.at(row * tracks.confidence.shape[2] + column)
     weights = np.zeros((len(shared), basis.shape[1], 6), np.float32)
     support = np.zeros(len(shared), np.float32)
 
@@ -324,9 +359,8 @@ def fit_tracks(
 
     def fit(first: int) -> None:
         some = slice(first, first + POINTS_AT_ONCE)
-        confidence = tracks.confidence[:, row[some], column[some]]  # [K, points]
-        changes = [values[:, row[some], column[some]] for values in (tracks.displacement_mm, tracks.colour)]
-        weights[some] = fit_series(np.concatenate(changes, axis=-1), np.maximum(confidence, least[:, None]), basis)
+        confidence, changes = trusted[:, some], np.concatenate([displacement_mm[:, some], colour[:, some]], axis=-1)
+        weights[some] = fit_series(changes, np.maximum(confidence, least[:, None]), basis)
         support[some] = confidence.mean(0)
 
     with ThreadPoolExecutor(2) as pool:

@@ -78,10 +78,7 @@ class Trial:
         depth_mm = clip.depth_mm[reference].reshape(-1)[places]
         trusted = np.flatnonzero((tracks.confidence.mean(0).reshape(-1) > MIN_TRACK_CONFIDENCE) & (depth_mm > 0))
         some = trusted[np.linspace(0, len(trusted) - 1, min(CELLS, len(trusted))).round().astype(np.intp)]
-
-        def of_some(values: NDArray[np.floating], *channels: int) -> Reals:
-            return values.reshape(frames, -1, *channels)[:, some].astype(np.float64)
-
+        displacement_mm, colour, confidence = (values.astype(np.float64) for values in tracks.at(some))
         validation = np.zeros(frames, np.bool_)
         validation[FIRST_VALIDATED::VALIDATE_EVERY] = True
         return cls(
@@ -90,9 +87,9 @@ class Trial:
             step_px=step,
             places=places[some],
             world_mm=unproject(places[some], depth_mm[some], clip.intrinsics, clip.world_from_camera[reference]),
-            displacement_mm=of_some(tracks.displacement_mm, 3),
-            colour=255 * of_some(tracks.colour, 3),
-            confidence=of_some(tracks.confidence),
+            displacement_mm=displacement_mm,
+            colour=255 * colour,
+            confidence=confidence,
             validation=validation,
             basis_values=basis_values,
         )
@@ -120,6 +117,7 @@ class Trial:
             column, row = (k.fx * x / z + k.cx - 0.5)[:, None], (k.fy * y / z + k.cy - 0.5)[:, None]
             image, places = self.clip.rgb[frame].astype(np.float32), (column.astype(np.float32), row.astype(np.float32))
             shown[place] = cv2.remap(image, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+            self.clip.let_go(frame)
         return self._mean_square(shown - expected)
 
     def _predicted(self, bases: int) -> tuple[Reals, Reals]:
