@@ -36,6 +36,8 @@ MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""
 HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not known apart: they stay."
 COARSE = "This picture was drawn at half the resolution and enlarged, because a job trains and time is short."
+PART_PIXELS = 1 << 19
+"""Pixels between two pauses of a large render."""
 ROUNDING = 1e-6
 """Model time by which t may exceed the last frame's without a warning: a decimal fraction may round i / T."""
 
@@ -110,7 +112,11 @@ class SceneRenderer:
         assert scene is not None
         camera = view_camera(scene, t, world_from_camera, intrinsics, highlights=highlights)
         with self._lock:
-            image = self._model.render(camera, t, self._values, pause).copy()
+            shown = self._model.render(camera, t, self._values, pause)
+            image = np.empty(shown.shape, np.float32)
+            for rows in _parts(shown.shape[1:]):
+                image[:, rows] = shown[:, rows]
+                pause()
         return image[:5], None if self._values is None else image[5]
 
 
@@ -147,24 +153,36 @@ def render_frame(
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
     camera = (intrinsics or scene.intrinsics, pose)
     image, blended = renderer_of(scene, device).layers(shown, pose, camera[0], highlights=highlights, pause=pause)
-    pause()
-    alpha = image[4]
-    solid = alpha >= COVERED_ALPHA
-    unseen = unseen_pixels(solid, blended)
+    size = image.shape[1:]
+    rgb, solid = np.empty((*size, 3), np.uint8), np.empty(size, np.bool_)
     # Of a snapshot nothing is known yet: nothing is blended, and 0 is shown.
-    trust = np.zeros_like(alpha) if blended is None else np.clip(blended / np.where(solid, alpha, 1), 0, 1) * solid
-    pause()
-    rgb = np.clip(image[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255).astype(np.uint8)
+    depth_mm, trust = np.empty(size, np.float32), np.zeros(size, np.float32)
+    for rows in _parts(size):
+        part, alpha = image[:, rows], image[4, rows]
+        solid[rows] = alpha >= COVERED_ALPHA
+        if blended is not None:
+            trust[rows] = np.clip(blended[rows] / np.where(solid[rows], alpha, 1), 0, 1) * solid[rows]
+        rgb[rows] = np.clip(part[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255)
+        depth_mm[rows] = solid_depth_mm(part[3], alpha, scene.units_per_mm)
+        pause()
+    unseen = unseen_pixels(solid, blended)
     pause()
     in_clip = 0.0 <= t <= last + ROUNDING
     warnings = () if in_clip else (_warning_of_time(t, shown),)
     warnings = (*warnings, *_warnings_of_pose(_distance_from_trained(scene, pose), trust, unseen))
     if not highlights and scene.right_eye_mm is None:
         warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
-    depth_mm = solid_depth_mm(image[3], alpha, scene.units_per_mm)
+    pause()
     own_view = partial(_endoscope_rgb, scene, shown, device, highlights)
     layer = partial(_confidence, scene, endoscope_pose(scene, shown), camera, (image[:3], depth_mm, trust), own_view)
     return Frame(rgb, depth_mm, unseen, warnings, layer)
+
+
+def _parts(size: tuple[int, ...]) -> Iterator[slice]:
+    """Rows of an image of H x W, PART_PIXELS of them at a time."""
+    height, width = size
+    step = max(1, PART_PIXELS // width)
+    return (slice(first, min(first + step, height)) for first in range(0, height, step))
 
 
 def _endoscope_rgb(scene: Scene, t: float, device: Device, highlights: bool) -> NDArray[np.float32]:

@@ -113,19 +113,25 @@ class CpuModel:
         """[N] whether any of the last step's frames could see each Gaussian."""
         return torch.from_numpy(self._seen[: self.count].copy())
 
-    def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
+    def project(
+        self, camera: NDArray[np.float64], t: float, sh_degree: int, pause: Callable[[], None] | None = None
+    ) -> None:
         """The Gaussians at time t on this camera's image."""
         self.motion.deform(self.canonical, t, self.state)
-        self._project_state(camera, sh_degree)
+        self._project_state(camera, sh_degree, pause)
 
-    def _project_state(self, camera: NDArray[np.float64], sh_degree: int) -> None:
+    def _project_state(
+        self, camera: NDArray[np.float64], sh_degree: int, pause: Callable[[], None] | None = None
+    ) -> None:
         """The Gaussians of the state on this camera's image."""
         self.rasterizer = self._rasterizer(*image_size(camera))
         if sh_degree == 0:
             run(harmonics.colour_from_gloss, camera, self.state, self.colour)
         else:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
-        self.rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
+        rasterizer = self.rasterizer
+        rasterizer.project(camera, self.state, self.opacity_logit, self.colour, pause)
+        self.rasterizer = rasterizer  # a pause may have used another
 
     def render(
         self,
@@ -135,7 +141,7 @@ class CpuModel:
         pause: Callable[[], None] | None = None,
     ) -> Floats:
         """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
-        self.project(camera, t, self.sh_degree)
+        self.project(camera, t, self.sh_degree, pause)
         return self.rasterizer.render(values, pause)
 
     def blend_values(self, values: Floats) -> Floats:

@@ -95,10 +95,25 @@ class Rasterizer:
         self._slot_info, self._entries = np.zeros((2, self.threads * slots), np.uint32)
         self._sums = np.zeros(self.threads * homes * bins.GRADIENT, np.float32)
 
-    def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
-        """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N]."""
+    def project(
+        self,
+        camera: NDArray[np.float64],
+        state: Floats,
+        opacity_logit: Floats,
+        colour: Floats,
+        pause: Callable[[], None] | None = None,
+    ) -> None:
+        """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N].
+
+        pause: called between the thirds of a large image, as in render.
+        """
+        is_large = self.width * self.height > PART_PIXELS
         self.place(camera, state, opacity_logit, colour)
+        if is_large and pause is not None:
+            pause()
         self.bin()
+        if is_large and pause is not None:
+            pause()
         self.sort()
 
     def place(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
