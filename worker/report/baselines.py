@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from worker.input.clip.types import DepthClip
 from worker.model.metrics import psnr_tissue
+from worker.train.scoring import Mapping
 
 Flow = NDArray[np.float32]  # [H, W, 2] px
 
@@ -30,8 +31,10 @@ class CopyBaselines:
     flow_db: tuple[float, ...]
 
 
-def copy_baselines(clip: DepthClip, train: Sequence[int], held_out: Sequence[int]) -> CopyBaselines:
-    """Scores both ways of copying.
+def copy_baselines(
+    clip: DepthClip, train: Sequence[int], held_out: Sequence[int], mapping: Mapping = map
+) -> CopyBaselines:
+    """Scores both ways of copying, by mapping, which may use several threads.
 
     blend  (1 - s) C_a + s C_b
     flow   the same of C_a and C_b, each first warped to time i along its share of the optical flow (DIS) between them
@@ -43,23 +46,35 @@ def copy_baselines(clip: DepthClip, train: Sequence[int], held_out: Sequence[int
     """
     if held_out and not train:
         raise ValueError(f"{len(held_out)} held-out frames have no training frame to be copied from")
-    blends, warps = [], []
-    pair, flows = (-1, -1), None
-    for index in held_out:
-        earlier = max((each for each in train if each < index), default=None)
-        later = min((each for each in train if each > index), default=None)
-        if earlier is None or later is None:
-            nearest = later if earlier is None else earlier
-            score = psnr_tissue(clip.rgb[nearest], clip.rgb[index], clip.tissue[index])
-            blends.append(score)
-            warps.append(score)
-            continue
-        if flows is None or pair != (earlier, later):  # a block of held-out frames shares its neighbours
-            pair, flows = (earlier, later), _flows(clip.rgb[earlier], clip.rgb[later])
-        blend, warp = _copies(clip, earlier, later, index, flows)
-        blends.append(psnr_tissue(blend, clip.rgb[index], clip.tissue[index]))
-        warps.append(psnr_tissue(warp, clip.rgb[index], clip.tissue[index]))
-    return CopyBaselines(tuple(blends), tuple(warps))
+    between = {index: _neighbours(index, train) for index in held_out}
+
+    def score(first: int) -> list[tuple[float, float]]:
+        """Of all frames between the neighbours of this one, which share their flow."""
+        pair = between[first]
+        frames = [index for index in held_out if between[index] == pair]
+        if pair[0] == pair[1]:
+            alone = [psnr_tissue(clip.rgb[pair[0]], clip.rgb[index], clip.tissue[index]) for index in frames]
+            return list(zip(alone, alone, strict=True))
+        flows, found = _flows(clip.rgb[pair[0]], clip.rgb[pair[1]]), []
+        for index in frames:
+            blend, warp = _copies(clip, *pair, index, flows)
+            truth, tissue = clip.rgb[index], clip.tissue[index]
+            found.append((psnr_tissue(blend, truth, tissue), psnr_tissue(warp, truth, tissue)))
+        return found
+
+    firsts = list({pair: index for index, pair in reversed(between.items())}.values())[::-1]
+    found = [scores for group in mapping(score, firsts) for scores in group]
+    blends, warps = zip(*found, strict=True) if found else ((), ())
+    return CopyBaselines(blends, warps)
+
+
+def _neighbours(index: int, train: Sequence[int]) -> tuple[int, int]:
+    """The nearest training frames before and after; outside their span twice the nearest."""
+    earlier = max((each for each in train if each < index), default=None)
+    later = min((each for each in train if each > index), default=None)
+    nearest = later if earlier is None else earlier
+    assert nearest is not None
+    return nearest if earlier is None else earlier, nearest if later is None else later
 
 
 def _copies(

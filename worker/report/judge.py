@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 from contract.wire.errors import Cancelled
 from contract.wire.report import Report
 from worker.input.clip import DepthClip, Eye
+from worker.machine.cores import cores
 from worker.machine.hooks import Hooks, Progress
+from worker.machine.opencv import one_opencv_thread
 from worker.raster.backend import CPU, Device
 from worker.render.view import renderer_of
 from worker.report.baselines import copy_baselines
@@ -54,10 +57,11 @@ def judged(
 
         return render
 
-    held_out = measure(clip, first.held_out, views(clip))
-    right = measure_right(clip, first.held_out, views(clip.right or clip))
-    trained = measure(clip, sampled, views(clip))
-    baselines = copy_baselines(clip, train, first.held_out)
+    with one_opencv_thread(), ThreadPoolExecutor(cores(), thread_name_prefix=STAGE) as pool:
+        held_out = measure(clip, first.held_out, views(clip), pool.map)
+        right = measure_right(clip, first.held_out, views(clip.right or clip), pool.map)
+        trained = measure(clip, sampled, views(clip), pool.map)
+        baselines = copy_baselines(clip, train, first.held_out, pool.map)
     report = scored_report(first, held_out, right, trained, baselines)
     made, left_db, right_db = first.iterations, report.psnr_tissue_db, report.psnr_right_db
     hooks.on_progress(Progress(STAGE, 1.0, made, made, psnr_db=left_db, psnr_right_db=right_db))

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from contract.wire.errors import TrainingDiverged
 from contract.wire.notices import Notice, NoticeCode
@@ -29,7 +30,7 @@ from worker.model.metrics import (
 from worker.report.baselines import CopyBaselines
 from worker.report.doubts import clip_warnings
 from worker.report.right_eye import RightScores
-from worker.train.scoring import FrameRenderer
+from worker.train.scoring import FrameRenderer, Mapping
 
 MIN_COVERAGE = 0.98
 MIN_TRAIN_DB = 25.0
@@ -89,34 +90,42 @@ SCORES_PENDING = Notice.info(
 _MERGED_FIELDS = ("assumptions", "warnings", "measurements")  # the clip has them, too; the report holds both
 
 
-def measure(clip: DepthClip, frames: Sequence[int], render: FrameRenderer) -> Scores:
-    """Scores the renders of these frames (clip indices) against the clip.
+Errors = NDArray[np.float32]
+
+
+def measure(clip: DepthClip, frames: Sequence[int], render: FrameRenderer, mapping: Mapping = map) -> Scores:
+    """Scores the renders of these frames (clip indices) against the clip, by mapping, which may use several threads.
 
     Raises:
         TrainingDiverged: a render holds NaN or infinity.
     """
-    tissue_db, clear_db, paper_db, similarity, covered = [], [], [], [], []
-    errors_mm, depths_mm = [], []
-    for index in frames:
+
+    def score(index: int) -> tuple[tuple[float, float, float, float, float], Errors, Errors]:
         shown, truth, tissue = render(index), clip.rgb[index], clip.tissue[index]
         if not (np.isfinite(shown.rgb).all() and np.isfinite(shown.depth_mm).all() and np.isfinite(shown.alpha).all()):
             raise TrainingDiverged(f"Frame {index} renders as NaN or infinity: training has diverged.")
-        tissue_db.append(psnr_tissue(shown.rgb, truth, tissue))
-        clear_db.append(psnr_tissue(shown.rgb, truth, tissue & clear_of_highlights(shown.rgb, truth)))
-        paper_db.append(psnr_paper(shown.rgb, truth, tissue))
-        similarity.append(ssim(shown.rgb, truth, tissue))
-        covered.append(coverage(shown.alpha, tissue))
-        errors_mm.append(depth_errors_mm(shown.depth_mm, clip.depth_mm[index], tissue))
-        depths_mm.append(clip.depth_mm[index][tissue & (clip.depth_mm[index] > 0)])
+        figures = (
+            psnr_tissue(shown.rgb, truth, tissue),
+            psnr_tissue(shown.rgb, truth, tissue & clear_of_highlights(shown.rgb, truth)),
+            psnr_paper(shown.rgb, truth, tissue),
+            ssim(shown.rgb, truth, tissue),
+            coverage(shown.alpha, tissue),
+        )
+        depth_mm = clip.depth_mm[index]
+        return figures, depth_errors_mm(shown.depth_mm, depth_mm, tissue), depth_mm[tissue & (depth_mm > 0)]
+
+    found = list(mapping(score, frames))
+    figures, errors_mm, depths_mm = zip(*found, strict=True) if found else ((), (), ())
+    tissue_db, clear_db, paper_db, similarity, covered = zip(*figures, strict=True) if figures else ((),) * 5
     return Scores(
         frames=tuple(frames),
-        psnr_tissue_db=tuple(tissue_db),
-        psnr_clear_db=tuple(clear_db),
-        psnr_paper_db=tuple(paper_db),
-        ssim=tuple(similarity),
-        coverage=tuple(covered),
-        depth_agreement_mm=depth_agreement_mm(errors_mm),
-        depth_mm=depth_agreement_mm(depths_mm),
+        psnr_tissue_db=tissue_db,
+        psnr_clear_db=clear_db,
+        psnr_paper_db=paper_db,
+        ssim=similarity,
+        coverage=covered,
+        depth_agreement_mm=depth_agreement_mm(list(errors_mm)),
+        depth_mm=depth_agreement_mm(list(depths_mm)),
     )
 
 

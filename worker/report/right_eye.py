@@ -20,7 +20,7 @@ from worker.input.camera import to_camera, unproject
 from worker.input.clip import DepthClip
 from worker.model.metrics import Image, clear_of_highlights, psnr_tissue
 from worker.stereo.right_eye import nearest_known
-from worker.train.scoring import FrameRenderer, judged_pixels
+from worker.train.scoring import FrameRenderer, Mapping, judged_pixels
 
 FAR_MM = 1e6
 """Depth at which the eyes see the same."""
@@ -40,22 +40,26 @@ class RightScores:
     warp_clear_db: tuple[float, ...] = ()
 
 
-def measure_right(clip: DepthClip, frames: Sequence[int], render: FrameRenderer) -> RightScores:
+def measure_right(clip: DepthClip, frames: Sequence[int], render: FrameRenderer, mapping: Mapping = map) -> RightScores:
     """Scores the renders of these frames (clip indices) from the right eye's pose; nothing for a clip of one eye.
+
+    By mapping, which may use several threads.
 
     Raises:
         TrainingDiverged: a render holds NaN or infinity.
     """
-    if clip.right is None:
+    right = clip.right
+    if right is None:
         return RightScores()
-    rows = []
-    for index in frames:
+
+    def score(index: int) -> list[float]:
         shown = render(index).rgb
         if not np.isfinite(shown).all():
             raise TrainingDiverged(f"Frame {index} renders as NaN or infinity from the right eye: training diverged.")
-        truth, judged = clip.right.rgb[index], judged_pixels(clip.right, index)
-        warped = warped_left(clip, index)
-        rows.append([score for image in (shown, warped) for score in _scores(image, truth, judged)])
+        truth, judged = right.rgb[index], judged_pixels(right, index)
+        return [figure for image in (shown, warped_left(clip, index)) for figure in _scores(image, truth, judged)]
+
+    rows = list(mapping(score, frames))
     model, clear, warp, warp_clear = zip(*rows, strict=True) if rows else ((), (), (), ())
     return RightScores(model, clear, warp, warp_clear)
 

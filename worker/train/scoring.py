@@ -6,8 +6,9 @@ Symbols: H W pixels.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,6 +34,8 @@ the left eye."""
 
 FrameRenderer = Callable[[int], RenderedFrame]
 """Renders the frame of this index from an eye's own pose."""
+Mapping = Callable[[Callable[[int], Any], Iterable[int]], Iterable[Any]]
+"""As map(): what a function gives for each frame, in their order."""
 
 
 def sample_frames(frames: Sequence[int], count: int = SAMPLED_FRAMES) -> list[int]:
