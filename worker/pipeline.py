@@ -32,18 +32,18 @@ from worker.report.trust import trust
 from worker.report.visibility import drop_strays
 from worker.scene.checkpoint import load_scene, save_scene
 from worker.scene.compact import compile_coder
-from worker.scene.resume_file import RESUME_FILE
 from worker.scene.scene import Scene
 from worker.stereo import ClipPaths
 from worker.stereo import open_with_depth as open_paths
 from worker.train.first_picture import first_picture
 from worker.train.hooks import TrainingHooks
+from worker.train.keep import Keeper, keeping
 from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import preset_named
 from worker.train.rate_distortion import QuantizedScene, quantize_model
 from worker.train.request import ReconstructionRequest
-from worker.train.resume import resume, save_run
+from worker.train.resume import resume
 from worker.train.run import Run, write_curve
 from worker.train.scoring import held_out_score
 from worker.train.setup import Setup
@@ -66,7 +66,7 @@ class Made:
 def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Report:
     """Clip in; manifest.json, scene.safetensors, report.json and curve.csv out, in out_dir.
 
-    A stopped run leaves its state in out_dir; the same request on the same folder resumes it.
+    A run that is stopped or killed leaves in out_dir what the same request on the same folder goes on from.
 
     Raises:
         InputError: the clip, its calibration, masks or an option cannot be used.
@@ -84,19 +84,17 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHo
     return report
 
 
-def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Made:
-    """As reconstruct, without the scores: the scene in out_dir is whole and can be viewed."""
-    setup = begin(request, out_dir, hooks)
-    run = prepare(setup)
-    if (resumed_s := resume(out_dir, run)) is not None:
-        setup.clock.restart(resumed_s)
-    try:
-        optimise(run)
+def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, kept_dir: Path | None = None) -> Made:
+    """As reconstruct, without the scores: the scene in out_dir is whole and can be viewed.
+
+    kept_dir: where to keep what the same request goes on from; whoever names it removes it. None: out_dir.
+    """
+    with keeping(kept_dir or out_dir, forgets=kept_dir is None) as keeper:
+        setup = begin(request, out_dir, hooks, keeper)
+        run = resume(keeper.folder, setup) or prepare(setup)
+        optimise(run, keeper)
         scene, quantized = finish(run)
-    except Cancelled:
-        save_run(out_dir, run, setup.timings.seconds.get("t_train_s", setup.clock.elapsed_s))
-        raise
-    report = publish(out_dir, run, scene, quantized)
+        report = publish(out_dir, run, scene, quantized)
     return Made(setup.clip, setup.split, scene, report, setup.device)
 
 
@@ -124,7 +122,7 @@ def judge_again(request: ReconstructionRequest, directory: Path, hooks: Training
     return judge(Made(clip, split, load_scene(directory), report, device), hooks)
 
 
-def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Setup:
+def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, keeper: Keeper) -> Setup:
     """The clip with depth, its split, its preset, the device and compiled kernels; then the clock starts."""
     accepted_at_s, timings = request.accepted_at_s or time.time(), Timings()
     timings.seconds |= request.seconds
@@ -140,7 +138,8 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -
                 hooks.on_first_picture(first_picture(moment))
         timings.seconds["t_first_view_s"] = time.time() - accepted_at_s
 
-    clip = open_with_depth(request, dataclasses.replace(hooks, on_first_moment=show), timings, device)
+    showing = dataclasses.replace(hooks, on_first_moment=show)
+    clip = keeper.clip(request, lambda: open_with_depth(request, showing, timings, device))
     split = split_frames(clip, options.holdout)
     keep_free_memory(USUAL_BYTES)
     timings.add("compile_s", compile_coder())
@@ -166,13 +165,18 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
     )
 
 
-def optimise(run: Run) -> None:
-    """Train run to its last iteration; score held-out frames and offer snapshots on the way."""
+def optimise(run: Run, keeper: Keeper) -> None:
+    """Train run to its last iteration; score held-out frames, keep its state and offer snapshots on the way."""
     clock, started_s, timings = run.setup.clock, run.setup.clock.elapsed_s, run.setup.timings
     timings.seconds.setdefault("t_first_view_s", time.time() - run.setup.accepted_at_s)
-    copy = partial(snapshot_of, run, as_it_lies=True)
-    train(run, clock, lambda: held_out_score(run), run.setup.hooks, copy_scene=copy)
+    scored, shown = partial(held_out_score, run), partial(snapshot_of, run, as_it_lies=True)
+    try:
+        train(run, clock, scored, run.setup.hooks, copy_scene=shown, keep=keeper.keep_if_due)
+    except Cancelled:
+        keeper.keep(run)
+        raise
     timings.seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
+    keeper.keep(run)
     keep_free_memory(LITTLE_BYTES)
 
 
@@ -266,12 +270,11 @@ def _warnings(run: Run) -> tuple[Notice, ...]:
 
 
 def publish(out_dir: Path, run: Run, scene: Scene, quantized: QuantizedScene | None) -> Report:
-    """Write the report, the curve and the scene; remove the state of a stopped run. The report has no scores yet."""
+    """Write the report, the curve and the scene. The report has no scores yet."""
     setup = run.setup
     setup.timings.seconds["t_post_s"] = time.time() - setup.accepted_at_s
     report = first_report(setup.clip, setup.split, _training(run, scene, quantized))
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)
     save_scene(out_dir, scene)
-    (out_dir / RESUME_FILE).unlink(missing_ok=True)
     return report

@@ -41,8 +41,11 @@ from contract.wire.names import MANIFEST
 SEEN_FOR_S = 2.0
 """How long an entry that was found counts as there. A purge on another machine takes effect with this delay."""
 
-FOLDERS = {Area.SPOOL: "spool", Area.WORK: "resume", Area.SCENES: "scenes"}
-"""The areas that a bucket keeps, and what their keys begin with. Of WORK it keeps the marker alone."""
+FOLDERS = {Area.SPOOL: "spool", Area.KEPT: "resume", Area.SCENES: "scenes"}
+"""The areas that a bucket keeps, and what their keys begin with.
+
+Of KEPT it keeps the marker alone: a clip is prepared anew in seconds, and its frames are some ten times as large.
+"""
 
 CONNECT_TIMEOUT_S = 5
 READ_TIMEOUT_S = 60
@@ -277,7 +280,7 @@ def _key(entry: ShelfEntry) -> str:
 
 def _files_to_put(folder: Path, entry: ShelfEntry) -> list[Path]:
     """The files that a bucket keeps of the entry, the marker last."""
-    if entry.area is Area.WORK:
+    if entry.area is Area.KEPT:
         return [folder / entry.marker]
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return sorted(files, key=lambda path: path.relative_to(folder) == Path(entry.marker))

@@ -23,10 +23,17 @@ class Area(StrEnum):
     INCOMING = "incoming"
     SPOOL = "spool"
     WORK = "work"
+    KEPT = "kept"
     SCENES = "scenes"
 
 
-MARKERS = {Area.INCOMING: SUBMISSION, Area.SPOOL: SUBMISSION, Area.WORK: RESUME, Area.SCENES: MANIFEST}
+MARKERS = {
+    Area.INCOMING: SUBMISSION,
+    Area.SPOOL: SUBMISSION,
+    Area.WORK: MANIFEST,
+    Area.KEPT: RESUME,
+    Area.SCENES: MANIFEST,
+}
 """The file without which an entry does not count: it is removed first and, in a bucket, written last."""
 
 
@@ -53,7 +60,7 @@ def checked(job_id: str) -> str:
 
 @dataclass(frozen=True)
 class ShelfEntry:
-    """The name of a folder in the store; ValueError if job_id is none. attempt: of entries in WORK and SCENES only."""
+    """The name of a folder in the store; ValueError if job_id is none. attempt: None in INCOMING and SPOOL."""
 
     area: Area
     job_id: str
@@ -76,7 +83,7 @@ class ShelfEntry:
 def entry_of(area: Area, name: str) -> ShelfEntry | None:
     """The entry whose folder has that name; None if the name is not one of ours."""
     job_id, dot, attempt = name.partition(".")
-    numbered = area in (Area.WORK, Area.SCENES)
+    numbered = area not in (Area.INCOMING, Area.SPOOL)
     if not is_job_id(job_id) or bool(dot) is not numbered or (numbered and not re.fullmatch(r"[0-9]{1,9}", attempt)):
         return None
     return ShelfEntry(area, job_id, int(attempt) if numbered else None)

@@ -3,7 +3,8 @@
     data_dir/
     ├── incoming/<id>/      an upload, whole or resumable, before it is a job; removed when it is refused or given up
     ├── spool/<job>/        an accepted clip: clip.mp4, calibration.json, ..., submission.json (the first JobRecord)
-    ├── work/<job>.<n>/     what attempt n has written so far
+    ├── work/<job>.<n>/     what attempt n has written of its scene so far
+    ├── kept/<job>.<n>/     what goes on from attempt n: resume.safetensors, and prepared/, the clip with depth
     ├── work/tmp-<name>/    what worker <name> has unpacked; emptied whenever it starts
     ├── scenes/<job>.<n>/   what attempt n has finished: manifest.json, scene.safetensors, report.json, curve.csv
     ├── unscored/<name>/    an empty file <job>.<n> for each scene that worker <name> has finished and not scored yet
@@ -36,7 +37,7 @@ from contract.store.s3 import S3Shelf
 from contract.store.shelf import ABANDONED_AFTER_S, Area, Removed, Shelf, ShelfEntry, entry_of, is_job_id
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
-from contract.wire.names import REPORT, RESUME, SUBMISSION
+from contract.wire.names import KEPT, REPORT, SUBMISSION
 from contract.wire.report import Report
 
 UNSCORED = "unscored"
@@ -131,27 +132,43 @@ class Store:
     # attempts
 
     def work_folder(self, job_id: str, attempt: int) -> Path:
-        """The folder for one attempt: empty but for the newest resume state of this or an earlier attempt.
+        """An empty folder for the scene of one attempt.
+
+        Those of earlier attempts are removed; a later attempt's is not touched.
+        """
+        folder = self._here.path(ShelfEntry(Area.WORK, job_id, attempt))
+        with disk_errors():
+            remove_tree(folder)
+            folder.mkdir(mode=0o700)
+            for entry in self._earlier(Area.WORK, job_id, attempt):
+                remove_tree(self._here.path(entry))
+        return folder
+
+    def kept_folder(self, job_id: str, attempt: int) -> Path:
+        """The folder for what goes on from an attempt, with the newest that this or an earlier one has kept.
 
         The folders of earlier attempts are removed; a later attempt's is not touched.
         """
         self._fetch_resume(job_id, attempt)
-        folder = self._here.path(ShelfEntry(Area.WORK, job_id, attempt))
+        folder = self._here.path(ShelfEntry(Area.KEPT, job_id, attempt))
         with disk_errors():
             folder.mkdir(mode=0o700, exist_ok=True)
-            for path in [path for path in folder.iterdir() if path.name != RESUME]:
+            for path in [path for path in folder.iterdir() if path.name not in KEPT]:
                 remove_tree(path)
-            for entry in reversed(self._here.folders(Area.WORK, job_id)):
-                if entry.attempt is not None and entry.attempt < attempt:
-                    if not (folder / RESUME).exists():
+            for entry in self._earlier(Area.KEPT, job_id, attempt):
+                for name in KEPT:
+                    if not (folder / name).exists():
                         with contextlib.suppress(FileNotFoundError):
-                            (self._here.path(entry) / RESUME).rename(folder / RESUME)
-                    remove_tree(self._here.path(entry))
+                            (self._here.path(entry) / name).rename(folder / name)
+                remove_tree(self._here.path(entry))
         return folder
 
     def hand_over(self, job_id: str, attempt: int) -> None:
-        """Let an attempt on any machine continue from this one's resume state; call it before releasing the job."""
-        entry = ShelfEntry(Area.WORK, job_id, attempt)
+        """Let an attempt on any machine continue from this one's resume state; call it before releasing the job.
+
+        On this machine nothing has to be done for that, and a prepared clip stays on it.
+        """
+        entry = ShelfEntry(Area.KEPT, job_id, attempt)
         if self._here.holds(entry):
             self._shelf.put(self._here.path(entry), entry)
 
@@ -240,12 +257,13 @@ class Store:
 
     def remove_attempt(self, job_id: str, attempt: int) -> None:
         """Remove all that one attempt has written, its published scene included."""
-        for area in (Area.WORK, Area.SCENES):
+        for area in (Area.WORK, Area.KEPT, Area.SCENES):
             self._shelf.remove(area, job_id, attempt)
 
     def remove_other_attempts(self, job_id: str, attempt: int) -> None:
         """Remove all work on the job and all scenes but that of the attempt, which the queue has accepted."""
-        self._shelf.remove(Area.WORK, job_id)
+        for area in (Area.WORK, Area.KEPT):
+            self._shelf.remove(area, job_id)
         for other in {*self._shelf.entries(Area.SCENES, job_id), *self._here.folders(Area.SCENES, job_id)}:
             if other.attempt != attempt:
                 self._shelf.remove(Area.SCENES, job_id, other.attempt)
@@ -296,9 +314,14 @@ class Store:
 
     def _fetch_resume(self, job_id: str, attempt: int) -> None:
         """Bring the resume state here that an earlier attempt handed over, if none as new lies here."""
-        here = [entry.attempt for entry in self._here.entries(Area.WORK, job_id) if entry.attempt is not None]
-        for entry in reversed(self._shelf.entries(Area.WORK, job_id)):
+        here = [entry.attempt for entry in self._here.entries(Area.KEPT, job_id) if entry.attempt is not None]
+        for entry in reversed(self._shelf.entries(Area.KEPT, job_id)):
             if entry.attempt is not None and entry.attempt < attempt:
                 if entry.attempt > max(here, default=0):
                     self._shelf.get(entry)
                 return
+
+    def _earlier(self, area: Area, job_id: str, attempt: int) -> list[ShelfEntry]:
+        """The folders of earlier attempts on this machine, the newest first."""
+        found = self._here.folders(area, job_id)
+        return [entry for entry in reversed(found) if entry.attempt is not None and entry.attempt < attempt]

@@ -31,3 +31,7 @@ MANIFEST = "manifest.json"
 REPORT = "report.json"
 CURVE = "curve.csv"
 RESUME = "resume.safetensors"
+PREPARED = "prepared"
+"""A folder: the clip with depth."""
+KEPT = (RESUME, PREPARED)
+"""What a stopped or killed job leaves for the next attempt."""

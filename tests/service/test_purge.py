@@ -80,7 +80,7 @@ def test_a_purge_leaves_nothing_and_its_receipt_counts_what_there_was(service: S
     assert response.status_code == 200
     receipt = response.json()
     assert (receipt["job_id"], receipt["record"], receipt["verified"]) == (scene_id, True, True)
-    assert receipt["files"] == {"incoming": 0, "spool": 2, "work": 0, "scenes": 3, "uploads": 0}
+    assert receipt["files"] == {"incoming": 0, "spool": 2, "work": 0, "kept": 0, "scenes": 3, "uploads": 0}
     assert (receipt["bytes"]["spool"], receipt["bytes"]["scenes"]) == (sizes["spool"], sizes["scenes"])
     assert receipt["purged_at"].startswith("20")
     assert traces_of(service.store.data_dir, scene_id) == []

@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
+from contract.wire.names import KEPT
 from contract.wire.notices import NoticeCode
 from contract.wire.options import ReconstructionOptions, parse_options
 from contract.wire.report import Report
@@ -182,7 +183,7 @@ def test_a_stopped_run_goes_on_in_its_folder(name: str, clip: Path, whole: Whole
     straight, out = whole(name)
     with pytest.raises(Cancelled):
         run(clip, tmp_path / "stopped", stopping_after(7), preset=name)
-    assert files(tmp_path / "stopped") == {RESUME_FILE}
+    assert files(tmp_path / "stopped") == set(KEPT)
     resumed = run(clip, tmp_path / "stopped", preset=name)
     assert files(tmp_path / "stopped") == SCENE_FILES
     assert tensor_bits(tmp_path / "stopped") == tensor_bits(out)
@@ -254,12 +255,6 @@ def test_a_damaged_stopped_run_is_refused(clip: Path, tmp_path: Path) -> None:
     (tmp_path / RESUME_FILE).write_bytes(b"half a file")
     with pytest.raises(InputError, match="new folder"):
         run(clip, tmp_path)
-
-
-def test_a_stop_before_training_publishes_nothing(clip: Path, tmp_path: Path) -> None:
-    with pytest.raises(Cancelled):
-        run(clip, tmp_path, TrainingHooks(should_stop=lambda: True))
-    assert files(tmp_path) <= {RESUME_FILE}
 
 
 def test_training_that_diverges_publishes_nothing(clip: Path, tmp_path: Path) -> None:

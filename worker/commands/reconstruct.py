@@ -18,7 +18,7 @@ from contract.runtime.arguments import add_options, given_options
 from contract.runtime.exits import ExitCode
 from contract.runtime.progress_bar import ProgressBar
 from contract.wire.errors import Cancelled, InputError
-from contract.wire.names import RESUME
+from contract.wire.names import KEPT
 from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
 from worker.commands.device import add_device
@@ -62,7 +62,7 @@ def run_cli(options: argparse.Namespace) -> int:
     from worker.machine.hooks import Hooks
 
     out: Path = options.out
-    if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= {RESUME}):
+    if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= set(KEPT)):
         problem = f"{out} is there already and is neither an empty folder nor that of a stopped run."
         raise InputError("--out", problem, "Name a new folder.")
     interrupted = threading.Event()
@@ -74,7 +74,7 @@ def run_cli(options: argparse.Namespace) -> int:
             hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
             report = _reconstruct(options, out, hooks, accepted_at_s)
     except Cancelled as error:
-        again = " The same command goes on from there." if (out / RESUME).exists() else ""
+        again = " The same command goes on from there." if any((out / name).exists() for name in KEPT) else ""
         raise Cancelled(f"{error}{again}") from error
     finally:
         for number, handler in before.items():

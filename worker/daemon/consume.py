@@ -214,10 +214,11 @@ class _Job:
         job_id, attempt = self._claim.job_id, self._claim.attempt
         self._heart.report(JobProgress(stage=FETCHING, fraction=0.0))
         spool = self._retry_store(lambda: self._store.fetch_clip(job_id))
+        kept = self._retry_store(lambda: self._store.kept_folder(job_id, attempt))
         out = self._retry_store(lambda: self._store.work_folder(job_id, attempt))
         if child.ended is not None:
             return Died(child.ended.cause, excused=True)
-        child.send(RunJob(record=record, spool=spool, out=out))
+        child.send(RunJob(record=record, spool=spool, out=out, kept=kept))
         detector, asked_s = HangDetector(), None
         while True:
             report = child.next_report(LOOK_PERIOD_S)

@@ -157,10 +157,10 @@ def work_on(
     job_id = order.record.job_id
     snapshots.begin(job_id)
     try:
-        return make_or_start_anew(request_of(order.record, order.spool, device, limits), order.out, hooks)
+        return make_or_start_anew(request_of(order.record, order.spool, device, limits), order.out, order.kept, hooks)
     except Cancelled:
         snapshots.drop(job_id)
-        return Stopped(checkpointed=(order.out / RESUME_FILE).exists())
+        return Stopped(checkpointed=(order.kept / RESUME_FILE).exists())
     except Exception as error:
         snapshots.drop(job_id)
         if gpu_is_lost():
@@ -216,14 +216,14 @@ def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits |
     )
 
 
-def make_or_start_anew(request: ReconstructionRequest, out: Path, hooks: TrainingHooks) -> Made:
-    """Make the scene, resuming the state in `out`; start again if that state is damaged or of another version."""
+def make_or_start_anew(request: ReconstructionRequest, out: Path, kept: Path, hooks: TrainingHooks) -> Made:
+    """Make the scene, resuming the state in `kept`; start again if that state is damaged or of another version."""
     try:
-        return make(request, out, hooks)
+        return make(request, out, hooks, kept)
     except ResumeMismatch:
         logger.warning("the stored state cannot be resumed; training starts again")
-        (out / RESUME_FILE).unlink()
-        return make(request, out, hooks)
+        (kept / RESUME_FILE).unlink()
+        return make(request, out, hooks, kept)
 
 
 def _socket_endpoint(store: Store, name: str) -> str:

@@ -26,12 +26,13 @@ class _Message(BaseModel):
 
 
 class RunJob(_Message):
-    """Reconstruct the record's clip from the folder `spool` into `out`, which is empty or holds a state to resume."""
+    """Reconstruct the record's clip from the folder `spool` into the empty `out`, from what `kept` holds on."""
 
     kind: Literal["run"] = "run"
     record: JobRecord
     spool: Path
     out: Path
+    kept: Path
 
 
 class ScoreScene(_Message):
@@ -44,7 +45,7 @@ class ScoreScene(_Message):
 
 
 class StopJob(_Message):
-    """Stop what runs; a job that is not finished keeps its state in `out`. Ignored while nothing runs."""
+    """Stop what runs; a job that is not finished keeps its state in `kept`. Ignored while nothing runs."""
 
     kind: Literal["stop"] = "stop"
 
@@ -85,7 +86,7 @@ class Scored(_Message):
 
 
 class Stopped(_Message):
-    """What ran stopped as ordered. checkpointed: training had begun, and its state is in `out`."""
+    """What ran stopped as ordered. checkpointed: training had begun, and its state is in `kept`."""
 
     kind: Literal["stopped"] = "stopped"
     checkpointed: bool

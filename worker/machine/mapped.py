@@ -42,7 +42,7 @@ def mapped_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
 def let_go(array: NDArray[Any]) -> None:
     """Take what a contiguous array views of a file out of this process's memory. It comes back when it is asked for.
 
-    Does nothing to an array that is not of mapped_zeros.
+    Does nothing to an array that is not mapped for writing, as those of mapped_zeros are.
     """
     base: Any = array
     while base is not None and not isinstance(base, np.memmap):

@@ -121,7 +121,7 @@ class Model(Protocol):
         ...
 
     def load_arrays(self, stored: dict[str, Tensor]) -> None:
-        """Put back what arrays() gave, on any device, into a model of the same size; ValueError if the sizes differ."""
+        """Put back what arrays() gave, or some of it, on any device; ValueError if the sizes differ."""
         ...
 
     def export(self, *, as_it_lies: bool = False) -> tuple[Gaussians, Deformation]:
@@ -133,12 +133,14 @@ class Model(Protocol):
 
 
 def put_back(arrays: Mapping[str, Tensor], stored: Mapping[str, Tensor]) -> None:
-    """Copy the stored tensors, on any device, into a model's arrays().
+    """Copy the stored tensors, on any device, into a model's arrays(). What is not stored stays as it is.
 
     Raises:
         ValueError: a stored tensor has another shape than the array of its name.
     """
     for name, each in arrays.items():
+        if name not in stored:
+            continue
         if stored[name].shape != each.shape:
             shapes = tuple(stored[name].shape), tuple(each.shape)
             raise ValueError(f"{name} has shape {shapes[0]}, this model needs {shapes[1]}")

@@ -1,68 +1,149 @@
-"""The state of a stopped training run in one file, resume.safetensors.
+"""The state of a training run in one file, resume.safetensors: what a stopped or killed run goes on from.
 
-Its header holds a version, the loop's state as JSON, and a SHA-256 over that state and all tensors.
+Its header holds a version, the loop's state as JSON, and a CRC-32 of that state and all tensors.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Mapping
+import os
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import safetensors
 import torch
-from safetensors.torch import save
+from safetensors.torch import load_file
 from torch import Tensor
 
-from contract.store.durable import FOR_ALL, replace_file
+from contract.store.durable import FOR_ALL, flush
 from contract.wire.errors import SceneError
 from contract.wire.names import RESUME
-from worker.scene.files import dtype_name, parse_tensors, read_file
 
 RESUME_FILE = RESUME
-RESUME_VERSION = 2
+RESUME_VERSION = 3
 """Raised whenever the stored state changes; no version reads another's."""
+
+_DTYPES = {
+    torch.float32: "F32",
+    torch.float64: "F64",
+    torch.int32: "I32",
+    torch.int64: "I64",
+    torch.uint8: "U8",
+    torch.bool: "BOOL",
+}
+_NO_CHECKSUM = "-" * 8
+"""In its place until the file is whole."""
+_AT_ONCE_BYTES = 1 << 20
 
 
 def save_resume(directory: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
     """Write a training state to directory/resume.safetensors. It replaces the earlier one without a gap.
 
     Args:
-        tensors: of any type, for example parameters, Adam's moments and a generator's state.
+        tensors: of a type in _DTYPES, on any device, for example parameters and Adam's moments.
         state: what JSON can hold: iteration, seconds, settings.
+
+    Raises:
+        OSError: the disk is full or refuses; the earlier file is as it was.
+    """
+    begin_resume(directory, tensors, state)()
+
+
+def begin_resume(directory: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> Callable[[], None]:
+    """As save_resume, but what has to wait for the disk is left to the function that this returns.
+
+    When this returns the tensors may change. The function may be called from any thread; only one file of a directory
+    may be under way at a time. The tensors are copied into the system's page cache, so this process needs no memory for
+    them.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    named = {name: each.detach().cpu().contiguous() for name, each in tensors.items()}
-    text = json.dumps(dict(state), sort_keys=True)
-    header = {"state": text, "version": str(RESUME_VERSION), "sha256": _digest(named, text)}
-    replace_file(directory / RESUME_FILE, save(named, metadata=header), FOR_ALL)
+    path, aside = directory / RESUME_FILE, directory / f".{RESUME_FILE}.new"
+    aside.unlink(missing_ok=True)  # left by a crash
+    tensors = dict(sorted(tensors.items(), key=lambda each: -each[1].element_size()))  # so that each is aligned
+    text, places = json.dumps(dict(state), sort_keys=True), _places(tensors)
+    try:
+        descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, FOR_ALL)
+        with open(descriptor, "wb") as file:
+            file.write(_header(places, text, _NO_CHECKSUM))
+            for tensor in tensors.values():
+                for piece in _pieces(tensor.detach().cpu()):
+                    file.write(piece)
+    except BaseException:
+        aside.unlink(missing_ok=True)
+        raise
+
+    def complete() -> None:
+        try:
+            start = len(_header(places, text, _NO_CHECKSUM))
+            with aside.open("r+b") as file:
+                file.write(_header(places, text, _checksum(aside, start, text)))
+                file.flush()
+                os.fsync(file.fileno())
+            aside.rename(path)
+        finally:
+            aside.unlink(missing_ok=True)
+        flush(directory)
+
+    return complete
 
 
 def load_resume(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The tensors and the state that save_resume wrote, on the CPU.
+    """The tensors and the state that save_resume wrote, on the CPU. The tensors are read from the file when they are
+    used: load them before it is replaced.
 
     Raises:
         SceneError: there is none, it is damaged, or another version wrote it.
     """
     path = directory / RESUME_FILE
-    data = read_file(path)
-    tensors = parse_tensors(data, path)
-    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__", {})
-    if header.get("version") != str(RESUME_VERSION):
-        found = header.get("version")
-        raise SceneError(f"{path} was written by another version ({found}; this program resumes {RESUME_VERSION}).")
-    if header.get("sha256") != _digest(tensors, header.get("state", "")):
-        raise SceneError(f"{path} is damaged: its contents do not match their hash.")
-    state: dict[str, Any] = json.loads(header["state"])
-    return tensors, state
+    try:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+            metadata = json.loads(file.read(min(length, path.stat().st_size)))["__metadata__"]
+        if metadata["version"] != str(RESUME_VERSION):
+            found = metadata["version"]
+            raise SceneError(f"{path} was written by another version ({found}; this program resumes {RESUME_VERSION}).")
+        if metadata["crc32"] != _checksum(path, 8 + length, metadata["state"]):
+            raise SceneError(f"{path} is damaged: its contents do not match their checksum.")
+        return load_file(path), json.loads(metadata["state"])
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read: {error.strerror}.") from error
+    except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise SceneError(f"{path} is damaged: {error}.") from error
 
 
-def _digest(tensors: Mapping[str, Tensor], state: str) -> str:
-    """SHA-256 over the state and every tensor's name, type, shape and bytes, in the order of names."""
-    digest = hashlib.sha256(state.encode())
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        digest.update(f"\n{name} {dtype_name(tensor)} {list(tensor.shape)}\n".encode())
-        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
+def _places(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Type, shape and place of each tensor in the file, in their order, as safetensors wants them."""
+    places, end = {}, 0
+    for name, tensor in tensors.items():
+        start, end = end, end + tensor.numel() * tensor.element_size()
+        places[name] = {"dtype": _DTYPES[tensor.dtype], "shape": list(tensor.shape), "data_offsets": [start, end]}
+    return places
+
+
+def _header(places: Mapping[str, Any], state: str, checksum: str) -> bytes:
+    """The file's start, as long for every checksum. The tensors after it are aligned."""
+    metadata = {"version": str(RESUME_VERSION), "crc32": checksum, "state": state}
+    text = json.dumps({"__metadata__": metadata, **places}).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text
+
+
+def _pieces(tensor: Tensor) -> Iterator[memoryview]:
+    """The bytes of a tensor in order, without a copy of all of it: rows of a padded array lie apart."""
+    if tensor.is_contiguous() or tensor.dim() < 2:
+        yield tensor.contiguous().view(-1).view(torch.uint8).numpy().data
+        return
+    for row in tensor:
+        yield from _pieces(row)
+
+
+def _checksum(path: Path, start: int, state: str) -> str:
+    """CRC-32 of the state and of the file's bytes from start on."""
+    found = zlib.crc32(state.encode())
+    with path.open("rb") as file:
+        file.seek(start)
+        while piece := file.read(_AT_ONCE_BYTES):
+            found = zlib.crc32(piece, found)
+    return f"{found:08x}"

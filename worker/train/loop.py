@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from contract.wire.errors import Cancelled, TrainingDiverged
+from worker.machine.hooks import ignore
 from worker.machine.timing import Stopwatch
 from worker.model.optimize import rates_at
 from worker.raster.step import StepSums
@@ -59,6 +60,7 @@ def train(
     evaluate: Callable[[], HeldOutScore],
     hooks: TrainingHooks,
     copy_scene: Callable[[], Scene] | None = None,
+    keep: Callable[[Run], None] = ignore,
 ) -> None:
     """Take run from its iteration to its last.
 
@@ -66,6 +68,7 @@ def train(
         clock: t_train_s so far; paused while held-out frames are scored.
         evaluate: the score of the held-out frames, NaN without any.
         copy_scene: the scene as the model is now, for hooks.on_snapshot; None shows none.
+        keep: called before every step; may store the run, as it is after a full iteration.
 
     Raises:
         Cancelled: hooks.should_stop said so; run is as it was after its last full iteration and can be resumed.
@@ -77,6 +80,7 @@ def train(
     while run.iteration < run.iterations:
         if hooks.should_stop():
             raise Cancelled(f"Stopped after iteration {run.iteration} of {run.iterations}.")
+        keep(run)
         if copy_scene is not None and hooks.wants_snapshot():
             hooks.on_snapshot(copy_scene(), run.iteration)
         iteration = _advance(run)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
+from contract.wire.notices import Notice
 from worker.fusion import fuse
 from worker.machine.memory import LITTLE_BYTES, keep_free_memory
 from worker.model.deformation import SharedBasis
 from worker.motion.tracks import Tracks, moved_along, track
 from worker.raster.backend import CPU, examine
+from worker.raster.model import Model
 from worker.train.calibrate import iterations_within, warm_up
 from worker.train.densify import Densifier
-from worker.train.run import Run
+from worker.train.presets import Preset
+from worker.train.run import Box, Run
 from worker.train.schedule import Schedule, validation_frames
 from worker.train.setup import Setup
-from worker.train.start import fusion_for, settled, start_model
+from worker.train.start import box_of, fusion_for, settled, start_model
 from worker.train.targets import TrainingFrames, units_per_mm
 
 
@@ -27,10 +31,7 @@ def prepare(setup: Setup) -> Run:
     """
     clip, train, timings = setup.clip, setup.split.train, setup.timings
     scale = units_per_mm(clip, train)
-    if setup.device != CPU:
-        setup.hooks.report_stage("compile", 0.0)
-        with setup.clock.paused():
-            timings.add("compile_s", examine(setup.device))
+    examine_device(setup)
     tracks = _tracks(setup)
     setup.hooks.report_stage("fusion", 0.0)
     with timings.measure("capacity_s"):
@@ -45,17 +46,42 @@ def prepare(setup: Setup) -> Run:
         model = start_model(
             cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device, gloss=any(setup.sides)
         )
-    with timings.measure("targets_s"):
+    run = begun(setup, frames_of(setup, scale), model, preset, chosen, box_of(model))
+    keep_free_memory(LITTLE_BYTES)
+    run.schedule = _schedule(run)
+    return run
+
+
+def examine_device(setup: Setup) -> None:
+    """Compile a GPU's kernels and check them; the clock is paused. Raises UnavailableError if they do not work."""
+    if setup.device != CPU:
+        setup.hooks.report_stage("compile", 0.0)
+        with setup.clock.paused():
+            setup.timings.add("compile_s", examine(setup.device))
+
+
+def frames_of(setup: Setup, scale: float) -> list[TrainingFrames]:
+    """The targets of each eye that teaches, left first. scale: optimiser units a millimetre."""
+    with setup.timings.measure("targets_s"):
         eyes = zip(setup.teaching_eyes, setup.sides, strict=False)
-        frames = [TrainingFrames(eye, train, scale, side) for eye, side in eyes]
+        return [TrainingFrames(eye, setup.split.train, scale, side) for eye, side in eyes]
+
+
+def begun(
+    setup: Setup, frames: Sequence[TrainingFrames], model: Model, preset: Preset, chosen: tuple[Notice, ...], box: Box
+) -> Run:
+    """The run of a model that has made no step, and no schedule yet. A GPU compiles what this very model needs.
+
+    Args:
+        frames: of each eye that teaches.
+        preset: settled.
+    """
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
-    run = Run(setup, model, frames[0], preset, Schedule(planned=0), densifier=densifier, chosen=chosen)
+    run = Run(setup, model, frames[0], preset, Schedule(planned=0), box, densifier=densifier, chosen=chosen)
     run.right = frames[1] if len(frames) > 1 else None
     if setup.device != CPU:
         with setup.clock.paused():
-            timings.add("compile_s", warm_up(run, partial(setup.hooks.report_stage, "compile")))
-    keep_free_memory(LITTLE_BYTES)
-    run.schedule, run.asked = _schedule(run)
+            setup.timings.add("compile_s", warm_up(run, partial(setup.hooks.report_stage, "compile")))
     return run
 
 
@@ -70,15 +96,13 @@ def _tracks(setup: Setup) -> Tracks | None:
     return tracks
 
 
-def _schedule(run: Run) -> tuple[Schedule, str]:
-    """How many iterations are made and how rates fall in them; and, in words, the length that was requested."""
+def _schedule(run: Run) -> Schedule:
+    """How many iterations are made and how rates fall in them."""
     setup, preset, epoch = run.setup, run.preset, run.steps_an_epoch
     fixed = setup.fixed_iterations
     if fixed is not None:
-        return Schedule(fixed, preset.warm_restarts, epoch=epoch), f"{fixed} iterations"
-    budget_s = setup.options.budget_s or preset.budget_s
-    assert budget_s is not None
+        return Schedule(fixed, preset.warm_restarts, epoch=epoch)
     setup.hooks.report_stage("calibrate", 0.0)
-    planned = iterations_within(run, budget_s, setup.clock.elapsed_s)
+    planned = iterations_within(run, setup.budget_s, setup.clock.elapsed_s)
     min_gain_db = preset.min_gain_db if validation_frames(run.frames.indices) else None
-    return Schedule(planned, preset.warm_restarts, min_gain_db, epoch), f"{budget_s} s"
+    return Schedule(planned, preset.warm_restarts, min_gain_db, epoch)

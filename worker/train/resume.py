@@ -1,51 +1,98 @@
-"""A stopped run stores its state in its folder; resumed, it reaches the bits of an uninterrupted run.
+"""A stored run resumes: a stopped or killed one goes on from its last state to the bits of an uninterrupted run.
 
 The state names no device: a run may be resumed on another one, but then reaches other bits.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from contract.wire.errors import ResumeMismatch, SceneError
-from worker.scene.resume_file import RESUME_FILE, load_resume, save_resume
+from contract.wire.notices import Notice
+from worker.scene.resume_file import RESUME_FILE, begin_resume, load_resume
+from worker.train.prepare import begun, examine_device, frames_of
+from worker.train.presets import Preset
 from worker.train.run import CurvePoint, Run
 from worker.train.schedule import Schedule
+from worker.train.setup import Setup
+from worker.train.start import resting_model
+from worker.train.targets import TrainingFrames
+
+MISFITS = (KeyError, SceneError, TypeError, ValueError)
+"""What reading a state raises that is damaged or of another run."""
 
 
-def resume(out_dir: Path, run: Run) -> float | None:
-    """Resume the run stored in out_dir, if there is one; returns its t_train_s.
+def resume(directory: Path, setup: Setup) -> Run | None:
+    """The run that is stored in directory, with the setup's clock and timings as they were; None if there is none.
+
+    Points, tracks and the start are not made again: all that came of them is in the state.
 
     Raises:
         ResumeMismatch: it was started with another preset, seed, length or clip, or cannot be read.
+        UnavailableError: the GPU does not work.
+        Cancelled: hooks.should_stop said so.
     """
-    if not (out_dir / RESUME_FILE).exists():
+    if not (directory / RESUME_FILE).exists():
         return None
     try:
-        return load_run(out_dir, run)
-    except (ValueError, KeyError, SceneError) as error:
-        problem = f"{out_dir / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
+        tensors, state = load_resume(directory)
+        preset = _settled(setup.preset, state["start"])
+        frames = frames_of(setup, float(state["start"]["units_per_mm"]))
+        _check(state, setup, preset, frames)
+        examine_device(setup)
+        low, high = state["start"]["box"]
+        model = resting_model(state["count"], (low, high), setup, preset)
+        chosen = tuple(Notice.model_validate(each) for each in state["start"]["chosen"])
+        run = begun(setup, frames, model, preset, chosen, (low, high))
+        _put(run, tensors, state)
+    except MISFITS as error:
+        problem = f"{directory / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
         raise ResumeMismatch("--out", problem, "Give the options it was started with, or name a new folder.") from error
+    setup.timings.seconds = state["seconds"] | setup.timings.seconds
+    setup.clock.restart(float(state["t_train_s"]))
+    return run
 
 
 def save_run(directory: Path, run: Run, t_train_s: float) -> None:
-    """Write what load_run needs: parameters, moments, averages, densification statistics, schedule, curve."""
-    arrays = {**run.model.arrays(), **run.average.arrays(), **(run.densifier.arrays() if run.densifier else {})}
-    tensors = {name: values.cpu().contiguous() for name, values in arrays.items()}
+    """Write what resume needs: parameters, moments, averages, densification statistics, schedule, curve.
+
+    Raises:
+        OSError: the disk is full or refuses; what was stored before is as it was.
+    """
+    begin_save(directory, run, t_train_s)()
+
+
+def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None]:
+    """As save_run, in two parts, as begin_resume does it: when this returns the run may go on."""
+    trains = 0 < run.iteration < run.iterations
+    arrays = run.model.arrays() if trains else run.model.parameters()  # before and after, nobody asks for moments
+    arrays |= {**run.average.arrays(), **(run.densifier.arrays() if run.densifier else {})}
     state = {
-        "identity": _identity(run),
+        "identity": _identity(run.setup, run.preset, run.eyes),
+        "start": {
+            "bases": run.preset.bases,
+            "stride": run.preset.fusion.stride,
+            "units_per_mm": run.frames.scale,
+            "box": run.box,
+            "chosen": [notice.model_dump() for notice in run.chosen],
+        },
         "iteration": run.iteration,
         "schedule": run.schedule.settings,
         "count": run.model.count,
         "averaged": run.average.count,
         "t_train_s": t_train_s,
+        "seconds": run.setup.timings.seconds,
         "curve": [astuple(point) for point in run.curve],
     }
-    save_resume(directory, tensors, state)
+    return begin_resume(directory, arrays, state)
 
 
 def load_run(directory: Path, run: Run) -> float:
@@ -56,13 +103,25 @@ def load_run(directory: Path, run: Run) -> float:
         ValueError: it was started with another preset, seed, length or clip.
     """
     tensors, state = load_resume(directory)
-    stored = state.get("identity", {})
-    differing = [f"another {name}" for name, own in _identity(run).items() if stored.get(name) != own]
-    if differing:
-        raise ValueError(f"the stored run was started with {', '.join(differing)}")
+    _check(state, run.setup, run.preset, run.eyes)
     if state["count"] != run.model.count:  # densified since the start
         columns = np.zeros(state["count"], np.int64)
         run.model.take(columns, np.ones(len(columns), np.bool_))
+    _put(run, tensors, state)
+    return float(state["t_train_s"])
+
+
+def _settled(preset: Preset, start: Mapping[str, Any]) -> Preset:
+    """The preset with what the scene settled when the run began."""
+    fusion = dataclasses.replace(preset.fusion, stride=start["stride"])
+    return dataclasses.replace(preset, bases=start["bases"], fusion=fusion)
+
+
+def _put(run: Run, tensors: dict[str, Tensor], state: Mapping[str, Any]) -> None:
+    """Put the stored state into a run of as many Gaussians that has made no step."""
+    lacking = run.model.parameters().keys() - tensors.keys()
+    if lacking:
+        raise ValueError(f"it holds no {', '.join(sorted(lacking))}")
     run.model.load_arrays(tensors)
     run.average.load_arrays(tensors, state["averaged"])
     if run.densifier is not None:
@@ -70,15 +129,24 @@ def load_run(directory: Path, run: Run) -> float:
     run.iteration = state["iteration"]
     run.schedule = Schedule.of(state["schedule"])
     run.curve = [CurvePoint(*row) for row in state["curve"]]
-    return float(state["t_train_s"])
 
 
-def _identity(run: Run) -> dict[str, str]:
+def _check(state: Mapping[str, Any], setup: Setup, preset: Preset, eyes: Sequence[TrainingFrames]) -> None:
+    """ValueError if a run with this state was started as something else."""
+    stored = state.get("identity", {})
+    own = _identity(setup, preset, eyes)
+    differing = [f"another {name}" for name, value in own.items() if stored.get(name) != value]
+    if differing:
+        raise ValueError(f"the stored run was started with {', '.join(differing)}")
+
+
+def _identity(setup: Setup, preset: Preset, eyes: Sequence[TrainingFrames]) -> dict[str, str]:
     """What a stored run must share with the one that resumes it, by the words of the error."""
+    fixed = setup.fixed_iterations
     return {
-        "preset": run.preset.name,
-        "settings of the preset": hashlib.sha256(repr(run.preset).encode()).hexdigest(),
-        "seed": str(run.seed),
-        "length": run.asked,
-        "clip, other frames of it, or depth from another device": "".join(eye.digest() for eye in run.eyes),
+        "preset": preset.name,
+        "settings of the preset": hashlib.sha256(repr(preset).encode()).hexdigest(),
+        "seed": str(setup.options.seed),
+        "length": f"{fixed} iterations" if fixed is not None else f"{setup.budget_s} s",
+        "clip, other frames of it, or depth from another device": "".join(eye.digest() for eye in eyes),
     }

@@ -30,6 +30,10 @@ class CurvePoint:
     psnr_right_db: float | None = None
 
 
+Box = tuple[tuple[float, ...], tuple[float, ...]]
+"""Two opposite corners of a box, x y z each."""
+
+
 @dataclass
 class Run:
     """A training run.
@@ -40,7 +44,7 @@ class Run:
     right        those of the right eye; None where the left eye alone teaches
     preset       rates, loss, order, densification; nothing is left to the scene any more
     schedule     how many iterations, and how the rates fall; iteration: those done
-    asked        the length that was asked for, in words; a stored run is resumed only with its own
+    box          corners of the box of the Gaussians' centres before the first step, units
     average      mean of the last models of a cycle
     densifier    its statistics; None where the preset has no densification
     chosen       what the preset left to the scene, its value and the reason, in words
@@ -52,7 +56,7 @@ class Run:
     frames: TrainingFrames
     preset: Preset
     schedule: Schedule
-    asked: str = ""
+    box: Box
     iteration: int = 0
     right: TrainingFrames | None = None
     average: RunningMean = field(default_factory=RunningMean)

@@ -55,3 +55,10 @@ class Setup:
     def fixed_iterations(self) -> int | None:
         """The requested iterations, else the preset's own; None where seconds limit the run."""
         return self.options.iterations or (None if self.options.budget_s else self.preset.iterations)
+
+    @property
+    def budget_s(self) -> float:
+        """The seconds of training that were asked for, where fixed_iterations is None."""
+        budget_s = self.options.budget_s or self.preset.budget_s
+        assert budget_s is not None
+        return budget_s

@@ -23,6 +23,8 @@ from worker.motion.tracks import GUESSED, Tracks, fit_tracks
 from worker.raster.backend import CPU, Device, make_model
 from worker.raster.model import Model
 from worker.train.presets import Preset
+from worker.train.run import Box
+from worker.train.setup import Setup
 
 SHARE_PX = 4
 """Points within such a square start with one motion. Tracks are smooth over more, and there is less to solve."""
@@ -126,6 +128,27 @@ def start_model(
     if tracks is not None and isinstance(motion, SharedBasis):
         gaussians = _follow_tracks(gaussians, motion, cloud, tracks, clip, train, scale)
     return make_model(gaussians, motion, clip.intrinsics.width, clip.intrinsics.height, device)
+
+
+def box_of(model: Model) -> Box:
+    """The corners of the box of the model's centres, units."""
+    centres = model.parameters()["canonical"][MEAN].cpu()
+    return tuple(centres.amin(1).tolist()), tuple(centres.amax(1).tolist())
+
+
+def resting_model(count: int, box: Box, setup: Setup, preset: Preset) -> Model:
+    """As start_model's for as many Gaussians in such a box, whose arrays are still to be loaded."""
+    gaussians = Gaussians(
+        mean=torch.tensor(box)[torch.arange(count) % 2],
+        quaternion=torch.zeros(count, 4),
+        log_scale=torch.zeros(count, 3),
+        opacity_logit=torch.zeros(count),
+        sh=torch.zeros(count, (preset.sh_degree + 1) ** 2, 3),
+    )
+    clip, times = setup.clip, [float(setup.clip.t[i]) for i in setup.split.train]
+    start = AtRest(preset.bases, preset.start_width, times, setup.options.seed, any(setup.sides))
+    motion = motion_named(preset.deformation).at_rest(gaussians, start)
+    return make_model(gaussians, motion, clip.intrinsics.width, clip.intrinsics.height, setup.device)
 
 
 def _follow_tracks(

@@ -42,7 +42,7 @@ def test_a_purge_leaves_no_file_of_a_job_and_says_what_it_took(store: Store) -> 
     store.open_incoming(job_id)
     removed = store.purge(job_id)
     assert everything_of(store, job_id) == []
-    assert removed.files == {"incoming": 0, "spool": 2, "work": 1, "scenes": 1}
+    assert removed.files == {"incoming": 0, "spool": 2, "work": 1, "kept": 0, "scenes": 1}
     assert removed.bytes["work"] == 5
     assert removed.bytes["scenes"] == len("{}")
     assert store.spooled_ids() == [other]

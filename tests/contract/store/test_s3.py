@@ -105,7 +105,7 @@ def test_a_purge_leaves_nothing_in_the_bucket_nor_on_any_machine_that_shows_it(
     worker.fetch_clip(job_id)
     for content in (b"first", b"again"):
         scene = published(worker, job_id, 1, content)
-    (worker.work_folder(job_id, 2) / RESUME).write_bytes(b"state")
+    (worker.kept_folder(job_id, 2) / RESUME).write_bytes(b"state")
     worker.hand_over(job_id, 2)
     assert service.has_scene(job_id, 1)
     removed = service.purge(job_id)

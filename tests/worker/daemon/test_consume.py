@@ -394,7 +394,7 @@ def test_the_state_of_an_attempt_goes_to_the_next(bench: JobLoop) -> None:
     bench.start()
     bench.wait_for_step(job_id)
     bench.stop()
-    assert (bench.store.data_dir / "work" / f"{job_id}.1" / RESUME).exists()
+    assert (bench.store.data_dir / "kept" / f"{job_id}.1" / RESUME).exists()
     bench.start()
     record = bench.wait_for_end(job_id)
     assert (record.state, record.attempt, record.released) == (JobState.DONE, 3, 1)

@@ -19,7 +19,7 @@ from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.wire.errors import InputError, TrainingDiverged, UnavailableError
 from contract.wire.job import JobFiles, JobRecord
-from contract.wire.names import REPORT
+from contract.wire.names import KEPT, REPORT
 from contract.wire.notices import NoticeCode
 from contract.wire.options import JobOptions, ReconstructionOptions
 from contract.wire.report import Report
@@ -99,8 +99,10 @@ def wait_until(holds: Callable[[], bool], timeout_s: float = 60.0) -> None:
 def order(clip: Path, out: Path, **options: object) -> RunJob:
     chosen = JobOptions.model_validate(options)
     record = JobRecord(job_id="a" * 32, files=JobFiles(clip=clip.name), options=chosen, created_at_s=time.time())
-    out.mkdir(exist_ok=True)
-    return RunJob(record=record, spool=clip.parent, out=out)
+    kept = out.with_name(f"{out.name}.kept")
+    for folder in (out, kept):
+        folder.mkdir(exist_ok=True)
+    return RunJob(record=record, spool=clip.parent, out=out, kept=kept)
 
 
 def end_of_job(child: DeviceChild, stop_after: int | None = None) -> tuple[object, list[Advanced]]:
@@ -142,8 +144,10 @@ def test_a_stopped_job_goes_on_to_the_same_bits_and_the_process_does_any_number_
     assert (failed.fault, failed.error.field) == ("InputError", "options.holdout")
     device.send(order(clip, out, iterations=600))
     assert end_of_job(device, stop_after=1)[0] == Stopped(checkpointed=True)
-    assert [path.name for path in out.iterdir()] == [RESUME_FILE]
-    stopped_at = load_resume(out)[1]["iteration"]
+    kept = tmp_path / "out.kept"
+    assert list(out.iterdir()) == []
+    assert {path.name for path in kept.iterdir()} == set(KEPT)
+    stopped_at = load_resume(kept)[1]["iteration"]
     device.send(StopJob())  # too late for the last job, and not meant for the next
     device.send(order(clip, out, iterations=600))
     finished, advances = end_of_job(device)
@@ -188,9 +192,9 @@ def is_alive(process_id: int) -> bool:
 def test_a_state_of_another_version_is_left_behind_and_training_starts_anew(tmp_path: Path, clip: Path) -> None:
     request_here = ReconstructionRequest(clip, ReconstructionOptions(iterations=3))
     (tmp_path / RESUME_FILE).write_bytes(b"of another version")
-    make_or_start_anew(request_here, tmp_path, TrainingHooks())
-    assert (tmp_path / REPORT).exists()
-    assert not (tmp_path / RESUME_FILE).exists()
+    make_or_start_anew(request_here, tmp_path / "out", tmp_path, TrainingHooks())
+    assert (tmp_path / "out" / REPORT).exists()
+    assert load_resume(tmp_path)[1]["iteration"] == 3
 
 
 @pytest.mark.parametrize(
@@ -228,7 +232,7 @@ def test_other_trouble_with_the_input_is_not_tried_twice(tmp_path: Path) -> None
     (tmp_path / RESUME_FILE).write_bytes(b"kept")
     asked = ReconstructionRequest(tmp_path / "no.zip", ReconstructionOptions(iterations=3))
     with pytest.raises(InputError, match="clip"):
-        make_or_start_anew(asked, tmp_path, TrainingHooks())
+        make_or_start_anew(asked, tmp_path / "out", tmp_path, TrainingHooks())
     assert (tmp_path / RESUME_FILE).read_bytes() == b"kept"
 
 

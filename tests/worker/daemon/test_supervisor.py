@@ -124,7 +124,7 @@ def test_a_real_worker_told_to_end_keeps_what_was_trained_and_the_next_comes_to_
         worker.terminate()
         assert worker.wait(WAIT_S) == ExitCode.OK
     assert bench.record(job_id).state is JobState.QUEUED
-    stopped_at = load_resume(bench.store.data_dir / "work" / f"{job_id}.1")[1]["iteration"]
+    stopped_at = load_resume(bench.store.data_dir / "kept" / f"{job_id}.1")[1]["iteration"]
     assert 0 < stopped_at < 500
     with bench.worker("worker-2", real):
         record = bench.wait_for_end(job_id)

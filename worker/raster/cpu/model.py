@@ -263,7 +263,7 @@ class CpuModel:
         return {name: torch.from_numpy(values)[..., : self.count] for name, values in padded_arrays.items()}
 
     def load_arrays(self, stored: dict[str, Tensor]) -> None:
-        """Put back what arrays() gave, into a model of the same size."""
+        """Put back what arrays() gave, or some of it, into a model of the same size."""
         put_back(self.arrays(), stored)
 
     def export(self, *, as_it_lies: bool = False) -> tuple[Gaussians, Deformation]:
