@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 import threading
 import weakref
 from collections.abc import Iterator
@@ -31,6 +32,7 @@ from worker.input.clip.types import RgbFrame
 
 MAX_MISSING_FRAMES = 1  # containers that store a duration instead of a count round it
 FALLBACK_RATE_HZ = 30.0
+MAX_KEPT_BYTES = 512 << 20
 
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm"
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
@@ -38,6 +40,35 @@ _LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _SILENT = 0  # OpenCV's own messages
 _QUIET = "-8"  # AV_LOG_QUIET: hides the messages of decoders that refuse a file
 _environment_lock = threading.Lock()  # OpenCV reads these options only from the environment, which all threads share
+
+
+class KeptFrames:
+    """The frames of a video in a file without a name, so that what counted them need not be repeated.
+
+    MAX_KEPT_BYTES at most: a longer video costs less to decode twice than its frames take of the disk.
+    """
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
+        self._shape: tuple[int, ...] = ()
+        self._count = 0
+
+    def add(self, frame: NDArray[np.uint8]) -> bool:
+        """Keep the next frame [H, W, 3], BGR. False if it is too much, the disk is full, or sizes differ."""
+        if (self._count + 1) * frame.nbytes > MAX_KEPT_BYTES or frame.shape != (self._shape or frame.shape):
+            return False
+        self._shape, self._count = frame.shape, self._count + 1
+        try:
+            return self._file.write(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB).data) == frame.nbytes
+        except OSError:
+            return False
+
+    def frame(self, index: int) -> RgbFrame:
+        """A frame that was kept, RGB."""
+        frame = np.empty(self._shape, np.uint8)
+        os.preadv(self._file.fileno(), [frame.data], index * frame.nbytes)
+        return frame
 
 
 @dataclass(frozen=True)
@@ -54,9 +85,15 @@ class VideoFile:
     frame_times_s: NDArray[np.float64] | None  # None: the container has no usable times
     limits: ClipLimits
     warnings: tuple[Notice, ...] = ()
+    kept: KeptFrames | None = None  # None: each call of frames() decodes anew
 
     def frames(self) -> Iterator[RgbFrame]:
         """RGB uint8 [H, W, 3], from the first frame on. InputError if frames change size or stop early."""
+        if self.kept is not None:
+            for index in range(self.frame_count):
+                self.limits.on_picture()
+                yield self.kept.frame(index)
+            return
         with _capture(self.path, self.decoder) as capture:
             for index in range(self.frame_count):
                 good, frame = capture.read() if capture is not None else (False, None)
@@ -114,12 +151,15 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
     limits.check_frame(field, label, width, height)
     limits.check_clip(field, label, declared, width, height)
     times_ms: list[float] = []
+    kept: KeptFrames | None = KeptFrames()
     while capture.grab():
         times_ms.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)))
         limits.on_picture()
-        if len(times_ms) == 1:
-            good, frame = capture.retrieve()  # a rotated clip has another size than its header says
-            height, width = frame.shape[:2] if good else (height, width)
+        if kept is not None or len(times_ms) == 1:
+            good, frame = capture.retrieve()
+            if len(times_ms) == 1:  # a rotated clip has another size than its header says
+                height, width = frame.shape[:2] if good else (height, width)
+            kept = kept if kept is not None and good and kept.add(frame) else None
         limits.check_clip(field, label, len(times_ms), width, height)
     times_s = _times_s(times_ms, rate_hz)
     limits.check_duration(field, label, 0.0 if times_s is None or len(times_s) == 0 else float(times_s[-1]))
@@ -128,7 +168,7 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
         raise _cut_short(field, label, len(times_ms), declared)
     unknown = f"{field}: the video names no frame count, a missing end would not be noticed"
     warnings = () if declared else (Notice.warning(NoticeCode.FRAME_COUNT_UNKNOWN, unknown),)
-    return VideoFile(path, field, label, decoder, len(times_ms), height, width, times_s, limits, warnings)
+    return VideoFile(path, field, label, decoder, len(times_ms), height, width, times_s, limits, warnings, kept)
 
 
 def _whole_despite_count(
