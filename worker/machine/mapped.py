@@ -17,6 +17,9 @@ from numpy.typing import DTypeLike, NDArray
 
 from contract.wire.errors import UnavailableError
 
+AROUND_BYTES = 1 << 16
+"""Linux maps so much around what is asked for: what lies beside an array is let go with it."""
+
 
 def mapped_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     """Zeros in a file in tempfile.gettempdir(), which is gone with the last array that views it.
@@ -51,5 +54,5 @@ def let_go(array: NDArray[Any]) -> None:
     if not isinstance(base, np.memmap) or base.mode != "r+" or not hasattr(pages, "madvise"):
         return
     start = array.ctypes.data - base.ctypes.data
-    first = start // mmap.PAGESIZE * mmap.PAGESIZE
-    pages.madvise(mmap.MADV_DONTNEED, first, start + array.nbytes - first)
+    first, end = start // AROUND_BYTES * AROUND_BYTES, -(-(start + array.nbytes) // AROUND_BYTES) * AROUND_BYTES
+    pages.madvise(mmap.MADV_DONTNEED, first, min(end, base.nbytes) - first)

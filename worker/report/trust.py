@@ -65,6 +65,7 @@ def evidence(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.float64
             seen[place] += np.where(sees, np.minimum(here / np.where(sees, drawn, 1), 1), 0)
             on_tissue += here
             error += wrong
+            frames.eye.let_go(index)
     mean_error = np.maximum(error, 0) / np.maximum(on_tissue, 1e-6)
     return np.stack([seen.max(0) / len(sampled), mean_error])
 

@@ -82,6 +82,7 @@ def _ever_on_tissue(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.
             sought = np.flatnonzero(~found)  # soon a few
             inside, i, j = _pixels(mean[:, sought], frames, index)
             found[sought[inside]] = frames.eye.tissue[index][i, j]
+            frames.eye.let_go(index)
     return found
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import InputError
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip, Eye
+from worker.input.clip.types import PIXELS
 from worker.model.metrics import COVERED_ALPHA, psnr_tissue
 from worker.raster import Camera
 from worker.raster.cpu import padded
@@ -68,6 +69,10 @@ MIN_DEPTH_MM = np.float32(1e-3)
 """Any number above 0: pixels without depth are masked after the division."""
 
 
+MAX_HELD_BYTES = 512 << 20
+"""Of an eye's pixels: if they are more, each step lets go of its frames. That takes half a millisecond an eye."""
+
+
 class TrainingFrames:
     """Colour, tissue, inverse depth and camera of every training frame of one eye.
 
@@ -82,6 +87,7 @@ class TrainingFrames:
             index: camera_vector(camera_in_units(eye.intrinsics, eye.world_from_camera[index], scale, side))
             for index in range(eye.frame_count)
         }
+        self._lets_go = sum(getattr(eye, name).nbytes for name in PIXELS) > MAX_HELD_BYTES
         self._frames = {index: self._frame(index) for index in self.indices}
         self._digest: str | None = None
 
@@ -103,6 +109,8 @@ class TrainingFrames:
         inside = inverse_depth[:, :width]  # a division everywhere, then a mask: faster than one where it is asked for
         np.divide(np.float32(1 / self.scale), np.maximum(self.eye.depth_mm[index], MIN_DEPTH_MM), out=inside)
         inside *= self._measured(index)
+        if self._lets_go:
+            self.eye.let_go(index)
         return Target(rgb.ravel(), weight.ravel(), inverse_depth.ravel())
 
     def frame(self, index: int) -> TrainingFrame:
