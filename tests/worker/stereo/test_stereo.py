@@ -22,6 +22,7 @@ from worker.input.calibration import RectifiedClip, load_calibration, rectify
 from worker.input.calibration.types import StereoCalibration, parse_calibration
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip, StereoClip, held_out_frames, open_clip
+from worker.input.clip.types import PIXELS
 from worker.machine.hooks import Hooks, Progress
 from worker.stereo import estimate_depth
 
@@ -252,6 +253,21 @@ def test_held_out_frames_change_no_bit_of_another_frames_depth(holdout: str) -> 
     for name in ("vertical_misalignment_px", "vertical_residual_px", "min_disparity_px", "max_disparity_px"):
         assert clean.measurements[name] == dirty.measurements[name]
     assert not np.array_equal(clean.depth_mm[held_out], dirty.depth_mm[held_out])
+
+
+def test_the_first_measured_frame_is_handed_over_as_it_stays() -> None:
+    seen: list[DepthClip] = []
+    clip = clip_of([draw_pair(slanted(), seed=i) for i in range(4)])
+    whole = estimate_depth(clip, Hooks(on_first_moment=seen.append), measured_frames=[1, 2])
+    (moment,) = seen
+    assert moment.frame_count == 1
+    assert moment.frame_times_s[0] == whole.frame_times_s[1]
+    assert moment.right is not None
+    assert whole.right is not None
+    for shown, eye in ((moment, whole), (moment.right, whole.right)):
+        for name in (*PIXELS, "world_from_camera"):
+            np.testing.assert_array_equal(getattr(shown, name)[0], getattr(eye, name)[1])
+        assert shown.intrinsics == eye.intrinsics
 
 
 @pytest.mark.parametrize("measured", [[], [3], [-1, 0]])

@@ -12,7 +12,8 @@ import pytest
 from contract.intake.limits import HELD_BYTES_PER_PIXEL
 from contract.wire.errors import InputError, LimitError
 from tests.worker.clips import open_with
-from worker.input.clip import ClipLimits, StereoClip, open_clip
+from worker.input.clip import ClipLimits, StereoClip, open_clip, video
+from worker.input.clip.video import open_video
 
 DATA = Path(__file__).parents[3] / "data"
 SBS_H264 = DATA / "stereo_sbs_h264.mp4"
@@ -80,6 +81,16 @@ def test_pairs_start_again_from_the_first_frame() -> None:
     first, again = next(clip.pairs()), next(clip.pairs())
     np.testing.assert_array_equal(first[0], again[0])
     np.testing.assert_array_equal(first[1], again[1])
+
+
+def test_frames_that_were_kept_are_those_that_are_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = list(open_video(SBS_H264, "clip", ClipLimits()).frames())
+    for most_bytes in (0, kept[0].nbytes * 3):
+        monkeypatch.setattr(video, "MAX_KEPT_BYTES", most_bytes)
+        anew = open_video(SBS_H264, "clip", ClipLimits())
+        assert anew.kept is None
+        for frame, other in zip(kept, anew.frames(), strict=True):
+            np.testing.assert_array_equal(frame, other)
 
 
 def test_frames_are_rgb(studio) -> None:
