@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 from contract.intake.limits import MAX_CALIBRATION_BYTES, ClipLimits
+from contract.intake.nesting import nesting
 from contract.intake.video_header import EBML, check_video, is_video
 from contract.intake.zips import UNREADABLE, open_zip
 from contract.wire.errors import InputError, LimitError
@@ -21,6 +22,7 @@ _MATROSKA_SUFFIXES = frozenset({".mkv", ".webm"})
 _IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 _HEAD_BYTES = 32  # holds a PNG's size
 _NPY_HEAD_BYTES = 4096  # NumPy writes 128; larger headers may attack their parser
+MAX_NESTING = 64  # of a calibration, whose own levels are four
 _PLAIN_TEXT_REMEDY = "Give numbers only: our JSON, OpenCV YAML or XML, or StereoMIS ini."
 _ACTIVE_TEXT = {"<!entity": "declares XML entities", "<!doctype": "has an XML document type", "!!python": "names code"}
 
@@ -51,11 +53,15 @@ def png_size(head: bytes) -> tuple[int, int] | None:
 
 
 def check_calibration_text(text: str, field: str, label: str) -> None:
-    """InputError for text with active content: XML entities, document types, code."""
+    """InputError for text with active content (XML entities, document types, code), or nested too deep for a parser."""
     small = text.lower()
     for sign, problem in _ACTIVE_TEXT.items():
         if sign in small:
             raise InputError(field, f"{label} {problem}.", _PLAIN_TEXT_REMEDY)
+    levels = nesting(text)
+    if levels > MAX_NESTING:
+        problem = f"{label} is nested {levels} levels deep; the limit is {MAX_NESTING}."
+        raise InputError(field, problem, _PLAIN_TEXT_REMEDY)
 
 
 def _text_of(path: Path, part: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -12,10 +13,15 @@ from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM, ReconstructionOpti
 from worker.input.calibration import rectify
 from worker.input.calibration.types import StereoCalibration
 from worker.input.clip import ClipLimits, DepthClip, StereoClip, training_frames
-from worker.input.decode import decode_clip
+from worker.input.decode import DecoderKilledError, decode_clip
 from worker.machine.hooks import Hooks, ignore
 from worker.machine.timing import Timings
 from worker.stereo.depth import estimate_depth
+
+TRIES = 3
+"""Of a clip whose decoding process is killed from outside."""
+
+logger = logging.getLogger("intrasplat.worker")
 
 
 @dataclass(frozen=True)
@@ -42,36 +48,47 @@ def open_with_depth(
 
     timings get decode_s, until the size of a stereo clip is known, and stereo_s, which includes decoding its frames.
 
+    When something outside kills the decoding process, it is tried again, TRIES times in all.
+
     Raises:
         InputError: the clip, its calibration, its masks or the holdout cannot be used.
-        UnavailableError: the disk is full; or before_matching raised it.
+        UnavailableError: the disk is full; or before_matching raised it; or the decoding process was killed every time.
         Cancelled: hooks.should_stop said so.
     """
-    hooks.report_stage("decode", 0.0)
-    with timings.measure("decode_s"):
-        decoded = decode_clip(
-            paths.clip,
-            paths.right,
-            calibration=paths.calibration,
-            masks=paths.masks,
-            options=options,
-            limits=limits,
-            hooks=hooks,
-        )
-    if isinstance(decoded, DepthClip):
-        hooks.on_first_moment(decoded.moment(training_frames(decoded.frame_count, options.holdout)[0]))
-        return decoded
-    with closing(decoded):
-        return match_eyes(
-            decoded.clip,
-            decoded.calibration,
-            options.holdout,
-            hooks,
-            timings,
-            device=device,
-            before_matching=before_matching,
-            depth_range_mm=(options.min_depth_mm, options.max_depth_mm),
-        )
+
+    def once() -> DepthClip:
+        hooks.report_stage("decode", 0.0)
+        with timings.measure("decode_s"):
+            decoded = decode_clip(
+                paths.clip,
+                paths.right,
+                calibration=paths.calibration,
+                masks=paths.masks,
+                options=options,
+                limits=limits,
+                hooks=hooks,
+            )
+        if isinstance(decoded, DepthClip):
+            hooks.on_first_moment(decoded.moment(training_frames(decoded.frame_count, options.holdout)[0]))
+            return decoded
+        with closing(decoded):
+            return match_eyes(
+                decoded.clip,
+                decoded.calibration,
+                options.holdout,
+                hooks,
+                timings,
+                device=device,
+                before_matching=before_matching,
+                depth_range_mm=(options.min_depth_mm, options.max_depth_mm),
+            )
+
+    for _ in range(TRIES - 1):
+        try:
+            return once()
+        except DecoderKilledError:
+            logger.warning("something killed the process that decodes the clip; it is tried again")
+    return once()
 
 
 def match_eyes(

@@ -270,10 +270,9 @@ def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path, text: str) -> 
     assert error.value.field == "calibration"
 
 
-def test_json_nested_too_deep_or_with_endless_digits_is_refused(tmp_path: Path) -> None:
-    for text in ('{"a":' * 100_000, '{"width": ' + "9" * 5000 + "}"):
-        with pytest.raises(InputError, match="not valid JSON"):
-            load(write(tmp_path / "c.json", text))
+def test_json_with_endless_digits_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not valid JSON"):
+        load(write(tmp_path / "c.json", '{"width": ' + "9" * 5000 + "}"))
 
 
 def test_a_missing_a_binary_and_a_huge_file_are_refused(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from tests.worker.input.clip.conftest import Studio
 from worker.input.calibration import load_calibration, rectify
 from worker.input.clip import ClipLimits, DepthClip, open_clip
 from worker.input.decode import StereoRecording, decode_clip
-from worker.input.decode.contained import Patience, keep_decoder_ready, run_contained
+from worker.input.decode.contained import DecoderKilledError, Patience, keep_decoder_ready, run_contained
 from worker.input.decode.guard import PROTECTIONS, Allowance
 from worker.input.decode.handover import map_array
 from worker.machine.hooks import Hooks, Progress
@@ -244,6 +244,11 @@ def test_a_decoder_that_misbehaves_is_an_error_of_its_clip(tmp_path: Path, work:
         run_stand_in(tmp_path, work.replace("os.write(3", "os.write(reports._stream.fileno()"))
     assert caught.value.field == "clip"
     assert "H.264" in caught.value.remedy
+
+
+def test_a_decoder_that_something_killed_is_no_error_of_its_clip(tmp_path: Path) -> None:
+    with pytest.raises(DecoderKilledError, match="memory runs out"):
+        run_stand_in(tmp_path, "import signal; signal.raise_signal(signal.SIGKILL)")
 
 
 def test_a_decoder_that_computes_without_end_is_ended(tmp_path: Path) -> None:

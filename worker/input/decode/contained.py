@@ -53,6 +53,14 @@ class Patience:
     max_exit_s: float = MAX_EXIT_S
 
 
+class DecoderKilledError(UnavailableError):
+    """Something outside killed the decoding process, such as a system without memory: the clip is not to blame."""
+
+    def __init__(self) -> None:
+        problem = "The system killed the process that decodes the clip, as it does when memory runs out."
+        super().__init__(problem, "Free memory on the worker's machine, or send a smaller clip; then retry.")
+
+
 class Decoder:
     """A decoding process with a folder of its own, from its start to its end. It answers one request.
 
@@ -133,6 +141,7 @@ class Decoder:
             InputError, LimitError: as the process raised them; or it crashed, hung, or exceeded its allowance.
             Cancelled: should_stop said so.
             UnavailableError: the disk is full.
+            DecoderKilledError: something outside killed it.
         """
         self._wait(lambda: False)
         assert self.result is not None
@@ -185,10 +194,14 @@ class Decoder:
         """The result that the process's last line, empty if it had none, and its exit give."""
         try:
             self._process.wait(self._patience.max_exit_s if answer else MAX_DEATH_S)
+            status = self._process.returncode
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        return _result(answer or None, self._process.returncode, self._field, self._allowance)
+            status = 0
+        if not answer and status == -signal.SIGKILL:  # none of its own limits ends it so
+            raise DecoderKilledError
+        return _result(answer or None, status, self._field, self._allowance)
 
 
 _ready: list[Decoder] = []

@@ -206,7 +206,7 @@ CORPUS: dict[str, Hostile] = {
         part="calibration",
     ),
     "bytes": Hostile("calibration.yaml", fixed(bytes(range(256)) * 9), "not a text", part="calibration"),
-    "deep": Hostile("calibration.json", fixed(b'{"a":' + b"[" * 99_999), "JSON|nested", "decoding", part="calibration"),
+    "deep": Hostile("calibration.json", fixed(b'{"a":' + b"[" * 99_999), "nested 100000 levels", part="calibration"),
     "large": Hostile("calibration.json", fixed(b"{" + b" " * 2_000_000 + b"}"), "2000002", part="calibration"),
     "masks of another size": Hostile(
         "masks.zip", fixed(zipped(*((f"{i}.png", png(16, 9000)) for i in range(12)))), "pixels", "decoding", "masks"
