@@ -6,7 +6,8 @@
 Starts `intrasplat up` on a data directory of its own, trains once untimed, so that the worker is warm, and then sends
 the clip again and again. Seconds from the POST, medians: first_view_s, the first answer to GET /render; good_view_s, a
 snapshot whose held-out score of the left eye is GOOD_DB or more, as the job's progress tells; done_s, the job is done;
-scored_s, its report has scores. psnr_db is the report's, stages the report's seconds. --shell measures `intrasplat
+scored_s, its report has scores. eta_off is how far the job's eta_s was off at most, as a share of done_s, after the
+first tenth of it. psnr_db is the report's, stages the report's seconds. --shell measures `intrasplat
 reconstruct` from the shell, too: done_s is the whole command.
 
 The recording is found through INTRASPLAT_DATA; without it a synthetic clip is drawn.
@@ -37,8 +38,10 @@ from worker.evaluate.sources import DATA_VARIABLE, source_of
 GOOD_DB = 33.0
 LOOK_PERIOD_S = 0.05
 CLOCKS = ("first_view_s", "good_view_s", "done_s", "scored_s")
-FIELDS = ("clip", "preset", "budget_s", "way", "repeat", *CLOCKS, "psnr_db", "psnr_right_db", "stages", "load_1min",
-          "machine", "commit")  # fmt: skip
+EARLY = 0.1
+"""Share of a job in which nobody can tell how long it takes."""
+FIELDS = ("clip", "preset", "budget_s", "way", "repeat", *CLOCKS, "eta_off", "psnr_db", "psnr_right_db", "stages",
+          "load_1min", "machine", "commit")  # fmt: skip
 
 Row = dict[str, Any]
 
@@ -88,11 +91,16 @@ def _sent(client: Client, clip: Path, files: Mapping[str, Path], preset: str, bu
     job = client.reconstruct(clip, **files, **chosen)
     viewer = threading.Thread(target=_look, args=(client.url, job.id, start_s, row))
     viewer.start()
+    told: list[tuple[float, float]] = []
     for now in client.watch(job.id):
+        if now.state is JobState.RUNNING and now.eta_s is not None:
+            told.append((time.perf_counter() - start_s, now.eta_s))
         if "good_view_s" not in row and (now.psnr_db or 0.0) >= GOOD_DB:
             row["good_view_s"] = round(time.perf_counter() - start_s, 2)
         if now.state is JobState.DONE:
-            row["done_s"] = round(time.perf_counter() - start_s, 2)
+            done_s = time.perf_counter() - start_s
+            late = [abs(at_s + eta_s - done_s) / done_s for at_s, eta_s in told if at_s > EARLY * done_s]
+            row |= {"done_s": round(done_s, 2), "eta_off": round(max(late, default=math.nan), 3)}
     viewer.join()
     client.wait(job.id)
     report = client.report(job.id)
@@ -129,7 +137,7 @@ def _run(clip: Path, files: Mapping[str, Path], preset: str, budget_s: float | N
 
 def _medians(rows: list[Row]) -> Row:
     numbers = {}
-    for name in (*CLOCKS, "psnr_db", "psnr_right_db"):
+    for name in (*CLOCKS, "eta_off", "psnr_db", "psnr_right_db"):
         known = [row[name] for row in rows if row.get(name) is not None]
         numbers[name] = median(known) if known else math.nan
     return {**rows[0], **numbers, "repeat": f"median of {len(rows)}", "stages": "{}"}
@@ -138,7 +146,8 @@ def _medians(rows: list[Row]) -> Row:
 def _line(row: Row) -> str:
     clocks = ", ".join(f"{name} {row[name]:.1f}" for name in CLOCKS if row.get(name) is not None)
     stages = ", ".join(f"{name.removesuffix('_s')} {value:.1f}" for name, value in json.loads(row["stages"]).items())
-    return f"{row['way']} {row['preset']} {row['repeat']}: {clocks}; {row['psnr_db']:.1f} dB; {stages}"
+    scores = f"eta off {row.get('eta_off', math.nan):.2f}; {row['psnr_db']:.1f} dB"
+    return f"{row['way']} {row['preset']} {row['repeat']}: {clocks}; {scores}; {stages}"
 
 
 def _parser() -> argparse.ArgumentParser:

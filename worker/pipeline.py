@@ -21,6 +21,7 @@ from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import Report
 from worker.input.camera import to_camera
 from worker.input.clip import DepthClip, FrameSplit, split_frames
+from worker.machine.forecast import Forecast
 from worker.machine.hooks import Hooks
 from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from worker.machine.timing import Timings
@@ -89,8 +90,15 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
 
     kept_dir: where to keep what the same request goes on from; whoever names it removes it. None: out_dir.
     """
+    options = request.options
+    preset = request.own_preset or preset_named(options.preset, options.budget_s)
+    iterations = options.iterations or (None if options.budget_s else preset.iterations)
+    forecast = Forecast(options.budget_s or preset.budget_s, iterations)
+    tell = hooks.on_progress
+    hooks = dataclasses.replace(hooks, on_progress=lambda progress: tell(forecast.completed(progress)))
     with keeping(kept_dir or out_dir, forgets=kept_dir is None) as keeper:
         setup = begin(request, out_dir, hooks, keeper)
+        forecast.learn(setup.clip.frame_count, setup.clip.tissue.size / 1e6)
         run = resume(keeper.folder, setup) or prepare(setup)
         optimise(run, keeper)
         scene, quantized = finish(run)

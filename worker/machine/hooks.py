@@ -13,7 +13,8 @@ from contract.wire.errors import Cancelled
 class Progress:
     """One report of progress. fraction is of the stage, in [0, 1].
 
-    psnr_db and psnr_right_db are the last held-out psnr_tissue of the left and of the right eye, if any.
+    psnr_db and psnr_right_db are the last held-out psnr_tissue of the left and of the right eye, if any. Some
+    reports tell the clip's frames, and the megapixels of all of them of one eye; else both are 0.
     """
 
     stage: str
@@ -23,6 +24,8 @@ class Progress:
     psnr_db: float | None = None
     psnr_right_db: float | None = None
     seconds_left: float | None = None
+    frames: int = 0
+    megapixels: float = 0.0
 
 
 def ignore(*arguments: object) -> None:

@@ -139,7 +139,8 @@ def _receive(
         if i in aligned:
             features += [pool.submit(find_features, grey_of(eye)) for eye in (left_frame, right_frame)]
         decoded = i + 1
-        hooks.on_progress(Progress(STAGE, DECODING_SHARE * decoded / clip.frame_count))
+        share = DECODING_SHARE * decoded / clip.frame_count
+        hooks.on_progress(Progress(STAGE, share, frames=clip.frame_count, megapixels=rgb.size / 3e6))
     if decoded < clip.frame_count:
         raise InputError("clip", f"it ended after {decoded} of {clip.frame_count} frames.", "Give the whole recording.")
     found = [job.result() for job in features]
