@@ -1,12 +1,15 @@
 """What a whole installation answers under load, idle and while a job trains, side by side in one run.
 
-    python benchmarks/bm_service.py [--seconds 10] [--upload-gib 1] [--csv docs/results/service.csv]
+    python benchmarks/bm_service.py [--seconds 10] [--queue-stop-s 60] [--upload-gib 1] [--csv docs/results/service.csv]
 
-Starts `intrasplat up` on a data directory of its own, trains a synthetic clip of 640x512 and then measures, each once
-idle and once while another clip trains:
+Starts `intrasplat up` on a data directory of its own, trains a synthetic clip of 640x512 and then measures:
 - GET /render as JPEG at 640x512, times and poses at random, by 1, 4 and 16 viewers that ask again when they are
-  answered; ms at the viewer, and all viewers' frames a second;
-- GET /jobs/{id}, 200 a second whether answered or not; ms from when each was due.
+  answered; ms at the viewer, all viewers' frames a second, and those of the viewer who got fewest. Idle, beside a job
+  that trains another clip, and of that job itself, there also by 16 who all ask for its first view;
+- GET /jobs/{id}, 200 a second whether answered or not, idle and beside training; ms from when each was due;
+- six renders of 4096x2160 at once, and meanwhile views of 320x256 of another scene, one after the other;
+- iterations a second of training, without viewers before and after each measurement of viewers, and with them.
+- views of a scene shown before and of one that was not, while the queue's server is stopped for --queue-stop-s.
 Then uploads of --upload-gib GiB, in one request and resumable, with the service's memory before and at its peak.
 Viewers, service, queue and worker share the machine's cores.
 """
@@ -18,13 +21,15 @@ import asyncio
 import csv
 import os
 import random
+import signal
 import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +44,9 @@ from worker.evaluate.rows import commit, machine
 WIDTH, HEIGHT, FRAMES = 640, 512, 48
 SCENE_ITERATIONS = 300
 VIEWERS = (1, 4, 16)
+LARGE = {"width": "4096", "height": "2160", "format": "jpeg"}
+SMALL = {"width": "320", "height": "256", "format": "jpeg"}
+LARGE_AT_ONCE = 6
 JOB_REQUESTS_A_SECOND = 200
 TRAINING_BUDGET_S = 1800  # longer than any of this takes; it is cancelled at the end
 CHUNK_BYTES = 1 << 20
@@ -51,6 +59,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each measurement")
     parser.add_argument("--upload-gib", type=float, default=1.0, help="0: no uploads")
+    parser.add_argument("--queue-stop-s", type=float, default=60.0, help="0: the queue is not stopped")
     parser.add_argument("--csv", type=Path, help="file that gets a row a figure")
     arguments = parser.parse_args()
     origin = {"machine": machine(), "commit": commit()}
@@ -62,9 +71,14 @@ def main() -> None:
         with started_service(folder / "data", folder / "service.log") as client:
             scene = trained(client, clip, iterations=SCENE_ITERATIONS)
             rows += asyncio.run(_under_load(client.url, scene, "idle", arguments.seconds))
+            other, unseen = (trained(client, clip, iterations=1) for _ in range(2))
+            rows += asyncio.run(_beside_large(client.url, scene, other, "idle"))
+            if arguments.queue_stop_s:
+                rows += _without_queue(client.url, folder / "data", scene, unseen, arguments.queue_stop_s)
             busy = client.reconstruct(clip.video, calibration=clip.calibration, budget_s=TRAINING_BUDGET_S)
             wait_for_stage(client, busy.id, "train")
             rows += asyncio.run(_under_load(client.url, scene, "training", arguments.seconds))
+            rows += _watched(client.url, busy.id, arguments.seconds)
             client.cancel(busy.id)
             if arguments.upload_gib:
                 rows += _uploads(client.url, folder, arguments.upload_gib)
@@ -108,32 +122,142 @@ async def _under_load(url: str, scene: str, worker: str, seconds: float) -> list
     limits = httpx.Limits(max_connections=256, max_keepalive_connections=256)
     async with httpx.AsyncClient(base_url=url, timeout=60, limits=limits) as http:
         for viewers in VIEWERS:
-            spent_ms = await _closed_loop(lambda: _view(http, scene), viewers, seconds)
-            name = f"GET /render, {viewers} viewer{'s' if viewers > 1 else ''}"
-            rows.append(_row(name, worker, spent_ms, len(spent_ms) / seconds))
+            rows.append(await _viewing(http, _random_view(scene), viewers, worker, seconds))
         spent_ms = await _open_loop(lambda: http.get(f"/jobs/{scene}"), JOB_REQUESTS_A_SECOND, seconds)
         rows.append(_row(f"GET /jobs/{{id}}, {JOB_REQUESTS_A_SECOND}/s", worker, spent_ms, len(spent_ms) / seconds))
     return rows
 
 
-async def _view(http: httpx.AsyncClient, scene: str) -> httpx.Response:
-    pose = f"orbit:{random.uniform(-15, 15):.2f},{random.uniform(-15, 15):.2f},1"
-    query = {"scene": scene, "t": f"{random.random():.3f}", "pose": pose, "format": "jpeg"}
-    return await http.get("/render", params=query)
+Query = Callable[[], dict[str, str]]
 
 
-async def _closed_loop(ask: Callable[[], Awaitable[httpx.Response]], callers: int, seconds: float) -> list[float]:
-    """Each caller asks again as soon as it is answered; ms of all answers."""
+def _random_view(scene: str) -> Query:
+    def query() -> dict[str, str]:
+        pose = f"orbit:{random.uniform(-15, 15):.2f},{random.uniform(-15, 15):.2f},1"
+        return {"scene": scene, "t": f"{random.random():.3f}", "pose": pose, "format": "jpeg"}
+
+    return query
+
+
+def _first_view(scene: str) -> Query:
+    return lambda: {"scene": scene, "format": "jpeg"}
+
+
+async def _viewing(
+    http: httpx.AsyncClient, query: Query, viewers: int, worker: str, seconds: float, what: str = ""
+) -> Row:
+    """Each viewer asks again as soon as it is answered."""
     end_s = time.perf_counter() + seconds
-    spent_ms: list[float] = []
+    spent_ms: list[list[float]] = [[] for _ in range(viewers)]
 
-    async def call() -> None:
+    async def view(own_ms: list[float]) -> None:
         while (start_s := time.perf_counter()) < end_s:
-            (await ask()).raise_for_status()
-            spent_ms.append(1e3 * (time.perf_counter() - start_s))
+            answer = await http.get("/render", params=query())
+            if answer.status_code == httpx.codes.SERVICE_UNAVAILABLE:
+                await asyncio.sleep(float(answer.headers["Retry-After"]))
+                continue
+            answer.raise_for_status()
+            own_ms.append(1e3 * (time.perf_counter() - start_s))
 
-    await asyncio.gather(*(call() for _ in range(callers)))
-    return spent_ms
+    await asyncio.gather(*(view(each) for each in spent_ms))
+    name = f"GET /render, {viewers} viewer{'s' if viewers > 1 else ''}{what}"
+    every_ms = [ms for each in spent_ms for ms in each]
+    row = _row(name, worker, every_ms, len(every_ms) / seconds)
+    row["least_per_s"] = round(min(len(each) for each in spent_ms) / seconds, 2)
+    print(f"{'':28} the viewer who got fewest: {row['least_per_s']}/s")
+    return row
+
+
+async def _beside_large(url: str, scene: str, other: str, worker: str) -> list[Row]:
+    """Small views of another scene while six large renders are asked for at once."""
+    async with httpx.AsyncClient(base_url=url, timeout=60) as http:
+
+        async def view(of: str, size: dict[str, str]) -> tuple[int, float]:
+            start_s = time.perf_counter()
+            pose = f"orbit:{random.uniform(-15, 15):.2f},0,1"
+            answer = await http.get("/render", params={"scene": of, "pose": pose, **size})
+            return answer.status_code, 1e3 * (time.perf_counter() - start_s)
+
+        await view(other, SMALL)  # loads it
+        large = [asyncio.create_task(view(scene, LARGE)) for _ in range(LARGE_AT_ONCE)]
+        small_ms: list[float] = []
+        while not all(task.done() for task in large):
+            status, ms = await view(other, SMALL)
+            if status != httpx.codes.OK:
+                raise RuntimeError(f"a small view was answered {status}")
+            small_ms.append(ms)
+        answers = [task.result() for task in large]
+    statuses = [status for status, _ in answers]
+    print(f"{LARGE_AT_ONCE} renders of 4096x2160 at once: {statuses}, {max(ms for _, ms in answers):.0f} ms in all")
+    row = _row("GET /render, 320x256 beside 6 of 4096x2160", worker, small_ms, 1e3 * len(small_ms) / sum(small_ms))
+    row["max_ms"] = round(max(small_ms), 1)
+    print(f"{'':28} at most {row['max_ms']} ms")
+    return [row]
+
+
+def _without_queue(url: str, data_dir: Path, seen: str, unseen: str, seconds: float) -> list[Row]:
+    """Views while the queue's server is stopped: it takes connections and answers nothing."""
+    server = _process(lambda command, _: str(data_dir / "valkey").encode() in command)
+    spent_ms: list[float] = []
+    os.kill(server, signal.SIGSTOP)
+    try:
+        end_s = time.perf_counter() + seconds
+        with httpx.Client(base_url=url, timeout=60) as http:
+            while time.perf_counter() < end_s:
+                for scene in (seen, unseen):
+                    start_s = time.perf_counter()
+                    http.get("/render", params={"scene": scene, **SMALL}).raise_for_status()
+                    spent_ms.append(1e3 * (time.perf_counter() - start_s))
+                time.sleep(0.2)
+    finally:
+        os.kill(server, signal.SIGCONT)
+    row = _row(f"GET /render, queue stopped for {seconds:g} s", "idle", spent_ms, len(spent_ms) / seconds)
+    row["max_ms"] = round(max(spent_ms), 1)
+    print(f"{'':28} at most {row['max_ms']} ms")
+    return [row]
+
+
+def _watched(url: str, job_id: str, seconds: float) -> list[Row]:
+    """Viewers of a job that trains, and how fast it trains with them and between."""
+    rows: list[Row] = []
+    cases = [(1, "", _random_view), (16, "", _random_view), (16, " of one view", _first_view)]
+    with _followed(url, job_id) as rate:
+        alone = [rate(lambda: time.sleep(seconds))]
+        for viewers, what, query in cases:
+            viewing = _view_for(url, query(job_id), viewers, seconds, what)
+            per_s = rate(lambda viewing=viewing: rows.append(asyncio.run(viewing)))  # type: ignore[misc]
+            alone.append(rate(lambda: time.sleep(seconds)))
+            slower = (alone[-2] + alone[-1]) / 2 / per_s - 1
+            print(f"{'':28} training: {per_s:.2f} iterations/s, {alone[-2]:.2f} before, {alone[-1]:.2f} after:"
+                  f" {slower:.0%} slower")  # fmt: skip
+            rows[-1] |= {"iterations_per_s": round(per_s, 2), "slower": round(slower, 3)}
+    return rows
+
+
+async def _view_for(url: str, query: Query, viewers: int, seconds: float, what: str) -> Row:
+    async with httpx.AsyncClient(base_url=url, timeout=60) as http:
+        return await _viewing(http, query, viewers, "the job", seconds, what)
+
+
+@contextmanager
+def _followed(url: str, job_id: str) -> Iterator[Callable[[Callable[[], None]], float]]:
+    """A function that gives the job's iterations a second while another function runs."""
+    points: list[tuple[float, int]] = []
+
+    def follow() -> None:
+        with Client(url) as client, suppress(Exception):
+            for job in client.watch(job_id):
+                if job.iteration is not None and (not points or job.iteration > points[-1][1]):
+                    points.append((time.perf_counter(), job.iteration))
+
+    def rate(work: Callable[[], None]) -> float:
+        start_s = time.perf_counter()
+        work()
+        (first_s, first), *_, (last_s, last) = [each for each in points if each[0] >= start_s]
+        return (last - first) / (last_s - first_s)
+
+    threading.Thread(target=follow, daemon=True).start()
+    yield rate
 
 
 async def _open_loop(ask: Callable[[], Awaitable[httpx.Response]], a_second: int, seconds: float) -> list[float]:
@@ -190,12 +314,21 @@ def _uploads(url: str, folder: Path, gib: float) -> list[Row]:
 def _service_process(url: str) -> int:
     """The process id of the service at this address, told by its environment (Linux)."""
     sign = f"INTRASPLAT_PORT={httpx.URL(url).port}\0".encode()
+    return _process(lambda command, entry: command.endswith(b"\0-m\0service\0") and sign in _environment(entry))
+
+
+def _environment(entry: Path) -> bytes:
+    return (entry / "environ").read_bytes()
+
+
+def _process(is_it: Callable[[bytes, Path], bool]) -> int:
+    """The id of the process whose command line and entry in /proc are those (Linux)."""
     for entry in Path("/proc").iterdir():
         with suppress(OSError):  # it has just ended, or is another user's
             command = (entry / "cmdline").read_bytes() if entry.name.isdigit() else b""
-            if command.endswith(b"\0-m\0service\0") and sign in (entry / "environ").read_bytes():
+            if command and is_it(command, entry):
                 return int(entry.name)
-    raise RuntimeError(f"no process serves {url}")
+    raise RuntimeError("there is no such process")
 
 
 def memory_mib(process_id: int, field: str = "VmRSS") -> float:

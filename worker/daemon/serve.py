@@ -253,10 +253,11 @@ class RequestServer:
         finally:
             self._charge()
             self._begun.pop()
-        self._pace.charge(max(0.0, MIN_CHARGE_S - turn.spent_s))
         if head.error is None and not turn.was_short:
             self._turns.learn(turn)
-        for each in (turn, *self._turns.take_same(turn.request)):
+        answered = [turn, *self._turns.take_same(turn.request)]
+        self._pace.charge(max(0.0, len(answered) * MIN_CHARGE_S - turn.spent_s))
+        for each in answered:
             self._send(each.caller, each.request_id, head, body)
 
     def _charge(self) -> float:
