@@ -28,7 +28,7 @@ from worker.evaluate.rows import commit, machine
 
 CANCEL_EVERY = 5
 """Every fifth kill at a point that a cancel can precede comes after one."""
-CANCELLABLE = (Point.CLAIMED, Point.TRAINING, Point.PUBLISHING, Point.PUBLISHED)
+CANCELLABLE = (Point.CLAIMED, Point.KEEPING, Point.TRAINING, Point.TRAINED, Point.PUBLISHING, Point.PUBLISHED)
 
 
 def main(argv: list[str] | None = None) -> int:

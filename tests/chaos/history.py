@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from contract.queue.interface import BEAT_PERIOD_S, LEASE_S, Event
 from contract.store.store import Store
 from contract.wire.job import TERMINAL_STATES, JobState
+from contract.wire.names import MANIFEST
+from tests.chaos.trainer import STEPS, STEPS_MADE
 
 RERUN_SLACK_S = 2.0
 RERUN_WITHIN_S = LEASE_S + BEAT_PERIOD_S + RERUN_SLACK_S
@@ -74,16 +77,21 @@ def violations(history: ClipHistory, store: Store) -> list[str]:
         broken.append("it was cancelled, and its clip is still there")
     if history.final is JobState.FAILED:
         broken.append("it failed")
+    if history.final is JobState.DONE and published == expected:
+        manifest = store.scene_folder(history.job_id, published[0]) / MANIFEST
+        made = json.loads(manifest.read_bytes())[STEPS_MADE]
+        if sorted(set(made)) != list(range(STEPS)) or len(made) > STEPS:
+            broken.append(f"the scene was made by the steps {made}")
     if history.rerun_s is not None and history.rerun_s > RERUN_WITHIN_S + history.restart_s:
         broken.append(f"it ran again only after {history.rerun_s:.1f} s")
     return broken
 
 
 def orphans(store: Store, known: set[str]) -> list[Path]:
-    """Folders of work and scenes that belong to no known job."""
+    """Folders of clips, states and scenes that belong to no known job."""
     return [
         folder
-        for area in ("spool", "scenes")
+        for area in ("spool", "kept", "scenes")
         for folder in (store.data_dir / area).iterdir()
         if folder.name.split(".")[0] not in known
     ]

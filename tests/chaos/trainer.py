@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from contract.runtime.processes import die_with_parent
 from contract.runtime.settings import Settings
 from contract.wire.job import JobProgress
-from contract.wire.names import CURVE, MANIFEST, REPORT
+from contract.wire.names import CURVE, MANIFEST, REPORT, RESUME
 from tests.chaos.points import Point, reach
 from tests.reports import REPORT_OF_A_SCENE
 from worker.daemon.channel import Channel, Orders, Task
 from worker.daemon.orders import Advanced, Finished, Ready, RunJob, Scored, ScoreScene, Stopped
 
 STEPS = 10
+STEPS_MADE = "steps_made"
+"""In the scene's manifest: by all attempts whose state it goes on from."""
 STEP_S = 0.05
 
 
@@ -30,30 +34,52 @@ def main() -> None:
         task = orders.next(60.0)
         if task is not None:
             if isinstance(task.order, RunJob):
-                end = _train(task, task.order.out, channel)
+                end = _train(task, task.order, channel)
                 channel.send(end)
             if isinstance(task.order, ScoreScene) or isinstance(end, Finished):
                 reach(Point.SCORING)
                 channel.send(Scored(report=REPORT_OF_A_SCENE))
 
 
-def _train(task: Task, out: Path, channel: Channel) -> Finished | Stopped:
-    for step in range(STEPS):
+def _train(task: Task, order: RunJob, channel: Channel) -> Finished | Stopped:
+    """Make the steps that no earlier attempt has kept; the scene's manifest lists all that were made."""
+    made = _kept_steps(order.kept)
+    for step in range(len(set(made)), STEPS):
         if task.stop.is_set():
-            return Stopped(checkpointed=False)
+            return Stopped(checkpointed=(order.kept / RESUME).exists())
         time.sleep(STEP_S)
+        made.append(step)
         channel.send(Advanced(progress=JobProgress(stage="train", fraction=step / STEPS, iteration=step)))
+        _keep(order.kept, made)
         if step == STEPS // 2:
             reach(Point.TRAINING)
-    _write_scene(out)
+    reach(Point.TRAINED)
+    _write_scene(order.out, made)
     return Finished()
 
 
-def _write_scene(out: Path) -> None:
+def _kept_steps(kept: Path) -> list[int]:
+    with suppress(FileNotFoundError):
+        steps: list[int] = json.loads((kept / RESUME).read_text())
+        return steps
+    return []
+
+
+def _keep(kept: Path, made: list[int]) -> None:
+    """As worker/train/keep.py does: aside, then in place. One whose folder a later attempt has taken over goes on."""
+    aside = kept / f".{RESUME}.new"
+    with suppress(FileNotFoundError):
+        aside.write_text(json.dumps(made))
+        if len(made) == STEPS // 2:
+            reach(Point.KEEPING)
+        aside.rename(kept / RESUME)
+
+
+def _write_scene(out: Path, made: list[int]) -> None:
     unscored = REPORT_OF_A_SCENE.model_copy(update={"scored": False})
     (out / REPORT).write_text(unscored.model_dump_json())
     (out / CURVE).write_text("t_train_s,psnr_tissue_db,psnr_right_db\n1,30,\n")
-    (out / MANIFEST).write_text('{"files": {}}')
+    (out / MANIFEST).write_text(json.dumps({"files": {}, STEPS_MADE: made}))
 
 
 if __name__ == "__main__":

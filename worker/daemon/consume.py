@@ -26,6 +26,7 @@ from contract.wire.report import Report
 from worker.daemon.child import DeviceChild, Ended, Keeper
 from worker.daemon.hang import HangDetector
 from worker.daemon.heartbeat import Heartbeat
+from worker.daemon.held import HeldClaim
 from worker.daemon.job_errors import describe
 from worker.daemon.orders import Advanced, Failed, Finished, RunJob, Scored, ScoreScene, StopJob, Stopped
 
@@ -73,6 +74,7 @@ class Consumer:
         self._name = name
         self._owner = owner
         self._end = end
+        self.held = HeldClaim(store.run_dir / f"{name}.claim")
         self.job_id: str | None = None
 
     def run(self, claim_timeout_s: float = CLAIM_TIMEOUT_S) -> None:
@@ -94,7 +96,9 @@ class Consumer:
             away = False
             if record is not None:
                 self.job_id = record.job_id
+                self.held.note(Claim(record.job_id, record.attempt, self._owner))
                 run_job(self._queue, self._store, child, record, self._name, self._end)
+                self.held.forget()
                 self.job_id = None
             else:
                 score_left(self._queue, self._store, child, self._name, self._end)

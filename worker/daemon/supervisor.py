@@ -61,7 +61,7 @@ def run_supervisor(
     queue = RedisQueue(settings.redis_url)
     environment = {**os.environ, **settings.to_environment()}
     keeper = Keeper(child_command or DEVICE_COMMAND, environment, store.run_dir / f"{name}.device.last-words")
-    # The owner's name is new at each start, so claims of an earlier process of this name simply run out.
+    # The owner's name is new at each start, so that what an earlier process of this name has sent changes nothing.
     consumer = Consumer(queue, store, keeper, name, f"{name}.{secrets.token_hex(4)}", end)
     try:
         with (
@@ -71,6 +71,7 @@ def run_supervisor(
             if renders_only:
                 keep_rendering(keeper, end)
             else:
+                consumer.held.give_back(queue)
                 consumer.run()
     finally:
         keeper.stop()

@@ -58,7 +58,7 @@ def keeping(folder: Path, *, forgets: bool) -> Iterator[Keeper]:
 
 
 class Keeper:
-    """Keeps one run in a folder. A thread writes and waits for the disk, one thing at a time.
+    """Keeps one run in a folder. Threads write and wait for the disk: one for the clip, one for a state at a time.
 
     written: those of KEPT that this has written
     """
@@ -66,15 +66,15 @@ class Keeper:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._ending = threading.Event()
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="keep")
-        self._last: Future[None] | None = None
+        self._threads = ThreadPoolExecutor(2, thread_name_prefix="keep")
+        self._state: Future[None] | None = None
         self._due_s: float | None = None
         self.written: set[str] = set()
 
     def close(self) -> None:
         """Wait until everything is on disk, and give up a clip that is still being written."""
         self._ending.set()
-        self._thread.shutdown()
+        self._threads.shutdown()
 
     def forget(self, names: Collection[str]) -> None:
         """Remove these of KEPT; call it after close()."""
@@ -103,19 +103,19 @@ class Keeper:
         now_s = time.monotonic()
         if self._due_s is None:
             self._due_s = now_s if run.iteration == 0 else now_s + PERIOD_S
-        if now_s >= self._due_s and (self._last is None or self._last.done()):
+        if now_s >= self._due_s and (self._state is None or self._state.done()):
             self._due_s = now_s + PERIOD_S
             self._begin(run)
 
     def keep(self, run: Run) -> None:
         """Keep the run's state as it is now; close() waits for it. A clip that is still being written is given up."""
         self._ending.set()
-        if self._last is not None:
-            self._last.exception()
+        if self._state is not None:
+            self._state.exception()
         self._begin(run)
 
     def _begin(self, run: Run) -> None:
-        """Copy the state to the page cache here, and let the thread wait for the disk."""
+        """Copy the state to the page cache here, and let a thread wait for the disk."""
         t_train_s = run.setup.timings.seconds.get("t_train_s", run.setup.clock.elapsed_s)
         size_bytes = sum(each.numel() * each.element_size() for each in run.model.arrays().values())
         try:
@@ -125,9 +125,9 @@ class Keeper:
             return
         if complete is not None:
             self.written.add(RESUME_FILE)
-            self._submit(complete, 0)
+            self._state = self._submit(complete, 0)
 
-    def _submit(self, work: Callable[[], None], size_bytes: int) -> None:
+    def _submit(self, work: Callable[[], None], size_bytes: int) -> Future[None]:
         def attempt() -> None:
             try:
                 if self._has_room(size_bytes):
@@ -137,7 +137,7 @@ class Keeper:
             except Exception:
                 logger.exception("what a later attempt could go on from was not kept")
 
-        self._last = self._thread.submit(attempt)
+        return self._threads.submit(attempt)
 
     def _has_room(self, size_bytes: int) -> bool:
         return shutil.disk_usage(self.folder).free >= size_bytes + SPARE_BYTES

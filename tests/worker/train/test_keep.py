@@ -68,7 +68,7 @@ def test_a_run_killed_at_any_time_goes_on_to_the_bits_of_an_unstopped_one(
     def copy(progress: Progress) -> None:
         """Set aside what a process that dies now would leave."""
         left, aside = tmp_path / "kept", tmp_path / f"left-{len(found)}"
-        if (left / RESUME_FILE).exists():
+        if (left / RESUME_FILE).exists() and (left / PREPARED / "manifest.json").exists():
             aside.mkdir(exist_ok=True)
             (aside / RESUME_FILE).unlink(missing_ok=True)
             os.link(left / RESUME_FILE, aside / RESUME_FILE)
