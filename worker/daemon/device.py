@@ -86,7 +86,7 @@ def run_device(settings: Settings) -> None:
 def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     device = choose_device(settings.device, cpu_by=CPU_BY_VARIABLE)
     store, snapshots = open_store(settings), Snapshots()
-    pace = Pace(thread_count()) if device == CPU else Pace()
+    pace = Pace(thread_count(), used_s=time.process_time) if device == CPU else Pace()
     # Clips are unpacked inside the data directory, in a folder that the next start empties.
     tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
     started_s = time.monotonic()

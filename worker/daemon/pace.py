@@ -1,8 +1,9 @@
 """Limit the CPU time that renders take while a job trains: both need all cores, and training has a time budget.
 
-A token bucket of CPU seconds. While a job trains, the bucket gains SHARE of what the cores could give, up to
-MAX_SAVED_S. A render takes the CPU time that it used out of the bucket, into debt if need be; the next one begins when
-the debt is paid. Time in which a render only waits for a core costs nothing.
+A token bucket of CPU seconds. While a job trains, the bucket gains SHARE of the CPU time that this process uses, up to
+MAX_SAVED_S: where other programs take the cores, training gets less, and so do renders. A render takes the CPU time
+that it used out of the bucket, into debt if need be; the next one begins when the debt is paid. Time in which a render
+only waits for a core costs nothing.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ from contextlib import contextmanager
 SHARE = 0.15
 """Of the CPU time while a job trains. Copies of the model, the service and its viewers take some more."""
 
+MIN_USE = 0.25
+"""The bucket gains as if the process used at least this share of the cores: while a clip is decoded it uses few."""
+
 MAX_SAVED_S = 0.1
 """Enough for a few renders when a viewer opens. More would disturb the 0.3 s in which training times its steps."""
 
@@ -25,11 +29,20 @@ class Pace:
     Args:
         cores: what a second can give, in CPU seconds.
         clock: monotonic seconds.
+        used_s: CPU seconds that this process has used; None: all that the cores give.
     """
 
-    def __init__(self, cores: int = 1, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        cores: int = 1,
+        clock: Callable[[], float] = time.monotonic,
+        used_s: Callable[[], float] | None = None,
+    ) -> None:
         self._cores = cores
         self._clock = clock
+        self._used_s = used_s or (lambda: cores * clock())
+        self._used_before_s = self._used_s()
+        self._use = 1.0
         self._lock = threading.Lock()
         self._trains = False
         self._left_s = MAX_SAVED_S
@@ -39,7 +52,8 @@ class Pace:
     def training(self) -> Iterator[None]:
         """Ration renders while the context lasts."""
         with self._lock:
-            self._trains, self._left_s, self._at_s = True, MAX_SAVED_S, self._clock()
+            self._fill()
+            self._trains, self._left_s, self._use = True, MAX_SAVED_S, 1.0
         try:
             yield
         finally:
@@ -77,9 +91,13 @@ class Pace:
 
     @property
     def _rate(self) -> float:
-        return SHARE * self._cores
+        return SHARE * self._cores * self._use
 
     def _fill(self) -> None:
-        now_s = self._clock()
-        self._left_s = min(MAX_SAVED_S, self._left_s + (now_s - self._at_s) * self._rate)
-        self._at_s = now_s
+        now_s, used_s = self._clock(), self._used_s()
+        passed_s = now_s - self._at_s
+        gained_s = min(max(used_s - self._used_before_s, MIN_USE * self._cores * passed_s), self._cores * passed_s)
+        if passed_s > 0:
+            self._use += (gained_s / (self._cores * passed_s) - self._use) * min(1.0, passed_s)  # of about a second
+        self._left_s = min(MAX_SAVED_S, self._left_s + SHARE * gained_s)
+        self._at_s, self._used_before_s = now_s, used_s

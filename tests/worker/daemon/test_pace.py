@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from worker.daemon.pace import MAX_SAVED_S, SHARE, Pace
+from worker.daemon.pace import MAX_SAVED_S, MIN_USE, SHARE, Pace
 
 VIEW_S = 0.05
 ROUNDING_S = 1e-9
@@ -95,3 +95,17 @@ def test_every_core_gives_its_share_and_waiting_for_one_costs_nothing() -> None:
         assert pace.rest_s() == 0.0
         pace.charge(MAX_SAVED_S + 0.08)
         assert pace.rest_s() == pytest.approx(0.08 / (4 * SHARE))
+
+
+def test_where_training_gets_less_of_the_cores_renders_do_too_but_never_nothing() -> None:
+    clock, used_s = Clock(), [0.0]
+    pace = Pace(2, clock, lambda: used_s[0])
+    with pace.training():
+        pace.charge(MAX_SAVED_S + 1.0)
+        for _ in range(10):
+            clock.now_s += 0.1
+            used_s[0] += 0.1  # half of what two cores give
+            pace.rest_s()
+        assert pace.rest_s() == pytest.approx((1.0 - SHARE) / pace.rate)
+        clock.now_s += 1.0
+        assert pace.rest_s() == pytest.approx((1.0 - SHARE - 2 * MIN_USE * SHARE) / pace.rate)
