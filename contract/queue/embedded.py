@@ -18,9 +18,12 @@ from pathlib import Path
 
 import redis
 
+from contract.queue.log_reserve import fill_reserve
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.locks import FolderLock
 from contract.runtime.supervised import Supervised
+from contract.store.disk import Disk
+from contract.store.disk_errors import disk_errors
 from contract.wire.errors import UnavailableError
 
 MAX_SOCKET_PATH_BYTES = 107
@@ -84,13 +87,14 @@ def short_socket_path(folder: Path, name: str) -> Path:
 class EmbeddedServer:
     """The one server of a data directory. Whoever starts it second shares the one that runs."""
 
+    @disk_errors()
     def __init__(self, data_dir: Path) -> None:
         self._folder = data_dir / "valkey"
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._socket = short_socket_path(self._folder, "queue.sock")
         self._log = self._folder / "server.log"
         self._server: Supervised | None = None
-        self._adopted = False
+        self._owner = self._adopted = False
         self._lock = FolderLock(self._folder / "lock")
 
     @property
@@ -107,11 +111,14 @@ class EmbeddedServer:
         """Start the server, or share the one that runs. Returns when it answers.
 
         Raises:
+            StoreFullError: the disk is full; ensure_running() tries again.
             UnavailableError: there is no server program, or the server does not answer.
         """
-        owner = self._lock.take()
-        self._adopted = owner and self._listens()
-        if owner and not self._adopted:
+        with disk_errors():
+            self._owner = self._lock.take()
+            self._log.touch()
+        self._adopted = self._owner and self._listens()
+        if self._owner and not self._adopted:
             self._server = Supervised(
                 "queue's server",
                 [str(self._binary().path), *self._arguments()],
@@ -123,13 +130,17 @@ class EmbeddedServer:
         self._wait_until_it_answers()
 
     def ensure_running(self) -> bool:
-        """Start the server again if it has died; True if it had."""
+        """Start the server again if it has died; True if it had. Keeps room for its log. Raises as start()."""
         if self._server is not None:
             if self._server.watch() is None:
+                fill_reserve(self._folder)
                 return False
             self._wait_until_it_answers()
             return True
-        if not self._adopted or self._listens():
+        if not self._owner:
+            return False
+        if self._adopted and self._listens():
+            fill_reserve(self._folder)
             return False
         self.start()
         return True
@@ -149,6 +160,7 @@ class EmbeddedServer:
         while not self._answers():
             ended = self._server.watch() if self._server else None
             if ended is not None:
+                self._server = None  # the next start() begins anew
                 raise self._ended(ended.status)
             if time.monotonic() > deadline_s:
                 problem = f"The queue's server did not answer within {START_TIMEOUT_S:g} s."
@@ -156,6 +168,8 @@ class EmbeddedServer:
             time.sleep(0.02)
         if self._server is not None:
             self._server.mark_healthy()
+        if self._owner:
+            fill_reserve(self._folder)
 
     def _listens(self) -> bool:
         """Whether a server runs, even if it still replays its log. A second one would write to the same log."""
@@ -201,7 +215,8 @@ class EmbeddedServer:
         if written_by is not None and os.access(written_by, os.X_OK):
             return ServerBinary(written_by, "the queue's folder")
         binary = find_server()
-        note.write_text(str(binary.path))
+        with disk_errors():
+            note.write_text(str(binary.path))
         return binary
 
     def _ended(self, status: int) -> UnavailableError:
@@ -211,6 +226,9 @@ class EmbeddedServer:
             problem = f"The queue's log in {self._folder} was written by another server, which this one cannot read."
             remedy = "Install that server again, or empty the folder; the service then queues all clips again."
             return UnavailableError(problem, remedy)
+        disk = Disk(self._folder.parent)
+        if disk.is_full():
+            return disk.full_error()
         problem = f"The queue's server ended with status {status}: {last}"
         return UnavailableError(problem, f"See {self._folder / 'server.log'}.")
 

@@ -15,9 +15,15 @@ NOT_THERE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.ESTALE})
 
 
 class StoreFullError(UnavailableError):
-    """The data directory's disk, quota or file size limit is used up. What was stored before is not harmed."""
+    """The data directory's disk, quota or file size limit is used up. What was stored before is not harmed.
+
+    Room may return at any time (may_return), so processes wait for it.
+    """
 
     code = ErrorCode.STORE_FULL
+
+    def __init__(self, problem: str, remedy: str, *, may_return: bool = True) -> None:
+        super().__init__(problem, remedy, may_return=may_return)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,50 @@
+"""Blocks of the disk that belong to the queue's log before it needs them, so that a full disk does not end the queue.
+
+The server ends when a write to its log fails (`appendfsync always`). The reserve lies behind the end of the log's
+newest file: the server appends into it, and nobody else can take it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from pathlib import Path
+
+LOG_FOLDER = "appendonlydir"
+RESERVE_BYTES = 16 * 2**20
+"""About a day of an idle installation, and about ten hours of a job that reports its progress."""
+
+_KEEP_SIZE = 1
+"""FALLOC_FL_KEEP_SIZE of linux/falloc.h: allocate blocks, and leave the file as long as it is."""
+
+
+def fill_reserve(folder: Path, reserve_bytes: int = RESERVE_BYTES) -> bool:
+    """Give the newest log in the server's folder blocks for reserve_bytes more; call it often.
+
+    Does nothing while at least half of them are left. False: there is no log, the disk has no room for them, or its
+    file system or this operating system cannot do it.
+    """
+    try:
+        newest = max((folder / LOG_FOLDER).glob("*.incr.aof"), key=_sequence)
+        status = newest.stat()
+        if status.st_blocks * 512 - status.st_size >= reserve_bytes // 2:
+            return True
+        descriptor = os.open(newest, os.O_WRONLY | os.O_CLOEXEC)
+        try:
+            return _allocate(descriptor, status.st_size, reserve_bytes)
+        finally:
+            os.close(descriptor)
+    except (OSError, ValueError):  # no log yet, or the server has just replaced it
+        return False
+
+
+def _sequence(path: Path) -> int:
+    """The N of appendonly.aof.N.incr.aof."""
+    return int(path.name.split(".")[-3])
+
+
+def _allocate(descriptor: int, start: int, length: int) -> bool:
+    fallocate = getattr(ctypes.CDLL(None), "fallocate", None)  # os.posix_fallocate would make the file longer
+    if fallocate is None:
+        return False
+    return bool(fallocate(descriptor, _KEEP_SIZE, ctypes.c_int64(start), ctypes.c_int64(length)) == 0)
