@@ -6,6 +6,8 @@ over, and ends it when it ends itself.
 
 A child that ends is started again (contract/runtime/supervised.py). If it lacks something that cannot come back by
 itself, and has never worked, the next child would end as well; so `up` ends with the child's remedy instead.
+
+A full disk ends nothing that runs: views and purges go on, the rest waits for room (docs/decisions/041).
 """
 
 from __future__ import annotations
@@ -13,16 +15,21 @@ from __future__ import annotations
 import os
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from client.up_room import RoomWatch
 from contract.access.keys import check_keys
 from contract.queue.embedded import EmbeddedServer
 from contract.runtime.locks import FolderLock
 from contract.runtime.processes import told_to_end
 from contract.runtime.settings import Settings
 from contract.runtime.supervised import Supervised
+from contract.store.disk import Disk
+from contract.store.disk_errors import StoreFullError, disk_errors
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from intrasplat_client import Client
@@ -30,6 +37,8 @@ from intrasplat_client import Client
 DASHBOARD = Path(__file__).resolve().parent / "dashboard"
 WATCH_PERIOD_S = 0.2
 READY_PERIOD_S = 1.0
+QUEUE_PERIOD_S = 1.0
+"""Between two starts of the queue's server."""
 HEALTHY_AFTER_S = 60.0
 """A child that has lived this long works: if it ends, it is started again at once."""
 STOP_TIMEOUT_S = 15.0
@@ -46,6 +55,8 @@ class Installation:
         data_dir = settings.data_dir.expanduser().resolve()
         self._lock = FolderLock(data_dir / "run" / "up.lock")
         self._queue = EmbeddedServer(data_dir) if settings.redis_url is None else None
+        self._queue_at_s = 0.0
+        self.room = RoomWatch(Disk(data_dir), settings.min_free_bytes, say)
         redis_url = settings.redis_url if self._queue is None else self._queue.url
         self.settings = settings.model_copy(
             update={"data_dir": data_dir, "redis_url": redis_url, "dashboard_dir": DASHBOARD}
@@ -64,12 +75,15 @@ class Installation:
         return f"http://{f'[{host}]' if ':' in host else host}:{self.settings.port}"
 
     def __enter__(self) -> Installation:
-        if not self._lock.take():
+        with disk_errors():
+            is_alone = self._lock.take()
+        if not is_alone:
             problem = f"Another `intrasplat up` uses {self.settings.data_dir}."
             raise UnavailableError(problem, "Use that one, end it, or choose another --data-dir.")
         try:
             if self._queue is not None:
-                self._queue.start()
+                with suppress(StoreFullError):  # watch() tries again
+                    self._queue.start()
             self.watch()
         except BaseException:
             self.__exit__()
@@ -94,8 +108,8 @@ class Installation:
 
     def watch(self) -> None:
         """Start again what has ended; call it often. Raises UnavailableError if a child cannot work here."""
-        if self._queue is not None and self._queue.ensure_running():
-            say("the queue's server had died and was started again; nothing it had accepted is lost")
+        self.room.look()
+        self._watch_queue()
         for child in (self.service, *self.workers):
             try:
                 ended = child.watch()
@@ -104,12 +118,30 @@ class Installation:
             if ended is not None:
                 say(f"the {child.name} {ended.cause}; starting it again in {ended.pause_s:g} s")
 
+    def _watch_queue(self) -> None:
+        """Start the queue's server again if it has died. While the disk is full it may die again and again."""
+        if self._queue is None or time.monotonic() < self._queue_at_s:
+            return
+        try:
+            if not self._queue.ensure_running():
+                return
+        except StoreFullError:
+            self.room.look(now=True)
+        else:
+            self.room.look(now=True)
+            if not self.room.is_full:
+                say("the queue's server had died and was started again; nothing it had accepted is lost")
+        self._queue_at_s = time.monotonic() + QUEUE_PERIOD_S
+
     def wait_until_ready(self, is_ended: Callable[[], bool], timeout_s: float) -> bool:
-        """Watch until the service would train a clip; False after timeout_s or once is_ended(). Raises as watch."""
+        """Watch until the service would train a clip; False after timeout_s, once is_ended(), or if the disk is short.
+
+        Raises as watch.
+        """
         deadline_s = time.monotonic() + timeout_s
         asked_s = 0.0
         with Client(self.url) as client:
-            while time.monotonic() < deadline_s and not is_ended():
+            while time.monotonic() < deadline_s and not is_ended() and not self.room.is_short:
                 self.watch()
                 if time.monotonic() > asked_s + READY_PERIOD_S:
                     asked_s = time.monotonic()
@@ -144,19 +176,29 @@ def run(settings: Settings, worker_count: int = 1, ready_timeout_s: float = 300.
     Raises:
         UnavailableError: there is no key to let anybody in, the port is taken, there is no queue, the service or a
             worker lacks something, or nothing becomes ready.
+        StoreFullError: the disk is so full that nothing can start; the error names it.
     """
     end = told_to_end()
     check_keys(settings)
     check_port(settings.host, settings.port)
+    try:
+        _run(settings, worker_count, ready_timeout_s, end)
+    except StoreFullError as error:
+        raise Disk(settings.data_dir).full_error() from error
+
+
+def _run(settings: Settings, worker_count: int, ready_timeout_s: float, end: threading.Event) -> None:
     with Installation(settings, worker_count) as installation:
         say("starting; the first time, the kernels are compiled, which takes up to a minute")
         if not installation.wait_until_ready(end.is_set, ready_timeout_s):
             if end.is_set():
                 return
-            raise UnavailableError(
-                "The worker did not become ready.", "Its messages are above; try `intrasplat doctor`."
-            )
-        say(f"ready: {installation.url}/   data: {installation.settings.data_dir}   end with Ctrl-C")
+            if not installation.room.is_short:
+                raise UnavailableError(
+                    "The worker did not become ready.", "Its messages are above; try `intrasplat doctor`."
+                )
+        state = "read-only" if installation.room.is_short else "ready"
+        say(f"{state}: {installation.url}/   data: {installation.settings.data_dir}   end with Ctrl-C")
         while not end.wait(WATCH_PERIOD_S):
             installation.watch()
         say("ending")

@@ -65,6 +65,10 @@ class Intake:
         if declared_bytes > room_bytes:
             raise no_room(f"The disk has room for {max(room_bytes, 0)} bytes of an upload.")
 
+    def has_room(self) -> bool:
+        """Whether the disk has what must stay free: without it no clip is accepted."""
+        return self._store.free_bytes() >= self._settings.min_free_bytes
+
     def room_bytes(self) -> int:
         """What may be written now: not what must stay free, nor what is kept for uploads that are on their way."""
         kept_bytes = sum(place.kept_bytes for place in self._places) + promised_bytes(self._store)

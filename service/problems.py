@@ -14,7 +14,7 @@ from starlette.websockets import WebSocketState
 
 from contract.queue.interface import QueueFullError
 from contract.store.disk_errors import NO_ROOM, StoreFullError
-from contract.wire.errors import InputError, LimitError, SceneError, UnavailableError
+from contract.wire.errors import ErrorCode, InputError, LimitError, SceneError, UnavailableError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
@@ -122,7 +122,7 @@ def problem_of(error: Exception) -> Problem | None:
         case QueueFullError():
             return Problem(429 if error.tenant else 503, error.problem, field="queue", remedy=error.remedy)
         case StoreFullError():
-            return Problem(507, error.problem, remedy=error.remedy)
+            return no_room(error.problem, error.remedy)
         case UnavailableError():
             return Problem(503, error.problem, remedy=error.remedy)
         case RequestValidationError():
@@ -140,9 +140,9 @@ def fault() -> Problem:
     return Problem(500, "Something went wrong in the service; its log has the details.", remedy=FAULT_REMEDY)
 
 
-def no_room(detail: str) -> Problem:
-    """The answer to what the disk has no room for."""
-    return Problem(507, detail, remedy=ROOM_REMEDY)
+def no_room(detail: str, remedy: str = ROOM_REMEDY, *, status: int = 507, field: str | None = None) -> Problem:
+    """The answer to what the disk has no room for; its member `code` is "store_full"."""
+    return Problem(status, detail, field=field, remedy=remedy, extensions={"code": ErrorCode.STORE_FULL.value})
 
 
 def _problem_of_validation(error: RequestValidationError) -> Problem:

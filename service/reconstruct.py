@@ -30,7 +30,7 @@ from service.deps import AnyCaller, Deps, Services
 from service.intake import declared_length
 from service.openapi import EXAMPLE_ID
 from service.partial import Partial, find_partial
-from service.problems import RETRY_AFTER_S, Problem
+from service.problems import RETRY_AFTER_S, Problem, no_room
 from service.retention import check_retention
 from service.upload import LIMIT_REMEDY, PARTS, Received, UploadLimits, receive_upload
 
@@ -175,7 +175,13 @@ def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key:
 def _make_job_of(
     services: Deps, caller: Caller, partials: Mapping[str, Partial], received: Received, key: str | None
 ) -> JobRecord:
-    """Link the uploads' files into a new job, and let go of them once it is accepted."""
+    """Link the uploads' files into a new job, and let go of them once it is accepted.
+
+    Raises:
+        Problem: 507: the disk is full; the uploads stay.
+    """
+    if not services.intake.has_room():
+        raise no_room("The disk is full; the uploads are kept.")
     job_id = new_job_id()
     folder = services.store.open_incoming(job_id)
     try:

@@ -15,7 +15,7 @@ from contract.queue.interface import trainers
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ImageFormat, Layer
 from service.deps import AnyCaller, Deps, Services
-from service.problems import ROOM_REMEDY, Problem
+from service.problems import Problem, no_room
 from service.renderer import WORKER_REMEDY
 from service.upload import SUFFIXES
 from service.version import version
@@ -84,7 +84,9 @@ def read_metrics(services: Services, caller: AnyCaller) -> Response:
 
 
 def _trouble(services: Deps) -> Problem | None:
-    """The first reason why work would not get done now."""
+    """The first reason why work would not get done now. A full disk comes first, for the queue may be away with it."""
+    if not services.intake.has_room():
+        return no_room("The disk is full.", status=503, field="disk")
     try:
         services.queue.ping()
         workers = services.queue.workers()
@@ -92,6 +94,4 @@ def _trouble(services: Deps) -> Problem | None:
         return Problem(503, error.problem, field="queue", remedy=error.remedy)
     if not trainers(workers):
         return Problem(503, "No worker is ready yet.", field="worker", remedy=f"Wait for it. {WORKER_REMEDY}")
-    if services.store.free_bytes() < services.settings.min_free_bytes:
-        return Problem(503, "The disk is nearly full.", field="disk", remedy=ROOM_REMEDY)
     return None

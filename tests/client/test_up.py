@@ -12,11 +12,15 @@ from pathlib import Path
 
 import pytest
 
+from client import up
 from client.up import Installation, check_port, worker_names
+from contract.queue.embedded import EmbeddedServer
 from contract.runtime.exits import ExitCode
 from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
 from contract.runtime.supervised import Supervised
+from contract.store.disk import Disk
+from contract.store.disk_errors import StoreFullError
 from contract.wire.errors import UnavailableError
 
 SLEEP = "import time; time.sleep(60)"
@@ -25,6 +29,20 @@ from contract.wire.errors import UnavailableError
 from contract.runtime.exits import end_by
 raise SystemExit(end_by(UnavailableError("There is no such device.", "Set INTRASPLAT_DEVICE.")))
 """
+
+
+class FailingQueue(EmbeddedServer):
+    """A queue's server whose starts end so: with an error, or well (None)."""
+
+    def __init__(self, data_dir: Path, starts: list[StoreFullError | None]) -> None:
+        super().__init__(data_dir)
+        self.starts = starts
+
+    def ensure_running(self) -> bool:
+        error = self.starts.pop(0)
+        if error is not None:
+            raise error
+        return True
 
 
 def child_that_runs(program: str, folder: Path) -> Supervised:
@@ -133,3 +151,48 @@ def test_every_worker_has_a_name_of_its_own(tmp_path: Path) -> None:
 def test_a_service_at_every_address_is_found_at_loopback(tmp_path: Path) -> None:
     urls = [Installation(Settings(data_dir=tmp_path, host=host)).url for host in ("127.0.0.1", "0.0.0.0", "::")]
     assert urls == ["http://127.0.0.1:8765", "http://127.0.0.1:8765", "http://[::1]:8765"]
+
+
+def test_a_disk_that_is_short_of_room_is_named_once_with_the_remedy_and_ends_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = [0]
+    monkeypatch.setattr(Disk, "free_bytes", lambda disk: free[0])
+    with started(tmp_path, SLEEP) as installation:
+        for free[0] in (0, 5 << 20, 2**40, 2**40):
+            installation.room.look(now=True)
+            assert not installation.wait_until_ready(lambda: True, 1.0)
+        assert installation.workers[0].process_id is not None
+    short, enough = capsys.readouterr().err.splitlines()
+    assert str(tmp_path) in short
+    assert "0 MiB left" in short
+    assert "DELETE /scenes/ID" in short
+    assert "clips are accepted" in enough
+
+
+def test_a_queue_that_a_full_disk_has_ended_is_tried_again_and_the_rest_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(up, "QUEUE_PERIOD_S", 0.0)
+    monkeypatch.setattr(Disk, "is_full", lambda disk: True)
+    with started(tmp_path, SLEEP) as installation:
+        starts = [Disk(tmp_path).full_error(), Disk(tmp_path).full_error(), None]
+        installation._queue = queue = FailingQueue(tmp_path, starts)
+        while queue.starts:
+            installation.watch()
+        assert installation.workers[0].process_id is not None
+    assert len([line for line in capsys.readouterr().err.splitlines() if "MiB left" in line]) == 1
+
+
+def test_an_installation_that_finds_no_room_to_start_names_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_room(*arguments: object) -> None:
+        raise StoreFullError("There is no room left in the data directory.", "Make room.")
+
+    monkeypatch.setattr(up, "Installation", no_room)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with pytest.raises(StoreFullError, match=rf"the disk of {tmp_path}.*DELETE /scenes/ID"):
+        up.run(Settings(data_dir=tmp_path, port=port))

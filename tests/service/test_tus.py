@@ -12,6 +12,7 @@ import httpx
 import pytest
 
 from contract.store.shelf import is_job_id
+from contract.store.store import Store
 from service.partial import promised_bytes
 from tests.service.under_test import CLIP, EMPTY_ZIP, ServiceUnderTest, another_clip, assert_problem, running_service
 
@@ -158,6 +159,18 @@ def test_room_on_disk_is_kept_for_what_was_announced(tmp_path: Path) -> None:
         assert_problem(create(service, length=most_of_it), 507)
         assert service.http.request("DELETE", path, headers=TUS).status_code == 204
         assert create(service, length=most_of_it).status_code == 201
+
+
+def test_of_finished_uploads_no_job_is_made_on_a_full_disk_and_they_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for service in running_service(tmp_path, min_free_bytes=1):
+        submission = {"clip": uploaded(service)}
+        with monkeypatch.context() as disk:
+            disk.setattr(Store, "free_bytes", lambda store: 0)
+            assert assert_problem(service.http.post("/reconstruct", json=submission), 507)["code"] == "store_full"
+        assert service.store.spooled_ids() == []
+        assert service.http.post("/reconstruct", json=submission).status_code == 202
 
 
 def test_an_upload_given_up_is_gone(service: ServiceUnderTest) -> None:

@@ -14,6 +14,7 @@ from fastapi import FastAPI
 
 from contract.store.shelf import ABANDONED_AFTER_S, new_job_id
 from contract.store.store import Store
+from contract.wire.errors import ErrorCode
 from contract.wire.job import JobRecord
 from contract.wire.names import SUBMISSION
 from service.problems import Problem, install_handlers
@@ -165,8 +166,8 @@ def test_a_disk_that_fills_up_is_told_as_such() -> None:
 
 def test_nothing_is_accepted_on_a_full_disk(tmp_path: Path) -> None:
     for service in running_service(tmp_path, min_free_bytes=2**62):
-        assert_problem(service.upload(), 507)
-        assert_problem(service.http.get("/readyz"), 503, "disk")
+        assert assert_problem(service.upload(), 507)["code"] == ErrorCode.STORE_FULL
+        assert assert_problem(service.http.get("/readyz"), 503, "disk")["code"] == ErrorCode.STORE_FULL
 
 
 def test_a_declared_length_that_is_too_large_is_refused_before_the_body_is_read(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ The clip's text is a list of words, one for each attempt; the last stands for al
     fail       fail with an InputError's fields          deaf     advance for ever
     noise      print what is no report, then publish     hang     advance once, then say nothing for ever
     slow       advance for two seconds, then publish     exit     end with status 3
+    full       fail because the disk is full
     SIGKILL, SIGSEGV, ...   die of that signal
 
 The words "unable" and "dies", as arguments of the program, spoil its start.
@@ -100,6 +101,9 @@ def run(word: str, out: Path, kept: Path, stop: threading.Event) -> None:
         (out / "half").write_text("written")
         error = {"problem": "they cover everything.", "field": "masks", "remedy": "Invert them."}
         tell("failed", error=error, fault="InputError")
+    elif word == "full":
+        error = {"code": "store_full", "problem": "The disk is full.", "remedy": "Make room."}
+        tell("failed", error=error, fault="StoreFullError")
     elif word == "exit":
         os._exit(3)
     elif word.startswith("SIG"):

@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from contract.queue.interface import Claim, Order, Queue
+from contract.store.disk_errors import StoreFullError
 from contract.store.results import without_scores
 from contract.store.store import Store
-from contract.wire.errors import IntrasplatError, SceneError, UnavailableError
+from contract.wire.errors import ErrorCode, IntrasplatError, SceneError, UnavailableError
 from contract.wire.job import JobProgress, JobRecord, JobState
 from contract.wire.report import Report
 from worker.daemon.child import DeviceChild, Ended, Keeper
@@ -29,6 +30,7 @@ from worker.daemon.heartbeat import Heartbeat
 from worker.daemon.held import HeldClaim
 from worker.daemon.job_errors import describe
 from worker.daemon.orders import Advanced, Failed, Finished, RunJob, Scored, ScoreScene, StopJob, Stopped
+from worker.daemon.room import Room
 
 CLAIM_TIMEOUT_S = 1.0
 """How soon an idle worker notices that it should end, or that its child has."""
@@ -42,7 +44,7 @@ MAX_STOP_S = 5.0
 UNREACHABLE_PAUSE_S = 1.0
 
 MAX_STORE_S = 60.0
-"""The job fails when the store fails for so long."""
+"""The job fails when the store fails for so long. For room on the disk it waits as long as it takes."""
 
 FETCHING = "fetch"
 PUBLISHING = "publish"
@@ -67,7 +69,17 @@ class Died:
 class Consumer:
     """Takes one job after the other. job_id names the running one and may be read from any thread."""
 
-    def __init__(self, queue: Queue, store: Store, keeper: Keeper, name: str, owner: str, end: threading.Event) -> None:
+    def __init__(
+        self,
+        queue: Queue,
+        store: Store,
+        keeper: Keeper,
+        name: str,
+        owner: str,
+        end: threading.Event,
+        min_free_bytes: int = 0,
+    ) -> None:
+        self._room = Room(store, min_free_bytes)
         self._queue = queue
         self._store = store
         self._keeper = keeper
@@ -83,8 +95,14 @@ class Consumer:
         Raises:
             UnavailableError: the child cannot work here.
         """
-        away = False
+        away = short = False
         while (child := self._keeper.child(self._end)) is not None:
+            was_short, short = short, self._room.is_short()
+            if short != was_short:
+                logger.warning("jobs wait for room on the disk" if short else "the disk has room for jobs again")
+            if short:
+                self._end.wait(claim_timeout_s)
+                continue
             try:
                 record = self._queue.claim(self._owner, claim_timeout_s)
             except UnavailableError as error:
@@ -97,22 +115,25 @@ class Consumer:
             if record is not None:
                 self.job_id = record.job_id
                 self.held.note(Claim(record.job_id, record.attempt, self._owner))
-                run_job(self._queue, self._store, child, record, self._name, self._end)
+                run_job(self._queue, self._store, child, record, self._name, self._end, self._room)
                 self.held.forget()
                 self.job_id = None
             else:
                 score_left(self._queue, self._store, child, self._name, self._end)
 
 
-def run_job(queue: Queue, store: Store, child: DeviceChild, record: JobRecord, name: str, end: threading.Event) -> None:
+def run_job(
+    queue: Queue, store: Store, child: DeviceChild, record: JobRecord, name: str, end: threading.Event, room: Room
+) -> None:
     """Run one claimed job to its end; hand it back if `end` is set first. name: the worker's."""
     assert record.owner is not None
     claim = Claim(record.job_id, record.attempt, record.owner)
     log = _log_of(claim)
     log.info("an attempt starts")
     started_s = time.monotonic()
+    room.begins()
     with Heartbeat(queue, claim) as heart:
-        job = _Job(queue, store, claim, heart, name, end)
+        job = _Job(queue, store, claim, heart, name, end, room)
         try:
             outcome = job.settle(job.work(child, record))
         except IntrasplatError as error:  # the store failed, and the job is not with the child, or no more
@@ -202,8 +223,16 @@ class _Job:
     """One attempt at a job: work() watches the child, settle() tells the queue how it ended."""
 
     def __init__(
-        self, queue: Queue, store: Store, claim: Claim, heart: Heartbeat, name: str, end: threading.Event
+        self,
+        queue: Queue,
+        store: Store,
+        claim: Claim,
+        heart: Heartbeat,
+        name: str,
+        end: threading.Event,
+        room: Room,
     ) -> None:
+        self._room = room
         self._queue = queue
         self._store = store
         self._claim = claim
@@ -261,6 +290,7 @@ class _Job:
         """
         if self._heart.order in (Order.CANCEL, Order.LOST):
             return self._withdraw()
+        result = self._excuse(result)
         accepted, outcome = self._tell(result)
         if accepted is None:
             return UNSETTLED
@@ -268,6 +298,17 @@ class _Job:
             return self._withdraw()
         self._tidy(result)
         return outcome
+
+    def _excuse(self, result: Finished | Stopped | Failed | Died) -> Finished | Stopped | Failed | Died:
+        """The same, but a job that a full disk ended is to be handed back, no death counted."""
+        is_full = isinstance(result, Failed) and result.error.code is ErrorCode.STORE_FULL
+        died = isinstance(result, Died) and not result.excused
+        if is_full or (died and self._room.is_short()):
+            if self._room.ran_out(self._claim.job_id):
+                return Died("found the disk full", excused=True)
+        elif isinstance(result, Finished | Failed):
+            self._room.sufficed(self._claim.job_id)
+        return result
 
     def _tell(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
         """Whether the queue accepts the end (None: it cannot be reached), and the end in words for the log."""
@@ -337,7 +378,8 @@ class _Job:
             try:
                 return work()
             except UnavailableError as error:
-                if time.monotonic() > deadline_s or self._is_to_stop():
+                is_over = time.monotonic() > deadline_s and not isinstance(error, StoreFullError)
+                if is_over or self._is_to_stop():
                     raise
                 self._log.warning("waiting for the store: %s", error.problem)
                 self._end.wait(UNREACHABLE_PAUSE_S)

@@ -16,6 +16,7 @@ from contract.queue.embedded import short_socket_path
 from contract.runtime.exits import ExitCode, leave_last_words
 from contract.runtime.processes import die_with_parent
 from contract.runtime.settings import Settings
+from contract.store.disk_errors import StoreFullError
 from contract.store.results import without_scores
 from contract.store.store import Store, open_store
 from contract.wire.errors import Cancelled, InputError, ResumeMismatch, UnavailableError
@@ -78,7 +79,8 @@ def run_device(settings: Settings) -> None:
     try:
         _serve(settings, channel, orders)
     except (UnavailableError, InputError) as error:
-        if not leave_last_words(UnavailableError(error.problem, error.remedy)):
+        may_return = isinstance(error, StoreFullError)
+        if not leave_last_words(UnavailableError(error.problem, error.remedy, may_return=may_return)):
             logger.error("%s", error)
         raise SystemExit(ExitCode.UNAVAILABLE) from error
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 
+from contract.store.disk_errors import NO_ROOM
 from contract.wire.errors import ErrorCode, InputError, IntrasplatError, UnavailableError
 from contract.wire.job import JobError
 
@@ -23,6 +24,9 @@ def describe(error: Exception) -> JobError:
         return JobError(code=error.code, problem=error.problem, remedy=error.remedy)
     if isinstance(error, IntrasplatError):
         return JobError(code=error.code, problem=str(error), remedy="The worker's log has the details.")
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
+        remedy = "Free space on its disk, and retry the job."
+        return JobError(code=ErrorCode.STORE_FULL, problem="The worker's disk is full.", remedy=remedy)
     # torch.OutOfMemoryError is known by its name, because the supervisor does not load torch
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         remedy = "Send a shorter or smaller clip."

@@ -62,7 +62,7 @@ def run_supervisor(
     environment = {**os.environ, **settings.to_environment()}
     keeper = Keeper(child_command or DEVICE_COMMAND, environment, store.run_dir / f"{name}.device.last-words")
     # The owner's name is new at each start, so that what an earlier process of this name has sent changes nothing.
-    consumer = Consumer(queue, store, keeper, name, f"{name}.{secrets.token_hex(4)}", end)
+    consumer = Consumer(queue, store, keeper, name, f"{name}.{secrets.token_hex(4)}", end, settings.min_free_bytes)
     try:
         with (
             announced(queue, name, lambda: address_of(name, keeper, consumer, renders_only=renders_only)),

@@ -6,7 +6,6 @@ in the system's page cache, which gives way to whatever needs the memory.
 
 from __future__ import annotations
 
-import errno
 import mmap
 import os
 import tempfile
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from contract.wire.errors import UnavailableError
+from contract.store.disk_errors import NO_ROOM, StoreFullError
 
 AROUND_BYTES = 1 << 16
 """Linux maps so much around what is asked for: what lies beside an array is let go with it."""
@@ -25,7 +24,7 @@ def mapped_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     """Zeros in a file in tempfile.gettempdir(), which is gone with the last array that views it.
 
     Raises:
-        UnavailableError: the disk is full.
+        StoreFullError: the disk is full.
     """
     needed_bytes = max(int(np.prod(shape)) * np.dtype(dtype).itemsize, 1)
     with tempfile.TemporaryFile(prefix="intrasplat-") as file:
@@ -35,10 +34,10 @@ def mapped_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
             else:
                 file.truncate(needed_bytes)
         except OSError as error:
-            if error.errno != errno.ENOSPC:
+            if error.errno not in NO_ROOM:
                 raise
             problem = f"The disk is full: {needed_bytes >> 20} MiB of a clip's frames found no room."
-            raise UnavailableError(problem, f"Make room in {tempfile.gettempdir()}.") from error
+            raise StoreFullError(problem, f"Make room in {tempfile.gettempdir()}.") from error
         return np.asarray(np.memmap(file, dtype, "r+", shape=shape))
 
 

@@ -21,6 +21,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from contract.store.disk import Disk
+from contract.store.disk_errors import StoreFullError
 from contract.wire.errors import Cancelled, InputError, LimitError, UnavailableError
 from worker.input.decode.guard import Allowance
 
@@ -140,7 +142,7 @@ class Decoder:
         Raises:
             InputError, LimitError: as the process raised them; or it crashed, hung, or exceeded its allowance.
             Cancelled: should_stop said so.
-            UnavailableError: the disk is full.
+            StoreFullError: the disk is full.
             DecoderKilledError: something outside killed it.
         """
         self._wait(lambda: False)
@@ -201,7 +203,12 @@ class Decoder:
             status = 0
         if not answer and status == -signal.SIGKILL:  # none of its own limits ends it so
             raise DecoderKilledError
-        return _result(answer or None, status, self._field, self._allowance)
+        try:
+            return _result(answer or None, status, self._field, self._allowance)
+        except InputError as error:
+            if Disk(self.folder).is_full():  # whatever it was, the clip is judged again when there is room
+                raise _no_room() from error
+            raise
 
 
 _ready: list[Decoder] = []
@@ -304,12 +311,16 @@ def _result(answer: dict[str, Any] | None, status: int, field: str, allowance: A
 def _fault(error: dict[str, Any], field: str, allowance: Allowance) -> dict[str, Any]:
     """Raise for an unexpected exception: an InputError for the caller, its place for the log."""
     if error["errno"] == errno.ENOSPC:
-        problem = "The disk is full: the clip's frames found no room."
-        raise UnavailableError(problem, "Make room where the data directory lies.")
+        raise _no_room()
     if error["errno"] == errno.EFBIG:
         raise _undecodable(field, f"its frames take more than {allowance.file_bytes} bytes")
     logger.error("a fault while a clip was decoded: %s\n%s", error["type"], error["where"])
     raise _undecodable(field, f"the decoder failed ({error['type']})")
+
+
+def _no_room() -> StoreFullError:
+    problem = "The disk is full: the clip's frames found no room."
+    return StoreFullError(problem, "Make room where the data directory lies.")
 
 
 def _undecodable(field: str, reason: str) -> InputError:

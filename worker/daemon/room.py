@@ -1,0 +1,55 @@
+"""Whether the disk has room for a job, and whether a job that found it full runs again."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+from contract.store.disk import Disk
+from contract.store.store import Store
+from contract.wire.errors import UnavailableError
+
+MIN_ROOM_BYTES = 16 * 2**20
+MAX_SHORTAGES = 3
+"""A job that finds the disk full so often, though it began with enough room, is larger than the disk and fails."""
+
+
+class Room:
+    """The room of a worker's data directory. min_free_bytes: what the service leaves free for jobs it has accepted.
+
+    A job begins while the disk has a quarter of that. After a job has found the disk full, none begins before uploads
+    are accepted again.
+    """
+
+    def __init__(self, store: Store, min_free_bytes: int) -> None:
+        self._store = store
+        self._enough_bytes = max(min_free_bytes, MIN_ROOM_BYTES)
+        self._needed_bytes = self._least_bytes = max(min_free_bytes // 4, MIN_ROOM_BYTES)
+        self._began_bytes: float = 0
+        self._shortages: Counter[str] = Counter()
+
+    def is_short(self) -> bool:
+        """Whether no job may begin now."""
+        return self._free_bytes() < self._needed_bytes or Disk(self._store.data_dir).is_full()
+
+    def begins(self) -> None:
+        """Note that a job begins."""
+        self._began_bytes = self._free_bytes()
+
+    def ran_out(self, job_id: str) -> bool:
+        """Note that the job found the disk full; whether it may run again."""
+        if self._began_bytes >= self._enough_bytes:
+            self._shortages[job_id] += 1
+        self._needed_bytes = self._enough_bytes
+        return self._shortages[job_id] < MAX_SHORTAGES
+
+    def sufficed(self, job_id: str) -> None:
+        """Note that the job did not find the disk full."""
+        del self._shortages[job_id]
+        self._needed_bytes = self._least_bytes
+
+    def _free_bytes(self) -> float:
+        try:
+            return self._store.free_bytes()
+        except UnavailableError:  # the disk is gone, which the store says of each job
+            return math.inf
