@@ -328,6 +328,15 @@ def test_no_way_of_sending_a_signal_reaches_another_process(tmp_path: Path, call
 
 
 @linux
+def test_a_decoder_with_a_thread_that_is_not_confined_reads_nothing(tmp_path: Path) -> None:
+    script = tmp_path / "threaded.py"
+    thread = "import threading, time; threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
+    script.write_text(f"{thread}from worker.input.decode.child import serve\nserve(lambda: lambda *given: {{}})\n")
+    with pytest.raises(InputError, match="crashed"):
+        run_contained({"readable": []}, ALLOWANCE, program=(str(script),))
+
+
+@linux
 def test_a_decoder_of_roots_is_not_root(tmp_path: Path) -> None:
     work = (
         "import ctypes, struct\n"

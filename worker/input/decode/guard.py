@@ -50,7 +50,9 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
 
     Raises:
         OSError: a limit cannot be set.
+        RuntimeError: another thread runs, which would not be confined.
     """
+    _check_alone()
     die_with_parent()
     _gain_no_privileges()
     _limit(resource.RLIMIT_CORE, 0)  # a dump would hold the clip
@@ -69,6 +71,12 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
     if confined:
         granted.append(OWN_FILES)
     return granted
+
+
+def _check_alone() -> None:
+    threads = Path("/proc/self/task")
+    if threads.is_dir() and len(list(threads.iterdir())) > 1:
+        raise RuntimeError("a library has started a thread, which would not be confined")
 
 
 def _limit(kind: int, soft: int, hard: int | None = None) -> None:
