@@ -130,7 +130,10 @@ def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     """Doubts about how the training frames follow each other: repeated, hidden at first, masks or poses that jump."""
     found = []
     pairs = list(itertools.pairwise(train))
-    repeated = sum(_repeats(clip.rgb[earlier], clip.rgb[later]) for earlier, later in pairs)
+    repeated = 0
+    for earlier, later in pairs:
+        repeated += _repeats(clip.rgb[earlier], clip.rgb[later])
+        clip.let_go(earlier)
     if repeated > MAX_REPEATED_SHARE * len(train):
         found.append(
             Notice.warning(
