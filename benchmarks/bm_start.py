@@ -24,6 +24,7 @@ from worker.machine.hooks import Progress
 from worker.pipeline import begin
 from worker.raster.cpu import compile_kernels
 from worker.train.hooks import TrainingHooks
+from worker.train.keep import keeping
 from worker.train.prepare import prepare
 from worker.train.request import ReconstructionRequest
 
@@ -70,8 +71,8 @@ def _run(arguments: argparse.Namespace) -> dict[str, float]:
         note("first frame has depth")
 
     hooks = TrainingHooks(on_progress=on_progress, on_first_moment=on_first_moment)
-    with TemporaryDirectory() as folder:
-        setup = begin(request, Path(folder), hooks)
+    with TemporaryDirectory() as folder, keeping(Path(folder), forgets=True) as keeper:
+        setup = begin(request, Path(folder), hooks, keeper)
         note("clip has depth")
         run = prepare(setup)
         note("ready to train")
