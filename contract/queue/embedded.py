@@ -24,6 +24,7 @@ from contract.runtime.locks import FolderLock
 from contract.runtime.supervised import Supervised
 from contract.store.disk import Disk
 from contract.store.disk_errors import disk_errors
+from contract.store.durable import replace_file
 from contract.wire.errors import UnavailableError
 
 MAX_SOCKET_PATH_BYTES = 107
@@ -211,12 +212,12 @@ class EmbeddedServer:
     def _binary(self) -> ServerBinary:
         """The program that wrote the log, if it is still there; else find_server(), noted next to the log."""
         note = self._folder / WRITER
-        written_by = Path(note.read_text()) if note.is_file() else None
-        if written_by is not None and os.access(written_by, os.X_OK):
-            return ServerBinary(written_by, "the queue's folder")
+        written_by = note.read_text() if note.is_file() else ""
+        if written_by and os.access(written_by, os.X_OK):
+            return ServerBinary(Path(written_by), "the queue's folder")
         binary = find_server()
         with disk_errors():
-            note.write_text(str(binary.path))
+            replace_file(note, str(binary.path).encode())
         return binary
 
     def _ended(self, status: int) -> UnavailableError:

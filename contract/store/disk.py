@@ -15,10 +15,14 @@ FULL_REMEDY = "Free space, or delete scenes: DELETE /scenes/ID."
 
 
 class Disk:
-    """The disk that holds a folder, which exists."""
+    """The disk that holds a folder, or that would hold it if it were made."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder.expanduser().resolve()
+
+    @property
+    def _there(self) -> Path:
+        return next(path for path in (self._folder, *self._folder.parents) if path.is_dir())
 
     @property
     def name(self) -> str:
@@ -28,13 +32,13 @@ class Disk:
 
     def free_bytes(self) -> int:
         """What this user may still write, without regard to quotas. Raises OSError if the disk is gone."""
-        status = os.statvfs(self._folder)
+        status = os.statvfs(self._there)
         return status.f_bavail * status.f_frsize
 
     def is_full(self) -> bool:
         """Whether not even PROBE_BYTES can be written."""
         try:
-            with tempfile.TemporaryFile(dir=self._folder) as probe:
+            with tempfile.TemporaryFile(dir=self._there) as probe:
                 if hasattr(os, "posix_fallocate"):
                     os.posix_fallocate(probe.fileno(), 0, PROBE_BYTES)
                 else:

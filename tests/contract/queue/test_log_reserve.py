@@ -101,6 +101,22 @@ def test_a_queue_whose_reserve_is_used_up_comes_back_with_all_it_acknowledged(sm
     server.stop()
 
 
+def test_a_queue_that_never_started_starts_when_there_is_room(small_disk: Path) -> None:
+    filler = fill(small_disk)
+    server = EmbeddedServer(small_disk / "data")
+    for start in (server.start, server.ensure_running):
+        with pytest.raises(StoreFullError):
+            start()
+    filler.unlink()
+    assert server.ensure_running()
+    assert redis.Redis.from_url(server.url).ping()
+    server.stop()
+
+
+def test_a_folder_that_could_not_be_made_is_named_with_the_disk_that_would_hold_it(tmp_path: Path) -> None:
+    assert f"the disk of {tmp_path}/new/data" in Disk(tmp_path / "new" / "data").full_error().problem
+
+
 def test_a_server_that_cannot_start_on_a_full_disk_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = tmp_path / "valkey-server"
     program.write_text("#!/bin/sh\nexit 1\n")
