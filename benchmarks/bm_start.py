@@ -18,7 +18,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from contract.wire.options import ReconstructionOptions
-from worker.input.clip import DepthClip
 from worker.input.decode import keep_decoder_ready
 from worker.machine.hooks import Progress
 from worker.pipeline import begin
@@ -66,17 +65,14 @@ def _run(arguments: argparse.Namespace) -> dict[str, float]:
     def on_progress(now: Progress) -> None:
         note("first frame decoded" if now.stage == "stereo" else f"{now.stage} begins")
 
-    def on_first_moment(moment: DepthClip) -> None:
-        assert moment.frame_count == 1
-        note("first frame has depth")
-
-    hooks = TrainingHooks(on_progress=on_progress, on_first_moment=on_first_moment)
+    hooks = TrainingHooks(on_progress=on_progress)
     with TemporaryDirectory() as folder, keeping(Path(folder), forgets=True) as keeper:
         setup = begin(request, Path(folder), hooks, keeper)
         note("clip has depth")
         run = prepare(setup)
         note("ready to train")
     stages = {f"  {name[:-2]}": seconds for name, seconds in run.setup.timings.seconds.items()}
+    events["first frame has depth"] = stages.pop("  t_first_view")
     return events | stages | {"processor": _busy_s() - busy_s}
 
 
