@@ -114,6 +114,9 @@ class Installation:
             try:
                 ended = child.watch()
             except UnavailableError as lack:
+                self.room.look(now=True)
+                if self.room.is_full:  # nor had its last words room to say what may return
+                    continue
                 raise UnavailableError(f"The {child.name} cannot work here: {lack.problem}", lack.remedy) from lack
             if ended is not None:
                 say(f"the {child.name} {ended.cause}; starting it again in {ended.pause_s:g} s")

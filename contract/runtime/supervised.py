@@ -169,13 +169,13 @@ class Supervised:
         self._process = None
         if self.age_s > self._healthy_after_s:
             self.mark_healthy()
-        if self._last_words is not None and status == ExitCode.UNAVAILABLE:
-            self._raise_if_it_cannot_work(take_last_words(self._last_words))
         cause = "was killed by its supervisor" if self._killed else cause_of(status)
         pause_s = 0.0 if self._healthy else self._pause_s
         if not self._healthy:
             self._pause_s = min(MAX_PAUSE_S, 2 * self._pause_s)
         self._start_at_s = time.monotonic() + pause_s
+        if self._last_words is not None and status == ExitCode.UNAVAILABLE:
+            self._raise_if_it_cannot_work(take_last_words(self._last_words))
         return ProcessEnd(status, cause, pause_s)
 
     def _raise_if_it_cannot_work(self, lack: UnavailableError | None) -> None:

@@ -184,6 +184,16 @@ def test_a_queue_that_a_full_disk_has_ended_is_tried_again_and_the_rest_goes_on(
     assert len([line for line in capsys.readouterr().err.splitlines() if "MiB left" in line]) == 1
 
 
+def test_a_child_that_cannot_start_on_a_full_disk_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Disk, "is_full", lambda disk: True)
+    with started(tmp_path, LACKS) as installation:
+        watch_the_worker_end(installation)
+        while installation.workers[0].process_id is None:
+            installation.watch()
+
+
 def test_an_installation_that_finds_no_room_to_start_names_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
