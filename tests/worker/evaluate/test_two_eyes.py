@@ -46,4 +46,4 @@ def test_the_page_has_a_section_of_these_rows(folder: Path, tmp_path: Path) -> N
     assert two_eyes_sections(tmp_path) == []
     page = "".join(two_eyes_sections(folder))
     assert "| phantom-breathing-160x128-12frames-stereo | every8 | fast:eyes=left | 5 iterations | 1 |" in page
-    assert "dB in the right eye; the left eye's picture, warped, scores" in page
+    assert "| clip | held out | series | limit | seeds | 10 degrees | bound |" in page

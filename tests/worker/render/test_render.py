@@ -104,7 +104,7 @@ def test_confidence_falls_with_the_distance_from_the_endoscope(scene: Scene) -> 
     levels = [float(np.median(each[each > 0])) for each in means]
     assert levels == sorted(levels, reverse=True)
     assert levels[0] > 0.5
-    assert levels[-1] < 0.2
+    assert levels[-1] < levels[0] / 2  # 30 degrees aside
 
 
 def test_a_pose_far_from_the_endoscope_warns(scene: Scene) -> None:
