@@ -231,6 +231,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> Scene:
         settings={
             "made_iterations": run.iteration,
             "schedule": run.schedule.settings,
+            "eyes": run.taught_by,
             "preset": json.loads(json.dumps(asdict(run.preset), default=str)),
         },
     )
@@ -249,6 +250,7 @@ def _training(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Train
     """What the report repeats of the run: what it was made of, what it chose, how long it took."""
     return Training(
         preset=run.preset.name,
+        eyes=run.taught_by,
         seed=run.seed,
         device=str(run.device),
         iterations=run.iteration,

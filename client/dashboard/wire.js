@@ -97,6 +97,7 @@
  *   right_eye?: RightEye | null,
  *   measurements?: Record<string, number>,
  *   preset: string,
+ *   eyes?: "left"|"both" | null,
  *   seed: number,
  *   device: string,
  *   iterations: number,

@@ -268,6 +268,8 @@ class Report(Model):
     measurements: dict[str, float] = Field(default={})
     """measured on the input, such as misalignment in px"""
     preset: str
+    eyes: str | None = None
+    """that taught the model; None: a report of version 0.2"""
     seed: int
     device: str
     iterations: int

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
+from contract.wire.names import Eyes
 from contract.wire.notices import Notice, NoticeCode, Severity
 
 REPORT_VERSION = 2
@@ -117,6 +118,7 @@ class Report(BaseModel):
     measurements: dict[str, float] = Field(default={}, description="measured on the input, such as misalignment in px")
 
     preset: str
+    eyes: Eyes | None = Field(default=None, description="that taught the model; None: a report of version 0.2")
     seed: int
     device: str
     iterations: int = Field(ge=0)

@@ -179,7 +179,8 @@ def _reply(scene: Scene, frame: Frame, request: RenderRequest, snapshot: Snapsho
         unknown = {NoticeCode.HARDLY_SEEN}
         if snapshot.of_one_moment:
             goes_on = Notice.warning(NoticeCode.FIRST_PICTURE, "First picture: one moment, not yet a model.")
-            unknown.add(NoticeCode.TIME_OUTSIDE_CLIP)  # it is shown at every time
+            # It is shown at every time, and no eye has taught it.
+            unknown |= {NoticeCode.TIME_OUTSIDE_CLIP, NoticeCode.HIGHLIGHTS_UNKNOWN}
         warnings = (goes_on, *(each for each in warnings if each.code not in unknown))
     shown = shown_time(scene, request.t)
     clip_size = scene.intrinsics.width, scene.intrinsics.height

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import TrainingDiverged
+from contract.wire.names import Eyes
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import FrameScore, Report
 from worker.input.clip import FrameSplit
@@ -69,6 +70,7 @@ class Training:
     """What the pipeline knows of a run and the report repeats (contract.wire.report.Report has their meaning)."""
 
     preset: str
+    eyes: Eyes
     seed: int
     device: str
     iterations: int

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from contract.wire.names import Eyes
 from contract.wire.notices import Notice
 from worker.machine.hooks import Progress
 from worker.raster.backend import Device
@@ -78,6 +79,11 @@ class Run:
     def eyes(self) -> tuple[TrainingFrames, ...]:
         """The eyes that teach, left first."""
         return (self.frames,) if self.right is None else (self.frames, self.right)
+
+    @property
+    def taught_by(self) -> Eyes:
+        """The eyes that teach, by their name."""
+        return "left" if self.right is None else "both"
 
     @property
     def iterations(self) -> int:

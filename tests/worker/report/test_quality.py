@@ -31,6 +31,7 @@ def info(text: str) -> Notice:
 
 TRAINING = Training(
     preset="fast",
+    eyes="left",
     seed=0,
     device="cpu",
     iterations=500,
