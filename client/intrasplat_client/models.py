@@ -30,6 +30,7 @@ class ErrorCode(StrEnum):
     RESUME_MISMATCH = "resume_mismatch"
     SCENE = "scene"
     STORE_FULL = "store_full"
+    DECODER_KILLED = "decoder_killed"
     TRAINING_DIVERGED = "training_diverged"
     UNAVAILABLE = "unavailable"
     UNCLASSIFIED = "unclassified"

@@ -23,7 +23,7 @@ from typing import Any
 
 from contract.store.disk import Disk
 from contract.store.disk_errors import StoreFullError
-from contract.wire.errors import Cancelled, InputError, LimitError, UnavailableError
+from contract.wire.errors import Cancelled, ErrorCode, InputError, LimitError, UnavailableError
 from worker.input.decode.guard import Allowance
 
 MAX_SILENCE_S = 10.0  # without another picture; the largest frame allowed takes well under a second
@@ -57,6 +57,8 @@ class Patience:
 
 class DecoderKilledError(UnavailableError):
     """Something outside killed the decoding process, such as a system without memory: the clip is not to blame."""
+
+    code = ErrorCode.DECODER_KILLED
 
     def __init__(self) -> None:
         problem = "The system killed the process that decodes the clip, as it does when memory runs out."
