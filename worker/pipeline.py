@@ -41,13 +41,12 @@ from worker.train.hooks import TrainingHooks
 from worker.train.keep import Keeper, keeping
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.presets import preset_named
 from worker.train.rate_distortion import QuantizedScene, quantize_model
 from worker.train.request import ReconstructionRequest
 from worker.train.resume import resume
 from worker.train.run import Run, write_curve
 from worker.train.scoring import held_out_score
-from worker.train.setup import Setup
+from worker.train.setup import Setup, length_of
 
 VERSIONED = ("intrasplat", "torch", "numba")
 """What decides a scene's numbers; the report names their versions."""
@@ -90,11 +89,7 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
 
     kept_dir: where to keep what the same request goes on from; whoever names it removes it. None: out_dir.
     """
-    options = request.options
-    preset = request.own_preset or preset_named(options.preset, options.budget_s)
-    iterations = options.iterations or (None if options.budget_s else preset.iterations)
-    forecast = Forecast(options.budget_s or preset.budget_s, iterations)
-    tell = hooks.on_progress
+    forecast, tell = Forecast(*length_of(request.options, request.preset)), hooks.on_progress
     hooks = dataclasses.replace(hooks, on_progress=lambda progress: tell(forecast.completed(progress)))
     with keeping(kept_dir or out_dir, forgets=kept_dir is None) as keeper:
         setup = begin(request, out_dir, hooks, keeper)
@@ -123,7 +118,7 @@ def judge_again(request: ReconstructionRequest, directory: Path, hooks: Training
         InputError: the clip, its calibration, masks or an option cannot be used.
         SceneError: the scene is missing or damaged.
     """
-    device = device_for(preset_named(request.options.preset).deformation, request.device)
+    device = device_for(request.preset.deformation, request.device)
     clip = open_with_depth(request, hooks, Timings(), device)
     split = split_frames(clip, request.options.holdout)
     report = Report.model_validate_json((directory / REPORT).read_bytes())
@@ -135,8 +130,7 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
     accepted_at_s, timings = request.accepted_at_s or time.time(), Timings()
     timings.seconds |= request.seconds
     keep_free_memory(USUAL_BYTES)
-    options = request.options
-    preset = request.own_preset or preset_named(options.preset, options.budget_s)
+    options, preset = request.options, request.preset
     device = device_for(preset.deformation, request.device)
     out_dir.mkdir(parents=True, exist_ok=True)
 

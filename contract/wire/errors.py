@@ -77,7 +77,7 @@ class ResumeMismatch(InputError):
 
 
 class TrainingDiverged(IntrasplatError):
-    """Training reached a NaN or lost its Gaussians; nothing is published."""
+    """Training reached a NaN or lost its Gaussians, or a render holds a NaN."""
 
     code = ErrorCode.TRAINING_DIVERGED
 
@@ -89,7 +89,7 @@ class SceneError(IntrasplatError):
 
 
 class Cancelled(IntrasplatError):
-    """The caller asked to stop; nothing is published."""
+    """The caller asked to stop."""
 
     code = ErrorCode.CANCELLED
 

@@ -36,13 +36,18 @@ LEAST_DONE_S = 1.0
 
 
 class Forecast:
-    """Adds seconds_left to each report of progress. clock: monotonic seconds."""
+    """Adds seconds_left to each report of progress.
+
+    Args:
+        iterations, budget_s: how long training is; one of the two is None.
+        clock: monotonic seconds.
+    """
 
     def __init__(
-        self, budget_s: float | None, iterations: int | None, clock: Callable[[], float] = time.monotonic
+        self, iterations: int | None, budget_s: float | None, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._budget_s = budget_s
         self._iterations = iterations
+        self._budget_s = budget_s
         self._clock = clock
         self._started_s = clock()
         self._frames = 0
@@ -63,8 +68,8 @@ class Forecast:
         if progress.stage == "train" and progress.seconds_left is not None:
             return replace(progress, seconds_left=progress.seconds_left + pace * rest_s)
         # The seconds of a budget are no work: they pass at the same pace everywhere.
-        has_budget = self._budget_s is not None and self._iterations is None
-        fixed_s = usual["train"] if has_budget and place <= stages.index("train") else 0.0
+        in_budget = self._budget_s is not None and place <= stages.index("train")
+        fixed_s = usual["train"] if in_budget else 0.0
         return replace(progress, seconds_left=pace * (own_s + rest_s - fixed_s) + fixed_s)
 
     def learn(self, frames: int, megapixels: float) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from contract.wire.options import ReconstructionOptions
 from worker.input.clip import ClipLimits, DepthClip
-from worker.train.presets import Preset
+from worker.train.presets import Preset, preset_named
 
 
 @dataclass(frozen=True)
@@ -32,3 +32,8 @@ class ReconstructionRequest:
     accepted_at_s: float | None = None
     limits: ClipLimits | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def preset(self) -> Preset:
+        """The preset that trains. Raises InputError if options name none that there is."""
+        return self.own_preset or preset_named(self.options.preset, self.options.budget_s)

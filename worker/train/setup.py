@@ -54,11 +54,17 @@ class Setup:
     @property
     def fixed_iterations(self) -> int | None:
         """The requested iterations, else the preset's own; None where seconds limit the run."""
-        return self.options.iterations or (None if self.options.budget_s else self.preset.iterations)
+        return length_of(self.options, self.preset)[0]
 
     @property
     def budget_s(self) -> float:
         """The seconds of training that were asked for, where fixed_iterations is None."""
-        budget_s = self.options.budget_s or self.preset.budget_s
+        _, budget_s = length_of(self.options, self.preset)
         assert budget_s is not None
         return budget_s
+
+
+def length_of(options: ReconstructionOptions, preset: Preset) -> tuple[int | None, float | None]:
+    """The iterations of a run, or else the seconds of its training; one of the two is None."""
+    fixed = options.iterations or (None if options.budget_s else preset.iterations)
+    return fixed, None if fixed is not None else options.budget_s or preset.budget_s

@@ -14,7 +14,7 @@ STAGES = [stage for stage in USUAL_S if stage != "publish"]
 def run_through(pace: float, budget_s: float | None = None, iterations: int | None = None) -> list[tuple[float, float]]:
     """Seconds left as told, and as they turn out, at ten moments of each stage of a machine of this pace."""
     now_s = 0.0
-    forecast = Forecast(budget_s, iterations, clock=lambda: now_s)
+    forecast = Forecast(iterations, budget_s, clock=lambda: now_s)
     took_s = {stage: pace * (fixed + each * MEGAPIXELS) for stage, (fixed, each) in USUAL_S.items()}
     if budget_s is None:
         assert iterations is not None
@@ -47,4 +47,4 @@ def test_from_the_first_tenth_on_it_is_right_within_a_quarter_of_the_whole(
 
 def test_a_stage_that_it_does_not_know_is_told_as_it_is() -> None:
     progress = Progress("score", 0.5)
-    assert Forecast(60.0, None).completed(progress) is progress
+    assert Forecast(None, 60.0).completed(progress) is progress
