@@ -4,12 +4,14 @@ curves  held-out psnr_tissue against seconds of training; curves-ssim, curves-de
 curves-eyes  the same of the left eye and of the right eye beside each other, where a clip has two
 pareto  its end against the seconds it took; the front joins what nothing is both sooner and better than
 pareto-right  the same for the right eye
+curves-post, pareto-post  the same against seconds from the request; pareto-one-clip has both clocks
 frames  its end against images rendered a second
 knee    of the grid of capacities: its end against the scene's bytes, and where the automatic choice lies
 
 The area of the disc behind a mark is the scene's size on disk; a small scene's is hidden by its mark. What was not
-measured is named over its panel. Copying the neighbouring frames is dashed everywhere; for the right eye, warping the
-left eye's picture of the same moment is. Series trained on the left eye alone have hollow marks.
+measured is named over its panel, and a clock that no row has makes no chart. Copying the neighbouring frames is dashed
+everywhere; for the right eye, warping the left eye's picture of the same moment is. Series trained on the left eye
+alone have hollow marks.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from worker.evaluate.cells import DEFAULT_SERIES, base_of, preset_of
-from worker.evaluate.published import LABEL, RESULTS, Published
+from worker.evaluate.published import LABEL, RESULTS
 from worker.evaluate.rows import Results, Row, key_of
 from worker.evaluate.style import BASES_LOOKS, FAINT, GREY, SETTINGS, Look, figure_of, look_of, save
 from worker.evaluate.summary import Group, Place, capacities, groups_of
@@ -36,16 +38,24 @@ MAX_FINE_TICKS = 500
 """An axis that spans more than this factor has ticks at powers of ten alone: others would run into each other."""
 REAL_CLIP, PAPERS_HOLDOUT = "d4d-a", "every8"
 """Published figures are drawn for the real clip alone, held out as the papers do."""
-DECIBEL = "held-out psnr_tissue, dB"
+SCORE, DECIBEL = "psnr_tissue_db", "held-out psnr_tissue, dB"
+TRAINING, SINCE_REQUEST, SPEED = "t_train_s", "t_post_s", "render_fps"
 OVER_TIME = {
-    "curves": ("psnr_tissue_db", DECIBEL),
-    "curves-ssim": ("ssim", "held-out SSIM"),
-    "curves-depth": ("depth_agreement_mm", "median depth error, mm"),
+    "curves": (SCORE, DECIBEL, TRAINING),
+    "curves-post": (SCORE, DECIBEL, SINCE_REQUEST),
+    "curves-ssim": ("ssim", "held-out SSIM", TRAINING),
+    "curves-depth": ("depth_agreement_mm", "median depth error, mm", TRAINING),
 }
-"""By chart: the column of curves.csv, and what it is called."""
+"""By chart: the column of curves.csv, what it is called, and the clock."""
+ACROSS = {
+    TRAINING: "seconds of training (log)",
+    SINCE_REQUEST: "seconds since the request (log)",
+    SPEED: "images rendered a second, at the clip's size (log)",
+}
+"""By column: what the axis across is called."""
 RIGHT = "psnr_right_db"
 EYES = {
-    "left eye": ("psnr_tissue_db", DECIBEL),
+    "left eye": (SCORE, DECIBEL),
     "right eye": (RIGHT, "held-out psnr_right, dB"),
 }
 """By eye: its column in both files, and what it is called."""
@@ -57,6 +67,8 @@ WARP_LINES = {"warp_db": ("warped left eye", (5, 3), 1, "right")}
 """By column: what a dashed line is called, its dashes, the side where its name stands and how that is aligned."""
 
 Points = list[tuple[float, float]]
+DrawPanel = Callable[[Any, Sequence[Group], str], list[str]]
+"""Draws groups of one place over a column of ACROSS; returns the series that have no figure in it."""
 
 
 def draw_all(results: Results, folder: Path) -> list[str]:
@@ -69,21 +81,34 @@ def draw_all(results: Results, folder: Path) -> list[str]:
     drawn = []
     with mpl.rc_context(SETTINGS):
         if any(group.rows for group in presets):
-            for name, (column, _) in OVER_TIME.items():
-                if points := _points_by_run(results.curves, column):
-                    _draw(presets, partial(_curves, points=points), folder, name)
-                    drawn.append(name)
-            _draw(presets, _pareto, folder, "pareto")
-            _draw([group for group in presets if group.clip == clip_alone(presets)], _pareto, folder, "pareto-one-clip")
-            _draw(presets, _frames, folder, "frames")
-            drawn += ["pareto", "pareto-one-clip", "frames"]
+            drawn += _draw_presets(presets, results.curves, folder)
         if stereo := _with_right_eye(presets):
             _draw_eyes(stereo, results.curves, folder)
-            _draw(stereo, partial(_pareto, score=RIGHT), folder, "pareto-right")
+            _draw(stereo, partial(_ends, score=RIGHT), folder, "pareto-right", [TRAINING])
             drawn += ["curves-eyes", "pareto-right"]
         if choices:
             _draw_knee(groups, choices, folder)
             drawn.append("knee")
+    return drawn
+
+
+def _draw_presets(presets: Sequence[Group], curves: Sequence[Row], folder: Path) -> list[str]:
+    """The charts that need no second eye and no grid; their names."""
+    drawn = []
+    for name, (column, _, clock) in OVER_TIME.items():
+        if _points_by_run(curves, column, clock):
+            _draw(presets, partial(_curves, rows=curves, score=column), folder, name, [clock])
+            drawn.append(name)
+    alone = [group for group in presets if group.clip == clip_alone(presets)]
+    for name, (groups, columns) in {
+        "pareto": (presets, [TRAINING]),
+        "pareto-post": (presets, [SINCE_REQUEST]),
+        "pareto-one-clip": (alone, [TRAINING, SINCE_REQUEST]),
+        "frames": (presets, [SPEED]),
+    }.items():
+        if known := [each for each in columns if any(not math.isnan(group.median(each)) for group in groups)]:
+            _draw(groups, _ends, folder, name, known)
+            drawn.append(name)
     return drawn
 
 
@@ -93,23 +118,25 @@ def clip_alone(groups: Sequence[Group]) -> str:
     return REAL_CLIP if REAL_CLIP in clips else clips[0]
 
 
-def _draw(groups: Sequence[Group], draw_panel: Callable[[Any, Sequence[Group]], None], folder: Path, name: str) -> None:
-    """One panel per place, the legend of all series below."""
-    places = _places(groups)
-    figure, axes = figure_of(len(places), _columns(places), _handles(groups, name))
-    for place, axis in zip(places, axes, strict=True):
+def _draw(groups: Sequence[Group], draw_panel: DrawPanel, folder: Path, name: str, across: Sequence[str]) -> None:
+    """One panel per column across and place, the legend of all series below."""
+    panels = [(column, place) for column in across for place in _places(groups)]
+    figure, axes = figure_of(len(panels), _columns([place for _, place in panels]), _handles(groups, name))
+    for (column, place), axis in zip(panels, axes, strict=True):
         here = [group for group in groups if group.place == place]
         if not here:
             _leave_empty(axis, place)
             continue
-        _name(axis, place, here, _missing(here))
-        axis.set_ylabel(EYES["right eye"][1] if name == "pareto-right" else OVER_TIME.get(name, ("", DECIBEL))[1])
-        draw_panel(axis, here)
-        if name not in OVER_TIME or name == "curves":
+        axis.set_xlabel(ACROSS[column])
+        score, label, _ = OVER_TIME.get(name, (SCORE, DECIBEL, column))
+        axis.set_ylabel(EYES["right eye"][1] if name == "pareto-right" else label)
+        without = draw_panel(axis, here, column)
+        _name(axis, place, here, _missing(here, {f"without {column}": without}))
+        if score == SCORE:
             _dashed(axis, here, WARP_LINES if name == "pareto-right" else COPY_LINES)
         _finish(axis)
-        if name == "curves":
-            _cut_below([axis], [group.median("psnr_tissue_db") for group in here])
+        if name in OVER_TIME and score == SCORE:
+            _cut_below([axis], [group.median(SCORE) for group in here])
     save(figure, folder, name)
 
 
@@ -127,8 +154,9 @@ def _draw_eyes(groups: Sequence[Group], curves: Sequence[Row], folder: Path) -> 
         here = [group for group in groups if group.place == place]
         for axis, (eye, (column, label)) in zip(pair, EYES.items(), strict=True):
             _name(axis, place, here, eye)
+            axis.set_xlabel(ACROSS[TRAINING])
             axis.set_ylabel(label)
-            _curves(axis, here, _points_by_run(curves, column))
+            _curves(axis, here, TRAINING, rows=curves, score=column)
             _dashed(axis, here, WARP_LINES if column == RIGHT else COPY_LINES)
             _finish(axis)
         limits = [axis.get_ylim() for axis in pair]
@@ -138,21 +166,22 @@ def _draw_eyes(groups: Sequence[Group], curves: Sequence[Row], folder: Path) -> 
     save(figure, folder, "curves-eyes")
 
 
-def _points_by_run(curves: Sequence[Row], column: str) -> dict[tuple[str, ...], Points]:
-    """Seconds and a score of every run's curve, by the run's key."""
+def _points_by_run(curves: Sequence[Row], column: str, clock: str) -> dict[tuple[str, ...], Points]:
+    """Seconds by a clock and a score of every run's curve, by the run's key."""
     points: dict[tuple[str, ...], Points] = {}
     for row in curves:
-        if row[column]:
-            points.setdefault(key_of(row), []).append((float(row["t_train_s"]), float(row[column])))
+        if row[column] and row[clock]:
+            points.setdefault(key_of(row), []).append((float(row[clock]), float(row[column])))
     return {key: sorted(each) for key, each in points.items()}
 
 
-def _curves(axis: Any, groups: Sequence[Group], points: dict[tuple[str, ...], Points]) -> None:
-    """Every run of a group, the one that ends in the middle drawn strongly."""
-    axis.set_xlabel("seconds of training (log)")
+def _curves(axis: Any, groups: Sequence[Group], clock: str, *, rows: Sequence[Row], score: str) -> list[str]:
+    """Every run of a group, the one that ends in the middle drawn strongly. A DrawPanel with the rows of the curves."""
+    points, without = _points_by_run(rows, score, clock), []
     for group in groups:
         look = look_of(group.series)
         runs = sorted((points[key_of(row)] for row in group.rows if key_of(row) in points), key=lambda run: run[-1][1])
+        without += [group.series] if group.rows and not runs else []
         for place, run in enumerate(runs):
             is_middle = place == len(runs) // 2
             marks = {"marker": look.marker, "markersize": 4.5, "markerfacecolor": look.face, "linewidth": 1.6}
@@ -160,28 +189,26 @@ def _curves(axis: Any, groups: Sequence[Group], points: dict[tuple[str, ...], Po
             axis.plot(*zip(*run, strict=True), color=look.colour, zorder=3 if is_middle else 2, **style)
             if is_middle:
                 _name_limit(axis, group, groups, run[-1], (3, 4))
+    return without
 
 
-def _pareto(axis: Any, groups: Sequence[Group], score: str = "psnr_tissue_db") -> None:
-    axis.set_xlabel("seconds of training (log)")
-    _marks(axis, groups, "t_train_s", score)
-    _front(axis, groups, score)
-    if groups and groups[0].place == (REAL_CLIP, PAPERS_HOLDOUT):
-        _published(axis, lambda each: each.train_s)
+def _ends(axis: Any, groups: Sequence[Group], across: str, *, score: str = SCORE) -> list[str]:
+    """The end of every group; joined by their front where seconds lie across. A DrawPanel."""
+    without = _marks(axis, groups, across, score)
+    if across != SPEED:
+        _front(axis, groups, across, score)
+    if across != SINCE_REQUEST and groups and groups[0].place == (REAL_CLIP, PAPERS_HOLDOUT):
+        _published(axis, across)
+    return without
 
 
-def _frames(axis: Any, groups: Sequence[Group]) -> None:
-    axis.set_xlabel("images rendered a second, at the clip's size (log)")
-    _marks(axis, groups, "render_fps", "psnr_tissue_db")
-    if groups and groups[0].place == (REAL_CLIP, PAPERS_HOLDOUT):
-        _published(axis, lambda each: each.fps)
-
-
-def _marks(axis: Any, groups: Sequence[Group], across: str, score: str) -> None:
-    """A mark a group at its medians, and behind it a disc whose area is the scene's size."""
+def _marks(axis: Any, groups: Sequence[Group], across: str, score: str) -> list[str]:
+    """A mark a group at its medians, and behind it a disc whose area is the scene's size; series without a mark."""
+    without = []
     for group in groups:
         x, y = group.median(across), group.median(score)
         if math.isnan(x) or math.isnan(y):
+            without += [group.series] if group.rows and math.isnan(x) else []
             continue
         look = look_of(group.series)
         area = AREA_A_MEGABYTE * group.median("scene_bytes") / 1e6
@@ -193,6 +220,7 @@ def _marks(axis: Any, groups: Sequence[Group], across: str, score: str) -> None:
         }
         axis.scatter(x, y, s=MARK_AREA, c=look.face, zorder=4, **mark)
         _name_limit(axis, group, groups, (x, y), (2 + math.sqrt(max(area, MARK_AREA)) / 2, -3))
+    return without
 
 
 def _name_limit(
@@ -204,21 +232,21 @@ def _name_limit(
         axis.annotate(group.limit, place, offset, textcoords="offset points", fontsize=7, color=colour, zorder=5)
 
 
-def _front(axis: Any, groups: Sequence[Group], score: str) -> None:
+def _front(axis: Any, groups: Sequence[Group], clock: str, score: str) -> None:
     """Joins the groups that no other beats in both seconds and decibels."""
-    points = sorted((group.median("t_train_s"), group.median(score)) for group in groups if group.rows)
+    points = ((group.median(clock), group.median(score)) for group in groups)
     front: Points = []
-    for x, y in points:
-        if not math.isnan(y) and (not front or y > front[-1][1]):
+    for x, y in sorted(point for point in points if not any(map(math.isnan, point))):
+        if not front or y > front[-1][1]:
             front.append((x, y))
     if len(front) > 1:
         axis.plot(*zip(*front, strict=True), color=GREY, linewidth=1.0, zorder=1)
 
 
-def _published(axis: Any, across: Callable[[Published], float | None]) -> None:
-    """Hollow marks, joined to nothing; their names stand above and below in turn."""
+def _published(axis: Any, across: str) -> None:
+    """What papers print: hollow marks, joined to nothing; their names stand above and below in turn."""
     for place, each in enumerate(each for each in RESULTS if each.data == "EndoNeRF"):
-        x, y = across(each), each.psnr_paper_db
+        x, y = each.fps if across == SPEED else each.train_s, each.psnr_paper_db
         if x is None:
             continue
         axis.scatter(x, y, s=45, facecolors="none", edgecolors=GREY, linewidths=1.0, zorder=2)
@@ -238,12 +266,12 @@ def _dashed(axis: Any, groups: Sequence[Group], lines: Mapping[str, tuple[str, t
             axis.annotate(what, inside, (4 - 8 * side, 2), textcoords="offset points", **text)
 
 
-def _missing(groups: Sequence[Group]) -> str:
-    """Which series have no figure here, and which failed."""
+def _missing(groups: Sequence[Group], more: Mapping[str, Sequence[str]]) -> str:
+    """Which series have no figure here, and which failed; and more of that kind."""
     failed = [group.series for group in groups if group.errors and not group.rows]
     missing = [series for series in DEFAULT_SERIES if series not in {group.series for group in groups}]
-    named = (("failed", failed), ("missing", missing))
-    return "; ".join(f"{word}: {', '.join(names)}" for word, names in named if names)
+    named = {"failed": failed, "missing": missing, **more}
+    return "; ".join(f"{word}: {', '.join(dict.fromkeys(names))}" for word, names in named.items() if names)
 
 
 def _draw_knee(groups: Sequence[Group], choices: Sequence[Group], folder: Path) -> None:
@@ -277,7 +305,7 @@ def _draw_knee(groups: Sequence[Group], choices: Sequence[Group], folder: Path) 
 
 def _size_and_score(group: Group) -> tuple[float, float]:
     """Megabytes and decibels."""
-    return group.median("scene_bytes") / 1e6, group.median("psnr_tissue_db")
+    return group.median("scene_bytes") / 1e6, group.median(SCORE)
 
 
 def _knee_handles(looks: dict[int, Look]) -> list[Any]:
@@ -307,7 +335,7 @@ def _handles(groups: Sequence[Group], name: str) -> list[Any]:
     for megabytes in LEGEND_MEGABYTES:
         disc: dict[str, Any] = {"marker": "o", "markersize": math.sqrt(AREA_A_MEGABYTE * megabytes)}
         handles.append(Line2D([], [], color=FAINT, linestyle="none", label=f"{megabytes} MB", **disc))
-    if (REAL_CLIP, PAPERS_HOLDOUT) in _places(groups):
+    if name != "pareto-post" and (REAL_CLIP, PAPERS_HOLDOUT) in _places(groups):
         hollow: dict[str, Any] = {"marker": "o", "markerfacecolor": "none"}
         handles.append(Line2D([], [], color=GREY, linestyle="none", label=LABEL, **hollow))
     return handles

@@ -118,7 +118,7 @@ class Bench:
             "stored_loss_held_out_db": _stored_loss_held_out_db(report, on_the_way.last_db),
         }
         if curve:  # else there was no tissue to score
-            curve = [point | scores for point, scores in zip(curve, on_the_way.scores(), strict=True)]
+            curve = on_the_way.completed(curve)
             # its end is scored on all held-out frames of the model as it is kept
             curve[-1] |= {"ssim": report.ssim, "depth_agreement_mm": report.depth_agreement_mm}
         return values | self._true(place, opened, scene, report), curve
@@ -147,6 +147,7 @@ class _OnTheWay:
         self.last_db: dict[int, float] = {}
         self.took_s = 0.0
         self._clip, self._last = clip, -1
+        self._before_s: list[float] = []
         self._ssim: list[list[float]] = []
         self._errors_mm: list[list[NDArray[np.float32]]] = []
 
@@ -155,6 +156,7 @@ class _OnTheWay:
         start = time.perf_counter()
         if frame <= self._last or not self._ssim:
             self.last_db.clear()
+            self._before_s.append(self.took_s)
             self._ssim.append([])
             self._errors_mm.append([])
         self._last = frame
@@ -164,11 +166,16 @@ class _OnTheWay:
         self._errors_mm[-1].append(depth_errors_mm(view.depth_mm, self._clip.depth_mm[frame], tissue))
         self.took_s += time.perf_counter() - start
 
-    def scores(self) -> list[Values]:
-        """One pair a scoring."""
+    def completed(self, curve: Sequence[Values]) -> list[Values]:
+        """The points of curve.csv with both scores, and with a t_post_s from which judging is taken out."""
         return [
-            {"ssim": _mean_of_known(found), "depth_agreement_mm": depth_agreement_mm(errors)}
-            for found, errors in zip(self._ssim, self._errors_mm, strict=True)
+            {
+                **point,
+                "t_post_s": float(str(point["t_post_s"])) - before_s,
+                "ssim": _mean_of_known(found),
+                "depth_agreement_mm": depth_agreement_mm(errors),
+            }
+            for point, before_s, found, errors in zip(curve, self._before_s, self._ssim, self._errors_mm, strict=True)
         ]
 
 

@@ -46,7 +46,9 @@ RUN_FIELDS = (*KEY, *SCORES, *COPIES, *TRUTH, *SIZE, *SPEED, *ORIGIN)
 """Empty means not measured. docs/conventions.md defines SCORES and the clocks, truth.py TRUTH, measure.py the rest:
 SIZE in _size and _stored_loss_held_out_db, SPEED in seconds_of and _speed. seconds is JSON, load_1min before the run.
 """
-CURVE_FIELDS = (*KEY, "t_train_s", "iteration", "psnr_tissue_db", "psnr_right_db", "ssim", "depth_agreement_mm")
+CURVE_FIELDS = (
+    *KEY, "t_train_s", "t_post_s", "iteration", "psnr_tissue_db", "psnr_right_db", "ssim", "depth_agreement_mm",
+)  # fmt: skip
 NO_RESULT = (Cancelled, UnavailableError, ModuleNotFoundError)
 """Errors of the caller or of this machine: the method had no part in them, so no row holds them, and where they come
 measuring ends. Any other error is what a method breaks on: a result of its own, with a row."""

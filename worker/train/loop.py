@@ -7,6 +7,7 @@ gives those of an uninterrupted one.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -140,10 +141,10 @@ def _check_finite(run: Run) -> None:
 
 def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], HeldOutScore]) -> None:
     check_sums(run.model.wait(), run.iteration)  # steps that still run do not count as scoring
-    t_train_s = clock.elapsed_s
+    t_train_s, t_post_s = clock.elapsed_s, time.time() - run.setup.accepted_at_s
     with clock.paused():
         score = evaluate()
     if math.isnan(score.left_db):
         return
     right_db = None if math.isnan(score.right_db) else score.right_db
-    run.curve.append(CurvePoint(t_train_s, run.iteration, score.left_db, right_db))
+    run.curve.append(CurvePoint(t_train_s, run.iteration, score.left_db, right_db, t_post_s))

@@ -23,12 +23,13 @@ from worker.train.targets import TrainingFrames
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """One row of curve.csv; t_train_s as docs/conventions.md defines it."""
+    """One row of curve.csv; both clocks as docs/conventions.md defines them. None: not known."""
 
     t_train_s: float
     iteration: int
     psnr_tissue_db: float
     psnr_right_db: float | None = None
+    t_post_s: float | None = None
 
 
 Box = tuple[tuple[float, ...], tuple[float, ...]]
@@ -125,16 +126,17 @@ def frames_at(run: Run, iteration: int) -> list[int]:
 
 
 def write_curve(path: Path, run: Run) -> None:
-    """curve.csv: t_train_s, iteration, scores of the held-out frames in training, training frames seen by then.
+    """curve.csv: seconds by both clocks, iteration, scores of the held-out frames in training, training frames seen.
 
     psnr_right_db is empty for a clip of one eye.
     """
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["t_train_s", "iteration", "psnr_tissue_db", "frames_seen", "psnr_right_db"])
+        writer.writerow(["t_train_s", "t_post_s", "iteration", "psnr_tissue_db", "frames_seen", "psnr_right_db"])
         writer.writerows(
             [
                 f"{p.t_train_s:.3f}",
+                "" if p.t_post_s is None else f"{p.t_post_s:.3f}",
                 p.iteration,
                 f"{p.psnr_tissue_db:.4f}",
                 p.iteration * run.preset.frames_a_step,

@@ -22,9 +22,17 @@ def failed_row(series: str) -> Row:
     return run_row(series, 0.0, error="TrainingDiverged: no more") | {"psnr_tissue_db": "", "t_train_s": ""}
 
 
-def curve_rows(run: Row, points: Sequence[tuple[float, int, float]]) -> list[Row]:
-    """The run's curve: seconds, iterations, dB; SSIM and depth error do not change."""
+def curve_rows(
+    run: Row, points: Sequence[tuple[float, int, float]], before_training_s: float | None = None
+) -> list[Row]:
+    """The run's curve: seconds, iterations, dB; SSIM and depth error do not change.
+
+    before_training_s: between the request and training; without it the curve has no t_post_s.
+    """
     names = ("t_train_s", "iteration", "psnr_tissue_db")
     other = {"ssim": "0.9", "depth_agreement_mm": "0.4"}
     key = {name: run[name] for name in KEY}
-    return [{**key, **dict(zip(names, map(str, each), strict=True)), **other} for each in points]
+    rows = [{**key, **dict(zip(names, map(str, each), strict=True)), **other} for each in points]
+    if before_training_s is None:
+        return rows
+    return [row | {"t_post_s": str(before_training_s + each[0])} for row, each in zip(rows, points, strict=True)]

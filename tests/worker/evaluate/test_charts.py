@@ -62,6 +62,25 @@ def test_a_chart_names_what_is_missing_what_failed_and_what_others_published(dra
     assert text.count(">copying: flow<") == 2
 
 
+def test_the_clock_of_the_user_has_charts_of_its_own_that_name_who_lacks_it(tmp_path: Path) -> None:
+    import matplotlib as mpl
+
+    fast, paper = run_row("fast", 39.0, t_post_s=75.0), run_row("paper", 38.0)
+    points = [(5.0, 200, 35.0), (60.0, 2900, 39.0)]
+    write_rows(tmp_path / RUNS, RUN_FIELDS, [fast, paper])
+    write_rows(tmp_path / CURVES, CURVE_FIELDS, [*curve_rows(fast, points, 9.0), *curve_rows(paper, points)])
+    with mpl.rc_context({"svg.fonttype": "none"}):
+        assert set(draw_all(Results(tmp_path), tmp_path)) == {*CHARTS, "curves-post", "pareto-post"}
+    charts = {name: (tmp_path / f"{name}.svg").read_text() for name in (*CHARTS, "curves-post", "pareto-post")}
+    for name in ("curves-post", "pareto-post"):
+        assert charts[name].count(">seconds since the request (log)<") == 1
+        assert charts[name].count("without t_post_s: paper<") == 1
+        assert LABEL not in charts[name], "papers print seconds of training"
+    alone = charts["pareto-one-clip"]
+    assert (alone.count(">seconds of training (log)<"), alone.count(">seconds since the request (log)<")) == (1, 1)
+    assert "without t_" not in charts["curves"] + charts["pareto"]
+
+
 def test_left_and_right_eye_stand_beside_each_other_where_a_clip_has_two(tmp_path: Path) -> None:
     import matplotlib as mpl
 

@@ -9,19 +9,21 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from contract.runtime.exits import ExitCode
 from contract.wire.errors import Cancelled, InputError, UnavailableError
+from tests.worker.phantoms import phantom_clip
 from worker.__main__ import main
 from worker.evaluate.cells import Cell, plan
 from worker.evaluate.command import SUMMARY, measure_all
-from worker.evaluate.measure import Bench, Values, command_of, seconds_of
+from worker.evaluate.measure import Bench, Values, _OnTheWay, command_of, seconds_of
 from worker.evaluate.rows import CURVES, KEY, LOCK, RUN_FIELDS, RUNS, Results, adding_alone, read_rows
 from worker.evaluate.sources import DATA_VARIABLE, source_of
 from worker.machine.hooks import Progress
-from worker.train.hooks import TrainingHooks
+from worker.train.hooks import RenderedFrame, TrainingHooks
 
 CLIP = "phantom:pull:96x80:12frames"
 NAME = "phantom-pull-96x80-12frames"
@@ -114,6 +116,17 @@ def test_the_seconds_of_a_row_are_those_of_a_run_that_nobody_evaluates() -> None
     assert seconds_of(run, opening, judging_s=3.0) == {**run, **opening, "t_post_s": 19.0}
 
 
+def test_the_curve_of_a_row_has_the_clock_of_a_run_that_nobody_evaluates() -> None:
+    clip = phantom_clip()
+    view = RenderedFrame(np.zeros(clip.rgb[1].shape, np.float32), clip.depth_mm[1], np.ones_like(clip.depth_mm[1]))
+    on_the_way = _OnTheWay(clip)
+    on_the_way.judge(1, view)
+    on_the_way.took_s = 2.0
+    on_the_way.judge(1, view)
+    curve: list[Values] = [{"t_post_s": "10.000"}, {"t_post_s": "16.000"}]
+    assert [point["t_post_s"] for point in on_the_way.completed(curve)] == [10.0, 14.0]
+
+
 def test_a_recording_is_looked_for_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(DATA_VARIABLE, raising=False)
     with pytest.raises(InputError, match=f"{DATA_VARIABLE} says, and that is not set"):
@@ -128,6 +141,7 @@ def test_a_recording_is_looked_for_where_the_environment_says(tmp_path: Path, mo
 def test_a_curve_ends_where_its_run_does(measured: Path) -> None:
     fast, _ = read_rows(measured / RUNS)
     last = [row for row in read_rows(measured / CURVES) if row["series"] == "fast"][-1]
+    assert float(last["t_train_s"]) < float(last["t_post_s"]) < float(fast["t_post_s"])
     assert (last["iteration"], fast["iterations"]) == ("12", "12")
     for score in ("psnr_tissue_db", "ssim", "depth_agreement_mm"):
         assert float(last[score]) == pytest.approx(float(fast[score]), abs=1e-3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
+import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -165,6 +166,7 @@ def test_the_curve_tells_iterations_and_the_frames_they_saw(tmp_path: Path) -> N
     with (tmp_path / "curve.csv").open() as file:
         (row,) = csv.DictReader(file)
     assert (row["iteration"], row["frames_seen"], row["psnr_tissue_db"]) == ("5", "10", "31.5000")
+    assert 0 < float(row["t_post_s"]) < time.time() - run.setup.accepted_at_s
 
 
 def fitting(run: Run, budget_s: float, elapsed_s: float = 0.0) -> int:
@@ -282,7 +284,7 @@ def test_a_run_does_not_go_on_with_another_clip(tmp_path: Path) -> None:
 
 def test_the_curve_is_kept_over_a_stop(tmp_path: Path) -> None:
     run, _ = prepared(phantom_clip())
-    run.curve.append(CurvePoint(1.25, 7, 30.5))
+    run.curve.append(CurvePoint(1.25, 7, 30.5, t_post_s=4.5))
     save_run(tmp_path, run, 2.0)
     again, _ = prepared(phantom_clip())
     load_run(tmp_path, again)
