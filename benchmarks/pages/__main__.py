@@ -3,8 +3,8 @@
     python -m benchmarks.pages
 
 Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
-stability`), {two-eyes,stereo_truth,confidence,ablation,raster,service,memory}.csv, off-axis.jpg, stereo.txt (the output
-of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
+stability`), {post,two-eyes,stereo_truth,confidence,ablation,raster,service,memory}.csv, off-axis.jpg, stereo.txt (the
+output of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from statistics import median
 from benchmarks.pages.evaluation import sections, write_readme
 from benchmarks.pages.gpu import gpu_sections
 from benchmarks.pages.markdown import origin, table
+from benchmarks.pages.post import post_sections
 from benchmarks.pages.right_eye import two_eyes_sections
 from benchmarks.pages.stability import stability_sections
 from benchmarks.pages.truth import confidence_sections, off_axis_sections, stereo_truth_sections
@@ -91,7 +92,13 @@ while a clip has nothing to show yet, NotFound and Conflict once it is purged or
 
 
 def main() -> None:
-    parts = [_INTRODUCTION, *sections(RESULTS), *two_eyes_sections(RESULTS), *off_axis_sections(RESULTS)]
+    parts = [
+        _INTRODUCTION,
+        *sections(RESULTS),
+        *post_sections(RESULTS),
+        *two_eyes_sections(RESULTS),
+        *off_axis_sections(RESULTS),
+    ]
     parts += [*confidence_sections(RESULTS), *stability_sections(RESULTS)]
     if rows := _read(STABILITY):
         parts.append(origin(rows))

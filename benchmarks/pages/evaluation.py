@@ -5,12 +5,14 @@ Every sentence with a figure in it is made from rows; the others hold whatever t
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import mode
 
 from benchmarks.pages.markdown import number, origin, table
+from benchmarks.pages.post import post_claim
 from benchmarks.pages.right_eye import RIGHT_EYE_CHARTS, both_eyes, right_eye_claim, two_eyes
 from worker.evaluate.cells import DEFAULT_SERIES, GRID_BASES, GRID_POINTS, OURS, base_of
 from worker.evaluate.charts import clip_alone
@@ -49,6 +51,13 @@ and nothing behind the instrument.
 SSIM weighs structure, decibels every error alike. Depth is compared with what training was given for its own frames:
 true depth on synthetic clips, stereo's on recorded ones, so that there it shows agreement and not truth.
 """,
+    "curves-post": """
+![Held-out psnr_tissue against seconds since the request](curves-post.png)
+
+The same curves by the clock of the user, `t_post_s`: it also counts decoding, stereo and compilation before training,
+and the scoring of held-out frames in it. A point is the moment of its step; the stored scene follows some seconds
+after the last one. Curves that were measured before points had this clock are not drawn.
+""",
     "pareto": """
 ### Seconds against decibels
 
@@ -58,6 +67,12 @@ A mark is the median of all seeds, its disc the scene on disk, and the line join
 than. `hexplane` has no kernels of its own here and moves its Gaussians in torch, so its seconds say more about that
 than about the method. The hollow marks are what papers print for other clips on other hardware, in `psnr_paper`, which
 is higher: they say where the field stands, and no distance from them to ours is a measurement.
+""",
+    "pareto-post": """
+![Final psnr_tissue against seconds from the request to the scene](pareto-post.png)
+
+By the clock of the user, `t_post_s`, the scene is there some seconds later: decoding, stereo, compilation and storing
+come on top. Papers print no such seconds. {scored_first}
 """,
     **RIGHT_EYE_CHARTS,
     "frames": """
@@ -122,7 +137,8 @@ def sections(folder: Path) -> list[str]:
     parts = []
     if any(group.rows for group in groups):
         parts += [_INTRODUCTION.format(count=_counted(results.runs)), _headline(sooner(results.curves))]
-        parts += [text for name, text in _CHARTS.items() if (folder / f"{name}.png").exists()]
+        said = {"scored_first": _scored_first(results.runs)}
+        parts += [text.format(**said) for name, text in _CHARTS.items() if (folder / f"{name}.png").exists()]
         parts += [both_eyes(groups), _truth(groups), _ablation(groups), _parsimony(groups), _published()]
     grid = Results(folder / CAPACITY)
     if found := capacities(groups_of(grid.runs)):
@@ -142,20 +158,21 @@ def write_readme(readme: Path, folder: Path) -> None:
     if not found or not chart.exists() or any(mark not in text for mark in MARKS):
         return
     place = chart.relative_to(readme.parent)
-    picture = f"![Seconds of training against held-out decibels, for every preset]({place})"
+    picture = f"![Seconds of training, and since the request, against held-out decibels, for every preset]({place})"
     clip = clip_alone(groups_of(results.runs))
     caption = (
-        f"*Held-out frames of `{clip}`, medians over seeds. Discs show the scene's size on disk; the line joins the "
-        "best trade-offs; dashed and dotted lines are copies of the neighbouring frames; hollow marks are published, "
-        "on other hardware and data. [docs/conventions.md](docs/conventions.md) defines every8, blocks8 and "
-        "psnr_tissue.*"
+        f"*Held-out frames of `{clip}`, medians over seeds, by both clocks: `t_train_s` and, since the request, "
+        "`t_post_s`. Discs show the scene's size on disk; the line joins the best trade-offs; dashed and dotted lines "
+        "are copies of the neighbouring frames; hollow marks are published, on other hardware and data. "
+        "[docs/conventions.md](docs/conventions.md) defines clocks, every8, blocks8 and psnr_tissue.*"
     )
     usual = [each for each in found if each.our_limit == _usual_limit(found, each.holdout)]
     page = f"[All charts and figures]({folder.relative_to(readme.parent)}/index.md)"
     before, rest = text.split(MARKS[0])
     after = rest.split(MARKS[1])[1]
     claims = filter(None, (_claim(usual), right_eye_claim(two_eyes(folder) or groups_of(results.runs)), f"{page}."))
-    body = "\n\n".join((MARKS[0], picture, caption, " ".join(claims), MARKS[1]))
+    parts = (MARKS[0], picture, caption, post_claim(folder), " ".join(claims), MARKS[1])
+    body = "\n\n".join(filter(None, parts))
     readme.write_text(f"{before}{body}{after}")
 
 
@@ -356,6 +373,14 @@ def _counted(runs: Sequence[Row]) -> str:
     return (
         f"{len(runs)} runs, {failed} of them failed; ours are {ours}, all others the published method and its rivals."
     )
+
+
+def _scored_first(runs: Sequence[Row]) -> str:
+    """How many of the runs are from when a scene was scored before it was published; their reports lack a clock."""
+    ended = [json.loads(row["seconds"]) for row in runs if row["t_post_s"] and row["seconds"]]
+    earlier = sum("t_first_view_s" not in seconds for seconds in ended)
+    what = "were measured when a scene was scored before it was published: there `t_post_s` contains `score_s`"
+    return f"{earlier} of {len(ended)} runs {what}." if earlier else ""
 
 
 def _listed(values: Sequence[int]) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from benchmarks.bm_post import FIELDS
 from benchmarks.pages.evaluation import CAPACITY, MARKS, sections, write_readme
+from benchmarks.pages.post import POST, post_claim, post_sections
 from tests.worker.evaluate.made_up import curve_rows, failed_row, run_row
 from worker.evaluate.rows import CURVE_FIELDS, CURVES, RUN_FIELDS, RUNS, write_rows
 
@@ -58,6 +60,7 @@ def test_the_readme_is_written_between_its_marks_alone_and_only_if_there_is_a_ch
     write_readme(readme, folder)
     assert "old" in readme.read_text()
     (folder / "pareto-one-clip.png").touch()
+    write_rows(folder / POST, FIELDS, [post_row()])
     write_readme(readme, folder)
     text = readme.read_text()
     assert text.startswith(f"before\n{first}\n")
@@ -65,5 +68,39 @@ def test_the_readme_is_written_between_its_marks_alone_and_only_if_there_is_a_ch
     assert "old" not in text
     assert "](docs/pareto-one-clip.png)" in text
     assert "20.0 times sooner" in text
+    assert "has its scene after 14.5 s (`t_post_s`)" in text
     write_readme(readme, folder)
     assert readme.read_text() == text, "twice is as good as once"
+
+
+def post_row(**values: object) -> dict[str, object]:
+    known = {"clip": "d4d_stereo", "preset": "instant", "way": "http", "commit": "new", "first_view_s": 2.0,
+             "done_s": 15.0, "psnr_db": 32.0, "stages": '{"t_train_s": 6.2, "t_post_s": 14.5}'}  # fmt: skip
+    return {**known, "machine": "a machine", **values}
+
+
+def test_the_page_tells_what_a_caller_waits_for_by_both_clocks(tmp_path: Path) -> None:
+    assert post_sections(tmp_path) == []
+    assert post_claim(tmp_path) == ""
+    rows = [post_row(commit="old", first_view_s=9.0), post_row(good_view_s=12.1), post_row(first_view_s=2.4)]
+    rows += [post_row(preset="fast", budget_s=20), post_row(way="shell", first_view_s="", done_s=20.0)]
+    write_rows(tmp_path / POST, FIELDS, rows)
+    page = "".join(post_sections(tmp_path))
+    assert "| d4d_stereo | instant |  | 2 | 2.2 | 12.1 (1 of 2) | 6.2 | 14.5 | 15.0 | – | – | 32.0 | – |" in page
+    assert "| d4d_stereo | fast | 20 s | 1 | 2.0 | – | 6.2 | 14.5 | 15.0 | – | – | 32.0 | – |" in page
+    assert "from the shell" in page
+    assert "| d4d_stereo | instant |  | 1 | 6.2 | 14.5 | 20.0 | 32.0 | – |" in page
+    assert "commits new " in page
+    assert post_claim(tmp_path) == (
+        "By the user's clock, over HTTP to a warm worker: `instant` shows a first view of `d4d_stereo` after 2.2 s and "
+        "has its scene after 14.5 s (`t_post_s`), 6.2 s of them training (`t_train_s`)."
+    )
+
+
+def test_the_page_says_which_runs_count_scoring_as_waiting(tmp_path: Path) -> None:
+    seconds = {"t_post_s": 75, "seconds": '{"score_s": 4}'}
+    rows = [run_row("fast", 39.0, **seconds), run_row("paper", 38.0, t_post_s=9, seconds='{"t_first_view_s": 1}')]
+    write_rows(tmp_path / RUNS, RUN_FIELDS, rows)
+    assert "t_post_s" not in "".join(sections(tmp_path)), "without the chart"
+    (tmp_path / "pareto-post.png").touch()
+    assert "1 of 2 runs were measured when a scene was scored before" in "".join(sections(tmp_path))
