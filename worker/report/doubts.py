@@ -242,14 +242,15 @@ def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
 
     Looked at is the point on the optical axis at the tissue's median depth, which errors of place and of angle move.
     """
-    wanted = set(train)
+    wanted, pose = set(train), clip.world_from_camera
     runs = [index for index in train if {index - 1, index + 1} <= wanted]
+    if (pose == pose[:1]).all():  # the camera stands still
+        return []
     depths = [clip.depth_mm[index][clip.tissue[index] & (clip.depth_mm[index] > 0)] for index in runs]
     known = [float(np.median(each)) for each in depths if each.size]
     if len(runs) < MIN_DOUBTFUL_FRAMES or not known:
         return []
     depth_mm = float(np.median(known))
-    pose = clip.world_from_camera
     looked_at = pose[:, :3, 3] + depth_mm * pose[:, :3, 2]
     step = np.array([np.linalg.norm(looked_at[i + 1] - looked_at[i]) for i in runs])
     change = np.array([np.linalg.norm(looked_at[i + 1] - 2 * looked_at[i] + looked_at[i - 1]) for i in runs])

@@ -60,7 +60,7 @@ def judged(
     with one_opencv_thread(), ThreadPoolExecutor(cores(), thread_name_prefix=STAGE) as pool:
         held_out = measure(clip, first.held_out, views(clip), pool.map)
         right = measure_right(clip, first.held_out, views(clip.right or clip), pool.map)
-        trained = measure(clip, sampled, views(clip), pool.map)
+        trained = measure(clip, sampled, views(clip), pool.map, compared=not first.held_out)
         baselines = copy_baselines(clip, train, first.held_out, pool.map)
     report = scored_report(first, held_out, right, trained, baselines)
     made, left_db, right_db = first.iterations, report.psnr_tissue_db, report.psnr_right_db

@@ -95,8 +95,13 @@ _MERGED_FIELDS = ("assumptions", "warnings", "measurements")  # the clip has the
 Errors = NDArray[np.float32]
 
 
-def measure(clip: DepthClip, frames: Sequence[int], render: FrameRenderer, mapping: Mapping = map) -> Scores:
+def measure(
+    clip: DepthClip, frames: Sequence[int], render: FrameRenderer, mapping: Mapping = map, *, compared: bool = True
+) -> Scores:
     """Scores the renders of these frames (clip indices) against the clip, by mapping, which may use several threads.
+
+    compared: whether the figures are wanted that compare one scene with another; else psnr_clear_db, psnr_paper_db and
+    ssim, which take most of the time, are NaN.
 
     Raises:
         TrainingDiverged: a render holds NaN or infinity.
@@ -106,13 +111,12 @@ def measure(clip: DepthClip, frames: Sequence[int], render: FrameRenderer, mappi
         shown, truth, tissue = render(index), clip.rgb[index], clip.tissue[index]
         if not (np.isfinite(shown.rgb).all() and np.isfinite(shown.depth_mm).all() and np.isfinite(shown.alpha).all()):
             raise TrainingDiverged(f"Frame {index} renders as NaN or infinity: training has diverged.")
-        figures = (
-            psnr_tissue(shown.rgb, truth, tissue),
-            psnr_tissue(shown.rgb, truth, tissue & clear_of_highlights(shown.rgb, truth)),
-            psnr_paper(shown.rgb, truth, tissue),
-            ssim(shown.rgb, truth, tissue),
-            coverage(shown.alpha, tissue),
-        )
+        clear_db = paper_db = similarity = math.nan
+        if compared:
+            clear_db = psnr_tissue(shown.rgb, truth, tissue & clear_of_highlights(shown.rgb, truth))
+            paper_db, similarity = psnr_paper(shown.rgb, truth, tissue), ssim(shown.rgb, truth, tissue)
+        tissue_db, covered = psnr_tissue(shown.rgb, truth, tissue), coverage(shown.alpha, tissue)
+        figures = (tissue_db, clear_db, paper_db, similarity, covered)
         depth_mm = clip.depth_mm[index]
         return figures, depth_errors_mm(shown.depth_mm, depth_mm, tissue), depth_mm[tissue & (depth_mm > 0)]
 
