@@ -48,7 +48,8 @@ LARGE = {"width": "4096", "height": "2160", "format": "jpeg"}
 SMALL = {"width": "320", "height": "256", "format": "jpeg"}
 LARGE_AT_ONCE = 6
 JOB_REQUESTS_A_SECOND = 200
-TRAINING_BUDGET_S = 1800  # longer than any of this takes; it is cancelled at the end
+SETTLED = 3
+ENDLESS = 1_000_000  # iterations; the job is cancelled at the end
 CHUNK_BYTES = 1 << 20
 VIDEO = Path(__file__).parents[1] / "tests" / "data" / "stereo_sbs_h264.mp4"
 
@@ -75,7 +76,7 @@ def main() -> None:
             rows += asyncio.run(_beside_large(client.url, scene, other, "idle"))
             if arguments.queue_stop_s:
                 rows += _without_queue(client.url, folder / "data", scene, unseen, arguments.queue_stop_s)
-            busy = client.reconstruct(clip.video, calibration=clip.calibration, budget_s=TRAINING_BUDGET_S)
+            busy = client.reconstruct(clip.video, calibration=clip.calibration, iterations=ENDLESS)
             wait_for_stage(client, busy.id, "train")
             rows += asyncio.run(_under_load(client.url, scene, "training", arguments.seconds))
             rows += _watched(client.url, busy.id, arguments.seconds)
@@ -257,6 +258,8 @@ def _followed(url: str, job_id: str) -> Iterator[Callable[[Callable[[], None]], 
         return (last - first) / (last_s - first_s)
 
     threading.Thread(target=follow, daemon=True).start()
+    while len(points) < SETTLED:  # the first may be of some time ago
+        time.sleep(0.1)
     yield rate
 
 

@@ -16,6 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from contract.access.keys import KeyScope
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
+from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose
 from contract.wire.rendering import (
     MEDIA_TYPES,
@@ -148,7 +149,8 @@ async def render(
     if shown.attempt != request.attempt:  # the job has ended meanwhile
         tag = tag_of(request.model_copy(update={"attempt": shown.attempt}))
     response = image_response(shown.scene_id, answer)
-    response.headers.update(cache_headers(shown, tag))
+    is_coarse = NoticeCode.COARSE in [each.code for each in answer.head.warnings]
+    response.headers.update(cache_headers(shown, tag, is_coarse=is_coarse))
     response.headers["X-Intrasplat-Unseen"] = f"{answer.head.unseen:.3f}"
     total_ms = (time.perf_counter() - start) * 1e3
     response.headers["Server-Timing"] = f"render;dur={answer.head.render_ms:.1f}, total;dur={total_ms:.1f}"
@@ -288,8 +290,10 @@ def matches(if_none_match: str | None, tag: str) -> bool:
     return "*" in given or tag.removeprefix("W/") in [each.removeprefix("W/") for each in given]
 
 
-def cache_headers(shown: Shown, tag: str) -> dict[str, str]:
-    """A finished scene may be cached but must be revalidated, so that its removal is noticed. A snapshot must not."""
-    if shown.attempt is None:
+def cache_headers(shown: Shown, tag: str, *, is_coarse: bool = False) -> dict[str, str]:
+    """A finished scene may be cached but must be revalidated, so that its removal is noticed. A snapshot must not, and
+    no picture that will be sharper when more time is left.
+    """
+    if shown.attempt is None or is_coarse:
         return {"Cache-Control": "no-store"}
     return {"Cache-Control": "private, no-cache", "ETag": tag}

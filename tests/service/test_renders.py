@@ -19,7 +19,7 @@ from contract.wire.names import MANIFEST, REPORT
 from contract.wire.rendering import RenderRequest, WorkerAddress, WorkerReply
 from contract.wire.report import Report
 from tests.reports import REPORT_OF_A_SCENE
-from tests.service.under_test import IDENTITY, ServiceUnderTest, assert_problem, bearer, running_service
+from tests.service.under_test import COARSE_WIDTH, IDENTITY, ServiceUnderTest, assert_problem, bearer, running_service
 
 
 def test_a_render_carries_scene_state_and_time_and_its_request_reaches_the_worker(service: ServiceUnderTest) -> None:
@@ -167,6 +167,12 @@ def test_who_has_the_picture_is_told_so_without_asking_the_worker(service: Servi
     another = service.http.get("/render", params=query | {"t": "0.6"}, headers={"If-None-Match": first.headers["etag"]})
     assert another.status_code == 200
     assert another.headers["etag"] != first.headers["etag"]
+
+
+def test_nobody_may_keep_a_coarse_picture_because_a_sharp_one_may_follow(service: ServiceUnderTest) -> None:
+    response = service.http.get("/render", params={"scene": service.finished_scene(), "width": COARSE_WIDTH})
+    assert response.headers["cache-control"] == "no-store"
+    assert "etag" not in response.headers
 
 
 def test_who_has_the_picture_of_a_purged_scene_is_not_told_that_it_is_still_right(service: ServiceUnderTest) -> None:

@@ -18,7 +18,7 @@ from contract.store.store import Store
 from contract.wire.errors import InputError, SceneError
 from contract.wire.job import JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
-from contract.wire.notices import NoticeCode
+from contract.wire.notices import Notice, NoticeCode
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
@@ -32,6 +32,7 @@ IDENTITY = "1,0,0,0,0,1,0,0,0,0,1,0"
 
 
 UNSEEN_SHARE = 0.06251
+COARSE_WIDTH = 11
 AFTER_THE_END = a_warning("t is after the last frame", NoticeCode.TIME_OUTSIDE_CLIP)
 
 
@@ -56,10 +57,11 @@ class Painter:
             raise SceneError("The scene is damaged.")
         if request.camera.width == 10:
             raise RuntimeError("patient Smith")
-        warnings = (AFTER_THE_END, a_warning("ansicht – geschätzt")) if request.t > 1 else ()
+        coarse = (Notice.info(NoticeCode.COARSE, "half"),) if request.camera.width == COARSE_WIDTH else ()
+        late = (AFTER_THE_END, a_warning("ansicht – geschätzt")) if request.t > 1 else ()
         iteration = 7 if request.attempt is None else None
         media_type, shown_t = f"image/{request.format.value}", min(request.t, 1.0)
-        return Reply(request.format.value.encode(), media_type, shown_t, warnings, iteration, UNSEEN_SHARE)
+        return Reply(request.format.value.encode(), media_type, shown_t, coarse + late, iteration, UNSEEN_SHARE)
 
 
 @dataclass

@@ -73,10 +73,10 @@ class Pace:
             return max(0.0, -self._left_s / self._rate) if self._trains else 0.0
 
     def affords(self, cpu_s: float) -> bool:
-        """Whether a render of so many CPU seconds may be made without going into debt."""
+        """Whether a render of so many CPU seconds may be made: without going into debt, or after a rest."""
         with self._lock:
             self._fill()
-            return not self._trains or cpu_s <= self._left_s
+            return not self._trains or min(cpu_s, MAX_SAVED_S) <= self._left_s
 
     @property
     def trains(self) -> bool:

@@ -38,7 +38,7 @@ MAX_HELD_SCENES = 64
 """However small they are: each announcement of the worker names all of them."""
 
 COARSENESS = 2
-"""By this a job's picture is smaller when time is short. Less would hardly be faster: each Gaussian takes its time."""
+"""By this a picture is smaller when time is short. Less would hardly be faster: each Gaussian takes its time."""
 
 UNKNOWN_GAUSSIANS, UNKNOWN_SIZE = 50_000, (640, 512)
 """What a scene that is not in memory is taken to have, when it is estimated how long it will take."""
@@ -48,8 +48,8 @@ class Views:
     """Answers render and export requests from the scenes of a store and the snapshots of a job; for one thread.
 
     `held` names the scenes in memory, the last used one at the end; other threads may read it. `pause` is called
-    between the parts of a large render; it may ask for other answers meanwhile. While is_short_of_time(), pictures of a
-    job in formats for eyes are drawn at half the resolution and enlarged.
+    between the parts of a large render; it may ask for other answers meanwhile. While is_short_of_time(), pictures in
+    formats for eyes are drawn at half the resolution and enlarged.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Views:
             snapshot = self._trained(request.scene_id)
             scene = snapshot.scene
         reply = self._kept.get(request)
-        is_coarse = snapshot is not None and request.format in FOR_EYES and self.is_short_of_time()
+        is_coarse = request.format in FOR_EYES and self.is_short_of_time()
         if reply is None or (reply.is_coarse and not is_coarse):
             reply = self._render(scene, request, snapshot, is_coarse=is_coarse)
             if snapshot is None or self._is_newest(scene):

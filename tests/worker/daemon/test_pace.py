@@ -109,3 +109,14 @@ def test_where_training_gets_less_of_the_cores_renders_do_too_but_never_nothing(
         assert pace.rest_s() == pytest.approx((1.0 - SHARE) / pace.rate)
         clock.now_s += 1.0
         assert pace.rest_s() == pytest.approx((1.0 - SHARE - 2 * MIN_USE * SHARE) / pace.rate)
+
+
+def test_after_a_rest_one_large_view_can_be_made_in_full() -> None:
+    clock = Clock()
+    pace = Pace(clock=clock)
+    with pace.training():
+        assert pace.affords(MAX_SAVED_S)
+        assert pace.affords(10 * MAX_SAVED_S)
+        pace.charge(MAX_SAVED_S / 2)
+        assert not pace.affords(10 * MAX_SAVED_S)
+        assert pace.affords(MAX_SAVED_S / 3)

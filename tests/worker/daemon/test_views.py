@@ -302,14 +302,18 @@ def test_a_large_render_can_be_paused_for_a_small_one_of_the_same_scene_and_ende
         views.answer(large.model_copy(update={"t": 0.25}))
 
 
-def test_a_job_s_pictures_are_coarse_while_time_is_short_and_exact_formats_are_not(store: Store) -> None:
+@pytest.mark.parametrize("attempt", [None, 1])
+def test_pictures_are_coarse_while_time_is_short_and_exact_formats_are_not(store: Store, attempt: int | None) -> None:
     snapshots = Snapshots(period_s=1e9)
-    views, running = Views(store, snapshots), new_job_id()
-    snapshots.begin(running)
-    snapshots.offer(scene(), 40)
+    views, shown = Views(store, snapshots), new_job_id()
+    if attempt is None:
+        snapshots.begin(shown)
+        snapshots.offer(scene(), 40)
+    else:
+        publish(store, shown)
     views.is_short_of_time = lambda: True
-    request = RenderRequest(scene_id=running, t=0, format=ImageFormat.JPEG)
-    coarse, exact = views.answer(request), views.answer(request_of(running, attempt=None))
+    request = RenderRequest(scene_id=shown, attempt=attempt, t=0, format=ImageFormat.JPEG)
+    coarse, exact = views.answer(request), views.answer(request_of(shown, attempt=attempt))
     assert NoticeCode.COARSE in [each.code for each in coarse.warnings]
     assert NoticeCode.COARSE not in [each.code for each in exact.warnings]
     assert views.answer(request) is coarse
