@@ -33,7 +33,10 @@ MAX_START_S = 240.0
 """To import torch and compile all kernels, on a slow machine whose cache is empty."""
 
 LOOK_PERIOD_S = 0.1
-"""How soon a supervisor that waits for its child sees what has become of it."""
+"""How soon a supervisor that waits for its child sees what has become of it, or acts on a new order of the queue."""
+
+MAX_STOP_S = 5.0
+"""How long a child that is told to stop may take to save the job's state before it is killed."""
 
 LAST_REPORTS_S = 0.5
 """How long to wait for the last reports of a dead child, in case a process of its own holds its pipe open."""

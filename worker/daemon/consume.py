@@ -19,27 +19,20 @@ from typing import TypeVar
 
 from contract.queue.interface import Claim, Order, Queue
 from contract.store.disk_errors import StoreFullError
-from contract.store.results import without_scores
 from contract.store.store import Store
-from contract.wire.errors import ErrorCode, IntrasplatError, SceneError, UnavailableError
+from contract.wire.errors import ErrorCode, IntrasplatError, UnavailableError
 from contract.wire.job import JobProgress, JobRecord, JobState
-from contract.wire.report import Report
-from worker.daemon.child import DeviceChild, Ended, Keeper
+from worker.daemon.child import LOOK_PERIOD_S, MAX_STOP_S, DeviceChild, Ended, Keeper
 from worker.daemon.hang import HangDetector
 from worker.daemon.heartbeat import Heartbeat
 from worker.daemon.held import HeldClaim
 from worker.daemon.job_errors import describe
-from worker.daemon.orders import Advanced, Failed, Finished, RunJob, Scored, ScoreScene, StopJob, Stopped
+from worker.daemon.orders import Advanced, Failed, Finished, RunJob, StopJob, Stopped
 from worker.daemon.room import Room
+from worker.daemon.scores import LeftScores, Scores
 
 CLAIM_TIMEOUT_S = 1.0
 """How soon an idle worker notices that it should end, or that its child has."""
-
-LOOK_PERIOD_S = 0.1
-"""How soon this process acts on a new order of the queue, or on a hang."""
-
-MAX_STOP_S = 5.0
-"""How long a child that is told to stop may take to save the job's state before it is killed."""
 
 UNREACHABLE_PAUSE_S = 1.0
 
@@ -86,6 +79,7 @@ class Consumer:
         self._name = name
         self._owner = owner
         self._end = end
+        self._left = LeftScores(queue, store, name, end)
         self.held = HeldClaim(store.run_dir / f"{name}.claim")
         self.job_id: str | None = None
 
@@ -119,7 +113,7 @@ class Consumer:
                 self.held.forget()
                 self.job_id = None
             else:
-                score_left(self._queue, self._store, child, self._name, self._end)
+                self._left.make_up(child)
 
 
 def run_job(
@@ -144,74 +138,10 @@ def run_job(
     log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
     if job.is_scoring:
         if outcome != DONE:
-            with contextlib.suppress(UnavailableError):  # else score_left() forgets it
+            with contextlib.suppress(UnavailableError):  # else LeftScores forgets it
                 store.expect_no_scores(name, claim.job_id, claim.attempt)
-        scores = Scores(store, name, claim.job_id, claim.attempt, log)
+        scores = Scores(store, name, claim.job_id, claim.attempt)
         scores.take(child, stop=end.is_set if outcome == DONE else lambda: True)
-
-
-def score_left(queue: Queue, store: Store, child: DeviceChild, name: str, end: threading.Event) -> None:
-    """Score one scene whose scoring a death or the end of this worker cut off, until a job waits."""
-    try:
-        job_id, attempt = next(iter(store.unscored(name)), (None, 0))
-        if job_id is None:
-            return
-        record = queue.get(job_id)
-        if record is None or record.state is not JobState.DONE or record.attempt != attempt:
-            store.expect_no_scores(name, job_id, attempt)
-            return
-        spool, scene = store.fetch_clip(job_id), store.scene_folder(job_id, attempt)
-    except (UnavailableError, SceneError) as error:
-        logger.warning("a scene waits for its scores: %s", error)
-        return
-    log = _log_of(Claim(job_id, attempt, name))
-    log.info("the scores of an earlier attempt are made up for")
-    child.send(ScoreScene(record=record, spool=spool, scene=scene))
-
-    def is_to_stop() -> bool:
-        with contextlib.suppress(UnavailableError):
-            return end.is_set() or queue.figures().queued > 0
-        return end.is_set()
-
-    Scores(store, name, job_id, attempt, log).take(child, stop=is_to_stop, gives_up=True)
-
-
-class Scores:
-    """Waits for the scores of a finished scene and adds them to it."""
-
-    def __init__(
-        self, store: Store, name: str, job_id: str, attempt: int, log: logging.LoggerAdapter[logging.Logger]
-    ) -> None:
-        self._store = store
-        self._scene = name, job_id, attempt
-        self._log = log
-
-    def take(self, child: DeviceChild, stop: Callable[[], bool], *, gives_up: bool = False) -> None:
-        """Until the child has scored the scene, is stopped, hangs or dies.
-
-        gives_up: a child that hangs or dies is the scene's fault, and its report says that there will be no scores.
-        """
-        detector, asked_s = HangDetector(), None
-        while not isinstance(report := child.next_report(LOOK_PERIOD_S), Scored | Stopped | Ended):
-            if isinstance(report, Advanced):
-                detector.observe(report.progress)
-            if asked_s is None and stop():
-                child.send(StopJob())
-                asked_s = time.monotonic()
-            if detector.is_hung() or (asked_s is not None and time.monotonic() - asked_s > MAX_STOP_S):
-                child.kill()
-        if isinstance(report, Scored):
-            self._add(report.report)
-        elif isinstance(report, Ended) and asked_s is None:
-            self._log.warning("the device process %s while it scored a scene", report.cause)
-            if gives_up:
-                self._add(without_scores(self._store.newest_report(*self._scene[1:]), report.cause))
-
-    def _add(self, report: Report) -> None:
-        try:
-            self._store.add_scores(*self._scene, report)
-        except (UnavailableError, SceneError) as error:  # it is still expected, and made up for later
-            self._log.warning("the scores were not kept: %s", error)
 
 
 def _log_of(claim: Claim) -> logging.LoggerAdapter[logging.Logger]:
