@@ -56,9 +56,8 @@ class Heartbeat:
         """Send this progress with the next beat that is due."""
         with self._changed:
             before = self._progress
-            if progress.psnr_db is None and before is not None:  # keep showing what training reached
-                kept = {"psnr_db": before.psnr_db, "psnr_right_db": before.psnr_right_db}
-                progress = progress.model_copy(update=kept)
+            if before is not None:  # keep showing what training reached
+                progress = progress.model_copy(update=_reached(before, progress))
             self._urgent = self._urgent or before is None or before.stage != progress.stage
             self._progress, self._unsent = progress, True
             self._changed.notify()
@@ -114,3 +113,10 @@ class Heartbeat:
                     return True
                 self._changed.wait(wait_s)
         return False
+
+
+def _reached(before: JobProgress, now: JobProgress) -> dict[str, object]:
+    """What a stage that does not train leaves out: the scores and the iterations."""
+    scores = {"psnr_db": before.psnr_db, "psnr_right_db": before.psnr_right_db}
+    iterations = {"iteration": before.iteration, "iterations": before.iterations}
+    return {**(scores if now.psnr_db is None else {}), **(iterations if now.iterations == 0 else {})}

@@ -81,6 +81,7 @@ def test_a_reconstruction_that_finishes_makes_its_job_done_and_its_scene_visible
     assert bench.store.has_scene(record.job_id, record.attempt)
     assert record.progress is not None
     assert (record.progress.psnr_db, record.progress.psnr_right_db) == (30.0, 28.0)
+    assert (record.progress.stage, record.progress.iteration, record.progress.iterations) == ("publish", 500, 1000)
     assert bench.files(record.job_id, "work") == []
 
 
