@@ -2,8 +2,8 @@
 
 A clip in the spool was accepted, or was about to be: its job must stand in the queue. The sweep goes through the
 spool at the start of the service, again for as long as a submission's answer is owing, and whenever a job was
-cancelled: where its worker had died, the queue ended it, and nobody has removed its files. It may run in several
-services at once, for all it does may be repeated.
+cancelled or failed: where its worker had died, the queue ended it, and nobody has removed its files. It may run in
+several services at once, for all it does may be repeated.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Sweep:
         self._in_hand: set[str] = set()
         self._lock = threading.Lock()
         self._unsettled = True
-        self._cancelled = 0
+        self._ended_badly = 0
 
     @contextmanager
     def in_hand(self, job_id: str) -> Iterator[None]:
@@ -61,7 +61,7 @@ class Sweep:
         """Settle all clips whenever one may be unsettled, until cancelled."""
         abandoned_at_s = time.monotonic()
         while True:
-            if self._unsettled or await run_in_threadpool(self._more_were_cancelled):
+            if self._unsettled or await run_in_threadpool(self._more_ended_badly):
                 await run_in_threadpool(self._try_to_settle)
             if time.monotonic() >= abandoned_at_s:
                 await run_in_threadpool(self._store.tidy)
@@ -88,15 +88,17 @@ class Sweep:
                     self._unsettled = True
             elif record.state is JobState.CANCELLED:  # its canceller or its worker died before it removed the clip
                 self._store.purge(job_id)
+            elif record.state is JobState.FAILED:  # by deaths of its workers, and the last could not remove its work
+                self._store.remove_failed(job_id, record.attempt)
 
-    def _more_were_cancelled(self) -> bool:
-        """Whether jobs came to be cancelled since this was asked before."""
+    def _more_ended_badly(self) -> bool:
+        """Whether jobs came to be cancelled or failed since this was asked before."""
         try:
-            cancelled = self._queue.figures().ended.get(JobState.CANCELLED, 0)
+            ended = self._queue.figures().ended
         except UnavailableError:
             return False
-        before, self._cancelled = self._cancelled, cancelled
-        return cancelled != before
+        before, self._ended_badly = self._ended_badly, ended[JobState.CANCELLED] + ended[JobState.FAILED]
+        return self._ended_badly != before
 
     def _try_to_settle(self) -> None:
         self._unsettled = False  # before the work, so that what comes to be owed meanwhile is not forgotten

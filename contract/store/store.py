@@ -260,6 +260,13 @@ class Store:
         for area in (Area.WORK, Area.KEPT, Area.SCENES):
             self._shelf.remove(area, job_id, attempt)
 
+    def remove_failed(self, job_id: str, attempt: int) -> None:
+        """Remove what this attempt and earlier ones of a failed job have left on this machine."""
+        for area in (Area.WORK, Area.KEPT, Area.SCENES):
+            for entry in self._here.folders(area, job_id):
+                if entry.attempt is not None and entry.attempt <= attempt:
+                    self._shelf.remove(area, job_id, entry.attempt)
+
     def remove_other_attempts(self, job_id: str, attempt: int) -> None:
         """Remove all work on the job and all scenes but that of the attempt, which the queue has accepted."""
         for area in (Area.WORK, Area.KEPT):

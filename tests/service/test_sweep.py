@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from contract.queue.interface import Admission
+from contract.queue.interface import MAX_ATTEMPTS, Admission
 from contract.queue.memory import MemoryQueue
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord, JobState
-from contract.wire.names import MANIFEST, SUBMISSION
+from contract.wire.names import MANIFEST, RESUME, SUBMISSION
 from service.sweep import Sweep
 from tests.service.under_test import ServiceUnderTest, assert_problem, running_service
 
@@ -184,6 +184,29 @@ def test_the_files_of_a_cancelled_job_go_even_if_its_worker_died(
         while (left := files_left(service, job_id)) and time.monotonic() < deadline:
             time.sleep(0.02)
         assert not left
+
+
+def test_the_work_of_a_job_that_deaths_of_whole_workers_failed_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.sweep.SWEEP_PERIOD_S", 0.05)
+    queue = MemoryQueue(lease_s=0.0)
+    for service in running_service(tmp_path, queue):
+        job_id = service.upload().json()["id"]
+        for attempt in range(1, MAX_ATTEMPTS + 1):
+            record = queue.claim(f"worker-{attempt}.dead", 0.0)  # which finds the lease of the one before run out
+            assert record is not None
+            kept = service.store.kept_folder(job_id, record.attempt)
+            (kept / RESUME).write_text("x")
+        assert queue.claim("worker-9", 0.0) is None
+        ended = queue.get(job_id)
+        assert ended is not None
+        assert ended.state is JobState.FAILED
+        deadline = time.monotonic() + PATIENCE_S
+        while kept.exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert not kept.exists()
+        assert service.store.submission(job_id) is not None, "it may be retried"
 
 
 def test_a_job_that_cannot_be_queued_is_not_in_the_way_of_others(tmp_path: Path) -> None:
