@@ -20,7 +20,7 @@ from contract.wire.names import CURVE, REPORT
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import Report
 from worker.input.camera import to_camera
-from worker.input.clip import DepthClip, FrameSplit, split_frames
+from worker.input.clip import DepthClip, FrameSplit, split_frames, training_frames
 from worker.machine.forecast import Forecast
 from worker.machine.hooks import Hooks
 from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
@@ -142,6 +142,10 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
 
     showing = dataclasses.replace(hooks, on_first_moment=show)
     clip = keeper.clip(request, lambda: open_with_depth(request, showing, timings, device))
+    if "t_first_view_s" not in timings.seconds:  # it was kept with its depth
+        frames = training_frames(clip.frame_count, options.holdout)
+        moment = next((i for i in frames if (clip.tissue[i] & (clip.depth_mm[i] > 0)).any()), frames[0])
+        show(clip.moment(moment))
     split = split_frames(clip, options.holdout)
     keep_free_memory(USUAL_BYTES)
     timings.add("compile_s", compile_coder())

@@ -56,7 +56,9 @@ def resume(directory: Path, setup: Setup) -> Run | None:
     except MISFITS as error:
         problem = f"{directory / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
         raise ResumeMismatch("--out", problem, "Give the options it was started with, or name a new folder.") from error
-    setup.timings.seconds = state["seconds"] | setup.timings.seconds
+    before = state["seconds"]
+    first_view = {name: before[name] for name in ("t_first_view_s",) if name in before}
+    setup.timings.seconds = before | setup.timings.seconds | first_view
     setup.clock.restart(float(state["t_train_s"]))
     return run
 

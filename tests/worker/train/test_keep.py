@@ -17,6 +17,7 @@ from worker.phantom import PhantomSettings, make_phantom, write_stereo_video
 from worker.pipeline import make
 from worker.scene.checkpoint import load_scene
 from worker.scene.resume_file import RESUME_FILE, load_resume
+from worker.scene.scene import Scene
 from worker.train import keep
 from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
@@ -98,6 +99,15 @@ def test_what_is_kept_stays_until_its_owner_removes_it_and_an_own_folder_is_left
     make(request_of(clip), tmp_path / "own", TrainingHooks())
     assert not set(KEPT) & {path.name for path in (tmp_path / "own").iterdir()}
     assert bits(tmp_path / "own") == bits(tmp_path / "scene")
+
+
+def test_an_attempt_on_a_kept_clip_shows_a_first_picture_too(clip: Path, tmp_path: Path) -> None:
+    first = make(request_of(clip), tmp_path / "first", TrainingHooks(), tmp_path / "kept")
+    shown: list[Scene] = []
+    hooks = TrainingHooks(on_first_picture=shown.append)
+    again = make(request_of(clip), tmp_path / "again", hooks, tmp_path / "kept")
+    assert [scene.preset for scene in shown] == ["first picture"]
+    assert again.report.seconds["t_first_view_s"] == first.report.seconds["t_first_view_s"], "it had been seen before"
 
 
 def test_a_file_that_has_changed_is_decoded_anew(clip: Path, tmp_path: Path) -> None:
