@@ -69,6 +69,7 @@ class NoticeCode(StrEnum):
     BLOOD = "blood"
     BLURRED_FRAMES = "blurred_frames"
     BRIGHTNESS_CHANGES = "brightness_changes"
+    CALIBRATION_SCALED = "calibration_scaled"
     COLOURS_UNKNOWN = "colours_unknown"
     COLOUR_CHANGES = "colour_changes"
     DEPTH_JUMPS = "depth_jumps"

@@ -131,7 +131,7 @@ def test_the_conventions_page_shows_both_kinds_as_they_are_read(tmp_path: Path) 
     parsed = [parse_calibration(example) for example in examples]
     assert [type(each) for each in parsed] == [RectifiedCalibration, RawCalibration]
     for block, example, calibration in zip(blocks, examples, parsed, strict=True):
-        assert set(example) == set(type(calibration).model_fields) - {"assumptions"}
+        assert set(example) == set(type(calibration).model_fields) - {"assumptions", "scaled_from"}
         width, height = calibration.width, calibration.height
         assert load(write(tmp_path / "c.json", block), width, height) == calibration
         image = np.zeros((height, width, 3), np.uint8)
@@ -195,7 +195,9 @@ def test_a_uniformly_scaled_calibration_sees_the_same_rays_and_says_so(tmp_path:
     half = load(write(tmp_path / "c.json", json.dumps(RECTIFIED)), WIDTH // 2, HEIGHT // 2)
     assert isinstance(half, RectifiedCalibration)
     assert (half.fx_px, half.cx_px, half.disparity_offset_px) == (70.0, 39.0, 0.125)
-    assert any("scaled by 0.5" in note for note in half.assumptions)
+    image = np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8)
+    (warning,) = rectify(clip_of(image, image), half).warnings
+    assert (warning.code, "160x128" in warning.text, "80x64" in warning.text) == ("calibration_scaled", True, True)
     raw = load(write(tmp_path / "r.json", raw_calibration().model_dump_json()), WIDTH // 2, HEIGHT // 2)
     assert isinstance(raw, RawCalibration)
     # OpenCV counts from pixel centres: the image's left edge is -0.5 in both grids.
@@ -204,6 +206,7 @@ def test_a_uniformly_scaled_calibration_sees_the_same_rays_and_says_so(tmp_path:
 
 WRONG_JSON: dict[str, tuple[dict[str, Any], str]] = {
     "another aspect": ({"height": 100}, "not one uniform scale"),
+    "a million times the size": ({"width": WIDTH * 10**6, "height": HEIGHT * 10**6}, "more than 8 times apart"),
     "zero baseline": ({"baseline_mm": 0.0}, "baseline_mm"),
     "negative focal length": ({"fx_px": -140.0}, "fx_px"),
     "not a number": ({"cx_px": float("nan")}, "cx_px"),

@@ -23,6 +23,8 @@ from worker.input.calibration.check import FIELD, check_calibration
 from worker.input.calibration.types import RectifiedCalibration, StereoCalibration, parse_calibration
 
 MAX_ASPECT_CHANGE = 0.005  # 1348x1080 read as 640x512 is still one scale; a cropped image is not
+MAX_SCALE = 8.0
+"""4K reduced to 480 columns; what is scaled by more, either way, is not this recording's."""
 
 FORMATS_REMEDY = (
     "Give our JSON (model rectified or raw), an OpenCV YAML or XML with M1 D1 M2 D2 R T, "
@@ -48,11 +50,12 @@ OPENCV_KEYS = {
 def load_calibration(path: Path | str, *, eye_width: int, eye_height: int) -> StereoCalibration:
     """Read a calibration file and fit it to eyes of eye_width x eye_height pixels.
 
-    A file made for another size of the same view is scaled, and its `assumptions` say so; so does a file without size.
+    A file made for another size of the same view is scaled, and `scaled_from` says so. A file without size is taken as
+    it is, and its `assumptions` say so.
 
     Raises:
-        InputError: unreadable, of no known format, not finite, not rigid, of another aspect, with an implausible
-            baseline, or with a principal point that does not fit the image.
+        InputError: unreadable, of no known format, not finite, not rigid, of another aspect, of a size far from
+            the clip's, with an implausible baseline, or with a principal point that does not fit the image.
     """
     text = _read_text(Path(path))
     value, size_known = _parse(text, eye_width, eye_height)
@@ -236,6 +239,12 @@ def _fit(calibration: StereoCalibration, eye_width: int, eye_height: int) -> Ste
             "not one uniform scale.",
             "Give the calibration of these frames, or the frames uncropped.",
         )
-    note = f"calibration scaled by {sx:.4g} from {calibration.width}x{calibration.height} to {eye_width}x{eye_height}"
+    if not 1 / MAX_SCALE <= sx <= MAX_SCALE:
+        raise InputError(
+            FIELD,
+            f"it is for {calibration.width}x{calibration.height} pixels an eye, the clip has {eye_width}x{eye_height}: "
+            f"more than {MAX_SCALE:g} times apart.",
+            "Give the calibration of these frames; check its width and height.",
+        )
     resized = calibration.resized(eye_width, eye_height)
-    return resized.model_copy(update={"assumptions": (*calibration.assumptions, note)})
+    return resized.model_copy(update={"scaled_from": (calibration.width, calibration.height)})

@@ -105,7 +105,7 @@ def _pass_through(clip: StereoClip, calibration: RectifiedCalibration) -> Rectif
         tissue=_all_tissue(clip) if clip.tissue is None else clip.tissue,
         frame_times_s=clip.frame_times_s,
         assumptions=_assumptions(clip, c, "frames: rectified already, as the calibration says"),
-        warnings=clip.warnings,
+        warnings=clip.warnings + _scale_warning(c),
         tissue_right=clip.tissue_right,
     )
 
@@ -137,7 +137,9 @@ def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
         tissue=_all_tissue(clip) if clip.tissue is None else _warp_tissue(clip.tissue, left_maps),
         frame_times_s=clip.frame_times_s,
         assumptions=_assumptions(clip, calibration, "frames: as recorded, rectified by the calibration"),
-        warnings=clip.warnings + _zoom_warning(float(left_p[0, 0]) / calibration.left.fx_px),
+        warnings=clip.warnings
+        + _scale_warning(calibration)
+        + _zoom_warning(float(left_p[0, 0]) / calibration.left.fx_px),
         equal_rows_px=float(
             np.median(_rows(size, *cameras[1], right_r, right_p) - _rows(size, *cameras[0], left_r, left_p))
         ),
@@ -181,6 +183,19 @@ def _all_tissue(clip: StereoClip) -> NDArray[np.bool_]:
 def _assumptions(clip: StereoClip, calibration: StereoCalibration, done: str) -> tuple[Notice, ...]:
     own = (Notice.info(NoticeCode.CALIBRATION, text) for text in calibration.assumptions)
     return (*clip.assumptions, *own, Notice.info(NoticeCode.RECTIFICATION, done))
+
+
+def _scale_warning(calibration: StereoCalibration) -> tuple[Notice, ...]:
+    """What to say of a calibration that was read for frames of another size than it names."""
+    if calibration.scaled_from is None:
+        return ()
+    width, height = calibration.scaled_from
+    text = (
+        f"the calibration is for {width}x{height} pixels an eye and was scaled to the clip's {calibration.width}x"
+        f"{calibration.height}: if its numbers are of another size than it names, or frames were cropped, every "
+        "distance is wrong"
+    )
+    return (Notice.warning(NoticeCode.CALIBRATION_SCALED, text),)
 
 
 def _zoom_warning(zoom: float) -> tuple[Notice, ...]:

@@ -11,6 +11,7 @@ import json
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator
+from pydantic.json_schema import SkipJsonSchema
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 """The numbers of coefficients OpenCV's distortion model comes in."""
@@ -25,7 +26,9 @@ class _Calibration(BaseModel):
 
     width: int = Field(gt=0, description="pixels of one eye")
     height: int = Field(gt=0, description="pixels of one eye")
-    assumptions: tuple[str, ...] = Field(default=(), description="what the reader assumed or changed, for the report")
+    assumptions: tuple[str, ...] = Field(default=(), description="what the reader assumed, for the report")
+    scaled_from: SkipJsonSchema[tuple[int, int] | None] = None
+    """Width and height that the file names, where a reader has scaled it to another clip."""
 
 
 class RectifiedCalibration(_Calibration):
