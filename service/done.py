@@ -7,7 +7,9 @@ other finished scene is made of what the store knows: the submission names the t
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
 
 from contract.queue.interface import Queue
 from contract.store.store import Store
@@ -20,8 +22,14 @@ REMEMBERED = 1_000
 PATIENCE_S = 1.0
 """How long to wait for the queue's record. The queue's client itself tries for many seconds."""
 
+LIST_PATIENCE_S = 5.0
+"""The same for the list of all jobs."""
+
 THREADS = 8
 """Look-ups at a time."""
+
+
+Answer = TypeVar("Answer")
 
 
 class DoneJobs:
@@ -33,7 +41,8 @@ class DoneJobs:
         self._lock = threading.Lock()
         self._records: dict[str, JobRecord] = {}
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="records")
-        self._unanswered: Future[JobRecord | None] | None = None
+        self._unanswered: Future[Any] | None = None
+        self._submitted: dict[str, JobRecord] = {}
 
     def record(self, job_id: str) -> JobRecord | None:
         """The job's record; None if there is none, or if the job is done and its scene has been removed.
@@ -44,7 +53,7 @@ class DoneJobs:
         record = self._records.get(job_id)
         if record is None:
             try:
-                record = self._ask(job_id)
+                record = self._ask(lambda: self._queue.get(job_id), PATIENCE_S)
             except UnavailableError:
                 stored = self._stored(job_id)
                 if stored is None:
@@ -61,6 +70,17 @@ class DoneJobs:
                 del self._records[next(iter(self._records))]
         return record if there else None
 
+    def of_tenant(self, tenant: str) -> tuple[list[JobRecord], bool]:
+        """The tenant's done jobs, newest first, and whether the queue named them.
+
+        While it is away they are those with a finished scene in the store.
+        """
+        try:
+            records = self._ask(lambda: self._queue.records(tenant, None), LIST_PATIENCE_S)
+        except UnavailableError:
+            return self._stored_of(tenant), False
+        return [record for record in records if record.state is JobState.DONE], True
+
     def forget(self, job_id: str) -> None:
         """Remember no more of a job that was purged."""
         with self._lock:
@@ -70,13 +90,13 @@ class DoneJobs:
         """Look up nothing more."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def _ask(self, job_id: str) -> JobRecord | None:
-        """The queue's record; UnavailableError if it, or one that was asked for before, does not come in PATIENCE_S."""
+    def _ask(self, question: Callable[[], Answer], patience_s: float) -> Answer:
+        """The queue's answer; UnavailableError if it, or one to an earlier question, does not come in time."""
         unanswered = self._unanswered
         if unanswered is None or unanswered.done():
-            asked = self._pool.submit(self._queue.get, job_id)
+            asked = self._pool.submit(question)
             try:
-                return asked.result(PATIENCE_S)
+                return asked.result(patience_s)
             except TimeoutError:
                 self._unanswered = asked
         remedy = "Start it with `intrasplat up`, or correct REDIS_URL."
@@ -87,7 +107,19 @@ class DoneJobs:
 
         Of a job with several finished attempts only the queue knows which one counts.
         """
-        attempts, submitted = self._store.scene_attempts(job_id), self._store.submission(job_id)
-        if submitted is None or len(attempts) != 1:
-            return None
-        return submitted.model_copy(update={"state": JobState.DONE, "attempt": attempts[0]})
+        return _as_done(self._store.submission(job_id), self._store.scene_attempts(job_id))
+
+    def _stored_of(self, tenant: str) -> list[JobRecord]:
+        """As _stored(), of all scenes of a tenant, the last submitted first."""
+        attempts = self._store.finished_scenes()
+        found = {job_id: self._submitted.get(job_id) or self._store.submission(job_id) for job_id in attempts}
+        self._submitted = {job_id: each for job_id, each in found.items() if each is not None}  # they never change
+        done = (_as_done(each, attempts[job_id]) for job_id, each in self._submitted.items() if each.tenant == tenant)
+        return sorted(filter(None, done), key=lambda record: record.created_at_s, reverse=True)
+
+
+def _as_done(submitted: JobRecord | None, attempts: list[int]) -> JobRecord | None:
+    """The record of a done job; None if the attempt is not known."""
+    if submitted is None or len(attempts) != 1:
+        return None
+    return submitted.model_copy(update={"state": JobState.DONE, "attempt": attempts[0]})

@@ -41,11 +41,17 @@ class SceneSummary(BaseModel):
 
 
 @router.get("", operation_id="list_scenes")
-def list_scenes(services: Services, caller: AnyCaller, limit: ListingLimit = MAX_LISTED) -> list[SceneSummary]:
-    """The newest finished scenes, newest first."""
+def list_scenes(
+    services: Services, caller: AnyCaller, response: Response, limit: ListingLimit = MAX_LISTED
+) -> list[SceneSummary]:
+    """The newest finished scenes, newest first.
+
+    While the queue is away they are those in the store, and the header `X-Intrasplat-Queue: away` says so.
+    """
     caller.require(KeyScope.VIEW)
-    records = services.queue.records(caller.tenant, None)
-    done = [record for record in records if record.state is JobState.DONE]
+    done, is_told = services.done.of_tenant(caller.tenant)
+    if not is_told:
+        response.headers["X-Intrasplat-Queue"] = "away"
     return [_summary(services, record) for record in done[:limit]]
 
 

@@ -251,6 +251,14 @@ class Store:
         """The attempts whose scenes are there. There may be several until remove_other_attempts()."""
         return [entry.attempt for entry in self._shelf.entries(Area.SCENES, job_id) if entry.attempt is not None]
 
+    def finished_scenes(self) -> dict[str, list[int]]:
+        """The attempts whose scenes are there, by job, of all jobs; see scene_attempts()."""
+        found: dict[str, list[int]] = {}
+        for entry in self._shelf.entries(Area.SCENES):
+            if entry.attempt is not None:
+                found.setdefault(entry.job_id, []).append(entry.attempt)
+        return found
+
     def published_attempt(self, job_id: str) -> int | None:
         """The last attempt whose scene is there; None if there is no scene. For a job whose record was lost."""
         return max(self.scene_attempts(job_id), default=None)

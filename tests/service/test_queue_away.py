@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from contract.queue.interface import MAX_LISTED
 from contract.queue.memory import MemoryQueue
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord
@@ -23,6 +24,10 @@ class LeavingQueue(MemoryQueue):
     def get(self, job_id: str) -> JobRecord | None:
         self._stay()
         return super().get(job_id)
+
+    def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
+        self._stay()
+        return super().records(tenant, limit)
 
     def workers(self) -> list[WorkerAddress]:
         self._stay()
@@ -72,6 +77,22 @@ def test_a_tenant_sees_no_scene_of_another_while_the_queue_is_away(tmp_path: Pat
         queue.is_away = True
         assert service.http.get("/render", params={"scene": scene}, headers=own).status_code == 200
         assert_problem(service.http.get("/render", params={"scene": scene}, headers=other), 404, "scene")
+
+
+def test_the_scenes_in_the_store_are_listed_while_the_queue_is_away(tmp_path: Path) -> None:
+    queue = LeavingQueue()
+    for service in running_service(tmp_path, queue, host="0.0.0.0", hosts=("127.0.0.1",)):
+        own, other = (bearer(service, tenant) for tenant in ("ward-3", "ward-4"))
+        scenes = [service.finished_scene(own) for _ in range(3)]
+        service.finished_scene(other)
+        service.upload(headers=own)
+        told = service.http.get("/scenes", headers=own)
+        queue.is_away = True
+        service.store.purge(scenes[1])
+        listed = service.http.get("/scenes", headers=own)
+        assert [each["id"] for each in listed.json()] == [scenes[2], scenes[0]]
+        assert listed.json()[0] == told.json()[0]
+        assert (told.headers.get("X-Intrasplat-Queue"), listed.headers["X-Intrasplat-Queue"]) == (None, "away")
 
 
 def test_a_queue_that_says_nothing_is_waited_for_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
