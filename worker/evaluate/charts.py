@@ -82,7 +82,7 @@ def draw_all(results: Results, folder: Path) -> list[str]:
     with mpl.rc_context(SETTINGS):
         if any(group.rows for group in presets):
             drawn += _draw_presets(presets, results.curves, folder)
-        if stereo := _with_right_eye(presets):
+        if stereo := _at_places(presets, lambda group: not math.isnan(group.median(RIGHT))):
             _draw_eyes(stereo, results.curves, folder)
             _draw(stereo, partial(_ends, score=RIGHT), folder, "pareto-right", [TRAINING])
             drawn += ["curves-eyes", "pareto-right"]
@@ -95,14 +95,18 @@ def draw_all(results: Results, folder: Path) -> list[str]:
 def _draw_presets(presets: Sequence[Group], curves: Sequence[Row], folder: Path) -> list[str]:
     """The charts that need no second eye and no grid; their names."""
     drawn = []
+    since_request = _points_by_run(curves, SCORE, SINCE_REQUEST)
+    with_curves = _at_places(presets, lambda group: any(key_of(row) in since_request for row in group.rows))
+    with_ends = _at_places(presets, lambda group: not math.isnan(group.median(SINCE_REQUEST)))
     for name, (column, _, clock) in OVER_TIME.items():
         if _points_by_run(curves, column, clock):
-            _draw(presets, partial(_curves, rows=curves, score=column), folder, name, [clock])
+            groups = with_curves if clock == SINCE_REQUEST else presets
+            _draw(groups, partial(_curves, rows=curves, score=column), folder, name, [clock])
             drawn.append(name)
     alone = [group for group in presets if group.clip == clip_alone(presets)]
     for name, (groups, columns) in {
         "pareto": (presets, [TRAINING]),
-        "pareto-post": (presets, [SINCE_REQUEST]),
+        "pareto-post": (with_ends, [SINCE_REQUEST]),
         "pareto-one-clip": (alone, [TRAINING, SINCE_REQUEST]),
         "frames": (presets, [SPEED]),
     }.items():
@@ -140,9 +144,9 @@ def _draw(groups: Sequence[Group], draw_panel: DrawPanel, folder: Path, name: st
     save(figure, folder, name)
 
 
-def _with_right_eye(groups: Sequence[Group]) -> list[Group]:
-    """The groups of the places where the right eye was scored."""
-    places = {group.place for group in groups if not math.isnan(group.median(RIGHT))}
+def _at_places(groups: Sequence[Group], is_known: Callable[[Group], bool]) -> list[Group]:
+    """The groups of the places where something is known of any."""
+    places = {group.place for group in groups if is_known(group)}
     return [group for group in groups if group.place in places]
 
 

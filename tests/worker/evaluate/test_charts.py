@@ -67,11 +67,14 @@ def test_the_clock_of_the_user_has_charts_of_its_own_that_name_who_lacks_it(tmp_
 
     fast, paper = run_row("fast", 39.0, t_post_s=75.0), run_row("paper", 38.0)
     points = [(5.0, 200, 35.0), (60.0, 2900, 39.0)]
-    write_rows(tmp_path / RUNS, RUN_FIELDS, [fast, paper])
-    write_rows(tmp_path / CURVES, CURVE_FIELDS, [*curve_rows(fast, points, 9.0), *curve_rows(paper, points)])
+    other = run_row("fast", 33.0, clip="other")
+    write_rows(tmp_path / RUNS, RUN_FIELDS, [fast, paper, other])
+    curves = [*curve_rows(fast, points, 9.0), *curve_rows(paper, points), *curve_rows(other, points)]
+    write_rows(tmp_path / CURVES, CURVE_FIELDS, curves)
     with mpl.rc_context({"svg.fonttype": "none"}):
         assert set(draw_all(Results(tmp_path), tmp_path)) == {*CHARTS, "curves-post", "pareto-post"}
     charts = {name: (tmp_path / f"{name}.svg").read_text() for name in (*CHARTS, "curves-post", "pareto-post")}
+    assert ("other, every8" in charts["curves"], "other, every8" in charts["curves-post"]) == (True, False)
     for name in ("curves-post", "pareto-post"):
         assert charts[name].count(">seconds since the request (log)<") == 1
         assert charts[name].count("without t_post_s: paper<") == 1
