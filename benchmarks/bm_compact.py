@@ -27,7 +27,7 @@ from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
-from worker.train.rate_distortion import quantize_scene
+from worker.train.rate_distortion import quantize_model
 from worker.train.scoring import HeldOutScore, held_out_score
 from worker.train.setup import Setup
 
@@ -67,7 +67,7 @@ def rows_of(path: Path | None, iterations: int, tolerances_db: list[float]) -> l
     rows: list[dict[str, object]] = []
     for tolerance_db in tolerances_db:
         start = time.perf_counter()
-        quantized = quantize_scene(scene, [run.frames], tolerance_db)
+        quantized = quantize_model(model_of(scene), scene, [run.frames], tolerance_db)
         shrink_s = time.perf_counter() - start
         if quantized is None:
             continue

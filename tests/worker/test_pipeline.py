@@ -35,7 +35,7 @@ from worker.scene.model import model_of
 from worker.scene.resume_file import RESUME_FILE
 from worker.train.hooks import TrainingHooks
 from worker.train.presets import PRESETS, Preset
-from worker.train.rate_distortion import TOLERANCE_DB, quantize_scene
+from worker.train.rate_distortion import TOLERANCE_DB, quantize_model
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units
 
@@ -387,7 +387,8 @@ def test_the_pipeline_and_the_loop_make_the_same_model(clip: Path, whole: Whole)
     assert isinstance(opened, DepthClip)
     split = split_frames(opened)
     loop = trained(prepared_on(opened, split, "fast", iterations=ITERATIONS))
-    quantized = quantize_scene(scene_of(loop), loop.eyes)
+    scene = scene_of(loop)
+    quantized = quantize_model(model_of(scene), scene, loop.eyes)
     assert quantized is not None
     assert tensor_bits(whole("fast")[1]) == {
         name: each.numpy().tobytes() for name, each in quantized.scene.tensors().items()

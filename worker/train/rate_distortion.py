@@ -78,13 +78,6 @@ class QuantizedScene:
         return {"stored_step": self.step, "stored_loss_db": self.loss_db}
 
 
-def quantize_scene(
-    scene: Scene, eyes: Sequence[TrainingFrames], tolerance_db: float = TOLERANCE_DB, device: Device = CPU
-) -> QuantizedScene | None:
-    """The scene in whole numbers; None for a model that is stored as floats, or if no trial kept the tolerance."""
-    return quantize_model(model_of(scene, device), scene, eyes, tolerance_db, device)
-
-
 def quantize_model(
     model: Model,
     scene: Scene,
@@ -92,7 +85,10 @@ def quantize_model(
     tolerance_db: float = TOLERANCE_DB,
     device: Device = CPU,
 ) -> QuantizedScene | None:
-    """The model in whole numbers, likewise, and what else the scene holds. The scene's motion needs no weights."""
+    """The model in whole numbers, and what else the scene holds; the scene's motion needs no weights.
+
+    None for a model that is stored as floats, or if no trial kept the tolerance.
+    """
     pictures = [(frames, index) for index in eyes[0].indices for frames in eyes if frames.eye.tissue[index].any()]
     if not isinstance(scene.deformation, SharedBasis) or scene.gaussians.sh_degree > 0 or not pictures:
         return None

@@ -31,7 +31,7 @@ from worker.scene.differences import MAX_STORED
 from worker.scene.model import model_of
 from worker.scene.quantize import prepare, rounding
 from worker.scene.scene import Scene
-from worker.train.rate_distortion import SCORED_FRAMES, TOLERANCE_DB, quantize_scene
+from worker.train.rate_distortion import SCORED_FRAMES, TOLERANCE_DB, QuantizedScene, quantize_model
 from worker.train.targets import TrainingFrames
 
 TIMES = tuple(np.arange(6) / 6)
@@ -329,12 +329,16 @@ def test_damage_to_a_compact_file_is_found(tmp_path: Path, damage: str) -> None:
         load_scene(tmp_path)
 
 
+def quantized(scene: Scene, frames: TrainingFrames, tolerance_db: float = TOLERANCE_DB) -> QuantizedScene | None:
+    return quantize_model(model_of(scene), scene, [frames], tolerance_db)
+
+
 def test_shrinking_keeps_its_tolerance_and_says_what_it_took() -> None:
     clip = phantom_clip()
     run, _ = prepared(clip, iterations=40)
     trained(run)
     scene = scene_of(run)
-    small, tiny = (quantize_scene(scene, [run.frames], tolerance_db) for tolerance_db in (0.1, 0.5))
+    small, tiny = (quantized(scene, run.frames, tolerance_db) for tolerance_db in (0.1, 0.5))
     assert small is not None
     assert tiny is not None
     assert small.loss_db <= 0.1 < tiny.loss_db <= 0.5
@@ -344,7 +348,7 @@ def test_shrinking_keeps_its_tolerance_and_says_what_it_took() -> None:
     assert small.frames == len(judged)
     exact, kept = (mean_db(each, clip, run.frames, judged) for each in (scene, small.scene))
     assert small.loss_db == pytest.approx(exact - kept, abs=1e-3)
-    again = quantize_scene(scene, [run.frames], 0.1)
+    again = quantized(scene, run.frames, 0.1)
     assert again is not None
     assert again.step == small.step
     assert save(dict(again.scene.stored or {})) == save(dict(small.scene.stored or {}))
@@ -357,23 +361,20 @@ def mean_db(scene: Scene, clip: DepthClip, frames: TrainingFrames, judged: list[
     return float(np.mean(scores))
 
 
+def frames_showing(clip: DepthClip, tissue: NDArray[np.bool_], like: TrainingFrames) -> TrainingFrames:
+    return TrainingFrames(dataclasses.replace(clip, tissue=tissue), like.indices, like.scale)
+
+
 def test_frames_without_tissue_are_not_judged_and_where_there_is_none_floats_are_kept() -> None:
     clip = phantom_clip()
     run, _ = prepared(clip, iterations=10)
     trained(run)
     scene = scene_of(run)
     hidden = np.zeros_like(clip.tissue)
-    assert (
-        quantize_scene(
-            scene, [TrainingFrames(dataclasses.replace(clip, tissue=hidden), run.frames.indices, run.frames.scale)]
-        )
-        is None
-    )
+    assert quantized(scene, frames_showing(clip, hidden, run.frames)) is None
     first, second = run.frames.indices[:2]
     hidden[[first, second]] = clip.tissue[[first, second]]
-    small = quantize_scene(
-        scene, [TrainingFrames(dataclasses.replace(clip, tissue=hidden), run.frames.indices, run.frames.scale)]
-    )
+    small = quantized(scene, frames_showing(clip, hidden, run.frames))
     assert small is not None
     assert small.frames == 2
     assert small.loss_db <= TOLERANCE_DB
@@ -384,14 +385,14 @@ def test_a_scene_that_whole_numbers_cannot_hold_stays_as_floats(monkeypatch: pyt
     run, _ = prepared(clip, iterations=10)
     scene = scene_of(run)
     scene.gaussians.mean[3, 0] = 1e9
-    assert quantize_scene(scene, [run.frames]) is None
+    assert quantized(scene, run.frames) is None
     scene.gaussians.mean[3, 0] = 0
     monkeypatch.setattr(compact, "MAX_NUMBERS", 1000)
-    assert quantize_scene(scene, [run.frames]) is None
+    assert quantized(scene, run.frames) is None
 
 
 def test_models_that_are_not_known_are_left_as_floats() -> None:
     clip = phantom_clip()
     run, _ = prepared(clip, iterations=1)
     for scene in (random_scene("fdm-gaussian"), random_scene("hexplane"), random_scene("shared", sh_degree=1)):
-        assert quantize_scene(scene, [run.frames]) is None
+        assert quantized(scene, run.frames) is None
