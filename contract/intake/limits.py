@@ -18,12 +18,15 @@ if TYPE_CHECKING:
 MIN_SIDE_PX = 16  # stereo matching and the rasteriser's tiles need as much
 
 HELD_BYTES_PER_PIXEL = 18
-"""Memory of a pixel of both eyes in every frame while a clip is reconstructed; one eye alone takes half.
+"""Bytes of a pixel of both eyes in every frame while a clip is reconstructed; one eye alone takes half.
 
-9 of each eye in the DepthClip: rgb 3, depth_mm 4, depth_confidence 1, tissue 1. Training frames are views of it.
+9 of each eye in the DepthClip: rgb 3, depth_mm 4, depth_confidence 1, tissue 1. Training frames are views of it. Where
+stereo makes the depth, frame by frame, the clip lies in files; a clip that has its depth is whole in memory first.
 """
 
-MAX_MEMORY_BYTES = 8 * 1024**3  # of a clip, on any machine: more frames would train for too long
+MAX_CLIP_BYTES = 8 * 1024**3  # of a clip in files, on any machine: more frames would train for too long
+
+MAX_MEMORY_BYTES = MAX_CLIP_BYTES  # of a clip with depth, on any machine
 MEMORY_PARTS = 2  # a clip gets one of this many parts of the machine's memory; the rest is for the model
 
 EYES = 2  # of a stereo clip; the largest picture accepted holds both
@@ -53,14 +56,16 @@ class ClipLimits:
     frames            frames of a clip
     duration_s        duration by the frame times
     pixels_per_frame  pixels of one recorded picture (both eyes when they share it); default: two eyes of 3840x2160
-    decoded_bytes     memory of the whole clip while it is reconstructed (HELD_BYTES_PER_PIXEL), and bytes of everything
-                      in an archive once inflated; default: half of this machine's memory, at most 8 GiB
+    clip_bytes        bytes of the whole clip while it is reconstructed (HELD_BYTES_PER_PIXEL)
+    decoded_bytes     memory of a clip that has its depth, likewise, and bytes of everything in an archive once
+                      inflated; default: half of this machine's memory, at most 8 GiB
     on_picture        called after each decoded picture, from any thread, as a sign of progress
     """
 
     frames: int = 1000
     duration_s: float = 600.0
     pixels_per_frame: int = 2 * 3840 * 2160
+    clip_bytes: int = MAX_CLIP_BYTES
     decoded_bytes: int = field(default_factory=memory_for_clip_bytes)
     on_picture: Callable[[], None] = field(default=_ignore, compare=False)
 
@@ -71,7 +76,8 @@ class ClipLimits:
 
     def numbers(self) -> dict[str, float]:
         """The limits by their names, for another process."""
-        return {name: getattr(self, name) for name in ("frames", "duration_s", "pixels_per_frame", "decoded_bytes")}
+        names = ("frames", "duration_s", "pixels_per_frame", "clip_bytes", "decoded_bytes")
+        return {name: getattr(self, name) for name in names}
 
     def check_duration(self, field: str, label: str, duration_s: float) -> None:
         """LimitError if a clip lasts too long."""
@@ -95,10 +101,21 @@ class ClipLimits:
                 "Scale the clip down.",
             )
 
-    def check_clip(self, field: str, label: str, frames: int, width: int, height: int, eyes: int = 2) -> None:
+    def check_clip(
+        self,
+        field: str,
+        label: str,
+        frames: int,
+        width: int,
+        height: int,
+        eyes: int = 2,
+        *,
+        has_depth: bool = False,
+    ) -> None:
         """LimitError if `frames` pictures of width x height pixels are too many or too large.
 
-        eyes: number of eyes in a picture, of which one is kept in memory; 2 if it is not known yet.
+        eyes: number of eyes in a picture; 2 if it is not known yet.
+        has_depth: the clip lies whole in memory, not in files.
         """
         if frames > self.frames:
             raise LimitError(
@@ -108,13 +125,14 @@ class ClipLimits:
             problem = f"an eye of {label} has {width}x{height} pixels; the limit is {self.pixels_per_frame // EYES}."
             raise LimitError(field, problem, "Scale the clip down.")
         bytes_per_frame = width * height * HELD_BYTES_PER_PIXEL // eyes
-        if frames * bytes_per_frame > self.decoded_bytes:
-            fitting = self.decoded_bytes // bytes_per_frame
+        place, allowed = ("memory", self.decoded_bytes) if has_depth else ("disk", self.clip_bytes)
+        if frames * bytes_per_frame > allowed:
+            fitting = allowed // bytes_per_frame
             raise LimitError(
                 field,
                 f"{label} has at least {frames} frames of {width}x{height} pixels; they take "
-                f"{_mebibytes(frames * bytes_per_frame)} of memory, and the limit of "
-                f"{_mebibytes(self.decoded_bytes)} holds {fitting}.",
+                f"{_mebibytes(frames * bytes_per_frame)} of {place}, and the limit of "
+                f"{_mebibytes(allowed)} holds {fitting}.",
                 f"Cut it to {fitting} frames, or scale it down." if fitting else "Scale it down.",
             )
 

@@ -5,7 +5,7 @@ Symbols of the whole worker: T frames, H W pixels (rows, columns), N Gaussians, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -80,6 +80,12 @@ class Eye:
         """Take a frame's pixels out of memory, as far as they lie in files. They come back when they are asked for."""
         for name in PIXELS:
             let_go(getattr(self, name)[index])
+
+    def one_by_one(self, frames: Iterable[int]) -> Iterator[int]:
+        """The frames as given; each is taken out of memory when the next is asked for."""
+        for index in frames:
+            yield index
+            self.let_go(index)
 
     def arrays_at(self, frames: slice) -> dict[str, Any]:
         """The eye's arrays by name, of some frames alone: views."""

@@ -106,7 +106,9 @@ def decode_clip(
         "readable": [each for path in (*paths.values(), *layouts) for each in _reached(path)],
         "limits": limits.numbers(),
     }
-    allowance = Allowance(LIBRARIES_BYTES + limits.decoded_bytes, limits.decoded_bytes, MAX_CPU_S)
+    allowance = Allowance(
+        LIBRARIES_BYTES + limits.decoded_bytes, max(limits.clip_bytes, limits.decoded_bytes), MAX_CPU_S
+    )
     decoder = take_decoder()
     decoder.ask(
         request,

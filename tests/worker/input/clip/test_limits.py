@@ -43,7 +43,7 @@ def test_where_the_system_does_not_tell_its_memory_eight_gib_are_taken(monkeypat
 
 
 def test_a_clip_that_does_not_fit_is_told_how_many_of_its_frames_do() -> None:
-    limits = ClipLimits(decoded_bytes=GIB)
+    limits = ClipLimits(clip_bytes=GIB)
     fitting = GIB // (1280 * 1024 * HELD_BYTES_PER_PIXEL)
     limits.check_clip("clip", "it", fitting, 1280, 1024, eyes=1)
     with pytest.raises(LimitError, match=r"1280x1024 pixels; .* limit of 1024.0 MiB holds 45") as caught:
@@ -51,8 +51,15 @@ def test_a_clip_that_does_not_fit_is_told_how_many_of_its_frames_do() -> None:
     assert caught.value.remedy == "Cut it to 45 frames, or scale it down."
     limits.check_clip("clip", "it", 2 * fitting, 1280, 1024, eyes=2)
     with pytest.raises(LimitError, match="holds 0") as caught:
-        ClipLimits(decoded_bytes=1000).check_clip("clip", "it", 1, 1280, 1024)
+        ClipLimits(clip_bytes=1000).check_clip("clip", "it", 1, 1280, 1024)
     assert caught.value.remedy == "Scale it down."
+
+
+def test_only_a_clip_that_has_its_depth_must_fit_into_memory() -> None:
+    limits = ClipLimits(decoded_bytes=2 * GIB)  # a machine of 4 GiB
+    limits.check_clip("clip", "it", 1000, 640, 512, eyes=1)
+    with pytest.raises(LimitError, match=r"of memory, and the limit of 2048\.0 MiB holds 364"):
+        limits.check_clip("clip", "it", 1000, 640, 512, eyes=1, has_depth=True)
 
 
 def test_the_limits_are_the_deployments() -> None:

@@ -262,7 +262,7 @@ def test_eyes_of_different_size_are_refused(studio) -> None:
     [
         (ClipLimits(frames=11), "the limit is 11"),
         (ClipLimits(pixels_per_frame=192 * 80 - 1), "192x80 pixels"),
-        (ClipLimits(decoded_bytes=HELD_BYTES - 1), "holds 11"),
+        (ClipLimits(clip_bytes=HELD_BYTES - 1), "holds 11"),
     ],
 )
 def test_clips_over_a_limit_are_refused(limits: ClipLimits, problem: str) -> None:
@@ -270,19 +270,19 @@ def test_clips_over_a_limit_are_refused(limits: ClipLimits, problem: str) -> Non
         open_clip(SBS_H264, limits=limits)
 
 
-@pytest.mark.parametrize("limits", [ClipLimits(frames=11), ClipLimits(decoded_bytes=HELD_BYTES - 1)])
+@pytest.mark.parametrize("limits", [ClipLimits(frames=11), ClipLimits(clip_bytes=HELD_BYTES - 1)])
 def test_limits_hold_while_decoding_where_the_header_says_nothing(limits: ClipLimits) -> None:
     with pytest.raises(LimitError):
         open_clip(DATA / "stereo_sbs_live.webm", limits=limits)
 
 
 def test_a_clip_that_just_fits_is_accepted(studio) -> None:
-    limits = ClipLimits(decoded_bytes=HELD_BYTES)
+    limits = ClipLimits(clip_bytes=HELD_BYTES)
     assert stereo(SBS_H264, limits=limits).frame_count == 12
     left, right = (studio.video(name, eye) for name, eye in zip(("a.webm", "b.webm"), studio.eyes(12), strict=True))
     assert stereo(left, right=right, limits=limits).frame_count == 12
     with pytest.raises(LimitError, match="96x80 pixels"):
-        open_clip(left, right, limits=ClipLimits(decoded_bytes=HELD_BYTES - 1))
+        open_clip(left, right, limits=ClipLimits(clip_bytes=HELD_BYTES - 1))
 
 
 def test_layouts_that_do_not_fit_a_video_are_refused() -> None:

@@ -52,7 +52,8 @@ def _open(files: ClipFiles) -> DepthClip:
     tree, convention = files.tree_for("endonerf"), files.pose_convention
     _check_files(tree)
     images = open_images(tree, tree.images("images"))
-    tree.limits.check_clip(tree.field, tree.label, images.frame_count, images.width, images.height, eyes=1)
+    size = images.frame_count, images.width, images.height
+    tree.limits.check_clip(tree.field, tree.label, *size, eyes=1, has_depth=True)
     header_bytes, frame_bytes = MAX_POSES_BYTES
     poses = parse_poses(
         tree.read(POSES_FILE, header_bytes + frame_bytes * images.frame_count), images.frame_count, convention
