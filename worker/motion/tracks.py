@@ -27,6 +27,7 @@ from worker.machine.cores import cores
 from worker.machine.mapped import let_go, mapped_zeros
 from worker.machine.opencv import one_opencv_thread
 from worker.motion.complete import complete_depth
+from worker.motion.least_squares import fit_series
 
 Floats = NDArray[np.float32]
 Moved = Callable[[int, NDArray[np.intp]], Floats]
@@ -42,8 +43,6 @@ SMOOTH_PX = 4.0
 """Standard deviation of the Gaussian mean of displacements, in px of the coarse grid: depth is noisy."""
 COLOUR_SMOOTH_PX = 2.0
 """The same for changes of colour: light varies over smaller patches than motion does."""
-STEADINESS = 0.02
-"""Weight of the differences between neighbouring bases; a fully trusted frame has 1. It carries motion across gaps."""
 SURROUNDINGS = 0.1
 """Weight of the wider surroundings' mean in an average; full trust has 1."""
 LOST, LOST_SMOOTH_PX = 0.1, 1.0
@@ -51,13 +50,11 @@ LOST, LOST_SMOOTH_PX = 0.1, 1.0
 MIN_DEPTH_MM = 1e-3
 GUESSED = 0.02
 """Minimum confidence of a track when a motion starts from it: the surroundings' displacement is better than none."""
-RIDGE = 1e-3
-"""Weight of the squared basis weights: it keeps the system solvable."""
 CHAINS = 2
 """Parts of the clip that are tracked in parallel. It does not depend on the number of cores, because each flow starts
 from the one before."""
-POINTS_AT_ONCE = 4096
-"""Points that are fitted together; it limits the memory of their normal equations."""
+POINTS_AT_ONCE, FRAMES_AT_ONCE = 4096, 128
+"""Points that are fitted together in a clip of so many frames; in a longer one fewer, for their tracks take memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,33 +347,21 @@ def fit_tracks(
     rows, columns = (place // share_px * share_px for place in np.divmod(pixels, width))
     shared, member = np.unique(rows * width + columns, return_inverse=True)
     row, column = tracks.cells(*np.divmod(shared, width))
-    displacement_mm, colour, trusted = tracks.at(row * tracks.confidence.shape[2] + column)
+    cells = row * tracks.confidence.shape[2] + column
     weights = np.zeros((len(shared), basis.shape[1], 6), np.float32)
     support = np.zeros(len(shared), np.float32)
 
     trust = tracks.confidence.mean((1, 2))
     least = guessed * trust / max(float(trust.max()), 1e-9)
+    at_once = max(1, POINTS_AT_ONCE * FRAMES_AT_ONCE // max(len(basis), FRAMES_AT_ONCE))
 
     def fit(first: int) -> None:
-        some = slice(first, first + POINTS_AT_ONCE)
-        confidence, changes = trusted[:, some], np.concatenate([displacement_mm[:, some], colour[:, some]], axis=-1)
+        some = slice(first, first + at_once)
+        displacement_mm, colour, confidence = tracks.at(cells[some])
+        changes = np.concatenate([displacement_mm, colour], axis=-1)
         weights[some] = fit_series(changes, np.maximum(confidence, least[:, None]), basis)
         support[some] = confidence.mean(0)
 
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(fit, range(0, len(shared), POINTS_AT_ONCE)))
+        list(pool.map(fit, range(0, len(shared), at_once)))
     return weights[member], support[member]
-
-
-def fit_series(
-    series: NDArray[np.floating], confidence: NDArray[np.floating], basis: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """The least squares of fit_tracks: series [K, N, C], confidence [K, N], basis [K, B] -> weights [N, B, C]."""
-    bases, (_, points, channels) = basis.shape[1], series.shape
-    difference = np.diff(np.eye(bases), axis=0)
-    prior = STEADINESS * difference.T @ difference + RIDGE * np.eye(bases)
-    outer = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    normal = (confidence.T @ outer).reshape(points, bases, bases) + prior
-    trusted = (series * confidence[..., None]).reshape(len(basis), -1)
-    right = (basis.T @ trusted).reshape(bases, points, channels).transpose(1, 0, 2)
-    return np.asarray(np.linalg.solve(normal, right), np.float64)

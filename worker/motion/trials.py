@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from worker.input.camera import to_camera, unproject
 from worker.input.clip import DepthClip
-from worker.motion.tracks import Tracks, cell_means, fit_series
+from worker.motion.least_squares import fit_series
+from worker.motion.tracks import Tracks, cell_means
 
 Reals = NDArray[np.float64]
 BasisValues = Callable[[int, Sequence[float], Sequence[float]], Reals]
