@@ -52,6 +52,12 @@ def copy_baselines(
         """Of all frames between the neighbours of this one, which share their flow."""
         pair = between[first]
         frames = [index for index in held_out if between[index] == pair]
+        found = score_between(pair, frames)
+        for index in (*pair, *frames):
+            clip.let_go(index)
+        return found
+
+    def score_between(pair: tuple[int, int], frames: Sequence[int]) -> list[tuple[float, float]]:
         if pair[0] == pair[1]:
             alone = [psnr_tissue(clip.rgb[pair[0]], clip.rgb[index], clip.tissue[index]) for index in frames]
             return list(zip(alone, alone, strict=True))

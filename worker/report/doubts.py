@@ -72,7 +72,7 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
                 NoticeCode.FEW_FRAMES, f"Only {len(train)} frames were trained on; motion between them is guessed."
             )
         )
-    tissue_share = float(np.mean([clip.tissue[index].mean() for index in train]))
+    tissue_share = float(np.mean([clip.tissue[index].mean() for index in clip.one_by_one(train)]))
     if tissue_share < MIN_TISSUE_SHARE:
         found.append(
             Notice.warning(
@@ -81,7 +81,7 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
                 "set mask_polarity.",
             )
         )
-    if all(clip.tissue[index].all() for index in train):
+    if all(clip.tissue[index].all() for index in clip.one_by_one(train)):
         found.append(
             Notice.warning(
                 NoticeCode.NO_INSTRUMENT_MASKED,
@@ -110,11 +110,11 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
 
 def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
     """Doubts about the pictures of some training frames: veiled, out of focus, smeared, of changing colour."""
-    seen = [index for index in sampled if clip.tissue[index].any()]
+    seen = [index for index in clip.one_by_one(sampled) if clip.tissue[index].any()]
     if not seen:
         return []
     found = []
-    dark = [_darkest(clip, index) for index in seen]
+    dark = [_darkest(clip, index) for index in clip.one_by_one(seen)]
     if sum(each > MAX_DARK_LEVEL for each in dark) >= min(MIN_DOUBTFUL_FRAMES, len(seen)):
         found.append(
             Notice.warning(
@@ -143,7 +143,7 @@ def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
             )
         )
     hidden = np.zeros(clip.tissue.shape[1:], np.bool_)
-    for index in train[1:]:
+    for index in clip.one_by_one(train[1:]):
         hidden |= clip.tissue[index]
     share = float((hidden & ~clip.tissue[train[0]]).mean()) if train else 0.0
     if share > MAX_HIDDEN_SHARE:
@@ -154,7 +154,7 @@ def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
                 "starts from those.",
             )
         )
-    flickering = _flickering(np.array([1 - clip.tissue[index].mean() for index in train]))
+    flickering = _flickering(np.array([1 - clip.tissue[index].mean() for index in clip.one_by_one(train)]))
     if flickering:
         found.append(
             Notice.warning(
@@ -167,7 +167,7 @@ def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
 
 
 def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
-    measured = [_fine_detail(clip, index) for index in frames]
+    measured = [_fine_detail(clip, index) for index in clip.one_by_one(frames)]
     detail = np.array([each for each in measured if each is not None])
     if not detail.size:
         return []
@@ -191,7 +191,7 @@ def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
 
 def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
     """Blood that comes in, or else a white balance that drifts."""
-    flooded = float(np.ptp([_blood_share(clip, index) for index in frames]))
+    flooded = float(np.ptp([_blood_share(clip, index) for index in clip.one_by_one(frames)]))
     if flooded > MAX_FLOODED_SHARE:
         return [
             Notice.warning(
@@ -200,7 +200,7 @@ def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
                 "not seen, and it has no texture to follow.",
             )
         ]
-    ratios = np.array([_colour_ratios(clip, index) for index in frames])
+    ratios = np.array([_colour_ratios(clip, index) for index in clip.one_by_one(frames)])
     drift = np.ptp(ratios, axis=0) / np.maximum(ratios.mean(axis=0), 1e-6)
     if drift.max() <= MAX_COLOUR_DRIFT:
         return []
@@ -220,12 +220,13 @@ def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     wanted = set(train)
     first = [index for index in train if index + 1 in wanted]
     jumps, total = 0, 0
-    for index in first[:: -(-len(first) // MAX_PAIRS) or 1]:
+    for index in clip.one_by_one(first[:: -(-len(first) // MAX_PAIRS) or 1]):
         pair = slice(index, index + 2)
         sure = (clip.tissue[pair] & (clip.depth_confidence[pair] >= SURE)).all(axis=0)
         before, after = clip.depth_mm[index][sure], clip.depth_mm[index + 1][sure]
         jumps += int((np.abs(after - before) > DEPTH_JUMP * before).sum())
         total += before.size
+        clip.let_go(index + 1)
     if jumps <= MAX_JUMPING_SHARE * total:
         return []
     return [
@@ -246,7 +247,7 @@ def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     runs = [index for index in train if {index - 1, index + 1} <= wanted]
     if (pose == pose[:1]).all():  # the camera stands still
         return []
-    depths = [clip.depth_mm[index][clip.tissue[index] & (clip.depth_mm[index] > 0)] for index in runs]
+    depths = (clip.depth_mm[index][clip.tissue[index] & (clip.depth_mm[index] > 0)] for index in clip.one_by_one(runs))
     known = [float(np.median(each)) for each in depths if each.size]
     if len(runs) < MIN_DOUBTFUL_FRAMES or not known:
         return []
@@ -275,7 +276,8 @@ def _pixels(clip: DepthClip, index: int) -> NDArray[np.uint8]:
 
 
 def _brightness_warnings(clip: DepthClip, sampled: Iterable[int]) -> list[Notice]:
-    medians = [float(np.median(clip.rgb[index][clip.tissue[index]])) for index in sampled if clip.tissue[index].any()]
+    shown = (clip.rgb[index][clip.tissue[index]] for index in clip.one_by_one(sampled))
+    medians = [float(np.median(pixels)) for pixels in shown if pixels.size]
     mean = float(np.mean(medians)) if medians else 0.0
     if mean == 0 or (max(medians) - min(medians)) / mean <= MAX_BRIGHTNESS_DRIFT:
         return []
@@ -291,7 +293,7 @@ def _brightness_warnings(clip: DepthClip, sampled: Iterable[int]) -> list[Notice
 def _share_of_tissue(clip: DepthClip, frames: Iterable[int], holds: Callable[[int], NDArray[np.bool_]]) -> float:
     """Share of all tissue pixels of these frames at which something holds; NaN without tissue."""
     kept, total = 0, 0
-    for index in frames:
+    for index in clip.one_by_one(frames):
         kept += int((clip.tissue[index] & holds(index)).sum())
         total += int(clip.tissue[index].sum())
     return kept / total if total else math.nan

@@ -118,7 +118,9 @@ def measure(
         tissue_db, covered = psnr_tissue(shown.rgb, truth, tissue), coverage(shown.alpha, tissue)
         figures = (tissue_db, clear_db, paper_db, similarity, covered)
         depth_mm = clip.depth_mm[index]
-        return figures, depth_errors_mm(shown.depth_mm, depth_mm, tissue), depth_mm[tissue & (depth_mm > 0)]
+        found = figures, depth_errors_mm(shown.depth_mm, depth_mm, tissue), depth_mm[tissue & (depth_mm > 0)]
+        clip.let_go(index)
+        return found
 
     found = list(mapping(score, frames))
     figures, errors_mm, depths_mm = zip(*found, strict=True) if found else ((), (), ())

@@ -57,7 +57,10 @@ def measure_right(clip: DepthClip, frames: Sequence[int], render: FrameRenderer,
         if not np.isfinite(shown).all():
             raise TrainingDiverged(f"Frame {index} renders as NaN or infinity from the right eye: training diverged.")
         truth, judged = right.rgb[index], judged_pixels(right, index)
-        return [figure for image in (shown, warped_left(clip, index)) for figure in _scores(image, truth, judged)]
+        found = [figure for image in (shown, warped_left(clip, index)) for figure in _scores(image, truth, judged)]
+        for eye in clip.eyes:
+            eye.let_go(index)
+        return found
 
     rows = list(mapping(score, frames))
     model, clear, warp, warp_clear = zip(*rows, strict=True) if rows else ((), (), (), ())

@@ -79,6 +79,7 @@ def held_out_score(run: Run, model: Model | None = None) -> HeldOutScore:
         run.setup.hooks.on_held_out(index, frame)
         if clip.tissue[index].any():  # else it has no score
             scores.append(psnr_tissue(frame.rgb, clip.rgb[index], clip.tissue[index]))
+        clip.let_go(index)
     right = _right_scores(run, frames, model)
     return HeldOutScore(*(float(np.mean(each)) if each else math.nan for each in (scores, right)))
 
@@ -89,7 +90,7 @@ def _right_scores(run: Run, frames: Sequence[int], model: Model | None) -> list[
     if right is None:
         return []
     render = frame_renderer(run, model, right)
-    judged = ((index, judged_pixels(right, index)) for index in frames)
+    judged = ((index, judged_pixels(right, index)) for index in right.one_by_one(frames))
     return [psnr_tissue(render(index).rgb, right.rgb[index], pixels) for index, pixels in judged if pixels.any()]
 
 
