@@ -21,7 +21,7 @@ from worker.machine.cores import cores
 from worker.motion.tracks import Tracks, resting
 from worker.motion.trials import BasisValues, FitError, Trial
 
-BASES = (3, 5, 9, 13, 17, 25, 33)
+BASES = (3, 5, 9, 13, 17, 25, 33, 49, 65, 97, 129, 161)
 """Numbers of bases to choose from, besides REST."""
 REST = 1
 """One basis is a constant: the scene neither moves nor changes its light."""
@@ -29,6 +29,8 @@ FRAMES_A_BASIS = 3
 """Training frames per basis where too few tracks can be trusted to try numbers of bases."""
 MIN_FRAMES_A_BASIS = 2
 """Each basis has more training frames than this. With fewer, training frames gain what held-out frames lose."""
+USUAL_BASES, LONG_FRAMES_A_BASIS = 33, 5
+"""More than USUAL_BASES have so many training frames each: a model's memory grows with its bases."""
 MAX_MOTION_LEFT = 0.5
 """No number of bases follows the motion if the best leaves more than this share of what the smallest number leaves."""
 MIN_GAIN_DB = 0.25
@@ -112,7 +114,8 @@ def choose_bases(trials: Trials, floor: float, frames: int, max_bases: int | Non
     """
     errors = trials.tracked
     if not errors:
-        bases = min(frames, max_bases or BASES[-1], max(BASES[0], -(-frames // FRAMES_A_BASIS)))
+        most = max_bases or min(BASES[-1], max(USUAL_BASES, _most_bases(frames)))
+        bases = min(frames, most, max(BASES[0], -(-frames // FRAMES_A_BASIS)))
         reason = f"one for {frames / bases:.2g} training frames, for too little could be followed to tell more"
         return Choice(bases, reason)
     smallest, limit = min(errors), _bases_limit(frames, max_bases)
@@ -135,9 +138,14 @@ def _bases_limit(frames: int, max_bases: int | None) -> Choice:
     limits = [
         Choice(BASES[-1], "the most there are to choose from"),
         Choice(max_bases or BASES[-1], "the most that the preset allows"),
-        Choice((frames - 1) // MIN_FRAMES_A_BASIS, f"the most that {frames} training frames bear"),
+        Choice(_most_bases(frames), f"the most that {frames} training frames bear"),
     ]
     return min(limits, key=lambda each: each.count)
+
+
+def _most_bases(frames: int) -> int:
+    """The largest number of bases that so many training frames bear."""
+    return min((frames - 1) // MIN_FRAMES_A_BASIS, max(USUAL_BASES, frames // LONG_FRAMES_A_BASIS))
 
 
 # points -------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
@@ -70,16 +70,27 @@ def write_stereo_video(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore
 
 def write_stereomis(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:
     """StereoMIS layout: NNNNNNl.png, NNNNNNr.png, StereoCalibration.ini, masks/NNNNNNl.png (tissue = 255); truth/."""
-    (path / "masks").mkdir(parents=True, exist_ok=True)
     for index in range(phantom.settings.frames):
+        write_stereomis_frames(phantom, path, [index], _write_frame_truth)
+        on_frame(index + 1, phantom.settings.frames)
+    _write_clip_truth(phantom, path)
+
+
+def write_stereomis_frames(
+    phantom: Phantom,
+    path: Path,
+    frames: Iterable[int],
+    also: Callable[[Path, int, PhantomFrame], None] = lambda path, index, frame: None,
+) -> None:
+    """Some frames of write_stereomis, and the calibration, but no truth; also(path, index, frame) adds to each."""
+    (path / "masks").mkdir(parents=True, exist_ok=True)
+    (path / "StereoCalibration.ini").write_text(_stereomis_calibration(phantom))
+    for index in frames:
         frame = phantom.frame(index)
         _save(path / f"{index:06d}l.png", frame.left)
         _save(path / f"{index:06d}r.png", frame.right)
         _save(path / "masks" / f"{index:06d}l.png", _white(frame.tissue))
-        _write_frame_truth(path, index, frame)
-        on_frame(index + 1, phantom.settings.frames)
-    (path / "StereoCalibration.ini").write_text(_stereomis_calibration(phantom))
-    _write_clip_truth(phantom, path)
+        also(path, index, frame)
 
 
 def write_endonerf(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:

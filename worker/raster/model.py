@@ -26,6 +26,8 @@ from worker.model.optimize import StepRates
 from worker.raster.step import StepSums, TrainingFrame
 
 Floats = NDArray[np.float32]
+FIRST_MOMENTS = "motion.first"
+"""In Model.arrays()."""
 
 
 class Model(Protocol):
@@ -130,6 +132,14 @@ class Model(Protocol):
         as_it_lies: the deformation's tensors need not be contiguous, which saves time to whoever makes a model of them.
         """
         ...
+
+
+def state_of(model: Model, beta1: float) -> dict[str, Tensor]:
+    """arrays() without a motion's first moments where no step asks for them: with beta1 = 0 each is the last gradient.
+
+    They take much of the model's memory on a CPU as soon as they are touched.
+    """
+    return {name: values for name, values in model.arrays().items() if beta1 or name != FIRST_MOMENTS}
 
 
 def put_back(arrays: Mapping[str, Tensor], stored: Mapping[str, Tensor]) -> None:

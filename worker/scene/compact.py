@@ -1,6 +1,6 @@
 """The compact form of a scene: a table of whole numbers, which the range coder packs, and back to Gaussians.
 
-Symbols: N Gaussians, C channels (10, 13 with colour, 14 with gloss), B bases, R = B - 1 patterns of motion per channel,
+Symbols: N Gaussians, C channels (10, 13 with colour, 14 with gloss), B bases, R < B patterns of motion per channel,
 K columns.
 
 A decoder undoes four steps (worker/scene/quantize.py does them): motion is coefficients of patterns, numbers are
@@ -44,13 +44,17 @@ GROUP_OF = np.array([0] * 3 + [1] * 7 + [2] * 5)
 """Which power belongs to each number of the state: of place, shape or colour."""
 PLAIN = 3
 """Group of the last columns, the powers and seen, whose steps are 1."""
+PLAIN_COLUMNS = 4
 MIN_POWER = -3
 """The least power of two, MAX_POWER being the largest, by which a Gaussian's precision may differ from the mean. What
 the trained frames hardly show may be seen from elsewhere, so it keeps an eighth."""
 SEEN_LEVELS = 63
 MAX_NUMBERS = 2**27
 """Numbers a scene may have, four times those of 80 thousand Gaussians and 33 bases. Unpacking takes up to 14 bytes
-a number (where there is one basis; 10 where there are many), so no file, however small, takes more than 2 GiB."""
+a number (where there is one basis; 10 where there are many), so no file, however small, takes more than 2 GiB, and
+what its motion's weights take."""
+MAX_WEIGHTS = 2**28
+"""Weights of a scene's motion: 1 GiB. A long clip's bases are more than its patterns."""
 OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 """Orthonormal: brightness, red - blue, magenta - green."""
 
@@ -193,13 +197,17 @@ def unpack(tensors: Mapping[str, Tensor]) -> Compact:
     codes = [_checked(tensors, f"code.{part}", torch.uint8, 1).numpy().tobytes() for part in range(PARTS)]
     channels, patterns, bases = pattern.shape
     at_rest = len(state_rows(channels))
-    columns = at_rest + channels * patterns + 4
+    columns = at_rest + channels * patterns + PLAIN_COLUMNS
     if count.shape != (1,) or step.shape != (at_rest,) or shared.shape != (columns,):
         raise ValueError(f"count, step and shared do not fit {channels} channels of {patterns} patterns")
-    if patterns != bases - 1 or channels not in (CHANNELS, COLOUR_CHANNELS, ROWS):
+    if not patterns < bases == len(centre) == len(width) or channels not in (CHANNELS, COLOUR_CHANNELS, ROWS):
         raise ValueError(f"{patterns} patterns in {channels} channels do not fit {bases} bases")
     rows = int(count[0])
     check_size(rows, columns)
+    if rows * channels * bases > MAX_WEIGHTS:
+        raise ValueError(
+            f"{rows} Gaussians of {channels} channels of {bases} bases are more than {MAX_WEIGHTS} weights"
+        )
     table: NDArray[np.int32] = np.empty((rows, columns), np.int32)
     table[coding_order(rows)] = decode(codes, rows, columns)
     _undo_differences(table, shared.numpy().astype(bool), pattern.shape)
@@ -259,7 +267,7 @@ def _group(shape: Sequence[int]) -> Whole:
     """[K] which power belongs to each column of the table; shape [C, R, B]."""
     channels, patterns, _ = shape
     at_rest = GROUP_OF[state_rows(channels)]
-    return np.concatenate([at_rest, np.repeat(GROUP_OF[:channels], patterns), np.full(4, PLAIN)])
+    return np.concatenate([at_rest, np.repeat(GROUP_OF[:channels], patterns), np.full(PLAIN_COLUMNS, PLAIN)])
 
 
 def _powers(table: NDArray[np.int32]) -> Whole:

@@ -1,6 +1,6 @@
 """Turn a scene into whole numbers: each as coarse as the picture allows.
 
-Symbols: N Gaussians, C channels (10, 13 with colour, 14 with gloss), B bases, R = B - 1 patterns of motion per channel.
+Symbols: N Gaussians, C channels (10, 13 with colour, 14 with gloss), B bases, R < B patterns of motion per channel.
 
 `effect` decides what is lost: the mean squared change of the picture that a change of 1 in a number makes.
 
@@ -30,8 +30,10 @@ from worker.model.gaussians import Gaussians
 from worker.model.layout import COLOUR, COLOUR_ROW, GLOSS, LOG_SCALE, MEAN, QUATERNION, QUATERNION_ROW
 from worker.scene.compact import (
     GROUP_OF,
+    MAX_NUMBERS,
     MIN_POWER,
     OPPONENT,
+    PLAIN_COLUMNS,
     SEEN_LEVELS,
     Compact,
     Numbers,
@@ -55,6 +57,9 @@ MIN_EFFECT = 1e-3
 RIDGE = 0.01
 """Added to the bases' strength, as a share of its mean: motion that no trained time shows keeps a tenth of the
 precision."""
+MIN_SHOWN = 2e-5
+"""RMS change of the picture, 1 being from black to white, below which a pattern is left out: all its numbers round to 0
+at any step that a scene is stored with."""
 CURVE_BITS = 16
 
 
@@ -63,8 +68,8 @@ class Prepared:
     """A scene in its new coordinates and order, ready for rounding at any step.
 
     state    [N, S]      means over the trained times; S as in compact.py
-    motion   [C, N, R]   coefficients of the patterns, float32
-    pattern  [C, R, B]   weights of each pattern
+    motion   C of [N, r] coefficients of the channel's r <= R patterns, float32
+    pattern  [C, R, B]   weights of each pattern; 0 of those that a channel has not
     power    [N, 3]      precision of place, shape and colour, as powers of two
     effect   [S]         RMS change of the picture when all Gaussians are off by 2**-power
     seen     [N]         in [0, 1]
@@ -72,7 +77,7 @@ class Prepared:
     """
 
     state: Reals
-    motion: NDArray[np.float32]
+    motion: Sequence[Floats]
     pattern: Reals
     power: Whole
     effect: Reals
@@ -110,7 +115,8 @@ def prepare(
     state, effect, scale = state[:, rows], effect[rows], np.exp2(power)[:, GROUP_OF[rows]]
     root = np.maximum(np.sqrt(effect.sum(1) / (scale**2).sum(0)), MIN_EFFECT)
     weights = _channels(weight, order, mean, length.astype(np.float32))
-    motion, pattern = _patterns(weights, channels, values, scale)
+    most = (MAX_NUMBERS // len(state) - len(rows) - PLAIN_COLUMNS) // channels
+    motion, pattern = _patterns(weights, root[:channels], values, scale, max(most, 1))
     share = np.clip(seen.double().numpy(), 0, 1)[order]
     basis = deformation.select(torch.zeros(0, dtype=torch.int64))
     return Prepared(state, motion, pattern, power, root, share, basis)
@@ -133,18 +139,22 @@ class Rounding(Numbers):
 
     def coefficients(self, first: int, last: int) -> NDArray[np.int32]:
         units = self.per_unit[:, first:last].astype(np.float32)
-        return np.concatenate(
-            [_whole(self.prepared.motion[c] * units[:, c - first, None]) for c in range(first, last)], axis=1
-        )
+        patterns = self.pattern.shape[1]
+        found: NDArray[np.int32] = np.zeros((len(units), (last - first) * patterns), np.int32)
+        for place, motion in enumerate(self.prepared.motion[first:last]):
+            start = place * patterns
+            found[:, start : start + motion.shape[1]] = _whole(motion * units[:, place, None])
+        return found
 
     def powers(self) -> Whole:
         return self.prepared.power
 
     def compact(self) -> Compact:
         """The same in one table."""
-        channels, count, patterns = self.prepared.motion.shape
+        channels, patterns, _ = self.pattern.shape
         first = len(self.step)
-        table: NDArray[np.int32] = np.empty((count, first + channels * patterns + 4), np.int32)
+        columns = first + channels * patterns + PLAIN_COLUMNS
+        table: NDArray[np.int32] = np.empty((len(self.prepared.power), columns), np.int32)
         table[:, :first] = self.at_rest()
         for channel in range(channels):
             table[:, first : first + patterns] = self.coefficients(channel, channel + 1)
@@ -167,9 +177,9 @@ def rounding(prepared: Prepared, step: float) -> Rounding:
     Raises:
         ValueError: there would be more than MAX_NUMBERS.
     """
-    channels, count, patterns = prepared.motion.shape
+    channels, patterns, _ = prepared.pattern.shape
     rows = state_rows(channels)
-    check_size(count, len(rows) + channels * patterns + 4)
+    check_size(len(prepared.power), len(rows) + channels * patterns + PLAIN_COLUMNS)
     steps = step / prepared.effect
     steps[QUATERNION] = np.minimum(steps[QUATERNION], MAX_ROTATION_STEP)
     pattern = np.ascontiguousarray(prepared.pattern * steps[:channels, None, None], np.float32)
@@ -228,25 +238,32 @@ def _channels(weight: Floats, order: Whole, mean: Floats, length: Floats) -> Ite
         yield from some.transpose(1, 0, 2)
 
 
-def _patterns(weights: Iterable[Floats], channels: int, values: Reals, scale: Reals) -> tuple[Floats, Reals]:
-    """Coefficients [C, N, R] and patterns [C, R, B] of the C channels' weights [N, B], whose mean over the times is 0.
+def _patterns(
+    weights: Iterable[Floats], effect: Reals, values: Reals, scale: Reals, most: int
+) -> tuple[list[Floats], Reals]:
+    """Coefficients, C of [N, r], and patterns [C, R, B] of C channels' weights [N, B], whose mean over the times is 0.
 
-    values [T, B] of the bases at the trained times; scale [N, C or more], precision of each Gaussian's channel.
+    A channel has the strongest patterns: those that show, and at most so many. effect [C] as in Prepared; values [T, B]
+    of the bases at the trained times; scale [N, C or more], precision of each Gaussian's channel.
     """
     bases = values.shape[1]
     strength = values.T @ values / len(values)
     strength += RIDGE * np.trace(strength) / bases * np.eye(bases)
     root = np.linalg.cholesky(strength)  # in these coordinates equal errors weigh the same over the trained times
-    coefficients = np.empty((channels, len(scale), bases - 1), np.float32)
-    patterns = np.empty((channels, bases - 1, bases))
+    coefficients, patterns = [], []
     for channel, weight in enumerate(weights):
         seen = weight @ root.astype(np.float32)
         scaled = seen * scale[:, channel, None].astype(np.float32)
-        _, components = np.linalg.eigh((scaled.T @ scaled).astype(np.float64))
+        energy, components = np.linalg.eigh((scaled.T @ scaled).astype(np.float64))
+        shown = effect[channel] * np.sqrt(np.maximum(energy[:0:-1], 0) / len(scale))  # of a pattern, in all Gaussians
         kept = components[:, :0:-1]  # the weakest is 0, because the mean over time is taken out
-        coefficients[channel] = seen @ kept.astype(np.float32)
-        patterns[channel] = np.linalg.solve(root.T, kept).T
-    return coefficients, patterns
+        kept = kept[:, : min(int((shown >= MIN_SHOWN).sum()), most)]
+        coefficients.append(seen @ kept.astype(np.float32))
+        patterns.append(np.linalg.solve(root.T, kept).T)
+    stored = np.zeros((len(patterns), max(len(each) for each in patterns), bases))
+    for found, rows in zip(patterns, stored, strict=True):
+        rows[: len(found)] = found
+    return coefficients, stored
 
 
 def _along_curve(mean: Reals) -> Whole:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from worker.model.optimize import rates_at
-from worker.raster.model import Model
+from worker.raster.model import Model, state_of
 from worker.raster.step import image_size
 from worker.train.loop import check_sums, step
 from worker.train.run import Run
@@ -24,12 +24,12 @@ GROWTH_ALLOWANCE = 1.15
 
 
 @contextmanager
-def taken_back(model: Model) -> Iterator[None]:
-    """Steps of a model that has made none yet: afterwards it is as it was."""
+def taken_back(model: Model, beta1: float) -> Iterator[None]:
+    """Steps of a model that has made none yet, with such a beta1: afterwards it is as it was."""
     stored = {name: values.clone() for name, values in model.parameters().items()}
 
     def restore() -> None:
-        for name, values in model.arrays().items():  # moments and their counts are 0 before the first step
+        for name, values in state_of(model, beta1).items():  # moments and their counts are 0 before the first step
             values.copy_(stored[name]) if name in stored else values.zero_()
 
     restore()  # touches the moments' memory once: the first touch of a page costs as much as a step
@@ -57,7 +57,7 @@ def warm_up(run: Run, on_progress: Callable[[float], None]) -> float:
         lambda: model.render(frame.camera, frame.t, np.zeros(model.count, np.float32)),
         lambda: model.image_gradient(frame.camera, frame.t, nothing),
     ]
-    with taken_back(model):
+    with taken_back(model, preset.rates.beta1):
         for done, part in enumerate(parts, start=1):
             part()
             on_progress(done / len(parts))
@@ -72,7 +72,7 @@ def iterations_within(run: Run, budget_s: float, elapsed_s: float) -> int:
     start = time.perf_counter()
     model, steps_an_answer = run.model, run.model.answers_every
     trial = replace(run, schedule=Schedule((UNTIMED_STEPS + TIMED_STEPS) * steps_an_answer))
-    with taken_back(model):
+    with taken_back(model, run.preset.rates.beta1):
         ends = [time.perf_counter()]
         for iteration in range(1, trial.iterations + 1):
             step(trial, iteration)

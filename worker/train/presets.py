@@ -17,6 +17,7 @@ from worker.model.deformation import GaussianFdm, HexPlane, PolynomialFourier, Q
 from worker.model.gaussians import MAX_SH_DEGREE
 from worker.model.loss import LossSettings
 from worker.model.optimize import Rate, Rates
+from worker.motion.capacity import USUAL_BASES
 from worker.train.densify import DensifySettings
 
 
@@ -93,6 +94,12 @@ class Preset:
             if value is not None and not minimum <= value <= maximum:
                 trainable = f"{minimum:g} or more" if maximum == math.inf else f"{minimum:g} to {maximum:g}"
                 raise ValueError(f"{name} is {value}, and {trainable} can be trained with")
+
+    def with_bases(self, bases: int) -> Preset:
+        """With so many bases; where they are many, without first moments, which gain next to nothing and take a third
+        of the model's memory (docs/decisions/042)."""
+        many = self.bases is None and bases > USUAL_BASES
+        return replace(self, bases=bases, rates=replace(self.rates, beta1=0.0) if many else self.rates)
 
 
 MAX_FRAMES_A_STEP = 16

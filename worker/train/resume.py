@@ -17,6 +17,7 @@ from torch import Tensor
 
 from contract.wire.errors import ResumeMismatch, SceneError
 from contract.wire.notices import Notice
+from worker.raster.model import state_of
 from worker.scene.resume_file import RESUME_FILE, begin_resume, load_resume
 from worker.train.prepare import begun, examine_device, frames_of
 from worker.train.presets import Preset
@@ -75,7 +76,8 @@ def save_run(directory: Path, run: Run, t_train_s: float) -> None:
 def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None]:
     """As save_run, in two parts, as begin_resume does it: when this returns the run may go on."""
     trains = 0 < run.iteration < run.iterations
-    arrays = run.model.arrays() if trains else run.model.parameters()  # before and after, nobody asks for moments
+    beta1 = run.preset.rates.beta1
+    arrays = state_of(run.model, beta1) if trains else run.model.parameters()  # else nobody asks for moments
     arrays |= {**run.average.arrays(), **(run.densifier.arrays() if run.densifier else {})}
     state = {
         "identity": _identity(run.setup, run.preset, run.eyes),
@@ -116,7 +118,7 @@ def load_run(directory: Path, run: Run) -> float:
 def _settled(preset: Preset, start: Mapping[str, Any]) -> Preset:
     """The preset with what the scene settled when the run began."""
     fusion = dataclasses.replace(preset.fusion, stride=start["stride"])
-    return dataclasses.replace(preset, bases=start["bases"], fusion=fusion)
+    return dataclasses.replace(preset.with_bases(start["bases"]), fusion=fusion)
 
 
 def _put(run: Run, tensors: dict[str, Tensor], state: Mapping[str, Any]) -> None:

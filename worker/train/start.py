@@ -75,7 +75,7 @@ def settled(
     if preset.bases is None:
         floor = floor_error(clip, train[0], fusion.stride)
         choice = choose_bases(trials, floor, len(train), preset.max_bases)
-        preset = dataclasses.replace(preset, bases=choice.count)
+        preset = preset.with_bases(choice.count)
         notices.append(
             Notice.info(
                 NoticeCode.BASES,

@@ -299,6 +299,24 @@ def test_a_fused_step_has_the_gradients_of_the_stages_one_by_one(kind: str, sh_d
             assert_close(stored["motion.first"][row, ..., :90], wanted[name].permute(1, 2, 0), name=name)
 
 
+def test_without_a_first_moment_a_step_follows_the_gradient_and_leaves_the_moment_alone() -> None:
+    gaussians, deformation, camera = moving_gaussians("shared with gloss", 0)
+    everywhere = random_frame(camera, np.zeros((camera.height, camera.width), bool))
+
+    def after(beta1: float) -> dict[str, Tensor]:
+        model = CpuModel(gaussians, deformation, camera.width, camera.height)
+        rates = dataclasses.replace(RATES, beta1=beta1)
+        for iteration, t in enumerate((0.4, 0.6, 0.45), start=1):
+            model.step([everywhere.seen_from(camera, t, model.rasterizer)], NORMALISED, rates, iteration)
+        return model.arrays()
+
+    without, nearly = after(0.0), after(1e-12)
+    assert not without["motion.first"].any()
+    assert nearly["motion.first"].any()
+    for name in ("motion.weight", "motion.second", "canonical"):
+        assert_close(without[name], nearly[name], relative=1e-5, name=name)
+
+
 @pytest.mark.parametrize("yaw_deg", [0, 4], ids=["one depth axis", "two depth axes"])
 @pytest.mark.parametrize(
     ("kind", "sh_degree"), [("shared with gloss", 0), ("shared with colour", 3), ("fdm-quartic", 0)]

@@ -240,6 +240,7 @@ def _change(name: str, value: Tensor | None) -> dict[str, Tensor]:
         ("step", torch.zeros(14), "a step or a quaternion is 0"),
         ("shared", torch.zeros(3, dtype=torch.uint8), "do not fit"),
         ("pattern", torch.zeros(13, 4, 6), "do not fit 6 bases"),
+        ("pattern", torch.zeros(13, 4, 4), "do not fit 4 bases"),
         ("pattern", torch.zeros(13, 4, 5, dtype=torch.float64), "another type"),
     ],
 )  # fmt: skip
@@ -268,7 +269,20 @@ def test_unpacking_takes_few_bytes_a_number(bases: int) -> None:
     back.model()
     peak = tracemalloc.get_traced_memory()[1] + 4 * VALUES * len(back.table)  # of numpy; and the Gaussians, of torch
     tracemalloc.stop()
-    assert peak < 14 * back.table.size + 2e6  # and the coder's models
+    weights = len(back.table) * back.pattern.shape[0] * bases
+    assert peak < 14 * back.table.size + 4 * weights + 2e6  # and the coder's models
+
+
+def test_patterns_that_do_not_show_are_left_out() -> None:
+    scene = colourful(200)
+    faint = scene.deformation.weight.clone()
+    faint[..., 1:] = faint[..., :1]  # every basis moves everything as the first one does: no motion is left
+    still = dataclasses.replace(scene, deformation=dataclasses.replace(scene.deformation, weight=faint))
+    assert rounded(scene).pattern.shape[1] == scene.deformation.bases - 1
+    assert rounded(still).pattern.shape[1] == 0
+    back = unpack(rounded(still).tensors()).model()[1]
+    assert back.weight.shape == faint.shape
+    assert not back.weight.any()
 
 
 def test_what_would_not_be_read_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -281,6 +295,13 @@ def test_no_file_unpacks_to_more_than_it_may(monkeypatch: pytest.MonkeyPatch) ->
     stored = rounded(colourful(50)).tensors()
     monkeypatch.setattr(compact, "MAX_NUMBERS", 50 * 60)
     with pytest.raises(ValueError, match="at most 3000 numbers"):
+        unpack(stored)
+
+
+def test_no_file_has_more_bases_than_memory_has_room_for() -> None:
+    bases = 10**6
+    stored = _change("pattern", torch.zeros(13, 4, bases)) | {"centre": torch.zeros(bases), "width": torch.ones(bases)}
+    with pytest.raises(ValueError, match="more than 268435456 weights"):
         unpack(stored)
 
 

@@ -91,6 +91,28 @@ def test_a_run_killed_at_any_time_goes_on_to_the_bits_of_an_unstopped_one(
         assert not {"decode", "stereo", "motion", "fusion", "start"} & set(again.seen)
 
 
+def test_a_long_clips_run_keeps_no_first_moments_and_goes_on_to_the_same_bits(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("worker.train.presets.USUAL_BASES", 1)  # what a long clip has more of
+    monkeypatch.setattr(keep, "PERIOD_S", 0.0)
+
+    def stop(progress: Progress) -> None:
+        if progress.stage == "train" and progress.iteration >= ITERATIONS // 2:
+            raise Cancelled("enough")
+
+    monkeypatch.setattr("worker.train.loop.REPORT_EVERY_S", 0.0)
+    asked = request_of(clip)
+    with pytest.raises(Cancelled):
+        make(asked, tmp_path / "again", Stages(stop).hooks, tmp_path / "kept")
+    stored = load_resume(tmp_path / "kept")[0]
+    assert "motion.second" in stored
+    assert "motion.first" not in stored
+    make(asked, tmp_path / "again", TrainingHooks(), tmp_path / "kept")
+    make(asked, tmp_path / "whole", TrainingHooks())
+    assert bits(tmp_path / "again") == bits(tmp_path / "whole")
+
+
 def test_what_is_kept_stays_until_its_owner_removes_it_and_an_own_folder_is_left_clean(
     clip: Path, tmp_path: Path
 ) -> None:

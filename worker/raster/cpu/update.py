@@ -33,6 +33,14 @@ def _adam(value, first, second, i, gradient, rate, eps, beta1, beta2):  # type: 
     store(value, i, load(value, i) - rate * m / (sqrt(v) + eps))
 
 
+@kernel(inline="always")
+def _scaled_step(value, second, i, gradient, rate, eps, beta2):  # type: ignore[no-untyped-def]
+    """_adam with beta1 = 0. The first moment would be the gradient: it is neither read nor written."""
+    v = fma(splat(beta2), load(second, i), splat(_ONE - beta2) * gradient * gradient)
+    store(second, i, v)
+    store(value, i, load(value, i) - rate * gradient / (sqrt(v) + eps))
+
+
 @kernel
 def adam(thread, threads, value, gradient, first, second, rate, eps, beta1, beta2):  # type: ignore[no-untyped-def]
     """Adam on flat arrays whose length is a multiple of LANES."""
@@ -61,7 +69,7 @@ def update_shared(  # type: ignore[no-untyped-def]
 ):
     """Adam on the weights of the bases in alive; v_state [F, ROWS, N], basis [F, B], rate and eps [B, C].
 
-    dL/dw_j = sum over the frames of dL/dpsi basis_j.
+    dL/dw_j = sum over the frames of dL/dpsi basis_j. Where beta1 is 0, the first moment stays as it is.
     """
     vectors = v_state.shape[2] // LANES
     for j in alive:
@@ -74,7 +82,10 @@ def update_shared(  # type: ignore[no-untyped-def]
                 gradient = value * load(v_state[0, c], i)
                 for frame in range(1, v_state.shape[0]):
                     gradient = fma(splat(basis[frame, j]), load(v_state[frame, c], i), gradient)
-                _adam(weight[j, c], first_moment[j, c], second_moment[j, c], i, gradient, step, floor, beta1, beta2)
+                if beta1 == _ZERO:
+                    _scaled_step(weight[j, c], second_moment[j, c], i, gradient, step, floor, beta2)
+                else:
+                    _adam(weight[j, c], first_moment[j, c], second_moment[j, c], i, gradient, step, floor, beta1, beta2)
 
 
 @kernel(inline="always")
