@@ -30,6 +30,7 @@
  *   holdout?: string,
  *   preset?: "instant"|"fast"|"quality"|"small"|"paper"|"paper-released"|"paper-wide"|"pfs"|"hexplane"|"without_mapf",
  *   eyes?: "left"|"both",
+ *   use_frames?: "new"|"all",
  *   min_depth_mm?: number,
  *   max_depth_mm?: number,
  *   iterations?: number | null,
@@ -71,7 +72,7 @@
  *   text: string,
  * }} Notice
  */
-/** @typedef {"baseline"|"calibration"|"decoding"|"depth_unit"|"frame_times"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"poses"|"rectification"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"few_frames"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"mask_gaps"|"no_instrument_masked"|"no_texture"|"out_of_focus"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
+/** @typedef {"baseline"|"calibration"|"decoding"|"depth_unit"|"frame_times"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"poses"|"rectification"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"few_frames"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"mask_gaps"|"no_instrument_masked"|"no_texture"|"nothing_new"|"out_of_focus"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
 /**
  * @typedef {{
  *   report_version?: number,
@@ -145,6 +146,7 @@ export const LIMITS = {
   holdout: {"default": "every8"},
   preset: {"default": "fast", "choices": ["instant", "fast", "quality", "small", "paper", "paper-released", "paper-wide", "pfs", "hexplane", "without_mapf"]},
   eyes: {"default": "both", "choices": ["left", "both"]},
+  use_frames: {"default": "new", "choices": ["new", "all"]},
   min_depth_mm: {"default": 10.0, "above": 0},
   max_depth_mm: {"default": 300.0, "above": 0},
   iterations: {"default": null, "min": 1, "max": 1000000},

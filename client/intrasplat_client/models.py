@@ -89,6 +89,7 @@ class NoticeCode(StrEnum):
     MASK_GAPS = "mask_gaps"
     NO_INSTRUMENT_MASKED = "no_instrument_masked"
     NO_TEXTURE = "no_texture"
+    NOTHING_NEW = "nothing_new"
     OUT_OF_FOCUS = "out_of_focus"
     POSE_JITTER = "pose_jitter"
     REPEATED_FRAMES = "repeated_frames"
@@ -169,6 +170,8 @@ class JobOptions(Model):
     """instant, fast, quality and small are ours; paper is the method as published"""
     eyes: str = "both"
     """the eyes of a stereo clip that our presets train on; with left, the right eye only judges"""
+    use_frames: str = "new"
+    """new leaves out frames of a long clip that show nothing new, such as repeats and pauses"""
     min_depth_mm: float = 10.0
     """nearest depth that stereo may find, in mm"""
     max_depth_mm: float = 300.0
@@ -290,7 +293,7 @@ class Report(Model):
     train_count: int
     held_out: tuple[int, ...]
     repeated: tuple[int, ...]
-    """frames in neither set, because they repeat a held-out one"""
+    """frames in neither set: they repeat a held-out one, or show nothing new since the one before"""
     frame_times_s: tuple[float, ...]
 
 
@@ -372,6 +375,8 @@ class GivenOptions(TypedDict, total=False):
     """instant, fast, quality and small are ours; paper is the method as published"""
     eyes: Literal["left", "both"]
     """the eyes of a stereo clip that our presets train on; with left, the right eye only judges"""
+    use_frames: Literal["new", "all"]
+    """new leaves out frames of a long clip that show nothing new, such as repeats and pauses"""
     min_depth_mm: Annotated[float, Field(gt=0)]
     """nearest depth that stereo may find, in mm"""
     max_depth_mm: Annotated[float, Field(gt=0)]

@@ -21,6 +21,7 @@ PoseConvention = Literal["opengl", "llff"]
 """Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
 
 Eyes = Literal["left", "both"]
+UsedFrames = Literal["new", "all"]
 """The eyes of a stereo clip that a model is trained on."""
 
 DeviceName = Literal["auto", "cpu", "cuda"]

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from pydantic_core.core_schema import ValidationInfo
 
 from contract.wire.errors import InputError
-from contract.wire.names import Eyes, Layout, MaskPolarity, PoseConvention, PresetName
+from contract.wire.names import Eyes, Layout, MaskPolarity, PoseConvention, PresetName, UsedFrames
 
 Priority = Literal["standard", "high"]
 """high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
@@ -58,6 +58,10 @@ class ReconstructionOptions(ClipOptions):
     eyes: Eyes = Field(
         default="both",
         description="the eyes of a stereo clip that our presets train on; with left, the right eye only judges",
+    )
+    use_frames: UsedFrames = Field(
+        default="new",
+        description="new leaves out frames of a long clip that show nothing new, such as repeats and pauses",
     )
     min_depth_mm: float = Field(default=MIN_DEPTH_MM, gt=0, description="nearest depth that stereo may find, in mm")
     max_depth_mm: float = Field(

@@ -134,7 +134,9 @@ class Report(BaseModel):
     frame_count: int = Field(gt=0)
     train_count: int = Field(ge=0)
     held_out: tuple[int, ...]
-    repeated: tuple[int, ...] = Field(description="frames in neither set, because they repeat a held-out one")
+    repeated: tuple[int, ...] = Field(
+        description="frames in neither set: they repeat a held-out one, or show nothing new since the one before"
+    )
     frame_times_s: tuple[float, ...]
 
     @field_validator("report_version")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import Cancelled, InputError
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM
+from worker.input.clip.sampling import nothing_new, told_of
 from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip
 from worker.machine.cores import cores
@@ -58,6 +59,7 @@ def estimate_depth(
     hooks: Hooks | None = None,
     *,
     measured_frames: Sequence[int] | None = None,
+    leave_out: bool = False,
     device: Literal["cpu", "cuda"] = "cpu",
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
 ) -> DepthClip:
@@ -65,7 +67,9 @@ def estimate_depth(
 
     What the eyes differ by and the disparity range are common to all frames. They are measured on measured_frames alone
     (None: on all); for the rest, a frame's depth depends on its own pair only. So frames outside measured_frames do not
-    change the depth of others. On "cuda" another matcher (worker/stereo/cuda, needs triton) matches many pairs at once.
+    change the depth of others. With leave_out, those of measured_frames that show nothing new
+    (worker/input/clip/sampling.py) get no depth. On "cuda" another matcher (worker/stereo/cuda, needs triton) matches
+    many pairs at once.
 
     `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| left after the correction),
     min_disparity_px and max_disparity_px (the range searched), depth_valid_share (of tissue pixels) and
@@ -84,24 +88,29 @@ def estimate_depth(
     aligned = spread(measured, ALIGNMENT_PAIRS)
     with one_opencv_thread(), _pool() as pool:
         rgb, right_rgb, matches = _receive(clip, aligned, pool, hooks)
+        left_out = nothing_new(rgb, measured, pool.map) if leave_out else ()
         if device == "cuda":
             hooks.on_progress(Progress(COMPILATION, 0.0))
         registration, plan, outside = _plan(clip, rgb, right_rgb, measured, matches, pool, device, depth_range_mm)
         work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan)
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
-        jobs = _match_on_device(work, pool, hooks) if device == "cuda" else _match_all(work, pool, first)
+        wanted = sorted(set(range(clip.frame_count)) - set(left_out))
+        jobs = (
+            _match_on_device(work, wanted, pool, hooks) if device == "cuda" else _match_all(work, wanted, pool, first)
+        )
         for done, (i, job) in enumerate(jobs, start=1):
             _check_stop(hooks)
             job.result()
             if i == first:
                 hooks.on_first_moment(work.matched.moment(i))
-            hooks.on_progress(Progress(STAGE, 1 - share * (clip.frame_count - done) / clip.frame_count))
+            hooks.on_progress(Progress(STAGE, 1 - share * (len(wanted) - done) / len(wanted)))
     pixels, valid, sure = (int(each) for each in work.counts.sum(axis=0))
     valid_share, sure_share = valid / max(pixels, 1), sure / max(pixels, 1)
     _check_depth(sure_share)
     return replace(
         work.matched,
-        assumptions=(*clip.assumptions, _scale_assumption(clip)),
+        left_out=left_out,
+        assumptions=(*clip.assumptions, _scale_assumption(clip), *told_of(left_out, clip.frame_count)),
         warnings=clip.warnings
         + registration.notices
         + _warnings(sure_share)
@@ -180,29 +189,29 @@ Jobs = Iterable[tuple[int, Future[None]]]
 """Frames, each with the job after which it is finished."""
 
 
-def _match_all(work: FrameWork, pool: ThreadPoolExecutor, first: int) -> Jobs:
-    """Match pairs side by side, frame `first` before the others: it may be shown at once."""
-    order = sorted(range(work.clip.frame_count), key=lambda i: i != first)
+def _match_all(work: FrameWork, wanted: Sequence[int], pool: ThreadPoolExecutor, first: int) -> Jobs:
+    """Match the wanted pairs side by side, frame `first` before the others: it may be shown at once."""
+    order = sorted(wanted, key=lambda i: i != first)
     return [(i, pool.submit(work.match, i)) for i in order]
 
 
-def _match_on_device(work: FrameWork, pool: ThreadPoolExecutor, hooks: Hooks) -> Jobs:
-    """Match as many pairs at once as their cost volumes fit into memory; the pool finishes each frame."""
+def _match_on_device(work: FrameWork, wanted: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks) -> Jobs:
+    """Match as many of the wanted pairs at once as their cost volumes fit into memory; the pool finishes each frame."""
     from worker.stereo.cuda import depth_of, frames_at_once
 
-    clip, matched, count = work.clip, work.matched, work.clip.frame_count
+    clip, matched = work.clip, work.matched
     at_once = frames_at_once(clip.intrinsics.height, clip.intrinsics.width, work.plan)
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
     hooks.on_progress(Progress(COMPILATION, 0.5))
-    for first in range(0, count, at_once):
+    for first in range(0, len(wanted), at_once):
         _check_stop(hooks)
-        some = slice(first, min(first + at_once, count))
-        left, other = (np.stack(eye) for eye in zip(*map(work.greys, range(some.start, some.stop)), strict=True))
+        some = list(wanted[first : first + at_once])
+        left, other = (np.stack(eye) for eye in zip(*map(work.greys, some), strict=True))
         tissue = np.ascontiguousarray(clip.tissue[some])
         matched.depth_mm[some], matched.depth_confidence[some] = depth_of(
             left, other, tissue, work.plan, focal_baseline, clip.disparity_offset_px
         )
-        yield from [(i, pool.submit(work.finish, i)) for i in range(some.start, some.stop)]
+        yield from [(i, pool.submit(work.finish, i)) for i in some]
 
 
 def _check_depth(sure_share: float) -> None:

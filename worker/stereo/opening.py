@@ -13,6 +13,7 @@ from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM, ReconstructionOpti
 from worker.input.calibration import rectify
 from worker.input.calibration.types import StereoCalibration
 from worker.input.clip import ClipLimits, DepthClip, StereoClip, training_frames
+from worker.input.clip.sampling import sampled
 from worker.input.decode import DecoderKilledError, decode_clip
 from worker.machine.hooks import Hooks, ignore
 from worker.machine.timing import Timings
@@ -70,7 +71,7 @@ def open_with_depth(
             )
         if isinstance(decoded, DepthClip):
             hooks.on_first_moment(decoded.moment(training_frames(decoded.frame_count, options.holdout)[0]))
-            return decoded
+            return sampled(decoded, options.holdout) if options.use_frames == "new" else decoded
         with closing(decoded):
             return match_eyes(
                 decoded.clip,
@@ -78,6 +79,7 @@ def open_with_depth(
                 options.holdout,
                 hooks,
                 timings,
+                leave_out=options.use_frames == "new",
                 device=device,
                 before_matching=before_matching,
                 depth_range_mm=(options.min_depth_mm, options.max_depth_mm),
@@ -98,6 +100,7 @@ def match_eyes(
     hooks: Hooks,
     timings: Timings,
     *,
+    leave_out: bool = False,
     device: Literal["cpu", "cuda"] = "cpu",
     before_matching: Callable[[], None] = ignore,
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
@@ -107,4 +110,11 @@ def match_eyes(
     measured = training_frames(clip.frame_count, holdout)
     before_matching()
     with timings.measure("stereo_s"):
-        return estimate_depth(rectified, hooks, measured_frames=measured, device=device, depth_range_mm=depth_range_mm)
+        return estimate_depth(
+            rectified,
+            hooks,
+            measured_frames=measured,
+            leave_out=leave_out,
+            device=device,
+            depth_range_mm=depth_range_mm,
+        )

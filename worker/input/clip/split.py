@@ -20,6 +20,8 @@ from worker.machine.mapped import let_go
 
 MIN_FRAMES = 9  # shorter clips hold out no frame
 REPEAT_LEVELS = 0.2  # mean |difference| in 8-bit levels; two frames below it are the same picture
+PAUSE_FRAMES = 8
+"""A picture that stands for more frames is a pause: it is trained on, and held-out frames in it say nothing."""
 RULES = ("every8", "blocks8", "none")
 _FIELD = "options.holdout"
 _REMEDY = 'Say "every8", "blocks8", "none", or frame numbers like "1,9,17".'
@@ -29,7 +31,8 @@ _REMEDY = 'Say "every8", "blocks8", "none", or frame numbers like "1,9,17".'
 class FrameSplit:
     """Frame indices, each list rising. No part of training reads held-out frames.
 
-    repeated lists frames that are in neither set, because they repeat a held-out frame.
+    repeated lists frames that are in neither set: training frames that repeat a held-out frame, held-out frames that
+    repeat training frames in a pause, and those that the clip left out.
     """
 
     train: list[int]
@@ -47,20 +50,27 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     """
     count = clip.frame_count
     held_out = held_out_frames(count, holdout)
+    train = sorted(set(range(count)) - set(held_out) - set(clip.left_out))
     if holdout == "none":
-        return FrameSplit(list(range(count)), [], [])
+        return FrameSplit(train, [], list(clip.left_out))
     if count < MIN_FRAMES:
-        return _nothing_held_out(count, f"the clip has {count} frames, fewer than {MIN_FRAMES}")
+        return _nothing_held_out(clip, f"the clip has {count} frames, fewer than {MIN_FRAMES}")
     if not held_out:
-        return _nothing_held_out(count, f"{holdout} finds no frame to hold out in {count}")
-    train = sorted(set(range(count)) - set(held_out))
-    repeated = find_repeats(clip.rgb, train, held_out)
+        return _nothing_held_out(clip, f"{holdout} finds no frame to hold out in {count}")
+    paused = find_paused(clip.rgb, held_out)
+    judged = [index for index in held_out if index not in paused]
+    if not judged:
+        return _nothing_held_out(clip, "every held-out frame repeats training frames: the picture does not change")
+    repeated = find_repeats(clip.rgb, train, judged)
     if len(repeated) == len(train):
-        return _nothing_held_out(count, "every training frame repeats a held-out one: the picture does not change")
-    text = f"frames that repeat a held-out frame are not used: {len(repeated)}"
-    warnings = (Notice.warning(NoticeCode.HELD_OUT_REPEATED, text),) if repeated else ()
-    gone = set(repeated)
-    return FrameSplit([index for index in train if index not in gone], held_out, repeated, warnings)
+        return _nothing_held_out(clip, "every training frame repeats a held-out one: the picture does not change")
+    unused = {*repeated, *paused, *clip.left_out}
+    return FrameSplit(
+        train=[index for index in train if index not in unused],
+        held_out=judged,
+        repeated=sorted(unused),
+        warnings=_warnings(len(repeated), len(paused)),
+    )
 
 
 def held_out_frames(frame_count: int, holdout: str) -> list[int]:
@@ -116,6 +126,24 @@ def find_repeats(rgb: NDArray[np.uint8], train: list[int], held_out: list[int]) 
     return repeats
 
 
+def find_paused(rgb: NDArray[np.uint8], held_out: Sequence[int]) -> set[int]:
+    """Held-out frames of rgb [T, H, W, 3] in a pause that has training frames, too.
+
+    A pause is a run of more than PAUSE_FRAMES frames that repeat its first.
+    """
+    limit, found, start = REPEAT_LEVELS * float(np.prod(rgb.shape[1:])), set[int](), 0
+    for index in range(1, len(rgb) + 1):
+        if index < len(rgb) and _closer_than(limit, rgb[start], rgb[index]):
+            let_go(rgb[index])
+            continue
+        within = set(range(start, index)) & set(held_out)
+        if index - start > max(PAUSE_FRAMES, len(within)):
+            found |= within
+        let_go(rgb[start])
+        start = index
+    return found
+
+
 def _closer_than(limit: float, frame: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
     """Whether the sum of |differences| is below the limit. Every 8th row is tried first: it often decides."""
     return all(cv2.norm(frame[::step], other[::step], cv2.NORM_L1) < limit for step in (8, 1))
@@ -142,6 +170,17 @@ def _held_out_by_rule(holdout: str, count: int) -> set[int]:
     return wanted
 
 
-def _nothing_held_out(count: int, reason: str) -> FrameSplit:
+def _warnings(repeated: int, paused: int) -> tuple[Notice, ...]:
+    texts = []
+    if repeated:
+        texts.append(f"frames that repeat a held-out frame are not used: {repeated}")
+    if paused:
+        texts.append(f"held-out frames of a paused picture, on which the scene is trained, are not scored: {paused}")
+    return tuple(Notice.warning(NoticeCode.HELD_OUT_REPEATED, text) for text in texts)
+
+
+def _nothing_held_out(clip: DepthClip, reason: str) -> FrameSplit:
     text = f"no frames are held out, so quality is not measured: {reason}"
-    return FrameSplit(list(range(count)), [], [], (Notice.warning(NoticeCode.NOTHING_HELD_OUT, text),))
+    left_out = set(clip.left_out)
+    train = [index for index in range(clip.frame_count) if index not in left_out]
+    return FrameSplit(train, [], list(clip.left_out), (Notice.warning(NoticeCode.NOTHING_HELD_OUT, text),))

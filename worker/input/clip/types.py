@@ -99,11 +99,13 @@ class DepthClip(Eye):
     frame_times_s    [T]          float64, seconds from frame 0
     right            the same moments and size; None for a clip of one eye
     registration     what the right eye's camera and colours were corrected by; None for a clip of one eye
+    left_out         frames that show nothing new (sampling.py): nobody looks at them, and stereo gives them no depth
     """
 
     frame_times_s: NDArray[np.float64]
     right: Eye | None = None
     registration: RightEye | None = None
+    left_out: tuple[int, ...] = ()
     assumptions: tuple[Notice, ...] = ()
     warnings: tuple[Notice, ...] = ()
     measurements: dict[str, float] = field(default_factory=dict)  # e.g. vertical misalignment in px, for the report
@@ -117,4 +119,4 @@ class DepthClip(Eye):
         """A clip of one frame of both eyes, which views this one's arrays."""
         only = slice(index, index + 1)
         right = None if self.right is None else replace(self.right, **self.right.arrays_at(only))
-        return replace(self, right=right, frame_times_s=self.frame_times_s[only], **self.arrays_at(only))
+        return replace(self, right=right, frame_times_s=self.frame_times_s[only], left_out=(), **self.arrays_at(only))

@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from contract.wire.notices import NoticeCode
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip, held_out_frames, open_clip, split_frames
-from worker.input.clip.split import REPEAT_LEVELS, find_repeats
+from worker.input.clip.split import PAUSE_FRAMES, REPEAT_LEVELS, find_repeats
 
 REAL_DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).parents[4].parent / "shared/data"))
 
@@ -113,6 +114,31 @@ def test_a_training_frame_that_repeats_a_held_out_one_is_in_neither_list() -> No
     assert split.held_out == [1, 9, 17]
     assert split.train == [0, 3, 4, 5, 6, 7, 8, 10, 11, 12, 13, 15, 16]
     assert [each.text for each in split.warnings] == ["frames that repeat a held-out frame are not used: 2"]
+
+
+@pytest.mark.parametrize(("pause", "paused"), [(PAUSE_FRAMES, False), (PAUSE_FRAMES + 1, True), (30, True)])
+def test_a_pause_is_trained_on_and_its_held_out_frames_are_in_neither_list(pause: int, paused: bool) -> None:
+    rgb = distinct(60).rgb.copy()
+    rgb[10 : 10 + pause] = rgb[10]
+    within = range(10, 10 + pause)
+    split = split_frames(clip_of(rgb), "every8")
+    held_out = held_out_frames(60, "every8")
+    if paused:
+        assert split.repeated == [index for index in held_out if index in within]
+        assert set(within) - set(held_out) <= set(split.train)
+    else:
+        assert split.repeated == [index for index in within if index not in held_out]
+        assert not set(within) & set(split.train)
+    assert sorted(split.train + split.held_out + split.repeated) == list(range(60))
+    assert [each.code for each in split.warnings] == [NoticeCode.HELD_OUT_REPEATED]
+
+
+def test_a_pause_that_is_held_out_as_a_whole_is_scored() -> None:
+    rgb = distinct(60).rgb.copy()
+    rgb[10:25] = rgb[10]
+    split = split_frames(clip_of(rgb), ",".join(map(str, range(10, 25))))
+    assert split.held_out == list(range(10, 25))
+    assert split.repeated == []
 
 
 def test_the_quick_bound_never_changes_the_answer() -> None:

@@ -1,0 +1,120 @@
+"""Frames that show nothing new, in synthetic clips that repeat, pause, rest, hardly move, or move.
+
+Symbols: T frames. A moment is a frame of the phantom, a real number.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from contract.wire.notices import NoticeCode
+from tests.worker.phantoms import phantom_clip
+from worker.input.clip import held_out_frames, split_frames, training_frames
+from worker.input.clip.sampling import KEPT_FRAMES, nothing_new, sampled
+from worker.phantom import Phantom, PhantomSettings, make_phantom
+from worker.phantom.shading import add_noise
+
+WIDTH, HEIGHT = 160, 128
+
+
+@cache
+def tissue() -> Phantom:
+    """It breathes, 36 frames a breath."""
+    return make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=400, tools=False))
+
+
+@cache
+def picture(moment: float) -> NDArray[np.float32]:
+    return tissue().render(moment)[0]
+
+
+def recorded(moments: list[float], noise: bool = True) -> NDArray[np.uint8]:
+    """[T, H, W, 3]; with noise, each frame has its own."""
+    frames = []
+    for frame, moment in enumerate(moments):
+        rgb = add_noise(picture(moment), np.random.default_rng(frame)) if noise else picture(moment)
+        frames.append(np.clip(rgb * 255 + 0.5, 0, 255).astype(np.uint8))
+    return np.stack(frames)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_of_a_clip_that_shows_each_frame_twice_half_is_left_out(noise: bool) -> None:
+    rgb = recorded([float(frame // 2) for frame in range(2 * KEPT_FRAMES)], noise)
+    assert nothing_new(rgb, range(len(rgb))) == tuple(range(1, len(rgb), 2))
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_of_a_pause_every_nth_frame_is_used_and_all_of_what_moves(noise: bool) -> None:
+    before, after = range(60), range(60 + 3 * KEPT_FRAMES, 120 + 3 * KEPT_FRAMES)
+    moments = [*map(float, range(60)), *[59.0] * 3 * KEPT_FRAMES, *map(float, range(60, 120))]
+    longest = len(moments) // KEPT_FRAMES
+    left_out = set(nothing_new(recorded(moments, noise), range(len(moments))))
+    used = [frame for frame in range(len(moments)) if frame not in left_out]
+    assert not left_out & {*before, *after}
+    assert set(np.diff([frame for frame in used if 59 <= frame < after[0]])) == {longest}
+
+
+def test_of_slow_tissue_frames_are_used_at_even_steps() -> None:
+    moments = [frame / 80 for frame in range(4 * KEPT_FRAMES)]
+    left_out = nothing_new(recorded(moments), range(len(moments)))
+    used = np.setdiff1d(range(len(moments)), left_out)
+    assert len(moments) / 4 <= len(used) < len(moments) / 1.8
+    assert np.diff(used).std() < 1
+
+
+def test_no_frame_of_moving_tissue_is_left_out() -> None:
+    assert nothing_new(recorded([float(frame) for frame in range(2 * KEPT_FRAMES)]), range(2 * KEPT_FRAMES)) == ()
+
+
+def test_no_frame_is_left_out_while_a_small_part_moves() -> None:
+    rgb = recorded([0.0] * 2 * KEPT_FRAMES)
+    moving = recorded([float(frame) for frame in range(2 * KEPT_FRAMES)])
+    rgb[:, 40:72, 60:92] = moving[:, 40:72, 60:92]
+    assert nothing_new(rgb, range(len(rgb))) == ()
+
+
+def test_a_short_clip_keeps_every_frame() -> None:
+    count = 2 * KEPT_FRAMES - 1
+    assert nothing_new(recorded([0.0] * count), range(count)) == ()
+
+
+@pytest.mark.parametrize("count", [150, 700, 1000])
+def test_a_still_clip_keeps_a_number_of_frames(count: int) -> None:
+    rgb = np.broadcast_to(recorded([0.0]), (count, HEIGHT, WIDTH, 3))
+    used = count - len(nothing_new(rgb, range(count)))
+    assert KEPT_FRAMES <= used < 1.6 * KEPT_FRAMES
+
+
+@pytest.mark.parametrize("holdout", ["every8", "blocks8", "5,6,77"])
+def test_held_out_frames_decide_nothing_and_are_not_left_out(holdout: str) -> None:
+    rgb = recorded([min(float(frame), 30.0) for frame in range(2 * KEPT_FRAMES)])
+    held_out, train = held_out_frames(len(rgb), holdout), training_frames(len(rgb), holdout)
+    left_out = nothing_new(rgb, train)
+    assert len(left_out) > 30
+    assert not set(left_out) & set(held_out)
+    rgb[held_out] = 255 - rgb[held_out]
+    assert nothing_new(rgb, train) == left_out
+
+
+@pytest.mark.parametrize("holdout", ["every8", "blocks8", "none"])
+def test_a_split_trains_on_no_frame_that_is_left_out_and_times_stay(holdout: str) -> None:
+    clip = phantom_clip(frames=48, width=WIDTH, height=HEIGHT, tools=False)
+    index = np.minimum(np.arange(2 * KEPT_FRAMES), 47)
+    arrays = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera")
+    long = dataclasses.replace(
+        clip, **{name: getattr(clip, name)[index] for name in arrays}, frame_times_s=np.arange(len(index)) / 25
+    )
+    shorter = sampled(long, holdout)
+    split, whole = split_frames(shorter, holdout), split_frames(long, holdout)
+    assert len(shorter.left_out) > 20
+    assert sorted(split.train + split.held_out + split.repeated) == list(range(len(index)))
+    assert set(split.train) == set(whole.train) - set(shorter.left_out)
+    assert split.held_out == whole.held_out
+    assert np.array_equal(shorter.t, long.t)
+    assert np.array_equal(shorter.frame_times_s, long.frame_times_s)
+    assert [each.code for each in shorter.assumptions].count(NoticeCode.NOTHING_NEW) == 1
