@@ -217,16 +217,16 @@ def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
 
 def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     """No tissue comes a tenth nearer within a frame; where depth does, on much of the tissue, it is wrong."""
-    wanted = set(train)
-    first = [index for index in train if index + 1 in wanted]
+    still = set(clip.left_out)
+    following = {one: two for one, two in itertools.pairwise(train) if still.issuperset(range(one + 1, two))}
     jumps, total = 0, 0
-    for index in clip.one_by_one(first[:: -(-len(first) // MAX_PAIRS) or 1]):
-        pair = slice(index, index + 2)
-        sure = (clip.tissue[pair] & (clip.depth_confidence[pair] >= SURE)).all(axis=0)
-        before, after = clip.depth_mm[index][sure], clip.depth_mm[index + 1][sure]
+    for index in clip.one_by_one(list(following)[:: -(-len(following) // MAX_PAIRS) or 1]):
+        pair = (index, following[index])
+        sure = np.logical_and(*(clip.tissue[i] & (clip.depth_confidence[i] >= SURE) for i in pair))
+        before, after = (clip.depth_mm[i][sure] for i in pair)
         jumps += int((np.abs(after - before) > DEPTH_JUMP * before).sum())
         total += before.size
-        clip.let_go(index + 1)
+        clip.let_go(pair[1])
     if jumps <= MAX_JUMPING_SHARE * total:
         return []
     return [

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from contract.wire.notices import Notice
+from contract.wire.notices import Notice, NoticeCode
 from tests.worker.phantoms import phantom_clip
 from worker.evaluate.conditions import CONDITIONS, CleanClip, clean_clip
 from worker.input.clip import DepthClip, open_clip, split_frames
@@ -82,6 +82,15 @@ def test_what_does_no_harm_is_not(clean: CleanClip, condition: str, severity: in
     given = CONDITIONS[condition].apply(clean, severity, 0)
     assert isinstance(given.clip, DepthClip)
     assert doubts(given.clip) == []
+
+
+def test_depth_that_jumps_across_frames_that_were_left_out_is_told(clean: CleanClip) -> None:
+    spoilt = CONDITIONS["depth_outliers"].apply(clean, 2, 0).clip
+    assert isinstance(spoilt, DepthClip)
+    left_out = tuple(index for index in range(1, 20, 2) if index % 8 != 1)
+    for clip, jumps in ((spoilt, 1), (clean.clip, 0)):
+        found = doubts(dataclasses.replace(clip, left_out=left_out))
+        assert [each.code for each in found].count(NoticeCode.DEPTH_JUMPS) == jumps
 
 
 def test_an_instrument_that_leaves_the_picture_is_no_missing_mask(clean: CleanClip) -> None:
