@@ -191,6 +191,18 @@ def test_depth_is_as_true_as_on_the_cpu() -> None:
     assert ours.measurements["min_disparity_px"] < 7 < 14 < ours.measurements["max_disparity_px"] < 26
 
 
+def test_frames_that_are_left_out_are_not_matched_and_the_others_have_the_same_depth(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("worker.input.clip.sampling.KEPT_FRAMES", 2)
+    pairs = [draw_pair(slanted(10.0, 7.0, WIDTH, HEIGHT), seed=seed) for seed in (0, 0, 1, 1)]
+    whole, sampled = (estimate_depth(clip_of(pairs), leave_out=each, device="cuda") for each in (False, True))
+    assert (whole.left_out, sampled.left_out) == ((), (1, 3))
+    assert np.array_equal(sampled.depth_mm[::2], whole.depth_mm[::2])
+    assert np.array_equal(sampled.depth_confidence[::2], whole.depth_confidence[::2])
+    assert not sampled.depth_mm[1::2].any()
+
+
 def test_kernels_compile_for_sm_90_within_its_registers_once_for_clips_of_every_size(triton_cache: Path) -> None:
     found = kernels_compiled_by("tests.worker.stereo.stereo_probe", triton_cache)
     lanes = 2
