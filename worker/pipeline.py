@@ -21,6 +21,7 @@ from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import Report
 from worker.input.camera import to_camera
 from worker.input.clip import DepthClip, FrameSplit, split_frames, training_frames
+from worker.input.clip.sampling import most_frames, sampled
 from worker.machine.forecast import Forecast
 from worker.machine.hooks import Hooks
 from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
@@ -89,7 +90,10 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
 
     kept_dir: where to keep what the same request goes on from; whoever names it removes it. None: out_dir.
     """
-    forecast, tell = Forecast(*length_of(request.options, request.preset)), hooks.on_progress
+    forecast, tell = (
+        Forecast(*length_of(request.options, request.preset), most_frames(request.options)),
+        hooks.on_progress,
+    )
     hooks = dataclasses.replace(hooks, on_progress=lambda progress: tell(forecast.completed(progress)))
     with keeping(kept_dir or out_dir, forgets=kept_dir is None) as keeper:
         setup = begin(request, out_dir, hooks, keeper)
@@ -159,7 +163,7 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
 def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
     """The clip of a request (worker/stereo/opening.py), its kernels examined before a GPU matches anything."""
     if isinstance(request.clip, DepthClip):
-        return request.clip
+        return request.clip if request.clip.left_out else sampled(request.clip, request.options)
 
     def examined() -> None:
         if device != CPU:

@@ -3,6 +3,7 @@ library is needed to read them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 PresetName = Literal[
@@ -10,6 +11,9 @@ PresetName = Literal[
 ]
 """instant, fast, quality and small are ours; paper is the published method as published; the others are compared with
 it (worker/train/presets.py)."""
+
+BUDGETS_S: Mapping[PresetName, float] = {"instant": 6.0, "fast": 60.0, "quality": 240.0, "small": 30.0}
+"""Seconds of training of our presets, where nothing else is asked for."""
 
 Layout = Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]
 """How a clip's eyes, depths and masks are laid out (docs/conventions.md); auto looks for itself."""
@@ -21,8 +25,10 @@ PoseConvention = Literal["opengl", "llff"]
 """Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
 
 Eyes = Literal["left", "both"]
-UsedFrames = Literal["new", "all"]
 """The eyes of a stereo clip that a model is trained on."""
+
+UsedFrames = Literal["new", "all"]
+"""The frames of a clip that a model may be trained on."""
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 """Where to compute; auto chooses the GPU if all of its requirements are met, otherwise the CPU."""

@@ -64,6 +64,7 @@ class NoticeCode(StrEnum):
     MASK_GAPS = "mask_gaps"
     NO_INSTRUMENT_MASKED = "no_instrument_masked"
     NO_TEXTURE = "no_texture"
+    NO_TIME = "no_time"
     NOTHING_NEW = "nothing_new"
     OUT_OF_FOCUS = "out_of_focus"
     POSE_JITTER = "pose_jitter"

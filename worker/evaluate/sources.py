@@ -108,10 +108,11 @@ def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU
         drawn = phantom.stereo_recording()
         clip = match_eyes(drawn.clip, drawn.calibration, holdout, hooks, timings, device=device.kind)
         return OpenClip(clip, phantom, timings.seconds, drawn.tissue_right)
-    options, files = ReconstructionOptions(holdout=holdout, **source.options.model_dump()), source.files
-    request = ReconstructionRequest(
-        source.clip, options, calibration=files.get("calibration"), masks=files.get("masks")
-    )
+    options = ReconstructionOptions(
+        holdout=holdout, use_frames="all", **source.options.model_dump()
+    )  # each run chooses
+    calibration, masks = source.files.get("calibration"), source.files.get("masks")
+    request = ReconstructionRequest(source.clip, options, calibration=calibration, masks=masks)
     clip = open_with_depth(request, hooks, timings, device)
     return OpenClip(clip, None, timings.seconds)
 

@@ -31,8 +31,8 @@ USUAL_MEGAPIXELS = 30.0
 STEP_S = 0.12
 """Of a step on both eyes, for each megapixel of a frame; until steps have been made."""
 LEAST_PACE, MOST_PACE = 0.5, 5.0
-LEAST_DONE_S = 1.0
-"""Less work than this says little of the machine's pace."""
+TRUSTED_S = 1.5
+"""Of work at the usual pace that is believed in before any has been done: little work says little of the pace."""
 
 
 class Forecast:
@@ -40,14 +40,20 @@ class Forecast:
 
     Args:
         iterations, budget_s: how long training is; one of the two is None.
+        most_frames: to train on; None: all.
         clock: monotonic seconds.
     """
 
     def __init__(
-        self, iterations: int | None, budget_s: float | None, clock: Callable[[], float] = time.monotonic
+        self,
+        iterations: int | None,
+        budget_s: float | None,
+        most_frames: int | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._iterations = iterations
         self._budget_s = budget_s
+        self._most_frames = most_frames
         self._clock = clock
         self._started_s = clock()
         self._frames = 0
@@ -74,7 +80,8 @@ class Forecast:
 
     def learn(self, frames: int, megapixels: float) -> None:
         """The clip's frames, and the megapixels of all of them, of one eye."""
-        self._frames, self._megapixels = frames, megapixels
+        used = frames if self._most_frames is None else min(frames, self._most_frames)
+        self._frames, self._megapixels = used, megapixels * used / frames
 
     def _usual_s(self) -> dict[str, float]:
         usual = {stage: fixed + each * self._megapixels for stage, (fixed, each) in USUAL_S.items()}
@@ -87,6 +94,5 @@ class Forecast:
 
     def _pace(self, done_s: float) -> float:
         """How much longer than usual the work takes here and now; done_s: what the work so far usually takes."""
-        if done_s < LEAST_DONE_S:
-            return 1.0
-        return min(max((self._clock() - self._started_s) / done_s, LEAST_PACE), MOST_PACE)
+        pace = (self._clock() - self._started_s + TRUSTED_S) / (done_s + TRUSTED_S)
+        return min(max(pace, LEAST_PACE), MOST_PACE)

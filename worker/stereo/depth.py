@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import Cancelled, InputError
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM
-from worker.input.clip.sampling import nothing_new, told_of
+from worker.input.clip.sampling import LeftOut, left_out
 from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip
 from worker.machine.cores import cores
@@ -60,6 +60,7 @@ def estimate_depth(
     *,
     measured_frames: Sequence[int] | None = None,
     leave_out: bool = False,
+    most_frames: int | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
 ) -> DepthClip:
@@ -88,13 +89,13 @@ def estimate_depth(
     aligned = spread(measured, ALIGNMENT_PAIRS)
     with one_opencv_thread(), _pool() as pool:
         rgb, right_rgb, matches = _receive(clip, aligned, pool, hooks)
-        left_out = nothing_new(rgb, measured, pool.map) if leave_out else ()
+        unused = left_out(rgb, measured, most_frames, pool.map) if leave_out else LeftOut()
         if device == "cuda":
             hooks.on_progress(Progress(COMPILATION, 0.0))
         registration, plan, outside = _plan(clip, rgb, right_rgb, measured, matches, pool, device, depth_range_mm)
         work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan)
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
-        wanted = sorted(set(range(clip.frame_count)) - set(left_out))
+        wanted = sorted(set(range(clip.frame_count)) - set(unused.frames))
         jobs = (
             _match_on_device(work, wanted, pool, hooks) if device == "cuda" else _match_all(work, wanted, pool, first)
         )
@@ -109,8 +110,8 @@ def estimate_depth(
     _check_depth(sure_share)
     return replace(
         work.matched,
-        left_out=left_out,
-        assumptions=(*clip.assumptions, _scale_assumption(clip), *told_of(left_out, clip.frame_count)),
+        left_out=unused.frames,
+        assumptions=(*clip.assumptions, _scale_assumption(clip), *unused.told(clip.frame_count)),
         warnings=clip.warnings
         + registration.notices
         + _warnings(sure_share)

@@ -13,7 +13,7 @@ from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM, ReconstructionOpti
 from worker.input.calibration import rectify
 from worker.input.calibration.types import StereoCalibration
 from worker.input.clip import ClipLimits, DepthClip, StereoClip, training_frames
-from worker.input.clip.sampling import sampled
+from worker.input.clip.sampling import most_frames, sampled
 from worker.input.decode import DecoderKilledError, decode_clip
 from worker.machine.hooks import Hooks, ignore
 from worker.machine.timing import Timings
@@ -71,7 +71,7 @@ def open_with_depth(
             )
         if isinstance(decoded, DepthClip):
             hooks.on_first_moment(decoded.moment(training_frames(decoded.frame_count, options.holdout)[0]))
-            return sampled(decoded, options.holdout) if options.use_frames == "new" else decoded
+            return sampled(decoded, options)
         with closing(decoded):
             return match_eyes(
                 decoded.clip,
@@ -80,6 +80,7 @@ def open_with_depth(
                 hooks,
                 timings,
                 leave_out=options.use_frames == "new",
+                most_frames=most_frames(options),
                 device=device,
                 before_matching=before_matching,
                 depth_range_mm=(options.min_depth_mm, options.max_depth_mm),
@@ -101,6 +102,7 @@ def match_eyes(
     timings: Timings,
     *,
     leave_out: bool = False,
+    most_frames: int | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
     before_matching: Callable[[], None] = ignore,
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
@@ -115,6 +117,7 @@ def match_eyes(
             hooks,
             measured_frames=measured,
             leave_out=leave_out,
+            most_frames=most_frames,
             device=device,
             depth_range_mm=depth_range_mm,
         )

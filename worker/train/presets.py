@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from contract.wire.errors import InputError
+from contract.wire.names import BUDGETS_S
 from worker.fusion import FusionSettings
 from worker.model.deformation import GaussianFdm, HexPlane, PolynomialFourier, QuarticFdm, SharedBasis, motion_named
 from worker.model.gaussians import MAX_SH_DEGREE
@@ -202,16 +203,16 @@ _FAST = Preset(
     loss=LossSettings(colour_huber_delta=0.1),
     densify=None,
     iterations=None,
-    budget_s=60.0,
+    budget_s=BUDGETS_S["fast"],
 )
 
 PRESETS: Mapping[str, Preset] = MappingProxyType(
     {
         preset.name: preset
         for preset in (
-            replace(_FAST, name="instant", points_per_image=FEW_POINTS, budget_s=6.0),
+            replace(_FAST, name="instant", points_per_image=FEW_POINTS, budget_s=BUDGETS_S["instant"]),
             _FAST,
-            replace(_FAST, name="quality", min_gain_db=0.05, budget_s=240.0),
+            replace(_FAST, name="quality", min_gain_db=0.05, budget_s=BUDGETS_S["quality"]),
             replace(
                 _FAST,
                 name="small",
@@ -219,7 +220,7 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
                 points_by_budget=False,
                 max_bases=17,
                 rates=_SMALL_RATES,
-                budget_s=30.0,
+                budget_s=BUDGETS_S["small"],
             ),
             _PAPER,
             replace(_PAPER, name="paper-released", deformation=QuarticFdm.kind),

@@ -6,18 +6,24 @@ Symbols: T frames, h w pixels of a thumbnail, P patches of PATCH x PATCH pixels 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.wire.names import BUDGETS_S
 from contract.wire.notices import Notice, NoticeCode
+from contract.wire.options import ReconstructionOptions
 from worker.input.clip.split import training_frames
 from worker.input.clip.types import DepthClip, RgbFrame
 from worker.machine.mapped import let_go
 
+FRAMES_A_SECOND, LEAST_FRAMES = 6.5, 32
+"""Training frames for each second of training, and the fewest: two cores make some three steps on each of so many."""
+LEFT_OUT_CODES = (NoticeCode.NOTHING_NEW, NoticeCode.NO_TIME)
 KEPT_FRAMES = 64
 """About so many frames are used at least: a clip of less than twice as many keeps all of them."""
 MAX_MOVED = 1 / 640
@@ -48,47 +54,85 @@ def thumbnail(rgb: RgbFrame) -> Thumbnail:
     return np.asarray(cv2.resize(grey.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA))
 
 
-def nothing_new(rgb: NDArray[np.uint8], frames: Sequence[int], mapping: Mapping = map) -> tuple[int, ...]:
-    """Those of `frames` that show nothing new since the last of them that is used, rising.
+@dataclass(frozen=True)
+class LeftOut:
+    """Training frames that are not used, rising: those that show nothing new, and those there is no time for."""
 
-    Beyond the clip's own noise no patch changed as if something in it had moved by MAX_MOVED. After T // KEPT_FRAMES
-    frames one is used in any case. Frames that are not in `frames`, such as held-out ones, are not looked at.
+    nothing_new: tuple[int, ...] = ()
+    no_time: tuple[int, ...] = ()
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """All of them, rising."""
+        return tuple(sorted({*self.nothing_new, *self.no_time}))
+
+    def told(self, frame_count: int) -> tuple[Notice, ...]:
+        """What the report says of them."""
+        found = []
+        if self.nothing_new:
+            text = f"frames: {len(self.nothing_new):,} of {frame_count:,} show nothing new and were left out"
+            found.append(Notice.info(NoticeCode.NOTHING_NEW, f"{text}; times stay those of the clip"))
+        if self.no_time:
+            text = f"frames: {len(self.no_time):,} of {frame_count:,} were left out, because training is too short for"
+            found.append(Notice.info(NoticeCode.NO_TIME, f"{text} more; a longer budget_s uses them"))
+        return tuple(found)
+
+
+def left_out(rgb: NDArray[np.uint8], frames: Sequence[int], most: int | None = None, mapping: Mapping = map) -> LeftOut:
+    """Those of `frames` that need not be used. Others, such as held-out ones, are not looked at.
+
+    A frame shows nothing new if beyond the clip's own noise no patch has changed as if something in it had moved by
+    MAX_MOVED since the last frame that is used. After T // KEPT_FRAMES frames one is used in any case. If more than
+    `most` would be used, about so many stay: half of them spread evenly over time, half evenly over the motion.
 
     Args:
         rgb: [T, H, W, 3] of the whole clip.
         frames: rising.
+        most: None: no limit.
         mapping: as map(); it may use several threads.
     """
     longest = len(rgb) // KEPT_FRAMES
-    if longest < 2 or min(rgb.shape[1:3]) < THUMBNAIL_WIDTH // 2:
-        return ()
+    too_many = most is not None and len(frames) > most
+    if (longest < 2 and not too_many) or min(rgb.shape[1:3]) < THUMBNAIL_WIDTH // 2:
+        return LeftOut()
     thumbnails = dict(zip(frames, mapping(lambda i: thumbnail(rgb[i]), frames), strict=True))
     noise = _noise(list(thumbnails.values()))
-    used, left_out = frames[0], []
+    used: list[int] = [frames[0]]
+    unused: list[int] = []
     for i in frames[1:]:
-        moved = _moved(thumbnails[used], thumbnails[i], noise)
-        if i - used < longest and moved <= MAX_MOVED:
-            left_out.append(i)
-        else:
-            used = i
-    return tuple(left_out)
+        moved = _moved(thumbnails[used[-1]], thumbnails[i], noise)
+        (unused if i - used[-1] < longest and moved <= MAX_MOVED else used).append(i)
+    if most is None or len(used) <= most:
+        return LeftOut(tuple(unused))
+    steps = [_moved(thumbnails[one], thumbnails[two], noise) for one, two in pairwise(used)]
+    return LeftOut(tuple(unused), tuple(sorted(set(used) - set(_spread(used, steps, most)))))
 
 
-def told_of(left_out: Sequence[int], frame_count: int) -> tuple[Notice, ...]:
-    """What the report says of frames that show nothing new."""
-    if not left_out:
-        return ()
-    text = (
-        f"frames: {len(left_out):,} of {frame_count:,} show nothing new and were left out; times stay those of the clip"
-    )
-    return (Notice.info(NoticeCode.NOTHING_NEW, text),)
+def _spread(frames: Sequence[int], moved: Sequence[float], count: int) -> list[int]:
+    """At most so many of the frames, at equal steps of the time and the motion between them; first and last included.
+
+    moved: between each frame and the next.
+    """
+    shares = [np.asarray(each, np.float64) / max(np.sum(each), 1e-12) for each in (np.diff(frames), moved)]
+    course = np.concatenate([[0.0], np.cumsum(np.mean(shares, axis=0))])
+    places = np.abs(course[:, None] - np.linspace(0, course[-1], count)).argmin(0)
+    return [frames[place] for place in np.unique(places)]
 
 
-def sampled(clip: DepthClip, holdout: str) -> DepthClip:
-    """A clip whose depth is known, with its training frames that show nothing new in left_out."""
-    left_out = nothing_new(clip.rgb, training_frames(clip.frame_count, holdout))
-    told = told_of(left_out, clip.frame_count)
-    return replace(clip, left_out=left_out, assumptions=(*clip.assumptions, *told))
+def most_frames(options: ReconstructionOptions) -> int | None:
+    """The training frames that the time of our presets is enough for; None where nothing limits them."""
+    if options.use_frames == "all" or options.iterations is not None or options.preset not in BUDGETS_S:
+        return None
+    return max(LEAST_FRAMES, round(FRAMES_A_SECOND * (options.budget_s or BUDGETS_S[options.preset])))
+
+
+def sampled(clip: DepthClip, options: ReconstructionOptions) -> DepthClip:
+    """A clip whose depth is known, without the training frames that need not be used."""
+    if options.use_frames == "all":
+        return clip
+    found = left_out(clip.rgb, training_frames(clip.frame_count, options.holdout), most_frames(options))
+    assumptions = tuple(each for each in clip.assumptions if each.code not in LEFT_OUT_CODES)
+    return replace(clip, left_out=found.frames, assumptions=(*assumptions, *found.told(clip.frame_count)))
 
 
 def _noise(thumbnails: Sequence[Thumbnail]) -> NDArray[np.float64]:
