@@ -85,8 +85,19 @@ def run_cli(options: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
+def _compile(on_cpu: bool) -> None:
+    """Compile the kernels for the CPU, or load them from the cache."""
+    from worker.raster.cpu import compile_kernels
+    from worker.scene.compact import compile_coder
+
+    compile_coder()
+    if on_cpu:
+        compile_kernels()
+
+
 def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_at_s: float) -> Report:
-    """Reconstruct. torch is imported while the clip is opened, unless a GPU may match it, which torch must find."""
+    """Reconstruct. torch is imported and kernels are loaded while the clip is opened, unless a GPU may match it, which
+    torch must find."""
     from worker.input.decode import keep_decoder_ready
     from worker.machine.gpu import may_have_gpu
     from worker.machine.timing import Timings
@@ -95,13 +106,16 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
     given = given_options(options, ReconstructionOptions)
     clip: Path | DepthClip = options.clip
     timings = Timings()
-    with ThreadPoolExecutor(1) as aside:
-        keep_decoder_ready()
-        pipeline = aside.submit(import_module, "worker.pipeline")
-        if options.device == "cpu" or not may_have_gpu():
-            paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
-            clip = open_with_depth(paths, given, hooks, timings)
-        pipeline.result()
+    keep_decoder_ready()
+    on_cpu = options.device == "cpu" or not may_have_gpu()
+    aside = ThreadPoolExecutor(1)
+    pipeline = aside.submit(import_module, "worker.pipeline")
+    aside.submit(_compile, on_cpu)  # nobody waits for it here: the pipeline does, and shows it
+    if on_cpu:
+        paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
+        clip = open_with_depth(paths, given, hooks, timings)
+    pipeline.result()
+    aside.shutdown(wait=False)
     from worker.pipeline import reconstruct
     from worker.train.hooks import TrainingHooks
     from worker.train.request import ReconstructionRequest
