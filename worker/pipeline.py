@@ -6,6 +6,8 @@ import dataclasses
 import json
 import platform
 import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -28,6 +30,7 @@ from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from worker.machine.timing import Timings
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
+from worker.report.doubts import clip_warnings
 from worker.report.judge import judged
 from worker.report.quality import Training, first_report
 from worker.report.trust import trust
@@ -90,10 +93,8 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
 
     kept_dir: where to keep what the same request goes on from; whoever names it removes it. None: out_dir.
     """
-    forecast, tell = (
-        Forecast(*length_of(request.options, request.preset), most_frames(request.options)),
-        hooks.on_progress,
-    )
+    length, tell = length_of(request.options, request.preset), hooks.on_progress
+    forecast = Forecast(*length, most_frames(request.options))
     hooks = dataclasses.replace(hooks, on_progress=lambda progress: tell(forecast.completed(progress)))
     with keeping(kept_dir or out_dir, forgets=kept_dir is None) as keeper:
         setup = begin(request, out_dir, hooks, keeper)
@@ -101,8 +102,10 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
         forecast.learn(used, used * setup.clip.tissue[0].size / 1e6)
         run = resume(keeper.folder, setup) or prepare(setup)
         optimise(run, keeper)
-        scene, quantized = finish(run)
-        report = publish(out_dir, run, scene, quantized)
+        with ThreadPoolExecutor(1) as aside:
+            doubts = aside.submit(clip_warnings, setup.clip, setup.split.train)
+            scene, quantized = finish(run)
+        report = publish(out_dir, run, scene, quantized, doubts.result())
     return Made(setup.clip, setup.split, scene, report, setup.device)
 
 
@@ -282,11 +285,13 @@ def _warnings(run: Run) -> tuple[Notice, ...]:
     return tuple(found)
 
 
-def publish(out_dir: Path, run: Run, scene: Scene, quantized: QuantizedScene | None) -> Report:
+def publish(
+    out_dir: Path, run: Run, scene: Scene, quantized: QuantizedScene | None, doubts: Sequence[Notice]
+) -> Report:
     """Write the report, the curve and the scene. The report has no scores yet."""
     setup = run.setup
     setup.timings.seconds["t_post_s"] = time.time() - setup.accepted_at_s
-    report = first_report(setup.clip, setup.split, _training(run, scene, quantized))
+    report = first_report(setup.clip, setup.split, _training(run, scene, quantized), doubts)
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)
     save_scene(out_dir, scene)

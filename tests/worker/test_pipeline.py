@@ -155,6 +155,7 @@ def test_the_report_tells_what_was_done(clip: Path, tmp_path: Path) -> None:
     assert report.depth_agreement_mm is not None
     assert report.depth_agreement_mm < 3
     assert report.assumptions
+    assert NoticeCode.FEW_FRAMES in [each.code for each in report.warnings]
     with (tmp_path / "curve.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert int(rows[-1]["iteration"]) == report.frames_seen == ITERATIONS

@@ -29,7 +29,6 @@ from worker.model.metrics import (
     ssim,
 )
 from worker.report.baselines import CopyBaselines
-from worker.report.doubts import clip_warnings
 from worker.report.right_eye import RightScores
 from worker.train.scoring import FrameRenderer, Mapping
 
@@ -137,9 +136,9 @@ def measure(
     )
 
 
-def first_report(clip: DepthClip, split: FrameSplit, training: Training) -> Report:
-    """The report of a finished scene before it is scored."""
-    found = [*clip.warnings, *split.warnings, *training.warnings, *clip_warnings(clip, split.train), SCORES_PENDING]
+def first_report(clip: DepthClip, split: FrameSplit, training: Training, doubts: Sequence[Notice] = ()) -> Report:
+    """The report of a finished scene before it is scored. doubts: clip_warnings() of the clip."""
+    found = [*clip.warnings, *split.warnings, *training.warnings, *doubts, SCORES_PENDING]
     return Report(
         scored=False,
         psnr_tissue_db=None,
