@@ -21,7 +21,7 @@ from worker.machine.cores import cores
 from worker.motion.tracks import Tracks, resting
 from worker.motion.trials import BasisValues, FitError, Trial
 
-BASES = (3, 5, 9, 13, 17, 25, 33, 49, 65, 97, 129, 161)
+BASES = (3, 5, 9, 13, 17, 25, 33, 49, 65, 97, 129, 161, 193)
 """Numbers of bases to choose from, besides REST."""
 REST = 1
 """One basis is a constant: the scene neither moves nor changes its light."""
@@ -29,7 +29,7 @@ FRAMES_A_BASIS = 3
 """Training frames per basis where too few tracks can be trusted to try numbers of bases."""
 MIN_FRAMES_A_BASIS = 2
 """Each basis has more training frames than this. With fewer, training frames gain what held-out frames lose."""
-USUAL_BASES, LONG_FRAMES_A_BASIS = 33, 5
+USUAL_BASES, LONG_FRAMES_A_BASIS = 33, 4
 """More than USUAL_BASES have so many training frames each: a model's memory grows with its bases."""
 MAX_MOTION_LEFT = 0.5
 """No number of bases follows the motion if the best leaves more than this share of what the smallest number leaves."""

@@ -36,6 +36,8 @@ _DTYPES = {
 _NO_CHECKSUM = "-" * 8
 """In its place until the file is whole."""
 _AT_ONCE_BYTES = 1 << 20
+_PIECE_BYTES, _AT_MOST_BYTES = 1 << 20, 64 << 20
+"""Of what is written at once: after less, nothing is let go of; more is written row by row."""
 
 
 def save_resume(directory: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
@@ -51,12 +53,17 @@ def save_resume(directory: Path, tensors: Mapping[str, Tensor], state: Mapping[s
     begin_resume(directory, tensors, state)()
 
 
-def begin_resume(directory: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> Callable[[], None]:
+def begin_resume(
+    directory: Path,
+    tensors: Mapping[str, Tensor],
+    state: Mapping[str, Any],
+    after_each: Callable[[], None] = lambda: None,
+) -> Callable[[], None]:
     """As save_resume, but what has to wait for the disk is left to the function that this returns.
 
     When this returns the tensors may change. The function may be called from any thread; only one file of a directory
     may be under way at a time. The tensors are copied into the system's page cache, so this process needs no memory for
-    them.
+    them. after_each is called whenever so much more is written that tensors in files should be let go of.
     """
     directory.mkdir(parents=True, exist_ok=True)
     path, aside = directory / RESUME_FILE, directory / f".{RESUME_FILE}.new"
@@ -70,6 +77,8 @@ def begin_resume(directory: Path, tensors: Mapping[str, Tensor], state: Mapping[
             for tensor in tensors.values():
                 for piece in _pieces(tensor.detach().cpu()):
                     file.write(piece)
+                    if piece.nbytes >= _PIECE_BYTES:
+                        after_each()
     except BaseException:
         aside.unlink(missing_ok=True)
         raise
@@ -132,7 +141,8 @@ def _header(places: Mapping[str, Any], state: str, checksum: str) -> bytes:
 
 def _pieces(tensor: Tensor) -> Iterator[memoryview]:
     """The bytes of a tensor in order, without a copy of all of it: rows of a padded array lie apart."""
-    if tensor.is_contiguous() or tensor.dim() < 2:
+    small = tensor.numel() * tensor.element_size() <= _AT_MOST_BYTES
+    if (tensor.is_contiguous() and small) or tensor.dim() < 2:
         yield tensor.contiguous().view(-1).view(torch.uint8).numpy().data
         return
     for row in tensor:

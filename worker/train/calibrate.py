@@ -12,6 +12,7 @@ import numpy as np
 from worker.model.optimize import rates_at
 from worker.raster.model import Model, state_of
 from worker.raster.step import image_size
+from worker.train.aside import Aside
 from worker.train.loop import check_sums, step
 from worker.train.run import Run
 from worker.train.schedule import Schedule
@@ -26,11 +27,14 @@ GROWTH_ALLOWANCE = 1.15
 @contextmanager
 def taken_back(model: Model, beta1: float) -> Iterator[None]:
     """Steps of a model that has made none yet, with such a beta1: afterwards it is as it was."""
-    stored = {name: values.clone() for name, values in model.parameters().items()}
+    stored = {name: Aside(values) for name, values in model.parameters().items()}
 
     def restore() -> None:
         for name, values in state_of(model, beta1).items():  # moments and their counts are 0 before the first step
-            values.copy_(stored[name]) if name in stored else values.zero_()
+            if name in stored:
+                stored[name].each(values, lambda copy, value: value.copy_(copy))
+            else:
+                values.zero_()
 
     restore()  # touches the moments' memory once: the first touch of a page costs as much as a step
     yield

@@ -96,7 +96,7 @@ def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None
         "seconds": run.setup.timings.seconds,
         "curve": [astuple(point) for point in run.curve],
     }
-    return begin_resume(directory, arrays, state)
+    return begin_resume(directory, arrays, state, after_each=run.average.let_go)
 
 
 def load_run(directory: Path, run: Run) -> float:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.worker.phantoms import phantom_clip, prepared
+from worker.train import aside
 from worker.train.average import PREFIX, RunningMean
 from worker.train.presets import PRESETS
 
@@ -37,6 +38,24 @@ def test_what_is_put_is_the_mean_of_what_was_added(models: list[Parameters]) -> 
         expected = np.mean([model[name].double().numpy() for model in models], axis=0)
         assert values.dtype == torch.float32
         np.testing.assert_allclose(values, expected, atol=1e-6)
+
+
+def test_a_mean_in_files_has_the_same_bits(models: list[Parameters], monkeypatch: pytest.MonkeyPatch) -> None:
+    means, stored = [], []
+    for large in (aside.LARGE_BYTES, 0):
+        monkeypatch.setattr(aside, "LARGE_BYTES", large)
+        first, mean = RunningMean(), RunningMean()
+        for model in models[:3]:
+            first.add(model)
+        stored.append({name: values.clone() for name, values in first.arrays().items()})
+        first.let_go()
+        mean.load_arrays(first.arrays(), first.count)
+        for model in models[3:]:
+            mean.add(model)
+        means.append(mean_of(mean, models[0]))
+    for made in (means, stored):
+        for name, values in made[0].items():
+            np.testing.assert_array_equal(values, made[1][name])
 
 
 def test_the_mean_of_one_model_is_that_model(models: list[Parameters]) -> None:

@@ -96,6 +96,8 @@ def test_a_long_clips_run_keeps_no_first_moments_and_goes_on_to_the_same_bits(
 ) -> None:
     monkeypatch.setattr("worker.train.presets.USUAL_BASES", 1)  # what a long clip has more of
     monkeypatch.setattr(keep, "PERIOD_S", 0.0)
+    monkeypatch.setattr("worker.train.aside.LARGE_BYTES", 1 << 12)
+    monkeypatch.setattr("worker.scene.resume_file._AT_MOST_BYTES", 1 << 12)
 
     def stop(progress: Progress) -> None:
         if progress.stage == "train" and progress.iteration >= ITERATIONS // 2:
