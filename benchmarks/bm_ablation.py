@@ -54,6 +54,7 @@ CHANGES: dict[str, Preset] = {
         colour=_PAPER.rates.colour, log_scale=_PAPER.rates.log_scale, quaternion=_PAPER.rates.quaternion
     ),
     "Adam's moments as published": _rates(beta1=_PAPER.rates.beta1, beta2=_PAPER.rates.beta2),
+    "without first moments": _rates(beta1=0.0),
     "plain L1 of colour": dataclasses.replace(_FAST, loss=dataclasses.replace(_FAST.loss, colour_huber_delta=0.0)),
     "rates fall once, nothing averaged": dataclasses.replace(_FAST, warm_restarts=False, min_gain_db=None),
     "opacity 0.8, spread 0.6": dataclasses.replace(_FAST, opacity=0.8, spread=0.6),

@@ -3,8 +3,8 @@
     python -m benchmarks.pages
 
 Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
-stability`), {post,two-eyes,stereo_truth,confidence,ablation,raster,service,memory}.csv, off-axis.jpg, stereo.txt (the
-output of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
+stability`), {post,two-eyes,stereo_truth,confidence,ablation,raster,service,memory,long}.csv, off-axis.jpg, stereo.txt
+(the output of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
 """
 
 from __future__ import annotations
@@ -75,6 +75,14 @@ _MEMORY = """
 resident memory in each stage, for a clip of both eyes as recorded. `import` is with all libraries loaded, before the
 clip; another process decodes ([decision 033](../decisions/033-memory.md)).
 """
+_LONG = """
+## A long clip
+
+`python -m benchmarks.bm_long --cache FOLDER --csv docs/results/long.csv` ([long.csv](long.csv)): a synthetic clip of
+both eyes, and its first frames alone with as many steps a frame. Scores of every8, in dB, left and right eye; the peak
+of the process's resident memory before training, in training, in finishing and in scoring, in MiB; seconds that storing
+and scoring take ([decision 042](../decisions/042-long-clips.md)).
+"""
 _CHAOS = """
 ## What survives what
 
@@ -116,6 +124,8 @@ def main() -> None:
         parts += [_SERVICE, *_service_tables(rows)]
     if rows := _read("memory.csv"):
         parts += [_MEMORY, _memory_table(rows), origin(rows)]
+    if rows := _read("long.csv"):
+        parts += [_LONG, _long_table(rows), origin(rows)]
     if (RESULTS / "chaos.md").exists():
         parts.append(_CHAOS)
     if (RESULTS / "soak.txt").exists():
@@ -194,6 +204,26 @@ def _memory_table(rows: list[Row]) -> str:
     header = ["clip", "preset", "limit", "Gaussians", "bases", "stage", "peak, MiB", "at its end", "decoding process"]
     names = ("clip", "preset", "limit", "gaussians", "bases", "stage", "peak_mib", "end_mib", "decoder_mib")
     return table(header, [[row[name] or "–" for name in names] for row in rows])
+
+
+def _long_table(rows: list[Row]) -> str:
+    header = ["clip", "preset", "iterations", "Gaussians", "bases", "ms a step", "psnr_tissue", "right eye"]
+    header += ["before", "train", "finish", "score", "store, s", "score, s"]
+    names = ("clip", "preset", "iterations", "gaussians", "bases", "step_ms", "psnr_tissue_db", "psnr_right_db")
+    before = ("decode_mib", "stereo_mib", "motion_mib", "fusion_mib", "start_mib")
+    return table(
+        header,
+        [
+            [
+                *(row[name] or "–" for name in names),
+                str(max(int(row[name]) for name in before)),
+                *(row[name] for name in ("train_mib", "finish_mib", "score_mib")),
+                f"{float(row['finish_s']) + float(row['shrink_s']):.1f}",
+                row["score_s"],
+            ]
+            for row in rows
+        ],
+    )
 
 
 if __name__ == "__main__":
