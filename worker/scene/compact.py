@@ -49,10 +49,10 @@ MIN_POWER = -3
 """The least power of two, MAX_POWER being the largest, by which a Gaussian's precision may differ from the mean. What
 the trained frames hardly show may be seen from elsewhere, so it keeps an eighth."""
 SEEN_LEVELS = 63
-MAX_NUMBERS = 2**27
-"""Numbers a scene may have, four times those of 80 thousand Gaussians and 33 bases. Unpacking takes up to 14 bytes
-a number (where there is one basis; 10 where there are many), so no file, however small, takes more than 2 GiB, and
-what its motion's weights take."""
+MAX_NUMBERS = 7 * 2**25
+"""Numbers a scene may have: those of 170 thousand Gaussians and 97 bases. Unpacking takes up to 14 bytes a number
+(where there is one basis; 10 where there are many), so no file, however small, takes more than 3.1 GiB, and what its
+motion's weights take."""
 MAX_WEIGHTS = 2**28
 """Weights of a scene's motion: 1 GiB. A long clip's bases are more than its patterns."""
 OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])

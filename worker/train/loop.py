@@ -16,6 +16,7 @@ from contract.wire.errors import Cancelled, TrainingDiverged
 from worker.machine.hooks import ignore
 from worker.machine.timing import Stopwatch
 from worker.model.optimize import rates_at
+from worker.raster.model import state_of
 from worker.raster.step import StepSums
 from worker.scene.scene import Scene, is_finite
 from worker.train.hooks import TrainingHooks
@@ -134,7 +135,8 @@ def _validation_psnr(run: Run) -> float:
 
 def _check_finite(run: Run) -> None:
     """Check the parameters themselves: a Gaussian that is not a number is not drawn, so the loss does not show it."""
-    broken = [name for name, values in run.model.arrays().items() if not is_finite(values)]
+    arrays = state_of(run.model, run.preset.rates.beta1)
+    broken = [name for name, values in arrays.items() if not is_finite(values)]
     if broken:
         raise TrainingDiverged(f"After {run.iteration} iterations {', '.join(broken)} hold values that are not finite.")
 
