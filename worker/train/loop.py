@@ -26,6 +26,8 @@ from worker.train.scoring import HeldOutScore
 
 CURVE_SECONDS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 90, 120, 180, 300, 600)
 """Training times at which held-out frames are scored; the clock is paused meanwhile."""
+UNSCORED_S = 2.0
+"""After the first step: a score takes a third of a second of whoever waits, and would tell little so soon."""
 REPORT_EVERY_S = 0.25
 
 
@@ -76,7 +78,7 @@ def train(
         Cancelled: hooks.should_stop said so; run is as it was after its last full iteration and can be resumed.
         TrainingDiverged: the loss or a parameter is not finite, or no Gaussian is visible.
     """
-    marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s]
+    marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s + UNSCORED_S]
     reported, began, begun_at = -math.inf, clock.elapsed_s, run.iteration
     hooks.on_progress(run.progress("train", run.iteration / run.iterations))
     while run.iteration < run.iterations:

@@ -130,7 +130,7 @@ def test_a_split_trains_on_no_frame_that_is_left_out_and_times_stay(holdout: str
 @pytest.mark.parametrize(
     ("options", "most"),
     [
-        ({"preset": "instant"}, 39),
+        ({"preset": "instant"}, 32),
         ({"preset": "fast"}, 390),
         ({"preset": "instant", "budget_s": 60.0}, 390),
         ({"preset": "fast", "budget_s": 1.0}, LEAST_FRAMES),
