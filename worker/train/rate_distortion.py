@@ -191,7 +191,7 @@ def _sensitivity(model: Model, pictures: Sequence[Picture], bases: int) -> NDArr
     for frames, index in sampled:
         tissue = frames.eye.tissue[index]
         signs = np.zeros((5, *tissue.shape), np.float32)
-        signs[:3] = random.choice(np.array([-1, 1], np.float32), (3, *tissue.shape)) * tissue
+        signs[:3] = (2 * random.integers(0, 2, (3, *tissue.shape), np.int8) - 1) * tissue
         found = model.image_gradient(frames.cameras[index], float(frames.t[index]), signs)
         sensitivity += found.astype(np.float64) ** 2 * (model.count / max(3 * int(tissue.sum()), 1) / len(sampled))
     across = max(float(sensitivity[:2].mean()), 1e-12)
