@@ -1,10 +1,10 @@
-"""Steps of a new model that are taken back: to compile its kernels, and to time how many fit into a budget."""
+"""The first steps of a new model: to compile its kernels, and to time how many fit into a budget."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -68,21 +68,26 @@ def warm_up(run: Run, on_progress: Callable[[float], None]) -> float:
     return time.perf_counter() - start
 
 
-def iterations_within(run: Run, budget_s: float, elapsed_s: float) -> int:
-    """How many iterations of a new run fit into what is left of budget_s, by timing a few and taking them back.
+def measured_schedule(run: Run, budget_s: float, min_gain_db: float | None = None) -> Schedule:
+    """The schedule of a new run that ends with its budget: iterations are as long as the first.
 
-    At least as many as show every training frame once.
+    budget_s includes what the run's clock shows already. There are at least as many iterations as show every training
+    frame once. Where every step is answered the timed ones are the run's first
+    iterations. A device that answers late would have made hundreds of them, so there they are taken back.
     """
-    start = time.perf_counter()
     model, steps_an_answer = run.model, run.model.answers_every
-    trial = replace(run, schedule=Schedule((UNTIMED_STEPS + TIMED_STEPS) * steps_an_answer))
-    with taken_back(model, run.preset.rates.beta1):
-        ends = [time.perf_counter()]
-        for iteration in range(1, trial.iterations + 1):
-            step(trial, iteration)
+    timed, count = (UNTIMED_STEPS + TIMED_STEPS) * steps_an_answer, steps_an_answer == 1
+    known = Schedule(timed, run.preset.warm_restarts, min_gain_db, run.steps_an_epoch, opening=timed)
+    run.schedule, ends = known, []
+    with nullcontext() if count else taken_back(model, run.preset.rates.beta1):
+        ends.append(time.perf_counter())
+        for iteration in range(1, timed + 1):
+            step(run, iteration)
             if iteration % steps_an_answer == 0:
                 check_sums(model.wait(), iteration)
                 ends.append(time.perf_counter())
+    made = timed if count else 0
+    run.iteration = made
     step_s = float(np.median(np.diff(ends)[UNTIMED_STEPS:])) / steps_an_answer * GROWTH_ALLOWANCE
-    left_s = budget_s - elapsed_s - (time.perf_counter() - start)
-    return max(run.steps_an_epoch, int(left_s / step_s))
+    left = int((budget_s - run.setup.clock.elapsed_s) / step_s)
+    return replace(known, planned=max(run.steps_an_epoch, made + left, made), opening=made)

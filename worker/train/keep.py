@@ -99,10 +99,11 @@ class Keeper:
         return clip
 
     def keep_if_due(self, run: Run) -> None:
-        """Keep the run's state at its start and after each PERIOD_S. Call it between two steps."""
+        """Keep the run's state at its start, unless that was a kept state, and after each PERIOD_S. Call it between two
+        steps."""
         now_s = time.monotonic()
         if self._due_s is None:
-            self._due_s = now_s if run.iteration == 0 else now_s + PERIOD_S
+            self._due_s = now_s + PERIOD_S if (self.folder / RESUME_FILE).exists() else now_s
         if now_s >= self._due_s and (self._state is None or self._state.done()):
             self._due_s = now_s + PERIOD_S
             self._begin(run)

@@ -12,7 +12,7 @@ from worker.model.deformation import SharedBasis
 from worker.motion.tracks import Tracks, moved_along, track
 from worker.raster.backend import CPU, examine
 from worker.raster.model import Model
-from worker.train.calibrate import iterations_within, warm_up
+from worker.train.calibrate import measured_schedule, warm_up
 from worker.train.densify import Densifier
 from worker.train.presets import Preset
 from worker.train.run import Box, Run
@@ -23,7 +23,8 @@ from worker.train.targets import TrainingFrames, units_per_mm
 
 
 def prepare(setup: Setup) -> Run:
-    """The run before its first step. Compiling a GPU's kernels does not count as training: the clock is paused.
+    """The run before its first step, or after those that tell its length. Compiling a GPU's kernels does not count as
+    training: the clock is paused.
 
     Raises:
         InputError: no training frame has valid depth.
@@ -97,12 +98,11 @@ def _tracks(setup: Setup) -> Tracks | None:
 
 
 def _schedule(run: Run) -> Schedule:
-    """How many iterations are made and how rates fall in them."""
-    setup, preset, epoch = run.setup, run.preset, run.steps_an_epoch
+    """How many iterations are made and how rates fall in them. Where a budget decides, the first are made here."""
+    setup, preset = run.setup, run.preset
     fixed = setup.fixed_iterations
     if fixed is not None:
-        return Schedule(fixed, preset.warm_restarts, epoch=epoch)
+        return Schedule(fixed, preset.warm_restarts, epoch=run.steps_an_epoch)
     setup.hooks.report_stage("calibrate", 0.0)
-    planned = iterations_within(run, setup.budget_s, setup.clock.elapsed_s)
     min_gain_db = preset.min_gain_db if validation_frames(run.frames.indices) else None
-    return Schedule(planned, preset.warm_restarts, min_gain_db, epoch)
+    return measured_schedule(run, setup.budget_s, min_gain_db)

@@ -40,6 +40,7 @@ class Schedule:
                    there are no validation frames and no early stopping
     epoch          iterations that show every training frame once; a long clip needs long cycles
     scores         psnr_tissue of the validation frames, dB, at the ends of the cycles so far
+    opening        first iterations, made before `planned` was known: at full rates, and on no validation frame
     """
 
     planned: int
@@ -47,6 +48,7 @@ class Schedule:
     min_gain_db: float | None = None
     epoch: int = 1
     scores: tuple[float, ...] = ()
+    opening: int = 0
 
     @property
     def _planned_ends(self) -> tuple[int, ...]:
@@ -84,7 +86,9 @@ class Schedule:
         return max((each for each in self.ends if each < end), default=0), end
 
     def progress(self, iteration: int) -> float:
-        """How far rates have fallen, in (0, 1]: 1 at the end of every cycle."""
+        """How far rates have fallen, in [0, 1]: 1 at the end of every cycle, 0 in the opening."""
+        if iteration <= self.opening:
+            return 0.0
         begun, end = self.cycle(iteration)
         fallen = RESTART if begun else 0.0
         return fallen + (1 - fallen) * (iteration - begun) / (end - begun)
@@ -97,6 +101,8 @@ class Schedule:
 
     def withholds_validation(self, iteration: int) -> bool:
         """Whether an iteration trains on no validation frame: early stopping is still undecided."""
+        if iteration <= self.opening:
+            return self.min_gain_db is not None
         may_stop = self.min_gain_db is not None and len(self._planned_ends) > 2  # two scores, and a cycle to be spared
         return may_stop and iteration <= self.ends[-2]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
 from worker.raster.cpu.model import CpuModel
 from worker.raster.step import StepSums, TrainingFrame
-from worker.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, iterations_within, warm_up
+from worker.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, measured_schedule, warm_up
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.presets import PRESETS
@@ -108,16 +109,21 @@ def test_a_cycle_does_not_end_before_its_steps_are_known_to_be_sound() -> None:
     assert 23 not in scored
 
 
-def test_a_budget_is_measured_on_all_steps_up_to_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_budget_is_measured_on_all_steps_up_to_an_answer_and_they_are_taken_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     run, model = lagging(20)
-    untimed, timed = UNTIMED_STEPS, TIMED_STEPS
-    answer_s = 0.1
-    times_s = np.cumsum([0.0, 0.5, *[answer_s] * (untimed + timed), 0.0])
-    clock = iter(times_s.tolist())
+    before = {key: values.clone() for key, values in model.arrays().items()}
+    untimed, timed, answer_s = UNTIMED_STEPS, TIMED_STEPS, 0.1
+    clock = iter(np.cumsum([0.0, *[answer_s] * (untimed + timed)]).tolist())
     monkeypatch.setattr("worker.train.calibrate.time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    planned = iterations_within(run, 60.0, 0.0)
-    assert planned == pytest.approx((60 - times_s[-1]) / (answer_s / LAG * GROWTH_ALLOWANCE), abs=1)
+    run.setup = dataclasses.replace(run.setup, clock=SimpleNamespace(elapsed_s=1.0))
+    schedule = measured_schedule(run, 60.0)
+    assert schedule.planned == pytest.approx(59 / (answer_s / LAG * GROWTH_ALLOWANCE), abs=1)
+    assert (schedule.opening, run.iteration) == (0, 0)
     assert model.steps_made == LAG * (untimed + timed)
+    for key, values in model.arrays().items():
+        assert torch.equal(values, before[key]), key
 
 
 @pytest.mark.parametrize("name", ["fast", "paper", "pfs"])

@@ -233,3 +233,12 @@ def test_validation_frames_lie_between_others(count: int) -> None:
 def test_few_frames_have_no_validation_frames() -> None:
     assert validation_frames(range(MIN_FRAMES_FOR_VALIDATION - 1)) == ()
     assert validation_frames([]) == ()
+
+
+@pytest.mark.parametrize("min_gain_db", [None, MIN_GAIN_DB])
+def test_in_the_opening_rates_are_full_and_validation_frames_stay_out(min_gain_db: float | None) -> None:
+    schedule = Schedule(300, True, min_gain_db, opening=15)
+    assert [schedule.progress(iteration) for iteration in (1, 15)] == [0.0, 0.0]
+    assert schedule.progress(16) == Schedule(300, True).progress(16)
+    assert schedule.withholds_validation(15) == (min_gain_db is not None)
+    assert not schedule.withholds_validation(16)

@@ -21,13 +21,14 @@ from worker.machine.hooks import Progress
 from worker.machine.timing import Stopwatch
 from worker.model.metrics import psnr_tissue
 from worker.model.optimize import Rate
-from worker.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, iterations_within
+from worker.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, measured_schedule
 from worker.train.densify import DensifySettings
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.presets import PRESETS, Preset
 from worker.train.resume import load_run, save_run
 from worker.train.run import CurvePoint, Run, frames_at, write_curve
+from worker.train.schedule import Schedule
 from worker.train.scoring import HeldOutScore
 
 SOON = DensifySettings(from_iteration=6, every=6, gradient_threshold=1e-5)
@@ -169,47 +170,34 @@ def test_the_curve_tells_iterations_and_the_frames_they_saw(tmp_path: Path) -> N
     assert 0 < float(row["t_post_s"]) < time.time() - run.setup.accepted_at_s
 
 
-def fitting(run: Run, budget_s: float, elapsed_s: float = 0.0) -> int:
-    return iterations_within(run, budget_s, elapsed_s)
+def after_seconds(run: Run, elapsed_s: float) -> Run:
+    """The run with so much on its clock."""
+    return dataclasses.replace(run, setup=dataclasses.replace(run.setup, clock=SimpleNamespace(elapsed_s=elapsed_s)))
 
 
 def test_a_budget_allows_what_is_left_of_it_over_the_median_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    run, split = prepared(phantom_clip(), "fast")
-    untimed, timed = UNTIMED_STEPS, TIMED_STEPS
-    storing_s, step_s, later_s = 0.5, 0.02, 0.25
+    untimed, timed, step_s = UNTIMED_STEPS, TIMED_STEPS, 0.02
     steps_s = [0.9] * untimed + [step_s] * (timed - 2) + [step_s / 2, 3.0]
-    durations_s = [storing_s, *steps_s, later_s]
-    times_s = [sum(durations_s[:place]) for place in range(len(durations_s) + 1)]
-
-    def fitting_by_this_clock(budget_s: float) -> int:
-        clock = iter(times_s)
-        monkeypatch.setattr("worker.train.calibrate.time", SimpleNamespace(perf_counter=lambda: next(clock)))
-        return fitting(run, budget_s, elapsed_s=1.0)
-
-    for budget_s in (10.0, 30.0, 61.0):
-        assert fitting_by_this_clock(budget_s) == int((budget_s - 1.0 - times_s[-1]) / (GROWTH_ALLOWANCE * step_s))
-    assert fitting_by_this_clock(1.0) == len(split.train)
+    for budget_s, more in ((10.0, 1), (61.0, 1), (1.0, 0)):
+        run, split = prepared(phantom_clip(), "fast")
+        clock = iter(np.cumsum([0.0, *steps_s]).tolist())
+        monkeypatch.setattr(
+            "worker.train.calibrate.time", SimpleNamespace(perf_counter=lambda clock=clock: next(clock))
+        )
+        schedule = measured_schedule(after_seconds(run, 1.0), budget_s)
+        fit = untimed + timed + int((budget_s - 1.0) / (GROWTH_ALLOWANCE * step_s))
+        assert schedule.planned == (fit if more else max(len(split.train), untimed + timed))
 
 
-def test_calibration_leaves_the_model_as_it_was() -> None:
-    for name in ("fast", "paper", "hexplane"):
-        run, split = prepared(phantom_clip(), name)
-        before = {key: values.clone() for key, values in run.model.arrays().items()}
-        for budget_s in (1e-9, 0.5):
-            assert fitting(run, budget_s, elapsed_s=0.1) >= len(split.train)
-        after = run.model.arrays()
-        assert before.keys() == after.keys()
-        for key, values in before.items():
-            np.testing.assert_array_equal(after[key], values, err_msg=f"{name}: {key}")
-        assert run.iteration == 0
-
-
-def test_calibration_does_not_change_what_training_makes() -> None:
+@pytest.mark.parametrize("name", ["fast", "hexplane"])
+def test_the_steps_that_tell_the_length_of_a_run_are_its_first(name: str) -> None:
     clip = phantom_clip()
-    for name in ("fast", "hexplane"):
-        run, _ = prepared(clip, name, iterations=ITERATIONS)
-        fitting(run, 1.0)
-        assert bits(trained(run)) == run_bits(clip, PRESETS[name])
+    run, _ = prepared(clip, name)
+    run.schedule = dataclasses.replace(measured_schedule(run, 1e-9), planned=ITERATIONS)
+    assert run.iteration == run.schedule.opening == UNTIMED_STEPS + TIMED_STEPS
+    again, _ = prepared(clip, name)
+    again.schedule = Schedule.of(run.schedule.settings)
+    assert bits(trained(run)) == bits(trained(again))
 
 
 def spoil(run: Run) -> None:
