@@ -7,7 +7,8 @@ every warm restart (worker/train/schedule.py) and at the end of a run.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -16,6 +17,10 @@ class Rate:
 
     start: float
     end: float | None = None
+
+    def times(self, factor: float) -> Rate:
+        """The rate larger by the factor."""
+        return Rate(factor * self.start, None if self.end is None else factor * self.end)
 
     def at(self, progress: float) -> float:
         if self.end is None or self.start == 0.0:
@@ -45,6 +50,12 @@ class Rates:
     eps: float = 1e-15
     beta1: float = 0.9
     beta2: float = 0.999
+
+    def times(self, factor: float) -> Rates:
+        """Every rate larger by the factor."""
+        found: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        found |= {name: each.times(factor) for name, each in found.items() if isinstance(each, Rate)}
+        return Rates(**found)
 
 
 @dataclass(frozen=True)

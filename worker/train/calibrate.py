@@ -72,8 +72,8 @@ def measured_schedule(run: Run, budget_s: float, min_gain_db: float | None = Non
     """The schedule of a new run that ends with its budget: iterations are as long as the first.
 
     budget_s includes what the run's clock shows already. There are at least as many iterations as show every training
-    frame once. Where every step is answered the timed ones are the run's first
-    iterations. A device that answers late would have made hundreds of them, so there they are taken back.
+    frame once. Where every step is answered the timed ones are the run's first iterations. A device that answers late
+    would have made hundreds of them, so there they are taken back.
     """
     model, steps_an_answer = run.model, run.model.answers_every
     timed, count = (UNTIMED_STEPS + TIMED_STEPS) * steps_an_answer, steps_an_answer == 1

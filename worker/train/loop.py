@@ -29,6 +29,8 @@ CURVE_SECONDS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 90, 120, 180, 300, 600)
 UNSCORED_S = 2.0
 """After the first step: a score takes a third of a second of whoever waits, and would tell little so soon."""
 REPORT_EVERY_S = 0.25
+TOLD_AFTER_S = 1.0
+"""Of training: the first steps, beside which the state is kept, tell little of how long the others take."""
 
 
 def step(run: Run, iteration: int) -> None:
@@ -93,7 +95,8 @@ def train(
             _score(run, clock, evaluate)
         if (now := clock.elapsed_s) - reported >= REPORT_EVERY_S:
             reported = now
-            left_s = (now - began) / (iteration - begun_at) * (run.iterations - iteration)
+            made_s = now - began
+            left_s = made_s / (iteration - begun_at) * (run.iterations - iteration) if made_s > TOLD_AFTER_S else None
             hooks.on_progress(run.progress("train", iteration / run.iterations, left_s))
     check_sums(run.model.wait(), run.iteration)
     _check_finite(run)

@@ -51,8 +51,11 @@ def test_a_rival_differs_from_the_paper_in_what_it_is_named_for_alone(name: str,
 def test_ours_differ_in_time_and_in_how_many_gaussians_it_pays_for() -> None:
     instant, fast, quality = (PRESETS[name] for name in ("instant", "fast", "quality"))
     for other in (instant, quality):
-        assert differing(other, fast) <= {"points_per_image", "budget_s", "min_gain_db"}
+        assert differing(other, fast) <= {"points_per_image", "budget_s", "min_gain_db", "rates"}
         assert other.points_by_budget
+    assert quality.rates == fast.rates
+    assert instant.rates.motion_mean.at(0.5) / fast.rates.motion_mean.at(0.5) == pytest.approx(1.6)
+    assert (instant.rates.beta1, instant.rates.beta2) == (fast.rates.beta1, fast.rates.beta2)
     budgets = [preset.budget_s or 0.0 for preset in (instant, fast, quality)]
     assert budgets == sorted(set(budgets))
 
