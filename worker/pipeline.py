@@ -276,7 +276,8 @@ def _training(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Train
 def _warnings(run: Run) -> tuple[Notice, ...]:
     """The warnings of the run itself."""
     found = []
-    if run.setup.fixed_iterations is None and run.schedule.planned == run.schedule.epoch:
+    least = max(run.schedule.epoch, run.schedule.opening)
+    if run.setup.fixed_iterations is None and run.schedule.planned == least:
         text = "The time given allowed less than one step per training frame; one per frame was made all the same."
         found.append(Notice.warning(NoticeCode.TIME_TOO_SHORT, text))
     if run.setup.gpu_is_idle:

@@ -167,7 +167,7 @@ def test_the_curve_tells_iterations_and_the_frames_they_saw(tmp_path: Path) -> N
     with (tmp_path / "curve.csv").open() as file:
         (row,) = csv.DictReader(file)
     assert (row["iteration"], row["frames_seen"], row["psnr_tissue_db"]) == ("5", "10", "31.5000")
-    assert 0 < float(row["t_post_s"]) < time.time() - run.setup.accepted_at_s
+    assert 0 < float(row["t_post_s"]) < time.time() - run.setup.accepted_at_s + 1e-3  # it is rounded
 
 
 def after_seconds(run: Run, elapsed_s: float) -> Run:
