@@ -294,7 +294,7 @@ class Report(Model):
     train_count: int
     held_out: tuple[int, ...]
     repeated: tuple[int, ...]
-    """frames in neither set: they repeat a held-out one, or show nothing new since the one before"""
+    """frames in neither set: they repeat a held-out one, show nothing new, or there is no time for them"""
     frame_times_s: tuple[float, ...]
 
 

@@ -135,7 +135,7 @@ class Report(BaseModel):
     train_count: int = Field(ge=0)
     held_out: tuple[int, ...]
     repeated: tuple[int, ...] = Field(
-        description="frames in neither set: they repeat a held-out one, or show nothing new since the one before"
+        description="frames in neither set: they repeat a held-out one, show nothing new, or there is no time for them"
     )
     frame_times_s: tuple[float, ...]
 
