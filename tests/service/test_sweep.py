@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -34,14 +35,16 @@ class AbsentQueue(MemoryQueue):
         return standing
 
 
-def wait_for_job(queue: MemoryQueue, job_id: str) -> JobRecord:
+def is_in(queue: MemoryQueue, job_id: str, state: JobState) -> bool:
+    record = queue.get(job_id)
+    return record is not None and record.state is state
+
+
+def wait_until(is_so: Callable[..., bool], *arguments: object) -> None:
     deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        record = queue.get(job_id)
-        if record is not None:
-            return record
+    while not is_so(*arguments):
+        assert time.monotonic() < deadline, "the sweep did not do it"
         time.sleep(0.02)
-    raise AssertionError("the sweep did not queue the job")
 
 
 @pytest.mark.parametrize("loses", [False, True])
@@ -57,7 +60,7 @@ def test_a_clip_accepted_while_the_queue_is_away_is_queued_once_it_is_back(
         assert refused.headers["retry-after"]
         assert service.store.submission(problem["job_id"]) is not None
         queue.is_away = False
-        assert wait_for_job(queue, problem["job_id"]).state is JobState.QUEUED
+        wait_until(is_in, queue, problem["job_id"], JobState.QUEUED)
         assert len(queue.records()) == 1
 
 
@@ -90,7 +93,7 @@ def test_a_service_that_starts_queues_what_an_earlier_one_left(tmp_path: Path) -
         job_id = service.upload().json()["id"]
     emptied = MemoryQueue()
     for _ in running_service(tmp_path, emptied):
-        assert wait_for_job(emptied, job_id).state is JobState.QUEUED
+        wait_until(is_in, emptied, job_id, JobState.QUEUED)
 
 
 def test_a_finished_scene_whose_record_was_lost_is_restored_and_not_run_again(tmp_path: Path) -> None:
@@ -158,10 +161,13 @@ def test_a_job_whose_clip_was_withdrawn_meanwhile_is_taken_back(service: Service
     assert queue.records() == []
 
 
-def files_left(service: ServiceUnderTest, job_id: str) -> list[object]:
-    """The clip and the attempts at a scene; they go one after the other."""
-    submission = service.store.submission(job_id)
-    return ([] if submission is None else [submission]) + list(service.store.scene_attempts(job_id))
+def no_files_left(service: ServiceUnderTest, job_id: str) -> bool:
+    """Neither the clip nor the attempts at a scene; they go one after the other."""
+    return service.store.submission(job_id) is None and not service.store.scene_attempts(job_id)
+
+
+def is_gone(path: Path) -> bool:
+    return not path.exists()
 
 
 def test_the_files_of_a_cancelled_job_go_even_if_its_worker_died(
@@ -177,13 +183,8 @@ def test_the_files_of_a_cancelled_job_go_even_if_its_worker_died(
         service.store.publish_scene(job_id, record.attempt)
         queue.cancel(job_id)
         assert queue.claim("worker-2", 0.0) is None  # which finds the lease run out
-        ended = queue.get(job_id)
-        assert ended is not None
-        assert ended.state is JobState.CANCELLED
-        deadline = time.monotonic() + PATIENCE_S
-        while (left := files_left(service, job_id)) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        assert not left
+        assert is_in(queue, job_id, JobState.CANCELLED)
+        wait_until(no_files_left, service, job_id)
 
 
 def test_the_work_of_a_job_that_deaths_of_whole_workers_failed_goes(
@@ -199,13 +200,8 @@ def test_the_work_of_a_job_that_deaths_of_whole_workers_failed_goes(
             kept = service.store.kept_folder(job_id, record.attempt)
             (kept / RESUME).write_text("x")
         assert queue.claim("worker-9", 0.0) is None
-        ended = queue.get(job_id)
-        assert ended is not None
-        assert ended.state is JobState.FAILED
-        deadline = time.monotonic() + PATIENCE_S
-        while kept.exists() and time.monotonic() < deadline:
-            time.sleep(0.02)
-        assert not kept.exists()
+        assert is_in(queue, job_id, JobState.FAILED)
+        wait_until(is_gone, kept)
         assert service.store.submission(job_id) is not None, "it may be retried"
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from worker.model.optimize import rates_at
 from worker.raster.model import Model, state_of
 from worker.raster.step import image_size
-from worker.train.aside import Aside
 from worker.train.loop import check_sums, step
 from worker.train.run import Run
 from worker.train.schedule import Schedule
@@ -27,12 +26,12 @@ GROWTH_ALLOWANCE = 1.15
 @contextmanager
 def taken_back(model: Model, beta1: float) -> Iterator[None]:
     """Steps of a model that has made none yet, with such a beta1: afterwards it is as it was."""
-    stored = {name: Aside(values) for name, values in model.parameters().items()}
+    stored = {name: values.clone() for name, values in model.parameters().items()}
 
     def restore() -> None:
         for name, values in state_of(model, beta1).items():  # moments and their counts are 0 before the first step
             if name in stored:
-                stored[name].each(values, lambda copy, value: value.copy_(copy))
+                values.copy_(stored[name])
             else:
                 values.zero_()
 

@@ -1,4 +1,6 @@
-"""Frames that show nothing new: repeats, a paused recording, tissue that rests or hardly moves.
+"""Training frames that are left out: those that show nothing new, and those that a short training has no time for.
+
+Nothing new: repeats, a paused recording, tissue that rests or hardly moves.
 
 Symbols: T frames, h w pixels of a thumbnail, P patches of PATCH x PATCH pixels of it.
 """
