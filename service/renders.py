@@ -183,8 +183,7 @@ def _find(services: Deps, caller: Caller, scene: str | None) -> Shown:
 
 
 def _only(services: Deps, caller: Caller) -> Shown:
-    records = services.queue.records(caller.tenant, None)
-    done = [record for record in records if record.state is JobState.DONE]
+    done, _ = services.done.of_tenant(caller.tenant)
     there = [record for record in done if services.store.has_scene(record.job_id, record.attempt)]
     if len(there) != 1:
         detail = f"There are {len(there)} scenes and none was named."

@@ -55,6 +55,17 @@ def test_finished_scenes_are_shown_while_the_queue_is_away_seen_before_or_not_bu
         assert_problem(service.http.get("/render", params={"scene": waiting}), 503)
 
 
+def test_the_only_scene_needs_no_name_while_the_queue_is_away_but_one_of_two_does(tmp_path: Path) -> None:
+    queue = LeavingQueue()
+    for service in running_service(tmp_path, queue):
+        scene, second = service.finished_scene(), service.finished_scene()
+        assert service.http.get("/render", params={"scene": second}).status_code == 200
+        queue.is_away = True
+        assert_problem(service.http.get("/render"), 400, "scene")
+        service.store.purge(second)
+        assert service.http.get("/render").headers["X-Intrasplat-Scene"] == scene
+
+
 def test_of_several_finished_attempts_none_is_shown_while_only_the_queue_knows_which_counts(tmp_path: Path) -> None:
     queue = LeavingQueue()
     for service in running_service(tmp_path, queue):
