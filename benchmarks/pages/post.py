@@ -56,15 +56,17 @@ def post_sections(folder: Path) -> list[str]:
 
 
 def post_claim(folder: Path) -> str:
-    """Both clocks of each preset that was sent as it is, in a sentence; empty without such rows."""
-    said = [
-        f"`{preset}` shows a first view of `{clip}` after {_median(rows, 'first_view_s'):.1f} s and has its scene "
-        f"after {_median(rows, 't_post_s'):.1f} s (`t_post_s`), {_median(rows, 't_train_s'):.1f} s of them training "
-        "(`t_train_s`)"
-        for (clip, preset, budget_s, way), rows in _groups(folder).items()
-        if way == "http" and not budget_s
-    ]
-    return f"By the user's clock, over HTTP to a warm worker: {'; '.join(said)}." if said else ""
+    """Both clocks of each preset that was sent as it is, in a sentence a clip; empty without such rows."""
+    said: dict[str, list[str]] = {}
+    for (clip, preset, budget_s, way), rows in _groups(folder).items():
+        if way == "http" and not budget_s:
+            said.setdefault(clip, []).append(
+                f"`{preset}` shows a first view after {_median(rows, 'first_view_s'):.1f} s and has its scene after "
+                f"{_median(rows, 't_post_s'):.1f} s (`t_post_s`), {_median(rows, 't_train_s'):.1f} s of them training "
+                "(`t_train_s`)"
+            )
+    clips = (f"Since the POST of `{clip}` to a warm worker: {'; '.join(each)}." for clip, each in said.items())
+    return " ".join(clips)
 
 
 def _groups(folder: Path) -> dict[tuple[str, str, str, str], list[Row]]:

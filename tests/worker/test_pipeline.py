@@ -229,7 +229,7 @@ def test_a_stopped_run_with_a_budget_keeps_its_schedule(clip: Path, tmp_path: Pa
 def test_a_budget_too_short_for_its_frames_is_told(name: str, clip: Path, tmp_path: Path) -> None:
     def told(**length: Any) -> bool:
         report = run(clip, tmp_path / str(length), preset=name, **length)
-        return any("less than one step per training frame" in warning.text for warning in report.warnings)
+        return NoticeCode.TIME_TOO_SHORT in [each.code for each in report.warnings]
 
     assert told(iterations=None, budget_s=1e-6)
     assert not told(iterations=FRAMES - 2)

@@ -92,8 +92,8 @@ def test_the_page_tells_what_a_caller_waits_for_by_both_clocks(tmp_path: Path) -
     assert "| d4d_stereo | instant |  | 1 | 6.2 | 14.5 | 20.0 | 32.0 | – |" in page
     assert "commits new " in page
     assert post_claim(tmp_path) == (
-        "By the user's clock, over HTTP to a warm worker: `instant` shows a first view of `d4d_stereo` after 2.2 s and "
-        "has its scene after 14.5 s (`t_post_s`), 6.2 s of them training (`t_train_s`)."
+        "Since the POST of `d4d_stereo` to a warm worker: `instant` shows a first view after 2.2 s and has its scene "
+        "after 14.5 s (`t_post_s`), 6.2 s of them training (`t_train_s`)."
     )
 
 
