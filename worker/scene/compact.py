@@ -93,15 +93,16 @@ class Numbers(ABC):
     def powers(self) -> NDArray[np.integer]:
         """[N, 3] of place, shape and colour."""
 
-    def at(self, times: Sequence[float]) -> Iterator[Gaussians]:
-        """The Gaussians at each model time, as model()'s deformation would give them but without its large weights."""
+    def at(self, times: Sequence[float]) -> Iterator[Floats]:
+        """The Gaussians' numbers at each model time, [VALUES, N], rows as in worker/model/layout.py: as model()'s
+        deformation would give them but without its large weights."""
         bases = SharedBasis(torch.zeros(0, CHANNELS, len(self.centre)), self.centre, self.width)
         values = np.stack([bases.basis(t).numpy() for t in times], 1)  # [B, times]
-        state, motion = self._state(), self._motion(self.pattern @ values)
-        for place in range(len(times)):
-            moved = state.copy()
-            moved[:, : motion.shape[1]] += motion[:, :, place]
-            yield _gaussians_of(moved)
+        state, motion = self._state().T, self._motion(self.pattern @ values).T  # [VALUES, N], [times, C, N]
+        for moved in motion:
+            numbers = state.copy(order="C")
+            numbers[: len(moved)] += moved
+            yield numbers
 
     def _scale(self, group: int) -> Floats:
         """[N] 2**-power of a group."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from contract.wire.notices import Notice, NoticeCode
 from worker.input.clip import spread
 from worker.model.deformation import SharedBasis
-from worker.model.layout import VALUES
+from worker.model.layout import OPACITY_ROW, ROWS, VALUES
 from worker.raster.backend import CPU, Device
 from worker.raster.model import Model
 from worker.scene.compact import Compact, Numbers
@@ -36,9 +36,13 @@ SCORED_FRAMES = 8
 MAX_TRIALS = 6
 ENOUGH = 0.85
 """A trial that uses this share of the tolerance is the last."""
-MIN_STEP = 1e-5
-FIRST_STEP = 4e-4
-"""Of white; what scenes of 38 dB took."""
+MIN_STEP, MAX_FIRST_STEP = 1e-5, 4e-3
+"""Of white."""
+FIRST_STEP = 0.36
+"""Of the picture's RMS error over the root of how many numbers a Gaussian has: what scenes of 29 to 40 dB took, give or
+take a sixth."""
+NOISE_STEP = 4e-4
+"""Of white: the rounding for which depth is measured."""
 RATE_EXPONENT = 1.7
 """The distortion grows about as this power of the step (1.2 to 2.2 were measured): as its square for fine steps, less
 where most numbers are 0 already."""
@@ -102,7 +106,7 @@ def quantize_model(
     def loss_db(numbers: Numbers) -> float:
         return exact_db - _mean_db(_renders(numbers, scene, scored, device), scored)
 
-    found = _rounded(_prepared(model, scene, sensitivity, times), loss_db, tolerance_db)
+    found = _rounded(_prepared(model, scene, sensitivity, times), exact_db, loss_db, tolerance_db)
     return None if found is None else _stored(scene, *found, len(scored))
 
 
@@ -114,19 +118,27 @@ def _prepared(model: Model, scene: Scene, sensitivity: NDArray[np.float64], time
 
 
 def _rounded(
-    prepared: Prepared, loss_of: Callable[[Numbers], float], tolerance_db: float
+    prepared: Prepared, exact_db: float, loss_of: Callable[[Numbers], float], tolerance_db: float
 ) -> tuple[Compact, float, float] | None:
     """The coarsest rounding tried that kept the tolerance: what it stores, its step, its loss in dB."""
-    found = _coarsest(lambda step: loss_of(rounding(prepared, step)), tolerance_db)
+    first = _first_step(prepared, exact_db)
+    found = _coarsest(lambda step: loss_of(rounding(prepared, step)), first, tolerance_db)
     return None if found is None else (rounding(prepared, found[0]).compact(), *found)
 
 
-def _coarsest(loss_of: Callable[[float], float], tolerance_db: float) -> tuple[float, float] | None:
+def _first_step(prepared: Prepared, exact_db: float) -> float:
+    """The step to try first: each number adds an error in proportion to it, and those of the picture may grow alike."""
+    numbers = prepared.state.shape[1] + sum(motion.shape[1] for motion in prepared.motion)
+    error = 10 ** (-exact_db / 20)
+    return min(max(FIRST_STEP * error / math.sqrt(numbers), 2 * MIN_STEP), MAX_FIRST_STEP)
+
+
+def _coarsest(loss_of: Callable[[float], float], first: float, tolerance_db: float) -> tuple[float, float] | None:
     """The coarsest step tried that kept the tolerance, and its loss in dB.
 
     Each trial predicts the step that should just keep the tolerance.
     """
-    step, good, bad, best = FIRST_STEP, MIN_STEP, math.inf, None
+    step, good, bad, best = first, MIN_STEP, math.inf, None
     for _ in range(MAX_TRIALS):
         try:
             loss_db = loss_of(step)
@@ -170,11 +182,14 @@ def _renders(
 ) -> Iterator[NDArray[np.float32]]:
     """The scored frames, rendered from what would be stored. Only the Gaussians at their times are decoded."""
     rest = SharedBasis.initial(len(scene.gaussians), bases=1)
+    still = model_of(dataclasses.replace(scene, deformation=rest), device)
+    canonical, opacity_logit = (still.parameters()[name] for name in ("canonical", "opacity_logit"))
     times = [float(frames.t[index]) for frames, index in scored]
-    for (frames, index), gaussians in zip(scored, numbers.at(times), strict=True):
-        still = model_of(dataclasses.replace(scene, gaussians=gaussians, deformation=rest), device)
+    for (frames, index), numbers_then in zip(scored, numbers.at(times), strict=True):
+        then = torch.from_numpy(numbers_then)
+        canonical.copy_(then[:ROWS])
+        opacity_logit.copy_(then[OPACITY_ROW])
         yield still.render(frames.cameras[index], 0.0)
-        del still  # before the next one is made
 
 
 def _sensitivity(model: Model, pictures: Sequence[Picture], bases: int) -> NDArray[np.float64]:
@@ -204,7 +219,7 @@ def _depth_over_place(model: Model, picture: Picture, across: float, bases: int)
 
     `across` is the mean sensitivity to an error across the axis.
     """
-    size = FIRST_STEP * math.sqrt(bases / (12 * across))  # so many numbers of a channel add their errors at any time
+    size = NOISE_STEP * math.sqrt(bases / (12 * across))  # so many numbers of a channel add their errors at any time
     noise = size * np.random.default_rng(0).standard_normal(model.count).astype(np.float32)
     depth = model.parameters()["canonical"][2]
     exact_depth = depth.clone()
