@@ -8,6 +8,7 @@ score of a picture that is not finite where it is judged.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -33,8 +34,7 @@ def psnr_tissue(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> flo
     Tissue without depth is included. This is the score we go by.
     """
     _check_shapes(rendered, truth, tissue)
-    channels = range(3)  # one after the other, because a render lies in memory so: it takes a third of the time
-    return _decibel(np.stack([(_unit(rendered[..., c]) - _unit(truth[..., c]))[tissue] for c in channels]))
+    return _decibel(_squared(rendered, truth, tissue, _unit), 3 * int(np.count_nonzero(tissue)))
 
 
 def clear_of_highlights(rendered: Image, truth: Image) -> NDArray[np.bool_]:
@@ -55,8 +55,7 @@ def psnr_paper(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> floa
     _check_shapes(rendered, truth, tissue)
     if not tissue.any():
         return math.nan
-    difference = np.rint(_unit(rendered) * 255) - np.rint(_unit(truth) * 255)
-    return _decibel(np.where(tissue[..., None], difference, 0) / 255)
+    return _decibel(_squared(rendered, truth, tissue, _levels) / 255**2, 3 * tissue.size)
 
 
 def ssim(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> float:
@@ -80,14 +79,13 @@ def ssim_map(first: NDArray[np.floating], second: NDArray[np.floating]) -> NDArr
 
     In single precision, which changes a frame's mean by some 1e-7.
     """
-    x, y = first.astype(np.float32), second.astype(np.float32)
+    x, y = first.astype(np.float32, copy=False), second.astype(np.float32, copy=False)
     mean_x, mean_y = _windowed(x), _windowed(y)
-    variance_x = _windowed(x * x) - mean_x**2
-    variance_y = _windowed(y * y) - mean_y**2
-    covariance = _windowed(x * y) - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
-    structure = (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
-    return np.asarray(luminance * structure)
+    product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    covariance = _windowed(x * y) - product
+    variances = _windowed(x * x + y * y) - squares
+    similarity = (2 * product + SSIM_C1) * (2 * covariance + SSIM_C2)
+    return np.asarray(similarity / ((squares + SSIM_C1) * (variances + SSIM_C2)))
 
 
 def depth_errors_mm(
@@ -116,8 +114,15 @@ def coverage(alpha: NDArray[np.floating], tissue: NDArray[np.bool_]) -> float:
 def _unit(image: Image) -> NDArray[np.float32]:
     """float32 in [0, 1]."""
     if image.dtype == np.uint8:
-        return image.astype(np.float32) / np.float32(255)
-    return np.clip(image, 0, 1).astype(np.float32)
+        values = image.astype(np.float32)
+        values /= 255
+        return values
+    return np.clip(image, 0, 1).astype(np.float32, copy=False)
+
+
+def _levels(image: Image) -> NDArray[np.float32]:
+    """Rounded to 0, 1, ... 255."""
+    return image.astype(np.float32) if image.dtype == np.uint8 else np.rint(_unit(image) * 255)
 
 
 def _least(image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -125,13 +130,20 @@ def _least(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.minimum(np.minimum(image[..., 0], image[..., 1]), image[..., 2]))
 
 
-def _decibel(difference: NDArray[np.floating]) -> float:
-    if not difference.size:
+def _squared(
+    first: Image, second: Image, chosen: NDArray[np.bool_], as_compared: Callable[[Image], NDArray[np.float32]]
+) -> float:
+    """The squared differences of two images [H, W, 3] at the chosen pixels, added up; NaN where one of them is NaN."""
+    mask = np.ascontiguousarray(chosen).view(np.uint8)
+    pairs = ((as_compared(first[..., place]), as_compared(second[..., place])) for place in range(3))
+    return float(sum(cv2.norm(*pair, cv2.NORM_L2SQR, mask) for pair in pairs))
+
+
+def _decibel(squared: float, count: int) -> float:
+    """Of a sum of squares over so many numbers."""
+    if not count or math.isnan(squared):
         return math.nan
-    squared = float(np.mean(np.square(difference, dtype=np.float64)))
-    if math.isnan(squared):
-        return math.nan
-    return min(BEST_PSNR_DB, -10 * math.log10(squared)) if squared > 0 else BEST_PSNR_DB
+    return min(BEST_PSNR_DB, -10 * math.log10(squared / count)) if squared > 0 else BEST_PSNR_DB
 
 
 def _windowed(image: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -92,6 +92,7 @@ _MERGED_FIELDS = ("assumptions", "warnings", "measurements")  # the clip has the
 
 
 Errors = NDArray[np.float32]
+NOTHING: Errors = np.zeros(0, np.float32)
 
 
 def measure(
@@ -99,8 +100,7 @@ def measure(
 ) -> Scores:
     """Scores the renders of these frames (clip indices) against the clip, by mapping, which may use several threads.
 
-    compared: whether the figures are wanted that compare one scene with another; else psnr_clear_db, psnr_paper_db and
-    ssim, which take most of the time, are NaN.
+    compared: whether the figures are wanted that compare one scene with another; else psnr_tissue_db alone is no NaN.
 
     Raises:
         TrainingDiverged: a render holds NaN or infinity.
@@ -110,12 +110,13 @@ def measure(
         shown, truth, tissue = render(index), clip.rgb[index], clip.tissue[index]
         if not (np.isfinite(shown.rgb).all() and np.isfinite(shown.depth_mm).all() and np.isfinite(shown.alpha).all()):
             raise TrainingDiverged(f"Frame {index} renders as NaN or infinity: training has diverged.")
-        clear_db = paper_db = similarity = math.nan
-        if compared:
-            clear_db = psnr_tissue(shown.rgb, truth, tissue & clear_of_highlights(shown.rgb, truth))
-            paper_db, similarity = psnr_paper(shown.rgb, truth, tissue), ssim(shown.rgb, truth, tissue)
-        tissue_db, covered = psnr_tissue(shown.rgb, truth, tissue), coverage(shown.alpha, tissue)
-        figures = (tissue_db, clear_db, paper_db, similarity, covered)
+        tissue_db = psnr_tissue(shown.rgb, truth, tissue)
+        if not compared:
+            clip.let_go(index)
+            return (tissue_db, math.nan, math.nan, math.nan, math.nan), NOTHING, NOTHING
+        clear_db = psnr_tissue(shown.rgb, truth, tissue & clear_of_highlights(shown.rgb, truth))
+        paper_db, similarity = psnr_paper(shown.rgb, truth, tissue), ssim(shown.rgb, truth, tissue)
+        figures = (tissue_db, clear_db, paper_db, similarity, coverage(shown.alpha, tissue))
         depth_mm = clip.depth_mm[index]
         found = figures, depth_errors_mm(shown.depth_mm, depth_mm, tissue), depth_mm[tissue & (depth_mm > 0)]
         clip.let_go(index)

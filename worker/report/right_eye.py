@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import TrainingDiverged
-from worker.input.camera import to_camera, unproject
 from worker.input.clip import DepthClip
 from worker.model.metrics import Image, clear_of_highlights, psnr_tissue
 from worker.stereo.right_eye import nearest_known
@@ -73,11 +72,12 @@ def warped_left(clip: DepthClip, index: int) -> NDArray[np.uint8]:
     right, left_k = clip.right, clip.intrinsics
     found_mm = nearest_known(right.depth_mm[index], right.depth_mm[index] > 0)
     depth_mm = np.where(found_mm > 0, found_mm, np.float32(FAR_MM))  # no pixel has any
-    points_mm = unproject(np.arange(depth_mm.size), depth_mm.ravel(), right.intrinsics, right.world_from_camera[index])
-    x, y, z = to_camera(points_mm, clip.world_from_camera[index]).T.reshape(3, *depth_mm.shape)
+    left_from_right = np.linalg.inv(clip.world_from_camera[index]) @ right.world_from_camera[index]
+    across = (np.arange(depth_mm.shape[1], dtype=np.float32) + 0.5 - right.intrinsics.cx) / right.intrinsics.fx
+    down = (np.arange(depth_mm.shape[0], dtype=np.float32)[:, None] + 0.5 - right.intrinsics.cy) / right.intrinsics.fy
+    x, y, z = (depth_mm * (a * across + b * down + c) + d for a, b, c, d in left_from_right[:3].tolist())
     column, row = left_k.fx * x / z + left_k.cx - 0.5, left_k.fy * y / z + left_k.cy - 0.5
-    there = column.astype(np.float32), row.astype(np.float32)
-    warped = cv2.remap(clip.rgb[index], *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    warped = cv2.remap(clip.rgb[index], column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(warped, np.uint8)
 
 
