@@ -1,38 +1,19 @@
 """The `intrasplat` command.
 
 reconstruct, render, phantom, evaluate, stability, doctor and worker run the worker's program on this machine
-(`python -m worker ...`). up starts a service, keys manages its API keys. submit, watch, fetch, jobs, cancel, retry and
-delete talk to a service.
+(`python -m worker ...`), and nothing that they do not need is imported here. up starts a service, keys manages its API
+keys. submit, watch, fetch, jobs, cancel, retry and delete talk to a service (client/commands.py).
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
-from pydantic import ValidationError
-
-from client.keys import add_keys
-from client.remote import add_remote
-from contract.runtime.arguments import LOCAL_COMMANDS, WORKER_SUMMARY, Commands, add_command, count
-from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.runtime.settings import Settings, default_data_dir
-from contract.wire.errors import InputError, IntrasplatError
-
-EXAMPLES = """\
-a clip on this machine:
-  intrasplat reconstruct left.mp4 right.mp4 --calibration calibration.json --out scene
-  intrasplat render scene --t 0.4 --pose orbit:10,0,1 --out view.png
-through a service:
-  intrasplat up
-  intrasplat submit clip.mp4 --calibration calibration.json --watch
-  intrasplat fetch JOB --out results
-"""
+from contract.runtime.local import LOCAL_COMMANDS
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,18 +23,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _run_local(arguments)
     if arguments and arguments[0] == "worker":
         return _run_local(["consume", *arguments[1:]])
-    options = _parser().parse_args(arguments)
-    command: Callable[[argparse.Namespace], int] = options.command
-    try:
-        return command(options)
-    except IntrasplatError as error:
-        print(f"intrasplat: {error}", file=sys.stderr)
-        return exit_code_of(error)
-    except KeyboardInterrupt:
-        return ExitCode.INTERRUPTED
-    except BrokenPipeError:  # the reader, such as head, has closed the pipe
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return ExitCode.OK
+    from client.commands import run
+
+    return run(arguments)
 
 
 def _run_local(arguments: list[str]) -> int:
@@ -65,57 +37,6 @@ def _run_local(arguments: list[str]) -> int:
     while True:
         with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C reaches both processes; the worker decides
             return process.wait()
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="intrasplat",
-        description="Dynamic 3D Gaussians of tissue from a stereo endoscope clip. Research use only.",
-        epilog=f"{EXAMPLES}\n{EXIT_CODES_HELP}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name, summary in LOCAL_COMMANDS.items():
-        commands.add_parser(name, help=summary, add_help=False)  # the worker parses its options
-    _add_up(commands)
-    commands.add_parser("worker", help=WORKER_SUMMARY, add_help=False)
-    add_remote(commands)
-    add_keys(commands)
-    return parser
-
-
-def _add_up(commands: Commands) -> None:
-    parser = add_command(commands, "up", "start a queue, the service and its workers on this machine", _up)
-    parser.add_argument("--port", type=int, help="where the service answers (default: 8765)")
-    parser.add_argument(
-        "--host",
-        help="address to listen on (default: 127.0.0.1, for this machine alone; others need `intrasplat keys`)",
-    )
-    parser.add_argument(
-        "--data-dir", type=Path, metavar="DIR", help=f"where clips and scenes are kept (default: {default_data_dir()})"
-    )
-    parser.add_argument(
-        "--workers",
-        type=count,
-        default=1,
-        metavar="N",
-        help="clips trained at a time; they share the cores (default: 1)",
-    )
-    parser.add_argument("--log-format", choices=("text", "json"), help="of service and workers (default: text)")
-
-
-def _up(options: argparse.Namespace) -> int:
-    from client.up import run  # imports the queue's client, which no other command needs
-
-    names = ("port", "host", "data_dir", "log_format")
-    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    try:
-        settings = Settings.model_validate({**Settings.from_environment().model_dump(), **given})
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(f"--{first['loc'][0]}".replace("_", "-"), f"{first['msg']}.", "See --help.") from error
-    run(settings, options.workers)
-    return ExitCode.OK
 
 
 if __name__ == "__main__":

@@ -7,12 +7,16 @@ the chosen command is imported: --help and doctor answer at once, and doctor eve
 from __future__ import annotations
 
 import argparse
+import atexit
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from typing import NoReturn
 
-from contract.runtime.arguments import LOCAL_COMMANDS, WORKER_SUMMARY, add_command
+from contract.runtime.arguments import add_command
 from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, end_by
+from contract.runtime.local import LOCAL_COMMANDS, WORKER_SUMMARY
 from contract.runtime.logs import configure
 from contract.runtime.processes import told_to_end
 from contract.runtime.settings import Settings
@@ -93,5 +97,17 @@ def _device(options: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
+def _leave(code: int) -> NoReturn:
+    """End this process. Python's own end would free every object of torch and Numba first, which takes most of a
+    second."""
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    status = main()
+    if sys.argv[1] in LOCAL_COMMANDS:
+        _leave(status)
+    sys.exit(status)

@@ -11,19 +11,6 @@ from typing import Any, Literal, TypeAlias, get_args, get_origin
 from contract.runtime.exits import EXIT_CODES_HELP, flag_of
 from contract.wire.options import ClipOptions, Options, parse_options
 
-LOCAL_COMMANDS = {
-    "reconstruct": "train a scene from a clip, on this machine",
-    "render": "render images of a scene that is on this machine",
-    "phantom": "make a synthetic stereo clip of tissue, with its truth",
-    "evaluate": "measure presets on clips, and draw speed against accuracy",
-    "stability": "spoil synthetic clips in many ways, and draw where presets break and whether they say so",
-    "doctor": "say what is installed, what would be used, what is missing",
-}
-"""What `intrasplat` and `python -m worker` do without a service: summaries by command."""
-
-WORKER_SUMMARY = "claim jobs from the queue of REDIS_URL and serve renders, until a signal ends it"
-"""What `intrasplat worker` does, which is `python -m worker consume`."""
-
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """What ArgumentParser.add_subparsers returns."""
 

@@ -98,15 +98,16 @@ def _compile(on_cpu: bool) -> None:
 def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_at_s: float) -> Report:
     """Reconstruct. torch is imported and kernels are loaded while the clip is opened, unless a GPU may match it, which
     torch must find."""
+    given = given_options(options, ReconstructionOptions)
     from worker.input.decode import keep_decoder_ready
+
+    keep_decoder_ready()  # it loads its libraries while this process loads its own
     from worker.machine.gpu import may_have_gpu
     from worker.machine.timing import Timings
     from worker.stereo import ClipPaths, open_with_depth
 
-    given = given_options(options, ReconstructionOptions)
     clip: Path | DepthClip = options.clip
     timings = Timings()
-    keep_decoder_ready()
     on_cpu = options.device == "cpu" or not may_have_gpu()
     aside = ThreadPoolExecutor(1)
     pipeline = aside.submit(import_module, "worker.pipeline")
