@@ -230,7 +230,7 @@ def turn_of_matches(matches: NDArray[np.float64], lower_px: float, camera: Intri
         dy = y - matches[:, 1]
         kept = np.abs(dy) < within_px
         if kept.any():
-            numbers = numbers + _step(_slopes(x, y, camera)[kept], dy[kept], numbers)
+            numbers = numbers + _step(_slopes(x, y, camera)[:, kept], dy[kept], numbers)
     return Turn(*numbers.tolist())
 
 
@@ -268,9 +268,10 @@ def turn_of_pictures(pairs: Sequence[MatchedPair], turn: Turn, camera: Intrinsic
     One step of Gauss and Newton is repeated FINE_STEPS times on pictures without their coarse brightness.
     """
     numbers = np.zeros(len(astuple(turn)))
+    details = list(each(partial(_RowDetail.of, camera=camera), pairs))
     for _ in range(FINE_STEPS):
-        found = each(partial(_row_errors, numbers=numbers, camera=camera), pairs)
-        slopes, missing = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        found = each(partial(_RowDetail.errors, numbers=numbers), details)
+        slopes, missing = (np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True))
         if len(missing) < MIN_SAMPLE:
             return turn
         numbers = numbers + _step(slopes, missing, numbers)
@@ -304,36 +305,57 @@ def _residual_px(matches: NDArray[np.float64], turn: Turn, camera: Intrinsics) -
     return float(np.median(near)) if near.size else 0.0
 
 
-def _slopes(x: NDArray[np.floating], y: NDArray[np.floating], camera: Intrinsics) -> NDArray[np.float64]:
-    """[M, 5] of dy by a Turn's numbers, where they are small; x, y [M] in the picture."""
+def _slopes(x: NDArray[np.floating], y: NDArray[np.floating], camera: Intrinsics) -> NDArray[np.floating]:
+    """[5, M] of dy by a Turn's numbers, where they are small; x, y [M] in the picture."""
     across, down = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
-    turns = np.stack([down * down, -across * down, -across, down], axis=-1)
-    return np.concatenate([np.ones_like(turns[..., :1]), camera.fy * turns], axis=-1).astype(np.float64)
+    turns = np.stack([down * down, -across * down, -across, down])
+    return np.concatenate([np.ones_like(turns[:1]), camera.fy * turns])
 
 
 def _step(
-    slopes: NDArray[np.float64], missing: NDArray[np.float64], numbers: NDArray[np.float64]
+    slopes: NDArray[np.floating], missing: NDArray[np.floating], numbers: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """What to add to the numbers so that slopes [M, 5] explain `missing` [M]; outliers count little."""
+    """What to add to the numbers so that slopes [5, M] explain `missing` [M]; outliers count little."""
     scale = 1.48 * float(np.median(np.abs(missing))) + 1e-6
-    weighted = slopes * (1 / (scale**2 + missing**2))[:, None]
+    weighted = slopes * (1 / (scale**2 + missing**2))
     prior = np.array([0.0, *[USUAL_TURN_RAD**-2] * 4])
-    normal = weighted.T @ slopes + np.diag(prior + 1e-9)
-    return np.asarray(np.linalg.solve(normal, weighted.T @ missing - prior * numbers), np.float64)
+    normal = weighted @ slopes.T + np.diag(prior + 1e-9)
+    return np.asarray(np.linalg.solve(normal, weighted @ missing - prior * numbers), np.float64)
 
 
-def _row_errors(
-    pair: MatchedPair, numbers: NDArray[np.float64], camera: Intrinsics
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes [M, 5] of the right picture's levels by a Turn's numbers, and what the levels lack [M], where sure."""
-    y = np.arange(len(pair.x), dtype=np.float32)[:, None] + np.zeros_like(pair.x)
-    by_number = _slopes(pair.x + 0.5, y + 0.5, camera)
-    left, right = (cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY).astype(np.float32) for eye in (pair.left, pair.right))
-    seen = pair.right_as_left(right, (by_number @ numbers).astype(np.float32))
-    sure = pair.sure & (cv2.dilate(np.maximum(left, seen), np.ones((3, 3), np.uint8)) < SATURATED_LEVEL)
-    left_detail, detail = (each - cv2.blur(each, (HIGH_PASS_PX,) * 2) for each in (left, seen))
-    gradient = cv2.Sobel((left_detail + detail) / 2, cv2.CV_32F, 0, 1, scale=1 / 8)
-    return (gradient[..., None] * by_number)[sure], (left_detail - detail)[sure].astype(np.float64)
+@dataclass(frozen=True, eq=False)
+class _RowDetail:
+    """A matched pair as its rows are compared: grey levels [H, W] of the left eye and of the recorded right one, and
+    slopes [5, H, W] of the right picture's rows by a Turn's numbers."""
+
+    pair: MatchedPair
+    left: Image
+    left_detail: Image
+    right: Image
+    slopes: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, pair: MatchedPair, camera: Intrinsics) -> _RowDetail:
+        left, right = (cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY).astype(np.float32) for eye in (pair.left, pair.right))
+        y = np.arange(len(pair.x), dtype=np.float32)[:, None] + np.zeros_like(pair.x)
+        return cls(pair, left, _detail(left), right, _slopes(pair.x + 0.5, y + 0.5, camera).astype(np.float32))
+
+    def errors(self, numbers: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Slopes [5, M] of the right picture's levels by the numbers, and what the levels lack [M], where sure."""
+        lower_px = np.tensordot(numbers.astype(np.float32), self.slopes, 1)
+        seen = self.pair.right_as_left(self.right, lower_px)
+        brightest = cv2.dilate(np.maximum(self.left, seen), np.ones((3, 3), np.uint8))
+        detail, sure = _detail(seen), self.pair.sure & (brightest < SATURATED_LEVEL)
+        gradient = cv2.Sobel((self.left_detail + detail) / 2, cv2.CV_32F, 0, 1, scale=1 / 8)
+        chosen = np.flatnonzero(sure)
+        slopes = self.slopes.reshape(5, -1).take(chosen, axis=1) * gradient.ravel()[chosen]
+        return slopes, (self.left_detail - detail).ravel()[chosen]
+
+
+def _detail(levels: Image) -> Image:
+    """A picture [H, W] without its coarse brightness."""
+    detail: Image = levels - cv2.blur(levels, (HIGH_PASS_PX,) * 2)
+    return detail
 
 
 def _colour_samples(pair: MatchedPair) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

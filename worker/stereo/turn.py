@@ -6,6 +6,7 @@ Symbols: H W pixels of one eye. `calibrated` is the right eye's camera without a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -54,16 +55,11 @@ class Turn:
 
         The third coordinate is a point's depth in the turned eye over that in the calibrated one.
         """
-        return _matrix(self.camera(calibrated)) @ self.rotation.T @ np.linalg.inv(_matrix(calibrated))
+        return _from_rectified(self, calibrated)
 
     def moved_px(self, calibrated: Intrinsics) -> float:
         """How far the turn moves that point of the picture's border which it moves farthest."""
-        if self == Turn():
-            return 0.0
-        x, y = (np.array([0, 0.5, 1]) * side for side in (calibrated.width, calibrated.height))
-        places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
-        moved = cv2.perspectiveTransform(places, self.from_rectified(calibrated))
-        return float(np.linalg.norm(moved - places, axis=2).max())
+        return _moved_px(self, calibrated)
 
     def rectified(self, image: Rgb, calibrated: Intrinsics) -> Rgb:
         """The recorded right picture as the calibrated eye would show it; as it is where that is hardly another."""
@@ -84,9 +80,33 @@ class Turn:
 
     def depth_factor(self, calibrated: Intrinsics) -> NDArray[np.float32]:
         """[H, W] depth in the turned eye over depth in the calibrated one, by the calibrated eye's pixels."""
-        a, b, c = self.from_rectified(calibrated)[2]
-        x, y = np.arange(calibrated.width), np.arange(calibrated.height)[:, None]
-        return np.asarray(a * x + b * y + c, np.float32)
+        return _depth_factor(self, calibrated)
+
+
+@lru_cache(16)  # the frames of a clip have one turn
+def _from_rectified(turn: Turn, calibrated: Intrinsics) -> NDArray[np.float64]:
+    matrix = _matrix(turn.camera(calibrated)) @ turn.rotation.T @ np.linalg.inv(_matrix(calibrated))
+    matrix.flags.writeable = False
+    return matrix
+
+
+@lru_cache(16)
+def _moved_px(turn: Turn, calibrated: Intrinsics) -> float:
+    if turn == Turn():
+        return 0.0
+    x, y = (np.array([0, 0.5, 1]) * side for side in (calibrated.width, calibrated.height))
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
+    moved = cv2.perspectiveTransform(places, turn.from_rectified(calibrated))
+    return float(np.linalg.norm(moved - places, axis=2).max())
+
+
+@lru_cache(1)
+def _depth_factor(turn: Turn, calibrated: Intrinsics) -> NDArray[np.float32]:
+    a, b, c = turn.from_rectified(calibrated)[2]
+    x, y = np.arange(calibrated.width), np.arange(calibrated.height)[:, None]
+    factor = np.asarray(a * x + b * y + c, np.float32)
+    factor.flags.writeable = False
+    return factor
 
 
 def _matrix(camera: Intrinsics) -> NDArray[np.float64]:
