@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in options.only:
         motion, own_noise, moments = CLIPS[name]
         size = {"width": options.width, "height": options.height, "frames": options.frames}
-        phantom = make_phantom(PhantomSettings(**size, motion=motion, tools=False))
+        phantom = make_phantom(PhantomSettings(**size, motion=motion, tools=()))
         drawn = _drawn(phantom, moments(options.frames), own_noise)
         matched = [(each, *_matched(phantom, drawn, each == "new")) for _ in range(REPEATS) for each in ("all", "new")]
         clips = {each: clip for each, clip, _ in matched}

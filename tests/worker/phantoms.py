@@ -40,8 +40,8 @@ def phantom_clip(
         height=height,
         frames=frames,
         motion=motion,
-        moving_camera=moving_camera,
-        tools=tools,
+        camera=("swing",) * moving_camera,
+        tools=("grasper",) * tools,
         noise=noise,
         period_frames=12.0,
     )

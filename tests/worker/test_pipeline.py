@@ -319,8 +319,8 @@ def test_odd_sizes_are_no_trouble(name: str, endonerf: Drawn, tmp_path: Path) ->
 
 
 def test_a_moving_camera_is_read_from_its_poses(endonerf: Drawn, tmp_path: Path) -> None:
-    clip = endonerf(10, moving_camera=True)
-    truth = make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=10, period_frames=12, moving_camera=True))
+    clip = endonerf(10, camera=("swing",))
+    truth = make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=10, period_frames=12, camera=("swing",)))
     placed = {}
     for convention in ("opengl", "llff"):
         run(clip, tmp_path / convention, iterations=10, pose_convention=convention)

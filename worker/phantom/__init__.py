@@ -5,16 +5,20 @@ Verbs: make_phantom, write_endonerf, write_stereomis, write_stereo_video.
 
 from worker.phantom.camera import orbit_pose
 from worker.phantom.scene import DrawnStereo, Phantom, PhantomFrame, Trajectories, make_phantom
-from worker.phantom.settings import MOTIONS, Motion, PhantomSettings
+from worker.phantom.settings import CAMERA_PATHS, MOTIONS, TOOLS, CameraPath, Motion, PhantomSettings, Tool
 from worker.phantom.writers import write_endonerf, write_stereo_video, write_stereomis
 
 __all__ = [
+    "CAMERA_PATHS",
     "MOTIONS",
+    "TOOLS",
+    "CameraPath",
     "DrawnStereo",
     "Motion",
     "Phantom",
     "PhantomFrame",
     "PhantomSettings",
+    "Tool",
     "Trajectories",
     "make_phantom",
     "orbit_pose",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from contract.wire.errors import InputError
 from worker.phantom.scene import make_phantom
-from worker.phantom.settings import MOTIONS, PhantomSettings
+from worker.phantom.settings import CAMERA_PATHS, MOTIONS, TOOLS, PhantomSettings
 from worker.phantom.writers import write_endonerf, write_stereo_video, write_stereomis
 
 WRITERS = {"video": write_stereo_video, "stereomis": write_stereomis, "endonerf": write_endonerf}
@@ -22,10 +22,20 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--width", type=int, default=default.width, help="width of one eye in pixels (%(default)s)")
     parser.add_argument("--height", type=int, default=default.height, help="height of one eye in pixels (%(default)s)")
     parser.add_argument("--seed", type=int, default=default.seed, help="seed of the tissue and the noise (%(default)s)")
-    parser.add_argument("--no-tools", action="store_true", help="draw no instrument")
+    parser.add_argument(
+        "--tools", nargs="+", choices=TOOLS, default=default.tools, help="up to three instruments (grasper)"
+    )
+    parser.add_argument("--no-tools", dest="tools", action="store_const", const=(), help="draw no instrument")
+    parser.add_argument("--no-masks", action="store_true", help="write no masks of the instruments; the truth has them")
     parser.add_argument("--no-noise", action="store_true", help="add no sensor noise")
     parser.add_argument(
-        "--moving-camera", action="store_true", help="let the endoscope swing; only --format endonerf stores poses"
+        "--camera",
+        nargs="+",
+        choices=CAMERA_PATHS,
+        default=default.camera,
+        metavar="PATH",
+        help=f"paths that the endoscope follows, all at once: {', '.join(CAMERA_PATHS)} (none: it is fixed). "
+        "A clip in --format endonerf has the poses; the others have them as truth alone",
     )
     parser.add_argument(
         "--format",
@@ -48,12 +58,13 @@ def run_cli(args: argparse.Namespace) -> int:
         frames=args.frames,
         motion=args.motion,
         seed=args.seed,
-        tools=not args.no_tools,
+        tools=tuple(args.tools),
         noise=not args.no_noise,
-        moving_camera=args.moving_camera,
+        camera=tuple(args.camera),
     )
-    WRITERS[args.format](make_phantom(settings), out, _show_progress if sys.stderr.isatty() else _show_nothing)
-    print(f"{settings.frames} frames of {settings.width}x{settings.height} ({settings.motion}) are in {out}")
+    on_frame = _show_progress if sys.stderr.isatty() else _show_nothing
+    WRITERS[args.format](make_phantom(settings), out, on_frame, masks=not args.no_masks)
+    print(f"{settings.frames} frames of {settings.width}x{settings.height} ({settings.moves}) are in {out}")
     return 0
 
 

@@ -19,7 +19,7 @@ from worker.input.camera import Intrinsics
 from worker.input.clip.types import DepthClip, StereoClip
 from worker.phantom.camera import endoscope_pose, right_eye
 from worker.phantom.fields import Image32
-from worker.phantom.instrument import InstrumentMesh, instrument_at
+from worker.phantom.instrument import InstrumentMesh, instruments_at
 from worker.phantom.mesh import Fragments, interpolate, rasterize_mesh
 from worker.phantom.motion import Still
 from worker.phantom.settings import PhantomSettings
@@ -65,9 +65,9 @@ class PhantomFrame:
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Material points of frame 0, as without the instrument, and their positions in every frame.
+    """Material points of one frame, as without instruments, and their positions in every frame.
 
-    pixels    [M, 2] int32, (row, column) in frame 0 of the left eye
+    pixels    [M, 2] int32, (row, column) in that frame of the left eye
     points_mm [T, M, 3] float64, world
     """
 
@@ -77,13 +77,15 @@ class Trajectories:
 
 @dataclass(frozen=True, eq=False)
 class DrawnStereo:
-    """A stereo clip as a user gives it, with the left eye's masks alone, and what only the phantom knows beside it.
+    """A stereo clip as a user gives it, without poses and with the left eye's masks or none; and what only the phantom
+    knows.
 
-    tissue_right  [T, H, W] bool, exact
+    tissue, tissue_right  [T, H, W] bool, exact
     """
 
     clip: StereoClip
     calibration: RectifiedCalibration
+    tissue: NDArray[np.bool_]
     tissue_right: NDArray[np.bool_]
 
 
@@ -164,18 +166,18 @@ class Phantom:
 
     def world_from_camera(self, frame: float) -> NDArray[np.float64]:
         """Pose [4, 4] of the endoscope's left eye, mm; the identity at frame 0."""
-        return endoscope_pose(frame, self.settings.period_frames, self.settings.moving_camera)
+        return endoscope_pose(frame, self.settings)
 
     def world_from_right(self, frame: float) -> NDArray[np.float64]:
         """Pose [4, 4] of the endoscope's right eye, mm."""
         return right_eye(self.world_from_camera(frame), self.settings.baseline_mm)
 
-    def trajectories(self, stride_px: int = 8) -> Trajectories:
-        """Positions, in all frames, of the material points that every stride_px-th pixel of frame 0 shows."""
+    def trajectories(self, stride_px: int = 8, shown_in: int = 0) -> Trajectories:
+        """Positions, in all frames, of the material points that every stride_px-th pixel of a frame shows."""
         seen = rasterize_mesh(
-            self.surface.vertices_mm(0),
+            self.surface.vertices_mm(shown_in),
             self.surface.triangles,
-            self.world_from_camera(0),
+            self.world_from_camera(shown_in),
             self.settings.intrinsics,
         )
         rows, columns = np.nonzero(seen.triangle >= 0)
@@ -198,7 +200,7 @@ class Phantom:
             view = self._view(index, LEFT)
             views.append((self._recorded(view.rgb, index, LEFT), view.tissue, view.depth_mm))
         rgb, tissue, depth_mm = (np.stack(layer) for layer in zip(*views, strict=True))
-        drawn = f"synthetic tissue: {settings.motion}, seed {settings.seed}, true depth"
+        drawn = f"synthetic tissue: {settings.moves}, seed {settings.seed}, true depth"
         return DepthClip(
             rgb=rgb,
             tissue=tissue,
@@ -210,21 +212,24 @@ class Phantom:
             assumptions=(Notice.info(NoticeCode.SYNTHETIC, drawn),),
         )
 
-    def stereo_recording(self) -> DrawnStereo:
-        """All frames of both eyes as a rectified stereo clip in memory, without any loss."""
+    def stereo_recording(self, *, masks: bool = True) -> DrawnStereo:
+        """All frames of both eyes as a rectified stereo clip in memory, without any loss; with or without masks."""
         settings = self.settings
         frames = [self.frame(index) for index in range(settings.frames)]
-        drawn = f"synthetic tissue: {settings.motion}, seed {settings.seed}, depth by stereo"
+        drawn = f"synthetic tissue: {settings.moves}, seed {settings.seed}, depth by stereo"
+        tissue, tissue_right = (
+            np.stack([getattr(frame, name) for frame in frames]) for name in ("tissue", "tissue_right")
+        )
         clip = StereoClip(
             frame_count=settings.frames,
             height=settings.height,
             width=settings.width,
             pairs=lambda: ((frame.left, frame.right) for frame in frames),
-            tissue=np.stack([frame.tissue for frame in frames]),
+            tissue=tissue if masks else None,
             frame_times_s=np.arange(settings.frames) / settings.frame_rate_hz,
             assumptions=(Notice.info(NoticeCode.SYNTHETIC, drawn),),
         )
-        return DrawnStereo(clip, settings.calibration, np.stack([frame.tissue_right for frame in frames]))
+        return DrawnStereo(clip, settings.calibration, tissue, tissue_right)
 
     def _view(self, index: int, eye: int) -> _EyeView:
         """One eye at a frame, with and without instrument."""
@@ -234,17 +239,20 @@ class Phantom:
         depth_mm = fragments.depth_mm
         if not self.settings.tools:
             return _EyeView(hidden_rgb, np.ones(depth_mm.shape, np.bool_), depth_mm, hidden_rgb, depth_mm)
-        tool = instrument_at(self.surface, index, self.settings.period_frames)
-        linear, tool_fragments = self._draw_instrument(tool, index, pose)
-        behind_tissue = (depth_mm > 0) & (depth_mm < tool_fragments.depth_mm)
-        shows_tool = (tool_fragments.triangle >= 0) & ~behind_tissue
-        both = np.where(shows_tool[..., None], linear, hidden)
+        shows_tool, both, nearest_mm = np.zeros(depth_mm.shape, np.bool_), hidden, depth_mm
+        for tool in instruments_at(self.surface, index, self.settings):
+            linear, tool_fragments = self._draw_instrument(tool, index, pose)
+            covered = (nearest_mm > 0) & (nearest_mm < tool_fragments.depth_mm)
+            shows = (tool_fragments.triangle >= 0) & ~covered
+            both = np.where(shows[..., None], linear, both)
+            nearest_mm = np.where(shows, tool_fragments.depth_mm, nearest_mm)
+            shows_tool |= shows
         # the lens blurs the instrument into its neighbours, which are then not clean tissue
         touched = cv2.dilate(shows_tool.astype(np.uint8), np.ones((BLUR_PX, BLUR_PX), np.uint8)) > 0
         return _EyeView(
             rgb=np.where(touched[..., None], to_srgb(_through_lens(both)), hidden_rgb),
             tissue=~touched,
-            depth_mm=np.where(shows_tool, tool_fragments.depth_mm, depth_mm),
+            depth_mm=nearest_mm,
             hidden_rgb=hidden_rgb,
             hidden_depth_mm=depth_mm,
         )

@@ -12,10 +12,16 @@ from worker.input.camera import Intrinsics
 
 Motion = Literal["still", "breathing", "pull", "cut"]
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
+CameraPath = Literal["swing", "pan", "advance", "roll", "turn", "shake"]
+CAMERA_PATHS: tuple[CameraPath, ...] = get_args(CameraPath)
+Tool = Literal["grasper", "steel", "yellow", "dark"]
+TOOLS: tuple[Tool, ...] = get_args(Tool)
+MAX_TOOLS = 3  # each has a port of its own
 
+MEAN_DEPTH_MM = 80.0
 FOCAL_PER_WIDTH = 0.89  # a da Vinci endoscope's field of view, about 59 degrees across
 MIN_WIDTH_PX, MIN_HEIGHT_PX = 64, 48  # below this vessels and instrument are a pixel wide
-MAX_SIDE_PX = 4096  # the tissue's texture is about twice as wide, and OpenCV's limit is 32767
+MAX_SIDE_PX = 4096  # the tissue's texture is up to six times as wide, and OpenCV's limit is 32767
 MAX_ASPECT = 4  # of the longer side to the shorter
 MAX_FRAMES = 100_000
 
@@ -29,9 +35,11 @@ class PhantomSettings:
         frames: length of the clip, T.
         motion: still | breathing (periodic heave and sway) | pull (a grasper lifts a fold, which falls back) |
             cut (the surface splits along a line and opens).
-        tools: whether an instrument moves in front of the tissue.
+        tools: the instruments in front of the tissue, up to three: grasper (steel, with a dark grey shaft) | steel (its
+            shaft, too) | yellow (wrist and collar, with a black shaft) | dark (all of it). The first pulls or cuts in
+            those motions; the others come into view and leave it.
         noise: whether frames carry sensor noise; depth, hidden surface and free viewpoints never do.
-        moving_camera: whether the endoscope swings slowly about the tissue; its pose is known.
+        camera: the paths that the endoscope follows, all at once (worker/phantom/camera.py); none if it is fixed.
         period_frames: frames of one breath, of one pull, or of half a cut.
 
     Raises InputError (field options.<name>) for a setting out of range.
@@ -42,9 +50,9 @@ class PhantomSettings:
     frames: int = 64
     motion: Motion = "breathing"
     seed: int = 0
-    tools: bool = True
+    tools: tuple[Tool, ...] = ("grasper",)
     noise: bool = True
-    moving_camera: bool = False
+    camera: tuple[CameraPath, ...] = ()
     baseline_mm: float = 4.3
     period_frames: float = 36.0
     frame_rate_hz: float = 25.0
@@ -63,8 +71,23 @@ class PhantomSettings:
                 f"{self.width}x{self.height} is more than {MAX_ASPECT} times as long as wide.",
                 "Give a less extreme shape.",
             )
-        if self.motion not in MOTIONS:
-            raise InputError("options.motion", f'"{self.motion}" is unknown.', f"Give one of {', '.join(MOTIONS)}.")
+        for name, values, known in (
+            ("motion", (self.motion,), MOTIONS),
+            ("tools", self.tools, TOOLS),
+            ("camera", self.camera, CAMERA_PATHS),
+        ):
+            _require_known(name, values, known)
+        if len(self.tools) > MAX_TOOLS:
+            problem = f"{len(self.tools)} instruments are too many."
+            raise InputError("options.tools", problem, f"Give up to {MAX_TOOLS}.")
+        if len(set(self.camera)) < len(self.camera):
+            problem = f"{' '.join(self.camera)} has a path twice."
+            raise InputError("options.camera", problem, "Give each path once.")
+
+    @property
+    def moves(self) -> str:
+        """How tissue and endoscope move, as the command line spells it: MOTION[+PATH...]."""
+        return "+".join((self.motion, *self.camera))
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -88,6 +111,12 @@ class PhantomSettings:
             cy_px=camera.cy,
             baseline_mm=self.baseline_mm,
         )
+
+
+def _require_known(name: str, values: tuple[str, ...], known: tuple[str, ...]) -> None:
+    for value in values:
+        if value not in known:
+            raise InputError(f"options.{name}", f'"{value}" is unknown.', f"Give one of {', '.join(known)}.")
 
 
 def _require_range(name: str, value: float, low: float, high: float) -> None:

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from worker.phantom.camera import farther_mm
 from worker.phantom.fields import Image32, lobed, smooth_field
 from worker.phantom.mesh import grid_normals, grid_triangles
 from worker.phantom.motion import CUT_HALF_LENGTH_MM, CUT_SLANT, Cut, TissueMotion, make_motion
-from worker.phantom.settings import PhantomSettings
+from worker.phantom.settings import MEAN_DEPTH_MM, PhantomSettings
 
-MEAN_DEPTH_MM = 80.0
 DEPTH_RANGE_MM = (58.0, 104.0)  # of the sheet at rest
 SHEET_PER_VIEW = 1.75  # the sheet over the view at mean depth: it leaves room for motion and other views
 MIN_HALF_MM = 30.0  # of the sheet, so that a cut fits into the flattest picture
@@ -117,13 +117,20 @@ class Surface:
         ]
 
 
-def make_surface(settings: PhantomSettings, rng: np.random.Generator) -> Surface:
-    """The tissue's shape. The sheet's extent follows the field of view; its mesh and atlas follow the pixels."""
-    intrinsics = settings.intrinsics
-    pixel_mm = MEAN_DEPTH_MM / intrinsics.fx
+def room_mm(settings: PhantomSettings) -> tuple[float, float]:
+    """Half the extent (right, down) of what a fixed endoscope needs: the view, room for motion and for other views."""
+    pixel_mm = MEAN_DEPTH_MM / settings.intrinsics.fx
     half_u, half_v = (
         max(SHEET_PER_VIEW * pixel_mm * side / 2, MIN_HALF_MM) for side in (settings.width, settings.height)
     )
+    return half_u, half_v
+
+
+def make_surface(settings: PhantomSettings, rng: np.random.Generator) -> Surface:
+    """The tissue's shape. The sheet reaches as far as the endoscope looks; its mesh and atlas follow the pixels."""
+    pixel_mm = MEAN_DEPTH_MM / settings.intrinsics.fx
+    farther = farther_mm(settings, DEPTH_RANGE_MM[1])
+    half_u, half_v = (half + more for half, more in zip(room_mm(settings), farther, strict=True))
     rest_z_mm = _rest_depth((2 * half_v, 2 * half_u), rng)
     motion = make_motion(settings.motion, settings.period_frames)
     texel_mm = TEXEL_PX * pixel_mm

@@ -5,9 +5,14 @@ NNNNNN.npz        depth_mm, hidden_depth_mm [H, W] float32; hidden_rgb [H, W, 3]
 trajectories.npz  pixels [M, 2] (row, column) in frame 0, points_mm [T, M, 3] float32 world
 novel_views.npz   frame [K], world_from_camera [K, 4, 4], rgb [K, H, W, 3] float16, depth_mm [K, H, W] float32
 camera.json       the exact intrinsics, every frame's world_from_camera of the left eye and of the right
+poses.tum         the left eye's path: a line `timestamp tx ty tz qx qy qz qw` a frame, in seconds and metres, as the
+                  TUM RGB-D benchmark defines it; in StereoMIS layout also as groundtruth.txt, as that data set has it
+
+No reader of stereo clips takes poses from these files. In EndoNeRF layout poses_bounds.npy gives them.
 
 Symbols: T frames, H W pixels of one eye, M tracked points, K novel views. `hidden` is without the instrument.
-VP9 video loses fine texture and PNG loses nothing, so measure against truth on the PNG layouts.
+VP9 video loses fine texture and PNG loses nothing, so measure against truth on the PNG layouts. With masks=False a clip
+is written without masks, and its truth stays.
 """
 
 from __future__ import annotations
@@ -15,11 +20,13 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from contract.wire.errors import UnavailableError
 from worker.machine.opencv import silent_stderr
@@ -29,10 +36,11 @@ from worker.phantom.scene import Phantom, PhantomFrame
 OnFrame = Callable[[int, int], None]  # called with (frames done, frames) after each frame
 
 VIDEO, CALIBRATION, MASKS, TRUTH = "stereo.webm", "calibration.json", "masks.zip", "truth"
+POSES, STEREOMIS_POSES = "poses.tum", "groundtruth.txt"
 BRIGHT = 255
 MAX_DEPTH_8_BIT_MM = 255
 NOVEL_TIMES = (0.0, 0.35, 0.7)  # model times of the novel views
-NOVEL_ANGLES_DEG = ((12.0, 0.0), (-12.0, 0.0), (0.0, 9.0), (8.0, -8.0))  # (yaw, pitch) about frame 0's axis
+NOVEL_ANGLES_DEG = ((12.0, 0.0), (-12.0, 0.0), (0.0, 9.0), (8.0, -8.0))  # (yaw, pitch) about the frame's axis
 BOUNDS_MARGIN = (0.9, 1.1)  # factors of the near and far bounds
 
 
@@ -40,7 +48,7 @@ def _ignore(done: int, frames: int) -> None:
     del done, frames
 
 
-def write_stereo_video(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:
+def write_stereo_video(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore, *, masks: bool = True) -> None:
     """Folder with stereo.webm (VP9, left | right), calibration.json, masks.zip (tool = 255) and truth/.
 
     Raises UnavailableError when this OpenCV cannot write VP9.
@@ -53,12 +61,13 @@ def write_stereo_video(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore
     if not video.isOpened():
         raise UnavailableError("OpenCV cannot write VP9 here.", "Write --format stereomis instead.")
     try:
-        with zipfile.ZipFile(path / MASKS, "w") as masks:
+        with zipfile.ZipFile(path / MASKS, "w") if masks else nullcontext() as archive:
             for index in range(settings.frames):
                 frame = phantom.frame(index)
                 both = np.concatenate([frame.left, frame.right], axis=1)
                 video.write(cv2.cvtColor(both, cv2.COLOR_RGB2BGR))
-                masks.writestr(f"{index:06d}.png", _png(_white(~frame.tissue)))
+                if archive is not None:
+                    archive.writestr(f"{index:06d}.png", _png(_white(~frame.tissue)))
                 _write_frame_truth(path, index, frame)
                 on_frame(index + 1, settings.frames)
     finally:
@@ -68,11 +77,14 @@ def write_stereo_video(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore
     _write_clip_truth(phantom, path)
 
 
-def write_stereomis(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:
-    """StereoMIS layout: NNNNNNl.png, NNNNNNr.png, StereoCalibration.ini, masks/NNNNNNl.png (tissue = 255); truth/."""
+def write_stereomis(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore, *, masks: bool = True) -> None:
+    """StereoMIS layout: NNNNNNl.png, NNNNNNr.png, StereoCalibration.ini, groundtruth.txt, masks/NNNNNNl.png
+    (tissue = 255); truth/.
+    """
     for index in range(phantom.settings.frames):
-        write_stereomis_frames(phantom, path, [index], _write_frame_truth)
+        write_stereomis_frames(phantom, path, [index], _write_frame_truth, masks=masks)
         on_frame(index + 1, phantom.settings.frames)
+    (path / STEREOMIS_POSES).write_text(_tum_lines(phantom))
     _write_clip_truth(phantom, path)
 
 
@@ -81,28 +93,32 @@ def write_stereomis_frames(
     path: Path,
     frames: Iterable[int],
     also: Callable[[Path, int, PhantomFrame], None] = lambda path, index, frame: None,
+    *,
+    masks: bool = True,
 ) -> None:
     """Some frames of write_stereomis, and the calibration, but no truth; also(path, index, frame) adds to each."""
-    (path / "masks").mkdir(parents=True, exist_ok=True)
+    (path / "masks" if masks else path).mkdir(parents=True, exist_ok=True)
     (path / "StereoCalibration.ini").write_text(_stereomis_calibration(phantom))
     for index in frames:
         frame = phantom.frame(index)
         _save(path / f"{index:06d}l.png", frame.left)
         _save(path / f"{index:06d}r.png", frame.right)
-        _save(path / "masks" / f"{index:06d}l.png", _white(frame.tissue))
+        if masks:
+            _save(path / "masks" / f"{index:06d}l.png", _white(frame.tissue))
         also(path, index, frame)
 
 
-def write_endonerf(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore) -> None:
+def write_endonerf(phantom: Phantom, path: Path, on_frame: OnFrame = _ignore, *, masks: bool = True) -> None:
     """EndoNeRF layout: images/ depth/ (8-bit mm) masks/ (tool = 255) poses_bounds.npy; truth/."""
-    for folder in ("images", "depth", "masks"):
+    for folder in ("images", "depth", *(["masks"] if masks else [])):
         (path / folder).mkdir(parents=True, exist_ok=True)
     nearest, farthest = np.inf, 0.0
     for index in range(phantom.settings.frames):
         frame, name = phantom.frame(index), f"{index:06d}"
         _save(path / "images" / f"{name}.png", frame.left)
         _save(path / "depth" / f"{name}.png", np.clip(np.rint(frame.depth_mm), 0, MAX_DEPTH_8_BIT_MM).astype(np.uint8))
-        _save(path / "masks" / f"{name}.png", _white(~frame.tissue))
+        if masks:
+            _save(path / "masks" / f"{name}.png", _white(~frame.tissue))
         _write_frame_truth(path, index, frame)
         seen = frame.depth_mm[frame.depth_mm > 0]
         nearest, farthest = min(nearest, float(seen.min())), max(farthest, float(seen.max()))
@@ -142,6 +158,16 @@ def _poses(phantom: Phantom) -> NDArray[np.float64]:
     return np.stack([phantom.world_from_camera(index) for index in range(phantom.settings.frames)])
 
 
+def _tum_lines(phantom: Phantom) -> str:
+    """The left eye's path as a TUM file."""
+    lines = ["# timestamp tx ty tz qx qy qz qw; world_from_camera of the left eye, seconds and metres"]
+    for index, pose in enumerate(_poses(phantom)):
+        metres, turn = pose[:3, 3] / 1000, Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+        values = (index / phantom.settings.frame_rate_hz, *metres, *turn)
+        lines.append(" ".join(f"{value:.9f}" for value in values))
+    return "\n".join(lines) + "\n"
+
+
 def _write_frame_truth(path: Path, index: int, frame: PhantomFrame) -> None:
     (path / TRUTH).mkdir(exist_ok=True)
     np.savez_compressed(
@@ -168,12 +194,14 @@ def _write_clip_truth(phantom: Phantom, path: Path) -> None:
         "world_from_right_camera": [phantom.world_from_right(index).tolist() for index in frames],
     }
     (path / TRUTH / "camera.json").write_text(json.dumps(camera, indent=1))
+    (path / TRUTH / POSES).write_text(_tum_lines(phantom))
 
 
 def _write_novel_views(phantom: Phantom, path: Path) -> None:
     """Write a view at each novel time from each novel angle."""
     frames = [int(t * phantom.settings.frames) for t in NOVEL_TIMES for _ in NOVEL_ANGLES_DEG]
-    poses = [orbit_pose(yaw_deg, pitch_deg) for _ in NOVEL_TIMES for yaw_deg, pitch_deg in NOVEL_ANGLES_DEG]
+    turns = [orbit_pose(yaw_deg, pitch_deg) for _ in NOVEL_TIMES for yaw_deg, pitch_deg in NOVEL_ANGLES_DEG]
+    poses = [phantom.world_from_camera(frame) @ turn for frame, turn in zip(frames, turns, strict=True)]
     views = [phantom.render(frame, pose) for frame, pose in zip(frames, poses, strict=True)]
     np.savez_compressed(
         path,

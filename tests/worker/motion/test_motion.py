@@ -29,8 +29,8 @@ TRUSTED = 0.5
 def phantom(motion: Motion, *, moving_camera: bool = False, noise: bool = True) -> tuple[DepthClip, Trajectories]:
     """A clip and where its points go. Callers share the arrays: copy before you write."""
     settings = PhantomSettings(
-        width=WIDTH, height=HEIGHT, frames=FRAMES, motion=motion, moving_camera=moving_camera, noise=noise,
-    )  # fmt: skip
+        width=WIDTH, height=HEIGHT, frames=FRAMES, motion=motion, camera=("swing",) * moving_camera, noise=noise
+    )
     made = make_phantom(settings)
     return made.depth_clip(), made.trajectories(stride_px=4)
 

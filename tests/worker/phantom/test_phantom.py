@@ -14,9 +14,11 @@ from worker.input.camera import Intrinsics
 from worker.input.clip.types import DepthClip
 from worker.phantom import (
     MOTIONS,
+    CameraPath,
     Motion,
     Phantom,
     PhantomSettings,
+    Tool,
     make_phantom,
     orbit_pose,
 )
@@ -25,9 +27,17 @@ PERIOD = 12.0
 
 
 @cache
-def phantom(motion: Motion = "breathing", *, noise: bool = False, tools: bool = True, moving: bool = False) -> Phantom:
+def phantom(
+    motion: Motion = "breathing",
+    *camera: CameraPath,
+    noise: bool = False,
+    tools: tuple[Tool, ...] = ("grasper",),
+    rate_hz: float = 25.0,
+) -> Phantom:
     return make_phantom(
-        PhantomSettings(160, 128, 12, motion, noise=noise, tools=tools, moving_camera=moving, period_frames=PERIOD)
+        PhantomSettings(
+            160, 128, 12, motion, noise=noise, tools=tools, camera=camera, period_frames=PERIOD, frame_rate_hz=rate_hz
+        )
     )
 
 
@@ -132,7 +142,7 @@ def test_the_hidden_surface_is_the_visible_one_wherever_no_tool_is(motion: Motio
 
 
 def test_without_tools_the_tissue_is_the_same_and_all_of_it_is_seen() -> None:
-    bare, full = phantom(tools=False).frame(2), phantom().frame(2)
+    bare, full = phantom(tools=()).frame(2), phantom().frame(2)
     assert bare.tissue.all()
     assert bare.tissue_right.all()
     np.testing.assert_array_equal(bare.hidden_rgb, full.hidden_rgb)
@@ -152,9 +162,11 @@ def test_the_instrument_hides_different_tissue_over_time_and_its_masks_differ_by
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-@pytest.mark.parametrize("moving", [False, True])
-def test_tracked_points_lie_on_the_depth_map_unless_tissue_covers_them(motion: Motion, moving: bool) -> None:
-    scene = phantom(motion, moving=moving)
+@pytest.mark.parametrize("camera", [(), ("swing",)])
+def test_tracked_points_lie_on_the_depth_map_unless_tissue_covers_them(
+    motion: Motion, camera: tuple[CameraPath, ...]
+) -> None:
+    scene = phantom(motion, *camera)
     camera, tracks = scene.settings.intrinsics, scene.trajectories(stride_px=4)
     first = scene.frame(0)
     rows, columns = tracks.pixels.T
@@ -173,7 +185,7 @@ def test_tracked_points_lie_on_the_depth_map_unless_tissue_covers_them(motion: M
 
 
 def test_colour_travels_with_the_material_point() -> None:
-    scene = phantom("pull", tools=False)
+    scene = phantom("pull", tools=())
     camera, tracks = scene.settings.intrinsics, scene.trajectories(stride_px=4)
     rows, columns = tracks.pixels.T
     before = scene.frame(0).hidden_rgb[rows, columns]
@@ -212,7 +224,7 @@ def test_pull_lifts_a_fold_far_and_lets_it_fall_back() -> None:
 
 
 def test_cut_opens_and_shows_deeper_tissue() -> None:
-    scene = make_phantom(PhantomSettings(160, 128, 24, "cut", tools=False, noise=False, period_frames=PERIOD))
+    scene = make_phantom(PhantomSettings(160, 128, 24, "cut", tools=(), noise=False, period_frames=PERIOD))
     groove = scene.surface.atlas.groove_row
 
     def groove_pixels(index: int) -> int:
@@ -253,14 +265,6 @@ def test_a_render_of_another_size_shows_the_same_view() -> None:
     assert np.median(np.abs(depth_mm - corners)) < 0.02
 
 
-def test_a_moving_camera_starts_at_the_world_and_stays_rigid() -> None:
-    scene = phantom(moving=True)
-    np.testing.assert_allclose(scene.world_from_camera(0), np.eye(4), atol=1e-12)
-    pose = scene.world_from_camera(8)
-    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
-    assert np.linalg.norm(pose[:3, 3]) > 2
-
-
 def test_depth_clip_holds_the_frames() -> None:
     clip, frame = phantom(noise=True).depth_clip(), phantom(noise=True).frame(7)
     assert isinstance(clip, DepthClip)
@@ -280,7 +284,18 @@ def test_noise_is_small_seeded_and_optional() -> None:
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("width", 32), ("height", 47), ("frames", 0), ("motion", "dance"), ("seed", -1), ("baseline_mm", float("nan"))],
+    [
+        ("width", 32),
+        ("height", 47),
+        ("frames", 0),
+        ("motion", "dance"),
+        ("seed", -1),
+        ("baseline_mm", float("nan")),
+        ("tools", ("spoon",)),
+        ("tools", ("steel",) * 4),
+        ("camera", ("fly",)),
+        ("camera", ("pan", "pan")),
+    ],
 )
 def test_settings_that_cannot_be_drawn_name_the_option(field: str, value: object) -> None:
     with pytest.raises(InputError) as raised:
@@ -298,13 +313,13 @@ def test_settings_of_an_extreme_shape_are_refused() -> None:
     [(64, 48, "cut"), (97, 61, "pull"), (192, 48, "cut"), (64, 200, "breathing"), (65, 49, "still")],
 )
 def test_any_size_is_covered_by_tissue(width: int, height: int, motion: Motion) -> None:
-    frame = make_phantom(PhantomSettings(width, height, 60, motion, moving_camera=True)).frame(59)
+    frame = make_phantom(PhantomSettings(width, height, 60, motion, camera=("swing",))).frame(59)
     assert frame.left.shape == frame.right.shape == (height, width, 3)
     assert (frame.hidden_depth_mm > 0).all()
 
 
 def test_the_stereo_recording_is_what_the_frames_show() -> None:
-    scene = make_phantom(PhantomSettings(96, 80, 3, "pull", moving_camera=True))
+    scene = make_phantom(PhantomSettings(96, 80, 3, "pull", camera=("swing",)))
     drawn = scene.stereo_recording()
     for index, (left, right) in enumerate(drawn.clip.pairs()):
         frame = scene.frame(index)

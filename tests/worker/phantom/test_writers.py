@@ -12,11 +12,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from contract.wire.errors import InputError
-from contract.wire.options import ClipOptions
+from contract.wire.options import ClipOptions, ReconstructionOptions
 from worker.input.clip import open_clip
 from worker.input.clip.types import DepthClip, StereoClip
+from worker.machine.hooks import Hooks
+from worker.machine.timing import Timings
 from worker.phantom import (
     Phantom,
     PhantomSettings,
@@ -26,11 +29,12 @@ from worker.phantom import (
     write_stereomis,
 )
 from worker.phantom.command import add_cli_arguments, run_cli
+from worker.stereo.opening import ClipPaths, open_with_depth
 
 
 @cache
 def short() -> Phantom:
-    return make_phantom(PhantomSettings(96, 80, 3, "pull", moving_camera=True))
+    return make_phantom(PhantomSettings(96, 80, 3, "pull", camera=("swing",)))
 
 
 def test_stereo_video_reads_back_close_with_its_calibration_and_masks(tmp_path: Path) -> None:
@@ -104,6 +108,34 @@ def test_every_layout_has_the_truth_beside_it(write: Callable[[Phantom, Path], N
     assert (np.linalg.inv(left) @ right)[0, 3] == pytest.approx(scene.settings.baseline_mm)
     views = np.load(tmp_path / "truth" / "novel_views.npz")
     assert views["rgb"].shape[1:] == (80, 96, 3)
+    path = np.loadtxt(tmp_path / "truth" / "poses.tum")
+    np.testing.assert_allclose(path[:, 0], np.arange(3) / scene.settings.frame_rate_hz)
+    np.testing.assert_allclose(path[2, 1:4], left[:3, 3] / 1000, atol=1e-9)
+    np.testing.assert_allclose(Rotation.from_quat(path[2, 4:]).as_matrix(), left[:3, :3], atol=1e-8)
+
+
+@pytest.mark.parametrize("write", [write_stereo_video, write_stereomis])
+def test_a_stereo_clip_has_its_poses_as_truth_alone(write: Callable[[Phantom, Path], None], tmp_path: Path) -> None:
+    write(short(), tmp_path)
+    assert (tmp_path / "groundtruth.txt").exists() == (write is write_stereomis)
+    clip = tmp_path / "stereo.webm" if write is write_stereo_video else tmp_path
+    calibration = None if write is write_stereomis else tmp_path / "calibration.json"
+    depth = open_with_depth(ClipPaths(clip, calibration=calibration), ReconstructionOptions(), Hooks(), Timings())
+    np.testing.assert_array_equal(depth.world_from_camera, np.tile(np.eye(4), (3, 1, 1)))
+
+
+@pytest.mark.parametrize("write", [write_stereo_video, write_stereomis, write_endonerf])
+def test_a_clip_without_masks_reads_back_as_tissue_alone_and_keeps_its_truth(
+    write: Callable[..., None], tmp_path: Path
+) -> None:
+    write(short(), tmp_path, masks=False)
+    clip = open_clip(tmp_path / "stereo.webm" if write is write_stereo_video else tmp_path)
+    if isinstance(clip, DepthClip):
+        assert clip.tissue.all()
+    else:
+        assert clip.tissue is None
+    truth = np.load(tmp_path / "truth" / "000001.npz")
+    np.testing.assert_array_equal(truth["tissue"], short().frame(1).tissue)
 
 
 def test_the_command_writes_a_clip_and_refuses_a_folder_in_use(
@@ -111,10 +143,12 @@ def test_the_command_writes_a_clip_and_refuses_a_folder_in_use(
 ) -> None:
     parser = argparse.ArgumentParser()
     add_cli_arguments(parser)
-    words = ["--width", "96", "--height", "80", "--frames", "2", "--motion", "still", "--format", "stereomis", "--out"]
-    args = parser.parse_args([*words, str(tmp_path / "clip")])
+    words = ["--width", "96", "--height", "80", "--frames", "2", "--motion", "still", "--no-masks"]
+    words += ["--camera", "pan", "shake", "--tools", "steel", "dark"]
+    args = parser.parse_args([*words, "--format", "stereomis", "--out", str(tmp_path / "clip")])
     assert run_cli(args) == 0
-    assert "2 frames of 96x80 (still)" in capsys.readouterr().out
+    assert "2 frames of 96x80 (still+pan+shake)" in capsys.readouterr().out
     assert (tmp_path / "clip" / "000001r.png").exists()
+    assert not (tmp_path / "clip" / "masks").exists()
     with pytest.raises(InputError, match="not an empty folder"):
         run_cli(args)

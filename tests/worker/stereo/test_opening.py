@@ -42,7 +42,7 @@ def test_a_killed_decoder_is_tried_again(deaths: int, tmp_path: Path, monkeypatc
 
 
 def test_frames_that_show_nothing_new_get_no_depth_and_change_no_bit_of_the_others() -> None:
-    drawn = make_phantom(PhantomSettings(width=160, height=128, frames=24, tools=False)).stereo_recording()
+    drawn = make_phantom(PhantomSettings(width=160, height=128, frames=24, tools=())).stereo_recording()
     pairs = list(drawn.clip.pairs())
     shown = [*range(12), *[11] * 106, *range(12, 24)]
     paused = dataclasses.replace(
@@ -73,7 +73,7 @@ def test_of_a_long_clip_with_depth_frames_are_left_out_unless_all_are_asked_for(
     use_frames: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("worker.input.clip.sampling.KEPT_FRAMES", 4)
-    write_endonerf(make_phantom(PhantomSettings(width=64, height=48, frames=12, motion="still", tools=False)), tmp_path)
+    write_endonerf(make_phantom(PhantomSettings(width=64, height=48, frames=12, motion="still", tools=())), tmp_path)
     options = ReconstructionOptions.model_validate({"use_frames": use_frames, "mask_polarity": "tool"})
     clip = open_with_depth(ClipPaths(tmp_path), options, Hooks(), Timings())
     assert clip.left_out == {"new": (2, 4, 5, 7, 8, 11), "all": ()}[use_frames]

@@ -17,7 +17,8 @@ from worker.evaluate.conditions.clean import CleanClip, Given, clean_clip, clean
 from worker.evaluate.conditions.recording import recording_of
 from worker.phantom import Phantom, PhantomFrame, PhantomSettings, make_phantom, orbit_pose
 from worker.phantom.motion import Pull
-from worker.phantom.surface import MEAN_DEPTH_MM, Surface
+from worker.phantom.settings import MEAN_DEPTH_MM
+from worker.phantom.surface import Surface
 
 PULL_FRAMES = 24.0  # from one pull to the next
 POSE_SWING_DEG = 5.0  # of the camera whose poses are noisy

@@ -28,7 +28,7 @@ WIDTH, HEIGHT = 160, 128
 @cache
 def tissue() -> Phantom:
     """It breathes, 36 frames a breath."""
-    return make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=400, tools=False))
+    return make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=400, tools=()))
 
 
 @cache
