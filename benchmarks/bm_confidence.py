@@ -68,7 +68,7 @@ def trained(motion: str, eyes: str) -> Trained:
         scene = load_scene(Path(folder))
     train = [i for i in range(report.frame_count) if i not in {*report.held_out, *report.repeated}]
     assert opened.phantom is not None
-    truth = Truth(opened.phantom, opened.clip, train, report.held_out, opened.tissue_right)
+    truth = Truth(opened.phantom, opened.tissue, train, report.held_out, opened.tissue_right)
     sides = zip(opened.clip.eyes, (0.0, 1.0) if eyes == "both" else (0.0,), strict=False)
     return Trained(scene, [TrainingFrames(eye, train, scene.units_per_mm, side) for eye, side in sides], truth)
 

@@ -63,7 +63,7 @@ def main() -> None:
     scenes = {eyes: trained(opened, eyes, options.iterations) for eyes in ("left", "both")}
     if opened.phantom is not None:
         split = split_frames(opened.clip, HOLDOUT)
-        truth = Truth(opened.phantom, opened.clip, split.train, split.held_out, opened.tissue_right)
+        truth = Truth(opened.phantom, opened.tissue, split.train, split.held_out, opened.tissue_right)
         for eyes, scene in scenes.items():
             for angle_deg, views in truth.off_axis.items():
                 print(f"{eyes} at {angle_deg:g} degrees: {parts(opened, scene, views)}", flush=True)
@@ -89,7 +89,7 @@ def parts(opened: OpenClip, scene: Scene, views: list[Expected]) -> str:
         shown = np.clip(candidate.view(view.frame, view.pose).rgb, 0, 1)
         error = np.square(shown - view.rgb).mean(-1)
         mirrored = np.abs(view.rgb - view.baked).max(-1) > MIRRORED
-        hidden = ~seen_now(opened.phantom, view, opened.clip.tissue, opened.tissue_right)
+        hidden = ~seen_now(opened.phantom, view, opened.tissue, opened.tissue_right)
         kind = np.select([mirrored, hidden, near_steps(view.depth_mm)], [0, 1, 2], 3)
         found.append(np.stack([kind[view.judged], error[view.judged]]))
     kind, error = np.concatenate(found, axis=1)

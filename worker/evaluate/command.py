@@ -20,7 +20,7 @@ from worker.evaluate.cells import BOTH_EYES, DEFAULT_HOLDOUTS, DEFAULT_SERIES, C
 from worker.evaluate.charts import draw_all
 from worker.evaluate.measure import Bench
 from worker.evaluate.rows import Results, adding_alone, write_rows
-from worker.evaluate.sources import source_of
+from worker.evaluate.sources import PHANTOM_SPELLING, source_of
 from worker.evaluate.summary import SUMMARY_FIELDS, Sooner, capacities, groups_of, orderings, sooner
 from worker.machine.hooks import Progress
 from worker.raster.backend import choose_device
@@ -37,8 +37,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "clips",
         nargs="*",
         metavar="CLIP",
-        help="a path, phantom:MOTION[:WxH][:FRAMESframes][:seedN][:stereo], or d4d_endonerf or d4d_stereo of "
-        "INTRASPLAT_DATA",
+        help=f"a path, {PHANTOM_SPELLING}, or d4d_endonerf or d4d_stereo of INTRASPLAT_DATA",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="rows, summary and charts; goes on there"

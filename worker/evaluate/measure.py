@@ -132,7 +132,7 @@ class Bench:
         if place not in self._truth:
             unused = {*report.held_out, *report.repeated}
             train = [frame for frame in range(report.frame_count) if frame not in unused]
-            self._truth[place] = Truth(opened.phantom, opened.clip, train, report.held_out, opened.tissue_right)
+            self._truth[place] = Truth(opened.phantom, opened.tissue, train, report.held_out, opened.tissue_right)
         return dataclasses.asdict(self._truth[place].score(SceneCandidate(scene)))
 
 

@@ -2,8 +2,13 @@
 
 PATH                                        anything `reconstruct` reads
 phantom:MOTION[:WxH][:FRAMESframes][:seedN] synthetic tissue with true depth, 320x256, 64 frames, seed 0
+phantom:MOTION[+PATH...][:...]              the same under an endoscope that follows paths: swing, pan, advance, roll,
+                                            turn, shake (worker/phantom/camera.py); the clip has the true poses
+phantom:MOTION[:...]:TOOL[+TOOL...]         with other instruments than the grasper: steel, yellow, dark; or none
+phantom:MOTION[:...]:nomasks                without masks of the instruments
 phantom:MOTION[:...]:stereo                 the same tissue as a stereo clip: both eyes without loss, their calibration
-                                            and the left eye's masks, rectified and matched as a user's clip is
+                                            and the left eye's masks, rectified and matched as a user's clip is; it has
+                                            no poses
 d4d_endonerf, d4d_stereo                    the recordings in the folder INTRASPLAT_DATA names; rows call them d4d-a
 """
 
@@ -12,7 +17,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +29,7 @@ from contract.wire.options import ClipOptions, ReconstructionOptions
 from worker.input.clip import DepthClip
 from worker.machine.hooks import Hooks
 from worker.machine.timing import Timings
-from worker.phantom import MOTIONS, Phantom, PhantomSettings, make_phantom
+from worker.phantom import MOTIONS, TOOLS, Phantom, PhantomSettings, make_phantom
 from worker.pipeline import open_with_depth
 from worker.raster.backend import CPU, Device
 from worker.stereo import match_eyes
@@ -32,8 +37,9 @@ from worker.train.request import ReconstructionRequest
 
 DATA_VARIABLE = "INTRASPLAT_DATA"
 PHANTOM_WIDTH, PHANTOM_HEIGHT = 320, 256
-STEREO = ":stereo"
+NO_TOOLS = "none"
 _STEREO: Mapping[str, Any] = {"calibration": "calibration.json", "masks": "tool_masks.zip"}
+PHANTOM_SPELLING = "phantom:MOTION[+PATH...][:WxH][:FRAMESframes][:seedN][:TOOL[+TOOL...]][:nomasks][:stereo]"
 RECORDINGS: Mapping[str, tuple[str, str, Mapping[str, Any]]] = {
     "d4d_endonerf": ("d4d-a", "d4d_endonerf", {}),
     "d4d_stereo": ("d4d-a-stereo", "d4d_stereo/stereo_sbs.mp4", _STEREO),
@@ -48,6 +54,7 @@ class Source:
 
     phantom  how to draw it; None for a recording
     stereo   whether it is drawn for both eyes, and its depth is stereo's
+    masks    whether a drawn clip has masks of its instruments
     clip     the recording's file or folder
     files    beside it: calibration, masks
     options  how the files are to be read
@@ -57,6 +64,7 @@ class Source:
     argument: str
     phantom: PhantomSettings | None = None
     stereo: bool = False
+    masks: bool = True
     clip: Path = Path()
     files: Mapping[str, Path] = field(default_factory=dict)
     options: ClipOptions = field(default_factory=ClipOptions)
@@ -66,12 +74,14 @@ class Source:
 class OpenClip:
     """A clip with depth; phantom knows its truth, seconds what decoding and stereo took.
 
-    tissue_right is [T, H, W] bool, the exact tissue of a phantom's right eye; None where there is no such eye.
+    tissue is [T, H, W] bool, where the left eye shows tissue: exact for a phantom, whose clip may have no masks, and
+    the clip's own else; tissue_right the exact one of a phantom's right eye, None where there is no such eye.
     """
 
     clip: DepthClip
     phantom: Phantom | None
     seconds: Mapping[str, float]
+    tissue: NDArray[np.bool_]
     tissue_right: NDArray[np.bool_] | None = None
 
 
@@ -82,9 +92,7 @@ def source_of(argument: str, files: Mapping[str, Path] | None = None, options: C
         InputError: there is no such motion or file, or a recording is asked for, and INTRASPLAT_DATA is not set.
     """
     if argument.startswith("phantom:"):
-        drawn, stereo = (argument[: -len(STEREO)], True) if argument.endswith(STEREO) else (argument, False)
-        settings = _phantom_settings(drawn)
-        return Source(_phantom_name(settings) + "-stereo" * stereo, argument, settings, stereo)
+        return _drawn(argument)
     if argument in RECORDINGS and not Path(argument).exists():
         return _recording(argument)
     if not Path(argument).exists():
@@ -104,17 +112,20 @@ def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU
     if source.phantom is not None:
         phantom = make_phantom(source.phantom)
         if not source.stereo:
-            return OpenClip(phantom.depth_clip(), phantom, {})
-        drawn = phantom.stereo_recording()
+            exact = phantom.depth_clip()
+            tissue = exact.tissue
+            clip = exact if source.masks else replace(exact, tissue=np.ones_like(tissue))
+            return OpenClip(clip, phantom, {}, tissue)
+        drawn = phantom.stereo_recording(masks=source.masks)
         clip = match_eyes(drawn.clip, drawn.calibration, holdout, hooks, timings, device=device.kind)
-        return OpenClip(clip, phantom, timings.seconds, drawn.tissue_right)
+        return OpenClip(clip, phantom, timings.seconds, drawn.tissue, drawn.tissue_right)
     options = ReconstructionOptions(
         holdout=holdout, use_frames="all", **source.options.model_dump()
     )  # each run chooses
     calibration, masks = source.files.get("calibration"), source.files.get("masks")
     request = ReconstructionRequest(source.clip, options, calibration=calibration, masks=masks)
     clip = open_with_depth(request, hooks, timings, device)
-    return OpenClip(clip, None, timings.seconds)
+    return OpenClip(clip, None, timings.seconds, clip.tissue)
 
 
 def _recording(argument: str) -> Source:
@@ -129,9 +140,12 @@ def _recording(argument: str) -> Source:
     return Source(name, argument, clip=path, files={key: path.parent / each for key, each in beside.items()})
 
 
-def _phantom_settings(argument: str) -> PhantomSettings:
+def _drawn(argument: str) -> Source:
+    """The source of phantom:MOTION[...]. InputError for what is not known."""
     values: dict[str, Any] = {"width": PHANTOM_WIDTH, "height": PHANTOM_HEIGHT}
-    _, motion, *parts = argument.split(":")
+    flags = {"stereo": False, "nomasks": False}
+    _, moves, *parts = argument.split(":")
+    motion, *paths = moves.split("+")
     for part in parts:
         if match := re.fullmatch(r"(\d+)x(\d+)", part):
             values |= {"width": int(match[1]), "height": int(match[2])}
@@ -139,20 +153,29 @@ def _phantom_settings(argument: str) -> PhantomSettings:
             values["frames"] = int(match[1])
         elif match := re.fullmatch(r"seed(\d+)", part):
             values["seed"] = int(match[1])
+        elif part in flags:
+            flags[part] = True
+        elif part == NO_TOOLS or set(part.split("+")) <= set(TOOLS):
+            values["tools"] = () if part == NO_TOOLS else tuple(part.split("+"))
         else:
             problem = f"{part!r} in {argument!r} is not known."
-            raise InputError("CLIP", problem, "Write phantom:MOTION[:WxH][:FRAMESframes][:seedN][:stereo].")
-    return PhantomSettings(motion=motion, **values)  # type: ignore[arg-type]  # it refuses what is not a motion
+            raise InputError("CLIP", problem, f"Write {PHANTOM_SPELLING}.")
+    settings = PhantomSettings(motion=motion, camera=tuple(paths), **values)  # type: ignore[arg-type]  # it judges them
+    stereo, masks = flags["stereo"], not flags["nomasks"]
+    name = _phantom_name(settings) + "-nomasks" * (not masks) + "-stereo" * stereo
+    return Source(name, argument, settings, stereo, masks)
 
 
 def _phantom_name(settings: PhantomSettings) -> str:
     """phantom-MOTION and what differs from the usual clip."""
     usual = PhantomSettings()
-    parts = ["phantom", settings.motion]
+    parts = ["phantom", settings.motion, *settings.camera]
     if (settings.width, settings.height) != (PHANTOM_WIDTH, PHANTOM_HEIGHT):
         parts.append(f"{settings.width}x{settings.height}")
     if settings.frames != usual.frames:
         parts.append(f"{settings.frames}frames")
     if settings.seed != usual.seed:
         parts.append(f"seed{settings.seed}")
+    if settings.tools != usual.tools:
+        parts.extend(settings.tools or [NO_TOOLS])
     return "-".join(parts)

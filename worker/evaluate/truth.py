@@ -4,12 +4,12 @@ Symbols: T frames, H W pixels, M material points of frame 0.
 
 Whatever is judged is a Candidate: a scene, or the phantom itself, which scores as well as anything can.
 
-view   a held-out frame's moment from a pose 10 or 15 degrees off, to the right, up, left or down, about the point at
-       median depth on frame 0's axis (contract/wire/pose.py). Judged are the pixels whose material point some training
-       frame showed as tissue. Wet tissue mirrors the lamp, elsewhere for every eye: a clip from one place cannot tell
-       where. So three figures: the view as it is; `baked`, the view with its highlights where the endoscope sees them;
-       and the bound, what that baked view itself scores as the view. No model whose colours do not depend on the
-       viewpoint passes the bound but by chance.
+view   a held-out frame's moment from a pose 10 or 15 degrees off the endoscope's, to the right, up, left or down, about
+       the point at the clip's median depth on its axis (contract/wire/pose.py). Judged are the pixels whose material
+       point some training frame showed as tissue. Wet tissue mirrors the lamp, elsewhere for every eye: a clip from one
+       place cannot tell where. So three figures: the view as it is; `baked`, the view with its highlights where the
+       endoscope sees them; and the bound, what that baked view itself scores as the view. No model whose colours do not
+       depend on the viewpoint passes the bound but by chance.
         A stereo clip has two eyes that show tissue, whichever of them is trained on.
 hidden the endoscope's own picture of a held-out frame behind the instrument, on the same condition.
 depth  median |z - truth| over tissue of held-out frames.
@@ -41,7 +41,6 @@ from numpy.typing import NDArray
 
 from contract.wire.pose import OrbitPose, world_from_camera
 from worker.evaluate.ranking import PixelErrors, pixel_errors, rank_scores, together
-from worker.input.clip import DepthClip
 from worker.model.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
 from worker.phantom import Phantom
 from worker.render.camera import view_camera
@@ -136,15 +135,15 @@ class Truth:
     def __init__(
         self,
         phantom: Phantom,
-        clip: DepthClip,
+        tissue: NDArray[np.bool_],
         train: Sequence[int],
         held_out: Sequence[int],
         tissue_right: NDArray[np.bool_] | None = None,
     ) -> None:
-        """tissue_right [T, H, W]: of a stereo clip, whose right eye shows tissue too."""
-        self._phantom, self._clip = phantom, clip
+        """tissue [T, H, W]: exact, of the left eye; tissue_right: of a stereo clip's right eye, which shows it too."""
+        self._phantom, self._tissue = phantom, tissue
         self._judged_frames = sample_frames(held_out, JUDGED_FRAMES)
-        self._seen, pivot_mm = _seen_by(phantom, train, clip.tissue, tissue_right)
+        self._seen, pivot_mm = _seen_by(phantom, train, tissue, tissue_right)
         self._tracks = phantom.trajectories(TRACK_STRIDE_PX)
         self._views = {angle: list(self._off_axis(angle, pivot_mm)) for angle in ANGLES_DEG}
         self._own = [self._expected(frame, phantom.world_from_camera(frame)) for frame in self._judged_frames]
@@ -197,8 +196,8 @@ class Truth:
         for place, frame in enumerate(self._judged_frames):
             yaw, pitch = DIRECTIONS[place % len(DIRECTIONS)]
             orbit = OrbitPose(yaw_deg=yaw * angle_deg, pitch_deg=pitch * angle_deg, zoom=1.0)
-            pose = np.array(world_from_camera(orbit, pivot_mm), np.float64)
-            yield self._expected(frame, pose)
+            about = np.array(world_from_camera(orbit, pivot_mm), np.float64)
+            yield self._expected(frame, self._phantom.world_from_camera(frame) @ about)
 
     def _expected(self, frame: int, pose: Pose) -> Expected:
         rgb, depth_mm = self._phantom.render(frame, pose)
@@ -208,11 +207,11 @@ class Truth:
         return Expected(frame, pose, rgb, baked, shows & self._seen[row, column], depth_mm)
 
     def _behind_instrument(self, own: Expected) -> Expected:
-        return replace(own, judged=own.judged & ~self._clip.tissue[own.frame])
+        return replace(own, judged=own.judged & ~self._tissue[own.frame])
 
     def _depth(self, own: Sequence[ShownView]) -> float:
         errors = [
-            depth_errors_mm(view.depth_mm, each.depth_mm, self._clip.tissue[each.frame])
+            depth_errors_mm(view.depth_mm, each.depth_mm, self._tissue[each.frame])
             for view, each in zip(own, self._own, strict=True)
         ]
         return depth_agreement_mm(errors)
@@ -220,7 +219,7 @@ class Truth:
     def _motion(self, candidate: Candidate) -> tuple[float, float, float]:
         """Medians in mm: end-point error of all, of what moves, and how far that has moved."""
         row, column = self._tracks.pixels.T
-        tissue = self._clip.tissue[0][row, column]
+        tissue = self._tissue[0][row, column]
         row, column, points_mm = row[tissue], column[tissue], self._tracks.points_mm[:, tissue]
         errors, moves = [np.empty(0)], [np.empty(0)]
         for frame in self._judged_frames:

@@ -21,8 +21,9 @@ from worker.evaluate.cells import Cell, plan
 from worker.evaluate.command import SUMMARY, measure_all
 from worker.evaluate.measure import Bench, Values, _OnTheWay, command_of, seconds_of
 from worker.evaluate.rows import CURVES, KEY, LOCK, RUN_FIELDS, RUNS, Results, adding_alone, read_rows
-from worker.evaluate.sources import DATA_VARIABLE, source_of
-from worker.machine.hooks import Progress
+from worker.evaluate.sources import DATA_VARIABLE, open_source, source_of
+from worker.machine.hooks import Hooks, Progress
+from worker.phantom import PhantomSettings
 from worker.train.hooks import RenderedFrame, TrainingHooks
 
 CLIP = "phantom:pull:96x80:12frames"
@@ -78,6 +79,33 @@ def test_a_phantom_is_also_a_stereo_clip_with_its_truth_beside_it(both_eyes: Pat
     for share in ("empty_ok", "seen_ok"):
         assert 0 < float(row[share]) <= 1
     assert f"{CLIP}:stereo" in row["command"]
+
+
+def test_a_phantom_s_name_tells_paths_instruments_and_missing_masks() -> None:
+    usual = source_of("phantom:breathing")
+    assert (usual.name, usual.phantom, usual.masks) == ("phantom-breathing", PhantomSettings(320, 256), True)
+    source = source_of("phantom:pull+pan+shake:96x80:3frames:steel+dark:nomasks:stereo")
+    assert source.name == "phantom-pull-pan-shake-96x80-3frames-steel-dark-nomasks-stereo"
+    assert source.phantom is not None
+    assert (source.phantom.camera, source.phantom.tools) == (("pan", "shake"), ("steel", "dark"))
+    assert source_of("phantom:cut:none").phantom == PhantomSettings(320, 256, motion="cut", tools=())
+
+
+def test_a_phantom_without_masks_is_judged_by_the_true_ones() -> None:
+    for spelling in ("phantom:breathing:96x80:3frames", "phantom:breathing:96x80:3frames:stereo"):
+        given, bare = (open_source(source_of(each), "none", Hooks()) for each in (spelling, f"{spelling}:nomasks"))
+        np.testing.assert_array_equal(given.clip.tissue, given.tissue)
+        np.testing.assert_array_equal(bare.tissue, given.tissue)
+        assert bare.clip.tissue.mean() > given.tissue.mean() + 0.01
+
+
+def test_a_moving_phantom_gives_its_poses_with_true_depth_and_none_with_stereo() -> None:
+    one, both = (
+        open_source(source_of(f"phantom:breathing+pan:96x80:9frames{end}"), "none", Hooks()) for end in ("", ":stereo")
+    )
+    assert one.phantom is not None
+    np.testing.assert_array_equal(one.clip.world_from_camera[8], one.phantom.world_from_camera(8))
+    np.testing.assert_array_equal(both.clip.world_from_camera, np.tile(np.eye(4), (9, 1, 1)))
 
 
 def test_the_right_eye_judges_what_either_number_of_eyes_taught(both_eyes: Path) -> None:
@@ -277,6 +305,8 @@ def test_a_curve_whose_run_has_no_row_is_forgotten(measured: Path, tmp_path: Pat
     [
         ["phantom:dancing"],
         ["phantom:pull:huge"],
+        ["phantom:pull+fly"],
+        ["phantom:pull:spoon"],
         ["nowhere.mp4"],
         [CLIP, "--series", "slow"],
         [CLIP, CLIP],

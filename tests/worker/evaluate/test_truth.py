@@ -55,7 +55,7 @@ class BakedPhantom(PhantomShown):
 def made() -> tuple[Phantom, DepthClip, Truth]:
     phantom = make_phantom(PhantomSettings(width=96, height=80, frames=FRAMES, motion="pull", period_frames=12.0))
     clip = phantom.depth_clip()
-    return phantom, clip, Truth(phantom, clip, TRAIN, HELD_OUT)
+    return phantom, clip, Truth(phantom, clip.tissue, TRAIN, HELD_OUT)
 
 
 def painted_scene(phantom: Phantom, clip: DepthClip, follows: bool) -> Scene:
@@ -131,8 +131,8 @@ def test_a_confidence_that_knows_where_the_model_errs_ranks_the_errors() -> None
 
 def test_the_right_eye_of_a_stereo_clip_shows_what_the_left_eye_does_not() -> None:
     phantom, clip, _ = made()
-    blind = dataclasses.replace(clip, tissue=np.zeros_like(clip.tissue))
-    blind.tissue[0, :, :48] = True
+    blind = np.zeros_like(clip.tissue)
+    blind[0, :, :48] = True
     nothing = np.zeros_like(clip.tissue)
     one, both = (Truth(phantom, blind, [0], HELD_OUT, right) for right in (nothing, ~nothing))
     judged = [sum(int(view.judged.sum()) for view in truth._views[10.0]) for truth in (one, both)]
@@ -164,16 +164,16 @@ def test_a_model_that_stays_errs_by_the_motion_itself() -> None:
 
 def test_only_what_a_training_frame_showed_is_judged() -> None:
     phantom, clip, _ = made()
-    blind = dataclasses.replace(clip, tissue=np.zeros_like(clip.tissue))
-    blind.tissue[0] = True  # else there is no depth to turn about
+    blind = np.zeros_like(clip.tissue)
+    blind[0] = True  # else there is no depth to turn about
     hidden = Truth(phantom, blind, [0], HELD_OUT).score(PhantomShown(phantom))
     assert hidden.psnr_view10_db == BEST_PSNR_DB
-    blind.tissue[0, :, 48:] = False
+    blind[0, :, 48:] = False
     half = Truth(phantom, blind, [0], HELD_OUT)
     assert (
         0
         < sum(view.judged.sum() for view in half._views[10.0])
-        < sum(view.judged.sum() for view in Truth(phantom, clip, TRAIN, HELD_OUT)._views[10.0])
+        < sum(view.judged.sum() for view in Truth(phantom, clip.tissue, TRAIN, HELD_OUT)._views[10.0])
     )
 
 
