@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 from contract.wire.errors import Cancelled
 from contract.wire.report import Report
@@ -19,7 +20,7 @@ from worker.report.quality import measure, scored_report
 from worker.report.right_eye import measure_right
 from worker.scene.scene import Scene
 from worker.train.hooks import RenderedFrame
-from worker.train.scoring import FrameRenderer, sample_frames
+from worker.train.scoring import FrameRenderer, Mapping, sample_frames
 from worker.train.targets import solid_depth_mm
 
 STAGE = "score"
@@ -48,8 +49,6 @@ def judged(
         def render(index: int) -> RenderedFrame:
             nonlocal done
             hooks.on_progress(Progress(STAGE, done / total, first.iterations, first.iterations))
-            if hooks.should_stop():
-                raise Cancelled("Stopped while scoring.")
             done += 1
             image, _ = renderer.layers(float(clip.t[index]), eye.world_from_camera[index], eye.intrinsics)
             depth_mm = solid_depth_mm(image[3], image[4], scene.units_per_mm)
@@ -57,12 +56,32 @@ def judged(
 
         return render
 
-    with one_opencv_thread(), ThreadPoolExecutor(cores(), thread_name_prefix=STAGE) as pool:
-        held_out = measure(clip, first.held_out, views(clip), pool.map)
-        right = measure_right(clip, first.held_out, views(clip.right or clip), pool.map)
-        trained = measure(clip, sampled, views(clip), pool.map, compared=not first.held_out)
-        baselines = copy_baselines(clip, train, first.held_out, pool.map)
+    with (
+        one_opencv_thread(),
+        ThreadPoolExecutor(cores(), thread_name_prefix=STAGE) as pool,
+        ThreadPoolExecutor(1) as beside,
+    ):
+        each = _until_stopped(pool, hooks)
+        copied = beside.submit(copy_baselines, clip, train, first.held_out, each)
+        held_out = measure(clip, first.held_out, views(clip), each)
+        right = measure_right(clip, first.held_out, views(clip.right or clip), each)
+        trained = measure(clip, sampled, views(clip), each, compared=not first.held_out)
+        baselines = copied.result()
     report = scored_report(first, held_out, right, trained, baselines)
     made, left_db, right_db = first.iterations, report.psnr_tissue_db, report.psnr_right_db
     hooks.on_progress(Progress(STAGE, 1.0, made, made, psnr_db=left_db, psnr_right_db=right_db))
     return report.model_copy(update={"seconds": {**first.seconds, "score_s": time.perf_counter() - started_s}})
+
+
+def _until_stopped(pool: ThreadPoolExecutor, hooks: Hooks) -> Mapping:
+    """The pool's map, of work that raises Cancelled as soon as hooks.should_stop says so."""
+
+    def each(work: Callable[[int], Any], frames: Iterable[int]) -> Iterable[Any]:
+        def unless_stopped(index: int) -> Any:
+            if hooks.should_stop():
+                raise Cancelled("Stopped while scoring.")
+            return work(index)
+
+        return pool.map(unless_stopped, frames)
+
+    return each
