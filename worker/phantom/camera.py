@@ -7,7 +7,7 @@ pan      to the right by PAN_VIEWS widths of the view at mean depth, once in the
 advance  by ADVANCE_MM towards the tissue and back, once in the clip
 roll     by ROLL_DEG about the optical axis, once in the clip
 turn     by TURN_DEG within TURN_S about the port that the endoscope goes through, from TURN_START_S on
-shake    as held by hand: sway of some mm and about a degree below 1.5 Hz, and tremor of 5 to 8 Hz
+shake    as held by hand: sway of a mm or two and half a degree at 1.1 to 2.1 Hz, and tremor of 5 to 8 Hz
 
 A turn and a shake take seconds, so settings.frame_rate_hz says how many frames they last.
 """
@@ -34,8 +34,9 @@ TURN_DEG, TURN_S, TURN_START_S = 5.0, 1.5, 0.4  # as fast as the kinematics of r
 PORT_BEHIND_MM = 120.0  # the endoscope turns about its port in the abdominal wall
 RAMP = 0.2  # share of a movement in which it gathers speed, and in which it loses it
 
-SWAY_MM, SWAY_MM_HZ = np.array([2.0, 1.6, 1.2]), np.array([0.7, 0.9, 0.5])  # along x, y, z
-SWAY_DEG, SWAY_DEG_HZ = np.array([0.8, 1.0, 0.7]), np.array([1.1, 0.8, 0.6])  # about x, y, z
+# A hand is faster than a breath, whose usual 36 frames are 0.7 Hz: at one frequency nobody could tell them apart.
+SWAY_MM, SWAY_MM_HZ = np.array([1.8, 1.5, 1.1]), np.array([1.1, 1.6, 1.3])  # along x, y, z
+SWAY_DEG, SWAY_DEG_HZ = np.array([0.6, 0.8, 0.6]), np.array([1.7, 1.2, 2.1])  # about x, y, z
 TREMOR_HZ = np.array([5.3, 6.1, 7.3])
 TREMOR_SHARE = 0.1  # of the sway
 
