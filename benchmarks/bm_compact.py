@@ -27,7 +27,7 @@ from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
-from worker.train.rate_distortion import quantize_model
+from worker.train.rate_distortion import round_model
 from worker.train.scoring import HeldOutScore, held_out_score
 from worker.train.setup import Setup
 
@@ -67,10 +67,11 @@ def rows_of(path: Path | None, iterations: int, tolerances_db: list[float]) -> l
     rows: list[dict[str, object]] = []
     for tolerance_db in tolerances_db:
         start = time.perf_counter()
-        quantized = quantize_model(model_of(scene), scene, [run.frames], tolerance_db)
-        shrink_s = time.perf_counter() - start
-        if quantized is None:
+        rounded = round_model(model_of(scene), scene, [run.frames], tolerance_db)
+        if rounded is None:
             continue
+        quantized = rounded.stored(scene)
+        shrink_s = time.perf_counter() - start
         with tempfile.TemporaryDirectory() as folder:
             save_scene(Path(folder), quantized.scene)
             start = time.perf_counter()

@@ -45,7 +45,7 @@ from worker.train.hooks import TrainingHooks
 from worker.train.keep import Keeper, keeping
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.rate_distortion import QuantizedScene, quantize_model
+from worker.train.rate_distortion import QuantizedScene, round_model
 from worker.train.request import ReconstructionRequest
 from worker.train.resume import resume
 from worker.train.run import Run, write_curve
@@ -195,17 +195,19 @@ def optimise(run: Run, keeper: Keeper) -> None:
 
 
 def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
-    """The scene to keep, quantized where that loses next to nothing, and what it loses."""
+    """The scene to keep, quantized where that loses next to nothing, and what it loses. It uses the run's model up."""
     run.setup.hooks.on_progress(run.progress("finish", 0.0))
     with run.setup.timings.measure("finish_s"):
         scene = scene_of(run)
         still = scene.deformation.select(torch.zeros(0, dtype=torch.int64))
         scene = dataclasses.replace(scene, deformation=still)  # the model has the weights, and they take much memory
     with run.setup.timings.measure("shrink_s"):
-        quantized = quantize_model(run.model, scene, run.eyes, device=run.device)
-    keep_free_memory(LITTLE_BYTES)
-    if quantized is None:
-        return dataclasses.replace(scene, deformation=run.model.export()[1]), None
+        rounded = round_model(run.model, scene, run.eyes, device=run.device)
+        keep_free_memory(LITTLE_BYTES)
+        if rounded is None:
+            return dataclasses.replace(scene, deformation=run.model.export()[1]), None
+        del run.model  # its weights would lie beside the stored ones
+        quantized = rounded.stored(scene)
     return quantized.scene, quantized
 
 

@@ -35,7 +35,7 @@ from worker.scene.model import model_of
 from worker.scene.resume_file import RESUME_FILE
 from worker.train.hooks import TrainingHooks
 from worker.train.presets import PRESETS, Preset
-from worker.train.rate_distortion import TOLERANCE_DB, quantize_model
+from worker.train.rate_distortion import TOLERANCE_DB, round_model
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units
 
@@ -389,11 +389,10 @@ def test_the_pipeline_and_the_loop_make_the_same_model(clip: Path, whole: Whole)
     split = split_frames(opened)
     loop = trained(prepared_on(opened, split, "fast", iterations=ITERATIONS))
     scene = scene_of(loop)
-    quantized = quantize_model(model_of(scene), scene, loop.eyes)
-    assert quantized is not None
-    assert tensor_bits(whole("fast")[1]) == {
-        name: each.numpy().tobytes() for name, each in quantized.scene.tensors().items()
-    }
+    rounded = round_model(model_of(scene), scene, loop.eyes)
+    assert rounded is not None
+    small = rounded.stored(scene).scene
+    assert tensor_bits(whole("fast")[1]) == {name: each.numpy().tobytes() for name, each in small.tensors().items()}
 
 
 def test_what_is_stored_is_what_was_scored_and_the_report_tells_its_price(clip: Path, whole: Whole) -> None:

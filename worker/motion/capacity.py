@@ -21,7 +21,7 @@ from worker.machine.cores import cores
 from worker.motion.tracks import Tracks, resting
 from worker.motion.trials import BasisValues, FitError, Trial
 
-BASES = (3, 5, 9, 13, 17, 25, 33, 49, 65, 97)
+BASES = (3, 5, 9, 13, 17, 25, 33, 49, 65, 97, 129, 161, 193)
 """Numbers of bases to choose from, besides REST."""
 REST = 1
 """One basis is a constant: the scene neither moves nor changes its light."""

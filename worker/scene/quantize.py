@@ -77,7 +77,7 @@ class Prepared:
     """
 
     state: Reals
-    motion: Sequence[Floats]
+    motion: list[Floats]
     pattern: Reals
     power: Whole
     effect: Reals
@@ -86,22 +86,28 @@ class Prepared:
 
 
 def prepare(
-    gaussians: Gaussians, deformation: SharedBasis, seen: Tensor, effect: Reals, trained_t: Sequence[float]
+    gaussians: Gaussians,
+    bases: SharedBasis,
+    weight: Floats,
+    seen: Tensor,
+    effect: Reals,
+    trained_t: Sequence[float],
 ) -> Prepared:
     """The scene in the coordinates in which it is rounded; nothing is lost yet.
 
     Args:
+        bases: those of the motion; its own weights are not read.
+        weight: [B, C, N] of the motion, as it lies in a model; read channel by channel.
         seen: [N] in [0, 1].
         effect: [VALUES, N]; an error e in a number adds effect * e**2 / N to the picture's mean squared error.
         trained_t: model times of the training frames, at least one.
     """
     order = np.argsort(_along_curve(gaussians.mean.double().numpy()), kind="stable")
     state = _state_of(gaussians)[order]
-    weight = deformation.weight.numpy()
     effect = effect[:, order].copy()
     channels = weight.shape[1]
-    values = np.stack([deformation.basis(t).double().numpy() for t in trained_t])  # [T, B]
-    mean = (weight @ values.mean(0).astype(np.float32))[order]
+    values = np.stack([bases.basis(t).double().numpy() for t in trained_t])  # [T, B]
+    mean = np.stack([values.mean(0).astype(np.float32) @ weight[:, c] for c in range(channels)], axis=1)[order]
     state[:, :channels] += mean
     length = np.linalg.norm(state[:, QUATERNION], axis=1)
     state[length == 0, QUATERNION_ROW], length[length == 0] = 1, 1  # zeros are not a rotation
@@ -118,8 +124,7 @@ def prepare(
     most = (MAX_NUMBERS // len(state) - len(rows) - PLAIN_COLUMNS) // channels
     motion, pattern = _patterns(weights, root[:channels], values, scale, max(most, 1))
     share = np.clip(seen.double().numpy(), 0, 1)[order]
-    basis = deformation.select(torch.zeros(0, dtype=torch.int64))
-    return Prepared(state, motion, pattern, power, root, share, basis)
+    return Prepared(state, motion, pattern, power, root, share, bases.select(torch.zeros(0, dtype=torch.int64)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +155,7 @@ class Rounding(Numbers):
         return self.prepared.power
 
     def compact(self) -> Compact:
-        """The same in one table."""
+        """The same in one table, which takes the memory of the prepared motion: nothing else can be rounded then."""
         channels, patterns, _ = self.pattern.shape
         first = len(self.step)
         columns = first + channels * patterns + PLAIN_COLUMNS
@@ -158,6 +163,7 @@ class Rounding(Numbers):
         table[:, :first] = self.at_rest()
         for channel in range(channels):
             table[:, first : first + patterns] = self.coefficients(channel, channel + 1)
+            self.prepared.motion[channel] = np.zeros((0, 0), np.float32)
             first += patterns
         table[:, -4:-1] = self.powers()
         # What was seen at all stays so: a render marks what was not.
@@ -226,16 +232,19 @@ def _power(effect: Reals) -> Whole:
 def _channels(weight: Floats, order: Whole, mean: Floats, length: Floats) -> Iterator[Floats]:
     """Each channel's weights [N, B] in the new coordinates and order; a copy of all of them would take much memory.
 
-    weight [N, C, B] as it was; mean [N, C] over the trained times and length [N] of the quaternions, in the new order.
+    weight [B, C, N] as it was; mean [N, C] over the trained times and length [N] of the quaternions, in the new order.
     """
     for rows in (MEAN, QUATERNION, LOG_SCALE, COLOUR, GLOSS):
-        some = weight[order, rows]  # no channels where the motion has none
-        some -= mean[:, rows, None]  # the bases sum to 1
+        apart = weight[:, rows]  # no channels where the motion has none
+        some = np.empty(apart.shape, np.float32)
+        for at_basis, ordered in zip(apart, some, strict=True):
+            np.take(at_basis, order, axis=1, out=ordered, mode="clip")  # raise would copy it once more
+        some -= mean[:, rows].T  # the bases sum to 1
         if rows is QUATERNION:
-            some /= length[:, None, None]
+            some /= length
         elif rows is COLOUR and some.size:
             some = OPPONENT.astype(np.float32) @ some
-        yield from some.transpose(1, 0, 2)
+        yield from some.transpose(1, 2, 0)
 
 
 def _patterns(

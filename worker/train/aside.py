@@ -10,8 +10,8 @@ from torch import Tensor
 
 from worker.machine.mapped import let_go, mapped_zeros
 
-LARGE_BYTES = 512 << 20
-"""Of the weights of a long clip; those of a usual one take less, and are not worth the disk's time."""
+LARGE_BYTES = 192 << 20
+"""Of the weights of a long clip; those of a usual one, of up to 33 bases, are not worth the disk's time."""
 
 
 class Aside:

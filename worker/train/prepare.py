@@ -18,7 +18,7 @@ from worker.train.presets import Preset
 from worker.train.run import Box, Run
 from worker.train.schedule import Schedule, validation_frames
 from worker.train.setup import Setup
-from worker.train.start import box_of, fusion_for, settled, start_model
+from worker.train.start import bounded, box_of, fusion_for, settled, start_model
 from worker.train.targets import TrainingFrames, units_per_mm
 
 
@@ -42,12 +42,13 @@ def prepare(setup: Setup) -> Run:
         right = setup.teaching_eyes[1] if len(setup.teaching_eyes) > 1 else None
         fusion = fusion_for(preset, clip.intrinsics)
         cloud = fuse(clip, train, fusion, seed=setup.options.seed, moved=moved, right=right)
+    preset, fewer = bounded(preset, len(cloud.points_mm))
     setup.hooks.report_stage("start", 0.0)
     with timings.measure("start_s"):
         model = start_model(
             cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device, gloss=any(setup.sides)
         )
-    run = begun(setup, frames_of(setup, scale), model, preset, chosen, box_of(model))
+    run = begun(setup, frames_of(setup, scale), model, preset, (*chosen, *fewer), box_of(model))
     keep_free_memory(LITTLE_BYTES)
     run.schedule = _schedule(run)
     return run

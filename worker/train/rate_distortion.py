@@ -82,14 +82,31 @@ class QuantizedScene:
         return {"stored_step": self.step, "stored_loss_db": self.loss_db}
 
 
-def quantize_model(
+@dataclass(frozen=True, eq=False)
+class RoundedModel:
+    """A model in whole numbers; step, loss_db and frames as in QuantizedScene."""
+
+    compact: Compact
+    step: float
+    loss_db: float
+    frames: int
+
+    def stored(self, scene: Scene) -> QuantizedScene:
+        """The model as it will be read back, and what else the scene holds. The float model is not needed any more."""
+        stored = self.compact.tensors()
+        gaussians, deformation, seen = self.compact.model()
+        small = dataclasses.replace(scene, gaussians=gaussians, deformation=deformation, seen=seen, stored=stored)
+        return QuantizedScene(small, self.step, self.loss_db, self.frames, small.byte_count)
+
+
+def round_model(
     model: Model,
     scene: Scene,
     eyes: Sequence[TrainingFrames],
     tolerance_db: float = TOLERANCE_DB,
     device: Device = CPU,
-) -> QuantizedScene | None:
-    """The model in whole numbers, and what else the scene holds; the scene's motion needs no weights.
+) -> RoundedModel | None:
+    """The model, of which the scene was made, in whole numbers. The scene's motion needs no weights.
 
     None for a model that is stored as floats, or if no trial kept the tolerance.
     """
@@ -106,24 +123,10 @@ def quantize_model(
     def loss_db(numbers: Numbers) -> float:
         return exact_db - _mean_db(_renders(numbers, scene, scored, device), scored)
 
-    found = _rounded(_prepared(model, scene, sensitivity, times), exact_db, loss_db, tolerance_db)
-    return None if found is None else _stored(scene, *found, len(scored))
-
-
-def _prepared(model: Model, scene: Scene, sensitivity: NDArray[np.float64], times: Sequence[float]) -> Prepared:
-    """The model ready for rounding. The copy of its weights ends here."""
-    gaussians, deformation = model.export()
-    assert isinstance(deformation, SharedBasis)
-    return prepare(gaussians, deformation, scene.seen, sensitivity, times)
-
-
-def _rounded(
-    prepared: Prepared, exact_db: float, loss_of: Callable[[Numbers], float], tolerance_db: float
-) -> tuple[Compact, float, float] | None:
-    """The coarsest rounding tried that kept the tolerance: what it stores, its step, its loss in dB."""
-    first = _first_step(prepared, exact_db)
-    found = _coarsest(lambda step: loss_of(rounding(prepared, step)), first, tolerance_db)
-    return None if found is None else (rounding(prepared, found[0]).compact(), *found)
+    weight = model.parameters()["motion.weight"].cpu().numpy()
+    prepared = prepare(scene.gaussians, scene.deformation, weight, scene.seen, sensitivity, times)
+    found = _coarsest(lambda step: loss_db(rounding(prepared, step)), _first_step(prepared, exact_db), tolerance_db)
+    return None if found is None else RoundedModel(rounding(prepared, found[0]).compact(), *found, len(scored))
 
 
 def _first_step(prepared: Prepared, exact_db: float) -> float:
@@ -154,13 +157,6 @@ def _coarsest(loss_of: Callable[[float], float], first: float, tolerance_db: flo
         predicted = SAFETY * step * (allowed / max(_added_error(loss_db), 1e-2 * allowed)) ** (1 / RATE_EXPONENT)
         step = predicted if good < predicted < bad else math.sqrt(good * min(bad, 100 * good))
     return best
-
-
-def _stored(scene: Scene, compact: Compact, step: float, loss_db: float, frames: int) -> QuantizedScene:
-    stored = compact.tensors()
-    gaussians, deformation, seen = compact.model()
-    small = dataclasses.replace(scene, gaussians=gaussians, deformation=deformation, seen=seen, stored=stored)
-    return QuantizedScene(small, step, loss_db, frames, small.byte_count)
 
 
 def _added_error(loss_db: float) -> float:

@@ -17,11 +17,12 @@ from worker.input.clip import DepthClip
 from worker.model.constants import SH_C0
 from worker.model.deformation import AtRest, SharedBasis, motion_named
 from worker.model.gaussians import Gaussians, initial_gaussians
-from worker.model.layout import COLOUR, MEAN
+from worker.model.layout import COLOUR, MEAN, ROWS
 from worker.motion.capacity import MAX_POINTS, Trials, choose_bases, choose_stride, floor_error, try_bases
 from worker.motion.tracks import GUESSED, Tracks, fit_tracks
 from worker.raster.backend import CPU, Device, make_model
 from worker.raster.model import Model
+from worker.scene.compact import MAX_WEIGHTS
 from worker.train.presets import Preset
 from worker.train.run import Box
 from worker.train.setup import Setup
@@ -83,6 +84,15 @@ def settled(
             )
         )
     return preset, tuple(notices)
+
+
+def bounded(preset: Preset, points: int) -> tuple[Preset, tuple[Notice, ...]]:
+    """The settled preset with so few bases that a scene of so many Gaussians can be stored, and the notice of it."""
+    most = MAX_WEIGHTS // (ROWS * points)
+    if preset.deformation != SharedBasis.kind or preset.bases is None or preset.bases <= most:
+        return preset, ()
+    text = f"Motion has {most} of {preset.bases} bases: more would make a scene of more than {MAX_WEIGHTS:,} weights."
+    return dataclasses.replace(preset, bases=most), (Notice.info(NoticeCode.BASES, text),)
 
 
 def basis_values(bases: int, trained_times: Sequence[float], times: Sequence[float]) -> NDArray[np.float64]:

@@ -164,7 +164,7 @@ def test_where_one_number_alone_could_be_tried_nothing_is_said_of_the_motion() -
         (40, 25, 17, "the most that 40 training frames bear"),
         (200, 17, 17, "the most that the preset allows"),
         (135, None, 33, "the most that 135 training frames bear"),
-        (875, None, 97, "the most there are to choose from"),
+        (1750, None, 193, "the most there are to choose from"),
     ],
 )
 def test_the_most_is_called_by_what_limits_it(frames: int, most: int | None, tried: int, cap: str) -> None:
@@ -216,7 +216,7 @@ def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: 
     assert any("too little could be followed" in each.text for each in notices)
 
 
-@pytest.mark.parametrize(("frames", "bases"), [(1, 1), (2, 2), (12, 4), (105, 33), (1000, 97)])
+@pytest.mark.parametrize(("frames", "bases"), [(1, 1), (2, 2), (12, 4), (105, 33), (875, 193)])
 def test_where_nothing_could_be_followed_bases_come_by_the_frames_up_to_the_most(frames: int, bases: int) -> None:
     assert choose_bases(Trials({}), 10.0, frames).count == bases
 

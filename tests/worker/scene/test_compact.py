@@ -31,7 +31,7 @@ from worker.scene.differences import MAX_STORED
 from worker.scene.model import model_of
 from worker.scene.quantize import prepare, rounding
 from worker.scene.scene import Scene
-from worker.train.rate_distortion import SCORED_FRAMES, TOLERANCE_DB, QuantizedScene, quantize_model
+from worker.train.rate_distortion import SCORED_FRAMES, TOLERANCE_DB, QuantizedScene, RoundedModel, round_model
 from worker.train.targets import TrainingFrames
 
 TIMES = tuple(np.arange(6) / 6)
@@ -48,15 +48,13 @@ def shared(scene: Scene) -> SharedBasis:
 
 
 def rounded(scene: Scene, step: float = 1e-3, effect: NDArray[np.float64] | None = None) -> Compact:
-    chosen = effect_of(len(scene.gaussians)) if effect is None else effect
-    return rounding(prepare(scene.gaussians, shared(scene), scene.seen, chosen, TIMES), step).compact()
+    chosen, motion = effect_of(len(scene.gaussians)) if effect is None else effect, shared(scene)
+    weight = motion.weight.permute(2, 1, 0).numpy()
+    return rounding(prepare(scene.gaussians, motion, weight, scene.seen, chosen, TIMES), step).compact()
 
 
 def compacted(scene: Scene, step: float = 1e-3) -> Scene:
-    small = rounded(scene, step)
-    gaussians, deformation, seen = small.model()
-    stored = small.tensors()
-    return dataclasses.replace(scene, gaussians=gaussians, deformation=deformation, seen=seen, stored=stored)
+    return RoundedModel(rounded(scene, step), step, loss_db=0.0, frames=1).stored(scene).scene
 
 
 def states(scene: Scene, t: float) -> Tensor:
@@ -332,7 +330,8 @@ def test_damage_to_a_compact_file_is_found(tmp_path: Path, damage: str) -> None:
 
 
 def quantized(scene: Scene, frames: TrainingFrames, tolerance_db: float = TOLERANCE_DB) -> QuantizedScene | None:
-    return quantize_model(model_of(scene), scene, [frames], tolerance_db)
+    found = round_model(model_of(scene), scene, [frames], tolerance_db)
+    return found and found.stored(scene)
 
 
 def test_shrinking_keeps_its_tolerance_and_says_what_it_took() -> None:

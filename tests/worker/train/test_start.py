@@ -8,15 +8,18 @@ import math
 import numpy as np
 import pytest
 
+from contract.wire.notices import NoticeCode
 from tests.helpers import assert_close
 from tests.worker.phantoms import phantom_clip
 from worker.fusion import PointCloud, fuse
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip
+from worker.model.layout import ROWS
 from worker.motion.tracks import moved_along, track
 from worker.raster.model import Model
+from worker.scene.compact import MAX_WEIGHTS
 from worker.train.presets import PRESETS, Preset
-from worker.train.start import MIN_STRIDE, fusion_for, settled, start_model
+from worker.train.start import MIN_STRIDE, bounded, fusion_for, settled, start_model
 from worker.train.targets import units_per_mm
 
 TIMES = (0.0, 0.31, 11 / 12)
@@ -45,6 +48,16 @@ def test_the_grid_of_points_is_the_one_nearest_to_what_was_asked_for(size: tuple
     others = [other for other in (stride - 1, stride + 1) if other >= MIN_STRIDE]
     assert stride >= MIN_STRIDE
     assert all(abs(stride - exact) <= abs(other - exact) for other in others)
+
+
+def test_many_gaussians_get_as_many_bases_as_their_scene_can_be_stored_with() -> None:
+    preset = dataclasses.replace(PRESETS["fast"], bases=193)
+    assert bounded(preset, 90_000) == (preset, ())
+    fewer, (notice,) = bounded(preset, 120_000)
+    assert fewer.bases is not None
+    assert 120_000 * ROWS * fewer.bases <= MAX_WEIGHTS < 120_000 * ROWS * (fewer.bases + 1)
+    assert notice.code is NoticeCode.BASES
+    assert bounded(PRESETS["paper"], 10**9) == (PRESETS["paper"], ())
 
 
 def test_the_published_fusion_is_left_as_it_is() -> None:
