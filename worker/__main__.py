@@ -21,6 +21,7 @@ from contract.runtime.logs import configure
 from contract.runtime.processes import told_to_end
 from contract.runtime.settings import Settings
 from contract.wire.errors import IntrasplatError, UnavailableError
+from worker.machine.cores import keep_libraries_to_one_thread
 
 MODULES = {
     "reconstruct": "worker.commands.reconstruct",
@@ -107,6 +108,7 @@ def _leave(code: int) -> NoReturn:
 
 
 if __name__ == "__main__":
+    keep_libraries_to_one_thread()
     status = main()
     if sys.argv[1] in LOCAL_COMMANDS:
         _leave(status)

@@ -24,10 +24,12 @@ from contract.wire.report import Report
 from worker.input.camera import to_camera
 from worker.input.clip import DepthClip, FrameSplit, split_frames, training_frames
 from worker.input.clip.sampling import most_frames, sampled
+from worker.machine.cores import cores
 from worker.machine.forecast import Forecast
 from worker.machine.hooks import Hooks
 from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from worker.machine.timing import Timings
+from worker.model.deformation import HexPlane
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
 from worker.report.doubts import clip_warnings
@@ -159,6 +161,7 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
     timings.add("compile_s", compile_coder())
     if device == CPU:
         timings.add("compile_s", compile_kernels(partial(hooks.report_stage, "compile")))
+    torch.set_num_threads(cores() if preset.deformation == HexPlane.kind else 1)  # else kernels do what takes time
     idle = device != choose_device(request.device)
     return Setup(clip, split, preset, options, device, hooks, timings, accepted_at_s=accepted_at_s, gpu_is_idle=idle)
 
