@@ -32,6 +32,7 @@ from worker.machine.timing import Timings
 from worker.model.deformation import HexPlane
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
+from worker.render.view import SceneRenderer
 from worker.report.doubts import clip_warnings
 from worker.report.judge import judged
 from worker.report.quality import Training, first_report
@@ -58,9 +59,9 @@ VERSIONED = ("intrasplat", "torch", "numba")
 """What decides a scene's numbers; the report names their versions."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Made:
-    """A scene that is finished, and all that judging it needs."""
+    """A scene that is finished, and all that judging it needs. Judging uses the scene up."""
 
     clip: DepthClip
     split: FrameSplit
@@ -118,7 +119,9 @@ def judge(made: Made, hooks: Hooks) -> Report:
         TrainingDiverged: a render holds NaN or infinity.
         Cancelled: hooks.should_stop said so.
     """
-    return judged(made.report, made.clip, made.split.train, made.scene, hooks, made.device)
+    renderer = SceneRenderer(made.scene, made.device)
+    del made.scene  # the renderer has the weights, and they take much memory
+    return judged(made.report, made.clip, made.split.train, renderer, hooks)
 
 
 def judge_again(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:
@@ -201,9 +204,7 @@ def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
     """The scene to keep, quantized where that loses next to nothing, and what it loses. It uses the run's model up."""
     run.setup.hooks.on_progress(run.progress("finish", 0.0))
     with run.setup.timings.measure("finish_s"):
-        scene = scene_of(run)
-        still = scene.deformation.select(torch.zeros(0, dtype=torch.int64))
-        scene = dataclasses.replace(scene, deformation=still)  # the model has the weights, and they take much memory
+        scene = scene_of(run).without_motion()  # the model has the weights, and they take much memory
     with run.setup.timings.measure("shrink_s"):
         rounded = round_model(run.model, scene, run.eyes, device=run.device)
         keep_free_memory(LITTLE_BYTES)

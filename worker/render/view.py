@@ -90,10 +90,13 @@ class Frame:
 
 
 class SceneRenderer:
-    """A scene ready to be rendered on a device. Serialises its threads: the kernels share buffers."""
+    """A scene ready to be rendered on a device. Serialises its threads: the kernels share buffers.
+
+    scene: all of it but its motion's weights, which its model has.
+    """
 
     def __init__(self, scene: Scene, device: Device = CPU) -> None:
-        self._scene = weakref.ref(scene)
+        self.scene = scene.without_motion()
         self._model = model_of(scene, device)
         self._values = blended_values(scene.seen.numpy())
         self._lock = RLock()  # who pauses a large render may make a small one
@@ -108,9 +111,7 @@ class SceneRenderer:
         pause: Callable[[], None] = no_pause,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """R G B Z A [5, H, W], Z unnormalised in units, and blended_values as they are blended [H, W], as copies."""
-        scene = self._scene()
-        assert scene is not None
-        camera = view_camera(scene, t, world_from_camera, intrinsics, highlights=highlights)
+        camera = view_camera(self.scene, t, world_from_camera, intrinsics, highlights=highlights)
         with self._lock:
             shown = self._model.render(camera, t, self._values, pause)
             image = np.empty(shown.shape, np.float32)

@@ -13,12 +13,10 @@ from worker.input.clip import DepthClip, Eye
 from worker.machine.cores import cores
 from worker.machine.hooks import Hooks, Progress
 from worker.machine.opencv import one_opencv_thread
-from worker.raster.backend import CPU, Device
-from worker.render.view import renderer_of
+from worker.render.view import SceneRenderer
 from worker.report.baselines import copy_baselines
 from worker.report.quality import measure, scored_report
 from worker.report.right_eye import measure_right
-from worker.scene.scene import Scene
 from worker.train.hooks import RenderedFrame
 from worker.train.scoring import FrameRenderer, Mapping, sample_frames
 from worker.train.targets import solid_depth_mm
@@ -26,14 +24,13 @@ from worker.train.targets import solid_depth_mm
 STAGE = "score"
 
 
-def judged(
-    first: Report, clip: DepthClip, train: Sequence[int], scene: Scene, hooks: Hooks, device: Device = CPU
-) -> Report:
+def judged(first: Report, clip: DepthClip, train: Sequence[int], renderer: SceneRenderer, hooks: Hooks) -> Report:
     """The report with the scores of the scene's held-out frames, of the right eye's, and of the copy baselines.
 
     Args:
         first: the report of the scene before it was scored.
         train: the frames that the scene was trained on.
+        renderer: the scene's.
 
     Raises:
         TrainingDiverged: a render holds NaN or infinity.
@@ -44,14 +41,13 @@ def judged(
 
     def views(eye: DepthClip | Eye) -> FrameRenderer:
         """Renders the frame of this index from the eye's own pose."""
-        renderer = renderer_of(scene, device)
 
         def render(index: int) -> RenderedFrame:
             nonlocal done
             hooks.on_progress(Progress(STAGE, done / total, first.iterations, first.iterations))
             done += 1
             image, _ = renderer.layers(float(clip.t[index]), eye.world_from_camera[index], eye.intrinsics)
-            depth_mm = solid_depth_mm(image[3], image[4], scene.units_per_mm)
+            depth_mm = solid_depth_mm(image[3], image[4], renderer.scene.units_per_mm)
             return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
 
         return render

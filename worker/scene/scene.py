@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -61,6 +61,10 @@ class Scene:
     def frame_count(self) -> int:
         """T."""
         return int(self.world_from_camera.shape[0])
+
+    def without_motion(self) -> Scene:
+        """The scene without the weights of its motion, for whoever has them elsewhere."""
+        return replace(self, deformation=self.deformation.select(torch.zeros(0, dtype=torch.int64)))
 
     def tensors(self) -> dict[str, Tensor]:
         """Every tensor of the model by its name in an exact file, on the CPU."""

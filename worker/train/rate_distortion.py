@@ -20,9 +20,9 @@ from worker.model.deformation import SharedBasis
 from worker.model.layout import OPACITY_ROW, ROWS, VALUES
 from worker.raster.backend import CPU, Device
 from worker.raster.model import Model
-from worker.scene.compact import Compact, Numbers
+from worker.scene.compact import Numbers
 from worker.scene.model import model_of
-from worker.scene.quantize import Prepared, prepare, rounding
+from worker.scene.quantize import Prepared, Rounding, prepare, rounding
 from worker.scene.scene import Scene
 from worker.train.targets import TrainingFrames
 
@@ -86,15 +86,17 @@ class QuantizedScene:
 class RoundedModel:
     """A model in whole numbers; step, loss_db and frames as in QuantizedScene."""
 
-    compact: Compact
+    rounding: Rounding
     step: float
     loss_db: float
     frames: int
 
     def stored(self, scene: Scene) -> QuantizedScene:
-        """The model as it will be read back, and what else the scene holds. The float model is not needed any more."""
-        stored = self.compact.tensors()
-        gaussians, deformation, seen = self.compact.model()
+        """The model as it will be read back, and what else the scene holds. It uses the rounding up; the float model
+        is not needed any more."""
+        compact = self.rounding.compact()
+        stored = compact.tensors()
+        gaussians, deformation, seen = compact.model()
         small = dataclasses.replace(scene, gaussians=gaussians, deformation=deformation, seen=seen, stored=stored)
         return QuantizedScene(small, self.step, self.loss_db, self.frames, small.byte_count)
 
@@ -126,7 +128,7 @@ def round_model(
     weight = model.parameters()["motion.weight"].cpu().numpy()
     prepared = prepare(scene.gaussians, scene.deformation, weight, scene.seen, sensitivity, times)
     found = _coarsest(lambda step: loss_db(rounding(prepared, step)), _first_step(prepared, exact_db), tolerance_db)
-    return None if found is None else RoundedModel(rounding(prepared, found[0]).compact(), *found, len(scored))
+    return None if found is None else RoundedModel(rounding(prepared, found[0]), *found, len(scored))
 
 
 def _first_step(prepared: Prepared, exact_db: float) -> float:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from contract.wire.errors import SceneError
 from tests.worker.phantoms import phantom_clip, prepared, trained
+from tests.worker.scene.compacting import TIMES, compacted, effect_of, rounded, shared
 from tests.worker.scene.plain_reader import read_plainly
 from tests.worker.scenes import random_scene
 from worker.input.clip import DepthClip, spread
@@ -26,35 +27,12 @@ from worker.model.metrics import psnr_tissue
 from worker.pipeline import scene_of
 from worker.scene import compact
 from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
-from worker.scene.compact import MIN_POWER, Compact, state_rows, unpack
+from worker.scene.compact import MIN_POWER, state_rows, unpack
 from worker.scene.differences import MAX_STORED
 from worker.scene.model import model_of
-from worker.scene.quantize import prepare, rounding
 from worker.scene.scene import Scene
-from worker.train.rate_distortion import SCORED_FRAMES, TOLERANCE_DB, QuantizedScene, RoundedModel, round_model
+from worker.train.rate_distortion import SCORED_FRAMES, TOLERANCE_DB, QuantizedScene, round_model
 from worker.train.targets import TrainingFrames
-
-TIMES = tuple(np.arange(6) / 6)
-
-
-def effect_of(count: int) -> NDArray[np.float64]:
-    """Every number of every Gaussian matters the same."""
-    return np.ones((VALUES, count))
-
-
-def shared(scene: Scene) -> SharedBasis:
-    assert isinstance(scene.deformation, SharedBasis)
-    return scene.deformation
-
-
-def rounded(scene: Scene, step: float = 1e-3, effect: NDArray[np.float64] | None = None) -> Compact:
-    chosen, motion = effect_of(len(scene.gaussians)) if effect is None else effect, shared(scene)
-    weight = motion.weight.permute(2, 1, 0).numpy()
-    return rounding(prepare(scene.gaussians, motion, weight, scene.seen, chosen, TIMES), step).compact()
-
-
-def compacted(scene: Scene, step: float = 1e-3) -> Scene:
-    return RoundedModel(rounded(scene, step), step, loss_db=0.0, frames=1).stored(scene).scene
 
 
 def states(scene: Scene, t: float) -> Tensor:
