@@ -22,6 +22,11 @@ def flush(path: Path) -> None:
         os.close(descriptor)
 
 
+def aside_of(path: Path) -> Path:
+    """Where a file is written before it takes its place; a crash may leave it there."""
+    return path.with_name(f".{path.name}.new")
+
+
 def replace_file(path: Path, content: bytes, mode: int = OWNER_ONLY) -> None:
     """Write a file whole, in place of any that is there. It is on disk when this returns.
 
@@ -33,7 +38,7 @@ def replace_file(path: Path, content: bytes, mode: int = OWNER_ONLY) -> None:
     Raises:
         OSError: the disk is full or refuses; the old file is as it was.
     """
-    aside = path.with_name(f".{path.name}.new")
+    aside = aside_of(path)
     aside.unlink(missing_ok=True)  # left by a crash
     try:
         descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)

@@ -35,6 +35,7 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 
 SUBMISSION = "submission.json"
 MANIFEST = "manifest.json"
+SCENE = "scene.safetensors"
 REPORT = "report.json"
 CURVE = "curve.csv"
 RESUME = "resume.safetensors"

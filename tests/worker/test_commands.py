@@ -170,6 +170,22 @@ def test_an_interrupted_run_goes_on_with_the_same_command(clip: Path, tmp_path: 
     assert load_resume(out)[1]["iteration"] > first > 0
 
 
+def test_a_run_killed_while_it_wrote_a_state_or_its_results_starts_again_in_its_folder(
+    clip: Path, tmp_path: Path
+) -> None:
+    for name in (f".{RESUME_FILE}.new", REPORT, CURVE, ".manifest.json.new"):
+        (tmp_path / name).write_bytes(b"cut off")
+    assert main(["reconstruct", str(clip), "--iterations", "5", "--out", str(tmp_path)]) == ExitCode.OK
+    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "scene.safetensors", REPORT, CURVE}
+
+
+def test_a_finished_scene_is_not_replaced(clip: Path, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (scene / REPORT).read_bytes()
+    assert main(["reconstruct", str(clip), "--iterations", "5", "--out", str(scene)]) == ExitCode.BAD_INPUT
+    assert "new folder" in capsys.readouterr().err
+    assert (scene / REPORT).read_bytes() == before
+
+
 def test_an_interrupted_run_does_not_go_on_as_another(
     clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 from contract.runtime.arguments import add_options, given_options
 from contract.runtime.exits import ExitCode
 from contract.runtime.progress_bar import ProgressBar
+from contract.store.durable import aside_of
 from contract.wire.errors import Cancelled, InputError
-from contract.wire.names import KEPT
+from contract.wire.names import CURVE, KEPT, MANIFEST, REPORT, SCENE
 from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
 from worker.commands.device import add_device
@@ -26,6 +27,11 @@ from worker.commands.device import add_device
 if TYPE_CHECKING:
     from worker.input.clip import DepthClip
     from worker.machine.hooks import Hooks
+
+
+_BEFORE_MANIFEST = (*KEPT, REPORT, CURVE, SCENE)
+UNFINISHED = {*_BEFORE_MANIFEST, *(aside_of(Path(name)).name for name in (*_BEFORE_MANIFEST, MANIFEST))}
+"""What a run that was stopped or killed may leave. The manifest is written last: with it the scene is finished."""
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,7 +68,7 @@ def run_cli(options: argparse.Namespace) -> int:
     from worker.machine.hooks import Hooks
 
     out: Path = options.out
-    if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= set(KEPT)):
+    if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= UNFINISHED):
         problem = f"{out} is there already and is neither an empty folder nor that of a stopped run."
         raise InputError("--out", problem, "Name a new folder.")
     interrupted = threading.Event()

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from contract.store.durable import FOR_ALL, replace_file
 from contract.wire.errors import SceneError
+from contract.wire.names import MANIFEST, SCENE
 from worker.input.camera import Intrinsics
 from worker.model.deformation import Deformation, restore
 from worker.model.gaussians import Gaussians
@@ -30,8 +31,7 @@ FORMAT = "intrasplat-scene"
 FORMAT_VERSION = 2
 """Raised when an older reader would misread what is written."""
 EXACT, COMPACT = "exact", "compact"
-SCENE_FILE = "scene.safetensors"
-MANIFEST_FILE = "manifest.json"
+SCENE_FILE, MANIFEST_FILE = SCENE, MANIFEST
 MISFITS = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 """Errors that reading raises where a manifest's entry or a tensor has the wrong shape or type."""
 

@@ -17,7 +17,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from contract.store.durable import FOR_ALL, flush
+from contract.store.durable import FOR_ALL, aside_of, flush
 from contract.wire.errors import SceneError
 from contract.wire.names import RESUME
 
@@ -66,7 +66,8 @@ def begin_resume(
     them. after_each is called whenever so much more is written that tensors in files should be let go of.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    path, aside = directory / RESUME_FILE, directory / f".{RESUME_FILE}.new"
+    path = directory / RESUME_FILE
+    aside = aside_of(path)
     aside.unlink(missing_ok=True)  # left by a crash
     tensors = dict(sorted(tensors.items(), key=lambda each: -each[1].element_size()))  # so that each is aligned
     text, places = json.dumps(dict(state), sort_keys=True), _places(tensors)
