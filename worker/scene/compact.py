@@ -49,6 +49,8 @@ MIN_POWER = -3
 """The least power of two, MAX_POWER being the largest, by which a Gaussian's precision may differ from the mean. What
 the trained frames hardly show may be seen from elsewhere, so it keeps an eighth."""
 SEEN_LEVELS = 63
+ROWS_AT_ONCE = 1 << 14
+"""Gaussians whose coefficients are floats at a time."""
 MAX_NUMBERS = 7 * 2**25
 """Numbers a scene may have: those of 170 thousand Gaussians and 97 bases. Unpacking takes up to 14 bytes a number
 (where there is one basis; 10 where there are many), so no file, however small, takes more than 3.1 GiB, and what its
@@ -122,19 +124,23 @@ class Numbers(ABC):
         channels, patterns, columns = pattern.shape
         motion = np.empty((len(self.powers()), channels, columns), np.float32)
 
-        def coefficients(first: int, last: int) -> Floats:
-            block = self.coefficients(first, last).astype(np.float32)
-            block *= self._scale(GROUP_OF[first])[:, None]
-            return block
+        def fill(first: int, last: int, weights: Floats) -> None:
+            """The channels from first to last, whose coefficients the weights [(last - first) R, (last - first) X] mix;
+            few rows at a time, because floats of all of them would take as much memory as the motion."""
+            whole, scale = self.coefficients(first, last), self._scale(GROUP_OF[first])[:, None]
+            for start in range(0, len(whole), ROWS_AT_ONCE):
+                some = slice(start, start + ROWS_AT_ONCE)
+                block = whole[some].astype(np.float32)
+                block *= scale[some]
+                motion[some, first:last] = (block @ weights).reshape(-1, last - first, columns)
 
         for channel in range(CHANNELS):
-            motion[:, channel] = coefficients(channel, channel + 1) @ pattern[channel]
+            fill(channel, channel + 1, pattern[channel])
         if channels > CHANNELS:
-            mixed = np.einsum("or,opx->oprx", OPPONENT.astype(np.float32), pattern[COLOUR])
-            colour = coefficients(CHANNELS, COLOUR_CHANNELS) @ mixed.reshape(3 * patterns, 3 * columns)
-            motion[:, COLOUR] = colour.reshape(-1, 3, columns)
+            mixing = np.einsum("or,opx->oprx", OPPONENT.astype(np.float32), pattern[COLOUR])
+            fill(CHANNELS, COLOUR_CHANNELS, mixing.reshape(3 * patterns, 3 * columns))
         if channels > COLOUR_CHANNELS:
-            motion[:, GLOSS_ROW] = coefficients(GLOSS_ROW, ROWS) @ pattern[GLOSS_ROW]
+            fill(GLOSS_ROW, ROWS, pattern[GLOSS_ROW])
         return motion
 
 
