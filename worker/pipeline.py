@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -55,6 +56,8 @@ from worker.train.run import Run, write_curve
 from worker.train.scoring import held_out_score
 from worker.train.setup import Setup, length_of
 
+FINISHING_STEPS = 7
+"""Of finish(), when three steps of rounding are tried."""
 VERSIONED = ("intrasplat", "torch", "numba")
 """What decides a scene's numbers; the report names their versions."""
 
@@ -201,12 +204,23 @@ def optimise(run: Run, keeper: Keeper) -> None:
 
 
 def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
-    """The scene to keep, quantized where that loses next to nothing, and what it loses. It uses the run's model up."""
-    run.setup.hooks.on_progress(run.progress("finish", 0.0))
-    with run.setup.timings.measure("finish_s"):
-        scene = scene_of(run).without_motion()  # the model has the weights, and they take much memory
-    with run.setup.timings.measure("shrink_s"):
-        rounded = round_model(run.model, scene, run.eyes, device=run.device)
+    """The scene to keep, quantized where that loses next to nothing, and what it loses. It uses the run's model up.
+
+    Raises:
+        Cancelled: hooks.should_stop said so.
+    """
+    timings, reached = run.setup.timings, itertools.count()
+
+    def report() -> None:
+        run.setup.hooks.on_progress(run.progress("finish", min(next(reached) / FINISHING_STEPS, 1.0)))
+        if run.setup.hooks.should_stop():
+            raise Cancelled("Stopped while the scene was finished.")
+
+    report()
+    with timings.measure("finish_s"):
+        scene = scene_of(run, report).without_motion()  # the model has the weights, and they take much memory
+    with timings.measure("shrink_s"):
+        rounded = round_model(run.model, scene, run.eyes, device=run.device, on_step=report)
         keep_free_memory(LITTLE_BYTES)
         if rounded is None:
             return dataclasses.replace(scene, deformation=run.model.export()[1]), None
@@ -215,9 +229,10 @@ def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
     return quantized.scene, quantized
 
 
-def scene_of(run: Run) -> Scene:
-    """The scene of a trained run; strays are removed from its model first."""
+def scene_of(run: Run, on_step: Callable[[], None] = lambda: None) -> Scene:
+    """The scene of a trained run; strays are removed from its model first. on_step is called after that."""
     drop_strays(run.model, run.eyes)
+    on_step()
     return dataclasses.replace(snapshot_of(run), seen=torch.from_numpy(trust(run.model, run.eyes)))
 
 
@@ -272,11 +287,17 @@ def _training(run: Run, scene: Scene, quantized: QuantizedScene | None) -> Train
         scene_bytes=scene.file_bytes,
         units_per_mm=scene.units_per_mm,
         seconds=dict(run.setup.timings.seconds),
-        assumptions=(*run.chosen, *run.schedule.notices, *(quantized.notices if quantized else ())),
+        assumptions=(*run.chosen, *run.schedule.notices, *(quantized.notices if quantized else (_floats(scene),))),
         measurements=quantized.measurements if quantized else {},
         warnings=_warnings(run),
         versions={"python": platform.python_version(), **{name: version(name) for name in VERSIONED}},
     )
+
+
+def _floats(scene: Scene) -> Notice:
+    """What is said of a scene that is not quantized."""
+    text = f"Numbers are stored as floats, in {scene.file_bytes / 1e6:.2f} MB. All scores are of the stored scene."
+    return Notice.info(NoticeCode.STORED_PRECISION, text)
 
 
 def _warnings(run: Run) -> tuple[Notice, ...]:

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
-from contract.wire.names import KEPT
+from contract.wire.names import KEPT, RESUME
 from contract.wire.notices import NoticeCode
 from contract.wire.options import ReconstructionOptions, parse_options
 from contract.wire.report import Report
@@ -184,11 +184,23 @@ def test_a_stopped_run_goes_on_in_its_folder(name: str, clip: Path, whole: Whole
     straight, out = whole(name)
     with pytest.raises(Cancelled):
         run(clip, tmp_path / "stopped", stopping_after(7), preset=name)
-    assert files(tmp_path / "stopped") == set(KEPT)
+    assert RESUME in files(tmp_path / "stopped") <= set(KEPT)  # the clip may still have been on its way to the disk
     resumed = run(clip, tmp_path / "stopped", preset=name)
     assert files(tmp_path / "stopped") == SCENE_FILES
     assert tensor_bits(tmp_path / "stopped") == tensor_bits(out)
     assert (resumed.frames, resumed.iterations) == (straight.frames, straight.iterations)
+
+
+def test_a_run_stopped_while_its_scene_is_finished_trains_no_more(clip: Path, whole: Whole, tmp_path: Path) -> None:
+    _, out = whole("fast")
+    stages: list[str] = []
+    hooks = TrainingHooks(lambda progress: stages.append(progress.stage), lambda: stages.count("finish") > 2)
+    with pytest.raises(Cancelled, match="finished"):
+        run(clip, tmp_path / "stopped", hooks, preset="fast")
+    stages.clear()
+    run(clip, tmp_path / "stopped", TrainingHooks(lambda progress: stages.append(progress.stage)), preset="fast")
+    assert "motion" not in stages
+    assert tensor_bits(tmp_path / "stopped") == tensor_bits(out)
 
 
 def test_a_run_stopped_while_it_is_scored_leaves_its_scene(clip: Path, whole: Whole, tmp_path: Path) -> None:

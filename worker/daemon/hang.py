@@ -11,14 +11,14 @@ from contract.wire.job import JobProgress
 STAGE_LIMITS_S: Mapping[str, float] = MappingProxyType(
     {
         "decode": 20.0,  # a frame has 10 s, which the decoding process enforces first
-        "stereo": 10.0,  # a pair of 4096 x 2160 takes about 3 s on one slow core
+        "stereo": 30.0,  # a pair of 4096 x 2160 takes 3 s on a slow core; three are aligned without a report
         "compile": 120.0,  # one set of kernels takes seconds, on a crowded machine minutes
         "fusion": 60.0,  # all frames at once, about 10 ms each
         "motion": 10.0,  # a frame takes some 10 ms
         "start": 120.0,  # least squares for every Gaussian, and the targets of all frames, without a report between
         "calibrate": 150.0,  # UNTIMED_STEPS and TIMED_STEPS are 15 iterations of training
         "train": 10.0,  # an iteration takes 10 to 500 ms
-        "finish": 60.0,  # one pass over the frames to find strays
+        "finish": 150.0,  # the motion of a long clip becomes patterns in some 10 s
         "score": 60.0,  # a frame takes some 100 ms; afterwards flow copies of every held-out frame, and the files
     }
 )

@@ -17,13 +17,14 @@ USUAL_S = {
     "motion": (0.1, 0.03),
     "fusion": (0.2, 0.02),
     "start": (0.4, 0.01),
-    "compile": (0.0, 0.0),
     "calibrate": (0.8, 0.0),
     "train": (0.0, 0.0),
     "finish": (1.5, 0.02),
     "publish": (0.7, 0.0),
 }
 """In their order: seconds of a stage, and seconds for each megapixel of all frames of one eye."""
+COMPILATION = "compile"
+"""May come after any stage; kernels that are compiled already take no time."""
 IN_BUDGET = ("motion", "fusion", "start", "calibrate")
 """Stages whose time a budget includes, besides training."""
 USUAL_MEGAPIXELS = 30.0
@@ -56,21 +57,25 @@ class Forecast:
         self._most_frames = most_frames
         self._clock = clock
         self._started_s = clock()
+        self._reached = "decode", 0.0  # stage and fraction
         self._frames = 0
         self._megapixels = USUAL_MEGAPIXELS
 
     def completed(self, progress: Progress) -> Progress:
         """The report with the seconds that are left until the scene is finished."""
-        if progress.stage not in USUAL_S:
+        if progress.stage not in (*USUAL_S, COMPILATION):
             return progress
         if progress.frames:
             self.learn(progress.frames, progress.megapixels)
+        if progress.stage != COMPILATION:
+            self._reached = progress.stage, progress.fraction
+        reached, fraction = self._reached
         usual = self._usual_s()
         stages = list(usual)
-        place = stages.index(progress.stage)
+        place = stages.index(reached)
         rest_s = sum(usual[stage] for stage in stages[place + 1 :])
-        pace = self._pace(sum(usual[stage] for stage in stages[:place]) + progress.fraction * usual[progress.stage])
-        own_s = (1 - progress.fraction) * usual[progress.stage]
+        pace = self._pace(sum(usual[stage] for stage in stages[:place]) + fraction * usual[reached])
+        own_s = (1 - fraction) * usual[reached]
         if progress.stage == "train" and progress.seconds_left is not None:
             return replace(progress, seconds_left=progress.seconds_left + pace * rest_s)
         # The seconds of a budget are no work: they pass at the same pace everywhere.

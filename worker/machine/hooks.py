@@ -40,7 +40,8 @@ def never() -> bool:
 
 @dataclass(frozen=True)
 class Hooks:
-    """The caller's callbacks: on_progress is called at least once a second during work, should_stop between steps.
+    """The caller's callbacks: both are called between two steps of the work (worker/daemon/hang.py
+    has the longest).
 
     on_first_moment gets a DepthClip of one frame (worker/input/clip/types.py), as soon as a training frame has depth:
     long before the others have. It is called at most once, by the thread that calls the stage.

@@ -61,6 +61,10 @@ OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6
 """Orthonormal: brightness, red - blue, magenta - green."""
 
 
+class DoesNotFitError(ValueError):
+    """As many and as large whole numbers as a scene may have cannot hold it."""
+
+
 def state_rows(channels: int) -> list[int]:
     """Rows of worker/model/layout.py that a table holds of a Gaussian at rest, where its motion has so many channels.
 
@@ -241,10 +245,10 @@ def check_size(rows: int, columns: int) -> None:
     """Refuse a table that is empty or larger than MAX_NUMBERS.
 
     Raises:
-        ValueError: it is.
+        DoesNotFitError: it is.
     """
     if rows < 1 or rows * columns > MAX_NUMBERS:
-        raise ValueError(
+        raise DoesNotFitError(
             f"{rows} Gaussians of {columns} numbers: a table has 1 Gaussian at least, and at most {MAX_NUMBERS} numbers"
         )
 

@@ -36,6 +36,7 @@ from worker.scene.compact import (
     PLAIN_COLUMNS,
     SEEN_LEVELS,
     Compact,
+    DoesNotFitError,
     Numbers,
     Whole,
     check_size,
@@ -175,13 +176,13 @@ class Rounding(Numbers):
 def rounding(prepared: Prepared, step: float) -> Rounding:
     """The scene with every number rounded to a multiple of its step.
 
-    What it gives raises ValueError where a number would exceed MAX_STORED.
+    What it gives raises DoesNotFitError where a number would exceed MAX_STORED.
 
     Args:
         step: change of the picture (1 is black to white) when all Gaussians' numbers of one kind are off by one step.
 
     Raises:
-        ValueError: there would be more than MAX_NUMBERS.
+        DoesNotFitError: there would be more than MAX_NUMBERS.
     """
     channels, patterns, _ = prepared.pattern.shape
     rows = state_rows(channels)
@@ -198,11 +199,11 @@ def _whole(numbers: NDArray[np.floating]) -> NDArray[np.int32]:
     """The numbers rounded, which are overwritten.
 
     Raises:
-        ValueError: one would exceed MAX_STORED.
+        DoesNotFitError: one would exceed MAX_STORED.
     """
     largest = max(-float(numbers.min(initial=0)), float(numbers.max(initial=0)))
     if not largest <= MAX_STORED:
-        raise ValueError(f"the step is so fine that a number becomes {largest:g}")
+        raise DoesNotFitError(f"the step is so fine that a number becomes {largest:g}")
     whole: NDArray[np.int32] = np.rint(numbers, out=numbers).astype(np.int32)
     return whole
 

@@ -118,6 +118,8 @@ def check_finite(tensors: dict[str, Tensor]) -> None:
 
 def is_finite(tensor: Tensor) -> bool:
     """Whether no number is NaN or infinite; takes no memory, as the question for each number would."""
+    if tensor.dim() > 1 and not tensor.is_contiguous():  # aminmax would copy it
+        return all(is_finite(row) for row in tensor)
     return tensor.numel() == 0 or all(math.isfinite(float(each)) for each in tensor.aminmax())
 
 

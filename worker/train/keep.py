@@ -1,4 +1,4 @@
-"""Keep what a killed run goes on from: the clip with depth, and the run's state every PERIOD_S.
+"""Keep what a killed run goes on from: the clip with depth, and the run's state about every PERIOD_S.
 
 What lies in the folder is always whole. A disk without room costs what would have been kept, never the run.
 """
@@ -30,6 +30,8 @@ from worker.train.run import Run
 
 PERIOD_S = 10.0
 """Seconds of training between two states that are kept."""
+MAX_SHARE = 0.05
+"""Of the time: where keeping a state takes long, as it does for a long clip, states are kept less often."""
 SPARE_BYTES = 1 << 30
 """Nothing is kept that would leave less room on the disk than this."""
 
@@ -105,8 +107,9 @@ class Keeper:
         if self._due_s is None:
             self._due_s = now_s + PERIOD_S if (self.folder / RESUME_FILE).exists() else now_s
         if now_s >= self._due_s and (self._state is None or self._state.done()):
-            self._due_s = now_s + PERIOD_S
             self._begin(run)
+            took_s = time.monotonic() - now_s
+            self._due_s = now_s + max(PERIOD_S, took_s / MAX_SHARE)
 
     def keep(self, run: Run) -> None:
         """Keep the run's state as it is now; close() waits for it. A clip that is still being written is given up."""

@@ -20,7 +20,7 @@ from worker.model.deformation import SharedBasis
 from worker.model.layout import OPACITY_ROW, ROWS, VALUES
 from worker.raster.backend import CPU, Device
 from worker.raster.model import Model
-from worker.scene.compact import Numbers
+from worker.scene.compact import DoesNotFitError, Numbers
 from worker.scene.model import model_of
 from worker.scene.quantize import Prepared, Rounding, prepare, rounding
 from worker.scene.scene import Scene
@@ -107,8 +107,10 @@ def round_model(
     eyes: Sequence[TrainingFrames],
     tolerance_db: float = TOLERANCE_DB,
     device: Device = CPU,
+    on_step: Callable[[], None] = lambda: None,
 ) -> RoundedModel | None:
-    """The model, of which the scene was made, in whole numbers. The scene's motion needs no weights.
+    """The model, of which the scene was made, in whole numbers. The scene's motion needs no weights. on_step is called
+    between two parts of the work.
 
     None for a model that is stored as floats, or if no trial kept the tolerance.
     """
@@ -119,12 +121,15 @@ def round_model(
     exact_db = _mean_db((model.render(frames.cameras[i], float(frames.t[i])) for frames, i in scored), scored)
     if not math.isfinite(exact_db):
         return None
+    on_step()
     sensitivity = _sensitivity(model, pictures, len(scene.deformation.centre))
     times = [float(eyes[0].t[index]) for index in eyes[0].indices]
 
     def loss_db(numbers: Numbers) -> float:
+        on_step()
         return exact_db - _mean_db(_renders(numbers, scene, scored, device), scored)
 
+    on_step()
     weight = model.parameters()["motion.weight"].cpu().numpy()
     prepared = prepare(scene.gaussians, scene.deformation, weight, scene.seen, sensitivity, times)
     found = _coarsest(lambda step: loss_db(rounding(prepared, step)), _first_step(prepared, exact_db), tolerance_db)
@@ -147,7 +152,7 @@ def _coarsest(loss_of: Callable[[float], float], first: float, tolerance_db: flo
     for _ in range(MAX_TRIALS):
         try:
             loss_db = loss_of(step)
-        except ValueError:  # finer than whole numbers of this size can be
+        except DoesNotFitError:
             loss_db = math.inf
         if not loss_db <= tolerance_db:
             bad = min(bad, step)

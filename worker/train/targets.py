@@ -70,7 +70,7 @@ MIN_DEPTH_MM = np.float32(1e-3)
 
 
 MAX_HELD_BYTES = 512 << 20
-"""Of an eye's pixels: if they are more, each step lets go of its frames. That takes half a millisecond an eye."""
+"""Of an eye's pixels: if they are more, who has used a frame lets go of it. That takes half a millisecond an eye."""
 
 
 class TrainingFrames:
@@ -125,7 +125,10 @@ class TrainingFrames:
 
     def psnr_tissue_db(self, index: int, image: NDArray[np.float32]) -> float:
         """Of a model's render [5, H, W] against frame `index`; NaN without tissue."""
-        return psnr_tissue(image[:3].transpose(1, 2, 0), *self.picture(index))
+        found = psnr_tissue(image[:3].transpose(1, 2, 0), *self.picture(index))
+        if self._lets_go:
+            self.eye.let_go(index)
+        return found
 
     def digest(self) -> str:
         """A hash of everything that training reads of the eye; equal for two runs on the same frames.

@@ -48,3 +48,10 @@ def test_from_the_first_tenth_on_it_is_right_within_a_quarter_of_the_whole(
 def test_a_stage_that_it_does_not_know_is_told_as_it_is() -> None:
     progress = Progress("score", 0.5)
     assert Forecast(None, 60.0).completed(progress) is progress
+
+
+def test_compilation_changes_nothing_wherever_it_comes() -> None:
+    forecast = Forecast(None, 60.0, clock=lambda: 0.0)
+    for stage in ("decode", "stereo", "start"):
+        before_s = forecast.completed(Progress(stage, 1.0)).seconds_left
+        assert forecast.completed(Progress("compile", 0.3)).seconds_left == before_s

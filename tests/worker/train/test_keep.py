@@ -63,6 +63,7 @@ def test_a_run_killed_at_any_time_goes_on_to_the_bits_of_an_unstopped_one(
     preset: str, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(keep, "PERIOD_S", 0.0)
+    monkeypatch.setattr(keep, "MAX_SHARE", 1e9)
     monkeypatch.setattr("worker.train.loop.REPORT_EVERY_S", 0.0)
     found: dict[int, Path] = {}
 
@@ -96,6 +97,7 @@ def test_a_long_clips_run_keeps_no_first_moments_and_goes_on_to_the_same_bits(
 ) -> None:
     monkeypatch.setattr("worker.train.presets.USUAL_BASES", 1)  # what a long clip has more of
     monkeypatch.setattr(keep, "PERIOD_S", 0.0)
+    monkeypatch.setattr(keep, "MAX_SHARE", 1e9)
     monkeypatch.setattr("worker.train.aside.LARGE_BYTES", 1 << 12)
     monkeypatch.setattr("worker.scene.resume_file._AT_MOST_BYTES", 1 << 12)
 
