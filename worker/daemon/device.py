@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from contract.intake.limits import ClipLimits
 from contract.queue.embedded import short_socket_path
 from contract.runtime.exits import ExitCode, leave_last_words
@@ -174,15 +176,27 @@ def work_on(
 def scored(judge: Callable[[], Report], first: Report | Path) -> Scored | Stopped:
     """What judging comes to. An error leaves the scene without scores, and its report says so.
 
+    Stopped: the scene may be scored later, because it was told to stop, something is not available now, or its report
+    cannot be read. A lost GPU ends this process.
+
     first: the report without scores, or its file.
     """
     try:
         return Scored(report=judge())
     except Cancelled:
         return Stopped(checkpointed=False)
+    except UnavailableError as error:
+        logger.warning("a scene cannot be scored now: %s", error)
+        return Stopped(checkpointed=False)
     except Exception as error:
+        if gpu_is_lost():
+            logger.error("this process has lost the GPU (%s); another takes its place", type(error).__name__)
+            raise SystemExit(1) from error
         logger.error("a scene could not be scored: %s", type(error).__name__, exc_info=error)
-        report = first if isinstance(first, Report) else Report.model_validate_json(first.read_bytes())
+        try:
+            report = first if isinstance(first, Report) else Report.model_validate_json(first.read_bytes())
+        except (OSError, ValidationError):  # it was purged, or is damaged
+            return Stopped(checkpointed=False)
         return Scored(report=without_scores(report, type(error).__name__))
 
 

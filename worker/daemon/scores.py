@@ -54,8 +54,16 @@ class Scores:
         elif isinstance(report, Ended) and asked_s is None:
             self._log.warning("the device process %s while it scored a scene", report.cause)
             if gives_up:
-                with contextlib.suppress(UnavailableError, SceneError):  # it was purged, or is made up for later
-                    self._add(without_scores(self._store.newest_report(*self._scene[1:]), report.cause))
+                self._give_up(report.cause)
+
+    def _give_up(self, cause: str) -> None:
+        with contextlib.suppress(UnavailableError):  # it is made up for later
+            try:
+                first = self._store.newest_report(*self._scene[1:])
+            except SceneError:  # it was purged, or is damaged
+                self._store.expect_no_scores(*self._scene)
+                return
+            self._add(without_scores(first, cause))
 
     def _add(self, report: Report) -> None:
         try:
@@ -99,6 +107,15 @@ class LeftScores:
         record = self._queue.get(job_id)
         if record is None or record.state is not JobState.DONE or record.attempt != attempt:
             self._store.expect_no_scores(self._name, job_id, attempt)
+            return None
+        try:
+            report = self._store.newest_report(job_id, attempt)
+        except SceneError as error:  # it was purged, or is damaged
+            self._warn_once(job_id, attempt, error)
+            self._store.expect_no_scores(self._name, job_id, attempt)
+            return None
+        if report.scored:  # adding the same scores again completes what a kill may have cut off
+            self._store.add_scores(self._name, job_id, attempt, report)
             return None
         spool, scene = self._store.fetch_clip(job_id), self._store.scene_folder(job_id, attempt)
         return ScoreScene(record=record, spool=spool, scene=scene)

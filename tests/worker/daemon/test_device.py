@@ -228,6 +228,24 @@ def test_a_scene_that_cannot_be_scored_says_so_in_its_report(tmp_path: Path) -> 
         assert [each.code for each in told.report.warnings] == [NoticeCode.SCORES_FAILED]
 
 
+@pytest.mark.parametrize("error", [UnavailableError("It is away.", "Wait."), FileNotFoundError("purged")])
+def test_a_scene_that_is_gone_or_waits_for_something_is_not_given_up(error: Exception, tmp_path: Path) -> None:
+    def fails() -> Report:
+        raise error
+
+    assert scored(fails, tmp_path / REPORT) == Stopped(checkpointed=False)
+
+
+def test_a_lost_gpu_ends_the_process_that_scores_and_is_not_the_scenes_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("worker.daemon.device.gpu_is_lost", lambda: True)
+
+    def fails() -> Report:
+        raise RuntimeError("CUDA error")
+
+    with pytest.raises(SystemExit):
+        scored(fails, REPORT_OF_A_SCENE)
+
+
 def test_other_trouble_with_the_input_is_not_tried_twice(tmp_path: Path) -> None:
     (tmp_path / RESUME_FILE).write_bytes(b"kept")
     asked = ReconstructionRequest(tmp_path / "no.zip", ReconstructionOptions(iterations=3))

@@ -112,3 +112,21 @@ def test_a_scene_whose_clip_is_gone_is_told_of_once_and_keeps_no_other_waiting(
     assert bench.store.newest_report(sound, 1).scored
     assert bench.store.unscored("worker-1") == [(lost, 1)]
     assert caplog.text.count("a scene waits for its scores") == 1
+
+
+def test_scores_that_were_added_are_not_measured_again(bench: Unscored) -> None:
+    job_id = bench.published()
+    bench.make_up()
+    folder = bench.store.scene_folder(job_id, 1)
+    added = {name: (folder / name).read_bytes() for name in (REPORT_FILE, CURVE, MANIFEST)}
+    bench.store.expect_scores("worker-1", job_id, 1)  # as after a kill between the manifest and expect_no_scores
+    assert bench.make_up().sent == []
+    assert bench.store.unscored("worker-1") == []
+    assert {name: (folder / name).read_bytes() for name in added} == added
+
+
+def test_a_scene_whose_report_cannot_be_read_is_not_scored(bench: Unscored) -> None:
+    job_id = bench.published()
+    (bench.store.scene_folder(job_id, 1) / REPORT_FILE).write_text("{")
+    assert bench.make_up().sent == []
+    assert bench.store.unscored("worker-1") == []
