@@ -91,14 +91,20 @@ class Views:
         is_coarse = request.format in FOR_EYES and self.is_short_of_time()
         if reply is None or (reply.is_coarse and not is_coarse):
             reply = self._render(scene, request, snapshot, is_coarse=is_coarse)
-            if snapshot is None or self._is_newest(scene):
+            # Between the parts of a render a scene may be purged, or a newer snapshot shown.
+            is_held = (
+                (request.scene_id, request.attempt) in self._scenes if snapshot is None else self._is_newest(scene)
+            )
+            if is_held:
                 self._kept.keep(request, reply)
         return reply
 
     def cost(self, request: RenderRequest | ExportRequest) -> float:
-        """What the answer will take, in pixels x Gaussians; 0 if it is kept."""
-        if isinstance(request, RenderRequest) and request in self._kept:
-            return 0.0
+        """What the answer will take, in pixels x Gaussians; 0 if it is kept at full resolution."""
+        if isinstance(request, RenderRequest):
+            kept = self._kept.get(request)
+            if kept is not None and not kept.is_coarse:
+                return 0.0
         if request.attempt is not None:
             scene = self._scenes.get((request.scene_id, request.attempt))
         else:

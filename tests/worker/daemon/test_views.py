@@ -317,9 +317,25 @@ def test_pictures_are_coarse_while_time_is_short_and_exact_formats_are_not(store
     assert NoticeCode.COARSE in [each.code for each in coarse.warnings]
     assert NoticeCode.COARSE not in [each.code for each in exact.warnings]
     assert views.answer(request) is coarse
+    assert views.cost(request) > 0  # it is rendered again when there is time
     views.is_short_of_time = lambda: False
     sharp = views.answer(request)
+    assert views.cost(request) == 0
     assert NoticeCode.COARSE not in [each.code for each in sharp.warnings]
     pictures = [cv2.imdecode(np.frombuffer(each.body, np.uint8), cv2.IMREAD_COLOR) for each in (coarse, sharp)]
     assert pictures[0].shape == pictures[1].shape == (CLIP.height, CLIP.width, 3)
     assert np.abs(pictures[0].astype(float) - pictures[1]).mean() < 12
+
+
+def test_a_picture_of_a_scene_that_is_purged_while_it_is_rendered_is_not_kept(store: Store, scene_id: str) -> None:
+    views = Views(store)
+    large = request_of(scene_id).model_copy(update={"camera": IntrinsicsOverride(width=1600, height=1200)})
+
+    def pause() -> None:
+        store.purge(scene_id)
+        views.forget_purged()
+
+    views.pause = pause
+    views.answer(large)
+    assert views.held == ()
+    assert views.cost(large) > 0
