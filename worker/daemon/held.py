@@ -31,7 +31,10 @@ class HeldClaim:
 
     def forget(self) -> None:
         """The worker holds no claim."""
-        self._path.unlink(missing_ok=True)
+        try:
+            self._path.unlink(missing_ok=True)
+        except OSError as error:
+            logger.warning("the noted claim was not removed: %s", error.strerror)
 
     def give_back(self, queue: Queue) -> bool:
         """Release the claim of an earlier process that was killed, as a death of its job; False if there was none."""

@@ -41,7 +41,10 @@ class Room:
         if self._began_bytes >= self._enough_bytes:
             self._shortages[job_id] += 1
         self._needed_bytes = self._enough_bytes
-        return self._shortages[job_id] < MAX_SHORTAGES
+        may_run_again = self._shortages[job_id] < MAX_SHORTAGES
+        if not may_run_again:  # a caller may retry it, and it begins anew then
+            del self._shortages[job_id]
+        return may_run_again
 
     def sufficed(self, job_id: str) -> None:
         """Note that the job did not find the disk full."""

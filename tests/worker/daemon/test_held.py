@@ -70,3 +70,11 @@ def test_a_queue_that_is_away_leaves_the_claim_to_its_lease(
     monkeypatch.setattr(jobs.queue, "release", away)
     assert not held.give_back(jobs.queue)
     assert jobs.state(claim.job_id) is JobState.RUNNING
+
+
+def test_a_note_that_cannot_be_removed_does_not_end_the_worker(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "claim").mkdir()  # unlink() refuses a folder
+    HeldClaim(tmp_path / "claim").forget()
+    assert "was not removed" in caplog.text

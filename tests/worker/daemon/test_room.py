@@ -90,3 +90,10 @@ def test_a_job_that_is_larger_than_the_disk_fails_as_such(tmp_path: Path) -> Non
     assert (record.state, record.attempt) == (JobState.FAILED, MAX_SHORTAGES)
     assert record.error is not None
     assert record.error.code is ErrorCode.STORE_FULL
+
+
+def test_a_job_that_is_retried_after_it_was_given_up_begins_anew(tmp_path: Path, free_bytes: list[int]) -> None:
+    room = Room(Store(tmp_path), MIN_FREE_BYTES)
+    room.begins()
+    assert [room.ran_out("a") for _ in range(MAX_SHORTAGES)][-1] is False
+    assert room.ran_out("a")
