@@ -1,10 +1,11 @@
 """The job loop: claim a job, let the device process reconstruct it, settle. No torch here, so nothing can hang.
 
-A job ends in exactly one of done, failed and cancelled. It is done before its scene is scored: the scores follow within
-seconds, and if the child or this process dies meanwhile, the scene is scored when there is nothing else to do. If the
-child dies before, the job is handed back and the death counts
+A job ends in exactly one of done, failed and cancelled. If the child dies, the job is handed back and the death counts
 against it. If this process is told to end, or the job to make way, the job is handed back and a later attempt resumes
 it. If this process dies, its child dies too, the claim runs out, and any worker takes the job.
+
+A job is done before its scene is scored. The scores follow within seconds. If scoring is cut off, the worker scores the
+scene when no job waits.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def run_job(
             outcome = job.settle(Failed(error=describe(error), fault=type(error).__name__))
     log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
     if job.is_scoring:
-        if outcome != DONE:
+        if outcome not in (DONE, UNSETTLED):  # if unsettled, the queue may have accepted the end
             with contextlib.suppress(UnavailableError):  # else LeftScores forgets it
                 store.expect_no_scores(name, claim.job_id, claim.attempt)
         scores = Scores(store, name, claim.job_id, claim.attempt)

@@ -439,3 +439,19 @@ def test_the_scores_of_a_scene_that_was_purged_meanwhile_are_dropped(bench: JobL
     bench.start()
     eventually(lambda: bench.store.unscored("worker-1") == [])
     assert bench.files(record.job_id) == []
+
+
+def test_a_scene_whose_end_the_queue_accepted_unheard_keeps_its_place_for_scores(
+    bench: JobLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish = bench.queue.finish
+
+    def accept_unheard(claim: Claim) -> bool:
+        finish(claim)
+        bench.end.set()
+        raise UnavailableError("It is away.", "Wait.")
+
+    monkeypatch.setattr(bench.queue, "finish", accept_unheard)
+    record = bench.outcome("scoring")
+    bench.stop()
+    assert bench.store.unscored("worker-1") == [(record.job_id, record.attempt)]
