@@ -1,8 +1,8 @@
 """Hand copies of the model that trains from the training loop to the renders.
 
-The loop copies its model at its start. Later it copies only if somebody has asked since the last copy and that copy is
-older than PERIOD_S, so a job that nobody watches pays for one copy. Training never waits here; a render waits a moment
-for a copy that is due.
+The loop copies its model if somebody has asked since the last copy and that copy is older than PERIOD_S. So a job that
+nobody watches pays for none, in neither time nor memory. Training never waits here; a render waits a moment for a copy
+that is due.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Snapshots:
     def begin(self, job_id: str) -> None:
         """A job starts: drop the copy of the one before."""
         with self._changed:
-            self._job_id, self._newest, self._asked, self._answers = job_id, None, False, True
+            self._job_id, self._newest, self._asked, self._answers = job_id, None, False, False
             self._changed.notify_all()
 
     def drop(self, job_id: str) -> None:
@@ -69,8 +69,8 @@ class Snapshots:
         with self._changed:
             if self._job_id is None:
                 return False
-            self._wanted_s, newest = time.monotonic(), self._newest
-            return newest is None or newest.of_one_moment or (self._asked and self._is_due(newest))
+            self._wanted_s, self._answers = time.monotonic(), True
+            return self._asked and self._is_due(self._newest)
 
     def offer(self, scene: Scene, iteration: int) -> None:
         """Show this copy from now on (TrainingHooks.on_snapshot)."""
@@ -86,17 +86,17 @@ class Snapshots:
                 self._newest = snapshot
                 if not snapshot.of_one_moment:
                     self._copy_s = snapshot.taken_s - self._wanted_s
-                self._asked, self._answers = False, not snapshot.of_one_moment  # the next may be long in coming
+                self._asked, self._answers = False, not snapshot.of_one_moment  # after which training is far
                 self._changed.notify_all()
 
     def newest(self, job_id: str) -> Snapshot | None:
         """The newest copy of the job's model, or None; asks the loop for a newer one."""
         with self._changed:
-            if self._job_id != job_id or self._newest is None:
+            if self._job_id != job_id:
                 return None
             self._asked, shown = True, self._newest
             if self._answers and self._is_due(shown):
-                # After one wait in vain do not wait again until the loop, which may be scoring, offers a copy.
+                # After one wait in vain do not wait again until the loop, which may be scoring, wants to know.
                 self._answers = self._changed.wait_for(lambda: self._newest is not shown, self._patience_s)
             return self._newest if self._job_id == job_id else None
 
@@ -105,7 +105,10 @@ class Snapshots:
         with self._changed:
             return self._newest if self._job_id == job_id else None
 
-    def _is_due(self, snapshot: Snapshot) -> bool:
+    def _is_due(self, snapshot: Snapshot | None) -> bool:
+        """Whether it is time for the next copy after this one."""
+        if snapshot is None or snapshot.of_one_moment:
+            return True
         return time.monotonic() - snapshot.taken_s >= max(
             self._period_s, min(self._copy_s / COPY_SHARE, SLOWEST * self._period_s)
         )

@@ -105,7 +105,7 @@ def test_a_reconstruction_can_be_watched_from_its_clip_to_its_scene(tmp_path: Pa
     assert first == second
 
 
-def test_a_run_that_nobody_watches_is_copied_once_at_its_start() -> None:
+def test_a_run_that_nobody_watches_is_not_copied() -> None:
     clip = phantom_clip()
     run, _ = prepared(clip, iterations=4)
     snapshots, copies = Snapshots(period_s=ALWAYS), list[int]()
@@ -116,7 +116,7 @@ def test_a_run_that_nobody_watches_is_copied_once_at_its_start() -> None:
 
     snapshots.begin(JOB)
     trained_with(run, copy, hooks_of(snapshots))
-    assert copies == [0]
+    assert copies == []
 
 
 def test_a_snapshot_shows_what_the_model_shows_and_training_does_not_move_it() -> None:
@@ -130,10 +130,12 @@ def test_a_snapshot_shows_what_the_model_shows_and_training_does_not_move_it() -
     assert not np.array_equal(view(run, 3).rgb, before.rgb)
 
 
-def test_the_first_copy_is_wanted_at_once_and_the_next_after_a_request() -> None:
+def test_a_copy_is_wanted_by_who_asks_for_it_alone() -> None:
     snapshots = Snapshots(period_s=ALWAYS, patience_s=0.0)
     assert not snapshots.wanted()
     snapshots.begin(JOB)
+    assert not snapshots.wanted()
+    assert snapshots.newest(JOB) is None
     assert snapshots.wanted()
     snapshots.offer(random_scene(), 0)
     assert not snapshots.wanted()
