@@ -1,8 +1,8 @@
 """What a death or an unreachable queue has left between the spool and the queue is put right here.
 
 A clip in the spool was accepted, or was about to be: its job must stand in the queue. The sweep goes through the
-spool at the start of the service, again for as long as a submission's answer is owing, and whenever a job was
-cancelled or failed: where its worker had died, the queue ended it, and nobody has removed its files. It may run in
+spool at the start of the service, every hour, again for as long as a submission's answer is owing, and whenever a job
+was cancelled or failed: where its worker had died, the queue ended it, and nobody has removed its files. It may run in
 several services at once, for all it does may be repeated.
 """
 
@@ -66,6 +66,7 @@ class Sweep:
             if time.monotonic() >= abandoned_at_s:
                 await run_in_threadpool(self._store.tidy)
                 abandoned_at_s = time.monotonic() + ABANDONED_PERIOD_S
+                self._unsettled = True  # a worker may have died just after its job was done
             await asyncio.sleep(SWEEP_PERIOD_S)
 
     def settle(self) -> None:
@@ -88,6 +89,9 @@ class Sweep:
                     self._unsettled = True
             elif record.state is JobState.CANCELLED:  # its canceller or its worker died before it removed the clip
                 self._store.purge(job_id)
+            elif record.state is JobState.DONE:  # its worker died before it removed what led to the scene
+                if self._store.has_left_work(job_id):
+                    self._store.remove_other_attempts(job_id, record.attempt)
             elif record.state is JobState.FAILED:  # by deaths of its workers, and the last could not remove its work
                 self._store.remove_failed(job_id, record.attempt)
 

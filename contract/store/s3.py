@@ -233,6 +233,11 @@ class S3Shelf:
     def tidy(self) -> None:
         self._here.tidy()
         then_s = time.time() - ABANDONED_AFTER_S
+        work = [entry for area in (Area.WORK, Area.KEPT) for entry in self._here.folders(area)]  # of accepted jobs
+        accepted = {entry.job_id for entry in self.entries(Area.SPOOL)}
+        for entry in work:
+            if entry.job_id not in accepted:  # it was purged on another machine
+                self._here.remove(entry.area, entry.job_id, entry.attempt)
         for area in (Area.SPOOL, Area.SCENES):
             copies = self._here.entries(area)  # before the originals, because an original is older than its copy
             stored = self._bucket.objects(f"{FOLDERS[area]}/")

@@ -275,6 +275,10 @@ class Store:
                 if entry.attempt is not None and entry.attempt <= attempt:
                     self._shelf.remove(area, job_id, entry.attempt)
 
+    def has_left_work(self, job_id: str) -> bool:
+        """Whether work on the job lies on this machine, or a state that an attempt could go on from."""
+        return any(self._here.folders(area, job_id) for area in (Area.WORK, Area.KEPT))
+
     def remove_other_attempts(self, job_id: str, attempt: int) -> None:
         """Remove all work on the job and all scenes but that of the attempt, which the queue has accepted."""
         for area in (Area.WORK, Area.KEPT):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from contract.queue.interface import MAX_ATTEMPTS, Admission
+from contract.queue.interface import MAX_ATTEMPTS, Admission, Claim
 from contract.queue.memory import MemoryQueue
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
@@ -203,6 +203,23 @@ def test_the_work_of_a_job_that_deaths_of_whole_workers_failed_goes(
         assert is_in(queue, job_id, JobState.FAILED)
         wait_until(is_gone, kept)
         assert service.store.submission(job_id) is not None, "it may be retried"
+
+
+def test_what_led_to_a_scene_goes_though_its_worker_died_when_the_job_was_done(tmp_path: Path) -> None:
+    queue = MemoryQueue()
+    for service in running_service(tmp_path, queue):
+        job_id = service.upload().json()["id"]
+        record = queue.claim("worker-1.dead", 60.0)
+        assert record is not None
+        assert record.owner is not None
+        kept = service.store.kept_folder(job_id, record.attempt)
+        (kept / RESUME).write_text("x")
+        (service.store.work_folder(job_id, record.attempt) / MANIFEST).write_text("{}")
+        service.store.publish_scene(job_id, record.attempt)
+        assert queue.finish(Claim(job_id, record.attempt, record.owner))
+        Sweep(queue, service.store).settle()
+        assert not kept.exists()
+        assert service.store.has_scene(job_id, record.attempt)
 
 
 def test_a_job_that_cannot_be_queued_is_not_in_the_way_of_others(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from worker.model.deformation import SharedBasis
 from worker.model.gaussians import Gaussians
-from worker.model.layout import COLOUR, COLOUR_ROW, GLOSS, LOG_SCALE, MEAN, QUATERNION, QUATERNION_ROW
+from worker.model.layout import COLOUR, COLOUR_ROW, MEAN, QUATERNION, QUATERNION_ROW
 from worker.scene.compact import (
     GROUP_OF,
     MAX_NUMBERS,
@@ -62,6 +62,7 @@ MIN_SHOWN = 2e-5
 """RMS change of the picture, 1 being from black to white, below which a pattern is left out: all its numbers round to 0
 at any step that a scene is stored with."""
 CURVE_BITS = 16
+COLOURS, QUATERNIONS = (range(rows.start, rows.stop) for rows in (COLOUR, QUATERNION))
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,17 +236,22 @@ def _channels(weight: Floats, order: Whole, mean: Floats, length: Floats) -> Ite
 
     weight [B, C, N] as it was; mean [N, C] over the trained times and length [N] of the quaternions, in the new order.
     """
-    for rows in (MEAN, QUATERNION, LOG_SCALE, COLOUR, GLOSS):
-        apart = weight[:, rows]  # no channels where the motion has none
-        some = np.empty(apart.shape, np.float32)
-        for at_basis, ordered in zip(apart, some, strict=True):
-            np.take(at_basis, order, axis=1, out=ordered, mode="clip")  # raise would copy it once more
-        some -= mean[:, rows].T  # the bases sum to 1
-        if rows is QUATERNION:
-            some /= length
-        elif rows is COLOUR and some.size:
-            some = OPPONENT.astype(np.float32) @ some
-        yield from some.transpose(1, 2, 0)
+
+    def ordered(row: int) -> Floats:
+        """[B, N] of one channel, whose mean is taken out: the bases sum to 1."""
+        found = np.empty((len(weight), len(order)), np.float32)
+        for at_basis, kept in zip(weight, found, strict=True):
+            np.take(at_basis[row], order, out=kept, mode="clip")  # raise would copy it once more
+        return np.subtract(found, mean[:, row], out=found)
+
+    for row in range(weight.shape[1]):
+        if row in COLOURS:
+            shares = OPPONENT[row - COLOUR_ROW].astype(np.float32)
+            yield sum(share * ordered(COLOUR_ROW + place) for place, share in enumerate(shares)).T
+        elif row in QUATERNIONS:
+            yield (ordered(row) / length).T
+        else:
+            yield ordered(row).T
 
 
 def _patterns(

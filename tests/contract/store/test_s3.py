@@ -105,7 +105,10 @@ def test_a_purge_leaves_nothing_in_the_bucket_nor_on_any_machine_that_shows_it(
     worker.fetch_clip(job_id)
     for content in (b"first", b"again"):
         scene = published(worker, job_id, 1, content)
-    (worker.kept_folder(job_id, 2) / RESUME).write_bytes(b"state")
+    kept, work = worker.kept_folder(job_id, 2), worker.work_folder(job_id, 2)
+    (kept / RESUME).write_bytes(b"state")
+    (kept / "frames").write_bytes(b"tissue")
+    goes_on = worker.work_folder(other, 1)
     worker.hand_over(job_id, 2)
     assert service.has_scene(job_id, 1)
     removed = service.purge(job_id)
@@ -119,6 +122,7 @@ def test_a_purge_leaves_nothing_in_the_bucket_nor_on_any_machine_that_shows_it(
     assert not scene.exists()
     worker.tidy()
     assert not worker.spool_folder(job_id).exists()
+    assert (kept.exists(), work.exists(), goes_on.exists()) == (False, False, True)
     assert sum(service.purge(job_id).files.values()) == 0
 
 
