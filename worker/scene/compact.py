@@ -55,8 +55,9 @@ MAX_NUMBERS = 7 * 2**25
 """Numbers a scene may have: those of 170 thousand Gaussians and 97 bases. Unpacking takes up to 14 bytes a number
 (where there is one basis; 10 where there are many), so no file, however small, takes more than 3.1 GiB, and what its
 motion's weights take."""
-MAX_WEIGHTS = 2**28
-"""Weights of a scene's motion: 1 GiB. A long clip's bases are more than its patterns."""
+MAX_WEIGHTS = 7 * 2**25
+"""Weights of a motion: 0.9 GiB, so that finishing a clip of 1,000 frames takes 3 GiB. A long clip has more bases
+than patterns."""
 OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 """Orthonormal: brightness, red - blue, magenta - green."""
 
