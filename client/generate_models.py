@@ -30,6 +30,7 @@ COLUMNS = 116
 
 HEAD = '''\
 """The service's types. Generated from contract/wire by `python -m client.generate_models`; do not edit."""
+# long: generated; it holds every type of the API
 
 from __future__ import annotations
 

@@ -82,9 +82,15 @@ async def export_scene(
     services: Services,
     caller: AnyCaller,
     t: ModelTime = 0.0,
-    format: Annotated[ExportName, Query(description="the property order common splat viewers read")] = "ply",
+    format: Annotated[
+        ExportName,
+        Query(
+            description="ply: the Gaussians at time t, in the property order common splat viewers read; tum: the "
+            "endoscope's path"
+        ),
+    ] = "ply",
 ) -> Response:
-    """The scene's Gaussians at time t as a file."""
+    """The scene's Gaussians at time t, or the endoscope's path, as a file."""
     caller.require(KeyScope.VIEW)
     record = await run_in_threadpool(finished_job, services, caller, scene_id)
     await run_in_threadpool(services.audit.record, AuditAction.EXPORTED, caller, scene_id)

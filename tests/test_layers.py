@@ -33,6 +33,7 @@ ROOMS = {
         "input",
         "stereo",
         "motion",
+        "poses",
         "fusion",
         "model",
         "raster",

@@ -31,6 +31,7 @@ from worker.machine.hooks import Hooks
 from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from worker.machine.timing import Timings
 from worker.model.deformation import HexPlane
+from worker.poses import with_poses
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
 from worker.render.view import SceneRenderer
@@ -173,9 +174,13 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
 
 
 def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
-    """The clip of a request (worker/stereo/opening.py), its kernels examined before a GPU matches anything."""
+    """The clip of a request with depth (worker/stereo/opening.py) and its camera's poses (worker/poses/posed.py).
+
+    A GPU's kernels are examined before it matches anything.
+    """
     if isinstance(request.clip, DepthClip):
-        return request.clip if request.clip.left_out else sampled(request.clip, request.options)
+        clip = request.clip if request.clip.left_out else sampled(request.clip, request.options)
+        return with_poses(clip, request.options, hooks, timings)
 
     def examined() -> None:
         if device != CPU:
@@ -183,9 +188,10 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
             timings.add("compile_s", examine(device))
 
     paths = ClipPaths(request.clip, request.right, request.calibration, request.masks)
-    return open_paths(
+    clip = open_paths(
         paths, request.options, hooks, timings, limits=request.limits, device=device.kind, before_matching=examined
     )
+    return with_poses(clip, request.options, hooks, timings)
 
 
 def optimise(run: Run, keeper: Keeper) -> None:

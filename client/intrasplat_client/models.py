@@ -1,4 +1,5 @@
 """The service's types. Generated from contract/wire by `python -m client.generate_models`; do not edit."""
+# long: generated; it holds every type of the API
 
 from __future__ import annotations
 
@@ -69,6 +70,7 @@ class NoticeCode(StrEnum):
     BLOOD = "blood"
     BLURRED_FRAMES = "blurred_frames"
     BRIGHTNESS_CHANGES = "brightness_changes"
+    CAMERA_OR_TISSUE = "camera_or_tissue"
     CALIBRATION_SCALED = "calibration_scaled"
     COLOURS_UNKNOWN = "colours_unknown"
     COLOUR_CHANGES = "colour_changes"
@@ -92,6 +94,7 @@ class NoticeCode(StrEnum):
     NO_TIME = "no_time"
     NOTHING_NEW = "nothing_new"
     OUT_OF_FOCUS = "out_of_focus"
+    POSES_UNSURE = "poses_unsure"
     POSE_JITTER = "pose_jitter"
     REPEATED_FRAMES = "repeated_frames"
     ROWS_MISALIGNED = "rows_misaligned"
@@ -129,6 +132,33 @@ class Severity(StrEnum):
 
     INFO = "info"
     WARNING = "warning"
+
+
+class CameraPoses(Model):
+    """Where the endoscope was. Tissue that moves as a whole looks like a camera that moves the other way; what of
+    the common motion follows the course of the tissue's own deformation was taken to be the tissue's.
+    """
+
+    source: str
+    """given with the clip; fixed: asked for or recognised; estimated from the pictures"""
+    path_mm: float | None = None
+    """length of the path; None: it was not estimated, or the camera is fixed"""
+    extent_mm: float | None = None
+    """largest distance between two frames' cameras"""
+    extent_deg: float | None = None
+    """largest turn between two frames' cameras"""
+    sigma_mm: float | None = None
+    """standard deviation by which camera and tissue may have been confused"""
+    sigma_deg: float | None = None
+    """the same of the turn"""
+    rigid_fit_mm: float | None = None
+    """median distance at the tissue by which matches miss what the path predicts"""
+    tissue_mm: float | None = None
+    """root mean square of the common motion that was taken to be the tissue's"""
+    tissue_period_s: float | None = None
+    """of that motion, if it has one"""
+    unsure_frames: tuple[int, ...] = ()
+    """frames whose pose is not to be relied on"""
 
 
 class FrameScore(Model):
@@ -173,6 +203,8 @@ class JobOptions(Model):
     """the eyes of a stereo clip that our presets train on; with left, the right eye only judges"""
     use_frames: str = "new"
     """new leaves out frames of a long clip that show nothing new, such as repeats and pauses"""
+    poses: str = "auto"
+    """the camera's poses: given with the clip, fixed, or to estimate from a stereo clip; auto finds out"""
     min_depth_mm: float = 10.0
     """nearest depth that stereo may find, in mm"""
     max_depth_mm: float = 300.0
@@ -271,6 +303,8 @@ class Report(Model):
     """what was taken for granted about the input"""
     right_eye: RightEye | None = None
     """how it was registered; None for a clip of one eye, or whose depth was given"""
+    poses: CameraPoses | None = None
+    """of the endoscope; None: a report of version 0.2"""
     measurements: dict[str, float] = Field(default={})
     """measured on the input, such as misalignment in px"""
     preset: str
@@ -378,6 +412,8 @@ class GivenOptions(TypedDict, total=False):
     """the eyes of a stereo clip that our presets train on; with left, the right eye only judges"""
     use_frames: Literal["new", "all"]
     """new leaves out frames of a long clip that show nothing new, such as repeats and pauses"""
+    poses: Literal["auto", "given", "fixed", "estimate"]
+    """the camera's poses: given with the clip, fixed, or to estimate from a stereo clip; auto finds out"""
     min_depth_mm: Annotated[float, Field(gt=0)]
     """nearest depth that stereo may find, in mm"""
     max_depth_mm: Annotated[float, Field(gt=0)]

@@ -24,6 +24,10 @@ MaskPolarity = Literal["auto", "tool", "tissue"]
 PoseConvention = Literal["opengl", "llff"]
 """Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
 
+Poses = Literal["auto", "given", "fixed", "estimate"]
+"""Where the camera's poses come from: from the clip, from nowhere because the camera is fixed, or from the pictures.
+auto takes the clip's; without any it looks whether the camera is fixed, and estimates its path if it is not."""
+
 Eyes = Literal["left", "both"]
 """The eyes of a stereo clip that a model is trained on."""
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from pydantic_core.core_schema import ValidationInfo
 
 from contract.wire.errors import InputError
-from contract.wire.names import Eyes, Layout, MaskPolarity, PoseConvention, PresetName, UsedFrames
+from contract.wire.names import Eyes, Layout, MaskPolarity, PoseConvention, Poses, PresetName, UsedFrames
 
 Priority = Literal["standard", "high"]
 """high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
@@ -62,6 +62,10 @@ class ReconstructionOptions(ClipOptions):
     use_frames: UsedFrames = Field(
         default="new",
         description="new leaves out frames of a long clip that show nothing new, such as repeats and pauses",
+    )
+    poses: Poses = Field(
+        default="auto",
+        description="the camera's poses: given with the clip, fixed, or to estimate from a stereo clip; auto finds out",
     )
     min_depth_mm: float = Field(default=MIN_DEPTH_MM, gt=0, description="nearest depth that stereo may find, in mm")
     max_depth_mm: float = Field(

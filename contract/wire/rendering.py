@@ -65,7 +65,7 @@ GAUSSIAN_PIXELS = 100_000
 """So many pixels take as long as moving and projecting the Gaussians (estimated from bm_raster)."""
 
 
-ExportName: TypeAlias = Literal["ply"]
+ExportName: TypeAlias = Literal["ply", "tum"]
 """What GET /scenes/{id}/export offers: the names of worker/scene/export, which the service must not import."""
 
 
@@ -119,7 +119,7 @@ class RenderRequest(BaseModel):
 
 
 class ExportRequest(BaseModel):
-    """The scene's Gaussians at time t as a file of one of the formats of worker/scene/export."""
+    """The scene's Gaussians at time t, or its path, as a file of one of the formats of worker/scene/export."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

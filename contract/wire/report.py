@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
@@ -72,6 +73,35 @@ class RightEye(BaseModel):
     )
 
 
+class CameraPoses(BaseModel):
+    """Where the endoscope was. Tissue that moves as a whole looks like a camera that moves the other way; what of the
+    common motion follows the course of the tissue's own deformation was taken to be the tissue's.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    source: Literal["given", "fixed", "estimated"] = Field(
+        description="given with the clip; fixed: asked for or recognised; estimated from the pictures"
+    )
+    path_mm: float | None = Field(
+        default=None, ge=0, description="length of the path; None: it was not estimated, or the camera is fixed"
+    )
+    extent_mm: float | None = Field(default=None, ge=0, description="largest distance between two frames' cameras")
+    extent_deg: float | None = Field(default=None, ge=0, description="largest turn between two frames' cameras")
+    sigma_mm: float | None = Field(
+        default=None, ge=0, description="standard deviation by which camera and tissue may have been confused"
+    )
+    sigma_deg: float | None = Field(default=None, ge=0, description="the same of the turn")
+    rigid_fit_mm: float | None = Field(
+        default=None, ge=0, description="median distance at the tissue by which matches miss what the path predicts"
+    )
+    tissue_mm: float | None = Field(
+        default=None, ge=0, description="root mean square of the common motion that was taken to be the tissue's"
+    )
+    tissue_period_s: float | None = Field(default=None, ge=0, description="of that motion, if it has one")
+    unsure_frames: tuple[int, ...] = Field(default=(), description="frames whose pose is not to be relied on")
+
+
 class Report(BaseModel):
     """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why; or
     while `scored` is False: a scene is finished before its scores are.
@@ -115,6 +145,7 @@ class Report(BaseModel):
     right_eye: RightEye | None = Field(
         default=None, description="how it was registered; None for a clip of one eye, or whose depth was given"
     )
+    poses: CameraPoses | None = Field(default=None, description="of the endoscope; None: a report of version 0.2")
     measurements: dict[str, float] = Field(default={}, description="measured on the input, such as misalignment in px")
 
     preset: str

@@ -158,5 +158,8 @@ def _print_report(report: Report, out: Path) -> None:
         warped = f" (the left eye's picture, warped by its depth: {report.baseline_warp_db:.2f} dB)"
         known = warped if report.baseline_warp_db is not None else ""
         print(f"psnr_right: {report.psnr_right_db:.2f} dB on held-out frames of the right eye{known}")
+    if report.poses is not None and report.poses.source == "estimated":
+        told = report.poses
+        print(f"camera: moved by {told.extent_mm:.1f} mm and {told.extent_deg:.1f} degrees (poses estimated)")
     for notice in report.warnings:
         print(f"{notice.severity}: {notice.text}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 
 from contract.wire.rendering import ExportName
 from tests.worker.scenes import KINDS, random_scene
+from worker.poses.trajectory import read_tum
 from worker.scene.export import EXPORTS
 from worker.scene.export.ply import export_ply
+from worker.scene.export.tum import export_tum
 
 
 def test_the_service_offers_the_formats_that_are_registered() -> None:
@@ -68,3 +71,11 @@ def test_the_state_at_t_is_written_in_millimetres(kind: str) -> None:
 def test_a_time_that_is_no_number_is_refused() -> None:
     with pytest.raises(ValueError, match="nan"):
         export_ply(random_scene(), math.nan)
+
+
+def test_a_tum_file_has_every_frames_pose_in_metres(tmp_path: Path) -> None:
+    scene = random_scene()
+    (tmp_path / "path.tum").write_bytes(export_tum(scene, 0.0))
+    times_s, poses = read_tum(tmp_path / "path.tum")
+    assert times_s == pytest.approx(scene.frame_times_s)
+    assert poses == pytest.approx(scene.world_from_camera, abs=1e-4)

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from contract.store.durable import flush, replace_file
 from contract.wire.notices import Notice
-from contract.wire.report import RightEye
+from contract.wire.report import CameraPoses, RightEye
 from worker.input.camera import Intrinsics
 from worker.input.clip.types import PIXELS, DepthClip, Eye
 from worker.machine.mapped import let_go
 
-VERSION = 2
+VERSION = 3
 """Raised whenever what the folder holds changes; no version reads another's."""
 MANIFEST = "manifest.json"
 EYES = ("left", "right")
@@ -56,6 +56,7 @@ def save_clip(folder: Path, clip: DepthClip, identity: str, should_stop: Callabl
         "identity": identity,
         "intrinsics": [eye.intrinsics.numbers() for eye in clip.eyes],
         "registration": clip.registration and clip.registration.model_dump(),
+        "poses": clip.poses and clip.poses.model_dump(),
         "left_out": clip.left_out,
         "assumptions": [notice.model_dump() for notice in clip.assumptions],
         "warnings": [notice.model_dump() for notice in clip.warnings],
@@ -79,6 +80,7 @@ def load_clip(folder: Path, identity: str) -> DepthClip | None:
             frame_times_s=np.load(folder / f"{TIMES}.npy"),
             right=Eye(**eyes[1]) if len(eyes) > 1 else None,
             registration=told["registration"] and RightEye.model_validate(told["registration"]),
+            poses=told["poses"] and CameraPoses.model_validate(told["poses"]),
             left_out=tuple(told["left_out"]),
             assumptions=tuple(Notice.model_validate(each) for each in told["assumptions"]),
             warnings=tuple(Notice.model_validate(each) for each in told["warnings"]),

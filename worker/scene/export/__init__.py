@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from worker.scene.export.ply import export_ply
+from worker.scene.export.tum import export_tum
 from worker.scene.scene import Scene
 
 
@@ -22,5 +23,6 @@ class ExportFormat:
 
 EXPORTS = {
     "ply": ExportFormat("application/octet-stream", export_ply),
+    "tum": ExportFormat("text/plain", export_tum),
 }
 """The formats by name, which is also the ending of their files. contract/wire/rendering.py lists the public names."""

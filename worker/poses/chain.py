@@ -1,0 +1,81 @@
+"""Keyframes, the links between frames, and a first guess of every camera from them.
+
+A keyframe is followed while most of it stays in view; the next one starts where less than KEY_OVERLAP of it is left.
+Each frame is linked to the keyframe before it and to the one after it; keyframes that show the same tissue at other
+times are linked, too, so that a camera that returns ends where it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from worker.poses.links import Frames, Link
+from worker.poses.rigid import Reals, align, inverse
+
+KEY_OVERLAP = 0.6
+KEY_FRAMES = 16
+"""Frames after which the next keyframe starts at the latest: the noise of one frame's depth is not in all poses."""
+LOOP_OVERLAP, MIN_OVERLAP = 0.5, 0.25
+"""Predicted share of a keyframe in another one's view for a link; the share found below which a link is dropped."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Frames that are linked, and where their cameras are if all tissue were rigid.
+
+    frames             [K]       indices in the clip, rising
+    world_from_camera  [K, 4, 4] mm; the world is the first one's camera
+    links                        a and b are indices in the clip
+    keys                         the keyframes' indices
+    """
+
+    frames: Sequence[int]
+    world_from_camera: Reals
+    links: list[Link]
+    keys: list[int]
+
+
+def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None) -> Chain:
+    """Follow the training frames, link by link."""
+    key, flow, poses, links, keys = train[0], None, {train[0]: np.eye(4)}, list[Link](), [train[0]]
+    done = 0
+    for last, i in pairwise(train):
+        link = frames.link(key, i, flow)
+        start = inverse(poses[last]) @ poses[key]
+        poses[i] = poses[key] @ inverse(align(frames.camera, link.before, link.after, link.trust, start).motion)
+        links.append(link)
+        flow, done = link.flow, done + 1
+        if link.overlap < KEY_OVERLAP or done == KEY_FRAMES:
+            links += _from_behind(frames, i, [each for each in train if key < each < i])
+            key, flow, done = i, None, 0
+            keys.append(i)
+        on_progress(train.index(i) / (len(train) - 1))
+    links += _loops(frames, keys, poses)
+    return Chain(
+        train, np.stack([poses[i] for i in train]), [each for each in links if each.overlap >= MIN_OVERLAP], keys
+    )
+
+
+def _from_behind(frames: Frames, key: int, between: Sequence[int]) -> list[Link]:
+    """Links from a keyframe back to the frames before it."""
+    found, flow = list[Link](), None
+    for i in reversed(between):
+        link = frames.link(key, i, flow)
+        flow = link.flow
+        found.append(link)
+    return found
+
+
+def _loops(frames: Frames, keys: Sequence[int], poses: dict[int, Reals]) -> list[Link]:
+    """Links between keyframes that are no neighbours and see the same tissue."""
+    found = []
+    for later, b in enumerate(keys):
+        for a in keys[: max(later - 1, 0)]:
+            flow, share = frames.predicted(a, inverse(poses[b]) @ poses[a])
+            if share > LOOP_OVERLAP:
+                found.append(frames.link(a, b, flow))
+    return found

@@ -1,0 +1,127 @@
+"""A clip gets its camera's poses: those it brought, a fixed camera's, or an estimated path."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.wire.errors import InputError
+from contract.wire.notices import Notice, NoticeCode
+from contract.wire.options import ReconstructionOptions
+from contract.wire.report import CameraPoses
+from worker.input.clip import DepthClip, training_frames
+from worker.machine.hooks import Hooks
+from worker.machine.timing import Timings
+from worker.poses.still import camera_rests
+
+if TYPE_CHECKING:  # a fixed camera needs none of it
+    from worker.poses.estimate import FoundPath
+
+STAGE = "poses"
+MIN_FRAMES = 2
+MAX_UNSURE = 0.5
+"""Share of a clip's frames whose pose may be unsure; with more, there is no path."""
+UNSURE_MM, UNSURE_DEG = 1.5, 1.0
+"""Standard deviations beyond which camera and tissue may have been confused."""
+
+
+def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, timings: Timings) -> DepthClip:
+    """The clip with its poses and what the report says of them; a clip that has been here stays as it is.
+
+    A camera that is fixed leaves all arrays as they are. timings get poses_s.
+
+    Raises:
+        InputError: options.poses asks for given poses, and the clip brought none.
+        Cancelled: hooks.should_stop said so.
+    """
+    brought = clip.right is None  # only layouts with depth bring poses
+    if clip.poses is not None:
+        return clip
+    if options.poses == "given" and not brought:
+        problem = "asks for poses that come with the clip, and stereo clips bring none."
+        raise InputError("options.poses", f"it {problem}", 'Say "auto" or "estimate", or give the EndoNeRF layout.')
+    if options.poses == "given" or (options.poses == "auto" and brought):
+        return replace(clip, poses=CameraPoses(source="given"))
+    train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.left_out))
+    with timings.measure("poses_s"):
+        hooks.report_stage(STAGE, 0.0)
+        if options.poses == "fixed" or len(train) < MIN_FRAMES:
+            return _fixed(clip, "was taken as fixed")
+        if options.poses == "auto" and camera_rests(clip, train):
+            return _fixed(clip, "is fixed: most of the picture rests")
+        from worker.poses.estimate import find_path
+
+        return _settled(clip, find_path(clip, train, lambda share: hooks.report_stage(STAGE, share)), options)
+
+
+def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) -> DepthClip:
+    """The clip with the path, or at rest if that explains it as well."""
+    if len(found.unsure) > MAX_UNSURE * clip.frame_count:
+        text = f"The camera's pose could not be found in {len(found.unsure)} of {clip.frame_count} frames: too little "
+        text += "tissue with texture and depth is common to them. The camera was taken as fixed."
+        return _fixed(clip, "was taken as fixed", None, Notice.warning(NoticeCode.POSES_UNSURE, text))
+    if not found.seems_to_move:
+        return _fixed(clip, f"is fixed: its path would spread by {found.spread_mm:.1f} mm", found)
+    if options.poses == "auto" and not found.moves:
+        text = (
+            f"Camera or tissue moved as a whole, by up to {found.extent_mm:.1f} mm and {found.extent_deg:.1f} degrees; "
+            "the clip does not tell which. The camera was taken as fixed, and the motion as the tissue's."
+        )
+        return _fixed(clip, "was taken as fixed", found, Notice.warning(NoticeCode.CAMERA_OR_TISSUE, text))
+    warnings = []
+    if found.sigma_mm > UNSURE_MM or found.sigma_deg > UNSURE_DEG or not found.told_apart:
+        text = (
+            f"The tissue moves as a whole in step with the camera: poses may be off by {found.sigma_mm:.1f} mm and "
+            f"{found.sigma_deg:.1f} degrees, and the tissue's motion by as much."
+        )
+        warnings.append(Notice.warning(NoticeCode.CAMERA_OR_TISSUE, text))
+    if found.unsure:
+        text = f"The camera's pose could not be found in {len(found.unsure)} of {clip.frame_count} frames."
+        warnings.append(Notice.warning(NoticeCode.POSES_UNSURE, text))
+    text = (
+        f"poses: the camera moved by {found.extent_mm:.1f} mm and {found.extent_deg:.1f} degrees; "
+        f"its path fits the rigid parts within {found.rigid_fit_mm:.2f} mm"
+    )
+    told = _told(clip, "estimated", found)
+    clip = _placed(clip, found.world_from_camera)
+    notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, text))
+    return replace(clip, poses=told, assumptions=notices, warnings=(*clip.warnings, *warnings))
+
+
+def _fixed(clip: DepthClip, how: str, found: FoundPath | None = None, *warnings: Notice) -> DepthClip:
+    told = CameraPoses(source="fixed")
+    if found is not None:
+        told = _told(clip, "fixed", found).model_copy(update={"path_mm": None, "extent_mm": None, "extent_deg": None})
+    if not (clip.world_from_camera == np.eye(4)).all():
+        clip = _placed(clip, np.tile(np.eye(4), (clip.frame_count, 1, 1)))
+    notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, f"poses: the camera {how}"))
+    return replace(clip, poses=told, assumptions=notices, warnings=(*clip.warnings, *warnings))
+
+
+def _placed(clip: DepthClip, world_from_camera: NDArray[np.float64]) -> DepthClip:
+    """The clip with both eyes at these poses of the left one."""
+    right = clip.right
+    if right is not None:
+        left_from_right = np.linalg.inv(clip.world_from_camera[0]) @ right.world_from_camera[0]
+        right = replace(right, world_from_camera=world_from_camera @ left_from_right)
+    return replace(clip, world_from_camera=world_from_camera, right=right)
+
+
+def _told(clip: DepthClip, source: Literal["fixed", "estimated"], found: FoundPath) -> CameraPoses:
+    """What the report repeats of a path."""
+    frame_s = float(np.median(np.diff(clip.frame_times_s)))
+    return CameraPoses(
+        source=source,
+        path_mm=found.path_mm,
+        extent_mm=found.extent_mm,
+        extent_deg=found.extent_deg,
+        sigma_mm=found.sigma_mm,
+        sigma_deg=found.sigma_deg,
+        rigid_fit_mm=found.rigid_fit_mm,
+        tissue_mm=found.tissue_mm,
+        tissue_period_s=None if found.period_frames is None else found.period_frames * frame_s,
+        unsure_frames=found.unsure,
+    )
