@@ -8,6 +8,7 @@ LOCAL_COMMANDS = {
     "phantom": "make a synthetic stereo clip of tissue, with its truth",
     "evaluate": "measure presets on clips, and draw speed against accuracy",
     "stability": "spoil synthetic clips in many ways, and draw where presets break and whether they say so",
+    "poses": "estimate the path of a stereo clip's camera, and compare it with a known one",
     "doctor": "say what is installed, what would be used, what is missing",
 }
 """What `intrasplat` and `python -m worker` do without a service: summaries by command."""
