@@ -29,6 +29,8 @@ UNUSUAL = np.array([2.0, 1.0, 1.5, 1.0])
 """Standard deviations of the logarithms of the trend's size and length and of the shake's."""
 STARTS = ((0.5, 0.2), (0.5, 2.0), (2.0, 0.2), (2.0, 2.0))
 """Times the usual length of the trend and the usual size of the shake: where the search for the likeliest begins."""
+SEARCHED = 48
+"""Frames, spread over the clip, on which that search looks."""
 TRIALS, ROUNDS = 150, 3
 
 
@@ -128,25 +130,26 @@ def _likeliest(path: Reals, frames: Reals, sized: Reals, period: float) -> Reals
 
     sized: [K, S] courses times the standard deviation of what the tissue may do.
     """
-    apart = np.abs(frames[:, None] - frames)
-    tissue, path = sized @ sized.T, path - path.mean()
+    some = np.unique(np.linspace(0, len(frames) - 1, SEARCHED).round().astype(np.intp))
+    tissue, path = sized[some] @ sized[some].T, path[some] - path[some].mean()
     usual = np.log([USUAL_MM, period, USUAL_SHAKE_MM, USUAL_QUICK * period])
 
-    def covariance(logs: Reals) -> Reals:
+    def covariance(logs: Reals, at: Reals) -> Reals:
+        apart = np.abs(at[:, None] - at)
         size, slow, shake, quick = np.exp(logs)
         slow, quick = max(slow, SLOW * period), min(quick, QUICK * period)
         trend = size**2 * np.exp(-np.square(apart / slow) / 2)
         near = np.sqrt(3) * apart / quick
         anywhere = 1e4
-        found = trend + shake**2 * (1 + near) * np.exp(-near) + NOISE_MM**2 * np.eye(len(frames)) + anywhere
+        found = trend + shake**2 * (1 + near) * np.exp(-near) + NOISE_MM**2 * np.eye(len(at)) + anywhere
         return np.asarray(found)
 
     def unlikely(logs: Reals) -> float:
-        root = np.linalg.cholesky(covariance(logs) + tissue)
+        root = np.linalg.cholesky(covariance(logs, frames[some]) + tissue)
         white = np.linalg.solve(root, path)
         unusual = np.square((logs - usual) / UNUSUAL).sum()
         return float(white @ white / 2 + np.log(np.diag(root)).sum() + unusual / 2)
 
     starts = [usual + np.log([1, length, shake, 1]) for length, shake in STARTS]
     ends = [minimize(unlikely, start, method="Nelder-Mead", options={"maxiter": TRIALS}) for start in starts]
-    return covariance(min(ends, key=lambda end: end.fun).x)
+    return covariance(min(ends, key=lambda end: end.fun).x, frames)

@@ -186,8 +186,12 @@ class Grams:
 
     def _by_frame(self, gram: Reals) -> Reals:
         """[n K, n K] normal matrix of n unknowns a frame, whose differences the links [L, n, n] measure."""
-        blocks = np.einsum("lk,lij,lm->kimj", self.incidence, gram, self.incidence, optimize=True)
-        return np.asarray(blocks.reshape(gram.shape[1] * len(self.frames), -1))
+        count, size = len(self.frames), gram.shape[1]
+        blocks = np.zeros((count, count, size, size))
+        first, second = self.incidence.argmax(1), self.incidence.argmin(1)
+        for one, two, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
+            np.add.at(blocks, (one, two), sign * gram)
+        return np.asarray(blocks.transpose(0, 2, 1, 3).reshape(count * size, -1))
 
     def _residuals(self) -> Reals:
         """[6 K] right side of the twists."""
