@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from worker.input.clip import spread
 from worker.poses.links import Frames, Link
 from worker.poses.rigid import Reals, align, inverse
 
@@ -21,6 +22,9 @@ KEY_FRAMES = 16
 """Frames after which the next keyframe starts at the latest: the noise of one frame's depth is not in all poses."""
 LOOP_OVERLAP, MIN_OVERLAP = 0.5, 0.25
 """Predicted share of a keyframe in another one's view for a link; the share found below which a link is dropped."""
+
+MAX_LOOKS, MAX_LOOPS = 32, 64
+"""Keyframes among which such pairs are sought, and the most links between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +75,13 @@ def _from_behind(frames: Frames, key: int, between: Sequence[int]) -> list[Link]
 
 
 def _loops(frames: Frames, keys: Sequence[int], poses: dict[int, Reals]) -> list[Link]:
-    """Links between keyframes that are no neighbours and see the same tissue."""
+    """Links between keyframes that are no neighbours and see the same tissue: those that should see most of it."""
+    some = spread(keys, MAX_LOOKS)
+    pairs = [(a, b) for later, b in enumerate(some) for a in some[:later] if keys.index(b) - keys.index(a) > 1]
+    shares = {(a, b): frames.predicted(a, inverse(poses[b]) @ poses[a])[1] for a, b in pairs}
+    chosen = sorted((pair for pair in pairs if shares[pair] > LOOP_OVERLAP), key=lambda pair: -shares[pair])
     found = []
-    for later, b in enumerate(keys):
-        for a in keys[: max(later - 1, 0)]:
-            flow, share = frames.predicted(a, inverse(poses[b]) @ poses[a])
-            if share > LOOP_OVERLAP:
-                found.append(frames.link(a, b, flow))
+    for a, b in sorted(chosen[:MAX_LOOPS], key=pairs.index):
+        flow, _ = frames.predicted(a, inverse(poses[b]) @ poses[a])
+        found.append(frames.link(a, b, flow))
     return found

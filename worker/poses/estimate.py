@@ -23,8 +23,11 @@ from worker.poses.rigid import Reals, align, exp, inverse, log
 
 MAX_FITTED = 128
 """Frames that are fitted together; in a longer clip the others are placed between them."""
-AGREES_PX, MIN_AGREEING = 1.5, 0.15
-"""A frame is sure if such a share of a keyframe's tissue is found in it this near to where the fit expects it."""
+CHAINING, FITTING = 0.45, 0.45
+"""Shares of the progress."""
+AGREES_PX, MIN_AGREEING, GOOD = 1.5, 0.15, 0.4
+"""A frame is sure if such a share of a keyframe's tissue is found in it this near to where the fit expects it.
+A frame that is placed asks no second one with the last share."""
 MOVED_MM, MOVED_DEG = 1.2, 0.6
 """Root mean square about its mean below which a camera counts as fixed."""
 MAX_DEFORMED_PX, LARGE_MM, LARGE_DEG = 0.6, 12.0, 6.0
@@ -91,11 +94,11 @@ def find_path(
 def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None]) -> FoundPath:
     frames = Frames(clip)
     used = spread(train, MAX_FITTED)
-    chain = chained(frames, used, lambda share: on_progress(0.6 * share))
+    chain = chained(frames, used, lambda share: on_progress(CHAINING * share))
     if not chain.links:
         return _unknown(clip.frame_count)
-    fit = fitted(frames.camera, chain)
-    on_progress(0.8)
+    fit = fitted(frames.camera, chain, lambda share: on_progress(CHAINING + FITTING * share))
+    on_progress(CHAINING + FITTING)
     t = np.asarray(used, np.float64)
     k = clip.intrinsics
     half_mm = fit.middle_mm[2] * k.width / k.fx / 2
@@ -110,7 +113,7 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
         path[i] = pose
         frames.forget(i)
         unsure += [i] if share < MIN_AGREEING else []
-        on_progress(0.8 + 0.2 * done / len(others))
+        on_progress(1 - (1 - CHAINING - FITTING) * (1 - done / len(others)))
     _fill(path, sorted({*used, *others}), clip.left_out)
     return _told(path, used, fit, gauge, frames, unsure)
 
@@ -146,6 +149,8 @@ def _placed(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, index:
         aligned = align(frames.camera, seen, link.after, link.trust, np.eye(4))
         share = link.overlap * float(np.mean(aligned.residual_px < AGREES_PX)) if len(link.cells) else 0.0
         found.append((share, gauge.tissue_at(course) @ pose @ inverse(aligned.motion)))
+        if share > GOOD:
+            break
     share, pose = max(found, key=lambda each: each[0])
     return pose, share
 

@@ -9,7 +9,7 @@ Symbols: K frames, L links, M matches of a link.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -57,17 +57,20 @@ class Fit:
     loss: float
 
 
-def fitted(camera: StereoCamera, chain: Chain) -> Fit:
-    """Cameras and the tissue's motion."""
-    fitting = _Fitting(camera, chain)
-    for scale_px in ROUGH_PX:
+def fitted(camera: StereoCamera, chain: Chain, on_progress: Callable[[float], None] = lambda share: None) -> Fit:
+    """Cameras and the tissue's motion. on_progress gets the share of the rounds done, and what it raises is raised."""
+    fitting, rounds = _Fitting(camera, chain), len(ROUGH_PX) + len(FINE_PX)
+    for done, scale_px in enumerate(ROUGH_PX):
+        on_progress(done / rounds)
         fitting.improve(scale_px)
     if not fitting.find_period(FINE_PX[0]):
-        for scale_px in FINE_PX:
+        for done, scale_px in enumerate(FINE_PX, len(ROUGH_PX)):
+            on_progress(done / rounds)
             fitting.improve(scale_px)
         return fitting.result()
     periodic, free = fitting, copy(fitting)  # nothing is changed in place
     for place, scale_px in enumerate(FINE_PX):
+        on_progress((len(ROUGH_PX) + place) / rounds)
         (periodic.tune if place in TUNED else periodic.improve)(scale_px)
         (free.follow if place in FOLLOWED else free.improve)(scale_px)
     one, two = periodic.result(), free.result()
