@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.worker.scene.test_compact import colourful, rounded
-from worker.scene.compact import unpack
+from worker.scene.compact import MAX_WEIGHTS, unpack
 
 
 def test_patterns_that_do_not_show_are_left_out() -> None:
@@ -27,5 +27,5 @@ def test_no_file_has_more_bases_than_memory_has_room_for() -> None:
     bases, stored = 10**6, rounded(colourful(50)).tensors()
     channels, patterns, _ = stored["pattern"].shape
     many = {"pattern": torch.zeros(channels, patterns, bases), "centre": torch.zeros(bases), "width": torch.ones(bases)}
-    with pytest.raises(ValueError, match="more than 268435456 weights"):
+    with pytest.raises(ValueError, match=f"more than {MAX_WEIGHTS} weights"):
         unpack(stored | many)
