@@ -188,6 +188,8 @@ class S3Shelf:
     def put_files(self, entry: ShelfEntry, names: Sequence[str]) -> None:
         for name in names:
             self._bucket.put(self._here.path(entry) / name, _key(entry) + name)
+        if all(each.key.rpartition("/")[2] in names for each in self._bucket.objects(_key(entry))):
+            self.remove(entry.area, entry.job_id, entry.attempt)  # the rest has been removed, before or meanwhile
 
     @disk_errors()
     def get(self, entry: ShelfEntry) -> Path | None:

@@ -118,7 +118,10 @@ class Shelf(Protocol):
         ...
 
     def put_files(self, entry: ShelfEntry, names: Sequence[str]) -> None:
-        """Keep these files of the entry's folder on this machine in place of the entry's own, one after the other."""
+        """Keep these files of the entry's folder on this machine in place of the entry's own, one after the other.
+
+        names: not all of the entry's. An entry that has been removed, or is being removed, does not come back.
+        """
         ...
 
     def get(self, entry: ShelfEntry) -> Path | None:

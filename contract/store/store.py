@@ -12,8 +12,9 @@
     └── valkey/             the embedded queue's log
 
 A folder in spool/ or scenes/ that is there is complete. The job's record in the queue says which attempt's scene is THE
-scene of the job. An attempt writes to and removes only folders of its own number, so a worker that was thought dead
-cannot damage another's. Only its owner can read the data directory.
+scene of the job. An attempt writes only to folders of its own number, and removes those of earlier attempts; the one
+that the queue has accepted removes all others. So a worker that was thought dead cannot damage a later attempt. Only
+its owner can read the data directory.
 
 Every method raises UnavailableError when the disk is full (StoreFullError), read-only, missing or failing, and when the
 bucket does not answer.
@@ -220,9 +221,9 @@ class Store:
             SceneError: the scene does not exist, or its report cannot be read.
         """
         report, entry = self._report(job_id, attempt), ShelfEntry(Area.SCENES, job_id, attempt)
-        if report.scored or any((self.data_dir / UNSCORED).glob(f"*/{entry.name}")):
+        if report.scored or self._here.read_marker(entry) == self._shelf.read_marker(entry):
             return report
-        self._shelf.drop_copy(entry)  # another machine may have added the scores to the bucket's since it was made
+        self._shelf.drop_copy(entry)  # another machine has added the scores to the bucket's since it was made
         return self._report(job_id, attempt)
 
     def _report(self, job_id: str, attempt: int) -> Report:

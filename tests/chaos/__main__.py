@@ -16,6 +16,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from contract.queue.interface import BEAT_PERIOD_S, LEASE_S
@@ -90,11 +91,9 @@ def _run_deployments(
             with lock:
                 left.extend(orphans(deployment.store, known))
 
-    threads = [threading.Thread(target=live_in, args=(number,)) for number in range(deployments)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(deployments) as threads:
+        for life in [threads.submit(live_in, number) for number in range(deployments)]:
+            life.result()  # raises what a deployment that does not start raises
     return outcomes, left
 
 

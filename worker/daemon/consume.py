@@ -110,17 +110,24 @@ class Consumer:
             if record is not None:
                 self.job_id = record.job_id
                 self.held.note(Claim(record.job_id, record.attempt, self._owner))
-                run_job(self._queue, self._store, child, record, self._name, self._end, self._room)
+                scores = run_job(self._queue, self._store, child, record, self._name, self._end, self._room)
                 self.held.forget()
                 self.job_id = None
+                if (
+                    scores is not None
+                ):  # also while a job waits: made up for later, they would take several times as long
+                    scores.take(child, stop=self._end.is_set)
             else:
                 self._left.make_up(child)
 
 
 def run_job(
     queue: Queue, store: Store, child: DeviceChild, record: JobRecord, name: str, end: threading.Event, room: Room
-) -> None:
-    """Run one claimed job to its end; hand it back if `end` is set first. name: the worker's."""
+) -> Scores | None:
+    """Run one claimed job to its end; hand it back if `end` is set first. name: the worker's.
+
+    Returns the scores that the child measures now, if the job is done.
+    """
     assert record.owner is not None
     claim = Claim(record.job_id, record.attempt, record.owner)
     log = _log_of(claim)
@@ -137,12 +144,16 @@ def run_job(
             child.kill()
             outcome = job.settle(Failed(error=describe(error), fault=type(error).__name__))
     log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
-    if job.is_scoring:
-        if outcome not in (DONE, UNSETTLED):  # if unsettled, the queue may have accepted the end
-            with contextlib.suppress(UnavailableError):  # else LeftScores forgets it
-                store.expect_no_scores(name, claim.job_id, claim.attempt)
-        scores = Scores(store, name, claim.job_id, claim.attempt)
-        scores.take(child, stop=end.is_set if outcome == DONE else lambda: True)
+    if not job.is_scoring:
+        return None
+    scores = Scores(store, name, claim.job_id, claim.attempt)
+    if outcome == DONE:
+        return scores
+    if outcome != UNSETTLED:  # if unsettled, the queue may have accepted the end
+        with contextlib.suppress(UnavailableError):  # else LeftScores forgets it
+            store.expect_no_scores(name, claim.job_id, claim.attempt)
+    scores.take(child, stop=lambda: True)
+    return None
 
 
 def _log_of(claim: Claim) -> logging.LoggerAdapter[logging.Logger]:

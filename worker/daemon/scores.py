@@ -24,6 +24,9 @@ from worker.daemon.orders import Advanced, Scored, ScoreScene, StopJob, Stopped
 ASK_PERIOD_S = 1.0
 """How often the queue is asked whether a job waits while nothing but scores is to do."""
 
+RETRY_AFTER_S = 60.0
+"""How long a scene waits after a try that ended without scores."""
+
 logger = logging.getLogger("intrasplat.worker")
 
 
@@ -81,6 +84,8 @@ class LeftScores:
         self._name = name
         self._end = end
         self._warned: set[str] = set()
+        self._tried_s: dict[str, float] = {}
+        """When the last try ended, on the monotonic clock."""
 
     def make_up(self, child: DeviceChild) -> None:
         """Score one of these scenes, until a job waits. One whose files cannot be had keeps no other waiting."""
@@ -90,6 +95,8 @@ class LeftScores:
             self._warn_once("", 0, error)
             return
         for job_id, attempt in expected:
+            if time.monotonic() < self._tried_s.get(job_id, -RETRY_AFTER_S) + RETRY_AFTER_S:
+                continue
             try:
                 order = self._order_for(job_id, attempt)
             except (UnavailableError, SceneError) as error:
@@ -100,6 +107,8 @@ class LeftScores:
                 child.send(order)
                 scores = Scores(self._store, self._name, job_id, attempt)
                 scores.take(child, stop=self._is_to_stop(), gives_up=True)
+                if (job_id, attempt) in self._store.unscored(self._name):
+                    self._tried_s[job_id] = time.monotonic()
                 return
 
     def _order_for(self, job_id: str, attempt: int) -> ScoreScene | None:

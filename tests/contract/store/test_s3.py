@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import time
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,9 @@ from contract.runtime.settings import Settings
 from contract.store.shelf import ABANDONED_AFTER_S, new_job_id
 from contract.store.store import Store, open_store
 from contract.wire.errors import SceneError, UnavailableError
-from contract.wire.names import MANIFEST, RESUME, SUBMISSION
+from contract.wire.names import CURVE, MANIFEST, REPORT, RESUME, SUBMISSION
 from tests.contract.stores import BUCKET_URL, accepted, lead_to, published, received
+from tests.reports import REPORT_OF_A_SCENE
 
 pytest.importorskip("s3fs")
 moto_server: Any = pytest.importorskip("moto.server")
@@ -124,6 +127,43 @@ def test_a_purge_leaves_nothing_in_the_bucket_nor_on_any_machine_that_shows_it(
     assert not worker.spool_folder(job_id).exists()
     assert (kept.exists(), work.exists(), goes_on.exists()) == (False, False, True)
     assert sum(service.purge(job_id).files.values()) == 0
+
+
+def unscored(store: Store) -> tuple[str, Path]:
+    """A scene that waits for its scores, and its folder on that machine."""
+    job_id = new_job_id()
+    work = store.work_folder(job_id, 1)
+    first = REPORT_OF_A_SCENE.model_copy(update={"scored": False})
+    contents = {"scene.safetensors": "tensors", REPORT: first.model_dump_json(), CURVE: "iteration\n0\n"}
+    for name, content in contents.items():
+        (work / name).write_text(content)
+    hashes = {name: {"sha256": sha256(content.encode()).hexdigest()} for name, content in contents.items()}
+    (work / MANIFEST).write_text(json.dumps({"files": hashes}))
+    store.expect_scores("worker-1", job_id, 1)
+    return job_id, store.publish_scene(job_id, 1)
+
+
+def test_a_scene_purged_elsewhere_before_its_scores_come_does_not_come_back(tmp_path: Path, bucket: Any) -> None:
+    service, worker = on(tmp_path, "service"), on(tmp_path, "worker")
+    job_id, scene = unscored(worker)
+    service.purge(job_id)
+    worker.add_scores("worker-1", job_id, 1, REPORT_OF_A_SCENE)
+    assert keys(bucket) == []
+    assert not scene.exists()
+    assert worker.unscored("worker-1") == []
+
+
+def test_an_unscored_scene_is_fetched_again_only_when_another_machine_has_scored_it(
+    tmp_path: Path, bucket: Any
+) -> None:
+    service, worker = on(tmp_path, "service"), on(tmp_path, "worker")
+    job_id, _ = unscored(worker)
+    assert not service.newest_report(job_id, 1).scored
+    copy = service.scene_folder(job_id, 1).stat().st_ino
+    assert not service.newest_report(job_id, 1).scored
+    assert service.scene_folder(job_id, 1).stat().st_ino == copy
+    worker.add_scores("worker-1", job_id, 1, REPORT_OF_A_SCENE)
+    assert service.newest_report(job_id, 1).scored
 
 
 def test_copies_that_nobody_has_used_for_a_day_are_dropped_and_come_back(tmp_path: Path, bucket: Any) -> None:

@@ -102,6 +102,18 @@ def test_scores_give_way_to_a_job_that_waits(bench: Unscored, monkeypatch: pytes
     assert bench.store.unscored("worker-1") == [(job_id, 1)]
 
 
+def test_a_try_without_scores_is_repeated_after_a_pause(bench: Unscored, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scores, "ASK_PERIOD_S", 0.05)
+    job_id = bench.published()
+    waiting = bench.submit("publish")
+    bench.make_up(score_s=60.0)
+    bench.queue.cancel(waiting)
+    assert bench.make_up().sent == []
+    monkeypatch.setattr(scores, "RETRY_AFTER_S", 0.0)
+    bench.make_up()
+    assert bench.store.newest_report(job_id, 1).scored
+
+
 def test_a_scene_whose_clip_is_gone_is_told_of_once_and_keeps_no_other_waiting(
     bench: Unscored, caplog: pytest.LogCaptureFixture
 ) -> None:
