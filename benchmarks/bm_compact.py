@@ -19,8 +19,8 @@ from contract.wire.options import ReconstructionOptions
 from worker.evaluate.rows import commit, machine, write_rows
 from worker.input.clip import DepthClip, open_clip, split_frames
 from worker.machine.timing import Stopwatch
+from worker.outcome import scene_of
 from worker.phantom import PhantomSettings, make_phantom
-from worker.pipeline import scene_of
 from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
 from worker.scene.model import model_of
 from worker.train.hooks import TrainingHooks

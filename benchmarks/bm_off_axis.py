@@ -30,7 +30,7 @@ from worker.evaluate.sources import OpenClip, open_source, source_of
 from worker.evaluate.truth import Expected, SceneCandidate, Truth, seen_now
 from worker.input.clip import split_frames
 from worker.machine.hooks import Hooks
-from worker.pipeline import scene_of
+from worker.outcome import scene_of
 from worker.raster.cpu import compile_kernels
 from worker.render.unseen import hatched
 from worker.render.view import render_frame

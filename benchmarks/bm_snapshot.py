@@ -31,8 +31,8 @@ from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.input.clip import DepthClip, split_frames
 from worker.machine.timing import Stopwatch
+from worker.outcome import snapshot_of
 from worker.phantom import PhantomSettings, make_phantom
-from worker.pipeline import snapshot_of
 from worker.raster.cpu import compile_kernels
 from worker.raster.cpu.threads import cpu_time_s, thread_count
 from worker.scene.scene import Scene

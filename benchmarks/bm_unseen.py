@@ -25,8 +25,8 @@ from contract.wire.options import ReconstructionOptions
 from contract.wire.pose import OrbitPose, world_from_camera
 from worker.input.clip import DepthClip, FrameSplit, split_frames
 from worker.model.metrics import COVERED_ALPHA, psnr_tissue
+from worker.outcome import scene_of
 from worker.phantom import MOTIONS, PhantomSettings, make_phantom
-from worker.pipeline import scene_of
 from worker.raster.cpu import compile_kernels
 from worker.raster.step import camera_vector
 from worker.render.unseen import blended_values, hatched, unseen_pixels

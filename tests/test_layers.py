@@ -41,6 +41,7 @@ ROOMS = {
         "train",
         "render",
         "report",
+        "outcome",
         "pipeline",
         "phantom",
         "evaluate",

@@ -10,8 +10,8 @@ import numpy as np
 from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, FrameSplit, split_frames
 from worker.machine.timing import Stopwatch
+from worker.outcome import scene_of
 from worker.phantom import Motion, PhantomSettings, make_phantom
-from worker.pipeline import scene_of
 from worker.train.hooks import RenderedFrame, TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare

@@ -26,8 +26,9 @@ from worker.input.clip import DepthClip, open_clip, split_frames
 from worker.machine.hooks import Progress
 from worker.model.metrics import coverage, psnr_tissue
 from worker.model.optimize import Rate
+from worker.outcome import scene_of
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
-from worker.pipeline import judge, judge_again, make, reconstruct, scene_of
+from worker.pipeline import judge, judge_again, make, reconstruct
 from worker.raster.step import camera_vector
 from worker.render.view import render_frame
 from worker.scene.checkpoint import load_scene

@@ -109,7 +109,7 @@ class DeviceChild:
                     self._reports.put(report)
 
 
-class Keeper:
+class ChildKeeper:
     """Keeps one device process running. Use it from one thread, which must live as long as the process."""
 
     def __init__(

@@ -23,14 +23,14 @@ from contract.store.disk_errors import StoreFullError
 from contract.store.store import Store
 from contract.wire.errors import ErrorCode, IntrasplatError, UnavailableError
 from contract.wire.job import JobProgress, JobRecord, JobState
-from worker.daemon.child import LOOK_PERIOD_S, MAX_STOP_S, DeviceChild, Ended, Keeper
+from worker.daemon.child import LOOK_PERIOD_S, MAX_STOP_S, ChildKeeper, DeviceChild, Ended
 from worker.daemon.hang import HangDetector
 from worker.daemon.heartbeat import Heartbeat
 from worker.daemon.held import HeldClaim
 from worker.daemon.job_errors import describe
 from worker.daemon.orders import Advanced, Failed, Finished, RunJob, StopJob, Stopped
 from worker.daemon.room import Room
-from worker.daemon.scores import LeftScores, Scores
+from worker.daemon.scores import AwaitedScores, LeftScores
 
 CLAIM_TIMEOUT_S = 1.0
 """How soon an idle worker notices that it should end, or that its child has."""
@@ -67,7 +67,7 @@ class Consumer:
         self,
         queue: Queue,
         store: Store,
-        keeper: Keeper,
+        keeper: ChildKeeper,
         name: str,
         owner: str,
         end: threading.Event,
@@ -123,7 +123,7 @@ class Consumer:
 
 def run_job(
     queue: Queue, store: Store, child: DeviceChild, record: JobRecord, name: str, end: threading.Event, room: Room
-) -> Scores | None:
+) -> AwaitedScores | None:
     """Run one claimed job to its end; hand it back if `end` is set first. name: the worker's.
 
     Returns the scores that the child measures now, if the job is done.
@@ -146,7 +146,7 @@ def run_job(
     log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
     if not job.is_scoring:
         return None
-    scores = Scores(store, name, claim.job_id, claim.attempt)
+    scores = AwaitedScores(store, name, claim.job_id, claim.attempt)
     if outcome == DONE:
         return scores
     if outcome != UNSETTLED:  # if unsettled, the queue may have accepted the end

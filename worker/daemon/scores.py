@@ -30,7 +30,7 @@ RETRY_AFTER_S = 60.0
 logger = logging.getLogger("intrasplat.worker")
 
 
-class Scores:
+class AwaitedScores:
     """Waits for the scores of a finished scene and adds them to it. name: the worker's."""
 
     def __init__(self, store: Store, name: str, job_id: str, attempt: int) -> None:
@@ -105,7 +105,7 @@ class LeftScores:
             if order is not None:
                 logger.info("the scores of an earlier attempt are made up for", extra=_named(job_id, attempt))
                 child.send(order)
-                scores = Scores(self._store, self._name, job_id, attempt)
+                scores = AwaitedScores(self._store, self._name, job_id, attempt)
                 scores.take(child, stop=self._is_to_stop(), gives_up=True)
                 if (job_id, attempt) in self._store.unscored(self._name):
                     self._tried_s[job_id] = time.monotonic()

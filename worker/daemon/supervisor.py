@@ -21,7 +21,7 @@ from contract.runtime.settings import Settings
 from contract.store.store import Store, open_store
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import WorkerAddress
-from worker.daemon.child import Keeper
+from worker.daemon.child import ChildKeeper
 from worker.daemon.consume import Consumer
 
 LOOK_PERIOD_S = 0.1
@@ -60,7 +60,7 @@ def run_supervisor(
         raise UnavailableError(problem, "End it, or set another INTRASPLAT_WORKER_NAME.")
     queue = RedisQueue(settings.redis_url)
     environment = {**os.environ, **settings.to_environment()}
-    keeper = Keeper(child_command or DEVICE_COMMAND, environment, store.run_dir / f"{name}.device.last-words")
+    keeper = ChildKeeper(child_command or DEVICE_COMMAND, environment, store.run_dir / f"{name}.device.last-words")
     # The owner's name is new at each start, so that what an earlier process of this name has sent changes nothing.
     consumer = Consumer(queue, store, keeper, name, f"{name}.{secrets.token_hex(4)}", end, settings.min_free_bytes)
     try:
@@ -79,13 +79,15 @@ def run_supervisor(
         lock.release()
 
 
-def keep_rendering(keeper: Keeper, end: threading.Event) -> None:
-    """Keep the child running, which answers renders, until `end` is set; raises as Keeper.child."""
+def keep_rendering(keeper: ChildKeeper, end: threading.Event) -> None:
+    """Keep the child running, which answers renders, until `end` is set; raises as ChildKeeper.child."""
     while keeper.child(end) is not None and not end.wait(LOOK_PERIOD_S):
         pass
 
 
-def address_of(name: str, keeper: Keeper, consumer: Consumer, *, renders_only: bool = False) -> WorkerAddress | None:
+def address_of(
+    name: str, keeper: ChildKeeper, consumer: Consumer, *, renders_only: bool = False
+) -> WorkerAddress | None:
     """The address that a worker announces now; None while its child is not ready."""
     child = keeper.live
     if child is None or child.ready is None:

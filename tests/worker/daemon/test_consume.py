@@ -23,7 +23,7 @@ from contract.wire.names import CURVE, MANIFEST, REPORT, RESUME
 from contract.wire.rendering import WorkerAddress
 from tests.worker.jobs import STANDIN, Jobs, eventually
 from worker.daemon import consume, hang
-from worker.daemon.child import Keeper
+from worker.daemon.child import ChildKeeper
 from worker.daemon.consume import Consumer
 from worker.daemon.supervisor import address_of, announced
 
@@ -35,7 +35,7 @@ class JobLoop(Jobs):
         super().__init__(queue or MemoryQueue(), Store(data_dir))
         self.end = threading.Event()
         command = [sys.executable, str(STANDIN), *arguments]
-        self.keeper = Keeper(command, last_words=self.store.run_dir / "worker-1.last-words")
+        self.keeper = ChildKeeper(command, last_words=self.store.run_dir / "worker-1.last-words")
         self.consumer = Consumer(self.queue, self.store, self.keeper, "worker-1", "worker-1.a", self.end)
         self.thread: threading.Thread | None = None
 

@@ -25,7 +25,7 @@ from contract.wire.options import JobOptions, ReconstructionOptions
 from contract.wire.report import Report
 from tests.reports import REPORT_OF_A_SCENE
 from worker.__main__ import main
-from worker.daemon.child import DeviceChild, Keeper
+from worker.daemon.child import ChildKeeper, DeviceChild
 from worker.daemon.device import make_or_start_anew, request_of, scored
 from worker.daemon.job_errors import describe
 from worker.daemon.orders import Advanced, Failed, Finished, RunJob, Scored, ScoreScene, StopJob, Stopped
@@ -82,7 +82,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def device(tmp_path: Path) -> Iterator[DeviceChild]:
     """`python -m worker device`, ready."""
     settings = Settings(data_dir=tmp_path / "data")
-    keeper = Keeper([sys.executable, "-m", "worker", "device"], {**os.environ, **settings.to_environment()})
+    keeper = ChildKeeper([sys.executable, "-m", "worker", "device"], {**os.environ, **settings.to_environment()})
     child = keeper.child(threading.Event())
     assert child is not None
     yield child
@@ -165,8 +165,8 @@ def test_a_job_that_trains_dies_with_the_process_that_ordered_it(tmp_path: Path,
     spool, out = clip.parent, tmp_path / "out"
     program = (
         "import sys; from threading import Event;"
-        "from worker.daemon.child import Keeper; from worker.daemon.orders import *;"
-        "child = Keeper([sys.executable, '-m', 'worker', 'device']).child(Event());"
+        "from worker.daemon.child import ChildKeeper; from worker.daemon.orders import *;"
+        "child = ChildKeeper([sys.executable, '-m', 'worker', 'device']).child(Event());"
         "child.send(read_order(sys.argv[1].encode())); report = None\n"
         "while report is None or report.progress.stage != 'train': report = child.next_report(60)\n"
         "print(child.process.pid, flush=True); child.next_report(60)"

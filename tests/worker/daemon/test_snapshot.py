@@ -21,8 +21,9 @@ from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.machine.hooks import Progress
 from worker.machine.timing import Stopwatch
+from worker.outcome import snapshot_of
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf
-from worker.pipeline import reconstruct, snapshot_of
+from worker.pipeline import reconstruct
 from worker.render.view import render_frame
 from worker.scene.checkpoint import SCENE_FILE
 from worker.scene.scene import Scene

@@ -18,8 +18,8 @@ from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared,
 from tests.worker.scenes import random_scene
 from worker.input.camera import Intrinsics
 from worker.model.metrics import psnr_tissue
+from worker.outcome import scene_of
 from worker.phantom import orbit_pose
-from worker.pipeline import scene_of
 from worker.render.camera import endoscope_pose
 from worker.render.view import FAR_POSE, render_frame
 from worker.scene.checkpoint import load_scene, save_scene

@@ -14,7 +14,7 @@ from contract.wire.notices import NoticeCode
 from tests.worker.clips import HEIGHT, WIDTH, plane_clip
 from tests.worker.phantoms import phantom_clip, prepared, trained
 from worker.input.clip import DepthClip
-from worker.pipeline import scene_of, snapshot_of
+from worker.outcome import scene_of, snapshot_of
 from worker.render.unseen import NEVER_SEEN, blended_values, hatched, unseen_pixels
 from worker.render.view import render_frame
 from worker.scene.checkpoint import load_scene

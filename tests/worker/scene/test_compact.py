@@ -24,7 +24,7 @@ from worker.model.deformation import SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.layout import COLOUR_CHANNELS, VALUES
 from worker.model.metrics import psnr_tissue
-from worker.pipeline import scene_of
+from worker.outcome import scene_of
 from worker.scene import compact
 from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
 from worker.scene.compact import MIN_POWER, state_rows, unpack

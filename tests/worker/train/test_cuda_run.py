@@ -17,7 +17,7 @@ from contract.wire.options import ReconstructionOptions
 from tests.helpers import assert_close
 from tests.worker.clips import plane_clip
 from worker.input.clip import DepthClip, FrameSplit, split_frames
-from worker.pipeline import scene_of
+from worker.outcome import scene_of
 from worker.raster.backend import CPU, Device
 from worker.raster.cuda.model import CudaModel
 from worker.render.view import render_frame

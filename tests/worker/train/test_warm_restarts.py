@@ -17,7 +17,7 @@ from tests.worker.phantoms import bits, phantom_clip, prepared_on, trained
 from worker.input.clip import DepthClip, FrameSplit, split_frames
 from worker.machine.timing import Stopwatch
 from worker.model.metrics import psnr_tissue
-from worker.pipeline import snapshot_of
+from worker.outcome import snapshot_of
 from worker.raster.model import Model
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
