@@ -26,7 +26,7 @@ class _Message(BaseModel):
 
 
 class RunJob(_Message):
-    """Reconstruct the record's clip from the folder `spool` into the empty `out`, from what `kept` holds on."""
+    """Reconstruct the record's clip in the folder `spool` into the empty `out`; go on from what `kept` holds."""
 
     kind: Literal["run"] = "run"
     record: JobRecord

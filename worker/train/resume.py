@@ -12,7 +12,6 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
 from contract.wire.errors import ResumeMismatch, SceneError
@@ -64,17 +63,14 @@ def resume(directory: Path, setup: Setup) -> Run | None:
     return run
 
 
-def save_run(directory: Path, run: Run, t_train_s: float) -> None:
-    """Write what resume needs: parameters, moments, averages, densification statistics, schedule, curve.
+def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None]:
+    """Begin to write what resume needs: parameters, moments, averages, densification statistics, schedule, curve.
+
+    When this returns, the run may go on. What it returns ends the writing, as that of begin_resume.
 
     Raises:
         OSError: the disk is full or refuses; what was stored before is as it was.
     """
-    begin_save(directory, run, t_train_s)()
-
-
-def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None]:
-    """As save_run, in two parts, as begin_resume does it: when this returns the run may go on."""
     trains = 0 < run.iteration < run.iterations
     beta1 = run.preset.rates.beta1
     arrays = state_of(run.model, beta1) if trains else run.model.parameters()  # else nobody asks for moments
@@ -97,22 +93,6 @@ def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None
         "curve": [astuple(point) for point in run.curve],
     }
     return begin_resume(directory, arrays, state, after_each=run.average.let_go)
-
-
-def load_run(directory: Path, run: Run) -> float:
-    """Bring a new run to the state of the stored one; returns its t_train_s.
-
-    Raises:
-        SceneError: nothing usable is stored there.
-        ValueError: it was started with another preset, seed, length or clip.
-    """
-    tensors, state = load_resume(directory)
-    _check(state, run.setup, run.preset, run.eyes)
-    if state["count"] != run.model.count:  # densified since the start
-        columns = np.zeros(state["count"], np.int64)
-        run.model.take(columns, np.ones(len(columns), np.bool_))
-    _put(run, tensors, state)
-    return float(state["t_train_s"])
 
 
 def _settled(preset: Preset, start: Mapping[str, Any]) -> Preset:

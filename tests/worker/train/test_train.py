@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from contract.wire.errors import Cancelled, SceneError, TrainingDiverged
+from contract.wire.errors import Cancelled, ResumeMismatch, TrainingDiverged
 from tests.worker.phantoms import bits, phantom_clip, prepared, prepared_on, trained, view
 from worker.input.clip import DepthClip, split_frames
 from worker.machine.hooks import Progress
@@ -26,7 +26,7 @@ from worker.train.densify import DensifySettings
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.presets import PRESETS, Preset
-from worker.train.resume import load_run, save_run
+from worker.train.resume import begin_save, resume
 from worker.train.run import CurvePoint, Run, frames_at, write_curve
 from worker.train.schedule import Schedule
 from worker.train.scoring import HeldOutScore
@@ -51,6 +51,17 @@ def stopping_after(iterations: int) -> TrainingHooks:
         return asked > iterations
 
     return TrainingHooks(should_stop=should_stop)
+
+
+def keep(directory: Path, run: Run, t_train_s: float = 0.0) -> None:
+    begin_save(directory, run, t_train_s)()
+
+
+def kept(directory: Path, new: Run) -> Run:
+    """The run that is kept there, resumed with the setup of a new one."""
+    run = resume(directory, new.setup)
+    assert run is not None
+    return run
 
 
 def run_bits(clip: DepthClip, preset: Preset, *, iterations: int = ITERATIONS, seed: int = 0) -> dict[str, bytes]:
@@ -80,9 +91,9 @@ def test_a_stopped_run_goes_on_to_the_bits_of_an_unstopped_one(name: str, tmp_pa
         trained(run, stopping_after(STOPPED_AFTER))
     assert run.iteration == STOPPED_AFTER
     assert preset.densify is None or run.model.count > count  # the stored model is larger than a fresh one
-    save_run(tmp_path, run, 1.5)
-    again, _ = prepared(clip, preset, iterations=ITERATIONS)
-    assert load_run(tmp_path, again) == 1.5
+    keep(tmp_path, run, 1.5)
+    again = kept(tmp_path, prepared(clip, preset, iterations=ITERATIONS)[0])
+    assert again.setup.clock.elapsed_s >= 1.5
     assert bits(trained(again)) == straight_bits(name)
 
 
@@ -149,13 +160,12 @@ def test_steps_on_several_frames_keep_their_bits_over_a_stop(name: str, tmp_path
     stopped, _ = prepared(clip, preset, iterations=9)
     with pytest.raises(Cancelled):
         trained(stopped, stopping_after(4))
-    save_run(tmp_path, stopped, 1.5)
-    again, _ = prepared(clip, preset, iterations=9)
-    load_run(tmp_path, again)
+    keep(tmp_path, stopped)
+    again = kept(tmp_path, prepared(clip, preset, iterations=9)[0])
     assert again.frames_seen == 12
     assert bits(trained(again)) == bits(trained(whole))
-    with pytest.raises(ValueError, match="another settings of the preset"):
-        load_run(tmp_path, prepared(clip, splitting_soon(name), iterations=9)[0])
+    with pytest.raises(ResumeMismatch, match="another settings of the preset"):
+        kept(tmp_path, prepared(clip, splitting_soon(name), iterations=9)[0])
 
 
 def test_the_curve_tells_iterations_and_the_frames_they_saw(tmp_path: Path) -> None:
@@ -256,24 +266,22 @@ def test_without_held_out_frames_there_is_no_curve() -> None:
 )
 def test_a_run_goes_on_only_with_what_it_was_started_with(change: dict[str, object], said: str, tmp_path: Path) -> None:
     started: dict[str, object] = {"preset": "paper", "iterations": 8, "seed": 0, "holdout": "every8"}
-    save_run(tmp_path, prepared(phantom_clip(), **started)[0], 0.0)  # type: ignore[arg-type]
+    keep(tmp_path, prepared(phantom_clip(), **started)[0])  # type: ignore[arg-type]
     other, _ = prepared(phantom_clip(), **(started | change))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=said):
-        load_run(tmp_path, other)
+    with pytest.raises(ResumeMismatch, match=said):
+        kept(tmp_path, other)
 
 
 def test_a_run_does_not_go_on_with_another_clip(tmp_path: Path) -> None:
-    save_run(tmp_path, prepared(phantom_clip("breathing"), "fast")[0], 0.0)
-    with pytest.raises(ValueError, match="another clip"):
-        load_run(tmp_path, prepared(phantom_clip("pull"), "fast")[0])
-    with pytest.raises(SceneError):
-        load_run(tmp_path / "nothing", prepared(phantom_clip(), "fast")[0])
+    keep(tmp_path, prepared(phantom_clip("breathing"), "fast")[0])
+    with pytest.raises(ResumeMismatch, match="another clip"):
+        kept(tmp_path, prepared(phantom_clip("pull"), "fast")[0])
+    assert resume(tmp_path / "nothing", prepared(phantom_clip(), "fast")[0].setup) is None
 
 
 def test_the_curve_is_kept_over_a_stop(tmp_path: Path) -> None:
     run, _ = prepared(phantom_clip())
     run.curve.append(CurvePoint(1.25, 7, 30.5, t_post_s=4.5))
-    save_run(tmp_path, run, 2.0)
-    again, _ = prepared(phantom_clip())
-    load_run(tmp_path, again)
+    keep(tmp_path, run)
+    again = kept(tmp_path, prepared(phantom_clip())[0])
     assert again.curve == run.curve
