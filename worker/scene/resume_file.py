@@ -37,7 +37,7 @@ _NO_CHECKSUM = "-" * 8
 """In its place until the file is whole."""
 _AT_ONCE_BYTES = 1 << 20
 _PIECE_BYTES, _AT_MOST_BYTES = 1 << 20, 64 << 20
-"""after_each is called after each piece; a tensor above the larger size is written row by row."""
+"""after_each is called after pieces of at least the first size; tensors above the second are written row by row."""
 
 
 def save_resume(directory: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
@@ -63,7 +63,7 @@ def begin_resume(
 
     When this returns the tensors may change. The function may be called from any thread; only one file of a directory
     may be under way at a time. The tensors are copied into the system's page cache, so this process needs no memory for
-    them. after_each is called after each megabyte or more, to free pages of tensors that are mapped from files.
+    them. after_each is called after each large piece, to free pages of tensors that are mapped from files.
     """
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / RESUME_FILE
