@@ -1,6 +1,7 @@
 """What a whole installation answers under load, idle and while a job trains, side by side in one run.
 
-    python benchmarks/bm_service.py [--seconds 10] [--queue-stop-s 60] [--upload-gib 1] [--csv docs/results/service.csv]
+    python benchmarks/bm_service.py [--seconds 10] [--queue-stop-s 60] [--upload-gib 1] [--job-only]
+        [--csv docs/results/service.csv]
 
 Starts `intrasplat up` on a data directory of its own, trains a synthetic clip of 640x512 and then measures:
 - GET /render as JPEG at 640x512, times and poses at random, by 1, 4 and 16 viewers that ask again when they are
@@ -8,7 +9,8 @@ Starts `intrasplat up` on a data directory of its own, trains a synthetic clip o
   that trains another clip, and of that job itself, there also by 16 who all ask for its first view;
 - GET /jobs/{id}, 200 a second whether answered or not, idle and beside training; ms from when each was due;
 - six renders of 4096x2160 at once, and meanwhile views of 320x256 of another scene, one after the other;
-- iterations a second of training, without viewers before and after each measurement of viewers, and with them.
+- iterations a second of training, without viewers before and after each measurement of viewers, and with them; `slower`
+  is by how much longer one takes with them, *_cpu how many cores worker, service and viewers use;
 - views of a scene shown before and of one that was not, while the queue's server is stopped for --queue-stop-s.
 Then uploads of --upload-gib GiB, in one request and resumable, with the service's memory before and at its peak.
 Viewers, service, queue and worker share the machine's cores.
@@ -53,6 +55,9 @@ ENDLESS = 1_000_000  # iterations; the job is cancelled at the end
 CHUNK_BYTES = 1 << 20
 VIDEO = Path(__file__).parents[1] / "tests" / "data" / "stereo_sbs_h264.mp4"
 
+PARTS = ("worker", "service", "viewers")
+"""Whose CPU seconds a second are counted while a job trains."""
+
 Row = dict[str, Any]
 
 
@@ -61,6 +66,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="of each measurement")
     parser.add_argument("--upload-gib", type=float, default=1.0, help="0: no uploads")
     parser.add_argument("--queue-stop-s", type=float, default=60.0, help="0: the queue is not stopped")
+    parser.add_argument("--job-only", action="store_true", help="only viewers of the job that trains")
     parser.add_argument("--csv", type=Path, help="file that gets a row a figure")
     arguments = parser.parse_args()
     origin = {"machine": machine(), "commit": commit()}
@@ -70,6 +76,12 @@ def main() -> None:
         folder = Path(name)
         clip = make_clip(folder)
         with started_service(folder / "data", folder / "service.log") as client:
+            if arguments.job_only:
+                busy = client.reconstruct(clip.video, calibration=clip.calibration, iterations=ENDLESS)
+                wait_for_stage(client, busy.id, "train")
+                _watched(client.url, busy.id, arguments.seconds)
+                client.cancel(busy.id)
+                return
             scene = trained(client, clip, iterations=SCENE_ITERATIONS)
             rows += asyncio.run(_under_load(client.url, scene, "idle", arguments.seconds))
             other, unseen = (trained(client, clip, iterations=1) for _ in range(2))
@@ -221,18 +233,33 @@ def _without_queue(url: str, data_dir: Path, seen: str, unseen: str, seconds: fl
 def _watched(url: str, job_id: str, seconds: float) -> list[Row]:
     """Viewers of a job that trains, and how fast it trains with them and between."""
     rows: list[Row] = []
+    parts = (
+        _process(lambda command, _: command.endswith(b"\0-m\0worker\0device\0")),
+        _service_process(url),
+        os.getpid(),
+    )
     cases = [(1, "", _random_view), (16, "", _random_view), (16, " of one view", _first_view)]
     with _followed(url, job_id) as rate:
         alone = [rate(lambda: time.sleep(seconds))]
         for viewers, what, query in cases:
             viewing = _view_for(url, query(job_id), viewers, seconds, what)
+            start_s, before = time.perf_counter(), [_cpu_s(each) for each in parts]
             per_s = rate(lambda viewing=viewing: rows.append(asyncio.run(viewing)))  # type: ignore[misc]
+            passed_s = time.perf_counter() - start_s
+            cpu = [(_cpu_s(each) - used_s) / passed_s for each, used_s in zip(parts, before, strict=True)]
             alone.append(rate(lambda: time.sleep(seconds)))
             slower = (alone[-2] + alone[-1]) / 2 / per_s - 1
+            used = {f"{name}_cpu": round(each, 2) for name, each in zip(PARTS, cpu, strict=True)}
             print(f"{'':28} training: {per_s:.2f} iterations/s, {alone[-2]:.2f} before, {alone[-1]:.2f} after:"
-                  f" {slower:.0%} slower")  # fmt: skip
-            rows[-1] |= {"iterations_per_s": round(per_s, 2), "slower": round(slower, 3)}
+                  f" each takes {slower:.0%} longer; cores used: {used}")  # fmt: skip
+            rows[-1] |= {"iterations_per_s": round(per_s, 2), "slower": round(slower, 3), **used}
     return rows
+
+
+def _cpu_s(process_id: int) -> float:
+    """CPU seconds that a process has used (Linux)."""
+    fields = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 async def _view_for(url: str, query: Query, viewers: int, seconds: float, what: str) -> Row:

@@ -79,9 +79,10 @@ _LONG = """
 ## A long clip
 
 `python -m benchmarks.bm_long --cache FOLDER --csv docs/results/long.csv` ([long.csv](long.csv)): a synthetic clip of
-both eyes, and its first frames alone with as many steps a frame. Scores of every8, in dB, left and right eye; the peak
-of the process's resident memory before training, in training, in finishing and in scoring, in MiB; seconds that storing
-and scoring take ([decision 042](../decisions/042-long-clips.md)).
+both eyes, and parts of it alone with as many steps a frame. Scores of every8, in dB, left and right eye: of the clip or
+part trained alone, and of the whole clip's scene on the part's frames. The peak of the process's resident memory before
+training, in training, in finishing and in scoring, in MiB; seconds that storing and scoring take
+([decision 042](../decisions/042-long-clips.md)).
 """
 _CHAOS = """
 ## What survives what
@@ -207,9 +208,11 @@ def _memory_table(rows: list[Row]) -> str:
 
 
 def _long_table(rows: list[Row]) -> str:
-    header = ["clip", "preset", "iterations", "Gaussians", "bases", "ms a step", "psnr_tissue", "right eye"]
+    header = ["clip", "preset", "iterations", "Gaussians", "bases", "ms a step", "alone", "right eye"]
+    header += ["whole", "right eye"]
     header += ["before", "train", "finish", "score", "store, s", "score, s"]
-    names = ("clip", "preset", "iterations", "gaussians", "bases", "step_ms", "psnr_tissue_db", "psnr_right_db")
+    names = ("clip", "preset", "iterations", "gaussians", "bases", "step_ms", "psnr_tissue_db", "psnr_right_db",
+             "whole_psnr_db", "whole_right_db")  # fmt: skip
     before = ("decode_mib", "stereo_mib", "motion_mib", "fusion_mib", "start_mib")
     return table(
         header,

@@ -115,7 +115,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
         max_wait_s=settings.render_timeout_s * MAX_WAIT_SHARE,
         render_secret=settings.render_secret,
     )
-    views.pause, views.is_short_of_time = server.pause, server.is_short_of_time
+    views.pause, views.level = server.pause, server.level
     with server:
         channel.send(Ready(endpoint=endpoint, device=str(device)))
         logger.info("the device process is ready on %s", device)

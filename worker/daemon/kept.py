@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import OrderedDict
 from collections.abc import Callable
 
@@ -33,7 +34,7 @@ class KeptReplies:
         """Keep an answer, in place of those asked for longest ago."""
         self.drop(lambda each: each == request)
         if len(reply.body) <= self._max_bytes // 4:
-            self._replies[request] = reply
+            self._replies[request] = dataclasses.replace(reply, is_kept=True)
             self._bytes += len(reply.body)
         while self._bytes > self._max_bytes:
             self._bytes -= len(self._replies.popitem(last=False)[1].body)

@@ -35,6 +35,7 @@ from contract.wire.rendering import (
 )
 from worker.daemon.pace import Pace
 from worker.daemon.turns import Turn, Turns
+from worker.render.encode import FOR_EYES
 
 POLL_MS = 50
 """How soon the thread notices that it shall end."""
@@ -49,6 +50,9 @@ MAX_READ = 1000
 
 SMALL_SHARE = 0.25
 """An answer that takes less than this share of a larger one's time is given between the parts of that one."""
+
+ALL_WITHIN_S = 1.0
+"""Each viewer's picture is at most so old, where a coarser one can make it so."""
 
 MIN_CHARGE_S = 0.01
 """Counted for each answer while a job trains: service and viewer have work with it, too."""
@@ -73,7 +77,8 @@ class Reply:
     iteration: of the snapshot that is shown; None: the scene is finished.
     unseen: share of a render's pixels that no training frame saw.
     gaussians, clip_size: of the scene, as in WorkerReply.
-    is_coarse: drawn at a part of the resolution, for want of time.
+    level: of detail at which it was drawn (worker/render/detail.py); 0 shows all.
+    is_kept: it was made for an earlier request.
     """
 
     body: bytes
@@ -84,7 +89,8 @@ class Reply:
     unseen: float = 0.0
     gaussians: int = 0
     clip_size: tuple[int, int] | None = None
-    is_coarse: bool = False
+    level: int = 0
+    is_kept: bool = False
 
 
 class RequestServer:
@@ -196,11 +202,18 @@ class RequestServer:
             self._give(small)
             left_s -= small.spent_s
 
-    def is_short_of_time(self) -> bool:
-        """Whether a job trains and the answer that is being made is too much for now, or others wait for theirs."""
+    def level(self) -> int:
+        """The level of detail of the answer that is being made: as fine as time allows.
+
+        0, the finest, if no job trains, or if the answer is not too much for now and nobody else waits. Else 1 if all
+        who wait get theirs within ALL_WITHIN_S by that. Else 2.
+        """
         turn = self._begun[-1]
-        turn.was_short = self._pace.trains and (len(self._turns) > 0 or not self._pace.affords(turn.seconds))
-        return turn.was_short
+        others = self._turns.others(turn.request)
+        if self._pace.trains and (others > 0 or not self._pace.affords(turn.seconds)):
+            all_s = (1 + others) * self._turns.seconds(turn.cost, 1)
+            turn.level = 1 if all_s <= ALL_WITHIN_S * self._pace.rate else 2
+        return turn.level
 
     def _read(self, wait_s: float) -> None:
         """Take in what has come; wait so long if nothing has."""
@@ -230,11 +243,16 @@ class RequestServer:
                 begun.is_given_up |= (begun.caller, begun.request_id) == (caller, request_id)
             return
         cost = self._cost(request)
-        turn = Turn(caller, request_id, request, cost, self._turns.seconds(cost), time.monotonic())
+        seconds, least_s = self._turns.seconds(cost), self._turns.seconds(cost, self._coarsest(request))
+        turn = Turn(caller, request_id, request, cost, seconds, least_s, time.monotonic())
         if (wait_s := self._wait_s(turn)) > self._max_wait_s:
             self._send(caller, request_id, WorkerReply(error=_busy(wait_s)))
         else:
             self._turns.add(turn)
+
+    def _coarsest(self, request: RenderRequest | ExportRequest) -> int:
+        """The coarsest level of detail that will do."""
+        return -1 if self._pace.trains and isinstance(request, RenderRequest) and request.format in FOR_EYES else 0
 
     def _wait_s(self, turn: Turn) -> float:
         """Seconds until its turn, as far as known."""
@@ -247,13 +265,13 @@ class RequestServer:
         self._begun.append(turn)
         self._charged_s = self._spent_s()
         try:
-            head, body = self._reply(turn.request)
+            head, body, is_new = self._reply(turn.request)
         except GivenUpError:
             return
         finally:
             self._charge()
             self._begun.pop()
-        if head.error is None and not turn.was_short:
+        if is_new:
             self._turns.learn(turn)
         answered = [turn, *self._turns.take_same(turn.request)]
         self._pace.charge(max(0.0, len(answered) * MIN_CHARGE_S - turn.spent_s))
@@ -281,14 +299,15 @@ class RequestServer:
             logger.error("between two requests: %s", type(error).__name__)
         self._between_at_s = time.monotonic() + BETWEEN_PERIOD_S
 
-    def _reply(self, request: RenderRequest | ExportRequest) -> tuple[WorkerReply, bytes]:
+    def _reply(self, request: RenderRequest | ExportRequest) -> tuple[WorkerReply, bytes, bool]:
+        """Head and body of the answer, and whether it was made for this request."""
         start = time.perf_counter()
         try:
             view = self._answer(request)
         except GivenUpError:
             raise
         except Exception as error:
-            return WorkerReply(error=_reply_error(error)), b""
+            return WorkerReply(error=_reply_error(error)), b"", False
         head = WorkerReply(
             media_type=view.media_type,
             t=view.t,
@@ -299,7 +318,7 @@ class RequestServer:
             clip_size=view.clip_size,
             render_ms=(time.perf_counter() - start) * 1e3,
         )
-        return head, view.body
+        return head, view.body, not view.is_kept
 
 
 def _busy(wait_s: float) -> ReplyError:

@@ -10,8 +10,9 @@ from contract.wire.rendering import ExportRequest, RenderRequest
 PATIENCE = 4.0
 """A request may wait so many times the seconds that it takes, before those that came later are answered first."""
 
-FIRST_SPEED = 3e11
-"""Pixels x Gaussians rendered in a CPU second, until the first render has been timed (bm_service, on two cores)."""
+FIRST_SPEEDS = (3e11, 9e11, 1.5e12)
+"""Pixels x Gaussians of the whole picture, rendered in a CPU second at each level of detail (worker/render/detail.py),
+until the first render has been timed (bm_service, on two cores)."""
 LEARNING = 0.2
 """Share of the newest render in what is known of the speed."""
 
@@ -21,8 +22,9 @@ class Turn:
     """A request that waits or is being answered.
 
     cost       pixels x Gaussians
-    seconds    CPU seconds that it will take, as far as known; spent_s: that it has taken
-    was_short  there was no time for all of it
+    seconds    CPU seconds that all of it will take, as far as known; spent_s: that it has taken
+    least_s    as seconds, of the coarsest picture that does
+    level      of detail at which it is answered
     arrived_s  monotonic
     """
 
@@ -31,10 +33,11 @@ class Turn:
     request: RenderRequest | ExportRequest
     cost: float
     seconds: float
+    least_s: float
     arrived_s: float
     spent_s: float = 0.0
     is_given_up: bool = False
-    was_short: bool = False
+    level: int = 0
 
     @property
     def due_s(self) -> float:
@@ -47,19 +50,19 @@ class Turns:
 
     def __init__(self) -> None:
         self._waiting: list[Turn] = []
-        self._speed = FIRST_SPEED
+        self._speeds = list(FIRST_SPEEDS)
 
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def seconds(self, cost: float) -> float:
-        """CPU seconds that a request of this cost takes."""
-        return cost / self._speed
+    def seconds(self, cost: float, level: int = 0) -> float:
+        """CPU seconds that a request of this cost takes at a level of detail."""
+        return cost / self._speeds[level]
 
     def learn(self, turn: Turn) -> None:
         """Remember how long the answer took."""
         if turn.cost > 0 and turn.spent_s > 0:
-            self._speed += LEARNING * (turn.cost / turn.spent_s - self._speed)
+            self._speeds[turn.level] += LEARNING * (turn.cost / turn.spent_s - self._speeds[turn.level])
 
     def add(self, turn: Turn) -> None:
         """Let it wait."""
@@ -84,7 +87,11 @@ class Turns:
         self._waiting = [each for each in self._waiting if each.request != request]
         return same
 
+    def others(self, request: RenderRequest | ExportRequest) -> int:
+        """How many other answers somebody waits for."""
+        return len({each.request for each in self._waiting} - {request})
+
     def seconds_before(self, turn: Turn) -> float:
-        """CPU seconds of all that are answered before this one; 0 if one of them has the same answer."""
+        """CPU seconds, at least, of all that are answered before this one; 0 if one of them has the same answer."""
         before = [each for each in self._waiting if each.due_s <= turn.due_s]
-        return 0.0 if any(each.request == turn.request for each in before) else sum(each.seconds for each in before)
+        return 0.0 if any(each.request == turn.request for each in before) else sum(each.least_s for each in before)

@@ -23,6 +23,7 @@ from worker.daemon.serve import NotYetError, Reply
 from worker.daemon.snapshot import Snapshot, Snapshots
 from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
+from worker.render.detail import LEVELS, thinned
 from worker.render.encode import FOR_EYES, encode_layer
 from worker.render.view import ROUNDING, Frame, no_pause, render_frame
 from worker.scene.checkpoint import load_scene
@@ -37,9 +38,6 @@ COPIES = 3
 MAX_HELD_SCENES = 64
 """However small they are: each announcement of the worker names all of them."""
 
-COARSENESS = 2
-"""By this a picture is smaller when time is short. Less would hardly be faster: each Gaussian takes its time."""
-
 UNKNOWN_GAUSSIANS, UNKNOWN_SIZE = 50_000, (640, 512)
 """What a scene that is not in memory is taken to have, when it is estimated how long it will take."""
 
@@ -48,8 +46,8 @@ class Views:
     """Answers render and export requests from the scenes of a store and the snapshots of a job; for one thread.
 
     `held` names the scenes in memory, the last used one at the end; other threads may read it. `pause` is called
-    between the parts of a large render; it may ask for other answers meanwhile. While is_short_of_time(), pictures in
-    formats for eyes are drawn at half the resolution and enlarged.
+    between the parts of a large render; it may ask for other answers meanwhile. `level` says at which of the LEVELS of
+    detail a picture in a format for eyes is drawn.
     """
 
     def __init__(
@@ -69,7 +67,7 @@ class Views:
         self._job_id = ""
         self.held: tuple[str, ...] = ()
         self.pause: Callable[[], None] = no_pause
-        self.is_short_of_time: Callable[[], bool] = lambda: False
+        self.level: Callable[[], int] = lambda: 0
 
     def answer(self, request: RenderRequest | ExportRequest) -> Reply:
         """The encoded image or file.
@@ -88,9 +86,9 @@ class Views:
             snapshot = self._trained(request.scene_id)
             scene = snapshot.scene
         reply = self._kept.get(request)
-        is_coarse = request.format in FOR_EYES and self.is_short_of_time()
-        if reply is None or (reply.is_coarse and not is_coarse):
-            reply = self._render(scene, request, snapshot, is_coarse=is_coarse)
+        level = self.level() if request.format in FOR_EYES else 0
+        if reply is None or reply.level > level:
+            reply = self._render(scene, request, snapshot, level)
             # Between the parts of a render a scene may be purged, or a newer snapshot shown.
             is_held = (
                 (request.scene_id, request.attempt) in self._scenes if snapshot is None else self._is_newest(scene)
@@ -103,7 +101,7 @@ class Views:
         """What the answer will take, in pixels x Gaussians; 0 if it is kept at full resolution."""
         if isinstance(request, RenderRequest):
             kept = self._kept.get(request)
-            if kept is not None and not kept.is_coarse:
+            if kept is not None and kept.level == 0:
                 return 0.0
         if request.attempt is not None:
             scene = self._scenes.get((request.scene_id, request.attempt))
@@ -154,15 +152,16 @@ class Views:
         self.held = tuple(name for name, _ in self._scenes)
         return self._scenes[key]
 
-    def _render(self, scene: Scene, request: RenderRequest, snapshot: Snapshot | None, *, is_coarse: bool) -> Reply:
-        """One render; snapshot: that the scene is of, None for a finished one."""
+    def _render(self, scene: Scene, request: RenderRequest, snapshot: Snapshot | None, level: int) -> Reply:
+        """One render; snapshot: that the scene is of, None for a finished one; level: of detail."""
         camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
         size = camera.width, camera.height
-        if is_coarse:
-            camera = camera.resized(-(-camera.width // COARSENESS), -(-camera.height // COARSENESS))
+        detail = LEVELS[level]
+        camera = camera.resized(-(-camera.width // detail.pixels), -(-camera.height // detail.pixels))
         pose, highlights = pose_of(scene, request.pose), request.highlights.shown_in(request.layer)
-        frame = render_frame(scene, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
-        return _reply(scene, frame.enlarged(*size) if is_coarse else frame, request, snapshot)
+        drawn = thinned(scene, detail.gaussians)
+        frame = render_frame(drawn, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
+        return _reply(scene, frame.enlarged(*size) if level else frame, request, snapshot, level)
 
     def _forget(self, key: tuple[str, int]) -> None:
         self._scenes.pop(key, None)
@@ -173,7 +172,7 @@ class Views:
         return COPIES * sum(scene.byte_count for scene in self._scenes.values())
 
 
-def _reply(scene: Scene, frame: Frame, request: RenderRequest, snapshot: Snapshot | None) -> Reply:
+def _reply(scene: Scene, frame: Frame, request: RenderRequest, snapshot: Snapshot | None, level: int) -> Reply:
     """A frame as it is sent."""
     iteration = None if snapshot is None else snapshot.iteration
     body = encode_layer(frame, request.layer, request.format, request.quality, request.unseen)
@@ -191,8 +190,7 @@ def _reply(scene: Scene, frame: Frame, request: RenderRequest, snapshot: Snapsho
     shown = shown_time(scene, request.t)
     clip_size = scene.intrinsics.width, scene.intrinsics.height
     media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
-    is_coarse = NoticeCode.COARSE in [each.code for each in warnings]
-    return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size, is_coarse)
+    return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size, level)
 
 
 def _export(scene: Scene, request: ExportRequest) -> Reply:

@@ -21,7 +21,7 @@ from contract.wire.rendering import CancelRequest, ExportRequest, RenderRequest,
 from tests.reports import a_warning
 from worker.daemon.pace import MAX_SAVED_S, SHARE, Pace
 from worker.daemon.serve import MAX_REQUEST_BYTES, NotYetError, Reply, RequestServer
-from worker.daemon.turns import FIRST_SPEED
+from worker.daemon.turns import FIRST_SPEEDS
 
 SCENE = "0" * 32
 SECRET = "a secret of at least 32 characters"
@@ -203,7 +203,7 @@ class Studio:
     """Renders whose cost is their t, each in parts that are made when they are let go."""
 
     def __init__(self, endpoint: str, **settings: Any) -> None:
-        self.server = RequestServer(endpoint, self.answer, cost=lambda each: each.t * FIRST_SPEED, **settings)
+        self.server = RequestServer(endpoint, self.answer, cost=lambda each: each.t * FIRST_SPEEDS[0], **settings)
         self.begun: list[float] = []
         self.has_begun = threading.Event()
         self.parts = threading.Semaphore(0)
@@ -271,6 +271,27 @@ def test_who_asks_the_same_at_the_same_time_shares_one_answer(endpoint: str) -> 
         assert [socket.recv_multipart()[0][0] for _ in range(2)] == [1, 2]
         assert {other.recv_multipart()[0][0] for _ in range(2)} == {3, 4}
     assert studio.begun == [2.0, 3.0]
+
+
+@pytest.mark.parametrize(("others", "level"), [(0, 0), (2, 1), (12, 2)])
+def test_the_more_wait_beside_training_the_coarser_they_are_drawn(endpoint: str, others: int, level: int) -> None:
+    levels: list[int] = []
+    may_go_on = threading.Event()
+
+    def answer_one(request: RenderRequest | ExportRequest) -> Reply:
+        assert may_go_on.wait(5)
+        levels.append(server.level())
+        return Reply(b"", "image/png", request.t)
+
+    pace = Pace(clock=lambda: 0.0)
+    server = RequestServer(endpoint, answer_one, cost=lambda each: 0.5 * MAX_SAVED_S * FIRST_SPEEDS[0], pace=pace)
+    with server, connected(endpoint) as socket, pace.training():
+        for number in range(1 + others):
+            send(socket, number, number / 16)
+        time.sleep(0.1)
+        may_go_on.set()
+        socket.recv_multipart()
+    assert levels[0] == level
 
 
 def test_whose_turn_is_too_far_off_is_told_when_to_come_back_and_small_renders_are_not(endpoint: str) -> None:

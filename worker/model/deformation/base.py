@@ -81,8 +81,8 @@ class Deformation(ABC):
         return {}
 
     @abstractmethod
-    def select(self, rows: Tensor) -> Self:
-        """The motion of the Gaussians rows ([M] indices, repeats allowed, or [N] bool); shared tensors stay shared."""
+    def select(self, rows: Tensor | slice) -> Self:
+        """The motion of the Gaussians rows: [M] indices, repeats allowed, [N] bool, a slice. Shared tensors stay so."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ class LinearDeformation(Deformation):
     def parameters(self) -> dict[str, Tensor]:
         return {"weight": self.weight}
 
-    def select(self, rows: Tensor) -> Self:
+    def select(self, rows: Tensor | slice) -> Self:
         return dataclasses.replace(self, weight=self.weight[rows])
 
 

@@ -75,7 +75,7 @@ class FlexibleDeformation(Deformation):
     def parameters(self) -> dict[str, Tensor]:
         return {"weight": self.weight, "centre": self.centre, "width": self.width}
 
-    def select(self, rows: Tensor) -> Self:
+    def select(self, rows: Tensor | slice) -> Self:
         return type(self)(self.weight[rows], self.centre[rows], self.width[rows])
 
 

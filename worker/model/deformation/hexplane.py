@@ -119,7 +119,7 @@ class HexPlane(Deformation):
     def constants(self) -> dict[str, Tensor]:
         return {"bounds": self.bounds}
 
-    def select(self, rows: Tensor) -> HexPlane:
+    def select(self, rows: Tensor | slice) -> HexPlane:
         del rows  # nothing here belongs to one Gaussian
         return self
 
