@@ -24,6 +24,7 @@ from contract.store.store import Store, open_store
 from contract.wire.errors import Cancelled, InputError, ResumeMismatch, UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.names import REPORT
+from contract.wire.rendering import ExportRequest, RenderRequest
 from contract.wire.report import Report
 from worker.daemon.channel import Channel, Orders, Task
 from worker.daemon.job_errors import describe
@@ -40,7 +41,7 @@ from worker.daemon.orders import (
     job_progress,
 )
 from worker.daemon.pace import Pace
-from worker.daemon.serve import RequestServer
+from worker.daemon.serve import Reply, RequestServer
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.input.decode import keep_decoder_ready
@@ -48,7 +49,7 @@ from worker.machine.hooks import Progress
 from worker.pipeline import Made, judge, judge_again, make
 from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lost
 from worker.raster.cpu import compile_kernels
-from worker.raster.cpu.threads import cpu_time_s, thread_count
+from worker.raster.cpu.threads import alone, cpu_time_s, thread_count
 from worker.scene.compact import compile_coder
 from worker.scene.resume_file import RESUME_FILE
 from worker.train.hooks import TrainingHooks
@@ -100,6 +101,10 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, device)
 
+    def answer(request: RenderRequest | ExportRequest) -> Reply:
+        with alone(is_alone=pace.trains):
+            return views.answer(request)
+
     def report_held_scenes() -> None:
         views.forget_purged()
         channel.send_if_new(Holding(scenes=views.held))
@@ -107,7 +112,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
     server = RequestServer(
         endpoint,
-        views.answer,
+        answer,
         cost=views.cost,
         between=report_held_scenes,
         pace=pace,

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-SHARE = 0.15
+SHARE = 0.12
 """Of the CPU time while a job trains. Copies of the model, the service and its viewers take some more."""
 
 MIN_USE = 0.25

@@ -10,7 +10,7 @@ from contract.wire.rendering import ExportRequest, RenderRequest
 PATIENCE = 4.0
 """A request may wait so many times the seconds that it takes, before those that came later are answered first."""
 
-FIRST_SPEEDS = (3e11, 9e11, 1.5e12)
+FIRST_SPEEDS = (3e11, 1e12, 2e12)
 """Pixels x Gaussians of the whole picture, rendered in a CPU second at each level of detail (worker/render/detail.py),
 until the first render has been timed (bm_service, on two cores)."""
 LEARNING = 0.2

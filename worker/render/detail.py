@@ -26,7 +26,7 @@ class Detail:
     gaussians: int
 
 
-LEVELS = (Detail(1, 1), Detail(2, 2), Detail(3, 4))
+LEVELS = (Detail(1, 1), Detail(2, 2), Detail(4, 6))
 """From all to the coarsest."""
 
 _thinned: WeakKeyDictionary[Scene, dict[int, Scene]] = WeakKeyDictionary()

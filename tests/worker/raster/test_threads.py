@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import InputError
 from tests.worker.raster.test_cpu import NORMALISED, RATES, moving_gaussians, random_frame
 from worker.raster.cpu.model import CpuModel
-from worker.raster.cpu.threads import THREADS_VARIABLE, run, thread_count
+from worker.raster.cpu.threads import THREADS_VARIABLE, alone, cpu_time_s, run, thread_count
 from worker.raster.step import camera_vector
 
 PATIENCE_S = 120.0
@@ -78,6 +78,21 @@ def test_training_and_rendering_at_once_give_what_each_gives_alone() -> None:
     for place, expected in enumerate(alone):
         for got, wanted in zip(together[place], expected, strict=True):
             assert np.array_equal(got, wanted)
+
+
+def test_a_caller_that_is_alone_uses_no_other_thread_and_comes_to_the_same_bits() -> None:
+    expected = render("shared with colour", 5)
+    users: set[int] = set()
+    with alone():
+        run(lambda thread, threads: users.add(threading.get_ident()))
+        with alone(is_alone=False):
+            pass
+        found = render("shared with colour", 5)
+    assert users == {threading.get_ident()}
+    assert all(np.array_equal(got, wanted) for got, wanted in zip(found, expected, strict=True))
+    elsewhere_s = cpu_time_s() - time.thread_time()
+    run(lambda thread, threads: sum(range(10**5)))
+    assert thread_count() == 1 or cpu_time_s() - time.thread_time() > elsewhere_s
 
 
 def test_more_callers_than_threads_all_come_to_an_end() -> None:

@@ -12,15 +12,17 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import cache
 
 from contract.wire.errors import InputError
 
 THREADS_VARIABLE = "INTRASPLAT_THREADS"
 
-_elsewhere = threading.local()
+_own = threading.local()
+"""Of each calling thread: elsewhere_s, CPU seconds that its kernels used on other threads; is_alone."""
 
 
 def _available_cores() -> int:
@@ -50,19 +52,39 @@ def _pool(process_id: int) -> ThreadPoolExecutor:
 
 
 def run(kernel: Callable[..., object], *args: object) -> None:
-    """Call kernel(thread, threads, *args) once a thread and wait for all; an error in any is raised here."""
+    """Call kernel(thread, threads, *args) for each share, each on a thread of its own unless alone(), and wait for all.
+
+    An error in any is raised here.
+    """
     threads = thread_count()
+    if getattr(_own, "is_alone", False):
+        for thread in range(threads):
+            kernel(thread, threads, *args)
+        return
     others = [_pool(os.getpid()).submit(_timed, kernel, thread, threads, *args) for thread in range(1, threads)]
     try:
         kernel(0, threads, *args)
     finally:
         wait(others)  # they write into the caller's arrays
-    _elsewhere.s = getattr(_elsewhere, "s", 0.0) + sum(other.result() for other in others)
+    _own.elsewhere_s = getattr(_own, "elsewhere_s", 0.0) + sum(other.result() for other in others)
+
+
+@contextmanager
+def alone(*, is_alone: bool = True) -> Iterator[None]:
+    """Kernels that this thread runs meanwhile use no other thread, and come to the same bits.
+
+    Shares of a render in the pool would keep those of a training step waiting.
+    """
+    before, _own.is_alone = getattr(_own, "is_alone", False), is_alone
+    try:
+        yield
+    finally:
+        _own.is_alone = before
 
 
 def cpu_time_s() -> float:
     """CPU seconds that this thread has used so far, with what its kernels used on other threads."""
-    return time.thread_time() + float(getattr(_elsewhere, "s", 0.0))
+    return time.thread_time() + float(getattr(_own, "elsewhere_s", 0.0))
 
 
 def _timed(kernel: Callable[..., object], *args: object) -> float:
