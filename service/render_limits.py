@@ -13,12 +13,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from contract.runtime.settings import Settings
-from contract.wire.rendering import RenderRequest, WorkerReply, render_cost
+from contract.wire.rendering import TYPICAL_GAUSSIANS, TYPICAL_SIZE, RenderRequest, WorkerReply, render_cost
 from service.access import Caller
 from service.problems import Problem
-
-TYPICAL_GAUSSIANS, TYPICAL_SIZE = 50_000, (640, 512)
-"""Of a scene that has not been shown yet."""
 
 OF_CALLER, OF_TENANT = 2, 4
 """How many renders of the most pixels, of a typical scene, may wait or be made at a time."""

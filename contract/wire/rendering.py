@@ -174,6 +174,10 @@ class WorkerReply(BaseModel):
     """Width and height of the clip in pixels: the image's where the request names none."""
 
 
+TYPICAL_GAUSSIANS, TYPICAL_SIZE = 50_000, (640, 512)
+"""What a scene is taken to have of which nothing is known yet."""
+
+
 def render_cost(pixels: int, gaussians: int) -> float:
     """What a render takes, in pixels x Gaussians. Work on each Gaussian counts as GAUSSIAN_PIXELS more pixels."""
     return float(pixels + GAUSSIAN_PIXELS) * gaussians

@@ -17,7 +17,15 @@ from contract.store.store import Store
 from contract.wire.errors import InputError, LimitError
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import MatrixPose, OrbitPose, world_from_camera
-from contract.wire.rendering import MEDIA_TYPES, ExportRequest, IntrinsicsOverride, RenderRequest, render_cost
+from contract.wire.rendering import (
+    MEDIA_TYPES,
+    TYPICAL_GAUSSIANS,
+    TYPICAL_SIZE,
+    ExportRequest,
+    IntrinsicsOverride,
+    RenderRequest,
+    render_cost,
+)
 from worker.daemon.kept import KeptReplies
 from worker.daemon.serve import NotYetError, Reply
 from worker.daemon.snapshot import Snapshot, Snapshots
@@ -37,9 +45,6 @@ COPIES = 3
 
 MAX_HELD_SCENES = 64
 """However small they are: each announcement of the worker names all of them."""
-
-UNKNOWN_GAUSSIANS, UNKNOWN_SIZE = 50_000, (640, 512)
-"""What a scene that is not in memory is taken to have, when it is estimated how long it will take."""
 
 
 class Views:
@@ -108,10 +113,10 @@ class Views:
         else:
             snapshot = self._snapshots.shown(request.scene_id)
             scene = snapshot.scene if snapshot is not None else None
-        gaussians = len(scene.gaussians) if scene is not None else UNKNOWN_GAUSSIANS
+        gaussians = len(scene.gaussians) if scene is not None else TYPICAL_GAUSSIANS
         if isinstance(request, ExportRequest):
             return render_cost(0, gaussians)
-        size = (scene.intrinsics.width, scene.intrinsics.height) if scene is not None else UNKNOWN_SIZE
+        size = (scene.intrinsics.width, scene.intrinsics.height) if scene is not None else TYPICAL_SIZE
         width, height = request.camera.size(*size)
         return render_cost(width * height, gaussians)
 
