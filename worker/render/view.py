@@ -35,7 +35,7 @@ HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see l
 MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""
 HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not known apart: they stay."
-COARSE = "This picture was drawn coarsely, because a job trains and time is short: rest, and it becomes sharp."
+COARSE = "This picture is coarse, because a job trains and time is short. It becomes sharp when the view rests."
 PART_PIXELS = 1 << 19
 """Pixels between two pauses of a large render."""
 ROUNDING = 1e-6
