@@ -7,8 +7,9 @@ and its ablation "w/o MAPF". Mode "fill" is ours. No mode reads a frame that is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -22,6 +23,7 @@ from worker.fusion.points import (
     concatenated,
     is_measured,
     measured_pixels,
+    nearest_pixels,
     points_at,
     sample,
     taken,
@@ -37,7 +39,11 @@ __all__ = [
     "PointCloud",
     "fuse",
     "motion_mask",
+    "nearest_pixels",
 ]
+
+
+NO_TRACKS: Mapping[int, Moved] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -45,8 +51,8 @@ class FusionSettings:
     """How points are chosen.
 
     mode               "paper": MAPF as published; "reference_only": the first training frame alone ("w/o MAPF");
-                       "fill": a grid on the first training frame; tissue hidden there is read in later
-                       frames, at the positions that tracks give
+                       "fill": a grid on the first training frame and on what later keyframes show beside it; tissue
+                       hidden there is read in later frames, at the positions that tracks give
     stride             "fill": pixels between neighbouring points
     motion_percentile  "paper": the threshold tau is this percentile of the nonzero differences on tissue
     frame_share        "paper": share kept of each later frame's points
@@ -74,13 +80,14 @@ def fuse(
     settings: FusionSettings,
     *,
     seed: int,
-    moved: Moved | None = None,
+    moved: Mapping[int, Moved] = NO_TRACKS,
     right: Eye | None = None,
 ) -> PointCloud:
     """The starting cloud of the training frames `train` (clip indices, rising). Same arguments, same bits.
 
     Args:
-        moved: for "fill", the tissue's displacement since the first training frame; None: it rests.
+        moved: for "fill", the keyframes and the tissue's displacement since each, of a single one since the first
+            training frame; empty: it rests.
         right: for "fill", the right eye, where it teaches too.
 
     Raises:

@@ -1,15 +1,16 @@
 """Points for all the tissue that the clip shows: the first frame's, then what later frames show of the rest.
 
 Tissue that is hidden in the first frame is read in a later frame, from where the tracks say it has moved to. Its point
-keeps its place among its neighbours in the first frame (docs/decisions/024).
+keeps its place among its neighbours in the first frame (docs/decisions/024). Where the camera moves on, later keyframes
+are searched likewise for what no point before shows (docs/decisions/050).
 
-Symbols: H W pixels (row i, column j), M cells, k stride in pixels. Lengths in mm, points in the world frame.
+Symbols: H W pixels (row i, column j), M cells, N points, k stride in pixels. Lengths in mm, points in the world frame.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -23,10 +24,12 @@ from worker.fusion.points import (
     cells_of,
     concatenated,
     is_measured,
+    nearest_pixels,
+    off_middle,
     points_at,
     same_pose,
 )
-from worker.input.camera import Intrinsics, unproject_at
+from worker.input.camera import Intrinsics, to_camera, unproject_at
 from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip, Eye
 from worker.machine.cores import cores
@@ -40,29 +43,40 @@ MARGIN = 1 / 16
 """Margin around the first frame, as a share of its sides, whose tissue gets points, too, if it comes into view."""
 MAX_VIEWS = 32
 """Later frames, evenly spread, that are searched for hidden cells along the tracks."""
+IN_VIEW = 0.5
+"""What is no farther off the middle (points.off_middle) is in view."""
+MAX_FARTHER = 1.15
+"""A keyframe that shows tissue from so many times the least distance shows it as finely."""
 HIDDEN, COMPLETED, MEASURED, CLEAR = range(4)
 """How well a frame shows a cell, rising: not; depth completed; depth measured; depth confident, far from masks."""
 
 
 def fill(
-    clip: DepthClip, frames: Sequence[int], stride: int, moved: Moved | None, right: Eye | None = None
+    clip: DepthClip, frames: Sequence[int], stride: int, moved: Mapping[int, Moved], right: Eye | None = None
 ) -> PointCloud:
     """A grid on the first frame's tissue; then each cell that it does not show, from the frame that shows it best.
 
     Of frames that show a cell equally well, the earliest is taken. A cell is k x k pixels. Its point comes from the
     middle pixel, or from the pixel to which the tissue in the middle has moved. What only the right eye sees comes
-    from its frames.
+    from its frames. Where the camera moves, keyframes share the tissue: each gives what it shows best.
+
+    moved: the keyframes, and the displacement since each; a single one is the first frame.
     """
     first, later = frames[0], frames[1:]
-    coverage = _Coverage(clip.intrinsics, stride)
-    parts = [coverage.add(clip, first, coverage.pixels[clip.tissue[first].reshape(-1)[coverage.pixels]])]
-    if moved is not None:
-        parts += _along_tracks(clip, first, later, stride, moved)
-        coverage.add_points(parts[1:])
-        later = [index for index in later if not same_pose(clip, index, first)]
-    views: list[tuple[Eye, int]] = [(clip, index) for index in later]
+    elsewhere = [index for index in later if not same_pose(clip, index, first)]
+    coverage = _Coverage(clip, stride, moved if elsewhere else {})
+    if len(moved) > 1:
+        parts = _from_keyframes(clip, frames, stride, moved, coverage)
+    else:
+        parts = [coverage.add(clip, first, coverage.pixels[clip.tissue[first].reshape(-1)[coverage.pixels]])]
+        for since in moved.values():
+            parts += _along_tracks(clip, first, later, _hidden_cells(clip, first, stride), since)
+            coverage.add_points(parts[1:])
+    views: list[tuple[Eye, int]] = [(clip, index) for index in (elsewhere if moved else later)]
     if right is not None:
         views += [(right, index) for index in frames]
+    if elsewhere and moved:
+        views = [views[place] for place in spread(range(len(views)), MAX_VIEWS)]
     for least in (CLEAR, MEASURED, COMPLETED):
         for eye, index in views:
             pixels = coverage.open_pixels(eye, index)
@@ -72,6 +86,37 @@ def fill(
                 parts.append(coverage.add(eye, index, pixels))
             eye.let_go(index)
     return concatenated(parts)
+
+
+def _from_keyframes(
+    clip: DepthClip, frames: Sequence[int], stride: int, moved: Mapping[int, Moved], coverage: _Coverage
+) -> list[PointCloud]:
+    """Points for what keyframes show: of each what it shows best, then the rest; then what instruments hide there."""
+    parts = []
+    for best in (True, False):
+        for key, index in enumerate(moved):
+            pixels = coverage.open_pixels(clip, index)
+            pixels = pixels[_shown(clip, index, pixels) >= MEASURED]
+            if best:
+                pixels = pixels[_best_key(points_at(clip, index, pixels).points_mm, clip, list(moved)) == key]
+            parts.append(coverage.add(clip, index, pixels, key))
+    for key, (index, since) in enumerate(moved.items()):
+        cells = _hidden_cells(clip, index, stride)
+        cells = cells.select(cells.in_view & np.isin(cells.pixels, coverage.open_pixels(clip, index)))
+        for found in _along_tracks(clip, index, [other for other in frames if other != index], cells, since):
+            parts.append(dataclasses.replace(found, key=np.full(len(found), key, np.int32)))
+            coverage.add_points(parts[-1:])
+    return parts
+
+
+def _best_key(points_mm: NDArray[np.float32], clip: DepthClip, keys: Sequence[int]) -> NDArray[np.intp]:
+    """[N] which keyframe shows each point nearest to the middle, of those that are not much farther from it than
+    another."""
+    off = np.stack([off_middle(points_mm, clip, index) for index in keys])
+    depth_mm = np.stack([to_camera(points_mm, clip.world_from_camera[index])[:, 2] for index in keys])
+    depth_mm[off > IN_VIEW] = np.inf
+    off[depth_mm > MAX_FARTHER * depth_mm.min(axis=0)] += 1
+    return np.asarray(np.argmin(off, axis=0), np.intp)
 
 
 def _shown(clip: Eye, index: int, pixels: NDArray[np.intp]) -> NDArray[np.uint8]:
@@ -87,13 +132,14 @@ def _shown(clip: Eye, index: int, pixels: NDArray[np.intp]) -> NDArray[np.uint8]
     return np.asarray(on_tissue.astype(np.uint8) + measured + clear, np.uint8)
 
 
-def _along_tracks(clip: DepthClip, first: int, later: Sequence[int], stride: int, moved: Moved) -> Iterator[PointCloud]:
-    """Points for the cells that the first frame does not show, each read where its tissue is when it is seen.
+def _along_tracks(
+    clip: DepthClip, first: int, later: Sequence[int], cells: _Cells, moved: Moved
+) -> Iterator[PointCloud]:
+    """Points for cells that the frame `first` does not show, each read where its tissue is when it is seen.
 
     So neighbouring cells get neighbouring tissue, whenever each is seen. A guessed motion may never bring a cell into
     sight. Such a cell gets the colour that a later frame shows in its place, and a completed depth.
     """
-    cells = _hidden_cells(clip, first, stride)
     unseen = cells.in_view.copy()
 
     def points_of(view: tuple[int, NDArray[np.intp], NDArray[np.intp]]) -> PointCloud:
@@ -117,6 +163,7 @@ def _along_tracks(clip: DepthClip, first: int, later: Sequence[int], stride: int
             confidence=np.full(len(chosen), COMPLETED_CONFIDENCE, np.float32),
             frame=np.full(len(chosen), first, np.int32),
             reference_mm=place_mm,
+            key=np.zeros(len(chosen), np.int32),
         )
 
 
@@ -194,8 +241,10 @@ def _middles(side: int, beyond: int, stride: int) -> NDArray[np.intp]:
 class _Coverage:
     """Which cells of a view the points taken so far already cover."""
 
-    def __init__(self, intrinsics: Intrinsics, stride: int) -> None:
-        """intrinsics: of any eye; all have one size."""
+    def __init__(self, clip: DepthClip, stride: int, moved: Mapping[int, Moved]) -> None:
+        """moved: as for fill, of a camera that moves; empty: points count where they lie in the first frame."""
+        self._clip, self._moved = clip, moved
+        intrinsics = clip.intrinsics  # all eyes have one size
         self._width, self._stride = intrinsics.width, stride
         middle_row, middle_column = (_middles(size, 0, stride) for size in (intrinsics.height, intrinsics.width))
         self._shape = (middle_row.size, middle_column.size)
@@ -203,37 +252,78 @@ class _Coverage:
         """Flat index of each cell's middle pixel."""
         self._covered = np.zeros(self.pixels.size, dtype=np.bool_)
         self._view: tuple[Intrinsics, NDArray[np.float64]] | None = None
-        self._points_mm: list[NDArray[np.float32]] = []
+        self._points: list[_Covering] = []
 
     def open_pixels(self, eye: Eye, index: int) -> NDArray[np.intp]:
         """Middle pixels of the cells that no point covers as seen by this eye in this frame."""
         self._look_from(eye, index)
         return self.pixels[~self._covered]
 
-    def add(self, eye: Eye, index: int, pixels: NDArray[np.intp]) -> PointCloud:
-        """The points of these middle pixels of one frame; from now on they cover their cells."""
+    def add(self, eye: Eye, index: int, pixels: NDArray[np.intp], key: int | None = None) -> PointCloud:
+        """The points of these middle pixels of one frame; from now on they cover their cells.
+
+        They follow the tracks of this keyframe; None: of the one that shows each best.
+        """
         self._look_from(eye, index)
         cloud = points_at(eye, index, pixels)
+        if self._moved:
+            best = _best_key(cloud.points_mm, self._clip, list(self._moved)) if key is None else key
+            cloud = dataclasses.replace(cloud, key=np.full(len(cloud), best, np.int32))
         rows, columns = np.divmod(pixels, self._width)
         self._covered[rows // self._stride * self._shape[1] + columns // self._stride] = True
-        self._points_mm.append(cloud.points_mm)
+        self.add_points([cloud])
         return cloud
 
     def add_points(self, clouds: Iterable[PointCloud]) -> None:
         """Count these points as covering the cells that they project into, from any pose."""
-        self._points_mm += [cloud.reference_mm for cloud in clouds]
+        self._points += [_Covering.of(cloud, self._clip, self._moved) for cloud in clouds]
 
     def _look_from(self, eye: Eye, index: int) -> None:
         view = eye.intrinsics, eye.world_from_camera[index]
         if self._view is not None and self._view[0] == view[0] and np.array_equal(self._view[1], view[1]):
             return
         self._view = view
-        if not self._points_mm:
+        if not self._points:
             return
-        points_mm = np.concatenate(self._points_mm)
+        points_mm = np.concatenate([each.at(index) for each in self._points])
         cells, _ = cells_of(points_mm, *view, self._stride)
         covered = np.zeros(self._shape, dtype=np.uint8)
         covered.reshape(-1)[cells] = 1
         # Seen from another pose the grid is uneven: a gap of one cell between points is not a hole.
         closed = cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         self._covered = np.asarray(closed, dtype=np.bool_).reshape(-1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Covering:
+    """Points and where they are at any time.
+
+    start_mm [N, 3]  where they would lie in their keyframes
+    motions          each keyframe's displacement, with which of the points [M] follow it and their pixels there [M]
+    """
+
+    start_mm: NDArray[np.float32]
+    motions: Sequence[tuple[Moved, NDArray[np.intp], NDArray[np.intp]]]
+
+    @classmethod
+    def of(cls, cloud: PointCloud, clip: DepthClip, moved: Mapping[int, Moved]) -> _Covering:
+        """moved: empty if they rest where they lie in their keyframes."""
+        if not moved:
+            return cls(cloud.reference_mm, ())
+        start_mm, motions = cloud.points_mm.copy(), []
+        for key, (index, since) in enumerate(moved.items()):
+            rows = np.flatnonzero(cloud.key == key)
+            pixels = nearest_pixels(cloud.reference_mm[rows], clip, index)
+            for frame in np.unique(cloud.frame[rows]):
+                there = cloud.frame[rows] == frame
+                start_mm[rows[there]] -= since(int(frame), pixels[there])
+            motions.append((since, rows, pixels))
+        return cls(start_mm, motions)
+
+    def at(self, index: int) -> NDArray[np.float32]:
+        """[N, 3] where they are at a frame."""
+        points_mm = self.start_mm.copy() if self.motions else self.start_mm
+        for since, rows, pixels in self.motions:
+            if rows.size:
+                points_mm[rows] += since(index, pixels)
+        return points_mm

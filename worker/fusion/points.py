@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,8 @@ class PointCloud:
     rgb          [N, 3] float32  in [0, 1]
     confidence   [N]    float32  of the depth, in [0, 1]; COMPLETED_CONFIDENCE where the depth was completed
     frame        [N]    int32    clip index of the frame in which each point lay at points_mm
-    reference_mm [N, 3] float32  world: where it lay in the first training frame if the tracks say, else points_mm
+    reference_mm [N, 3] float32  world: where it lay in its keyframe if the tracks say, else points_mm
+    key          [N]    int32    which of the keyframes (worker/motion/keyframes.py) this is
     """
 
     points_mm: NDArray[np.float32]
@@ -38,6 +40,7 @@ class PointCloud:
     confidence: NDArray[np.float32]
     frame: NDArray[np.int32]
     reference_mm: NDArray[np.float32]
+    key: NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.points_mm)
@@ -68,13 +71,34 @@ def cells_of(
     return cells, in_front[visible]
 
 
+def nearest_pixels(points_mm: NDArray[np.floating], clip: Eye, index: int) -> NDArray[np.intp]:
+    """[N] flat index of the pixel of a frame that points (world) lie in, the nearest one if outside."""
+    k, (column, row) = clip.intrinsics, _places(points_mm, clip, index)
+    column, row = np.clip(np.floor(column), 0, k.width - 1), np.clip(np.floor(row), 0, k.height - 1)
+    return np.asarray(row * k.width + column, np.intp)
+
+
+def off_middle(points_mm: NDArray[np.floating], clip: Eye, index: int) -> NDArray[np.floating]:
+    """[N] how far from the middle of a frame points (world) lie, as a share of its sides: up to 0.5 in view."""
+    k, (column, row) = clip.intrinsics, _places(points_mm, clip, index)
+    return np.asarray(np.maximum(np.abs(column / k.width - 0.5), np.abs(row / k.height - 0.5)))
+
+
+def _places(points_mm: NDArray[np.floating], clip: Eye, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Column and row [N] of points (world) in a frame, px."""
+    k, (x, y, z) = clip.intrinsics, to_camera(points_mm, clip.world_from_camera[index]).T
+    z = np.maximum(z, 1e-6)
+    return k.fx * x / z + k.cx, k.fy * y / z + k.cy
+
+
 def measured_pixels(clip: Eye, index: int) -> NDArray[np.intp]:
     """Flat indices of the frame's tissue pixels with valid depth."""
     return np.flatnonzero(is_measured(clip, index))
 
 
 def points_at(clip: Eye, index: int, pixels: NDArray[np.intp]) -> PointCloud:
-    """The points of one frame's tissue pixels (flat indices). Depth that was not measured is completed."""
+    """The points of one frame's tissue pixels (flat indices), with the first keyframe. Depth that was not measured is
+    completed."""
     depth_mm = clip.depth_mm[index].reshape(-1)[pixels]
     measured = depth_mm > 0
     if not measured.all():
@@ -88,6 +112,7 @@ def points_at(clip: Eye, index: int, pixels: NDArray[np.intp]) -> PointCloud:
         confidence=np.where(measured, confidence, np.float32(COMPLETED_CONFIDENCE)),
         frame=np.full(pixels.size, index, dtype=np.int32),
         reference_mm=points_mm,
+        key=np.zeros(pixels.size, dtype=np.int32),
     )
 
 

@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from worker.input.clip import DepthClip
 from worker.machine.cores import cores
 from worker.motion.tracks import Tracks, resting
-from worker.motion.trials import BasisValues, FitError, Trial
+from worker.motion.trials import CELLS, BasisValues, FitError, Trial, mean_error, mean_picture_error
 
 BASES = (3, 5, 9, 13, 17, 25, 33, 49, 65, 97, 129, 161, 193)
 """Numbers of bases to choose from, besides REST."""
@@ -75,31 +76,40 @@ class Trials:
 
 
 def try_bases(
-    tracks: Tracks, clip: DepthClip, train: Sequence[int], basis_values: BasisValues, max_bases: int | None = None
+    tracks: Sequence[Tracks],
+    clip: DepthClip,
+    train: Sequence[int],
+    basis_values: BasisValues,
+    max_bases: int | None = None,
 ) -> Trials:
-    """The error of each number of bases up to max_bases, in validation frames.
+    """The error of each number of bases up to max_bases, in validation frames. tracks: of each keyframe.
 
     Every fourth training frame is a validation frame. The tracks in the others are fitted by three quarters of B bases;
     the error is the fit's difference from the tracks in the validation frames. There are more than MIN_FRAMES_A_BASIS
     training frames for each basis.
 
-    Tracks are noise if moving along them brings the pictures of the validation frames no more than MIN_GAIN_DB nearer
-    than rest does, with the largest number of bases. The result then has `resting`.
+    The tracks of a single keyframe are noise if moving along them brings the pictures of the validation frames no more
+    than MIN_GAIN_DB nearer than rest does, with the largest number of bases. The result then has `resting`.
     """
     if len(train) < MIN_TRIAL_FRAMES:
         return Trials({})
-    trial, at_rest = (Trial.of(each, clip, train, basis_values) for each in (tracks, resting(tracks, clip, train)))
-    if len(trial.places) < MIN_TRIAL_CELLS:
+    cells = CELLS // len(tracks)
+    trials = [Trial.of(each, clip, train, basis_values, cells) for each in tracks]
+    if sum(len(each.places) for each in trials) < MIN_TRIAL_CELLS:
         return Trials({})
     limit = _bases_limit(len(train), max_bases).count
     numbers = sorted({REST, min(limit, BASES[0]), *(each for each in BASES if each <= limit)})
     with ThreadPoolExecutor(cores()) as pool:
-        tracked = dict(zip(numbers, pool.map(trial.error, numbers), strict=True))
-    if len(at_rest.places) < MIN_TRIAL_CELLS:  # instruments hide the tissue's places: rest cannot be judged
+        tracked = dict(zip(numbers, pool.map(partial(mean_error, trials), numbers), strict=True))
+    if len(tracks) > 1:  # the camera moved on: no picture rests
         return Trials(tracked)
-    if at_rest.picture_error(numbers[-1]) > trial.picture_error(numbers[-1]) * 10 ** (MIN_GAIN_DB / 10):
+    at_rest = [Trial.of(resting(tracks[0], clip, train), clip, train, basis_values)]
+    if len(at_rest[0].places) < MIN_TRIAL_CELLS:  # instruments hide the tissue's places: rest cannot be judged
         return Trials(tracked)
-    return Trials(tracked, {bases: at_rest.error(bases) for bases in numbers})
+    error, error_at_rest = (mean_picture_error(each, numbers[-1]) for each in (trials, at_rest))
+    if error_at_rest > error * 10 ** (MIN_GAIN_DB / 10):
+        return Trials(tracked)
+    return Trials(tracked, {bases: mean_error(at_rest, bases) for bases in numbers})
 
 
 def choose_bases(trials: Trials, floor: float, frames: int, max_bases: int | None = None) -> Choice:
@@ -151,13 +161,14 @@ def _most_bases(frames: int) -> int:
 # points -------------------------------------------------------------------------------------------------------------
 
 
-def choose_stride(clip: DepthClip, index: int, finest: int, motion_error: float) -> Choice:
-    """Pixels between points: the largest stride whose expected error is within MIN_GAIN_DB of the finest's.
+def choose_stride(clip: DepthClip, keys: Sequence[int], finest: int, motion_error: float) -> Choice:
+    """Pixels between points: the largest stride whose expected error in these frames is within MIN_GAIN_DB of the
+    finest's.
 
     It is at most MAX_COARSENING times the finest. motion_error is what the motion leaves whatever the points, in
     squared grey levels.
     """
-    errors = {stride: floor_error(clip, index, stride) for stride in range(finest, MAX_COARSENING * finest + 1)}
+    errors = {stride: mean_floor_error(clip, keys, stride) for stride in range(finest, MAX_COARSENING * finest + 1)}
     allowed = (errors[finest] + motion_error) * 10 ** (MIN_GAIN_DB / 10)
     stride = max(each for each, error in errors.items() if error + motion_error <= allowed)
     left = ", ".join(
@@ -181,3 +192,8 @@ def floor_error(clip: DepthClip, index: int, stride: int) -> float:
     mean = cv2.resize(image * tissue[..., None], few, interpolation=cv2.INTER_AREA) / weight[..., None]
     missed = (cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR) - image)[clip.tissue[index]]
     return TRAINED_SHARE * float(np.square(missed).mean()) if missed.size else 0.0
+
+
+def mean_floor_error(clip: DepthClip, keys: Sequence[int], stride: int) -> float:
+    """Mean of floor_error over these frames."""
+    return sum(floor_error(clip, index, stride) for index in keys) / len(keys)

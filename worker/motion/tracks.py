@@ -1,11 +1,12 @@
-"""Motion known before training: optical flow from the first training frame, lifted to 3D by stereo depth.
+"""Motion known before training: optical flow from a keyframe, the reference, lifted to 3D by stereo depth.
 
-Dense flow (DIS) from the reference to every training frame gives each reference pixel a track. Forward and backward
-flow check each other. A track's displacements and changes of colour are averages of its trusted neighbours, over a
-wider area where few are trusted (docs/decisions/024). fit_tracks fits the bases of a motion to them. Held-out frames
-are never read.
+Dense flow (DIS) from the reference to every training frame that sees enough of it gives each reference pixel a track.
+Forward and backward flow check each other. A track's displacements and changes of colour are averages of its trusted
+neighbours, over a wider area where few are trusted (docs/decisions/024). fit_tracks fits the bases of a motion to them.
+Held-out frames are never read.
 
-Symbols: K training frames, h w pixels of the coarse grid on which flow is computed, N points, B bases.
+Symbols: T training frames, K of them followed; h w pixels of the coarse grid on which flow is computed; N points, B
+bases.
 """
 
 from __future__ import annotations
@@ -17,37 +18,32 @@ from dataclasses import dataclass
 from threading import Lock, Semaphore
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.input.camera import unproject
 from worker.input.clip import DepthClip
 from worker.machine.cores import cores
 from worker.machine.mapped import let_go, mapped_zeros
 from worker.machine.opencv import one_opencv_thread
-from worker.motion.complete import complete_depth
 from worker.motion.least_squares import fit_series
+from worker.motion.lifted import (
+    COLOUR_SMOOTH_PX,
+    CoarseFrame,
+    Floats,
+    Flows,
+    Grid,
+    averaged,
+    cell_means,
+    lifted,
+)
 
-Floats = NDArray[np.float32]
 Moved = Callable[[int, NDArray[np.intp]], Floats]
-"""Displacements [M, 3] mm (world) of what the first training frame's pixels (flat, [M]) show, to a training frame."""
+"""Displacements [M, 3] mm (world) of what a keyframe's pixels (flat, [M]) show, to a training frame."""
 
 FLOW_WIDTH = 320
 """Maximum width in px at which flow is computed: the clip is reduced by the smallest whole factor that fits."""
 MIN_GRID_SIDE = 16
 """Minimum cells along the coarse grid's shorter side, which DIS needs; a smaller clip is not reduced."""
-ROUND_TRIP_PX = 1.0
-"""A difference of this much between forward and backward flow, in px of the coarse grid, halves the confidence."""
-SMOOTH_PX = 4.0
-"""Standard deviation of the Gaussian mean of displacements, in px of the coarse grid: depth is noisy."""
-COLOUR_SMOOTH_PX = 2.0
-"""The same for changes of colour: light varies over smaller patches than motion does."""
-SURROUNDINGS = 0.1
-"""Weight of the wider surroundings' mean in an average; full trust has 1."""
-LOST, LOST_SMOOTH_PX = 0.1, 1.0
-"""A track of less confidence ends on the surface that surrounds it; px of the coarse grid over which that eases in."""
-MIN_DEPTH_MM = 1e-3
 GUESSED = 0.02
 """Minimum confidence of a track when a motion starts from it: the surroundings' displacement is better than none."""
 CHAINS = 2
@@ -59,25 +55,35 @@ POINTS_AT_ONCE, FRAMES_AT_ONCE = 4096, 128
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Displacement of reference pixels to every training frame, and how their colour changed on the way.
+    """Displacement of a reference's pixels to training frames, and how their colour changed on the way.
 
     displacement_mm [K, h, w, 3]  world axes, mm; mean of the trusted neighbours, 0 without any; a lost one ends on
                                   the frame's surface
     colour          [K, h, w, 3]  colour there minus colour in the reference, RGB in [0, 1]; mean likewise
     confidence      [K, h, w]     in [0, 1]; 0 where the track is lost, hidden or without depth
     step_px                       clip pixels between neighbouring cells of the grid
+    reference                     place of the reference among all training frames
+    places                        [K] those of the frames followed, rising; None: K are all training frames
     """
 
     displacement_mm: Floats
     colour: Floats
     confidence: Floats
     step_px: int
+    reference: int = 0
+    places: Sequence[int] | None = None
 
     @classmethod
-    def empty(cls, frames: int, grid: tuple[int, ...], step_px: int) -> Tracks:
+    def empty(cls, places: Sequence[int], grid: tuple[int, ...], step_px: int, reference: int = 0) -> Tracks:
         """Tracks of zeros, in files (worker/machine/mapped.py)."""
-        displacement_mm, colour = (mapped_zeros((frames, *grid, 3), np.float32) for _ in range(2))
-        return cls(displacement_mm, colour, mapped_zeros((frames, *grid), np.float32), step_px)
+        displacement_mm, colour = (mapped_zeros((len(places), *grid, 3), np.float32) for _ in range(2))
+        confidence = mapped_zeros((len(places), *grid), np.float32)
+        return cls(displacement_mm, colour, confidence, step_px, reference, places)
+
+    @property
+    def followed(self) -> NDArray[np.intp]:
+        """[K] places of the frames followed among all training frames."""
+        return np.array(range(len(self.confidence)) if self.places is None else self.places, np.intp)
 
     def let_go(self, place: int) -> None:
         """Take a frame's part out of memory. It comes back when it is asked for."""
@@ -107,41 +113,45 @@ def track(
     train: Sequence[int],
     on_progress: Callable[[float], None] = lambda share: None,
     *,
+    reference: int = 0,
+    places: Sequence[int] | None = None,
     threads: int | None = None,
 ) -> Tracks:
-    """Tracks of the first training frame's tissue through the others. They do not depend on `threads` (None: cores).
+    """Tracks of one training frame's tissue through the others. They do not depend on `threads` (None: cores).
 
-    on_progress gets the share of frames done. Threads of this function call it, one at a time. What it raises ends the
-    tracking and is raised here.
+    Args:
+        reference: the place of that frame in train.
+        places: those of the frames to follow it to, rising, with its own; None: all.
+        on_progress: gets the share of frames done. Threads of this function call it, one at a time. What it raises
+            ends the tracking and is raised here.
     """
     step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // MIN_GRID_SIDE))
-    grid = _Grid(clip, step)
-    reference = _Coarse(clip, train[0], grid)
-    tracks = Tracks.empty(len(train), reference.grey.shape, step)
-    tracks.confidence[0] = reference.trust
+    grid = Grid(clip, step)
+    start, places = CoarseFrame(clip, train[reference], grid), range(len(train)) if places is None else places
+    tracks, own = Tracks.empty(places, start.grey.shape, step, reference), places.index(reference)
+    tracks.confidence[own] = start.trust
     followed, counting = 0, Lock()
 
-    def lift(place: int, target: _Coarse, forward: Floats, backward: Floats) -> None:
+    def lift(row: int, target: CoarseFrame, forward: Floats, backward: Floats) -> None:
         nonlocal followed
-        found = _lift(reference, target, forward, backward)
-        tracks.displacement_mm[place], tracks.colour[place], tracks.confidence[place] = found
-        tracks.let_go(place)
+        found = lifted(start, target, forward, backward)
+        tracks.displacement_mm[row], tracks.colour[row], tracks.confidence[row] = found
+        tracks.let_go(row)
         with counting:
             followed += 1
-            on_progress(followed / (len(train) - 1))
+            on_progress(followed / (len(places) - 1))
 
-    def follow(places: Sequence[int]) -> None:
-        flow_solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        forward: Floats | None = None
-        for place in places:  # in order of time: the last flow starts the next
-            target = _Coarse(clip, train[place], grid)
-            forward = flow_solver.calc(reference.grey, target.grey, None if forward is None else forward.copy())
-            backward = flow_solver.calc(target.grey, reference.grey, -forward)
-            helped.run(lift, place, target, forward, backward)
+    def follow(rows: Sequence[int]) -> None:
+        flows = Flows(start)
+        for row in rows:
+            target = CoarseFrame(clip, train[places[row]], grid)
+            forward, backward = flows.to(target)
+            helped.run(lift, row, target, forward, backward)
 
     threads = cores() if threads is None else threads
-    length = -(-len(train) // CHAINS)
-    chains = [range(max(first, 1), min(first + length, len(train))) for first in range(0, len(train), length)]
+    length = -(-len(places) // CHAINS)
+    parts = (range(first, min(first + length, len(places))) for first in range(0, len(places), length))
+    chains = [[row for row in part if row != own] for part in parts]
     with one_opencv_thread(), ThreadPoolExecutor(min(CHAINS, threads)) as pool, _Helpers(threads - CHAINS) as helped:
         list(pool.map(follow, chains))
     return tracks
@@ -175,121 +185,16 @@ class _Helpers:
             job.result()
 
 
-def cell_means(image: NDArray[Any], step: int) -> NDArray[Any]:
-    """[h, w, ...] means of the cells of step by step pixels. Cell (i, j) starts at pixel (step i, step j).
-
-    Pixels beyond the last whole cell are ignored.
-    """
-    h, w = image.shape[0] // step, image.shape[1] // step
-    means: NDArray[Any] = cv2.resize(image[: h * step, : w * step], (w, h), interpolation=cv2.INTER_AREA)
-    return means
-
-
-class _Grid:
-    """The coarse grid: the pixels that it samples and their rays. h w cells, step pixels apart."""
-
-    def __init__(self, clip: DepthClip, step: int) -> None:
-        height, width = clip.tissue.shape[1:]
-        self.step, self.size = step, (width // step, height // step)
-        rows, columns = np.mgrid[0 : self.size[1], 0 : self.size[0]] * step + step // 2
-        pixels = (rows * width + columns).ravel()
-        rays = unproject(pixels, np.ones(pixels.size, np.float32), clip.intrinsics, np.eye(4))
-        self.rays = rays.reshape(*rows.shape, 3).astype(np.float32)
-        """[h, w, 3] points at depth 1, camera axes."""
-
-    def cells_at(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Column and row in the grid, not rounded, of what lies at (x, y) at depth 1, camera axes."""
-        height, width = self.rays.shape[:2]
-        (left, top, _), (right, bottom, _) = self.rays[0, 0], self.rays[-1, -1]
-        return (x - left) * ((width - 1) / (right - left)), (y - top) * ((height - 1) / (bottom - top))
-
-    def sample(self, values: NDArray[Any]) -> NDArray[Any]:
-        """[h, w] the cells' middle pixels of an image; a view."""
-        return values[self.step // 2 :: self.step, self.step // 2 :: self.step][: self.size[1], : self.size[0]]
-
-
-class _Coarse:
-    """A frame on the coarse grid: colour, grey, depth, points (world, mm), and the confidence of depth and mask.
-
-    Where no tissue is measured, depth is completed from around; it is 0 in a frame without any.
-    """
-
-    def __init__(self, clip: DepthClip, index: int, grid: _Grid) -> None:
-        self.grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), grid.step)
-        self.rgb = np.asarray(cell_means(clip.rgb[index], grid.step) / np.float32(255), np.float32)
-        depth_mm = grid.sample(clip.depth_mm[index])
-        usable = grid.sample(clip.tissue[index]) & (depth_mm > 0)
-        pose = clip.world_from_camera[index].astype(np.float32)
-        self.grid, self.axes, self.place_mm = grid, pose[:3, :3], pose[:3, 3]
-        self.depth_mm = complete_depth(depth_mm, usable, np.ones_like(usable))
-        self.points_mm: Floats = (grid.rays * self.depth_mm[..., None]) @ self.axes.T + self.place_mm
-        confidence = grid.sample(clip.depth_confidence[index]) / np.float32(255)
-        self.trust = np.where(usable, confidence, np.float32(0))
-        clip.let_go(index)
-
-
-def _lift(reference: _Coarse, target: _Coarse, forward: Floats, backward: Floats) -> tuple[Floats, Floats, Floats]:
-    """Displacement (mm), change of colour and confidence of every reference cell, from the flows there and back."""
-    rows, columns = np.mgrid[0 : forward.shape[0], 0 : forward.shape[1]].astype(np.float32)
-    x, y = columns + forward[..., 0], rows + forward[..., 1]
-
-    def at_target(values: Floats) -> Floats:
-        moved: Floats = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        return moved
-
-    round_trip = forward + at_target(backward)
-    trust = at_target(target.trust)
-    agree = 1 / (1 + (np.square(round_trip).sum(-1) / ROUND_TRIP_PX**2) ** 2)
-    confidence = reference.trust * trust * (trust > 0.5) * agree
-    point_mm = at_target(target.points_mm * target.trust[..., None]) / np.maximum(trust, 1e-3)[..., None]
-    displacement = _averaged(np.subtract(point_mm, reference.points_mm), confidence, SMOOTH_PX)
-    if target.depth_mm.any():  # else nobody knows its surface
-        displacement = _onto_surface(reference, target, displacement, confidence)
-    colour = _averaged(np.subtract(at_target(target.rgb), reference.rgb), confidence, COLOUR_SMOOTH_PX)
-    return displacement, colour, np.minimum(confidence, 1).astype(np.float32)
-
-
-def _onto_surface(reference: _Coarse, target: _Coarse, displacement: Floats, confidence: Floats) -> Floats:
-    """The displacement [h, w, 3] with the ends of lost tracks on target's surface, along the line of sight.
-
-    What hides stays on the surface around it: a displacement that is guessed from farther away, where tissue may be
-    pulled towards the camera, would lift it into free space.
-    """
-    end_mm = (reference.points_mm + displacement - target.place_mm) @ target.axes
-    z = np.maximum(end_mm[..., 2], MIN_DEPTH_MM)
-    x, y = target.grid.cells_at(end_mm[..., 0] / z, end_mm[..., 1] / z)
-    surface_mm = cv2.remap(target.depth_mm, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    lost = cv2.GaussianBlur((confidence < LOST).astype(np.float32), (0, 0), LOST_SMOOTH_PX)
-    along_mm = end_mm * (lost * (surface_mm / z - 1))[..., None]
-    return np.asarray(displacement + along_mm @ target.axes.T, np.float32)
-
-
-def _averaged(values: Floats, confidence: Floats, over_px: float) -> Floats:
-    """Normalised convolution: Gaussian mean [h, w, 3] weighted by confidence.
-
-    Where no neighbour is trusted, wider surroundings fill in.
-    """
-    weight = np.asarray(cv2.GaussianBlur(confidence, (0, 0), over_px), np.float32)
-    return _completed(cv2.GaussianBlur(values * confidence[..., None], (0, 0), over_px), weight)
-
-
-def _completed(total: Floats, weight: Floats) -> Floats:
-    """total [h, w, 3] / weight [h, w]; the result on a grid half as fine counts as one more observation (pull-push)."""
-    height, width = weight.shape
-    if min(height, width) < 2:
-        return np.broadcast_to(total.sum((0, 1)) / max(float(weight.sum()), 1e-9), total.shape).astype(np.float32)
-    half = ((width + 1) // 2, (height + 1) // 2)
-    coarse = _completed(*(np.asarray(cv2.resize(x, half, interpolation=cv2.INTER_AREA)) for x in (total, weight)))
-    wider = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.asarray((total + SURROUNDINGS * wider) / (weight + SURROUNDINGS)[..., None], np.float32)
-
-
 def moved_along(tracks: Tracks, train: Sequence[int], width: int) -> Moved:
-    """The tracks as a function for fusion. train lists the clip's frames that they cover; width is the clip's in px."""
-    place_of = {index: place for place, index in enumerate(train)}
+    """The tracks as a function for fusion: to a frame that was not followed as to the nearest one that was.
+
+    train lists the clip's training frames; width is the clip's in px.
+    """
+    followed = np.array(train)[tracks.followed]
 
     def moved(index: int, pixels: NDArray[np.intp]) -> Floats:
-        found: Floats = tracks.displacement_mm[place_of[index]][tracks.cells(*np.divmod(pixels, width))]
+        row = int(np.abs(followed - index).argmin())
+        found: Floats = tracks.displacement_mm[row][tracks.cells(*np.divmod(pixels, width))]
         return found
 
     return moved
@@ -301,21 +206,22 @@ def resting(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> Tracks:
     The confidence is the tracks' where a cell shows only tissue, else 0.
     """
     (frames, *grid), step = tracks.confidence.shape, tracks.step_px
-    rest = Tracks.empty(frames, tuple(grid), step)
-    start = cell_means(clip.rgb[train[0]], step).astype(np.float32)
+    followed = tracks.followed
+    rest = Tracks.empty(followed.tolist(), tuple(grid), step, tracks.reference)
+    start = cell_means(clip.rgb[train[tracks.reference]], step).astype(np.float32)
 
     def look(place: int) -> None:
-        index = train[place]
+        index = train[followed[place]]
         tissue = cell_means(clip.tissue[index].astype(np.uint8) * np.uint8(255), step) == 255
         rest.confidence[place] = np.where(tissue, tracks.confidence[place], 0)
         change = (cell_means(clip.rgb[index], step) - start) / np.float32(255)
-        rest.colour[place] = _averaged(change, rest.confidence[place], COLOUR_SMOOTH_PX)
+        rest.colour[place] = averaged(change, rest.confidence[place], COLOUR_SMOOTH_PX)
         for used in (rest, tracks):
             used.let_go(place)
         clip.let_go(index)
 
     with one_opencv_thread(), ThreadPoolExecutor(cores()) as pool:
-        list(pool.map(look, range(len(train))))
+        list(pool.map(look, range(frames)))
     return rest
 
 
@@ -334,7 +240,7 @@ def fit_tracks(
     point.
 
     Args:
-        basis: [K, B] value of every basis at every training time.
+        basis: [T, B] value of every basis at every training time, of T.
         pixels: [N] flat pixel indices (row * width + column) of the points in the reference frame.
         width: of the clip, px.
         share_px: points in the same square of this many pixels share the weights of its first pixel.
@@ -351,7 +257,7 @@ def fit_tracks(
     weights = np.zeros((len(shared), basis.shape[1], 6), np.float32)
     support = np.zeros(len(shared), np.float32)
 
-    trust = tracks.confidence.mean((1, 2))
+    basis, trust = basis[tracks.followed], tracks.confidence.mean((1, 2))
     least = guessed * trust / max(float(trust.max()), 1e-9)
     at_once = max(1, POINTS_AT_ONCE * FRAMES_AT_ONCE // max(len(basis), FRAMES_AT_ONCE))
 

@@ -3,7 +3,7 @@
 Verbs: with_poses; camera_rests, and find_path of estimate.py.
 """
 
-from worker.poses.posed import with_poses
+from worker.poses.posed import placed, with_poses
 from worker.poses.still import camera_rests
 
-__all__ = ["camera_rests", "with_poses"]
+__all__ = ["camera_rests", "placed", "with_poses"]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.input.clip import DepthClip
-from worker.motion.tracks import cell_means
+from worker.motion.lifted import cell_means
 from worker.poses.rigid import Reals, StereoCamera
 
 Floats = NDArray[np.float32]

@@ -86,7 +86,7 @@ def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) 
         f"its path fits the rigid parts within {found.rigid_fit_mm:.2f} mm"
     )
     told = _told(clip, "estimated", found)
-    clip = _placed(clip, found.world_from_camera)
+    clip = placed(clip, found.world_from_camera)
     notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, text))
     return replace(clip, poses=told, assumptions=notices, warnings=(*clip.warnings, *warnings))
 
@@ -96,13 +96,13 @@ def _fixed(clip: DepthClip, how: str, found: FoundPath | None = None, *warnings:
     if found is not None:
         told = _told(clip, "fixed", found).model_copy(update={"path_mm": None, "extent_mm": None, "extent_deg": None})
     if not (clip.world_from_camera == np.eye(4)).all():
-        clip = _placed(clip, np.tile(np.eye(4), (clip.frame_count, 1, 1)))
+        clip = placed(clip, np.tile(np.eye(4), (clip.frame_count, 1, 1)))
     notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, f"poses: the camera {how}"))
     return replace(clip, poses=told, assumptions=notices, warnings=(*clip.warnings, *warnings))
 
 
-def _placed(clip: DepthClip, world_from_camera: NDArray[np.float64]) -> DepthClip:
-    """The clip with both eyes at these poses of the left one."""
+def placed(clip: DepthClip, world_from_camera: NDArray[np.float64]) -> DepthClip:
+    """The clip with both eyes at these poses [T, 4, 4] of the left one, mm."""
     right = clip.right
     if right is not None:
         left_from_right = np.linalg.inv(clip.world_from_camera[0]) @ right.world_from_camera[0]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.input.clip import DepthClip, spread
-from worker.motion.tracks import cell_means
+from worker.motion.lifted import cell_means
 
 LOOK_WIDTH = 160
 LOOKS = 8

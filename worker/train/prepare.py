@@ -9,7 +9,8 @@ from contract.wire.notices import Notice
 from worker.fusion import fuse
 from worker.machine.memory import LITTLE_BYTES, keep_free_memory
 from worker.model.deformation import SharedBasis
-from worker.motion.tracks import Tracks, moved_along, track
+from worker.motion.keyframes import track_keyframes
+from worker.motion.tracks import Tracks, moved_along
 from worker.raster.backend import CPU, examine
 from worker.raster.model import Model
 from worker.train.calibrate import measured_schedule, warm_up
@@ -38,7 +39,7 @@ def prepare(setup: Setup) -> Run:
     with timings.measure("capacity_s"):
         preset, chosen = settled(setup.preset, tracks, clip, train)
     with timings.measure("fusion_s"):
-        moved = moved_along(tracks, train, clip.intrinsics.width) if tracks is not None else None
+        moved = {train[each.reference]: moved_along(each, train, clip.intrinsics.width) for each in tracks}
         right = setup.teaching_eyes[1] if len(setup.teaching_eyes) > 1 else None
         fusion = fusion_for(preset, clip.intrinsics)
         cloud = fuse(clip, train, fusion, seed=setup.options.seed, moved=moved, right=right)
@@ -87,13 +88,13 @@ def begun(
     return run
 
 
-def _tracks(setup: Setup) -> Tracks | None:
-    """Optical-flow tracks of the training frames, where the preset starts its motion with them."""
+def _tracks(setup: Setup) -> list[Tracks]:
+    """Optical-flow tracks of each keyframe, where the preset starts its motion with them."""
     train = setup.split.train
     if not setup.preset.tracks or setup.preset.deformation != SharedBasis.kind or len(train) < 2:
-        return None
+        return []
     with setup.timings.measure("motion_s"):
-        tracks = track(setup.clip, train, partial(setup.hooks.report_stage, "motion"))
+        tracks = track_keyframes(setup.clip, train, partial(setup.hooks.report_stage, "motion"))
     keep_free_memory(LITTLE_BYTES)
     return tracks
 

@@ -11,14 +11,14 @@ import torch
 from numpy.typing import NDArray
 
 from contract.wire.notices import Notice, NoticeCode
-from worker.fusion import FusionSettings, PointCloud
-from worker.input.camera import Intrinsics, to_camera
+from worker.fusion import FusionSettings, PointCloud, nearest_pixels
+from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip
 from worker.model.constants import SH_C0
 from worker.model.deformation import AtRest, SharedBasis, motion_named
-from worker.model.gaussians import Gaussians, initial_gaussians
+from worker.model.gaussians import NEIGHBOURS, Gaussians, initial_gaussians
 from worker.model.layout import COLOUR, MEAN, ROWS
-from worker.motion.capacity import MAX_POINTS, Trials, choose_bases, choose_stride, floor_error, try_bases
+from worker.motion.capacity import MAX_POINTS, Trials, choose_bases, choose_stride, mean_floor_error, try_bases
 from worker.motion.tracks import GUESSED, Tracks, fit_tracks
 from worker.raster.backend import CPU, Device, make_model
 from worker.raster.model import Model
@@ -29,6 +29,8 @@ from worker.train.setup import Setup
 
 SHARE_PX = 4
 """Points within such a square start with one motion. Tracks are smooth over more, and there is less to solve."""
+BETWEEN_KEYFRAMES_MM = 1e4
+"""Farther than any neighbours are apart."""
 MIN_STRIDE = 2
 """Pixels between the points of a grid. A Gaussian for every pixel would fit noise, not surface."""
 
@@ -45,13 +47,16 @@ def stride_for(points: int, intrinsics: Intrinsics) -> int:
 
 
 def settled(
-    preset: Preset, tracks: Tracks | None, clip: DepthClip, train: Sequence[int]
+    preset: Preset, tracks: Sequence[Tracks], clip: DepthClip, train: Sequence[int]
 ) -> tuple[Preset, tuple[Notice, ...]]:
-    """The preset with what it leaves to the scene settled (decisions 014, 018), and why, in words for the report."""
-    notices = []
+    """The preset with what it leaves to the scene settled (decisions 014, 018), and why, in words for the report.
+
+    tracks: of each keyframe, if there are any.
+    """
+    notices, keys = [], [train[each.reference] for each in tracks] or [train[0]]
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
     trials = Trials({})
-    if tracks is not None and left_open:
+    if tracks and left_open:
         trials = try_bases(tracks, clip, train, basis_values, preset.max_bases)
     fusion = fusion_for(preset, clip.intrinsics)
     if fusion.mode == "fill" and preset.points_per_image is not None:
@@ -65,16 +70,14 @@ def settled(
         )
     elif fusion.mode == "fill":
         finest = stride_for(MAX_POINTS, clip.intrinsics)
-        choice = choose_stride(
-            clip, train[0], finest, min((each.total for each in trials.decisive.values()), default=0.0)
-        )
+        choice = choose_stride(clip, keys, finest, min((each.total for each in trials.decisive.values()), default=0.0))
         fusion = dataclasses.replace(fusion, stride=choice.count)
         preset = dataclasses.replace(preset, fusion=fusion)
         notices.append(
             Notice.info(NoticeCode.SPACING, f"Gaussians start {choice.count} pixels apart: {choice.reason}.")
         )
     if preset.bases is None:
-        floor = floor_error(clip, train[0], fusion.stride)
+        floor = mean_floor_error(clip, keys, fusion.stride)
         choice = choose_bases(trials, floor, len(train), preset.max_bases)
         preset = preset.with_bases(choice.count)
         notices.append(
@@ -107,7 +110,7 @@ def values_at(motion: SharedBasis, times: Sequence[float]) -> NDArray[np.float64
 
 def start_model(
     cloud: PointCloud,
-    tracks: Tracks | None,
+    tracks: Sequence[Tracks],
     clip: DepthClip,
     train: Sequence[int],
     preset: Preset,
@@ -119,11 +122,11 @@ def start_model(
 ) -> Model:
     """Gaussians at the cloud's points, scaled from mm to optimiser units, with the motion of the (settled) preset.
 
-    A "shared" motion starts from the tracks if there are any. Every other motion starts at rest. gloss: whether two
-    eyes teach.
+    A "shared" motion starts from the tracks of the keyframes, if there are any. Every other motion starts at rest.
+    gloss: whether two eyes teach.
     """
     gaussians = initial_gaussians(
-        cloud.reference_mm * np.float32(scale),  # widths are by neighbours of one time
+        _apart_by_keyframe_mm(cloud) * np.float32(scale),  # widths are by neighbours of one time
         cloud.rgb,
         sh_degree=preset.sh_degree,
         opacity=preset.opacity,
@@ -135,9 +138,16 @@ def start_model(
     )
     start = AtRest(preset.bases, preset.start_width, [float(clip.t[i]) for i in train], seed, gloss)
     motion = motion_named(preset.deformation).at_rest(gaussians, start)
-    if tracks is not None and isinstance(motion, SharedBasis):
+    if tracks and isinstance(motion, SharedBasis):
         gaussians = _follow_tracks(gaussians, motion, cloud, tracks, clip, train, scale)
     return make_model(gaussians, motion, clip.intrinsics.width, clip.intrinsics.height, device)
+
+
+def _apart_by_keyframe_mm(cloud: PointCloud) -> NDArray[np.float32]:
+    """[N, 3] where the points lay in their keyframes, so that each has its neighbours in its own one."""
+    alone = np.bincount(cloud.key)[cloud.key] <= NEIGHBOURS
+    apart_mm = (BETWEEN_KEYFRAMES_MM * np.where(alone, 0, cloud.key)).astype(np.float32)
+    return cloud.reference_mm + apart_mm[:, None]
 
 
 def box_of(model: Model) -> Box:
@@ -165,7 +175,7 @@ def _follow_tracks(
     gaussians: Gaussians,
     motion: SharedBasis,
     cloud: PointCloud,
-    tracks: Tracks,
+    tracks: Sequence[Tracks],
     clip: DepthClip,
     train: Sequence[int],
     scale: float,
@@ -173,23 +183,16 @@ def _follow_tracks(
     """Fill motion's weights from optical-flow tracks; returns the Gaussians with each canonical mean and colour shifted
     so that they pass through their point and its colour at the time of the frame it was taken from."""
     basis = values_at(motion, [float(clip.t[i]) for i in range(clip.frame_count)])
-    pixels = _reference_pixels(cloud, clip, train[0])
-    width = clip.intrinsics.width
-    weights, _ = fit_tracks(tracks, basis[list(train)], pixels, width, share_px=SHARE_PX, guessed=GUESSED)
+    weights = np.zeros((len(cloud), basis.shape[1], 6), np.float32)
+    for key, each in enumerate(tracks):
+        rows = np.flatnonzero(cloud.key == key)
+        pixels = nearest_pixels(cloud.reference_mm[rows], clip, train[each.reference])
+        weights[rows], _ = fit_tracks(
+            each, basis[list(train)], pixels, clip.intrinsics.width, share_px=SHARE_PX, guessed=GUESSED
+        )
     weights *= np.repeat(np.array([scale, 1 / SH_C0], np.float32), 3)
     by_channel = torch.from_numpy(weights).permute(0, 2, 1)
     motion.weight[:, MEAN], motion.weight[:, COLOUR] = by_channel[:, :3], by_channel[:, 3:]
     moved = torch.from_numpy(np.einsum("nbc,nb->nc", weights, basis[cloud.frame]).astype(np.float32))
     colour = torch.cat([gaussians.sh[:, :1] - moved[:, None, 3:], gaussians.sh[:, 1:]], 1)
     return dataclasses.replace(gaussians, mean=gaussians.mean - moved[:, :3], sh=colour)
-
-
-def _reference_pixels(cloud: PointCloud, clip: DepthClip, reference: int) -> NDArray[np.intp]:
-    """[N] flat index of the pixel of the reference frame each point lay in, the nearest one if outside."""
-    pose, k = clip.world_from_camera[reference], clip.intrinsics
-    x, y, z = to_camera(cloud.reference_mm, pose).T
-    z = np.maximum(z, 1e-6)
-    column = np.clip(np.floor(k.fx * x / z + k.cx), 0, k.width - 1)
-    row = np.clip(np.floor(k.fy * y / z + k.cy), 0, k.height - 1)
-    pixels: NDArray[np.intp] = (row * k.width + column).astype(np.intp)
-    return pixels

@@ -269,7 +269,7 @@ def at_first(clip: DepthClip, cloud: PointCloud) -> tuple[NDArray[np.intp], NDAr
 
 def test_hidden_tissue_is_taken_from_where_it_has_moved_to() -> None:
     clip, texture = drifting_clip()
-    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=1), seed=0, moved=drift(clip))
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=1), seed=0, moved={0: drift(clip)})
     row, column = at_first(clip, cloud)
     hits = np.zeros((HEIGHT, WIDTH), int)
     in_view = (column >= 0) & (column < WIDTH)
@@ -285,7 +285,7 @@ def test_hidden_tissue_is_taken_from_where_it_has_moved_to() -> None:
 
 def test_tissue_that_comes_into_view_later_gets_points_beside_the_first_frame() -> None:
     clip, _ = drifting_clip()
-    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=1), seed=0, moved=drift(clip))
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=1), seed=0, moved={0: drift(clip)})
     _, column = at_first(clip, cloud)
     margin = int(WIDTH * MARGIN)
     assert set(column[column < 0]) == set(range(-margin, 0)), "all that came in from the left, as far as is looked"
@@ -301,7 +301,7 @@ def test_where_nothing_moves_the_first_frame_is_filled_as_without_tracks(stride:
     clip = plane_clip()
     clip.tissue[0, 30:, 50:] = False  # also at the border, where the last cells may be smaller
     settings = FusionSettings(mode="fill", stride=stride)
-    bare, followed = (fuse(clip, TRAIN, settings, seed=0, moved=moved) for moved in (None, at_rest))
+    bare, followed = (fuse(clip, TRAIN, settings, seed=0, moved=moved) for moved in ({}, {0: at_rest}))
     order = [np.lexsort(np.floor(pixels_of(clip, each)).T) for each in (bare, followed)]
     np.testing.assert_array_equal(bare.frame[order[0]], followed.frame[order[1]])
     np.testing.assert_array_equal(bare.points_mm[order[0]], followed.points_mm[order[1]])
@@ -314,7 +314,7 @@ def test_what_a_wrong_guess_never_brings_into_sight_gets_a_colour_from_its_place
     def out_of_sight(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
         return np.tile(np.array([2 * reach_mm, 0, 0], np.float32), (len(pixels), 1))
 
-    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=1), seed=0, moved=out_of_sight)
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=1), seed=0, moved={0: out_of_sight})
     rows, columns = np.floor(pixels_of(clip, cloud)).astype(int).T
     hidden = ~clip.tissue[0, rows, columns]
     assert hidden.sum() == (~clip.tissue[0]).sum(), "every cell that is seen in place at some time, once"
@@ -340,13 +340,13 @@ def test_along_tracks_too_held_out_frames_change_no_bit(step_mm: float) -> None:
         return np.tile(np.array([0.2 * index, 0, 0], np.float32), (len(pixels), 1))
 
     settings = FusionSettings(mode="fill", stride=2)
-    assert same_bits(*(fuse(each, TRAIN, settings, seed=3, moved=moved) for each in (clip, poisoned)))
+    assert same_bits(*(fuse(each, TRAIN, settings, seed=3, moved={0: moved}) for each in (clip, poisoned)))
 
 
 def test_a_first_frame_without_depth_gives_way_along_tracks_too() -> None:
     clip = plane_clip()
     clip.depth_mm[0] = 0
-    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=2), seed=0, moved=at_rest)
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=2), seed=0, moved={0: at_rest})
     assert (cloud.frame == 2).mean() > 0.4
     x, y, z = cloud.points_mm.T
     np.testing.assert_allclose(z, 60 + 0.2 * x + 0.1 * y, atol=0.1)
@@ -354,7 +354,7 @@ def test_a_first_frame_without_depth_gives_way_along_tracks_too() -> None:
 
 def test_a_moving_camera_still_fills_what_lies_beyond_the_margin() -> None:
     clip = plane_clip(step_mm=2.0)
-    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=2), seed=0, moved=at_rest)
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=2), seed=0, moved={0: at_rest})
     assert pixels_of(clip, cloud, 11)[:, 1].max() > WIDTH - 4
     x, y, z = cloud.points_mm.T
     np.testing.assert_allclose(z, 60 + 0.2 * x + 0.1 * y, atol=0.1)

@@ -33,10 +33,10 @@ FRAMES = 40
 
 
 @cache
-def followed(motion: Motion) -> tuple[DepthClip, list[int], Tracks]:
+def followed(motion: Motion) -> tuple[DepthClip, list[int], list[Tracks]]:
     clip = phantom_clip(motion, frames=FRAMES)
     train = split_frames(clip).train
-    return clip, train, track(clip, train)
+    return clip, train, [track(clip, train)]
 
 
 def bases_for(motion: Motion) -> int:
@@ -51,7 +51,7 @@ def motion_left(errors: dict[int, float]) -> Trials:
     return Trials({bases: FitError(motion=error, light=0.0) for bases, error in errors.items()})
 
 
-def tried_bases(tracks: Tracks, clip: DepthClip, train: list[int], most: int | None = None) -> Trials:
+def tried_bases(tracks: list[Tracks], clip: DepthClip, train: list[int], most: int | None = None) -> Trials:
     return try_bases(tracks, clip, train, basis_values, most)
 
 
@@ -75,7 +75,7 @@ def test_a_clip_that_moves_gets_more(motion: Motion) -> None:
 def test_displacements_that_the_pictures_do_not_confirm_ask_for_no_bases() -> None:
     clip, train, tracks = followed("still")
     drift_mm = np.random.default_rng(0).normal(0, 0.1, (len(train), 1, 1, 3)).cumsum(0).astype(np.float32)
-    drifting = dataclasses.replace(tracks, displacement_mm=tracks.displacement_mm + drift_mm)
+    drifting = [dataclasses.replace(tracks[0], displacement_mm=tracks[0].displacement_mm + drift_mm)]
     tried = tried_bases(drifting, clip, train)
     assert settled(FAST, drifting, clip, train)[0].bases == REST
     assert choose_bases(dataclasses.replace(tried, resting={}), 0.1, len(train)).count > REST
@@ -94,7 +94,7 @@ def test_light_that_changes_on_tissue_at_rest_gets_bases() -> None:
     clip, train, _ = followed("still")
     brightness = 1 + 0.3 * np.sin(np.linspace(0, 2 * np.pi, FRAMES))[:, None, None, None]
     fading = dataclasses.replace(clip, rgb=np.clip(clip.rgb * brightness, 0, 255).astype(np.uint8))
-    assert (settled(FAST, track(fading, train), fading, train)[0].bases or 0) > REST
+    assert (settled(FAST, [track(fading, train)], fading, train)[0].bases or 0) > REST
 
 
 def test_faster_motion_never_gets_fewer_bases_for_as_many_frames() -> None:
@@ -103,7 +103,7 @@ def test_faster_motion_never_gets_fewer_bases_for_as_many_frames() -> None:
     for every in (1, 2):
         quicker = faster(clip, every)
         frames = list(range(FRAMES))
-        chosen.append(settled(FAST, track(quicker, frames), quicker, frames)[0].bases or 0)
+        chosen.append(settled(FAST, [track(quicker, frames)], quicker, frames)[0].bases or 0)
     assert chosen[0] <= chosen[1]
 
 
@@ -112,7 +112,7 @@ def test_held_out_frames_are_never_read() -> None:
     held_out = sorted(set(range(clip.frame_count)) - set(train))
     poisoned = dataclasses.replace(clip, rgb=clip.rgb.copy(), tissue=clip.tissue.copy(), depth_mm=clip.depth_mm.copy())
     poisoned.rgb[held_out], poisoned.tissue[held_out], poisoned.depth_mm[held_out] = 255, False, np.nan
-    assert tried_bases(track(poisoned, train), poisoned, train) == tried_bases(tracks, clip, train)
+    assert tried_bases([track(poisoned, train)], poisoned, train) == tried_bases(tracks, clip, train)
     assert settled(FAST, tracks, poisoned, train) == settled(FAST, tracks, clip, train)
 
 
@@ -142,7 +142,7 @@ def test_light_that_no_number_follows_gets_no_more_bases() -> None:
     clip, train, _ = followed("still")
     brightness = 1 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (FRAMES, 1, 1, 1))
     flickering = dataclasses.replace(clip, rgb=np.clip(clip.rgb * brightness, 0, 255).astype(np.uint8))
-    tried = tried_bases(track(flickering, train), flickering, train)
+    tried = tried_bases([track(flickering, train)], flickering, train)
     floor = floor_error(flickering, train[0], MIN_STRIDE)
     assert min(each.light for each in tried.tracked.values()) > max(floor, tried.tracked[REST].light / 2)
     choice = choose_bases(tried, floor, len(train))
@@ -178,7 +178,7 @@ def test_the_most_is_called_by_what_limits_it(frames: int, most: int | None, tri
 def test_there_are_more_than_two_training_frames_for_each_basis(frames: int) -> None:
     clip = phantom_clip("pull", frames=frames)
     train = list(range(frames))
-    tried = tried_bases(track(clip, train), clip, train)
+    tried = tried_bases([track(clip, train)], clip, train)
     assert frames / max(tried.tracked) > 2
 
 
@@ -210,7 +210,7 @@ def test_a_fixed_number_of_points_is_kept_to(points: int) -> None:
 def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: int) -> None:
     clip = phantom_clip(frames=frames)
     train = list(range(frames))
-    preset, notices = settled(FAST, track(clip, train) if frames > 1 else None, clip, train)
+    preset, notices = settled(FAST, [track(clip, train)] if frames > 1 else [], clip, train)
     assert preset.bases is not None
     assert 1 <= preset.bases <= frames
     assert any("too little could be followed" in each.text for each in notices)

@@ -16,7 +16,8 @@ from worker.input.camera import unproject
 from worker.input.clip import DepthClip
 from worker.model.deformation import SharedBasis
 from worker.motion.complete import complete_depth
-from worker.motion.tracks import GUESSED, Tracks, cell_means, fit_tracks, track
+from worker.motion.lifted import cell_means
+from worker.motion.tracks import GUESSED, Tracks, fit_tracks, track
 from worker.phantom import Motion, PhantomSettings, Trajectories, make_phantom
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 24

@@ -7,15 +7,20 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from contract.wire.notices import NoticeCode
 from tests.helpers import assert_close
 from tests.worker.phantoms import phantom_clip
 from worker.fusion import PointCloud, fuse
+from worker.fusion.points import cells_of
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip
 from worker.model.layout import ROWS
-from worker.motion.tracks import moved_along, track
+from worker.motion.keyframes import track_keyframes
+from worker.motion.lifted import cell_means
+from worker.motion.tracks import moved_along
+from worker.phantom import PhantomSettings, make_phantom
 from worker.raster.model import Model
 from worker.scene.compact import MAX_WEIGHTS
 from worker.train.presets import PRESETS, Preset
@@ -32,9 +37,9 @@ def camera(width: int, height: int) -> Intrinsics:
 def started(clip: DepthClip, preset: Preset, train: list[int] | None = None) -> tuple[Model, PointCloud, float]:
     frames = train or list(range(clip.frame_count))
     scale = units_per_mm(clip, frames)
-    tracks = track(clip, frames) if preset.tracks and len(frames) > 1 else None
+    tracks = track_keyframes(clip, frames) if preset.tracks and len(frames) > 1 else []
     preset, _ = settled(preset, tracks, clip, frames)
-    moved = moved_along(tracks, frames, clip.intrinsics.width) if tracks is not None else None
+    moved = {frames[each.reference]: moved_along(each, frames, clip.intrinsics.width) for each in tracks}
     cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0, moved=moved)
     return start_model(cloud, tracks, clip, frames, preset, scale, seed=0), cloud, scale
 
@@ -111,6 +116,41 @@ def test_what_the_instrument_hides_at_first_moves_like_the_tissue_about_it() -> 
     assert later.sum() > 20
     assert np.median(np.linalg.norm(moved[seen][nearest], axis=1)) > 1
     assert np.median(apart) < 0.3 * np.median(np.linalg.norm(moved[later], axis=1))
+
+
+def test_tissue_that_comes_into_view_later_starts_with_its_own_motion() -> None:
+    phantom = make_phantom(PhantomSettings(160, 128, 40, camera=("pan",)))
+    clip = phantom.depth_clip()
+    model, cloud, scale = started(clip, PRESETS["fast"])
+    later = np.flatnonzero(cloud.frame > 20)
+    assert len(later) > 0.3 * len(cloud)
+    nearest = np.zeros(len(later), np.intp)
+    for frame in np.unique(cloud.frame[later]):
+        there = cloud.frame[later] == frame
+        nearest[there] = cKDTree(phantom.surface.vertices_mm(frame)).query(cloud.points_mm[later[there]])[1]
+    off_mm = cloud.points_mm[later] - np.stack(
+        [phantom.surface.vertices_mm(frame)[point] for frame, point in zip(cloud.frame[later], nearest, strict=True)]
+    )
+    k, errors_mm, moved_mm = clip.intrinsics, [], []
+    for frame in range(0, 40, 4):
+        true_mm = phantom.surface.vertices_mm(frame)[nearest] + off_mm
+        seen = cells_of(true_mm, k, clip.world_from_camera[frame], stride=1)[1]
+        shown_mm = model.deformed_mean(float(clip.t[frame])).T[later] / scale
+        errors_mm.append(np.linalg.norm(shown_mm - true_mm, axis=1)[seen])
+        moved_mm.append(np.linalg.norm(cloud.points_mm[later] - true_mm, axis=1)[seen])
+    assert np.median(np.concatenate(moved_mm)) > 1
+    assert np.median(np.concatenate(errors_mm)) < 0.5 * np.median(np.concatenate(moved_mm))
+
+
+def test_points_cover_what_every_frame_of_a_pan_shows() -> None:
+    phantom = make_phantom(PhantomSettings(160, 128, 40, camera=("pan",)))
+    clip = phantom.depth_clip()
+    model, _, scale = started(clip, PRESETS["fast"])
+    for frame in range(0, 40, 3):
+        shown_mm = model.deformed_mean(float(clip.t[frame])).T / scale
+        cells, _ = cells_of(shown_mm, clip.intrinsics, clip.world_from_camera[frame], stride=4)
+        tissue = cell_means(clip.tissue[frame].astype(np.float32), 4).ravel() == 1
+        assert np.isin(np.flatnonzero(tissue), cells).mean() > 0.98
 
 
 def test_gaussians_start_as_wide_as_their_neighbours_of_the_first_frame_are_apart() -> None:
