@@ -21,6 +21,7 @@ from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
 from worker.render.camera import endoscope_pose, view_camera
 from worker.render.confidence import confidence, evidence, seen_from_endoscope
+from worker.render.left import OutOfView
 from worker.render.unseen import blended_values, unseen_pixels
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
@@ -99,6 +100,7 @@ class SceneRenderer:
         self.scene = scene.without_motion()
         self._model = model_of(scene, device)
         self._values = blended_values(scene.seen.numpy())
+        self._out_of_view = None if self._values is None else OutOfView.of(self.scene, self._model)
         self._lock = RLock()  # who pauses a large render may make a small one
 
     def layers(
@@ -112,13 +114,18 @@ class SceneRenderer:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """R G B Z A [5, H, W], Z unnormalised in units, and blended_values as they are blended [H, W], as copies."""
         camera = view_camera(self.scene, t, world_from_camera, intrinsics, highlights=highlights)
+        values = self._values
+        if values is not None and self._out_of_view is not None:
+            times_s = self.scene.frame_times_s
+            time_s = float(np.interp(t * self.scene.frame_count, np.arange(len(times_s)), times_s))
+            values = self._out_of_view.faded(values, time_s)
         with self._lock:
-            shown = self._model.render(camera, t, self._values, pause)
+            shown = self._model.render(camera, t, values, pause)
             image = np.empty(shown.shape, np.float32)
             for rows in _parts(shown.shape[1:]):
                 image[:, rows] = shown[:, rows]
                 pause()
-        return image[:5], None if self._values is None else image[5]
+        return image[:5], None if values is None else image[5]
 
 
 _renderers: weakref.WeakKeyDictionary[Scene, dict[Device, SceneRenderer]] = weakref.WeakKeyDictionary()
