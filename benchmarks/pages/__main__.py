@@ -3,8 +3,8 @@
     python -m benchmarks.pages
 
 Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
-stability`), {post,two-eyes,stereo_truth,confidence,ablation,raster,service,memory,long}.csv, off-axis.jpg, stereo.txt
-(the output of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
+stability`), {post,two-eyes,stereo_truth,confidence,ablation,raster,service,memory,long,poses,keyframes}.csv,
+off-axis.jpg, stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from statistics import median
 from benchmarks.pages.evaluation import sections, write_readme
 from benchmarks.pages.gpu import gpu_sections
 from benchmarks.pages.markdown import origin, table
+from benchmarks.pages.moving import moving_sections
 from benchmarks.pages.post import post_sections
 from benchmarks.pages.right_eye import two_eyes_sections
 from benchmarks.pages.stability import stability_sections
@@ -118,6 +119,7 @@ def main() -> None:
     if (RESULTS / "raster-scene.txt").exists():
         parts += [_SCENE, f"\n```\n{(RESULTS / 'raster-scene.txt').read_text().strip()}\n```\n"]
     parts += gpu_sections(RESULTS)
+    parts += moving_sections(RESULTS)
     if (RESULTS / "stereo.txt").exists():
         parts += [_STEREO, f"\n```\n{(RESULTS / 'stereo.txt').read_text().strip()}\n```\n"]
     parts += stereo_truth_sections(RESULTS)
