@@ -31,6 +31,7 @@ ROOMS = {
     "worker": (
         "machine",
         "input",
+        "instruments",
         "stereo",
         "motion",
         "poses",

@@ -182,7 +182,14 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
 
     paths = ClipPaths(request.clip, request.right, request.calibration, request.masks)
     clip = open_paths(
-        paths, request.options, hooks, timings, limits=request.limits, device=device.kind, before_matching=examined
+        paths,
+        request.options,
+        hooks,
+        timings,
+        limits=request.limits,
+        device=device.kind,
+        before_matching=examined,
+        segmenter=request.segmenter,
     )
     return with_poses(clip, request.options, hooks, timings)
 

@@ -52,6 +52,13 @@ _SCENE = """
 The model that `intrasplat reconstruct CLIP --iterations 600 --out s600` ends with on `d4d-a`:
 `python benchmarks/bm_raster.py --scene s600 --quick | tee docs/results/raster-scene.txt`
 """
+_MASKS = """
+## Instruments found without masks
+
+`python benchmarks/bm_masks.py --seeds 31 --size 320x256`, with `--iterations 300` for the first steel clip and the
+real ones ([masks.csv](masks.csv)): masks that are found against true ones, of every kind of instrument, and what a
+model loses by them. [Decision 048](../decisions/048-instruments-found.md) has the table and what it means.
+"""
 _STEREO = """
 ## Depth from stereo
 
@@ -120,6 +127,7 @@ def main() -> None:
         parts += [_SCENE, f"\n```\n{(RESULTS / 'raster-scene.txt').read_text().strip()}\n```\n"]
     parts += gpu_sections(RESULTS)
     parts += moving_sections(RESULTS)
+    parts += [_MASKS] if (RESULTS / "masks.csv").exists() else []
     if (RESULTS / "stereo.txt").exists():
         parts += [_STEREO, f"\n```\n{(RESULTS / 'stereo.txt').read_text().strip()}\n```\n"]
     parts += stereo_truth_sections(RESULTS)

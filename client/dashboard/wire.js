@@ -40,6 +40,7 @@
  * @typedef {{
  *   layout?: "auto"|"endonerf"|"stereomis"|"sbs"|"tb"|"frames",
  *   mask_polarity?: "auto"|"tool"|"tissue",
+ *   mask_source?: "given"|"auto"|"none",
  *   pose_convention?: "opengl"|"llff",
  *   holdout?: string,
  *   preset?: "instant"|"fast"|"quality"|"small"|"paper"|"paper-released"|"paper-wide"|"pfs"|"hexplane"|"without_mapf",
@@ -82,12 +83,19 @@
  */
 /**
  * @typedef {{
+ *   source: "given"|"found"|"segmenter"|"none",
+ *   share?: number,
+ *   sure?: number | null,
+ * }} Masks
+ */
+/**
+ * @typedef {{
  *   code: NoticeCode,
  *   severity: Severity,
  *   text: string,
  * }} Notice
  */
-/** @typedef {"baseline"|"calibration"|"decoding"|"depth_unit"|"frame_times"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"poses"|"rectification"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"few_frames"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"mask_gaps"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
+/** @typedef {"baseline"|"calibration"|"decoding"|"depth_unit"|"frame_times"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"poses"|"rectification"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"few_frames"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"masks_unsure"|"mask_gaps"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
 /**
  * @typedef {{
  *   report_version?: number,
@@ -111,6 +119,7 @@
  *   warnings: Notice[],
  *   assumptions: Notice[],
  *   right_eye?: RightEye | null,
+ *   masks?: Masks | null,
  *   poses?: CameraPoses | null,
  *   measurements?: Record<string, number>,
  *   preset: string,
@@ -158,6 +167,7 @@
 export const LIMITS = {
   layout: {"default": "auto", "choices": ["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]},
   mask_polarity: {"default": "auto", "choices": ["auto", "tool", "tissue"]},
+  mask_source: {"default": "given", "choices": ["given", "auto", "none"]},
   pose_convention: {"default": "opengl", "choices": ["opengl", "llff"]},
   holdout: {"default": "every8"},
   preset: {"default": "fast", "choices": ["instant", "fast", "quality", "small", "paper", "paper-released", "paper-wide", "pfs", "hexplane", "without_mapf"]},

@@ -88,6 +88,7 @@ class NoticeCode(StrEnum):
     LITTLE_TISSUE = "little_tissue"
     MAGNIFIED = "magnified"
     MASKS_MARK_NOTHING = "masks_mark_nothing"
+    MASKS_UNSURE = "masks_unsure"
     MASK_GAPS = "mask_gaps"
     NO_INSTRUMENT_MASKED = "no_instrument_masked"
     NO_TEXTURE = "no_texture"
@@ -193,6 +194,8 @@ class JobOptions(Model):
     """how the clip's eyes, depths and masks are laid out"""
     mask_polarity: str = "auto"
     """what is bright in the masks"""
+    mask_source: str = "given"
+    """masks of instruments: given with the clip; auto finds them if none are given; none uses none"""
     pose_convention: str = "opengl"
     """axes of poses_bounds.npy"""
     holdout: str = "every8"
@@ -250,6 +253,19 @@ class JobView(Model):
     links: dict[str, str]
 
 
+class Masks(Model):
+    """How instruments were told from tissue."""
+
+    source: str
+    """given with the clip; found by colour and depth; by this installation's segmenter; none: every pixel counts
+    as tissue
+    """
+    share: float = 0.0
+    """of the left eye's pixels, which is no tissue"""
+    sure: float | None = None
+    """how clearly instruments were told from tissue, where masks were found; None: they were not"""
+
+
 class Notice(Model):
     """One thing to know about a scene or a picture."""
 
@@ -303,6 +319,8 @@ class Report(Model):
     """what was taken for granted about the input"""
     right_eye: RightEye | None = None
     """how it was registered; None for a clip of one eye, or whose depth was given"""
+    masks: Masks | None = None
+    """of instruments; None: a report of version 0.2"""
     poses: CameraPoses | None = None
     """of the endoscope; None: a report of version 0.2"""
     measurements: dict[str, float] = Field(default={})
@@ -391,6 +409,8 @@ class GivenOptions(TypedDict, total=False):
     """how the clip's eyes, depths and masks are laid out"""
     mask_polarity: Literal["auto", "tool", "tissue"]
     """what is bright in the masks"""
+    mask_source: Literal["given", "auto", "none"]
+    """masks of instruments: given with the clip; auto finds them if none are given; none uses none"""
     pose_convention: Literal["opengl", "llff"]
     """axes of poses_bounds.npy"""
     holdout: Annotated[str, Field(max_length=8000, pattern="^(every8|blocks8|none|\\d{1,6}(,\\d{1,6})*)$")] | list[int]

@@ -57,6 +57,8 @@ class Settings(BaseModel):
     dashboard_dir: Path | None = None
     worker_name: str = Field(default="worker-1", pattern=r"^[A-Za-z0-9-]{1,40}$")
     device: DeviceName = "auto"
+    segmenter: Path | None = None
+    """An ONNX file with which a worker finds the instruments of clips without masks; needs the extra `onnx`."""
     log_format: Literal["text", "json"] = "text"
 
     # what is accepted

@@ -21,6 +21,10 @@ Layout = Literal["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]
 MaskPolarity = Literal["auto", "tool", "tissue"]
 """What is bright in the masks."""
 
+MaskSource = Literal["given", "auto", "none"]
+"""Where masks of instruments come from. given: the clip's, if it has any, else those of this installation's segmenter,
+if there is one. auto: the same, and with neither they are found by colour and depth. none: every pixel is tissue."""
+
 PoseConvention = Literal["opengl", "llff"]
 """Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
 

@@ -62,6 +62,7 @@ class NoticeCode(StrEnum):
     LITTLE_TISSUE = "little_tissue"
     MAGNIFIED = "magnified"
     MASKS_MARK_NOTHING = "masks_mark_nothing"
+    MASKS_UNSURE = "masks_unsure"
     MASK_GAPS = "mask_gaps"
     NO_INSTRUMENT_MASKED = "no_instrument_masked"
     NO_TEXTURE = "no_texture"

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from pydantic_core.core_schema import ValidationInfo
 
 from contract.wire.errors import InputError
-from contract.wire.names import Eyes, Layout, MaskPolarity, PoseConvention, Poses, PresetName, UsedFrames
+from contract.wire.names import Eyes, Layout, MaskPolarity, MaskSource, PoseConvention, Poses, PresetName, UsedFrames
 
 Priority = Literal["standard", "high"]
 """high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
@@ -37,6 +37,10 @@ class ClipOptions(BaseModel):
 
     layout: Layout = Field(default="auto", description="how the clip's eyes, depths and masks are laid out")
     mask_polarity: MaskPolarity = Field(default="auto", description="what is bright in the masks")
+    mask_source: MaskSource = Field(
+        default="given",
+        description="masks of instruments: given with the clip; auto finds them if none are given; none uses none",
+    )
     pose_convention: PoseConvention = Field(default="opengl", description="axes of poses_bounds.npy")
 
 

@@ -73,6 +73,24 @@ class RightEye(BaseModel):
     )
 
 
+class Masks(BaseModel):
+    """How instruments were told from tissue."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    source: Literal["given", "found", "segmenter", "none"] = Field(
+        description="given with the clip; found by colour and depth; by this installation's segmenter; none: every "
+        "pixel counts as tissue"
+    )
+    share: float = Field(default=0.0, ge=0, le=1, description="of the left eye's pixels, which is no tissue")
+    sure: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="how clearly instruments were told from tissue, where masks were found; None: they were not",
+    )
+
+
 class CameraPoses(BaseModel):
     """Where the endoscope was. Tissue that moves as a whole looks like a camera that moves the other way; what of the
     common motion follows the course of the tissue's own deformation was taken to be the tissue's.
@@ -145,6 +163,7 @@ class Report(BaseModel):
     right_eye: RightEye | None = Field(
         default=None, description="how it was registered; None for a clip of one eye, or whose depth was given"
     )
+    masks: Masks | None = Field(default=None, description="of instruments; None: a report of version 0.2")
     poses: CameraPoses | None = Field(default=None, description="of the endoscope; None: a report of version 0.2")
     measurements: dict[str, float] = Field(default={}, description="measured on the input, such as misalignment in px")
 

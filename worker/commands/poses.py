@@ -16,6 +16,7 @@ from contract.wire.options import ReconstructionOptions
 OPTIONS = (
     "layout",
     "mask_polarity",
+    "mask_source",
     "pose_convention",
     "holdout",
     "use_frames",

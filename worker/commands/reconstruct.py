@@ -52,6 +52,9 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="F",
         help="zip or folder of PNGs, or a video: the instruments, of the left eye or of both",
     )
+    parser.add_argument(
+        "--segmenter", type=Path, metavar="F", help="a network of your own (ONNX) that finds instruments without masks"
+    )
     add_options(parser, ReconstructionOptions)
     add_device(parser, "auto")
 
@@ -120,7 +123,7 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
     aside.submit(_compile, on_cpu)  # nobody waits for it here: the pipeline does, and shows it
     if on_cpu:
         paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
-        clip = open_with_depth(paths, given, hooks, timings)
+        clip = open_with_depth(paths, given, hooks, timings, segmenter=options.segmenter)
     pipeline.result()
     aside.shutdown(wait=False)
     from worker.pipeline import reconstruct
@@ -132,6 +135,7 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
         right=options.right,
         calibration=options.calibration,
         masks=options.masks,
+        segmenter=options.segmenter,
         options=given,
         device=options.device,
         accepted_at_s=accepted_at_s,
@@ -161,5 +165,7 @@ def _print_report(report: Report, out: Path) -> None:
     if report.poses is not None and report.poses.source == "estimated":
         told = report.poses
         print(f"camera: moved by {told.extent_mm:.1f} mm and {told.extent_deg:.1f} degrees (poses estimated)")
+    if report.masks is not None and report.masks.sure is not None:
+        print(f"instruments: found in {report.masks.share:.1%} of the picture, {report.masks.sure:.0%} of it clearly")
     for notice in report.warnings:
         print(f"{notice.severity}: {notice.text}")

@@ -147,11 +147,11 @@ def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, chann
         on_first_picture=snapshots.offer_first,
     )
     if isinstance(order, ScoreScene):
-        request = request_of(order.record, order.spool, settings.device, limits)
+        request = request_of(order.record, order.spool, settings.device, limits, settings.segmenter)
         channel.send(scored(lambda: judge_again(request, order.scene, hooks), order.scene / REPORT))
         return
     with pace.training():
-        made = work_on(order, settings.device, limits, snapshots, hooks)
+        made = work_on(order, settings.device, limits, snapshots, hooks, settings.segmenter)
     if not isinstance(made, Made):
         channel.send(made)
         return
@@ -160,13 +160,19 @@ def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, chann
 
 
 def work_on(
-    order: RunJob, device: str, limits: ClipLimits, snapshots: Snapshots, hooks: TrainingHooks
+    order: RunJob,
+    device: str,
+    limits: ClipLimits,
+    snapshots: Snapshots,
+    hooks: TrainingHooks,
+    segmenter: Path | None = None,
 ) -> Made | Stopped | Failed:
     """Run one job until its scene is finished. An error ends the job; only a lost GPU ends this process too."""
     job_id = order.record.job_id
     snapshots.begin(job_id)
     try:
-        return make_or_start_anew(request_of(order.record, order.spool, device, limits), order.out, order.kept, hooks)
+        request = request_of(order.record, order.spool, device, limits, segmenter)
+        return make_or_start_anew(request, order.out, order.kept, hooks)
     except Cancelled:
         snapshots.drop(job_id)
         return Stopped(checkpointed=(order.kept / RESUME_FILE).exists())
@@ -222,7 +228,9 @@ class _Reporter:
         self._channel.send(Advanced(progress=job_progress(progress)))
 
 
-def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits | None = None) -> ReconstructionRequest:
+def request_of(
+    record: JobRecord, spool: Path, device: str, limits: ClipLimits | None = None, segmenter: Path | None = None
+) -> ReconstructionRequest:
     """The request of a job, with its files in the folder where the store keeps them."""
     files = record.files
     return ReconstructionRequest(
@@ -230,6 +238,7 @@ def request_of(record: JobRecord, spool: Path, device: str, limits: ClipLimits |
         right=spool / files.right if files.right else None,
         calibration=spool / files.calibration if files.calibration else None,
         masks=spool / files.masks if files.masks else None,
+        segmenter=segmenter,
         options=record.options,
         device=device,
         accepted_at_s=record.created_at_s,

@@ -117,7 +117,15 @@ def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU
             clip = exact if source.masks else replace(exact, tissue=np.ones_like(tissue))
             return OpenClip(clip, phantom, {}, tissue)
         drawn = phantom.stereo_recording(masks=source.masks)
-        clip = match_eyes(drawn.clip, drawn.calibration, holdout, hooks, timings, device=device.kind)
+        clip = match_eyes(
+            drawn.clip,
+            drawn.calibration,
+            holdout,
+            hooks,
+            timings,
+            device=device.kind,
+            mask_source=source.options.mask_source,
+        )
         return OpenClip(clip, phantom, timings.seconds, drawn.tissue, drawn.tissue_right)
     options = ReconstructionOptions(
         holdout=holdout, use_frames="all", **source.options.model_dump()

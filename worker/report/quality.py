@@ -153,6 +153,7 @@ def first_report(clip: DepthClip, split: FrameSplit, training: Training, doubts:
         warnings=tuple(dict.fromkeys(found)),
         assumptions=tuple(dict.fromkeys((*clip.assumptions, *training.assumptions))),
         right_eye=clip.registration,
+        masks=clip.masks,
         poses=clip.poses,
         measurements={**clip.measurements, **training.measurements},
         **{name: value for name, value in vars(training).items() if name not in _MERGED_FIELDS},

@@ -5,7 +5,7 @@ Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. d
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from contract.wire.errors import Cancelled, InputError
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM
+from contract.wire.report import Masks
 from worker.input.clip.sampling import LeftOut, left_out
 from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip
+from worker.instruments import Finder, looked_at
 from worker.machine.cores import cores
 from worker.machine.hooks import Hooks, Progress
 from worker.machine.mapped import let_go, mapped_zeros
@@ -37,10 +39,13 @@ from worker.stereo.alignment import (
 )
 from worker.stereo.frames import FrameWork, grey_of
 from worker.stereo.matching import MatchPlan
+from worker.stereo.nearness import nearness
 from worker.stereo.registration import MatchedPair, Registration
 
 if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
     from worker.input.calibration import RectifiedClip
+
+FinderOf = Callable[[Iterable[NDArray[np.uint8]]], Finder]
 
 STAGE = "stereo"
 COMPILATION = "compile"
@@ -63,6 +68,7 @@ def estimate_depth(
     most_frames: int | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
+    finder_of: FinderOf | None = None,
 ) -> DepthClip:
     """Depth and confidence of every frame. How the eyes differ in turn, rows (up to 8 px) and colour is corrected.
 
@@ -70,7 +76,8 @@ def estimate_depth(
     (None: on all); for the rest, a frame's depth depends on its own pair only. So frames outside measured_frames do not
     change the depth of others. With leave_out, those of measured_frames that show nothing new
     (worker/input/clip/sampling.py) get no depth. On "cuda" another matcher (worker/stereo/cuda, needs triton) matches
-    many pairs at once.
+    many pairs at once. finder_of makes what finds the instruments of a clip without masks, from some of its pictures;
+    each frame's are found by itself, before it is matched. None: `clip.tissue` is right.
 
     `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| left after the correction),
     min_disparity_px and max_disparity_px (the range searched), depth_valid_share (of tissue pixels) and
@@ -92,8 +99,11 @@ def estimate_depth(
         unused = left_out(rgb, measured, most_frames, pool.map) if leave_out else LeftOut()
         if device == "cuda":
             hooks.on_progress(Progress(COMPILATION, 0.0))
-        registration, plan, outside = _plan(clip, rgb, right_rgb, measured, matches, pool, device, depth_range_mm)
-        work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan)
+        finder = None if finder_of is None else finder_of(rgb[i] for i in looked_at(measured))
+        registration, plan, outside = _plan(
+            clip, rgb, right_rgb, measured, matches, pool, device, depth_range_mm, finder
+        )
+        work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, finder)
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
         wanted = sorted(set(range(clip.frame_count)) - set(unused.frames))
         jobs = (
@@ -108,11 +118,19 @@ def estimate_depth(
     pixels, valid, sure = (int(each) for each in work.counts.sum(axis=0))
     valid_share, sure_share = valid / max(pixels, 1), sure / max(pixels, 1)
     _check_depth(sure_share)
+    share = 1 - pixels / (len(wanted) * clip.tissue[0].size)
+    masks, assumptions = Masks(source="given", share=share), clip.assumptions
+    doubts: tuple[Notice, ...] = ()
+    if finder is not None:
+        masks, told, doubts = finder.told(share, work.sure)
+        assumptions = (*(each for each in assumptions if each.code is not NoticeCode.MASKS), told)
     return replace(
         work.matched,
         left_out=unused.frames,
-        assumptions=(*clip.assumptions, _scale_assumption(clip), *unused.told(clip.frame_count)),
+        masks=masks,
+        assumptions=(*assumptions, _scale_assumption(clip), *unused.told(clip.frame_count)),
         warnings=clip.warnings
+        + doubts
         + registration.notices
         + _warnings(sure_share)
         + _range_warnings(outside, depth_range_mm),
@@ -166,6 +184,7 @@ def _plan(
     pool: ThreadPoolExecutor,
     device: str,
     depth_range_mm: tuple[float, float],
+    finder: Finder | None,
 ) -> tuple[Registration, MatchPlan, float]:
     """How the eyes differ, and the disparity range, from a few pairs spread over the measured frames; outside_share."""
     shift = measure_row_shift(matches, clip.disparity_offset_px, clip.equal_rows_px)
@@ -181,8 +200,15 @@ def _plan(
     plan = MatchPlan(
         *choose_range(pairs, clip.disparity_offset_px, focal_baseline, depth_range_mm, agreed), depth_range_mm
     )
-    aligned = spread(measured, ALIGNMENT_PAIRS)
-    found = pool.map(lambda i: MatchedPair.of(rgb[i], coarse.rectified(right[i]), clip.tissue[i], plan), aligned)
+
+    def matched_pair(i: int) -> MatchedPair:
+        tissue, rectified = clip.tissue[i], coarse.rectified(right[i])
+        if finder is not None:
+            grey, offset_px = grey_of(rectified), clip.disparity_offset_px
+            tissue = tissue & ~finder(rgb[i], lambda coarse: nearness(coarse, grey, plan, offset_px)).tool
+        return MatchedPair.of(rgb[i], rectified, tissue, plan)
+
+    found = pool.map(matched_pair, spread(measured, ALIGNMENT_PAIRS))
     return coarse.refined(list(found), matches, pool.map), plan, outside
 
 
@@ -208,7 +234,7 @@ def _match_on_device(work: FrameWork, wanted: Sequence[int], pool: ThreadPoolExe
         _check_stop(hooks)
         some = list(wanted[first : first + at_once])
         left, other = (np.stack(eye) for eye in zip(*map(work.greys, some), strict=True))
-        tissue = np.ascontiguousarray(clip.tissue[some])
+        tissue = np.stack(list(pool.map(work.tell_tissue, some, other)))
         matched.depth_mm[some], matched.depth_confidence[some] = depth_of(
             left, other, tissue, work.plan, focal_baseline, clip.disparity_offset_px
         )

@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.input.clip.types import DepthClip, Eye
+from worker.instruments import Finder
 from worker.machine.mapped import let_go, mapped_zeros
 from worker.stereo.matching import MIN_CONFIDENCE, Grey, MatchPlan, match
+from worker.stereo.nearness import nearness
 from worker.stereo.registration import Registration
 from worker.stereo.right_eye import moved_depth, moved_tissue, painted_over
 
@@ -40,7 +42,9 @@ class FrameWork:
 
     matched  the clip with both eyes; its pictures are there, and each frame's depth after finish(i)
     label    [H, W] what is painted into both eyes' pictures
+    finder   finds the instruments of a clip without masks; None: the clip's own tell
     counts   [T, 3] pixels of tissue, those with depth, those with sure depth
+    sure     [T, 2] `seen` and `clear` of what the finder found
     """
 
     clip: RectifiedClip
@@ -49,10 +53,13 @@ class FrameWork:
     matched: DepthClip
     right: Eye
     label: NDArray[np.bool_]
+    finder: Finder | None = None
     counts: NDArray[np.int64] = field(init=False)
+    sure: NDArray[np.float64] = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "counts", np.zeros((self.clip.frame_count, 3), np.int64))
+        object.__setattr__(self, "sure", np.zeros((self.clip.frame_count, 2)))
 
     @classmethod
     def begin(
@@ -63,6 +70,7 @@ class FrameWork:
         measured: Sequence[int],
         registration: Registration,
         plan: MatchPlan,
+        finder: Finder | None = None,
     ) -> FrameWork:
         """Before the first frame. The right eye lies on the calibrated baseline, turned as it was measured.
 
@@ -93,16 +101,29 @@ class FrameWork:
             right=right,
             registration=registration.told,
         )
-        return cls(clip, plan, registration, matched, right, label)
+        return cls(clip, plan, registration, matched, right, label, finder)
 
     def greys(self, i: int) -> tuple[Grey, Grey]:
         """The pair to match. The right picture has its final colours from here on."""
         self.right.rgb[i] = self.registration.recoloured(self.right.rgb[i])
         return grey_of(self.matched.rgb[i]), self.registration.rectified(grey_of(self.right.rgb[i]))
 
+    def tell_tissue(self, i: int, right: Grey) -> NDArray[np.bool_]:
+        """The tissue [H, W] of a frame's left eye, in the matched clip from here on. right: of greys(i)."""
+        tissue: NDArray[np.bool_] = self.matched.tissue[i]
+        if self.matched.tissue is not self.clip.tissue:
+            tissue[:] = self.clip.tissue[i]
+        if self.finder is not None:
+            rgb, offset_px = self.matched.rgb[i], self.clip.disparity_offset_px
+            found = self.finder(rgb, lambda coarse: nearness(coarse, right, self.plan, offset_px))
+            tissue &= ~found.tool
+            self.sure[i] = found.seen, found.clear
+        return tissue
+
     def match(self, i: int) -> None:
         """Match a frame and finish it."""
-        disparity, trust = match(*self.greys(i), self.plan, self.clip.tissue[i])
+        left, right = self.greys(i)
+        disparity, trust = match(left, right, self.plan, self.tell_tissue(i, right))
         beyond_infinity_px = disparity - np.float32(self.clip.disparity_offset_px)
         focal_baseline = self.clip.intrinsics.fx * self.clip.baseline_mm
         self.matched.depth_mm[i], self.matched.depth_confidence[i] = to_depth(
@@ -118,10 +139,8 @@ class FrameWork:
         right.depth_mm[i] = registration.recorded_depth(moved_mm)
         right.depth_confidence[i] = registration.recorded(moved_trust)
         if self.clip.tissue_right is None:
-            shown = moved_tissue(self.clip.tissue[i] | self.label, left.depth_mm[i], focal_baseline, offset_px)
+            shown = moved_tissue(left.tissue[i] | self.label, left.depth_mm[i], focal_baseline, offset_px)
             right.tissue[i] = (registration.recorded((~shown).astype(np.uint8)) == 0) & ~self.label
-        if left.tissue is not self.clip.tissue:
-            left.tissue[i] = self.clip.tissue[i]
         for eye in (left, right):
             drop_beside_instruments(eye.tissue[i], eye.depth_mm[i], eye.depth_confidence[i])
         trust = left.depth_confidence[i][left.tissue[i]]

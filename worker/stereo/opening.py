@@ -5,16 +5,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from contract.wire.names import MaskSource
 from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM, ReconstructionOptions
+from contract.wire.report import Masks
 from worker.input.calibration import rectify
 from worker.input.calibration.types import StereoCalibration
 from worker.input.clip import ClipLimits, DepthClip, StereoClip, training_frames
 from worker.input.clip.sampling import most_frames, sampled
 from worker.input.decode import DecoderKilledError, decode_clip
+from worker.instruments import Finder, Segmenter, load_segmenter, with_instruments_found
 from worker.machine.hooks import Hooks, ignore
 from worker.machine.timing import Timings
 from worker.stereo.depth import estimate_depth
@@ -44,18 +48,24 @@ def open_with_depth(
     limits: ClipLimits | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
     before_matching: Callable[[], None] = ignore,
+    segmenter: Path | None = None,
 ) -> DepthClip:
     """Decode, and for stereo input rectify and match: the left frames with depth, and the right ones.
 
     timings get decode_s, until the size of a stereo clip is known, and stereo_s, which includes decoding its frames.
 
+    Without masks instruments are found (worker/instruments) by the segmenter, an ONNX file, if there is one, else if
+    options.mask_source is auto.
+
     When something outside kills the decoding process, it is tried again, TRIES times in all.
 
     Raises:
         InputError: the clip, its calibration, its masks or the holdout cannot be used.
-        UnavailableError: the disk is full; or before_matching raised it; or the decoding process was killed every time.
+        UnavailableError: the disk is full; or before_matching raised it; or the segmenter cannot be used; or the
+            decoding process was killed every time.
         Cancelled: hooks.should_stop said so.
     """
+    network = load_segmenter(segmenter) if segmenter is not None and options.mask_source != "none" else None
 
     def once() -> DepthClip:
         hooks.report_stage("decode", 0.0)
@@ -70,8 +80,14 @@ def open_with_depth(
                 hooks=hooks,
             )
         if isinstance(decoded, DepthClip):
-            hooks.on_first_moment(decoded.moment(training_frames(decoded.frame_count, options.holdout)[0]))
-            return sampled(decoded, options)
+            measured = training_frames(decoded.frame_count, options.holdout)
+            hooks.on_first_moment(decoded.moment(measured[0]))
+            clip = sampled(decoded, options)
+            without = clip.masks is not None and clip.masks.source == "none"
+            if not without or not _finds(options.mask_source, network):
+                return clip
+            with timings.measure("masks_s"):
+                return with_instruments_found(clip, measured, hooks, network)
         with closing(decoded):
             return match_eyes(
                 decoded.clip,
@@ -84,6 +100,8 @@ def open_with_depth(
                 device=device,
                 before_matching=before_matching,
                 depth_range_mm=(options.min_depth_mm, options.max_depth_mm),
+                mask_source=options.mask_source,
+                segmenter=network,
             )
 
     for _ in range(TRIES - 1):
@@ -106,13 +124,16 @@ def match_eyes(
     device: Literal["cpu", "cuda"] = "cpu",
     before_matching: Callable[[], None] = ignore,
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
+    mask_source: MaskSource = "given",
+    segmenter: Segmenter | None = None,
 ) -> DepthClip:
     """Rectify a stereo clip and match its eyes, as open_with_depth does."""
+    finds = clip.tissue is None and _finds(mask_source, segmenter)
     rectified = rectify(clip, calibration)
     measured = training_frames(clip.frame_count, holdout)
     before_matching()
     with timings.measure("stereo_s"):
-        return estimate_depth(
+        matched = estimate_depth(
             rectified,
             hooks,
             measured_frames=measured,
@@ -120,4 +141,11 @@ def match_eyes(
             most_frames=most_frames,
             device=device,
             depth_range_mm=depth_range_mm,
+            finder_of=partial(Finder.of, segmenter=segmenter) if finds else None,
         )
+    return replace(matched, masks=Masks(source="none")) if clip.tissue is None and not finds else matched
+
+
+def _finds(mask_source: MaskSource, segmenter: Segmenter | None) -> bool:
+    """Whether instruments of a clip without masks are to be found."""
+    return mask_source == "auto" or (mask_source == "given" and segmenter is not None)

@@ -149,7 +149,7 @@ class Keeper:
 
 def _identity(request: ReconstructionRequest) -> str:
     """What the clip is made of: name, size and time of change of every file, the options, and the program."""
-    given = (request.clip, request.right, request.calibration, request.masks)
+    given = (request.clip, request.right, request.calibration, request.masks, request.segmenter)
     found = hashlib.sha256(f"{version('intrasplat')} {request.options.model_dump_json()}".encode())
     for place, path in enumerate((*given, *registered_files())):
         if isinstance(path, Path):

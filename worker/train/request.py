@@ -19,6 +19,7 @@ class ReconstructionRequest:
     seconds        by stage, what was spent on such a clip, for the report
     own_preset     trains in place of the preset that options name
     accepted_at_s  Unix time at which the clip was accepted, for t_post_s; None means now
+    segmenter      an ONNX file that finds the instruments of clips without masks (worker/instruments/segmenter.py)
     limits         what this machine accepts; None means what its memory allows
     """
 
@@ -27,6 +28,7 @@ class ReconstructionRequest:
     right: Path | None = None
     calibration: Path | None = None
     masks: Path | None = None
+    segmenter: Path | None = None
     own_preset: Preset | None = None
     device: str = "auto"
     accepted_at_s: float | None = None

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from contract.store.durable import flush, replace_file
 from contract.wire.notices import Notice
-from contract.wire.report import CameraPoses, RightEye
+from contract.wire.report import CameraPoses, Masks, RightEye
 from worker.input.camera import Intrinsics
 from worker.input.clip.types import PIXELS, DepthClip, Eye
 from worker.machine.mapped import let_go
 
-VERSION = 3
+VERSION = 4
 """Raised whenever what the folder holds changes; no version reads another's."""
 MANIFEST = "manifest.json"
 EYES = ("left", "right")
@@ -56,6 +56,7 @@ def save_clip(folder: Path, clip: DepthClip, identity: str, should_stop: Callabl
         "identity": identity,
         "intrinsics": [eye.intrinsics.numbers() for eye in clip.eyes],
         "registration": clip.registration and clip.registration.model_dump(),
+        "masks": clip.masks and clip.masks.model_dump(),
         "poses": clip.poses and clip.poses.model_dump(),
         "left_out": clip.left_out,
         "assumptions": [notice.model_dump() for notice in clip.assumptions],
@@ -80,6 +81,7 @@ def load_clip(folder: Path, identity: str) -> DepthClip | None:
             frame_times_s=np.load(folder / f"{TIMES}.npy"),
             right=Eye(**eyes[1]) if len(eyes) > 1 else None,
             registration=told["registration"] and RightEye.model_validate(told["registration"]),
+            masks=told["masks"] and Masks.model_validate(told["masks"]),
             poses=told["poses"] and CameraPoses.model_validate(told["poses"]),
             left_out=tuple(told["left_out"]),
             assumptions=tuple(Notice.model_validate(each) for each in told["assumptions"]),

@@ -37,13 +37,14 @@ _POLARITY_REMEDY = 'Say mask_polarity "tool" if white marks instruments, "tissue
 class TissueMasks:
     """tissue [T, H, W] bool, True = tissue, with the assumption behind it and warnings.
 
-    right is the same of the right eye; None if the masks show the left eye alone.
+    right is the same of the right eye; None if the masks show the left eye alone. given: False if there are no masks.
     """
 
     tissue: NDArray[np.bool_]
     assumption: Notice
     warnings: tuple[Notice, ...] = ()
     right: NDArray[np.bool_] | None = None
+    given: bool = True
 
 
 @dataclass(frozen=True)
@@ -109,9 +110,9 @@ def _mask_images(tree: FileTree, names: tuple[str, ...]) -> MaskFrames:
     return MaskFrames(open_images(tree, left), open_images(tree, right))
 
 
-def no_masks() -> Notice:
-    """The assumption of a clip without masks."""
-    return Notice.info(NoticeCode.MASKS, "masks: none given, every pixel is tissue")
+def no_masks(*, ignored: bool = False) -> Notice:
+    """The assumption of a clip without masks, or whose masks are not to be used."""
+    return Notice.info(NoticeCode.MASKS, f"masks: none {'used' if ignored else 'given'}, every pixel is tissue")
 
 
 def tissue_from_masks(

@@ -40,6 +40,7 @@ def open_clip(
              own masks/ folder, if it has one
     options  layout: one of clip/layouts/ by its name; "auto" detects it by names, shape and content.
              mask_polarity: "auto" decides by layout and look (masks.tissue_from_masks)
+             mask_source: "none" leaves masks unread, also those of the clip
 
     Raises InputError for everything that is wrong, with field and remedy, and LimitError for a clip that is too large.
     """
@@ -48,19 +49,20 @@ def open_clip(
     named = layout_named(layout) if layout != "auto" else None
     path = Path(path)
     check_exists(path, "clip")
-    given = open_masks(Path(masks), limits) if masks is not None else None
+    ignored = options.mask_source == "none"
+    given = open_masks(Path(masks), limits) if masks is not None and not ignored else None
     if right is not None:
         clip = _open_two(path, Path(right), layout, limits)
-        return with_masks(clip, given, mask_polarity, None) if given is not None else _without_masks(clip)
+        return with_masks(clip, given, mask_polarity, None) if given is not None else _without_masks(clip, ignored)
     tree = open_tree(path, "clip", limits)
-    files = ClipFiles(path, tree, limits, named is None, given, mask_polarity, options.pose_convention)
+    files = ClipFiles(path, tree, limits, named is None, given, ignored, mask_polarity, options.pose_convention)
     chosen = named or detect_layout(files)
     opened = chosen.open(files)
     if isinstance(opened, DepthClip):
         return opened
-    found = given or (own_masks(tree) if tree is not None else None)
+    found = given or (own_masks(tree) if tree is not None and not ignored else None)
     if found is None:
-        return _without_masks(opened)
+        return _without_masks(opened, ignored)
     by_layout = (chosen.title or chosen.name, chosen.white) if chosen.white is not None else None
     return with_masks(opened, found, mask_polarity, by_layout)
 
@@ -107,8 +109,8 @@ def _open_eye(path: Path, field: str, limits: ClipLimits) -> FrameSequence:
     return open_video_in(tree, videos[0]) if len(videos) == 1 else open_images(tree, outside_masks(tree.images()))
 
 
-def _without_masks(clip: StereoClip) -> StereoClip:
-    return replace(clip, assumptions=(*clip.assumptions, no_masks()))
+def _without_masks(clip: StereoClip, ignored: bool) -> StereoClip:
+    return replace(clip, assumptions=(*clip.assumptions, no_masks(ignored=ignored)))
 
 
 def _as_path(tree: FileTree, name: str, scratch: Path | None) -> Path:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.notices import Notice
-from contract.wire.report import CameraPoses, RightEye
+from contract.wire.report import CameraPoses, Masks, RightEye
 from worker.input.camera import Intrinsics
 from worker.machine.mapped import let_go
 
@@ -99,6 +99,7 @@ class DepthClip(Eye):
     frame_times_s    [T]          float64, seconds from frame 0
     right            the same moments and size; None for a clip of one eye
     registration     what the right eye's camera and colours were corrected by; None for a clip of one eye
+    masks            where `tissue` comes from
     poses            how world_from_camera is known; None: nobody has asked yet
     left_out         frames that show nothing new (sampling.py): nobody looks at them, and stereo gives them no depth
     """
@@ -106,6 +107,7 @@ class DepthClip(Eye):
     frame_times_s: NDArray[np.float64]
     right: Eye | None = None
     registration: RightEye | None = None
+    masks: Masks | None = None
     poses: CameraPoses | None = None
     left_out: tuple[int, ...] = ()
     assumptions: tuple[Notice, ...] = ()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import InputError
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import ClipOptions
+from contract.wire.report import Masks
 from worker.input.calibration import check_calibration
 from worker.input.calibration.types import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
 from worker.input.camera import Intrinsics
@@ -161,6 +162,7 @@ def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | Depth
             intrinsics=Intrinsics.parsed(told["intrinsics"]),
             world_from_camera=_finite(map_array(folder, "world_from_camera", size).copy()),
             frame_times_s=frame_times_s,
+            masks=told["masks"] and Masks.model_validate(told["masks"]),
             assumptions=assumptions,
             warnings=warnings,
         )

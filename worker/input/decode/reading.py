@@ -51,7 +51,8 @@ def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[s
     }
     if isinstance(clip, DepthClip):
         write_arrays(folder, _depth_arrays(clip, reports))
-        return told | {"intrinsics": clip.intrinsics.numbers()}
+        masks = clip.masks and clip.masks.model_dump()
+        return told | {"intrinsics": clip.intrinsics.numbers(), "masks": masks}
     reports.reading("calibration")
     path = given_calibration or find_calibration(paths["path"], folder, limits)
     calibration = _calibration(path, clip)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from contract.intake.limits import MAX_POSES_BYTES
 from contract.wire.errors import InputError
-from contract.wire.names import MaskPolarity, PoseConvention
+from contract.wire.names import PoseConvention
 from contract.wire.notices import Notice, NoticeCode
+from contract.wire.report import Masks
 from worker.input.camera import Intrinsics
 from worker.input.clip.files import FileTree
 from worker.input.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
@@ -59,7 +60,7 @@ def _open(files: ClipFiles) -> DepthClip:
         tree.read(POSES_FILE, header_bytes + frame_bytes * images.frame_count), images.frame_count, convention
     )
     _check_size(images, poses)
-    masks = _masks(tree, images, files.masks, files.mask_polarity)
+    masks = _masks(tree, images, files)
     rgb = _decode_all(images, np.uint8, (3,), lambda name: as_rgb(images.decode(name), tree.field, name))
     depth_mm = _read_depth(tree, images)
     if not ((depth_mm > 0) & masks.tissue).any():
@@ -82,6 +83,7 @@ def _open(files: ClipFiles) -> DepthClip:
         ),
         world_from_camera=poses.world_from_camera,
         frame_times_s=np.arange(images.frame_count) / FALLBACK_RATE_HZ,
+        masks=Masks(source="given" if masks.given else "none", share=float(1 - masks.tissue.mean())),
         assumptions=_assumptions(masks, poses, convention),
         warnings=(*masks.warnings, *_depth_warnings(depth_mm, masks.tissue)),
     )
@@ -132,15 +134,16 @@ def _read_depth(tree: FileTree, images: ImageSequence) -> NDArray[np.float32]:
     return _decode_all(depth, np.float32, (), lambda name: as_depth_mm(depth.decode(name), tree.field, name))
 
 
-def _masks(tree: FileTree, images: ImageSequence, given: MaskFrames | None, told: MaskPolarity) -> TissueMasks:
-    shape = (images.frame_count, images.height, images.width)
+def _masks(tree: FileTree, images: ImageSequence, files: ClipFiles) -> TissueMasks:
+    shape, given = (images.frame_count, images.height, images.width), files.masks
     if given is None:
-        names = tree.images("masks")
+        names = () if files.ignores_masks else tree.images("masks")
         if not names:
-            return TissueMasks(np.ones(shape, dtype=np.bool_), no_masks())
+            none = no_masks(ignored=files.ignores_masks)
+            return TissueMasks(np.ones(shape, dtype=np.bool_), none, given=False)
         check_aligned("masks", images.names, names)
         given = MaskFrames(open_images(tree, names))
-    return tissue_from_masks(given, shape, told, by_layout=(TITLE, "tool"))
+    return tissue_from_masks(given, shape, files.mask_polarity, by_layout=(TITLE, "tool"))
 
 
 def _decode_all(

@@ -26,6 +26,7 @@ class ClipFiles:
     tree             files of a folder or zip, or one image; None where path is a single other file, such as a video
     detected         the caller left the layout open
     masks            those that the caller gave in addition to the clip
+    ignores_masks    the caller wants no masks, not even those in the tree
     mask_polarity    what white means in masks, as the caller said
     pose_convention  axes of poses_bounds.npy, as the caller said
     """
@@ -35,6 +36,7 @@ class ClipFiles:
     limits: ClipLimits
     detected: bool = False
     masks: MaskFrames | None = None
+    ignores_masks: bool = False
     mask_polarity: MaskPolarity = "auto"
     pose_convention: PoseConvention = "opengl"
 

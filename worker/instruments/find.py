@@ -1,0 +1,255 @@
+"""Instruments told from tissue in one picture: less red than tissue, in front of it, and coming in from the border.
+
+Symbols: H W pixels; h w pixels of the coarse picture; nearness: proportional to 1 / depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Rgb = NDArray[np.uint8]  # [H, W, 3]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Bits = NDArray[np.uint8]
+
+COARSE_WIDTH, FINE_WIDTH = 160, 320
+"""Px: pictures are looked at this wide, first for instruments, then for their outlines."""
+SMOOTHNESS, COLOUR_SIGMA = 5.0, 10.0
+MIN_WEIGHT = 1e-9
+BEHIND_SHARE = 0.26
+"""Of the picture's width: the tissue behind an instrument is the farthest of so wide a window."""
+DARK_LEVELS = 20.0
+"""Added to a sum of two colours, so that black has no colour."""
+MIN_REDNESS = 0.05
+"""Of tissue, as the median of its pixels; a picture of less has no colours."""
+GREY, SLIGHTLY_FRONT, FRONT = 0.45, 0.02, 0.10
+"""Redness of an instrument at most, relative to the tissue's; how much nearer it is at least than what is behind it."""
+MIN_AREA = 0.001
+OUTLINE_PX, GAP_PX = 9, 2
+"""Window in which both sides of an outline are compared, and the width of the outline that belongs to neither."""
+STEP, REDNESS_STEP = 0.04, 0.3
+"""Across an outline: relative fall of nearness, and rise of redness in parts of the tissue's."""
+FRONT_BETWEEN, STEPS_BETWEEN, STEP_BETWEEN, COLOURED_BETWEEN = (0.2, 0.6), (0.4, 0.8), (0.02, 0.10), (0.3, 0.9)
+"""Between which values a candidate's signs turn from tissue's into an instrument's: the share of it that is in front;
+the share of its outline with a step in depth, and the median step; the share of its outline with a step in redness."""
+ZONE_SHARE, TIP_SHARE, TIP_QUANTILE, LOCAL_SHARE = 0.0125, 0.05, 0.85, 0.2
+"""Of the width: how far the fine outline may leave the coarse one, at its tip, and how far tissue is compared."""
+MAX_LOCAL_REDNESS, TIP_FRONT = 1.2, 0.05
+"""Redness of the tissue around counts as so much at most; around a tip, only what is so much in front may be its."""
+CLOSED_PX, GROWN_PX = 3, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """A picture of H W pixels as it is looked at: FINE_WIDTH and COARSE_WIDTH wide."""
+
+    size: tuple[int, int]
+    fine: Rgb
+    coarse: Rgb
+
+    @classmethod
+    def at(cls, rgb: Rgb) -> Looked:
+        """The picture [H, W, 3]."""
+        height, width = rgb.shape[:2]
+        fine = cv2.resize(rgb, (FINE_WIDTH, round(height * FINE_WIDTH / width)), interpolation=cv2.INTER_AREA)
+        coarse_size = (COARSE_WIDTH, round(height * COARSE_WIDTH / width))
+        return cls((height, width), fine, cv2.resize(fine, coarse_size, interpolation=cv2.INTER_AREA))
+
+
+@dataclass(frozen=True)
+class TissueLook:
+    """The colour of a clip's tissue: the median of (red - green) / (red + green)."""
+
+    redness: float
+
+    @classmethod
+    def of(cls, pictures: Iterable[Rgb]) -> TissueLook:
+        """The look of what is in most pixels of some pictures [H, W, 3]."""
+        return cls(float(np.median([np.median(_redness(Looked.at(each).coarse)) for each in pictures])))
+
+
+@dataclass(frozen=True, eq=False)
+class FoundMask:
+    """Instruments in a picture.
+
+    tool    [H, W]
+    seen    share of the picture that might be instruments
+    clear   of that, what was told clearly: from 0 to `seen`
+    """
+
+    tool: Mask
+    seen: float
+    clear: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """Pixels [h, w] without tissue's colour; likely: 0 looks like tissue, 1 like an instrument."""
+
+    pixels: Mask
+    likely: float
+
+
+def smooth_nearness(rgb: Rgb, nearness: Image, trust: Image) -> Image:
+    """Nearness [h, w], filled and smoothed within areas of one colour of the picture [h, w, 3]; trust is in [0, 1]."""
+    smoother = cv2.ximgproc.createFastGlobalSmootherFilter(rgb, SMOOTHNESS, COLOUR_SIGMA)
+    weighted, weight = smoother.filter(nearness * trust), smoother.filter(trust)
+    smooth: Image = weighted / np.maximum(weight, np.float32(MIN_WEIGHT))
+    return smooth
+
+
+def find_instruments(picture: Looked, nearness: Image, look: TissueLook) -> FoundMask:
+    """The instruments in a picture.
+
+    Args:
+        nearness: [h, w] of its coarse form: smooth_nearness.
+    """
+    if look.redness < MIN_REDNESS:
+        return FoundMask(np.zeros(picture.size, np.bool_), 1.0, 0.0)
+    candidates = _candidates(picture, nearness, look)
+    found = [each for each in candidates if each.likely >= 0.5]
+    areas = [float(each.pixels.mean()) for each in candidates]
+    clear = sum(area * abs(2 * each.likely - 1) for area, each in zip(areas, candidates, strict=True))
+    in_front = _in_front(nearness) > TIP_FRONT
+    tool = _outlined(picture, found, in_front, look) if found else np.zeros(picture.size, np.bool_)
+    return FoundMask(tool, sum(areas), clear)
+
+
+def _candidates(picture: Looked, nearness: Image, look: TissueLook) -> list[_Candidate]:
+    """What has no tissue's colour, is not behind its surroundings and touches the border."""
+    height, width = nearness.shape
+    redness = cv2.GaussianBlur(_redness(picture.coarse), (3, 3), 0)
+    grey = cv2.morphologyEx((redness < GREY * look.redness).astype(np.uint8), cv2.MORPH_OPEN, _box(2))
+    front = _in_front(nearness)
+    part = _closed(grey, 5) & (front > SLIGHTLY_FRONT)
+    part = cv2.morphologyEx(part.astype(np.uint8), cv2.MORPH_OPEN, _box(3))
+    count, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
+    found = []
+    for j in range(1, count):
+        left, top, across, down, area = stats[j]
+        touches = left <= 1 or top <= 1 or left + across >= width - 1 or top + down >= height - 1
+        if touches and area >= MIN_AREA * height * width:
+            pixels = label == j
+            found.append(_Candidate(pixels, _likely(pixels, front, nearness, redness / np.float32(look.redness))))
+    return found
+
+
+def _in_front(nearness: Image) -> Image:
+    """[h, w] by how much each pixel is nearer than the tissue around it, relative to that."""
+    behind = cv2.morphologyEx(nearness, cv2.MORPH_OPEN, _box(round(BEHIND_SHARE * nearness.shape[1]) | 1))
+    front: Image = (nearness - behind) / np.maximum(behind, np.float32(1e-6))
+    return front
+
+
+def _likely(pixels: Mask, front: Image, nearness: Image, redness: Image) -> float:
+    """How much a candidate looks like an instrument: the weaker of what depth and colour say."""
+    (near, beyond), (own, around) = _across_outline(pixels, nearness, redness)
+    if not near.size:
+        return 0.0
+    steps = (near - beyond) / np.maximum(beyond, np.float32(1e-6))
+    by_depth = (
+        _ramp(float((front[pixels] > FRONT).mean()), FRONT_BETWEEN),
+        _ramp(float((steps > STEP).mean()), STEPS_BETWEEN),
+        _ramp(float(np.median(steps)), STEP_BETWEEN),
+    )
+    by_colour = _ramp(float((around - own > REDNESS_STEP).mean()), COLOURED_BETWEEN)
+    return min(sum(by_depth) / len(by_depth), by_colour)
+
+
+def _across_outline(pixels: Mask, *images: Image) -> list[tuple[Image, Image]]:
+    """Of each image [h, w] its means on both sides of the outline of some pixels, one value a pixel of the outline.
+
+    The outline at the picture's border does not count.
+    """
+    whole = pixels.astype(np.uint8)
+    core = cv2.erode(whole, _box(3), borderValue=1)
+    inside = core.astype(np.float32)
+    outside = (cv2.dilate(whole, _box(2 * GAP_PX + 1)) == 0).astype(np.float32)
+    many_in, many_out = _mean(inside, OUTLINE_PX), _mean(outside, OUTLINE_PX)
+    outline = (whole > core) & (many_in > 0.02) & (many_out > 0.02)
+    return [
+        (
+            _mean(inside * each, OUTLINE_PX)[outline] / many_in[outline],
+            _mean(outside * each, OUTLINE_PX)[outline] / many_out[outline],
+        )
+        for each in images
+    ]
+
+
+def _ramp(value: float, between: tuple[float, float]) -> float:
+    """0 below, 1 above, and straight between."""
+    low, high = between
+    return min(max((value - low) / (high - low), 0.0), 1.0)
+
+
+def _outlined(picture: Looked, candidates: Sequence[_Candidate], in_front: Mask, look: TissueLook) -> Mask:
+    """[H, W] the candidates with the outline of their colour: half-way between their own and that of the tissue around.
+
+    They grow by a rim, for matching and blur reach over the outline.
+    """
+    size = picture.fine.shape[1::-1]
+    redness = cv2.GaussianBlur(_redness(picture.fine), (3, 3), 0) / np.float32(look.redness)
+    enlarged = [_resized(each.pixels, size) for each in candidates]
+    zone_px = 2 * round(ZONE_SHARE * size[0]) + 1
+    far = (cv2.dilate(np.maximum.reduce(enlarged), _box(zone_px)) == 0).astype(np.float32)
+    window = round(LOCAL_SHARE * size[0]) | 1
+    around = np.minimum(_mean(redness * far, window) / np.maximum(_mean(far, window), 1e-3), MAX_LOCAL_REDNESS)
+    found = np.zeros(size[::-1], np.uint8)
+    for each, whole in zip(candidates, enlarged, strict=True):
+        core = cv2.erode(whole, _box(3), borderValue=1)
+        own = float(np.median(redness[core > 0])) if core.any() else 0.2
+        zone = cv2.dilate(whole, _box(zone_px)) | _resized(_around_tip(each.pixels) & in_front, size)
+        like = ((redness < (own + around) / 2) & (zone > 0)).astype(np.uint8) | core
+        count, label = cv2.connectedComponents(like, connectivity=8)
+        connected = np.zeros(count, np.bool_)
+        connected[label[core > 0]] = True
+        connected[0] = False
+        found |= _closed(connected[label].astype(np.uint8), CLOSED_PX)
+    found = cv2.dilate(found, _box(GROWN_PX))
+    tool: Mask = cv2.resize(found * np.uint8(255), picture.size[::-1], interpolation=cv2.INTER_LINEAR) > 127
+    return tool
+
+
+def _around_tip(pixels: Mask) -> Mask:
+    """What [h, w] is near the part of an instrument that is farthest from where it enters the picture."""
+    row, column = np.nonzero(pixels)
+    height, width = pixels.shape
+    enters = np.minimum.reduce([row, column, height - 1 - row, width - 1 - column]) <= 1
+    away = np.hypot(row - row[enters].mean(), column - column[enters].mean())
+    far = away >= np.quantile(away, TIP_QUANTILE)
+    other = np.ones(pixels.shape, np.uint8)
+    other[row[far], column[far]] = 0
+    near: Mask = cv2.distanceTransform(other, cv2.DIST_L2, 3) <= TIP_SHARE * width
+    return near
+
+
+def _redness(rgb: Rgb) -> Image:
+    red, green = rgb[..., 0].astype(np.float32), rgb[..., 1].astype(np.float32)
+    redness: Image = (red - green) / (red + green + np.float32(DARK_LEVELS))
+    return redness
+
+
+def _resized(pixels: Mask, size: tuple[int, int]) -> Bits:
+    resized: Bits = cv2.resize(pixels.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    return resized
+
+
+def _closed(bits: Bits, side_px: int) -> Bits:
+    """Gaps of less than side_px are closed, also at the picture's border."""
+    wide = cv2.copyMakeBorder(bits, side_px, side_px, side_px, side_px, cv2.BORDER_REPLICATE)
+    closed: Bits = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _box(side_px))[side_px:-side_px, side_px:-side_px]
+    return closed
+
+
+def _mean(image: Image, side_px: int) -> Image:
+    mean: Image = cv2.boxFilter(image, -1, (side_px, side_px))
+    return mean
+
+
+def _box(side_px: int) -> Bits:
+    return np.ones((side_px, side_px), np.uint8)

@@ -1,0 +1,65 @@
+"""What finds a clip's instruments, a frame at a time, and what the report says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract.wire.notices import Notice, NoticeCode
+from contract.wire.report import Masks
+from worker.instruments.find import FoundMask, Image, Looked, Rgb, TissueLook, find_instruments
+from worker.instruments.segmenter import Segmenter
+
+MIN_SURE = 0.7
+"""Of what might be instruments, told clearly; below it the report warns."""
+LOOKED_AT = 7
+"""Pictures that tell the tissue's colour."""
+
+
+@dataclass(frozen=True)
+class Finder:
+    """Finds instruments in single pictures of one clip: by the segmenter if there is one, else by colour and depth."""
+
+    look: TissueLook
+    segmenter: Segmenter | None = None
+
+    @classmethod
+    def of(cls, pictures: Iterable[Rgb], segmenter: Segmenter | None = None) -> Finder:
+        """The finder of a clip, from some of its pictures [H, W, 3]."""
+        return cls(TissueLook.of(pictures), segmenter)
+
+    def __call__(self, rgb: Rgb, nearness: Callable[[Rgb], Image]) -> FoundMask:
+        """The instruments in a picture [H, W, 3]; nearness(coarse) is that of its coarse form."""
+        if self.segmenter is not None:
+            return self.segmenter(rgb)
+        picture = Looked.at(rgb)
+        return find_instruments(picture, nearness(picture.coarse), self.look)
+
+    def told(self, share: float, found: NDArray[np.float64]) -> tuple[Masks, Notice, tuple[Notice, ...]]:
+        """What the report says: of masks, the assumption, and warnings.
+
+        Args:
+            share: of all pixels, which is masked.
+            found: [T, 2] seen and clear of each frame (FoundMask).
+        """
+        seen, clear = found.sum(axis=0)
+        sure = float(clear / seen) if seen > 0 else 1.0
+        how = "found by colour and depth" if self.segmenter is None else "found by this installation's segmenter"
+        told = Masks(source="found" if self.segmenter is None else "segmenter", share=share, sure=sure)
+        text = f"masks: none given; instruments were {how} in {share:.1%} of the picture"
+        warnings = []
+        if sure < MIN_SURE:
+            doubt = (
+                f"No masks were given, and of what looks like instruments only {sure:.0%} is told clearly from tissue: "
+                "some may be modelled as tissue, or tissue left out. Give masks."
+            )
+            warnings.append(Notice.warning(NoticeCode.MASKS_UNSURE, doubt))
+        return told, Notice.info(NoticeCode.MASKS, text), tuple(warnings)
+
+
+def looked_at(frames: Sequence[int]) -> Sequence[int]:
+    """Those of a clip's frames whose pictures tell the tissue's colour."""
+    return frames[:: -(-len(frames) // LOOKED_AT)]
