@@ -82,12 +82,10 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
             )
         )
     if all(clip.tissue[index].all() for index in clip.one_by_one(train)):
-        found.append(
-            Notice.warning(
-                NoticeCode.NO_INSTRUMENT_MASKED,
-                "No instrument is masked anywhere: an instrument in the clip is modelled as if it were tissue.",
-            )
-        )
+        text = "No instrument is masked anywhere: an instrument in the clip is modelled as if it were tissue."
+        if clip.masks is not None and clip.masks.source == "none":
+            text += ' Give masks, or let mask_source "auto" find them.'
+        found.append(Notice.warning(NoticeCode.NO_INSTRUMENT_MASKED, text))
     confident = _share_of_tissue(clip, sampled, lambda index: clip.depth_confidence[index] >= CLEAR_CONFIDENCE)
     if confident < MIN_CONFIDENT_SHARE:
         found.append(
