@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from worker.train.hooks import RenderedFrame, TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS, Preset
+from worker.train.resume import begin_save, resume
 from worker.train.run import Run
 from worker.train.scoring import HeldOutScore, frame_renderer
 from worker.train.setup import Setup
@@ -68,6 +70,17 @@ def prepared_on(
 def trained(run: Run, hooks: TrainingHooks | None = None) -> Run:
     """The run after its last step, nothing scored."""
     train(run, Stopwatch(), lambda: HeldOutScore(math.nan, math.nan), hooks or TrainingHooks())
+    return run
+
+
+def keep(directory: Path, run: Run, t_train_s: float = 0.0) -> None:
+    begin_save(directory, run, t_train_s)()
+
+
+def kept(directory: Path, new: Run) -> Run:
+    """The run that is kept there, resumed with the setup of a new one."""
+    run = resume(directory, new.setup)
+    assert run is not None
     return run
 
 

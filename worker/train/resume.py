@@ -16,7 +16,7 @@ from torch import Tensor
 
 from contract.wire.errors import ResumeMismatch, SceneError
 from contract.wire.notices import Notice
-from worker.raster.model import state_of
+from worker.raster.model import Model, state_of
 from worker.scene.resume_file import RESUME_FILE, begin_resume, load_resume
 from worker.train.prepare import begun, examine_device, frames_of
 from worker.train.presets import Preset
@@ -50,6 +50,7 @@ def resume(directory: Path, setup: Setup) -> Run | None:
         examine_device(setup)
         low, high = state["start"]["box"]
         model = resting_model(state["count"], (low, high), setup, preset)
+        _load_parameters(model, tensors)  # a GPU warms up on them
         chosen = tuple(Notice.model_validate(each) for each in state["start"]["chosen"])
         run = begun(setup, frames, model, preset, chosen, (low, high))
         _put(run, tensors, state)
@@ -101,11 +102,17 @@ def _settled(preset: Preset, start: Mapping[str, Any]) -> Preset:
     return dataclasses.replace(preset.with_bases(start["bases"]), fusion=fusion)
 
 
-def _put(run: Run, tensors: dict[str, Tensor], state: Mapping[str, Any]) -> None:
-    """Put the stored state into a run of as many Gaussians that has made no step."""
-    lacking = run.model.parameters().keys() - tensors.keys()
+def _load_parameters(model: Model, tensors: dict[str, Tensor]) -> None:
+    """Load the stored parameters into a model of as many Gaussians."""
+    names = model.parameters().keys()
+    lacking = names - tensors.keys()
     if lacking:
         raise ValueError(f"it holds no {', '.join(sorted(lacking))}")
+    model.load_arrays({name: tensors[name] for name in names})
+
+
+def _put(run: Run, tensors: dict[str, Tensor], state: Mapping[str, Any]) -> None:
+    """Put the stored state into a run that has made no step."""
     run.model.load_arrays(tensors)
     run.average.load_arrays(tensors, state["averaged"])
     if run.densifier is not None:

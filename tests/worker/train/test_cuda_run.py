@@ -16,6 +16,7 @@ pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA 
 from contract.wire.options import ReconstructionOptions
 from tests.helpers import assert_close
 from tests.worker.clips import plane_clip
+from tests.worker.phantoms import keep, kept
 from worker.input.clip import DepthClip, FrameSplit, split_frames
 from worker.outcome import scene_of
 from worker.raster.backend import CPU, Device
@@ -24,7 +25,6 @@ from worker.render.view import render_frame
 from worker.train.loop import step
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
-from worker.train.resume import load_run, save_run
 from worker.train.run import Run
 from worker.train.setup import Setup
 
@@ -97,11 +97,11 @@ def test_a_run_that_was_stopped_goes_on_on_the_other_device(
 ) -> None:
     for device, run in runs.items():
         run.average.add(run.model.parameters())
-        save_run(tmp_path / device.kind, run, 1.0)
-    resumed = {CPU: prepared(clip, split, CPU), gpu: runs[gpu]}
+        keep(tmp_path / device.kind, run)
+    resumed = {}
     for device, other in ((CPU, gpu), (gpu, CPU)):
-        run = resumed[device]
-        assert load_run(tmp_path / other.kind, run) == 1.0
+        run = resumed[device] = kept(tmp_path / other.kind, prepared(clip, split, device))
+        assert run.iteration == 2
         assert_alike(run, runs[CPU])
         go_on(run, ITERATIONS)
         run.average.add(run.model.parameters())

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from contract.wire.errors import Cancelled, ResumeMismatch, TrainingDiverged
-from tests.worker.phantoms import bits, phantom_clip, prepared, prepared_on, trained, view
+from tests.worker.phantoms import bits, keep, kept, phantom_clip, prepared, prepared_on, trained, view
 from worker.input.clip import DepthClip, split_frames
 from worker.machine.hooks import Progress
 from worker.machine.timing import Stopwatch
@@ -26,7 +26,7 @@ from worker.train.densify import DensifySettings
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.presets import PRESETS, Preset
-from worker.train.resume import begin_save, resume
+from worker.train.resume import resume
 from worker.train.run import CurvePoint, Run, frames_at, write_curve
 from worker.train.schedule import Schedule
 from worker.train.scoring import HeldOutScore
@@ -51,17 +51,6 @@ def stopping_after(iterations: int) -> TrainingHooks:
         return asked > iterations
 
     return TrainingHooks(should_stop=should_stop)
-
-
-def keep(directory: Path, run: Run, t_train_s: float = 0.0) -> None:
-    begin_save(directory, run, t_train_s)()
-
-
-def kept(directory: Path, new: Run) -> Run:
-    """The run that is kept there, resumed with the setup of a new one."""
-    run = resume(directory, new.setup)
-    assert run is not None
-    return run
 
 
 def run_bits(clip: DepthClip, preset: Preset, *, iterations: int = ITERATIONS, seed: int = 0) -> dict[str, bytes]:

@@ -13,7 +13,7 @@ import pytest
 
 from contract.wire.errors import Cancelled
 from contract.wire.options import ReconstructionOptions
-from tests.worker.phantoms import bits, phantom_clip, prepared_on, trained
+from tests.worker.phantoms import bits, keep, kept, phantom_clip, prepared_on, trained
 from worker.input.clip import DepthClip, FrameSplit, split_frames
 from worker.machine.timing import Stopwatch
 from worker.model.metrics import psnr_tissue
@@ -23,7 +23,6 @@ from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
 from worker.train.presets import PRESETS
-from worker.train.resume import load_run, save_run
 from worker.train.run import Run, frames_at
 from worker.train.schedule import AVERAGED, Schedule, validation_frames
 from worker.train.scoring import HeldOutScore
@@ -198,9 +197,8 @@ def test_held_out_frames_do_not_decide_when_a_run_ends(
 def test_a_validated_run_goes_on_to_the_bits_of_an_unstopped_one(
     straight: Run, clip: DepthClip, split: FrameSplit, stopped_after: int, tmp_path: Path
 ) -> None:
-    save_run(tmp_path, until(stopped_after, validated(clip, split)), 1.5)
-    again = validated(clip, split)
-    load_run(tmp_path, again)
+    keep(tmp_path, until(stopped_after, validated(clip, split)))
+    again = kept(tmp_path, validated(clip, split))
     assert again.iteration == stopped_after
     assert bits(trained(again)) == bits(straight)
     assert again.schedule == straight.schedule
