@@ -23,7 +23,7 @@ from worker.input.clip.split import training_frames
 from worker.input.clip.types import DepthClip, RgbFrame
 from worker.machine.mapped import let_go
 
-FRAMES_A_SECOND, LEAST_FRAMES = 6.5, 32
+FRAMES_A_SECOND, LEAST_FRAMES = 5.8, 32
 """Training frames for each second of training, and the fewest: two cores make some three steps on each of so many."""
 LEFT_OUT_CODES = (NoticeCode.NOTHING_NEW, NoticeCode.NO_TIME)
 KEPT_FRAMES = 64
