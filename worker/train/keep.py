@@ -10,6 +10,7 @@ import hashlib
 import logging
 import os
 import shutil
+import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -32,6 +33,8 @@ PERIOD_S = 10.0
 """Seconds of training between two states that are kept."""
 MAX_SHARE = 0.05
 """Of the time: where keeping a state takes long, as it does for a long clip, states are kept less often."""
+NICENESS = 10
+"""Of the threads that write: copying a clip takes half a second of a core while the start of training needs both."""
 SPARE_BYTES = 1 << 30
 """Nothing is kept that would leave less room on the disk than this."""
 
@@ -68,7 +71,7 @@ class Keeper:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._ending = threading.Event()
-        self._threads = ThreadPoolExecutor(2, thread_name_prefix="keep")
+        self._threads = ThreadPoolExecutor(2, thread_name_prefix="keep", initializer=_give_way)
         self._state: Future[None] | None = None
         self._due_s: float | None = None
         self.written: set[str] = set()
@@ -145,6 +148,12 @@ class Keeper:
 
     def _has_room(self, size_bytes: int) -> bool:
         return shutil.disk_usage(self.folder).free >= size_bytes + SPARE_BYTES
+
+
+def _give_way() -> None:
+    """Lower the priority of the calling thread; elsewhere than on Linux it would be the whole process's."""
+    if sys.platform == "linux":
+        os.nice(NICENESS)
 
 
 def _identity(request: ReconstructionRequest) -> str:
