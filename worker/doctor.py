@@ -46,6 +46,7 @@ OPTIONAL_PACKAGES = {
     "triton": f"only needed for a GPU, {triton_range()}",
     "fsspec": "only needed for a store in a bucket",
     "s3fs": "only needed for a store in a bucket",
+    "onnxruntime": "only needed for a segmenter of your own",
 }
 INSTALL_REMEDY = "in a checkout, run `make setup`, or `pip install .`"
 
@@ -75,6 +76,7 @@ def examine(settings: Settings) -> list[Finding]:
         _packages,
         lambda: _device(settings),
         _video,
+        lambda: _segmenter(settings),
         lambda: _queue(settings),
         lambda: _disk(settings),
     )
@@ -157,6 +159,18 @@ def bundled_ffmpeg(site_packages: Path) -> tuple[int, ...] | None:
         if found:
             return tuple(int(part) for part in found[1].split(b"."))
     return None
+
+
+def _segmenter(settings: Settings) -> list[Finding]:
+    if settings.segmenter is None:
+        return []
+    from worker.instruments import load_segmenter  # needs packages that _packages may miss
+
+    try:
+        load_segmenter(settings.segmenter)
+    except UnavailableError as error:
+        return [Finding("segmenter", error.problem, error.remedy, blocks=True)]
+    return [Finding("segmenter", str(settings.segmenter))]
 
 
 def _queue(settings: Settings) -> list[Finding]:

@@ -195,7 +195,9 @@ class JobOptions(Model):
     mask_polarity: str = "auto"
     """what is bright in the masks"""
     mask_source: str = "given"
-    """masks of instruments: given with the clip; auto finds them if none are given; none uses none"""
+    """masks of instruments. given: the clip's, else the segmenter's if the installation has one; auto: else found
+    by colour and depth; none: every pixel is tissue
+    """
     pose_convention: str = "opengl"
     """axes of poses_bounds.npy"""
     holdout: str = "every8"
@@ -261,7 +263,7 @@ class Masks(Model):
     as tissue
     """
     share: float = 0.0
-    """of the left eye's pixels, which is no tissue"""
+    """of the left eye's pixels that are no tissue"""
     sure: float | None = None
     """how clearly instruments were told from tissue, where masks were found; None: they were not"""
 
@@ -410,7 +412,9 @@ class GivenOptions(TypedDict, total=False):
     mask_polarity: Literal["auto", "tool", "tissue"]
     """what is bright in the masks"""
     mask_source: Literal["given", "auto", "none"]
-    """masks of instruments: given with the clip; auto finds them if none are given; none uses none"""
+    """masks of instruments. given: the clip's, else the segmenter's if the installation has one; auto: else found
+    by colour and depth; none: every pixel is tissue
+    """
     pose_convention: Literal["opengl", "llff"]
     """axes of poses_bounds.npy"""
     holdout: Annotated[str, Field(max_length=8000, pattern="^(every8|blocks8|none|\\d{1,6}(,\\d{1,6})*)$")] | list[int]

@@ -39,7 +39,8 @@ class ClipOptions(BaseModel):
     mask_polarity: MaskPolarity = Field(default="auto", description="what is bright in the masks")
     mask_source: MaskSource = Field(
         default="given",
-        description="masks of instruments: given with the clip; auto finds them if none are given; none uses none",
+        description="masks of instruments. given: the clip's, else the segmenter's if the installation has one; "
+        "auto: else found by colour and depth; none: every pixel is tissue",
     )
     pose_convention: PoseConvention = Field(default="opengl", description="axes of poses_bounds.npy")
 

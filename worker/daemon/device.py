@@ -45,6 +45,7 @@ from worker.daemon.serve import Reply, RequestServer
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.input.decode import keep_decoder_ready
+from worker.instruments import load_segmenter
 from worker.machine.hooks import Progress
 from worker.pipeline import Made, judge, judge_again, make
 from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lost
@@ -90,6 +91,8 @@ def run_device(settings: Settings) -> None:
 
 def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     device = choose_device(settings.device, cpu_by=CPU_BY_VARIABLE)
+    if settings.segmenter is not None:
+        load_segmenter(settings.segmenter)  # says now what every job without masks would fail by
     store, snapshots = open_store(settings), Snapshots()
     pace = Pace(thread_count(), used_s=time.process_time) if device == CPU else Pace()
     # Clips are unpacked inside the data directory, in a folder that the next start empties.
@@ -250,8 +253,8 @@ def make_or_start_anew(request: ReconstructionRequest, out: Path, kept: Path, ho
     """Make the scene, resuming the state in `kept`; start again if that state is damaged or of another version."""
     try:
         return make(request, out, hooks, kept)
-    except ResumeMismatch:
-        logger.warning("the stored state cannot be resumed; training starts again")
+    except ResumeMismatch as error:
+        logger.warning("training starts again, because the stored state cannot be resumed: %s", error.__cause__)
         (kept / RESUME_FILE).unlink()
         return make(request, out, hooks, kept)
 

@@ -13,6 +13,7 @@ STAGE_LIMITS_S: Mapping[str, float] = MappingProxyType(
         "decode": 20.0,  # a frame has 10 s, which the decoding process enforces first
         "stereo": 30.0,  # a pair of 4096 x 2160 takes 3 s on a slow core; three are aligned without a report
         "compile": 120.0,  # one set of kernels takes seconds, on a crowded machine minutes
+        "masks": 60.0,  # a frame takes some 10 ms, of a hospital's own segmenter seconds
         "poses": 60.0,  # a step of the fit takes up to some seconds
         "fusion": 60.0,  # all frames at once, about 10 ms each
         "motion": 10.0,  # a frame takes some 10 ms

@@ -23,7 +23,7 @@ from worker.machine.hooks import Hooks
 from worker.machine.mapped import let_go, mapped_zeros
 from worker.machine.opencv import one_opencv_thread
 
-MASKED = "masks"
+STAGE = "masks"
 """The stage."""
 
 
@@ -54,9 +54,13 @@ def with_instruments_found(
         clip.let_go(i)
         return masked
 
-    hooks.report_stage(MASKED, 0.0)
+    hooks.report_stage(STAGE, 0.0)
+    shares = []
     with one_opencv_thread(), ThreadPoolExecutor(cores()) as pool:
-        share = float(np.mean(list(pool.map(find, wanted))))
+        for masked in pool.map(find, wanted):
+            shares.append(masked)
+            hooks.report_stage(STAGE, len(shares) / len(wanted))
+    share = float(np.mean(shares))
     masks, assumption, doubts = finder.told(share, told)
     kept = (each for each in clip.assumptions if each.code is not NoticeCode.MASKS)
     return replace(

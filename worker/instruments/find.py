@@ -140,7 +140,7 @@ def _candidates(picture: Looked, nearness: Image, look: TissueLook) -> list[_Can
 
 
 def _in_front(nearness: Image) -> Image:
-    """[h, w] by how much each pixel is nearer than the tissue around it, relative to that."""
+    """[h, w] how much nearer each pixel is than the tissue around it, as a share of that tissue's nearness."""
     behind = cv2.morphologyEx(nearness, cv2.MORPH_OPEN, _box(round(BEHIND_SHARE * nearness.shape[1]) | 1))
     front: Image = (nearness - behind) / np.maximum(behind, np.float32(1e-6))
     return front

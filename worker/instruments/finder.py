@@ -23,18 +23,19 @@ LOOKED_AT = 7
 class Finder:
     """Finds instruments in single pictures of one clip: by the segmenter if there is one, else by colour and depth."""
 
-    look: TissueLook
+    look: TissueLook | None
     segmenter: Segmenter | None = None
 
     @classmethod
     def of(cls, pictures: Iterable[Rgb], segmenter: Segmenter | None = None) -> Finder:
         """The finder of a clip, from some of its pictures [H, W, 3]."""
-        return cls(TissueLook.of(pictures), segmenter)
+        return cls(TissueLook.of(pictures) if segmenter is None else None, segmenter)
 
     def __call__(self, rgb: Rgb, nearness: Callable[[Rgb], Image]) -> FoundMask:
         """The instruments in a picture [H, W, 3]; nearness(coarse) is that of its coarse form."""
         if self.segmenter is not None:
             return self.segmenter(rgb)
+        assert self.look is not None
         picture = Looked.at(rgb)
         return find_instruments(picture, nearness(picture.coarse), self.look)
 

@@ -7,6 +7,7 @@ which class 0 is tissue.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,12 @@ from contract.wire.errors import UnavailableError
 from worker.instruments.find import FoundMask, Rgb
 
 INSTALL = "Install intrasplat with its extra onnx: pip install 'intrasplat[onnx]'."
-CHECK = "docs/operations.md says what a segmenter gets and gives."
+CHECK = "Set INTRASPLAT_SEGMENTER (--segmenter) to an ONNX network as in docs/operations.md, or leave it unset."
 LIKELY = 0.1
 """Probability from which a pixel counts as what might be an instrument."""
+
+
+logger = logging.getLogger("intrasplat.worker")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +52,8 @@ class Segmenter:
         try:
             answer = self.session.run(None, {name: planes})[0]
         except Exception as error:  # onnxruntime has no error tree to rely on
-            raise UnavailableError(f"The segmenter failed: {str(error)[:200]}", CHECK) from error
+            logger.warning("the segmenter failed: %s", error)
+            raise UnavailableError(f"The segmenter failed ({type(error).__name__}).", CHECK) from error
         likely = _probability(np.asarray(answer), given.shape[:2])
         likely = cv2.resize(likely, (width, height), interpolation=cv2.INTER_LINEAR)
         asked = likely > LIKELY
@@ -71,7 +76,8 @@ def load_segmenter(path: Path) -> Segmenter:
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        problem = f"The segmenter {path.name} cannot be loaded: {str(error)[:200]}"
+        logger.warning("the segmenter %s cannot be loaded: %s", path, error)  # the text may hold paths
+        problem = f"The segmenter {path.name} cannot be loaded ({type(error).__name__})."
         raise UnavailableError(problem, CHECK) from error
     inputs = session.get_inputs()
     shape = inputs[0].shape if len(inputs) == 1 else []

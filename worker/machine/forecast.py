@@ -14,6 +14,7 @@ from worker.machine.hooks import Progress
 USUAL_S = {
     "decode": (1.0, 0.0),
     "stereo": (0.8, 0.09),
+    "masks": (0.0, 0.0),
     "poses": (0.1, 0.0),
     "motion": (0.1, 0.03),
     "fusion": (0.2, 0.02),

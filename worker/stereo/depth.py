@@ -205,7 +205,7 @@ def _plan(
         tissue, rectified = clip.tissue[i], coarse.rectified(right[i])
         if finder is not None:
             grey, offset_px = grey_of(rectified), clip.disparity_offset_px
-            tissue = tissue & ~finder(rgb[i], lambda coarse: nearness(coarse, grey, plan, offset_px)).tool
+            tissue = tissue & ~finder(rgb[i], lambda picture: nearness(picture, grey, plan, offset_px)).tool
         return MatchedPair.of(rgb[i], rectified, tissue, plan)
 
     found = pool.map(matched_pair, spread(measured, ALIGNMENT_PAIRS))

@@ -18,7 +18,7 @@ from worker.input.calibration.types import StereoCalibration
 from worker.input.clip import ClipLimits, DepthClip, StereoClip, training_frames
 from worker.input.clip.sampling import most_frames, sampled
 from worker.input.decode import DecoderKilledError, decode_clip
-from worker.instruments import Finder, Segmenter, load_segmenter, with_instruments_found
+from worker.instruments import Finder, load_segmenter, with_instruments_found
 from worker.machine.hooks import Hooks, ignore
 from worker.machine.timing import Timings
 from worker.stereo.depth import estimate_depth
@@ -65,7 +65,6 @@ def open_with_depth(
             decoding process was killed every time.
         Cancelled: hooks.should_stop said so.
     """
-    network = load_segmenter(segmenter) if segmenter is not None and options.mask_source != "none" else None
 
     def once() -> DepthClip:
         hooks.report_stage("decode", 0.0)
@@ -84,8 +83,9 @@ def open_with_depth(
             hooks.on_first_moment(decoded.moment(measured[0]))
             clip = sampled(decoded, options)
             without = clip.masks is not None and clip.masks.source == "none"
-            if not without or not _finds(options.mask_source, network):
+            if not without or not _finds(options.mask_source, segmenter):
                 return clip
+            network = None if segmenter is None else load_segmenter(segmenter)
             with timings.measure("masks_s"):
                 return with_instruments_found(clip, measured, hooks, network)
         with closing(decoded):
@@ -101,7 +101,7 @@ def open_with_depth(
                 before_matching=before_matching,
                 depth_range_mm=(options.min_depth_mm, options.max_depth_mm),
                 mask_source=options.mask_source,
-                segmenter=network,
+                segmenter=segmenter,
             )
 
     for _ in range(TRIES - 1):
@@ -125,10 +125,11 @@ def match_eyes(
     before_matching: Callable[[], None] = ignore,
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
     mask_source: MaskSource = "given",
-    segmenter: Segmenter | None = None,
+    segmenter: Path | None = None,
 ) -> DepthClip:
     """Rectify a stereo clip and match its eyes, as open_with_depth does."""
     finds = clip.tissue is None and _finds(mask_source, segmenter)
+    network = load_segmenter(segmenter) if finds and segmenter is not None else None
     rectified = rectify(clip, calibration)
     measured = training_frames(clip.frame_count, holdout)
     before_matching()
@@ -141,11 +142,11 @@ def match_eyes(
             most_frames=most_frames,
             device=device,
             depth_range_mm=depth_range_mm,
-            finder_of=partial(Finder.of, segmenter=segmenter) if finds else None,
+            finder_of=partial(Finder.of, segmenter=network) if finds else None,
         )
     return replace(matched, masks=Masks(source="none")) if clip.tissue is None and not finds else matched
 
 
-def _finds(mask_source: MaskSource, segmenter: Segmenter | None) -> bool:
+def _finds(mask_source: MaskSource, segmenter: Path | None) -> bool:
     """Whether instruments of a clip without masks are to be found."""
     return mask_source == "auto" or (mask_source == "given" and segmenter is not None)

@@ -10,9 +10,11 @@ from contract.wire.job import JobProgress
 from contract.wire.options import ReconstructionOptions
 from worker.daemon.hang import MAX_LOOK_S, OTHER_LIMIT_S, STAGE_LIMITS_S, HangDetector
 from worker.daemon.orders import job_progress
-from worker.machine.hooks import Progress
-from worker.phantom import PhantomSettings, make_phantom, write_stereo_video
+from worker.machine.hooks import Hooks, Progress
+from worker.machine.timing import Timings
+from worker.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
 from worker.pipeline import reconstruct
+from worker.stereo import ClipPaths, open_with_depth
 from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
 
@@ -99,3 +101,13 @@ def test_a_reconstruction_from_stereo_advances_with_every_frame_and_knows_no_sta
     assert len(places["stereo"]) >= frames
     assert len(places["motion"]) >= frames / 2 - 2  # in two halves side by side, less what is held out
     assert len(places["score"]) >= 3
+
+
+def test_finding_instruments_in_a_clip_with_depth_advances_with_every_frame(tmp_path: Path) -> None:
+    frames = 4
+    write_endonerf(make_phantom(PhantomSettings(width=64, height=48, frames=frames)), tmp_path / "clip", masks=False)
+    told: list[Progress] = []
+    options = ReconstructionOptions(holdout="none", mask_source="auto")
+    open_with_depth(ClipPaths(tmp_path / "clip"), options, Hooks(on_progress=told.append), Timings())
+    assert {each.stage for each in told} <= set(STAGE_LIMITS_S)
+    assert sorted({each.fraction for each in told if each.stage == "masks"}) == [0.0, 0.25, 0.5, 0.75, 1.0]

@@ -69,5 +69,16 @@ def test_a_clip_without_masks_asks_the_segmenter(blue: Path, tmp_path: Path) -> 
 def test_what_is_no_such_network_is_refused(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "other.onnx"
     path.write_bytes(content)
-    with pytest.raises(UnavailableError, match=r"other\.onnx"):
+    with pytest.raises(UnavailableError, match=r"other\.onnx") as refused:
         load_segmenter(path)
+    assert str(tmp_path) not in str(refused.value)
+    assert "INTRASPLAT_SEGMENTER" in refused.value.remedy
+
+
+def test_a_clip_with_masks_of_its_own_needs_no_segmenter(tmp_path: Path) -> None:
+    folder = tmp_path / "clip"
+    write_endonerf(make_phantom(PhantomSettings(width=64, height=48, frames=3)), folder)
+    options = ReconstructionOptions(holdout="none")
+    clip = open_with_depth(ClipPaths(folder), options, Hooks(), Timings(), segmenter=tmp_path / "missing.onnx")
+    assert clip.masks is not None
+    assert clip.masks.source == "given"
