@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 
 from contract.store.durable import FOR_ALL, replace_file
+from contract.wire.errors import SceneError
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import Report
@@ -26,13 +27,18 @@ def add_scores(folder: Path, report: Report) -> None:
 
     Raises:
         FileNotFoundError: the scene has been removed.
+        SceneError: its manifest or its curve is damaged.
     """
-    manifest = json.loads((folder / MANIFEST).read_bytes())
-    curve = (folder / CURVE).read_text()
-    files = {REPORT: report.model_dump_json(indent=1).encode(), CURVE: _with_score(curve, report).encode()}
+    try:
+        manifest = json.loads((folder / MANIFEST).read_bytes())
+        curve = _with_score((folder / CURVE).read_text(), report)
+        files = {REPORT: report.model_dump_json(indent=1).encode(), CURVE: curve.encode()}
+        for name, content in files.items():
+            manifest["files"][name] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    except (ValueError, KeyError, TypeError) as error:
+        raise SceneError(f"The manifest or the curve of the scene in {folder.name} is damaged.") from error
     for name, content in files.items():
         replace_file(folder / name, content, FOR_ALL)
-        manifest["files"][name] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     replace_file(folder / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False).encode(), FOR_ALL)
 
 

@@ -38,8 +38,8 @@ class AwaitedScores:
         self._scene = name, job_id, attempt
         self._log = logging.LoggerAdapter(logger, _named(job_id, attempt))
 
-    def take(self, child: DeviceChild, stop: Callable[[], bool], *, gives_up: bool = False) -> None:
-        """Until the child has scored the scene, is stopped, hangs or dies.
+    def take(self, child: DeviceChild, stop: Callable[[], bool], *, gives_up: bool = False) -> bool:
+        """Until the child has scored the scene, is stopped, hangs or dies. Whether nothing is expected any more.
 
         gives_up: a child that hangs or dies is the scene's fault, and its report says that there will be no scores.
         """
@@ -53,26 +53,26 @@ class AwaitedScores:
             if detector.is_hung() or (asked_s is not None and time.monotonic() - asked_s > MAX_STOP_S):
                 child.kill()
         if isinstance(report, Scored):
-            self._add(report.report)
-        elif isinstance(report, Ended) and asked_s is None:
-            self._log.warning("the device process %s while it scored a scene", report.cause)
+            return self._settle(lambda: report.report)
+        if isinstance(report, Ended) and asked_s is None:
+            cause = report.cause
+            self._log.warning("the device process %s while it scored a scene", cause)
             if gives_up:
-                self._give_up(report.cause)
+                return self._settle(lambda: without_scores(self._store.newest_report(*self._scene[1:]), cause))
+        return False
 
-    def _give_up(self, cause: str) -> None:
-        with contextlib.suppress(UnavailableError):  # it is made up for later
-            try:
-                first = self._store.newest_report(*self._scene[1:])
-            except SceneError:  # it was purged, or is damaged
-                self._store.expect_no_scores(*self._scene)
-                return
-            self._add(without_scores(first, cause))
-
-    def _add(self, report: Report) -> None:
+    def _settle(self, scored: Callable[[], Report]) -> bool:
+        """Add the report that this gives. False: it is still expected, and made up for later."""
         try:
-            self._store.add_scores(*self._scene, report)
-        except (UnavailableError, SceneError) as error:  # it is still expected, and made up for later
+            try:
+                self._store.add_scores(*self._scene, scored())
+            except SceneError as error:  # it was purged, or is damaged
+                self._log.warning("the scores were not kept: %s", error)
+                self._store.expect_no_scores(*self._scene)
+        except UnavailableError as error:
             self._log.warning("the scores were not kept: %s", error)
+            return False
+        return True
 
 
 class LeftScores:
@@ -106,8 +106,7 @@ class LeftScores:
                 logger.info("the scores of an earlier attempt are made up for", extra=_named(job_id, attempt))
                 child.send(order)
                 scores = AwaitedScores(self._store, self._name, job_id, attempt)
-                scores.take(child, stop=self._is_to_stop(), gives_up=True)
-                if (job_id, attempt) in self._store.unscored(self._name):
+                if not scores.take(child, stop=self._is_to_stop(), gives_up=True):
                     self._tried_s[job_id] = time.monotonic()
                 return
 

@@ -86,11 +86,14 @@ def bench(tmp_path: Path) -> Unscored:
     return Unscored(tmp_path)
 
 
-def test_the_queue_is_not_asked_at_every_look_whether_a_job_waits(bench: Unscored) -> None:
+def test_the_queue_is_not_asked_at_every_look_whether_a_job_waits(
+    bench: Unscored, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scores, "ASK_PERIOD_S", 60.0)
     job_id = bench.published()
     bench.make_up(score_s=0.3)
     assert bench.store.newest_report(job_id, 1).scored
-    assert cast(Queue, bench.queue).asked <= 1
+    assert cast(Queue, bench.queue).asked == 0
 
 
 def test_scores_give_way_to_a_job_that_waits(bench: Unscored, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,4 +144,11 @@ def test_a_scene_whose_report_cannot_be_read_is_not_scored(bench: Unscored) -> N
     job_id = bench.published()
     (bench.store.scene_folder(job_id, 1) / REPORT_FILE).write_text("{")
     assert bench.make_up().sent == []
+    assert bench.store.unscored("worker-1") == []
+
+
+def test_a_scene_whose_manifest_is_damaged_is_waited_for_no_longer(bench: Unscored) -> None:
+    job_id = bench.published()
+    (bench.store.scene_folder(job_id, 1) / MANIFEST).write_text("{")
+    bench.make_up()
     assert bench.store.unscored("worker-1") == []
