@@ -60,12 +60,12 @@ def fill(
     middle pixel, or from the pixel to which the tissue in the middle has moved. What only the right eye sees comes
     from its frames. Where the camera moves, keyframes share the tissue: each gives what it shows best.
 
-    moved: the keyframes, and the displacement since each; a single one is the first frame.
+    moved: the keyframes, and the displacement since each.
     """
     first, later = frames[0], frames[1:]
     elsewhere = [index for index in later if not same_pose(clip, index, first)]
     coverage = _Coverage(clip, stride, moved if elsewhere else {})
-    if len(moved) > 1:
+    if elsewhere and moved and list(moved) != [first]:
         parts = _from_keyframes(clip, frames, stride, moved, coverage)
     else:
         parts = [coverage.add(clip, first, coverage.pixels[clip.tissue[first].reshape(-1)[coverage.pixels]])]

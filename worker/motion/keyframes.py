@@ -24,7 +24,7 @@ SAMPLE_SHARE = 1 / 32
 MAX_NEW_SHARE = 0.5
 """A frame becomes a keyframe if more than this share of its tissue lies in no earlier keyframe's view."""
 MAX_NEARER = 1.3
-"""Nor does tissue count as in view that an earlier keyframe shows from farther away than this times the distance."""
+"""A keyframe that is more than this times as far from the tissue as the frame does not count as showing it."""
 MIN_OVERLAP = 0.2
 """Tracks of a keyframe go to the frames that show at least this share of its tissue."""
 
@@ -46,6 +46,8 @@ def keyframes(clip: DepthClip, train: Sequence[int]) -> list[tuple[int, list[int
         known = np.any([depth <= MAX_NEARER * depth_mm for depth in found], axis=0)
         if not keys or known.mean() < 1 - MAX_NEW_SHARE:
             keys.append(place)
+    if not keys:  # no sampled pixel has a depth
+        return [(0, list(range(len(train))))]
     near_mm = {key: np.median(to_camera(seen_mm[key], poses[key])[:, 2]) for key in keys}
     least_mm = min(near_mm.values())
     keys.sort(key=lambda key: int(np.log(near_mm[key] / least_mm) / np.log(MAX_NEARER)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache
 
 import numpy as np
@@ -52,6 +53,12 @@ def test_a_fixed_camera_has_one_keyframe_and_the_same_tracks_as_ever() -> None:
     (found,), expected = followed("breathing"), track(clip, TRAIN)
     np.testing.assert_array_equal(found.displacement_mm, expected.displacement_mm)
     np.testing.assert_array_equal(found.confidence, expected.confidence)
+
+
+def test_where_no_sampled_pixel_has_depth_the_first_frame_is_followed() -> None:
+    _, clip = drawn("breathing", "pan")
+    sparse = dataclasses.replace(clip, depth_mm=np.zeros_like(clip.depth_mm))
+    assert keyframes(sparse, TRAIN) == [(0, list(range(len(TRAIN))))]
 
 
 def test_the_keyframes_of_a_pan_show_most_of_what_every_frame_shows() -> None:
