@@ -145,14 +145,14 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
     out_dir.mkdir(parents=True, exist_ok=True)
 
     def show(moment: DepthClip) -> None:
-        if hooks.on_first_picture is not None:
-            with suppress(InputError):  # no depth: the stages to come say so, if no frame has any
+        with suppress(InputError):  # no depth: the stages to come say so, if no frame has any
+            if hooks.on_first_picture is not None:
                 hooks.on_first_picture(first_picture(moment))
-        timings.seconds["t_first_view_s"] = time.time() - accepted_at_s
+            timings.seconds["t_first_view_s"] = time.time() - accepted_at_s
 
     showing = dataclasses.replace(hooks, on_first_moment=show)
     clip = keeper.clip(request, lambda: open_with_depth(request, showing, timings, device))
-    if "t_first_view_s" not in timings.seconds:  # it was kept with its depth
+    if "t_first_view_s" not in timings.seconds:  # it was kept with its depth, or the first moment has none
         frames = training_frames(clip.frame_count, options.holdout)
         moment = next((i for i in frames if (clip.tissue[i] & (clip.depth_mm[i] > 0)).any()), frames[0])
         show(clip.moment(moment))

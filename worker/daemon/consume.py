@@ -113,9 +113,8 @@ class Consumer:
                 scores = run_job(self._queue, self._store, child, record, self._name, self._end, self._room)
                 self.held.forget()
                 self.job_id = None
-                if (
-                    scores is not None
-                ):  # also while a job waits: made up for later, they would take several times as long
+                if scores is not None:
+                    # also while a job waits: made up for later they take several times as long
                     scores.take(child, stop=self._end.is_set)
             else:
                 self._left.make_up(child)

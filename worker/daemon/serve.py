@@ -34,7 +34,7 @@ from contract.wire.rendering import (
     WorkerRequest,
 )
 from worker.daemon.pace import Pace
-from worker.daemon.turns import Turn, Turns
+from worker.daemon.turns import COARSEST, Turn, Turns
 from worker.render.encode import FOR_EYES
 
 POLL_MS = 50
@@ -205,8 +205,8 @@ class RequestServer:
     def level(self) -> int:
         """The level of detail of the answer that is being made: as fine as time allows.
 
-        0, the finest, if no job trains, or if the answer is not too much for now and nobody else waits. Else 1 if all
-        who wait get theirs within ALL_WITHIN_S by that. Else 2.
+        0, the finest, if no job trains, or if nobody else waits and the pace affords it. 1 if the answers of this level
+        to all who wait take less than ALL_WITHIN_S. 2 otherwise.
         """
         turn = self._begun[-1]
         others = self._turns.others(turn.request)
@@ -252,12 +252,14 @@ class RequestServer:
 
     def _coarsest(self, request: RenderRequest | ExportRequest) -> int:
         """The coarsest level of detail that will do."""
-        return -1 if self._pace.trains and isinstance(request, RenderRequest) and request.format in FOR_EYES else 0
+        may_be_coarse = isinstance(request, RenderRequest) and request.format in FOR_EYES
+        return COARSEST if self._pace.trains and may_be_coarse else 0
 
     def _wait_s(self, turn: Turn) -> float:
         """Seconds until its turn, as far as known."""
         larger = [each for each in self._begun if turn.seconds >= SMALL_SHARE * each.seconds]
-        before_s = self._turns.seconds_before(turn) + sum(max(0.0, each.seconds - each.spent_s) for each in larger)
+        left_s = (max(0.0, self._turns.seconds(each.cost, each.level) - each.spent_s) for each in larger)
+        before_s = self._turns.seconds_before(turn) + sum(left_s)
         return self._pace.rest_s() + before_s / self._pace.rate
 
     def _give(self, turn: Turn) -> None:

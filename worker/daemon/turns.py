@@ -13,6 +13,8 @@ PATIENCE = 4.0
 FIRST_SPEEDS = (3e11, 1e12, 2e12)
 """Pixels x Gaussians of the whole picture, rendered in a CPU second at each level of detail (worker/render/detail.py),
 until the first render has been timed (bm_service, on two cores)."""
+COARSEST = len(FIRST_SPEEDS) - 1
+"""Level of detail."""
 LEARNING = 0.2
 """Share of the newest render in what is known of the speed."""
 
@@ -23,7 +25,7 @@ class Turn:
 
     cost       pixels x Gaussians
     seconds    CPU seconds that all of it will take, as far as known; spent_s: that it has taken
-    least_s    as seconds, of the coarsest picture that does
+    least_s    the same at the coarsest level of detail that the caller accepts
     level      of detail at which it is answered
     arrived_s  monotonic
     """

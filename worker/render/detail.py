@@ -35,7 +35,8 @@ _thinned: WeakKeyDictionary[Scene, dict[int, Scene]] = WeakKeyDictionary()
 def thinned(scene: Scene, one_of: int) -> Scene:
     """The scene with one of so many Gaussians, each larger; it is made once, and kept as long as the scene is.
 
-    The Gaussians lie in the order of the pixels that they were made of, so those that are left cover all evenly. The
+    Neighbours in space are close in the order of the Gaussians, of pixels in training and of a space-filling curve in a
+    finished scene, so those that are left cover all evenly. The
     tensors are views of the scene's.
     """
     if one_of == 1:

@@ -40,30 +40,24 @@ _PIECE_BYTES, _AT_MOST_BYTES = 1 << 20, 64 << 20
 """after_each is called after pieces of at least the first size; tensors above the second are written row by row."""
 
 
-def save_resume(directory: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
-    """Write a training state to directory/resume.safetensors. It replaces the earlier one without a gap.
-
-    Args:
-        tensors: of a type in _DTYPES, on any device, for example parameters and Adam's moments.
-        state: what JSON can hold: iteration, seconds, settings.
-
-    Raises:
-        OSError: the disk is full or refuses; the earlier file is as it was.
-    """
-    begin_resume(directory, tensors, state)()
-
-
 def begin_resume(
     directory: Path,
     tensors: Mapping[str, Tensor],
     state: Mapping[str, Any],
     after_each: Callable[[], None] = lambda: None,
 ) -> Callable[[], None]:
-    """As save_resume, but what has to wait for the disk is left to the function that this returns.
+    """Copy a training state to the page cache; the function that this returns waits for the disk, on any thread.
 
-    When this returns the tensors may change. The function may be called from any thread; only one file of a directory
-    may be under way at a time. The tensors are copied into the system's page cache, so this process needs no memory for
-    them. after_each is called after each large piece, to free pages of tensors that are mapped from files.
+    Then directory/resume.safetensors is the new state; until then it is the earlier one. When this returns the tensors
+    may change. Only one file of a directory may be under way at a time.
+
+    Args:
+        tensors: of a type in _DTYPES, on any device, for example parameters and Adam's moments.
+        state: what JSON can hold: iteration, seconds, settings.
+        after_each: called after each large piece, to free pages of tensors that are mapped from files.
+
+    Raises:
+        OSError: the disk is full or refuses; the earlier file is as it was. The returned function raises it, too.
     """
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / RESUME_FILE
@@ -100,7 +94,7 @@ def begin_resume(
 
 
 def load_resume(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The tensors and the state that save_resume wrote, on the CPU. The tensors are read from the file when they are
+    """The tensors and the state that begin_resume wrote, on the CPU. The tensors are read from the file when they are
     used: load them before it is replaced.
 
     Raises:

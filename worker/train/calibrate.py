@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from contract.wire.errors import Cancelled
 from worker.model.optimize import rates_at
 from worker.raster.model import Model, state_of
 from worker.raster.step import image_size
@@ -73,19 +74,25 @@ def measured_schedule(run: Run, budget_s: float, min_gain_db: float | None = Non
     budget_s includes what the run's clock shows already. There are at least as many iterations as show every training
     frame once. Where every step is answered the timed ones are the run's first iterations. A device that answers late
     would have made hundreds of them, so there they are taken back.
+
+    Raises:
+        Cancelled: hooks.should_stop said so.
+        TrainingDiverged: a loss is not finite, or no Gaussian is visible.
     """
     model, steps_an_answer = run.model, run.model.answers_every
-    timed, count = (UNTIMED_STEPS + TIMED_STEPS) * steps_an_answer, steps_an_answer == 1
+    timed, keeps_steps = (UNTIMED_STEPS + TIMED_STEPS) * steps_an_answer, steps_an_answer == 1
     known = Schedule(timed, run.preset.warm_restarts, min_gain_db, run.steps_an_epoch, opening=timed)
     run.schedule, ends = known, []
-    with nullcontext() if count else taken_back(model, run.preset.rates.beta1):
+    with nullcontext() if keeps_steps else taken_back(model, run.preset.rates.beta1):
         ends.append(time.perf_counter())
         for iteration in range(1, timed + 1):
+            if run.setup.hooks.should_stop():
+                raise Cancelled(f"Stopped after {iteration - 1} timed iterations.")
             step(run, iteration)
             if iteration % steps_an_answer == 0:
                 check_sums(model.wait(), iteration)
                 ends.append(time.perf_counter())
-    made = timed if count else 0
+    made = timed if keeps_steps else 0
     run.iteration = made
     step_s = float(np.median(np.diff(ends)[UNTIMED_STEPS:])) / steps_an_answer * GROWTH_ALLOWANCE
     left = int((budget_s - run.setup.clock.elapsed_s) / step_s)

@@ -284,8 +284,9 @@ def test_the_more_wait_beside_training_the_coarser_they_are_drawn(endpoint: str,
         levels.append(found)
         return Reply(b"", "image/png", request.t)
 
+    cost = 0.5 * MAX_SAVED_S * FIRST_SPEEDS[0]
     pace = Pace(clock=lambda: 0.0)
-    server = RequestServer(endpoint, answer_one, cost=lambda each: 0.5 * MAX_SAVED_S * FIRST_SPEEDS[0], pace=pace)
+    server = RequestServer(endpoint, answer_one, cost=lambda each: cost, pace=pace, spent_s=lambda: 0.0)
     with server, connected(endpoint) as socket, pace.training():
         for number in range(1 + others):
             send(socket, number, number / 16)

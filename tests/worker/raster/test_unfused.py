@@ -35,7 +35,7 @@ from worker.raster.cpu.model import CpuModel
 from worker.raster.cpu.motion import FdmMotion, LinearMotion, motion_of
 from worker.raster.cpu.unfused import AutogradMotion
 from worker.raster.step import StepSums, TrainingFrame, camera_vector
-from worker.scene.resume_file import load_resume, save_resume
+from worker.scene.resume_file import begin_resume, load_resume
 
 LOSSES = pytest.mark.parametrize("loss", [PAPER, NORMALISED], ids=["paper", "normalised"])
 
@@ -190,7 +190,7 @@ def test_a_resumed_model_takes_the_steps_of_an_uninterrupted_one(tmp_path: Path)
     frames = training_frames(4)
     whole = CpuModel(gaussians, moving_hexplane(gaussians), WIDTH, HEIGHT)
     take_steps(whole, frames[:2])
-    save_resume(tmp_path, {name: each.contiguous() for name, each in whole.arrays().items()}, {})
+    begin_resume(tmp_path, {name: each.contiguous() for name, each in whole.arrays().items()}, {})()
     take_steps(whole, frames[2:], first=3)
 
     tensors, _ = load_resume(tmp_path)

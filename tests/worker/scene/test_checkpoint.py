@@ -20,7 +20,7 @@ from contract.wire.report import Report
 from tests.reports import REPORT_OF_A_SCENE
 from tests.worker.scenes import KINDS, random_scene
 from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
-from worker.scene.resume_file import RESUME_FILE, RESUME_VERSION, load_resume, save_resume
+from worker.scene.resume_file import RESUME_FILE, RESUME_VERSION, begin_resume, load_resume
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -234,8 +234,8 @@ def test_a_training_state_comes_back_with_every_type(tmp_path: Path) -> None:
         "none": torch.empty(0, 3),
     }
     state = {"iteration": 12, "t_train_s": 3.25, "settings": {"preset": "fast"}}
-    save_resume(tmp_path, tensors, {"iteration": 0})
-    save_resume(tmp_path, tensors, state)
+    begin_resume(tmp_path, tensors, {"iteration": 0})()
+    begin_resume(tmp_path, tensors, state)()
     loaded, loaded_state = load_resume(tmp_path)
     assert loaded_state == state
     assert loaded.keys() == tensors.keys()
@@ -247,13 +247,13 @@ def test_a_training_state_comes_back_with_every_type(tmp_path: Path) -> None:
 def test_a_training_state_of_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as earlier:
         earlier.setattr("worker.scene.resume_file.RESUME_VERSION", RESUME_VERSION - 1)
-        save_resume(tmp_path, {"moment": torch.ones(4)}, {"iteration": 12})
+        begin_resume(tmp_path, {"moment": torch.ones(4)}, {"iteration": 12})()
     with pytest.raises(SceneError, match=rf"another version \({RESUME_VERSION - 1}; .* {RESUME_VERSION}\)"):
         load_resume(tmp_path)
 
 
 def test_a_damaged_training_state_is_refused(tmp_path: Path) -> None:
-    save_resume(tmp_path, {"moment": torch.ones(4)}, {"iteration": 12})
+    begin_resume(tmp_path, {"moment": torch.ones(4)}, {"iteration": 12})()
     path = tmp_path / RESUME_FILE
     whole = path.read_bytes()
     for broken in (whole[:-1], whole[:-1] + b"\x01", whole.replace(b"12", b"13"), whole[:4], b""):

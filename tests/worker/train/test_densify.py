@@ -33,7 +33,7 @@ from worker.raster.cpu.model import CpuModel
 from worker.raster.cpu.unfused import AutogradMotion
 from worker.raster.model import Model
 from worker.raster.step import camera_vector
-from worker.scene.resume_file import load_resume, save_resume
+from worker.scene.resume_file import begin_resume, load_resume
 from worker.train.densify import Densifier, DensifySettings
 
 NOTHING = DensifySettings(gradient_threshold=1e9)
@@ -302,7 +302,7 @@ def test_a_run_resumed_after_densification_takes_the_same_steps(tmp_path: Path) 
     statistics = Densifier(settings, whole.count)
     go_on(whole, statistics, 1, 3)
     stored = {name: values.contiguous() for name, values in (whole.arrays() | statistics.arrays()).items()}
-    save_resume(tmp_path, stored, {"count": whole.count})
+    begin_resume(tmp_path, stored, {"count": whole.count})()
     go_on(whole, statistics, 4, 6)
 
     arrays, state = load_resume(tmp_path)
