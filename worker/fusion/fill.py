@@ -34,7 +34,7 @@ from worker.input.clip.split import spread
 from worker.input.clip.types import DepthClip, Eye
 from worker.machine.cores import cores
 from worker.machine.opencv import one_opencv_thread
-from worker.motion.complete import complete_depth
+from worker.motion.complete import complete_colour, complete_depth
 from worker.motion.tracks import Moved
 
 EDGE_PX = 5
@@ -47,6 +47,8 @@ IN_VIEW = 0.5
 """What is no farther off the middle (points.off_middle) is in view."""
 MAX_FARTHER = 1.15
 """A keyframe that shows tissue from so many times the least distance shows it as finely."""
+RIM_SHARE = 0.01
+"""Of the width: so far masks that were found may reach over the instrument's outline."""
 HIDDEN, COMPLETED, MEASURED, CLEAR = range(4)
 """How well a frame shows a cell, rising: not; depth completed; depth measured; depth confident, far from masks."""
 
@@ -138,7 +140,9 @@ def _along_tracks(
     """Points for cells that the frame `first` does not show, each read where its tissue is when it is seen.
 
     So neighbouring cells get neighbouring tissue, whenever each is seen. A guessed motion may never bring a cell into
-    sight. Such a cell gets the colour that a later frame shows in its place, and a completed depth.
+    sight. Such a cell gets the colour that a later frame shows in its place, and a completed depth. What no frame shows
+    stays empty, but for the rim of masks that were found: they may be too wide, and where neither camera nor instrument
+    moves their rim would be a hole. It gets the colour of the tissue beside it.
     """
     unseen = cells.in_view.copy()
 
@@ -155,16 +159,30 @@ def _along_tracks(
         unseen[chosen] = False
     cells = cells.select(unseen)
     from_there = [index for index in later if same_pose(clip, index, first)]
+    unseen = cells.in_view.copy()
     for index, chosen, pixels in _best_views(clip, from_there, cells, _at_rest):
-        place_mm = cells.world_mm[chosen]
-        yield PointCloud(
-            points_mm=place_mm,
-            rgb=clip.rgb[index].reshape(-1, 3)[pixels] / np.float32(255),
-            confidence=np.full(len(chosen), COMPLETED_CONFIDENCE, np.float32),
-            frame=np.full(len(chosen), first, np.int32),
-            reference_mm=place_mm,
-            key=np.zeros(len(chosen), np.int32),
-        )
+        unseen[chosen] = False
+        yield _guessed(cells.world_mm[chosen], clip.rgb[index].reshape(-1, 3)[pixels] / np.float32(255), first)
+    masks_are_found = clip.masks is not None and clip.masks.source in ("found", "segmenter")
+    if masks_are_found and len(from_there) == len(later):  # the camera rests
+        cells = cells.select(unseen)
+        shown = np.any([clip.tissue[index] for index in (first, *from_there)], axis=0)
+        away_px = cv2.distanceTransform((~shown).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5).reshape(-1)
+        rim = cells.select(away_px[cells.pixels] <= RIM_SHARE * clip.intrinsics.width)
+        rgb = complete_colour(clip.rgb[first], clip.tissue[first]).reshape(-1, 3)[rim.pixels]
+        yield _guessed(rim.world_mm, rgb, first)
+
+
+def _guessed(place_mm: NDArray[np.float32], rgb: NDArray[np.float32], frame: int) -> PointCloud:
+    """Points [M, 3] and colours [M, 3] that no frame shows in this place."""
+    return PointCloud(
+        points_mm=place_mm,
+        rgb=rgb,
+        confidence=np.full(len(place_mm), COMPLETED_CONFIDENCE, np.float32),
+        frame=np.full(len(place_mm), frame, np.int32),
+        reference_mm=place_mm,
+        key=np.zeros(len(place_mm), np.int32),
+    )
 
 
 def _best_views(

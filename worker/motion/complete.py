@@ -1,4 +1,4 @@
-"""Depth where none was measured: a smooth membrane between the measured surroundings.
+"""Depth and colour where none was seen: a smooth membrane between the surroundings.
 
 Symbols: H W pixels. Lengths in mm.
 """
@@ -27,6 +27,12 @@ def complete_depth(
     inverse = np.divide(1.0, depth_mm, out=np.zeros_like(depth_mm), where=known)
     completed = 1.0 / _membrane(inverse, known)
     return np.where(known, depth_mm, np.where(tissue, completed, 0)).astype(np.float32)
+
+
+def complete_colour(rgb: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Colour [H, W, 3] in [0, 1]: the picture's on tissue, of which it needs some; elsewhere a membrane."""
+    planes = [_membrane(plane, tissue) for plane in cv2.split(rgb / np.float32(255))]
+    return np.stack(planes, axis=-1)
 
 
 def _membrane(value: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:

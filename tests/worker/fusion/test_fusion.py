@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
+from typing import Literal
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
+from contract.wire.report import Masks
 from tests.worker.clips import HEIGHT, WIDTH, plane_clip
 from worker.fusion import (
     COMPLETED_CONFIDENCE,
@@ -17,7 +20,7 @@ from worker.fusion import (
     fuse,
     motion_mask,
 )
-from worker.fusion.fill import MARGIN
+from worker.fusion.fill import MARGIN, fill
 from worker.input.camera import unproject
 from worker.input.clip.types import DepthClip
 from worker.motion.tracks import Moved
@@ -341,6 +344,24 @@ def test_along_tracks_too_held_out_frames_change_no_bit(step_mm: float) -> None:
 
     settings = FusionSettings(mode="fill", stride=2)
     assert same_bits(*(fuse(each, TRAIN, settings, seed=3, moved={0: moved}) for each in (clip, poisoned)))
+
+
+@pytest.mark.parametrize(("source", "is_filled"), [("given", False), ("found", True), ("segmenter", True)])
+def test_the_rim_of_masks_that_were_found_gets_the_colour_beside_it(
+    source: Literal["given", "found", "segmenter"], is_filled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.modules[fill.__module__], "RIM_SHARE", 4 / WIDTH)
+    clip = dataclasses.replace(plane_clip(), masks=Masks(source=source))
+    clip.tissue[:, 6:30, 36:60] = False  # an instrument that rests
+    clip.rgb[:, 6:30, 36:60] = 230
+    cloud = fuse(clip, TRAIN, FusionSettings(mode="fill", stride=2), seed=0, moved={0: at_rest})
+    row, column = pixels_of(clip, cloud).T
+    inside = np.minimum(np.minimum(row - 6, 30 - row), np.minimum(column - 36, 60 - column))
+    assert (inside > 0).any() == is_filled
+    assert not (inside > 4.5).any()
+    assert (cloud.rgb[inside > 0] < 220 / 255).all()
+    x, y, z = cloud.points_mm.T
+    np.testing.assert_allclose(z, 60 + 0.2 * x + 0.1 * y, atol=0.2)
 
 
 def test_a_first_frame_without_depth_gives_way_along_tracks_too() -> None:
