@@ -28,7 +28,7 @@ from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from worker.machine.timing import Timings
 from worker.model.deformation import HexPlane
 from worker.outcome import scene_of, snapshot_of, training_of
-from worker.poses import with_poses
+from worker.poses import placed, with_poses
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
 from worker.render.view import SceneRenderer
@@ -122,17 +122,19 @@ def judge(made: Made, hooks: Hooks) -> Report:
 
 
 def judge_again(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:
-    """As judge, of the finished scene in a directory: its clip is opened anew.
+    """As judge, of the finished scene in a directory: its clip is opened anew, and seen from the scene's poses.
 
     Raises:
         InputError: the clip, its calibration, masks or an option cannot be used.
         SceneError: the scene is missing or damaged.
     """
     device = device_for(request.preset.deformation, request.device)
-    clip = open_with_depth(request, hooks, Timings(), device)
+    scene, unplaced = load_scene(directory), request.options.model_copy(update={"poses": "fixed"})
+    clip = open_with_depth(dataclasses.replace(request, options=unplaced), hooks, Timings(), device)
+    clip = placed(clip, scene.world_from_camera)
     split = split_frames(clip, request.options.holdout)
     report = Report.model_validate_json((directory / REPORT).read_bytes())
-    return judge(Made(clip, split, load_scene(directory), report, device), hooks)
+    return judge(Made(clip, split, scene, report, device), hooks)
 
 
 def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, keeper: Keeper) -> Setup:

@@ -231,6 +231,16 @@ def test_a_scene_is_whole_before_it_is_scored_and_is_scored_alike_from_disk(
     assert again.warnings == straight.warnings
 
 
+def test_a_scene_of_a_moving_camera_is_scored_anew_from_its_own_poses(tmp_path: Path) -> None:
+    moving = PhantomSettings(width=96, height=80, frames=10, camera=("swing",))
+    write_endonerf(make_phantom(moving), tmp_path / "clip")
+    asked = request(tmp_path / "clip", preset="fast")
+    made = make(asked, tmp_path / "out", TrainingHooks())
+    assert (made.scene.world_from_camera != made.scene.world_from_camera[0]).any()
+    again = judge_again(asked, tmp_path / "out", TrainingHooks())
+    assert again.frames == judge(made, TrainingHooks()).frames
+
+
 def test_a_stopped_run_with_a_budget_keeps_its_schedule(clip: Path, tmp_path: Path) -> None:
     with pytest.raises(Cancelled) as stopped:
         run(clip, tmp_path, stopping_after(3), iterations=None, budget_s=0.5)
