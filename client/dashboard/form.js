@@ -6,9 +6,15 @@ import { Upload } from "./upload.js";
 import { LIMITS } from "./wire.js";
 
 const PARTS = ["clip", "right", "calibration", "masks"];
-const OPTIONS = ["budget_s", "layout", "eyes", "priority", "mask_source", "mask_polarity"];
+const OPTIONS = ["budget_s", "layout", "eyes", "poses", "priority", "mask_source", "mask_polarity"];
 const LABELS = {
   mask_source: { given: "as given", auto: "as given, or found", none: "not at all" },
+  poses: {
+    auto: "may move: to be found out",
+    given: "moves as the clip's poses say",
+    fixed: "rests",
+    estimate: "moves: its path is estimated",
+  },
   mask_polarity: { auto: "to be found out", tool: "the instrument", tissue: "the tissue" },
   layout: {
     auto: "to be found out",

@@ -100,9 +100,11 @@ def test_a_stereo_clip_may_be_trained_on_its_left_eye_alone(site: Site, page: Pa
     eyes = Select(page.find("#upload [name=eyes]"))
     assert eyes.first_selected_option.text == "both eyes"
     eyes.select_by_value("left")
+    Select(page.find("#upload [name=poses]")).select_by_value("fixed")
     page.click("#upload [type=submit]")
     page.until(lambda: site.queue.records())
-    assert site.queue.records()[0].options.eyes == "left"
+    options = site.queue.records()[0].options
+    assert (options.eyes, options.poses, options.mask_source) == ("left", "fixed", "given")
 
 
 def test_a_clip_that_cannot_be_used_is_refused_in_words(page: Page, tmp_path: Path) -> None:
