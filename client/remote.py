@@ -56,7 +56,9 @@ def _add_submit(commands: Commands) -> None:
 
 
 def _add_fetch(commands: Commands) -> None:
-    parser = add_command(commands, "fetch", "save a finished scene's report, curve, picture and Gaussians", _fetch)
+    parser = add_command(
+        commands, "fetch", "save a finished scene's report, curve, picture, Gaussians and found masks", _fetch
+    )
     parser.add_argument("job", metavar="JOB", help="the id that submit printed")
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder to write into; created if it is missing"
@@ -141,11 +143,14 @@ def progress_of(job: JobView) -> JobProgress:
 
 def _fetch(options: argparse.Namespace) -> int:
     with _client(options, f"See `intrasplat watch {options.job}`.") as client:
+        report = client.report(options.job)
         files: dict[str, bytes] = {
-            "report.json": client.report(options.job).model_dump_json(indent=1).encode(),
+            "report.json": report.model_dump_json(indent=1).encode(),
             "curve.csv": client.curve(options.job).encode(),
             "view.png": client.render(options.t, scene=options.job, pose=options.pose).content,
         }
+        if report.masks is not None and report.masks.source in ("found", "segmenter") and report.masks.share > 0:
+            files["masks.zip"] = client.masks(options.job)
         if not options.no_ply:
             files["scene.ply"] = client.export(options.job, options.t)
     try:

@@ -15,7 +15,7 @@ from contract.queue.interface import MAX_LISTED
 from contract.store.shelf import is_job_id
 from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
-from contract.wire.names import CURVE
+from contract.wire.names import CURVE, MASKS
 from contract.wire.rendering import ExportName, ExportRequest
 from contract.wire.report import Report
 from service.access import Caller
@@ -74,6 +74,22 @@ async def get_curve(scene_id: str, services: Services, caller: AnyCaller) -> Fil
         raise Problem(404, "This scene has no curve.", field="scene_id", remedy=f"See GET /scenes/{scene_id}.")
     await services.audit.viewed(caller, scene_id)
     return FileResponse(folder / CURVE, media_type="text/csv")
+
+
+@router.get("/{scene_id}/masks", operation_id="get_masks", response_class=FileResponse)
+async def get_masks(scene_id: str, services: Services, caller: AnyCaller) -> FileResponse:
+    """The masks that were found, as a zip that POST /reconstruct takes as `masks`: correct them, send the clip again.
+
+    One PNG a frame in the pixels of the recorded left eye, 255 on instruments.
+    """
+    caller.require(KeyScope.VIEW)
+    record = await run_in_threadpool(finished_job, services, caller, scene_id)
+    folder = await run_in_threadpool(services.store.scene_folder, scene_id, record.attempt)
+    if not (folder / MASKS).is_file():
+        detail = "No masks were found for this scene: they were given, there were none, or nothing looked like one."
+        raise Problem(404, detail, field="scene_id", remedy=f"See masks in GET /scenes/{scene_id}.")
+    await run_in_threadpool(services.audit.record, AuditAction.EXPORTED, caller, scene_id)
+    return FileResponse(folder / MASKS, media_type="application/zip", filename=f"{scene_id}-masks.zip")
 
 
 @router.get("/{scene_id}/export", operation_id="export_scene", response_class=Response)

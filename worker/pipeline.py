@@ -14,13 +14,15 @@ from pathlib import Path
 
 import torch
 
+from contract.store.durable import FOR_ALL, replace_file
 from contract.store.results import add_scores, without_scores
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged
-from contract.wire.names import CURVE, REPORT
+from contract.wire.names import CURVE, MASKS, REPORT
 from contract.wire.notices import Notice
 from contract.wire.report import Report
 from worker.input.clip import DepthClip, FrameSplit, split_frames, training_frames
 from worker.input.clip.sampling import most_frames, sampled
+from worker.instruments import zipped_masks
 from worker.machine.cores import cores
 from worker.machine.forecast import Forecast
 from worker.machine.hooks import Hooks
@@ -68,7 +70,7 @@ class Made:
 
 
 def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Report:
-    """Clip in; manifest.json, scene.safetensors, report.json and curve.csv out, in out_dir.
+    """Clip in; manifest.json, scene.safetensors, report.json, curve.csv and masks.zip, if masks were found, out.
 
     A run that is stopped or killed leaves in out_dir what the same request on the same folder goes on from.
 
@@ -104,8 +106,9 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
         optimise(run, keeper)
         with ThreadPoolExecutor(1) as aside:
             doubts = aside.submit(clip_warnings, setup.clip, setup.split.train)
+            masks = aside.submit(zipped_masks, setup.clip)
             scene, quantized = finish(run)
-        report = publish(out_dir, run, scene, quantized, doubts.result())
+        report = publish(out_dir, run, scene, quantized, doubts.result(), masks.result())
     return Made(setup.clip, setup.split, scene, report, setup.device)
 
 
@@ -238,13 +241,20 @@ def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
 
 
 def publish(
-    out_dir: Path, run: Run, scene: Scene, quantized: QuantizedScene | None, doubts: Sequence[Notice]
+    out_dir: Path,
+    run: Run,
+    scene: Scene,
+    quantized: QuantizedScene | None,
+    doubts: Sequence[Notice],
+    masks: bytes | None,
 ) -> Report:
-    """Write the report, the curve and the scene. The report has no scores yet."""
+    """Write the report, the curve, the masks that were found and the scene. The report has no scores yet."""
     setup = run.setup
     setup.timings.seconds["t_post_s"] = time.time() - setup.accepted_at_s
     report = first_report(setup.clip, setup.split, training_of(run, scene, quantized), doubts)
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)
+    if masks is not None:
+        replace_file(out_dir / MASKS, masks, FOR_ALL)
     save_scene(out_dir, scene)
     return report

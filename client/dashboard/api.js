@@ -57,6 +57,9 @@ export const getCurve = async (id) => (await request(`/scenes/${id}/curve`)).tex
 /** @param {string} id @param {number} t @returns {Promise<Blob>} a .ply */
 export const exportScene = async (id, t) => (await request(`/scenes/${id}/export?format=ply&t=${t}`)).blob();
 
+/** @param {string} id @returns {Promise<Blob>} a zip of the masks that were found */
+export const getMasks = async (id) => (await request(`/scenes/${id}/masks`)).blob();
+
 /** @returns {Promise<string>} why nothing would be trained now, in words; empty if it would */
 export async function trouble() {
   try {

@@ -1,6 +1,6 @@
 // A scene's report in plain words. Values that a report does not hold are left out.
 
-import { exportScene } from "./api.js";
+import { exportScene, getMasks } from "./api.js";
 import { button, element } from "./element.js";
 
 const number = (value, digits, unit) => (Number.isFinite(value) ? `${value.toFixed(digits)} ${unit}`.trim() : null);
@@ -61,12 +61,37 @@ function clip({ frame_count: frames, width, height, held_out: heldOut }) {
   return `${frames} frames of ${width} × ${height}, ${heldOut?.length ?? 0} held out to judge by`;
 }
 
+const SOURCES = {
+  given: "Masked as given with the clip",
+  found: "Found by their colour and depth",
+  segmenter: "Found by this installation's network",
+};
+/** As the service's own warning has it (masks_unsure). */
+const MIN_SURE = 0.7;
+
+/** @param {import("./wire.js").Masks | null} masks */
+const areFound = (masks) => masks?.source === "found" || masks?.source === "segmenter";
+
+/**
+ * What is masked, and how sure that is. Reports of version 0.2 do not tell.
+ * @param {import("./wire.js").Report} report
+ */
+function instruments({ masks }) {
+  if (!masks) return null;
+  if (masks.source === "none") return "None masked: every pixel counts as tissue.";
+  const masked = `${SOURCES[masks.source]}; ${(masks.share * 100).toFixed(1)} % of the picture.`;
+  if (!Number.isFinite(masks.sure)) return masked;
+  const clear = `of what looks like an instrument, ${share(masks.sure)} is told clearly from tissue`;
+  return masks.sure < MIN_SURE ? `${masked} Not sure: ${clear}.` : `${masked} Sure: ${clear}.`;
+}
+
 function rows(report) {
   return [
     ["Likeness", quality(report)],
     ["Likeness from the right eye", rightEye(report)],
     ["Depth against stereo", number(report.depth_agreement_mm, 2, "mm (median difference)")],
     ["Tissue covered", share(report.coverage)],
+    ["Instruments", instruments(report)],
     ["Clip", clip(report)],
     ["Size", Number.isFinite(report.gaussians) ? `${report.gaussians.toLocaleString("en")} Gaussians` : null],
     ["Training", number(report.seconds?.t_train_s, 1, "s")],
@@ -83,16 +108,25 @@ function list(title, notices, kind) {
 }
 
 /** Not a link: a link sends no key. */
-async function download(id, message) {
+async function download(name, load, message) {
+  message.textContent = "";
   try {
     const link = element("a");
-    link.href = URL.createObjectURL(await exportScene(id, 0));
-    link.download = `${id}.ply`;
+    link.href = URL.createObjectURL(await load());
+    link.download = name;
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
   } catch (error) {
     message.textContent = error.message;
   }
+}
+
+/** How to send better masks, where they were found. */
+function correction(id, { masks }, message) {
+  if (!areFound(masks) || !masks.share) return [];
+  const save = button("Save the masks (.zip)", () => download(`${id}-masks.zip`, () => getMasks(id), message));
+  const text = "To correct them: save them, paint instruments white and tissue black, and send the clip again with them as instrument masks.";
+  return [save, element("p", { class: "quiet", text })];
 }
 
 /**
@@ -109,6 +143,8 @@ export function showReport(target, id, report) {
   for (const [title, text] of rows(report)) lines.append(element("dt", { text: title }), element("dd", { text }));
   lines.append(...list("Assumed", report.assumptions, ""));
   const message = element("p", { class: "message bad" });
-  const save = button("Save the first frame's Gaussians (.ply)", () => download(id, message));
-  target.replaceChildren(lines, save, message);
+  const save = button("Save the first frame's Gaussians (.ply)", () =>
+    download(`${id}.ply`, () => exportScene(id, 0), message),
+  );
+  target.replaceChildren(lines, save, ...correction(id, report, message), message);
 }

@@ -177,6 +177,10 @@ class Client:
         """Held-out psnr_tissue over seconds of training, as CSV."""
         return run(self._core.curve(scene))
 
+    def masks(self, scene: str) -> bytes:
+        """The masks that were found, as a zip to correct and to send with the clip again."""
+        return run(self._core.masks(scene))
+
     def export(self, scene: str, t: float = 0.0, format: str = "ply") -> bytes:
         """The scene's Gaussians at time t as a file."""
         return run(self._core.export(scene, t, format))

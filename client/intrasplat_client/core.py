@@ -167,6 +167,10 @@ class Core:
         """Held-out psnr_tissue over seconds of training, as CSV."""
         return (await self._get("scenes", scene, "curve")).content.decode()
 
+    async def masks(self, scene: str) -> bytes:
+        """The masks that were found, as a zip to correct and to send with the clip again."""
+        return (await self._get("scenes", scene, "masks")).content
+
     async def export(self, scene: str, t: float = 0.0, format: str = "ply") -> bytes:
         """The scene's Gaussians at time t as a file."""
         return (await self._get("scenes", scene, "export", t=t, format=format)).content

@@ -19,10 +19,12 @@ from contract.access.keys import KeyFile, KeyScope
 from contract.runtime.exits import ExitCode, exit_code_of
 from contract.wire.errors import IntrasplatError
 from contract.wire.job import JobError
-from contract.wire.names import SUBMISSION
+from contract.wire.names import MASKS, SUBMISSION
+from contract.wire.report import Masks
 from intrasplat_client import Client, JobState
 from intrasplat_client.errors import error_of_document
 from tests.client.local_service import LocalService, local_service
+from tests.reports import REPORT_OF_A_SCENE
 
 
 def run_in(service: LocalService, *arguments: str) -> int:
@@ -49,6 +51,18 @@ def test_submit_watch_fetch_and_delete(
     capsys.readouterr()
     assert run_in(service, "delete", job_id) == ExitCode.OK
     assert json.loads(capsys.readouterr().out)["job_id"] == job_id
+
+
+def test_fetch_saves_masks_that_were_found(
+    service: LocalService, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    job_id = submitted(service, clip, capsys)
+    service.finish()
+    masks = Masks(source="found", share=0.1, sure=0.9)
+    service.store.add_scores("worker-1", job_id, 1, REPORT_OF_A_SCENE.model_copy(update={"masks": masks}))
+    (service.store.scene_folder(job_id, 1) / MASKS).write_bytes(b"PK")
+    assert run_in(service, "fetch", job_id, "--out", str(tmp_path), "--no-ply") == ExitCode.OK
+    assert (tmp_path / MASKS).read_bytes() == b"PK"
 
 
 def test_jobs_lists_cancel_stops_and_retry_queues_again(

@@ -16,6 +16,7 @@ import pytest
 
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobError, JobProgress
+from contract.wire.names import MASKS
 from intrasplat_client import (
     AsyncClient,
     Client,
@@ -49,6 +50,8 @@ def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(
     assert client.report(job.id).psnr_tissue_db == 36.2
     assert client.curve(job.id).startswith("t_train_s")
     assert client.export(job.id) == b"ply\n"
+    (service.store.scene_folder(job.id, 1) / MASKS).write_bytes(b"PK")
+    assert client.masks(job.id) == b"PK"
     assert job.id in {scene["id"] for scene in client.scenes()}
     receipt = client.delete(job.id)
     assert receipt["verified"]

@@ -15,7 +15,7 @@ from contract.queue.embedded import short_socket_path
 from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue
 from contract.wire.job import JobRecord
-from contract.wire.names import MANIFEST, REPORT
+from contract.wire.names import MANIFEST, MASKS, REPORT
 from contract.wire.rendering import RenderRequest, WorkerAddress, WorkerReply
 from contract.wire.report import Report
 from tests.reports import REPORT_OF_A_SCENE
@@ -269,6 +269,20 @@ def test_scenes_have_report_curve_and_export_until_they_are_deleted(service: Ser
     for path in (f"/scenes/{scene}", f"/scenes/{scene}/curve", f"/jobs/{scene}", f"/scenes/{scene}/export"):
         assert service.http.get(path).status_code == 404
     assert [path for path in service.store.data_dir.rglob("*") if scene in path.name] == []
+
+
+def test_found_masks_are_there_until_the_scene_is_deleted(service: ServiceUnderTest) -> None:
+    scene = service.finished_scene()
+    assert_problem(service.http.get(f"/scenes/{scene}/masks"), 404, "scene_id")
+    (service.store.scene_folder(scene, 1) / MASKS).write_bytes(b"PK")
+    masks = service.http.get(f"/scenes/{scene}/masks")
+    assert masks.content == b"PK"
+    assert masks.headers["content-type"] == "application/zip"
+    assert f'filename="{scene}-masks.zip"' in masks.headers["content-disposition"]
+    stranger = bearer(service, "another")
+    assert service.http.get(f"/scenes/{scene}/masks", headers=stranger).status_code == 404
+    assert service.http.delete(f"/scenes/{scene}").status_code == 200
+    assert service.http.get(f"/scenes/{scene}/masks").status_code == 404
 
 
 @pytest.mark.parametrize("report", [b"", b"[]", b"\xff", b'{"psnr_tissue_db": NaN}', b'{"psnr_tissue_db": "good"}'])

@@ -20,7 +20,7 @@ from contract.wire.errors import Cancelled, InputError, TrainingDiverged, Unavai
 from contract.wire.names import KEPT, RESUME
 from contract.wire.notices import NoticeCode
 from contract.wire.options import ReconstructionOptions, parse_options
-from contract.wire.report import Report
+from contract.wire.report import Masks, Report
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared_on, trained, view
 from worker.input.clip import DepthClip, open_clip, split_frames
 from worker.machine.hooks import Progress
@@ -434,3 +434,12 @@ def test_what_is_stored_is_what_was_scored_and_the_report_tells_its_price(clip: 
     assert 0 <= report.measurements["stored_loss_db"] <= TOLERANCE_DB
     assert any("All scores are of the stored scene" in each.text for each in report.assumptions)
     assert report.seconds["shrink_s"] > 0
+
+
+def test_found_masks_are_kept_with_the_scene_as_a_file_to_correct(tmp_path: Path) -> None:
+    drawn = make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=3, period_frames=12)).depth_clip()
+    found = dataclasses.replace(drawn, masks=Masks(source="found", share=0.1, sure=0.9))
+    for clip, files in ((found, {*SCENE_FILES, "masks.zip"}), (drawn, SCENE_FILES)):
+        out = tmp_path / str(len(files))
+        reconstruct(request(clip, iterations=2, holdout="none"), out, TrainingHooks())  # type: ignore[arg-type]
+        assert {path.name for path in out.iterdir()} == files

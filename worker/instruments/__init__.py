@@ -1,11 +1,12 @@
 """A picture and how near everything in it is come in; which pixels are instruments, and how sure that is, go out.
 
-Verbs: find_instruments, Finder.of, with_instruments_found, load_segmenter.
+Verbs: find_instruments, Finder.of, with_instruments_found, load_segmenter, zipped_masks.
 """
 
 from worker.instruments.depth_clip import with_instruments_found
 from worker.instruments.find import FoundMask, Looked, TissueLook, find_instruments, smooth_nearness
 from worker.instruments.finder import Finder, looked_at
+from worker.instruments.masks_file import zipped_masks
 from worker.instruments.segmenter import Segmenter, load_segmenter
 
 __all__ = [
@@ -19,4 +20,5 @@ __all__ = [
     "looked_at",
     "smooth_nearness",
     "with_instruments_found",
+    "zipped_masks",
 ]

@@ -128,6 +128,7 @@ def estimate_depth(
         work.matched,
         left_out=unused.frames,
         masks=masks,
+        rectification=clip.rectification,
         assumptions=(*assumptions, _scale_assumption(clip), *unused.told(clip.frame_count)),
         warnings=clip.warnings
         + doubts

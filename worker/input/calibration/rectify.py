@@ -18,6 +18,7 @@ from worker.input.calibration.check import FIELD, check_calibration
 from worker.input.calibration.types import RawCalibration, RawEye, RectifiedCalibration, StereoCalibration
 from worker.input.camera import Intrinsics
 from worker.input.clip.types import PairSource, RgbFrame, StereoClip
+from worker.input.recorded import Rectification
 from worker.machine.mapped import let_go, mapped_zeros
 
 OPENCV_PIXEL_CENTRE = 0.5  # OpenCV puts pixel centres at whole numbers, this project at +0.5 (docs/conventions.md)
@@ -35,7 +36,7 @@ class RectifiedClip:
     pairs yields rectified (left, right) RGB uint8 frames, remapped as they are asked for. tissue is [T, H, W] bool in
     the pixels of the rectified left eye (a read-only view when no masks were given), False where the rectified image
     reaches beyond the recorded one. tissue_right is the same of the right eye, None if no masks show it. intrinsics are
-    the left eye's.
+    the left eye's. rectification says how they were moved; None: they were not.
 
     equal_rows_px is y_right - y_left in these frames of points that lay on one row in the recorded ones: about what is
     measured here when frames that had been rectified were rectified again.
@@ -52,6 +53,7 @@ class RectifiedClip:
     warnings: tuple[Notice, ...] = ()
     equal_rows_px: float = 0.0
     tissue_right: NDArray[np.bool_] | None = None
+    rectification: Rectification | None = None
 
 
 def rectify(clip: StereoClip, calibration: StereoCalibration) -> RectifiedClip:
@@ -144,6 +146,12 @@ def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
             np.median(_rows(size, *cameras[1], right_r, right_p) - _rows(size, *cameras[0], left_r, left_p))
         ),
         tissue_right=None if clip.tissue_right is None else _warp_tissue(clip.tissue_right, right_maps),
+        rectification=Rectification(
+            camera=_rows_of(cameras[0][0]),
+            distortion=tuple(cameras[0][1].tolist()),
+            rotation=_rows_of(left_r),
+            projection=_rows_of(left_p),
+        ),
     )
 
 
@@ -163,6 +171,10 @@ def _rows(
 
 def _matrix(eye: RawEye) -> NDArray[np.float64]:
     return np.array([[eye.fx_px, 0.0, eye.cx_px], [0.0, eye.fy_px, eye.cy_px], [0.0, 0.0, 1.0]])
+
+
+def _rows_of(matrix: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))
 
 
 def _warp_tissue(tissue: NDArray[np.bool_], maps: Maps) -> NDArray[np.bool_]:

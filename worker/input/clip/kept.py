@@ -21,9 +21,10 @@ from contract.wire.notices import Notice
 from contract.wire.report import CameraPoses, Masks, RightEye
 from worker.input.camera import Intrinsics
 from worker.input.clip.types import PIXELS, DepthClip, Eye
+from worker.input.recorded import Rectification
 from worker.machine.mapped import let_go
 
-VERSION = 4
+VERSION = 5
 """Raised whenever what the folder holds changes; no version reads another's."""
 MANIFEST = "manifest.json"
 EYES = ("left", "right")
@@ -57,6 +58,7 @@ def save_clip(folder: Path, clip: DepthClip, identity: str, should_stop: Callabl
         "intrinsics": [eye.intrinsics.numbers() for eye in clip.eyes],
         "registration": clip.registration and clip.registration.model_dump(),
         "masks": clip.masks and clip.masks.model_dump(),
+        "rectification": clip.rectification and clip.rectification.numbers(),
         "poses": clip.poses and clip.poses.model_dump(),
         "left_out": clip.left_out,
         "assumptions": [notice.model_dump() for notice in clip.assumptions],
@@ -82,6 +84,7 @@ def load_clip(folder: Path, identity: str) -> DepthClip | None:
             right=Eye(**eyes[1]) if len(eyes) > 1 else None,
             registration=told["registration"] and RightEye.model_validate(told["registration"]),
             masks=told["masks"] and Masks.model_validate(told["masks"]),
+            rectification=told["rectification"] and Rectification.parsed(told["rectification"]),
             poses=told["poses"] and CameraPoses.model_validate(told["poses"]),
             left_out=tuple(told["left_out"]),
             assumptions=tuple(Notice.model_validate(each) for each in told["assumptions"]),

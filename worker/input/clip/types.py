@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from contract.wire.notices import Notice
 from contract.wire.report import CameraPoses, Masks, RightEye
 from worker.input.camera import Intrinsics
+from worker.input.recorded import Rectification
 from worker.machine.mapped import let_go
 
 PIXELS = ("rgb", "tissue", "depth_mm", "depth_confidence")
@@ -100,6 +101,7 @@ class DepthClip(Eye):
     right            the same moments and size; None for a clip of one eye
     registration     what the right eye's camera and colours were corrected by; None for a clip of one eye
     masks            where `tissue` comes from
+    rectification    how the recorded left eye became this one; None: it is as recorded
     poses            how world_from_camera is known; None: nobody has asked yet
     left_out         frames that show nothing new (sampling.py): nobody looks at them, and stereo gives them no depth
     """
@@ -108,6 +110,7 @@ class DepthClip(Eye):
     right: Eye | None = None
     registration: RightEye | None = None
     masks: Masks | None = None
+    rectification: Rectification | None = None
     poses: CameraPoses | None = None
     left_out: tuple[int, ...] = ()
     assumptions: tuple[Notice, ...] = ()
