@@ -64,9 +64,10 @@ def main() -> None:
     arguments = parser.parse_args()
     width, height = map(int, arguments.size.split("x"))
     rows: list[dict[str, object]] = []
+    measured_at = commit()
 
     def add(name: str, opened: Opened) -> None:
-        row = {"commit": commit(), "clip": name, "frames": opened.found.frame_count, **measured(opened)}
+        row = {"commit": measured_at, "clip": name, "frames": opened.found.frame_count, **measured(opened)}
         row |= compared(opened, arguments.iterations)
         rows.append(row)
         print("  ".join(f"{key} {value}" for key, value in row.items() if key != "commit"), flush=True)
