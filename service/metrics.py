@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import time
 from collections.abc import Iterator
 from http import HTTPStatus
@@ -148,9 +149,10 @@ class _QueueCollector(Collector):
         ended = CounterMetricFamily("intrasplat_jobs_ended", "Jobs that came to each end.", labels=("state",))
         for state, count in figures.ended.items():
             ended.add_metric((state.value,), count)
-        live = GaugeMetricFamily("intrasplat_workers", "Live workers.", labels=("device",))
-        for device in sorted({worker.device for worker in workers}):
-            live.add_metric((device,), sum(worker.device == device for worker in workers))
+        live = GaugeMetricFamily("intrasplat_workers", "Live workers.", labels=("device", "trains"))
+        kinds = collections.Counter((worker.device, "no" if worker.renders_only else "yes") for worker in workers)
+        for kind, count in sorted(kinds.items()):
+            live.add_metric(kind, count)
         return [
             GaugeMetricFamily("intrasplat_jobs_queued", "Jobs that wait.", figures.queued),
             GaugeMetricFamily("intrasplat_jobs_running", "Jobs that a worker holds.", figures.running),

@@ -100,7 +100,10 @@ def _warnings(run: Run) -> tuple[Notice, ...]:
     found = []
     least = max(run.schedule.epoch, run.schedule.opening)
     if run.setup.fixed_iterations is None and run.schedule.planned == least:
-        text = "The time given was too short for the fewest steps that training makes; they were made all the same."
+        text = (
+            f"{run.setup.budget_s:g} s of training are too short for the fewest steps that training makes; they were "
+            "made all the same. Give a larger budget_s."
+        )
         found.append(Notice.warning(NoticeCode.TIME_TOO_SHORT, text))
     if run.setup.gpu_is_idle:
         text = f"The motion of preset {run.preset.name} trains on the CPU only, so the GPU was left idle."

@@ -7,6 +7,7 @@ Derived from it: the fields of POST /reconstruct, the options of `intrasplat rec
 from __future__ import annotations
 
 from collections.abc import Mapping
+from difflib import get_close_matches
 from typing import ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -130,5 +131,9 @@ def parse_options(model: type[Options], given: str | Mapping[str, object]) -> Op
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join([FIELD_PREFIX, *(str(part) for part in first["loc"])])
-        problem = f"{first['msg']} (given: {str(first['input'])[:80]!r})."
-        raise InputError(field, problem, f"The options are {', '.join(model.model_fields)}.") from error
+        if first["type"] == "extra_forbidden":
+            near = get_close_matches(str(first["loc"][-1]), model.model_fields, 1)
+            remedy = f"Did you mean {near[0]}?" if near else f"The options are {', '.join(model.model_fields)}."
+            raise InputError(field, "there is no such option.", remedy) from error
+        problem = f"{first['msg'].removeprefix('Value error, ')} (given: {str(first['input'])[:80]!r})."
+        raise InputError(field, problem, "Give a value that /openapi.json allows for it.") from error

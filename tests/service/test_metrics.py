@@ -45,7 +45,7 @@ def test_jobs_workers_and_the_version_are_told(service: ServiceUnderTest) -> Non
     assert value(found, "intrasplat_jobs_running") == 1
     assert value(found, "intrasplat_jobs_ended_total", state="done") == 1
     assert value(found, "intrasplat_jobs_ended_total", state="failed") == 1
-    assert value(found, "intrasplat_workers", device="cpu") == 1
+    assert value(found, "intrasplat_workers", device="cpu", trains="yes") == 1
     assert value(found, "intrasplat_queue_up") == 1
     assert value(found, "intrasplat_build_info", version=version()) == 1
     assert value(found, "intrasplat_free_bytes") > 0

@@ -166,6 +166,7 @@ def _print_report(report: Report, out: Path) -> None:
         told = report.poses
         print(f"camera: moved by {told.extent_mm:.1f} mm and {told.extent_deg:.1f} degrees (poses estimated)")
     if report.masks is not None and report.masks.sure is not None:
-        print(f"instruments: found in {report.masks.share:.1%} of the picture, {report.masks.sure:.0%} of it clearly")
+        masks = report.masks
+        print(f"instruments: in {masks.share:.1%} of the picture; {masks.sure:.0%} of what may be one told clearly")
     for notice in report.warnings:
         print(f"{notice.severity}: {notice.text}")

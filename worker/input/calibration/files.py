@@ -237,7 +237,7 @@ def _fit(calibration: StereoCalibration, eye_width: int, eye_height: int) -> Ste
             FIELD,
             f"it is for {calibration.width}x{calibration.height} pixels an eye, the clip has {eye_width}x{eye_height}: "
             "not one uniform scale.",
-            "Give the calibration of these frames, or the frames uncropped.",
+            "Give the calibration of these frames, one eye's width and height, or the frames uncropped.",
         )
     if not 1 / MAX_SCALE <= sx <= MAX_SCALE:
         raise InputError(
