@@ -16,7 +16,7 @@ from worker.input.camera import to_camera
 from worker.report.quality import Training
 from worker.report.trust import trust
 from worker.report.visibility import drop_strays
-from worker.scene.scene import Scene
+from worker.scene.scene import POSE_DOUBTS, Scene
 from worker.train.rate_distortion import QuantizedScene
 from worker.train.run import Run
 
@@ -54,6 +54,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> Scene:
             "made_iterations": run.iteration,
             "schedule": run.schedule.settings,
             "eyes": run.taught_by,
+            "pose_warnings": [each.model_dump(mode="json") for each in clip.warnings if each.code in POSE_DOUBTS],
             "preset": json.loads(json.dumps(asdict(run.preset), default=str)),
         },
     )

@@ -177,7 +177,7 @@ def render_frame(
     pause()
     in_clip = 0.0 <= t <= last + ROUNDING
     warnings = () if in_clip else (_warning_of_time(t, shown),)
-    warnings = (*warnings, *_warnings_of_pose(_distance_from_trained(scene, pose), trust, unseen))
+    warnings = (*warnings, *scene.pose_warnings, *_warnings_of_pose(_distance_from_trained(scene, pose), trust, unseen))
     if not highlights and scene.right_eye_mm is None:
         warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
     pause()

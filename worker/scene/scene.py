@@ -18,10 +18,14 @@ from safetensors.torch import save
 from torch import Tensor
 
 from contract.wire.errors import SceneError
+from contract.wire.notices import Notice, NoticeCode
 from worker.input.camera import Intrinsics
 from worker.model.deformation import Deformation
 from worker.model.gaussians import Gaussians
 from worker.scene.files import dtype_name
+
+POSE_DOUBTS = frozenset({NoticeCode.POSES_UNSURE, NoticeCode.CAMERA_OR_TISSUE})
+"""Warnings of a clip that every view of its scene repeats: a view is as right as the poses it was made with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +65,11 @@ class Scene:
     def frame_count(self) -> int:
         """T."""
         return int(self.world_from_camera.shape[0])
+
+    @cached_property
+    def pose_warnings(self) -> tuple[Notice, ...]:
+        """Why the endoscope's poses are in doubt: the clip's warnings of POSE_DOUBTS. Empty: nothing is known of it."""
+        return tuple(Notice.model_validate(each) for each in self.settings.get("pose_warnings", ()))
 
     def without_motion(self) -> Scene:
         """The scene without the weights of its motion, for whoever has them elsewhere."""

@@ -12,18 +12,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from contract.wire.notices import NoticeCode
+from contract.wire.notices import Notice, NoticeCode
 from tests.helpers import assert_close
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared, trained, view
 from tests.worker.scenes import random_scene
 from worker.input.camera import Intrinsics
 from worker.model.metrics import psnr_tissue
-from worker.outcome import scene_of
+from worker.outcome import scene_of, snapshot_of
 from worker.phantom import orbit_pose
 from worker.render.camera import endoscope_pose
 from worker.render.view import FAR_POSE, render_frame
 from worker.scene.checkpoint import load_scene, save_scene
-from worker.scene.scene import Scene
+from worker.scene.scene import POSE_DOUBTS, Scene
 from worker.train.presets import PRESETS
 from worker.train.run import Run
 
@@ -57,6 +57,20 @@ def test_a_time_outside_the_clip_shows_its_first_or_last_frame_and_warns(scene: 
 
 def test_the_endoscopes_own_view_needs_no_warning(scene: Scene) -> None:
     assert render_frame(scene, 0.4).warnings == ()
+
+
+def test_every_view_repeats_that_the_clips_poses_are_in_doubt(tmp_path: Path) -> None:
+    doubts = tuple(Notice.warning(code, f"{code} is so.") for code in sorted(POSE_DOUBTS))
+    other = Notice.warning(NoticeCode.BLOOD, "It is red.")
+    clip = dataclasses.replace(phantom_clip(), warnings=(other, *doubts))
+    run, _ = prepared(clip, "fast", iterations=2)
+    trained(run)
+    save_scene(tmp_path / "scene", scene_of(run))
+    assert snapshot_of(run).pose_warnings == doubts
+    assert load_scene(tmp_path / "scene").pose_warnings == doubts
+    beside = render_frame(load_scene(tmp_path / "scene"), 0.4, orbit_pose(3, 0)).warnings
+    assert [each for each in beside if each.code in POSE_DOUBTS] == list(doubts)
+    assert other not in beside
 
 
 @pytest.mark.parametrize(("trust", "warns"), [(0.5, False), (0.05, True)])
