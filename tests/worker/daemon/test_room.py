@@ -11,7 +11,7 @@ from contract.store.store import Store
 from contract.wire.errors import ErrorCode
 from contract.wire.job import JobState
 from tests.worker.daemon.test_consume import JobLoop
-from worker.daemon.room import MAX_SHORTAGES, Room
+from worker.daemon.room import MAX_SHORTAGES, MIN_ROOM_BYTES, Room
 
 MIN_FREE_BYTES = 400 * 2**20
 
@@ -22,6 +22,27 @@ def free_bytes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     free = [2**40]
     monkeypatch.setattr(Store, "free_bytes", lambda store: free[0])
     return free
+
+
+@pytest.fixture
+def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("worker.daemon.room.PAUSE_S", 0.0)
+
+
+def test_after_a_shortage_jobs_pause_until_more_is_free(
+    tmp_path: Path, free_bytes: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room = Room(Store(tmp_path), MIN_FREE_BYTES)
+    free_bytes[0] = 2 * MIN_FREE_BYTES
+    room.begins()
+    assert room.ran_out("a")
+    assert room.is_short()
+    free_bytes[0] += MIN_ROOM_BYTES + 1
+    assert not room.is_short()
+    monkeypatch.setattr("worker.daemon.room.PAUSE_S", 0.0)
+    room.begins()
+    assert room.ran_out("a")
+    assert not room.is_short()
 
 
 def test_jobs_begin_while_a_quarter_of_what_stays_free_is_there(tmp_path: Path, free_bytes: list[int]) -> None:
@@ -74,7 +95,7 @@ def test_a_worker_claims_nothing_while_the_disk_is_short_and_goes_on_by_itself(
     assert (ended.state, ended.attempt) == (JobState.DONE, 1)
 
 
-def test_a_job_that_finds_the_disk_full_runs_again_and_no_death_is_counted(tmp_path: Path) -> None:
+def test_a_job_that_finds_the_disk_full_runs_again_and_no_death_is_counted(tmp_path: Path, no_pause: None) -> None:
     bench = JobLoop(tmp_path)
     record = bench.outcome("full publish")
     bench.stop()
@@ -82,7 +103,7 @@ def test_a_job_that_finds_the_disk_full_runs_again_and_no_death_is_counted(tmp_p
     assert (record.state, record.attempt, record.released) == (JobState.DONE, 2, 1)
 
 
-def test_a_job_that_is_larger_than_the_disk_fails_as_such(tmp_path: Path) -> None:
+def test_a_job_that_is_larger_than_the_disk_fails_as_such(tmp_path: Path, no_pause: None) -> None:
     bench = JobLoop(tmp_path)
     record = bench.outcome("full")
     bench.stop()
