@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from contract.wire.errors import InputError, TrainingDiverged
 from contract.wire.notices import Severity
-from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
 from worker.evaluate.cells import eyes_of, preset_of
 from worker.evaluate.conditions import (
@@ -43,10 +42,11 @@ from worker.evaluate.rows import NO_RESULT, Row, commit, machine, read_rows, wri
 from worker.model.metrics import psnr_tissue
 from worker.phantom import PhantomSettings
 from worker.pipeline import reconstruct
+from worker.poses.trajectory import trajectory_error
 from worker.render.camera import view_camera
 from worker.scene.checkpoint import load_scene
 from worker.scene.model import model_of
-from worker.scene.scene import Scene
+from worker.scene.scene import POSE_DOUBTS, Scene
 from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import solid_depth_mm
@@ -54,14 +54,17 @@ from worker.train.targets import solid_depth_mm
 STABILITY = "stability.csv"
 KEY = ("condition", "severity", "series", "seed", "iterations", "width", "height", "frames")
 VERDICT = ("outcome", "loss_db", "depth_loss_mm")
+PATH = ("path_error_mm", "path_error_deg")
 FIELDS = (
     *KEY, "level", *VERDICT, "psnr_db", "depth_error_mm", "reported_db", "seconds", "new_warnings", "warnings",
-    "codes", "error", "machine", "commit",
+    "codes", "error", "machine", "commit", *PATH,
 )  # fmt: skip
 """psnr_db and depth_error_mm (mean) are against the truth, reported_db is what the report says of itself; codes
 has SEVERITY:CODE of each of the warnings."""
 MAX_LOSS_DB = 3.0
 """Twice the squared error: nobody would call that the same quality."""
+MAX_PATH_ERROR_MM, MAX_PATH_ERROR_DEG = 1.5, 1.0
+"""Of a path that nobody gave; more is harm, of which a warning of the poses has to tell (POSE_DOUBTS)."""
 MAX_DEPTH_LOSS_MM = 2.0
 """About the width of a grasper's jaw."""
 SEPARATOR = " | "
@@ -199,12 +202,21 @@ def verdict(row: Row, clean: Row | None) -> dict[str, str]:
     new = new_warnings(row, clean)
     harmed = loss_db > MAX_LOSS_DB or depth_loss_mm > MAX_DEPTH_LOSS_MM
     outcome = "held" if not harmed else "told" if new else "silent"
+    if _lost_its_way(row):
+        doubts = {f"{Severity.WARNING}:{each}" for each in POSE_DOUBTS}
+        outcome = "told" if doubts & {*row["codes"].split()} else "silent"
     return {
         "outcome": outcome,
         "loss_db": f"{loss_db:.2f}",
         "depth_loss_mm": f"{depth_loss_mm:.2f}",
         "new_warnings": SEPARATOR.join(new),
     }
+
+
+def _lost_its_way(row: Row) -> bool:
+    """Whether a path that was to be found is not well found."""
+    limits = zip(PATH, (MAX_PATH_ERROR_MM, MAX_PATH_ERROR_DEG), strict=True)
+    return any(float(row.get(name) or 0) > limit for name, limit in limits)
 
 
 def failure(error: Exception) -> str:
@@ -250,12 +262,16 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Trainin
             else ReconstructionRequest(given.clip)
         )
         preset = preset_of(cell.series)
-        options = ReconstructionOptions(iterations=grid.iterations, seed=cell.seed, eyes=eyes_of(cell.series))
+        chosen = {"iterations": grid.iterations, "seed": cell.seed, "eyes": eyes_of(cell.series)}
+        options = asked.options.model_copy(update=chosen)
         request = dataclasses.replace(asked, own_preset=preset, options=options)
         report = reconstruct(request, Path(folder, "scene"), hooks)
         scene = load_scene(Path(folder, "scene"))
     psnr_db, depth_error_mm = _judged(given, scene, moments_of(given, report.held_out, report.frame_count))
+    off = None if given.path is None else trajectory_error(scene.world_from_camera, given.path)
     return {
+        "path_error_mm": _text(None if off is None else off.mm),
+        "path_error_deg": _text(None if off is None else off.deg),
         "psnr_db": _text(psnr_db),
         "depth_error_mm": _text(depth_error_mm),
         "reported_db": _text(report.psnr_tissue_db),

@@ -250,7 +250,7 @@ def test_the_page_of_results_counts_how_the_places_ended(tmp_path: Path) -> None
     assert stability_sections(tmp_path) == []
     write_rows(tmp_path / STABILITY, FIELDS, ROWS)
     page = "".join(stability_sections(tmp_path))
-    assert "| fast | 6 of 155 | 1 | 1 | 1 | 1 | 1 | 1 | 0 |  |" in page
+    assert "| fast | 6 of 165 | 1 | 1 | 1 | 1 | 1 | 1 | 0 |  |" in page
     assert "stability-fast.png" not in page
     assert "Why a wrong baseline is silent" not in page
 

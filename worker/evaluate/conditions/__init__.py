@@ -89,6 +89,7 @@ def _conditions() -> dict[str, Condition]:
         Condition("depth_outliers", "depth grossly wrong, share", depth.depth_outliers, (0.01, 0.05, 0.1, 0.2, 0.4)),
         Condition("mask_shift", "masks shifted, px", hiding.mask_shift, (4, 8, 16, 32, 64)),
         Condition("masks_missing", "masks missing, share of frames", hiding.masks_missing, (0.1, 0.25, 0.5, 0.75, 1)),
+        Condition("no_masks", "no masks, of instruments ever harder to find", hiding.no_masks, (1, 2, 3, 4, 5), True),
         Condition(
             "inverted_masks", "masks inverted, tools' share", hiding.inverted_masks, (0.1, 0.2, 0.3, 0.45, 0.6), True
         ),
@@ -107,6 +108,9 @@ def _conditions() -> dict[str, Condition]:
         ),
         Condition("moving_camera", "camera swings, poses right, degrees", scenes.moving_camera, (2, 5, 10, 15, 20)),
         Condition("noisy_poses", "camera swings, poses wrong, mm", scenes.noisy_poses, (0.1, 0.25, 0.5, 1, 2)),
+        Condition(
+            "camera_unknown", "camera turns, poses unknown, degrees", scenes.camera_unknown, (1, 3, 6, 12, 24), True
+        ),
         Condition("no_texture", "texture lost, share", scenes.no_texture, (0.5, 0.75, 0.9, 0.97, 1), True),
         Condition("misrectified", "rows of the eyes differ, px", scenes.misrectified, (1, 2, 4, 6, 8), True),
         Condition("wrong_baseline", "baseline wrong, times", scenes.wrong_baseline, (1.02, 1.05, 1.1, 1.25, 1.5), True),

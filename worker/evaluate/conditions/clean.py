@@ -54,6 +54,7 @@ class Given:
     depth_mm [T, H, W] float32, its depth
     scored   [T, H, W] bool, the pixels that are judged
     source   [S] the clean frame at the time of each given frame
+    path     [T, 4, 4] mm, the camera's poses, if the user does not know them
     """
 
     clip: DepthClip | Recording
@@ -61,6 +62,7 @@ class Given:
     depth_mm: NDArray[np.float32]
     scored: NDArray[np.bool_]
     source: tuple[int, ...]
+    path: NDArray[np.float64] | None = None
 
 
 def clean_clip(settings: PhantomSettings) -> CleanClip:

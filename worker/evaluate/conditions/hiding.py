@@ -12,14 +12,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.evaluate.conditions.clean import CleanClip, Given, given
+from worker.evaluate.conditions.clean import CleanClip, Given, clean_clip, given
 from worker.evaluate.conditions.recording import recording_of
 from worker.input.clip.types import DepthClip
 from worker.phantom import PhantomFrame
+from worker.phantom.settings import Tool
 
 STEEL = (118, 121, 124)
 BRUSHED_LEVELS = 6  # of 255, deviation of the steel's grain
 TOOL_DEPTH_MM = 45.0  # nearer than any tissue of the phantom
+NO_MASKS: tuple[tuple[tuple[Tool, ...], float], ...] = (
+    (("yellow",), 0.0),
+    (("steel",), 0.0),
+    (("dark",), 0.3),
+    (("steel", "dark"), 0.6),
+    (("grasper", "steel", "dark"), 0.9),
+)
+"""Instruments, and how far their colour is the tissue's: ever harder to find."""
 WAG_DEG, WAG_PERIODS = 12.0, 1.5  # a large instrument turns to and fro about where it enters
 
 
@@ -78,6 +87,29 @@ def inverted_masks(clean: CleanClip, level: float, random: np.random.Generator) 
         return dataclasses.replace(frame, left=left, right=right, tissue=~(frame.tissue & ~covered[index]))
 
     return given(clean, recording_of(clean.phantom, spoil), scored=clean.seen & ~covered)
+
+
+def no_masks(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
+    """Stereo files without masks, of the instruments NO_MASKS[level - 1], which are to be found."""
+    del random
+    tools, tint = NO_MASKS[round(level) - 1]
+    drawn = clean_clip(dataclasses.replace(clean.phantom.settings, tools=tools))
+
+    def spoil(frame: PhantomFrame, index: int) -> PhantomFrame:
+        del index
+        eyes = ((frame.left, frame.tissue), (frame.right, frame.tissue_right))
+        left, right = (_tinted(eye, ~tissue, tint) for eye, tissue in eyes)
+        return dataclasses.replace(frame, left=left, right=right)
+
+    return given(drawn, recording_of(drawn.phantom, spoil, masks=False))
+
+
+def _tinted(eye: NDArray[np.uint8], where: NDArray[np.bool_], tint: float) -> NDArray[np.uint8]:
+    """The picture with `tint` of the tissue's mean colour where an instrument is."""
+    if where.all() or not where.any():
+        return eye
+    tissue_rgb = eye[~where].mean(axis=0)
+    return np.where(where[..., None], (1 - tint) * eye + tint * tissue_rgb + 0.5, eye).astype(np.uint8)
 
 
 def _wag(index: int, frames: int) -> float:

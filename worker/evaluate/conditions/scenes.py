@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from worker.evaluate.conditions.clean import CleanClip, Given, clean_clip, clean_of, given
 from worker.evaluate.conditions.recording import recording_of
 from worker.phantom import Phantom, PhantomFrame, PhantomSettings, make_phantom, orbit_pose
+from worker.phantom.camera import PORT_BEHIND_MM
 from worker.phantom.motion import Pull
 from worker.phantom.settings import MEAN_DEPTH_MM
 from worker.phantom.surface import Surface
@@ -34,6 +35,22 @@ class SwingingPhantom(Phantom):
         """Pose [4, 4] of the left eye, mm; the identity at frame 0."""
         angle = 2 * np.pi * frame / self.settings.frames
         return orbit_pose(self.swing_deg * np.sin(angle), 0.5 * self.swing_deg * np.sin(2 * angle))
+
+
+@dataclass(frozen=True)
+class TurningPhantom(Phantom):
+    """A phantom whose endoscope turns to the right about its port, by turn_deg from the first frame to the last."""
+
+    turn_deg: float
+
+    def world_from_camera(self, frame: float) -> NDArray[np.float64]:
+        """Pose [4, 4] of the left eye, mm; the identity at frame 0."""
+        share = frame / max(self.settings.frames - 1, 1)
+        angle = np.deg2rad(self.turn_deg) * (3 - 2 * share) * share**2
+        pose = np.eye(4)
+        pose[:3, :3], _ = cv2.Rodrigues(np.array([0.0, angle, 0.0]))
+        pose[:3, 3] = PORT_BEHIND_MM * (pose[:3, 2] - [0.0, 0.0, 1.0])
+        return pose
 
 
 @dataclass(frozen=True)
@@ -88,6 +105,15 @@ def moving_camera(clean: CleanClip, level: float, random: np.random.Generator) -
     """The endoscope swings once by `level` degrees to either side; its poses are right."""
     del random
     return given(clean_of(_swinging(clean.phantom, level)))
+
+
+def camera_unknown(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
+    """Stereo files of an endoscope that turns about its port by `level` degrees in the clip; nobody gives its poses."""
+    del random
+    # a pan has tissue as far as the widest turn looks
+    phantom = make_phantom(dataclasses.replace(clean.phantom.settings, camera=("pan",)))
+    turning = clean_of(TurningPhantom(phantom.settings, phantom.surface, phantom.paint, level))
+    return dataclasses.replace(given(turning, recording_of(turning.phantom)), path=turning.clip.world_from_camera)
 
 
 def noisy_poses(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
