@@ -17,7 +17,7 @@ from zmq.utils.monitor import parse_monitor_message
 
 from contract.access.render_keys import service_keys, worker_keys
 from contract.wire.errors import UnavailableError
-from contract.wire.rendering import CancelRequest, ExportRequest, RenderRequest, WorkerReply, WorkerRequest
+from contract.wire.rendering import CancelRequest, SceneRequest, WorkerReply, WorkerRequest
 
 CONNECT_TIMEOUT_S = 2.0
 """A worker that listens is connected to in milliseconds; one that has just died is tried for no longer than this."""
@@ -82,7 +82,7 @@ class Connection:
         self._socket.connect(endpoint)
         self._tasks = [asyncio.create_task(self._read()), asyncio.create_task(self._watch())]
 
-    async def ask(self, request: RenderRequest | ExportRequest, *, patiently: bool = True) -> Answer:
+    async def ask(self, request: SceneRequest, *, patiently: bool = True) -> Answer:
         """The worker's answer. patiently: wait a moment for a worker that is down, for there is no other.
 
         The worker has all requests at once and chooses their order. If this is cancelled, so is the request.

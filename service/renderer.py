@@ -15,7 +15,7 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.queue.interface import WORKER_TTL_S, Queue
 from contract.wire.errors import UnavailableError
-from contract.wire.rendering import ExportRequest, RenderRequest, ReplyError, WorkerAddress, WorkerReply
+from contract.wire.rendering import ReplyError, SceneRequest, WorkerAddress, WorkerReply
 from service.connection import Answer, Connection, Reached, WorkerGoneError
 
 WORKER_REMEDY = (
@@ -34,7 +34,7 @@ logger = logging.getLogger("intrasplat.service")
 class Renderer(Protocol):
     """Whoever can answer render and export requests."""
 
-    async def ask(self, request: RenderRequest | ExportRequest) -> Answer:
+    async def ask(self, request: SceneRequest) -> Answer:
         """The answer; raises UnavailableError if no worker gives one in time."""
         ...
 
@@ -64,7 +64,7 @@ class ZmqRenderer:
         self._read_s = self._heard_s = -math.inf
         self._reading: asyncio.Task[None] | None = None
 
-    async def ask(self, request: RenderRequest | ExportRequest) -> Answer:
+    async def ask(self, request: SceneRequest) -> Answer:
         workers = await self._workers_for(request)
         if not workers:
             problem = f"No worker runs job {request.scene_id} yet."
@@ -86,9 +86,7 @@ class ZmqRenderer:
         except WorkerGoneError:
             raise UnavailableError("The worker is gone.", _remedy(first)) from None
 
-    async def _ask(
-        self, address: WorkerAddress, request: RenderRequest | ExportRequest, *, patiently: bool = True
-    ) -> Answer:
+    async def _ask(self, address: WorkerAddress, request: SceneRequest, *, patiently: bool = True) -> Answer:
         connection = await self._connection(address)
         return await connection.ask(request, patiently=patiently)
 
@@ -107,7 +105,7 @@ class ZmqRenderer:
             self._context.term()
             self._context = None
 
-    async def _workers_for(self, request: RenderRequest | ExportRequest) -> list[WorkerAddress]:
+    async def _workers_for(self, request: SceneRequest) -> list[WorkerAddress]:
         """Who can answer, best first; none if a job is asked for that nobody runs.
 
         Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ import torch
 from contract.store.durable import FOR_ALL, replace_file
 from contract.store.results import add_scores, without_scores
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged
-from contract.wire.names import CURVE, MASKS, REPORT
+from contract.wire.names import CURVE, MASKS, RECORDED, REPORT
 from contract.wire.notices import Notice
 from contract.wire.report import Report
 from worker.input.clip import DepthClip, FrameSplit, split_frames, training_frames
@@ -33,6 +33,7 @@ from worker.outcome import scene_of, snapshot_of, training_of
 from worker.poses import placed, with_poses
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
+from worker.render.recorded import marked_frames
 from worker.render.view import SceneRenderer
 from worker.report.doubts import clip_warnings
 from worker.report.judge import judged
@@ -70,7 +71,7 @@ class Made:
 
 
 def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Report:
-    """Clip in; manifest.json, scene.safetensors, report.json, curve.csv and masks.zip, if masks were found, out.
+    """Clip in; manifest.json, scene.safetensors, report.json and curve.csv out. If masks were found, masks.zip, too.
 
     A run that is stopped or killed leaves in out_dir what the same request on the same folder goes on from.
 
@@ -106,9 +107,10 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
         optimise(run, keeper)
         with ThreadPoolExecutor(1) as aside:
             doubts = aside.submit(clip_warnings, setup.clip, setup.split.train)
-            masks = aside.submit(zipped_masks, setup.clip)
+            files = {MASKS: aside.submit(zipped_masks, setup.clip), RECORDED: aside.submit(marked_frames, setup.clip)}
             scene, quantized = finish(run)
-        report = publish(out_dir, run, scene, quantized, doubts.result(), masks.result())
+        of_masks = {name: each.result() for name, each in files.items()}
+        report = publish(out_dir, run, scene, quantized, doubts.result(), of_masks)
     return Made(setup.clip, setup.split, scene, report, setup.device)
 
 
@@ -161,6 +163,7 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
         frames = training_frames(clip.frame_count, options.holdout)
         moment = next((i for i in frames if (clip.tissue[i] & (clip.depth_mm[i] > 0)).any()), frames[0])
         show(clip.moment(moment))
+    hooks.on_clip(clip)
     split = split_frames(clip, options.holdout)
     keep_free_memory(USUAL_BYTES)
     timings.add("compile_s", compile_coder())
@@ -246,15 +249,16 @@ def publish(
     scene: Scene,
     quantized: QuantizedScene | None,
     doubts: Sequence[Notice],
-    masks: bytes | None,
+    of_masks: Mapping[str, bytes | None],
 ) -> Report:
-    """Write the report, the curve, the masks that were found and the scene. The report has no scores yet."""
+    """Write the report, the curve, files of the masks that were found and the scene. The report has no scores yet."""
     setup = run.setup
     setup.timings.seconds["t_post_s"] = time.time() - setup.accepted_at_s
     report = first_report(setup.clip, setup.split, training_of(run, scene, quantized), doubts)
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)
-    if masks is not None:
-        replace_file(out_dir / MASKS, masks, FOR_ALL)
+    for name, content in of_masks.items():
+        if content is not None:
+            replace_file(out_dir / name, content, FOR_ALL)
     save_scene(out_dir, scene)
     return report

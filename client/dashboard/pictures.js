@@ -12,9 +12,12 @@ const ANSWER_MS = 15000;
 const FIRST_RETRY_MS = 1000;
 const MAX_RETRY_MS = 15000;
 
-/** @param {View} view @param {AbortSignal} signal @returns {Promise<Picture>} */
-async function renderOnce(view, signal) {
-  const response = await request(`/render?${new URLSearchParams(view)}`, { signal });
+/** Not a layer of the model, but what the endoscope saw, with the masked parts marked. */
+const RECORDED = "recorded";
+
+/** @param {string} path @param {AbortSignal} signal @returns {Promise<Picture>} */
+async function askOnce(path, signal) {
+  const response = await request(path, { signal });
   const header = (name) => response.headers.get(`X-Intrasplat-${name}`);
   const total = /total;dur=([\d.]+)/.exec(response.headers.get("Server-Timing") ?? "");
   return {
@@ -30,6 +33,10 @@ async function renderOnce(view, signal) {
     way: "single pictures",
   };
 }
+
+/** @param {View} view */
+const pathOf = (view) =>
+  view.layer === RECORDED ? `/scenes/${view.scene}/recorded?t=${view.t}` : `/render?${new URLSearchParams(view)}`;
 
 export class Pictures {
   constructor() {
@@ -56,10 +63,13 @@ export class Pictures {
    */
   async ask(view) {
     this.#keepOpen();
-    const picture = this.stream.isOpen ? await this.#fromStream(view) : await this.#fromRender(view);
+    const isRecorded = view.layer === RECORDED;
+    const isStreamed = this.stream.isOpen && !isRecorded;
+    const picture = isStreamed ? await this.#fromStream(view) : await this.#fromPath(pathOf(view));
     if (picture.scene !== view.scene) throw new Error("The service sent another scene's picture; it is not shown.");
     // What is hatched is no guess, and highlights that stay were seen: the rest of the picture is as good as ever.
     const harmless = ["coarse", "highlights_unknown", ...(view.unseen === "mark" ? ["unseen"] : [])];
+    picture.isRecorded = isRecorded;
     picture.isExtrapolated = picture.codes.some((code) => !harmless.includes(code));
     return picture;
   }
@@ -72,9 +82,9 @@ export class Pictures {
     this.stream.connect();
   }
 
-  async #fromRender(view) {
+  async #fromPath(path) {
     this.controller = new AbortController();
-    return renderOnce(view, AbortSignal.any([this.controller.signal, AbortSignal.timeout(ANSWER_MS)]));
+    return askOnce(path, AbortSignal.any([this.controller.signal, AbortSignal.timeout(ANSWER_MS)]));
   }
 
   async #fromStream(view) {

@@ -87,6 +87,7 @@ export class Screen {
       const reason = this.trouble || "The service does not answer.";
       return ["stale", "STALE", `Last picture ${clockTime(this.shownAt)}. ${reason} Reconnecting.`];
     }
+    if (this.shown.isRecorded) return ["live", "RECORDED, what is coloured is masked", ""];
     if (this.shown.codes?.includes(FIRST_PICTURE)) return ["training", "FIRST PICTURE, not yet a model", ""];
     if (this.shown.state === "running") return ["training", `TRAINING, iteration ${this.shown.iteration}`, ""];
     return this.shown.isExtrapolated ? ["extrapolated", "EXTRAPOLATED", ""] : ["live", "CURRENT", ""];

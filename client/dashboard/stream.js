@@ -10,9 +10,10 @@ import { connectionLost, Problem } from "./problem.js";
  */
 /**
  * What came. isExtrapolated: it shows a guess, or a pose or time far from the clip's (set by Pictures.ask).
+ * isRecorded: it is a frame of the clip, no render.
  * @typedef {{blob: Blob, scene: string, state: "running"|"done", t: number, iteration: number | null,
  *   unseen: number, warning: string, codes: string[], totalMs: number, way: string,
- *   isExtrapolated?: boolean}} Picture
+ *   isExtrapolated?: boolean, isRecorded?: boolean}} Picture
  */
 
 const LENGTH_BYTES = 4;

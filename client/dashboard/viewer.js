@@ -72,7 +72,8 @@ export class Viewer {
     const guesses = this.parts.guess.checked ? ", guesses shown" : "";
     const view = this.#view(scene);
     const highlights = view.highlights === "off" ? ", without highlights" : "";
-    const name = `${this.parts.layer.selectedOptions[0].text}, ${this.orbit.words}${guesses}${highlights}`;
+    const layer = this.parts.layer.selectedOptions[0].text;
+    const name = view.layer === "recorded" ? layer : `${layer}, ${this.orbit.words}${guesses}${highlights}`;
     try {
       const picture = await this.pictures.ask(view);
       const bitmap = await createImageBitmap(picture.blob);

@@ -181,6 +181,10 @@ class Client:
         """The masks that were found, as a zip to correct and to send with the clip again."""
         return run(self._core.masks(scene))
 
+    def recorded(self, scene: str, t: float = 0.0) -> bytes:
+        """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains."""
+        return run(self._core.recorded(scene, t))
+
     def export(self, scene: str, t: float = 0.0, format: str = "ply") -> bytes:
         """The scene's Gaussians at time t as a file."""
         return run(self._core.export(scene, t, format))

@@ -171,6 +171,10 @@ class Core:
         """The masks that were found, as a zip to correct and to send with the clip again."""
         return (await self._get("scenes", scene, "masks")).content
 
+    async def recorded(self, scene: str, t: float = 0.0) -> bytes:
+        """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains."""
+        return (await self._get("scenes", scene, "recorded", t=t)).content
+
     async def export(self, scene: str, t: float = 0.0, format: str = "ply") -> bytes:
         """The scene's Gaussians at time t as a file."""
         return (await self._get("scenes", scene, "export", t=t, format=format)).content

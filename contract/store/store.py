@@ -7,7 +7,7 @@
     ├── kept/<job>.<n>/     what goes on from attempt n: resume.safetensors, and prepared/, the clip with depth
     ├── work/tmp-<name>/    what worker <name> has unpacked; emptied whenever it starts
     ├── scenes/<job>.<n>/   what attempt n has finished: manifest.json, scene.safetensors, report.json, curve.csv
-    │                       and, of a clip whose masks were found, masks.zip
+    │                       and, of a clip whose masks were found, masks.zip, recorded.zip
     ├── unscored/<name>/    an empty file <job>.<n> for each scene that worker <name> has finished and not scored yet
     ├── run/                sockets of live workers
     └── valkey/             the embedded queue's log

@@ -130,6 +130,17 @@ class ExportRequest(BaseModel):
     format: str = Field(default="ply", max_length=32)
 
 
+class RecordedRequest(BaseModel):
+    """The recorded frame nearest to time t, as JPEG, with the masked parts marked; attempt as in RenderRequest."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["recorded"] = "recorded"
+    scene_id: str = Field(pattern=JOB_ID_PATTERN)
+    attempt: int | None = None
+    t: float = Field(ge=0, le=1e6)
+
+
 class CancelRequest(BaseModel):
     """Nobody waits any more for the answer to the request of the same id."""
 
@@ -138,10 +149,14 @@ class CancelRequest(BaseModel):
     kind: Literal["cancel"] = "cancel"
 
 
+SceneRequest: TypeAlias = RenderRequest | ExportRequest | RecordedRequest
+"""What is asked of a scene."""
+
+
 class WorkerRequest(BaseModel):
     """The envelope: one of the requests above."""
 
-    request: RenderRequest | ExportRequest | CancelRequest = Field(discriminator="kind")
+    request: SceneRequest | CancelRequest = Field(discriminator="kind")
 
 
 class ReplyError(BaseModel):

@@ -90,6 +90,11 @@ class Masks(BaseModel):
         description="how clearly instruments were told from tissue, where masks were found; None: they were not",
     )
 
+    @property
+    def are_found(self) -> bool:
+        """Whether this program, or a segmenter, found them in the pictures."""
+        return self.source in ("found", "segmenter")
+
 
 class CameraPoses(BaseModel):
     """Where the endoscope was. Tissue that moves as a whole looks like a camera that moves the other way; what of the

@@ -6,10 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from selenium import webdriver
 
 from contract.queue.interface import Claim
 from intrasplat_client import Client
 from tests.client.local_service import CLIP, LocalService, local_service
+from tests.client.page import Page, Site, browser, site_at
 
 
 @pytest.fixture(scope="package")
@@ -37,3 +39,24 @@ def client(service: LocalService) -> Iterator[Client]:
 @pytest.fixture
 def clip() -> Path:
     return CLIP
+
+
+@pytest.fixture(scope="module")
+def driver() -> Iterator[webdriver.Chrome]:
+    with browser() as driver:
+        yield driver
+
+
+@pytest.fixture
+def site(tmp_path: Path, driver: webdriver.Chrome) -> Iterator[Site]:
+    with site_at(tmp_path / "data") as site:
+        yield site
+
+
+@pytest.fixture
+def page(site: Site, driver: webdriver.Chrome) -> Iterator[Page]:
+    page = Page(driver, site.url)
+    page.open()
+    yield page
+    assert page.faults() == []
+    driver.get("about:blank")  # or its connections keep the service from ending

@@ -22,7 +22,15 @@ from contract.runtime.settings import Settings
 from contract.store.store import Store
 from contract.wire.job import JobError
 from contract.wire.names import CURVE, MANIFEST, REPORT
-from contract.wire.rendering import MEDIA_TYPES, ExportRequest, Highlights, RenderRequest, Unseen, WorkerAddress
+from contract.wire.rendering import (
+    MEDIA_TYPES,
+    ExportRequest,
+    Highlights,
+    RecordedRequest,
+    SceneRequest,
+    Unseen,
+    WorkerAddress,
+)
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
@@ -33,13 +41,15 @@ CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
 SNAPSHOT_ITERATION = 7
 
 
-def paint(request: RenderRequest | ExportRequest) -> Reply:
+def paint(request: SceneRequest) -> Reply:
     """A 4 x 6 depth map that holds t everywhere, -t without highlights.
 
     A quarter of it is unseen, unless guesses are asked for.
     """
     if isinstance(request, ExportRequest):
         return Reply(b"ply\n", "application/octet-stream", request.t)
+    if isinstance(request, RecordedRequest):
+        return Reply(b"jpeg", "image/jpeg", request.t)
     buffer = io.BytesIO()
     shown = request.t if request.highlights is Highlights.ON else -request.t
     np.save(buffer, np.full((4, 6), shown, np.float32))

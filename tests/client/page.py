@@ -33,7 +33,15 @@ from contract.wire.job import JobFiles, JobProgress, JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import OrbitPose
-from contract.wire.rendering import MEDIA_TYPES, ExportRequest, Highlights, RenderRequest, Unseen, WorkerAddress
+from contract.wire.rendering import (
+    MEDIA_TYPES,
+    ExportRequest,
+    Highlights,
+    RecordedRequest,
+    SceneRequest,
+    Unseen,
+    WorkerAddress,
+)
 from contract.wire.report import Report
 from service.app import create_app
 from service.renderer import ZmqRenderer
@@ -48,6 +56,8 @@ MAX_WAIT_S = 1.0
 LOOK_S = 0.05
 WORKER = "worker-1"
 SNAPSHOT_ITERATION = 40
+RECORDED_SHADE = 8
+"""Darker than any scene."""
 FAR_DEG = 25.0
 FAR_OUT_ZOOM = 0.9
 UNSEEN = "No frame saw 12% of this view."
@@ -92,9 +102,12 @@ class Painter:
         self.shown_unseen: Unseen | None = None
         self.shown_highlights: Highlights | None = None
 
-    def answer(self, request: RenderRequest | ExportRequest) -> Reply:
+    def answer(self, request: SceneRequest) -> Reply:
         if isinstance(request, ExportRequest):
             return Reply(b"ply\n", "application/octet-stream", request.t)
+        if isinstance(request, RecordedRequest):
+            picture = cv2.imencode(".jpg", np.full((48, 60, 3), RECORDED_SHADE, np.uint8))[1].tobytes()
+            return Reply(picture, "image/jpeg", request.t, iteration=0 if request.attempt is None else None)
         time.sleep(self.pause_s)
         self.shown_unseen, self.shown_highlights = request.unseen, request.highlights
         picture = np.full((48, 60, 3), grey_of(request.scene_id), np.uint8)

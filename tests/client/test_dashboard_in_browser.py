@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,35 +13,21 @@ from selenium.webdriver.support.select import Select
 
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobError, JobState
-from contract.wire.names import MASKS
 from contract.wire.rendering import Highlights, Unseen
-from contract.wire.report import Masks
 from tests.client.local_service import CLIP
-from tests.client.page import FAR, HIGHLIGHTS_STAY, REPORT_OF_THE_PAGE, UNSEEN, Page, Site, browser, grey_of, site_at
+from tests.client.page import (
+    FAR,
+    HIGHLIGHTS_STAY,
+    REPORT_OF_THE_PAGE,
+    UNSEEN,
+    Page,
+    Site,
+    grey_of,
+    site_at,
+)
 from worker.daemon.pace import MAX_SAVED_S, SHARE
 
 POINTS = "return document.querySelector(`#curve polyline.${arguments[0]}`)?.points ?? []"
-
-
-@pytest.fixture(scope="module")
-def driver() -> Iterator[webdriver.Chrome]:
-    with browser() as driver:
-        yield driver
-
-
-@pytest.fixture
-def site(tmp_path: Path, driver: webdriver.Chrome) -> Iterator[Site]:
-    with site_at(tmp_path / "data") as site:
-        yield site
-
-
-@pytest.fixture
-def page(site: Site, driver: webdriver.Chrome) -> Iterator[Page]:
-    page = Page(driver, site.url)
-    page.open()
-    yield page
-    assert page.faults() == []
-    driver.get("about:blank")  # or its connections keep the service from ending
 
 
 @pytest.fixture
@@ -80,34 +65,6 @@ def test_a_clip_is_sent_and_its_job_watched_to_the_scene(site: Site, page: Page)
     page.until(lambda: page.script("return document.querySelectorAll('#curve .baseline').length") == 2)
     assert (len(page.script(POINTS, "score")), len(page.script(POINTS, "beside"))) == (3, 2)
     assert "31.2 dB, right eye 28.4 dB" in page.find("#curve").get_attribute("aria-label")
-
-
-def test_found_masks_are_told_of_and_saved_to_be_corrected(site: Site, page: Page, tmp_path: Path) -> None:
-    page.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
-    masks = Masks(source="found", share=0.123, sure=0.41)
-    scene = site.scene()
-    site.store.add_scores("worker-1", scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"masks": masks}))
-    (site.store.scene_folder(scene, 1) / MASKS).write_bytes(b"PK")
-    page.press(scene, "View")
-    page.until_text("#report", "Found by their colour and depth; 12.3 % of the picture. Not sure: of what looks")
-    page.click('#report button[aria-label^="Save the masks"]')
-    page.until(lambda: (tmp_path / f"{scene}-masks.zip").exists())
-    assert (tmp_path / f"{scene}-masks.zip").read_bytes() == b"PK"
-
-
-@pytest.mark.parametrize(
-    ("masks", "words"),
-    [
-        (Masks(source="none"), "None masked: every pixel counts as tissue."),
-        (Masks(source="given", share=0.2), "Masked as given with the clip; 20.0 % of the picture."),
-    ],
-)
-def test_masks_that_were_not_found_are_not_offered(site: Site, page: Page, masks: Masks, words: str) -> None:
-    scene = site.scene()
-    site.store.add_scores("worker-1", scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"masks": masks}))
-    page.press(scene, "View")
-    page.until_text("#report", words)
-    assert "Save the masks" not in page.text("#report")
 
 
 def test_what_is_dropped_finds_its_place(page: Page) -> None:

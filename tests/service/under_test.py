@@ -19,7 +19,7 @@ from contract.wire.errors import InputError, SceneError
 from contract.wire.job import JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode
-from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
+from contract.wire.rendering import ExportRequest, RecordedRequest, SceneRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from tests.reports import REPORT_OF_A_SCENE, a_warning
@@ -45,12 +45,14 @@ class Painter:
     """Answers like a worker and remembers what it was asked."""
 
     def __init__(self) -> None:
-        self.requests: list[RenderRequest | ExportRequest] = []
+        self.requests: list[SceneRequest] = []
 
-    def answer(self, request: RenderRequest | ExportRequest) -> Reply:
+    def answer(self, request: SceneRequest) -> Reply:
         self.requests.append(request)
         if isinstance(request, ExportRequest):
             return Reply(b"ply\n", "application/octet-stream", request.t)
+        if isinstance(request, RecordedRequest):
+            return Reply(b"jpeg", "image/jpeg", 0.25, iteration=7 if request.attempt is None else None)
         if request.camera.width == 8:
             raise InputError("width", "8 is too narrow.", "Use more.")
         if request.camera.width == 9:

@@ -439,7 +439,9 @@ def test_what_is_stored_is_what_was_scored_and_the_report_tells_its_price(clip: 
 def test_found_masks_are_kept_with_the_scene_as_a_file_to_correct(tmp_path: Path) -> None:
     drawn = make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=3, period_frames=12)).depth_clip()
     found = dataclasses.replace(drawn, masks=Masks(source="found", share=0.1, sure=0.9))
-    for clip, files in ((found, {*SCENE_FILES, "masks.zip"}), (drawn, SCENE_FILES)):
+    shown: list[DepthClip] = []
+    for clip, files in ((found, {*SCENE_FILES, "masks.zip", "recorded.zip"}), (drawn, SCENE_FILES)):
         out = tmp_path / str(len(files))
-        reconstruct(request(clip, iterations=2, holdout="none"), out, TrainingHooks())  # type: ignore[arg-type]
+        reconstruct(request(clip, iterations=2, holdout="none"), out, TrainingHooks(on_clip=shown.append))  # type: ignore[arg-type]
         assert {path.name for path in out.iterdir()} == files
+    assert [clip.masks for clip in shown] == [found.masks, drawn.masks]

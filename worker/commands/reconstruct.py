@@ -19,7 +19,7 @@ from contract.runtime.exits import ExitCode
 from contract.runtime.progress_bar import ProgressBar
 from contract.store.durable import aside_of
 from contract.wire.errors import Cancelled, InputError
-from contract.wire.names import CURVE, KEPT, MANIFEST, MASKS, REPORT, SCENE
+from contract.wire.names import CURVE, KEPT, MANIFEST, MASKS, RECORDED, REPORT, SCENE
 from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
 from worker.commands.device import add_device
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from worker.machine.hooks import Hooks
 
 
-_BEFORE_MANIFEST = (*KEPT, REPORT, CURVE, MASKS, SCENE)
+_BEFORE_MANIFEST = (*KEPT, REPORT, CURVE, MASKS, RECORDED, SCENE)
 UNFINISHED = {*_BEFORE_MANIFEST, *(aside_of(Path(name)).name for name in (*_BEFORE_MANIFEST, MANIFEST))}
 """What a run that was stopped or killed may leave. The manifest is written last: with it the scene is finished."""
 

@@ -24,7 +24,7 @@ from contract.store.store import Store, open_store
 from contract.wire.errors import Cancelled, InputError, ResumeMismatch, UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.names import REPORT
-from contract.wire.rendering import ExportRequest, RenderRequest
+from contract.wire.rendering import SceneRequest
 from contract.wire.report import Report
 from worker.daemon.channel import Channel, Orders, Task
 from worker.daemon.job_errors import describe
@@ -104,7 +104,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, device)
 
-    def answer(request: RenderRequest | ExportRequest) -> Reply:
+    def answer(request: SceneRequest) -> Reply:
         with alone(is_alone=pace.trains):
             return views.answer(request)
 
@@ -148,6 +148,7 @@ def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, chann
         wants_snapshot=snapshots.wanted,
         on_snapshot=snapshots.offer,
         on_first_picture=snapshots.offer_first,
+        on_clip=snapshots.offer_clip,
     )
     if isinstance(order, ScoreScene):
         request = request_of(order.record, order.spool, settings.device, limits, settings.segmenter)

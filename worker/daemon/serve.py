@@ -27,9 +27,9 @@ from contract.wire.errors import ErrorCode, InputError, IntrasplatError, SceneEr
 from contract.wire.notices import Notice
 from contract.wire.rendering import (
     CancelRequest,
-    ExportRequest,
     RenderRequest,
     ReplyError,
+    SceneRequest,
     WorkerReply,
     WorkerRequest,
 )
@@ -110,9 +110,9 @@ class RequestServer:
     def __init__(
         self,
         endpoint: str,
-        answer: Callable[[RenderRequest | ExportRequest], Reply],
+        answer: Callable[[SceneRequest], Reply],
         *,
-        cost: Callable[[RenderRequest | ExportRequest], float] = lambda request: 0.0,
+        cost: Callable[[SceneRequest], float] = lambda request: 0.0,
         between: Callable[[], None] | None = None,
         pace: Pace | None = None,
         spent_s: Callable[[], float] = time.thread_time,
@@ -250,7 +250,7 @@ class RequestServer:
         else:
             self._turns.add(turn)
 
-    def _coarsest(self, request: RenderRequest | ExportRequest) -> int:
+    def _coarsest(self, request: SceneRequest) -> int:
         """The coarsest level of detail that will do."""
         may_be_coarse = isinstance(request, RenderRequest) and request.format in FOR_EYES
         return COARSEST if self._pace.trains and may_be_coarse else 0
@@ -301,7 +301,7 @@ class RequestServer:
             logger.error("between two requests: %s", type(error).__name__)
         self._between_at_s = time.monotonic() + BETWEEN_PERIOD_S
 
-    def _reply(self, request: RenderRequest | ExportRequest) -> tuple[WorkerReply, bytes, bool]:
+    def _reply(self, request: SceneRequest) -> tuple[WorkerReply, bytes, bool]:
         """Head and body of the answer, and whether it was made for this request."""
         start = time.perf_counter()
         try:

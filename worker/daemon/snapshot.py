@@ -11,6 +11,7 @@ import threading
 import time
 from dataclasses import dataclass
 
+from worker.input.clip import DepthClip
 from worker.scene.scene import Scene
 
 PERIOD_S = 1.0
@@ -39,7 +40,7 @@ class Snapshot:
 
 
 class Snapshots:
-    """Keeps the newest copy of at most one job; for one training thread and any number of others."""
+    """Keeps the newest copy of at most one job, and its clip; for one training thread and any number of others."""
 
     def __init__(self, period_s: float = PERIOD_S, patience_s: float = PATIENCE_S) -> None:
         self._period_s = period_s
@@ -47,6 +48,7 @@ class Snapshots:
         self._changed = threading.Condition()
         self._job_id: str | None = None
         self._newest: Snapshot | None = None
+        self._clip: DepthClip | None = None
         self._asked = False
         self._answers = True
         self._wanted_s = self._copy_s = 0.0
@@ -55,13 +57,14 @@ class Snapshots:
         """A job starts: drop the copy of the one before."""
         with self._changed:
             self._job_id, self._newest, self._asked, self._answers = job_id, None, False, False
+            self._clip = None
             self._changed.notify_all()
 
     def drop(self, job_id: str) -> None:
         """Show nothing of this job any more."""
         with self._changed:
             if self._job_id == job_id:
-                self._job_id = self._newest = None
+                self._job_id = self._newest = self._clip = None
                 self._changed.notify_all()
 
     def wanted(self) -> bool:
@@ -79,6 +82,17 @@ class Snapshots:
     def offer_first(self, scene: Scene) -> None:
         """Show the scene of one moment until there is a copy (TrainingHooks.on_first_picture)."""
         self._show(Snapshot(scene, 0, time.monotonic(), of_one_moment=True))
+
+    def offer_clip(self, clip: DepthClip) -> None:
+        """Show the frames of this clip from now on (TrainingHooks.on_clip)."""
+        with self._changed:
+            if self._job_id is not None:
+                self._clip = clip
+
+    def clip(self, job_id: str) -> DepthClip | None:
+        """The job's clip; None before it is complete, and once nothing of the job is shown any more."""
+        with self._changed:
+            return self._clip if self._job_id == job_id else None
 
     def _show(self, snapshot: Snapshot) -> None:
         with self._changed:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from contract.wire.rendering import ExportRequest, RenderRequest
+from contract.wire.rendering import SceneRequest
 
 PATIENCE = 4.0
 """A request may wait so many times the seconds that it takes, before those that came later are answered first."""
@@ -32,7 +32,7 @@ class Turn:
 
     caller: bytes
     request_id: bytes
-    request: RenderRequest | ExportRequest
+    request: SceneRequest
     cost: float
     seconds: float
     least_s: float
@@ -83,13 +83,13 @@ class Turns:
             self._waiting.remove(turn)
         return turn
 
-    def take_same(self, request: RenderRequest | ExportRequest) -> list[Turn]:
+    def take_same(self, request: SceneRequest) -> list[Turn]:
         """All who wait for the same answer."""
         same = [each for each in self._waiting if each.request == request]
         self._waiting = [each for each in self._waiting if each.request != request]
         return same
 
-    def others(self, request: RenderRequest | ExportRequest) -> int:
+    def others(self, request: SceneRequest) -> int:
         """How many other answers somebody waits for."""
         return len({each.request for each in self._waiting} - {request})
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from contract.runtime.settings import GIB
 from contract.store.store import Store
 from contract.wire.errors import InputError, LimitError
+from contract.wire.names import RECORDED
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import MatrixPose, OrbitPose, world_from_camera
 from contract.wire.rendering import (
@@ -22,8 +23,11 @@ from contract.wire.rendering import (
     TYPICAL_GAUSSIANS,
     TYPICAL_SIZE,
     ExportRequest,
+    ImageFormat,
     IntrinsicsOverride,
+    RecordedRequest,
     RenderRequest,
+    SceneRequest,
     render_cost,
 )
 from worker.daemon.kept import KeptReplies
@@ -33,6 +37,7 @@ from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
 from worker.render.detail import LEVELS, thinned
 from worker.render.encode import FOR_EYES, encode_layer
+from worker.render.recorded import marked_frame, stored_frame
 from worker.render.view import ROUNDING, Frame, no_pause, render_frame
 from worker.scene.checkpoint import load_scene
 from worker.scene.export import EXPORTS
@@ -74,8 +79,8 @@ class Views:
         self.pause: Callable[[], None] = no_pause
         self.level: Callable[[], int] = lambda: 0
 
-    def answer(self, request: RenderRequest | ExportRequest) -> Reply:
-        """The encoded image or file.
+    def answer(self, request: SceneRequest) -> Reply:
+        """The encoded image or file. A recorded frame counts as kept: it tells nothing of the time of renders.
 
         Raises:
             SceneError: the scene is missing or damaged.
@@ -83,6 +88,8 @@ class Views:
             LimitError: the image would exceed request.max_pixels.
             InputError: the export format does not exist.
         """
+        if isinstance(request, RecordedRequest):
+            return self._recorded(request)
         if isinstance(request, ExportRequest):
             return _export(self._stored(request.scene_id, request.attempt), request)
         if request.attempt is not None:
@@ -102,12 +109,14 @@ class Views:
                 self._kept.keep(request, reply)
         return reply
 
-    def cost(self, request: RenderRequest | ExportRequest) -> float:
+    def cost(self, request: SceneRequest) -> float:
         """What the answer will take, in pixels x Gaussians; 0 if it is kept at full resolution."""
         if isinstance(request, RenderRequest):
             kept = self._kept.get(request)
             if kept is not None and kept.level == 0:
                 return 0.0
+        if isinstance(request, RecordedRequest):
+            return 0.0
         if request.attempt is not None:
             scene = self._scenes.get((request.scene_id, request.attempt))
         else:
@@ -127,6 +136,21 @@ class Views:
         if self._snapshot is not None and self._snapshots.shown(self._job_id) is not self._snapshot:
             self._kept.drop(lambda request: request.attempt is None)
             self._snapshot = None
+
+    def _recorded(self, request: RecordedRequest) -> Reply:
+        """A recorded frame with the masked parts marked: of the job that trains, or of those that a scene keeps."""
+        if request.attempt is not None:
+            path = self._store.scene_folder(request.scene_id, request.attempt) / RECORDED
+            count = self._store.newest_report(request.scene_id, request.attempt).frame_count
+            index, picture = stored_frame(path, request.t, count)
+            return Reply(picture, MEDIA_TYPES[ImageFormat.JPEG], index / count, is_kept=True)
+        clip, snapshot = self._snapshots.clip(request.scene_id), self._snapshots.shown(request.scene_id)
+        if clip is None:
+            raise NotYetError(f"The clip of job {request.scene_id} is not prepared yet.")
+        index, picture = marked_frame(clip, request.t)
+        iteration = 0 if snapshot is None else snapshot.iteration
+        shown = index / clip.frame_count
+        return Reply(picture, MEDIA_TYPES[ImageFormat.JPEG], shown, iteration=iteration, is_kept=True)
 
     def _trained(self, job_id: str) -> Snapshot:
         """The newest snapshot; may wait for training, without slowing it."""

@@ -30,7 +30,7 @@ def zipped_masks(clip: DepthClip) -> bytes | None:
     looked at (left_out) has the mask of the nearest one that was. None where nothing was found, and where the file
     would have more than MAX_BYTES.
     """
-    if clip.masks is None or clip.masks.source not in ("found", "segmenter") or clip.masks.share == 0:
+    if clip.masks is None or not clip.masks.are_found or clip.masks.share == 0:
         return None
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:

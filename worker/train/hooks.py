@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.input.clip import DepthClip
 from worker.machine.hooks import Hooks, ignore, never
 from worker.scene.scene import Scene
 
@@ -33,11 +34,12 @@ class TrainingHooks(Hooks):
 
     wants_snapshot is asked between training steps; after a yes, on_snapshot receives the scene as it is then and the
     number of iterations that made it. on_first_picture receives a scene of one moment while the clip is still being
-    prepared; None: nobody wants it. on_held_out receives each held-out frame that is rendered for a score during
-    training, with its index; training's clock is paused meanwhile.
+    prepared; None: nobody wants it. on_clip receives the clip once it is prepared. on_held_out receives each held-out
+    frame that is rendered for a score during training, with its index; training's clock is paused meanwhile.
     """
 
     wants_snapshot: Callable[[], bool] = never
     on_snapshot: Callable[[Scene, int], None] = ignore
     on_first_picture: Callable[[Scene], None] | None = None
+    on_clip: Callable[[DepthClip], None] = ignore
     on_held_out: Callable[[int, RenderedFrame], None] = ignore

@@ -1,0 +1,55 @@
+"""What the page shows of masks, in a real browser: recorded frames with marks, and masks to save and correct."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from selenium.webdriver.support.select import Select
+
+from contract.wire.names import MASKS
+from contract.wire.report import Masks
+from tests.client.page import RECORDED_SHADE, REPORT_OF_THE_PAGE, Page, Site
+
+
+def test_found_masks_are_told_of_and_saved_to_be_corrected(site: Site, page: Page, tmp_path: Path) -> None:
+    page.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
+    masks = Masks(source="found", share=0.123, sure=0.41)
+    scene = site.scene()
+    site.store.add_scores("worker-1", scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"masks": masks}))
+    (site.store.scene_folder(scene, 1) / MASKS).write_bytes(b"PK")
+    page.press(scene, "View")
+    page.until_text("#report", "Found by their colour and depth; 12.3 % of the picture. Not sure: of what looks")
+    page.click('#report button[aria-label^="Save the masks"]')
+    page.until(lambda: (tmp_path / f"{scene}-masks.zip").exists())
+    assert (tmp_path / f"{scene}-masks.zip").read_bytes() == b"PK"
+
+
+def test_recorded_frames_show_the_masks_while_a_job_trains_and_afterwards(site: Site, page: Page) -> None:
+    job_id = site.queued_job()
+    claim = site.claim()
+    site.train(claim, 20, 24.0)
+    page.press(job_id, "Watch")
+    page.until_state("training")
+    Select(page.find("#layer")).select_by_value("recorded")
+    for end in (lambda: None, lambda: site.finish(claim)):
+        end()
+        page.until(lambda: page.text("#badge").startswith("RECORDED") and page.shade == RECORDED_SHADE)
+        assert page.view == "recorded, masks marked, t 0.000"
+    Select(page.find("#layer")).select_by_value("rgb")
+    page.until(lambda: page.text("#badge") == "CURRENT" and page.shade > RECORDED_SHADE)
+
+
+@pytest.mark.parametrize(
+    ("masks", "words"),
+    [
+        (Masks(source="none"), "None masked: every pixel counts as tissue."),
+        (Masks(source="given", share=0.2), "Masked as given with the clip; 20.0 % of the picture."),
+    ],
+)
+def test_masks_that_were_not_found_are_not_offered(site: Site, page: Page, masks: Masks, words: str) -> None:
+    scene = site.scene()
+    site.store.add_scores("worker-1", scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"masks": masks}))
+    page.press(scene, "View")
+    page.until_text("#report", words)
+    assert "Save the masks" not in page.text("#report")
