@@ -163,7 +163,7 @@ def _along_tracks(
     for index, chosen, pixels in _best_views(clip, from_there, cells, _at_rest):
         unseen[chosen] = False
         yield _guessed(cells.world_mm[chosen], clip.rgb[index].reshape(-1, 3)[pixels] / np.float32(255), first)
-    masks_are_found = clip.masks is not None and clip.masks.source in ("found", "segmenter")
+    masks_are_found = clip.masks is not None and clip.masks.are_found
     if masks_are_found and len(from_there) == len(later):  # the camera rests
         cells = cells.select(unseen)
         shown = np.any([clip.tissue[index] for index in (first, *from_there)], axis=0)
