@@ -101,7 +101,7 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
     hooks = dataclasses.replace(hooks, on_progress=lambda progress: tell(forecast.completed(progress)))
     with keeping(kept_dir or out_dir, forgets=kept_dir is None) as keeper:
         setup = begin(request, out_dir, hooks, keeper)
-        used = setup.clip.frame_count - len(setup.clip.left_out)
+        used = len(setup.clip.used)
         forecast.learn(used, used * setup.clip.tissue[0].size / 1e6)
         run = resume(keeper.folder, setup) or prepare(setup)
         optimise(run, keeper)

@@ -40,7 +40,7 @@ def with_instruments_found(
     """
     finder = Finder.of((clip.rgb[i] for i in looked_at(measured)), segmenter)
     tissue = mapped_zeros(clip.tissue.shape, np.bool_)
-    wanted = sorted(set(range(clip.frame_count)) - set(clip.left_out))
+    wanted = clip.used
     told = np.zeros((clip.frame_count, 2))
 
     def find(i: int) -> float:

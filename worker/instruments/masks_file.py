@@ -19,8 +19,6 @@ from worker.machine.mapped import let_go
 
 MAX_BYTES = 32 << 20
 """Of the file. Masks that take more are not kept; a frame of 1920 x 1080 takes some 5 kB."""
-EARLIEST = (1980, 1, 1, 0, 0, 0)
-"""The time of every member, so that the same masks are the same bytes."""
 
 
 def zipped_masks(clip: DepthClip) -> bytes | None:
@@ -28,7 +26,7 @@ def zipped_masks(clip: DepthClip) -> bytes | None:
 
     000000.png and so on are [H, W] in the pixels of the recorded left eye, 255 on instruments. A frame that nobody
     looked at (left_out) has the mask of the nearest one that was. None where nothing was found, and where the file
-    would have more than MAX_BYTES.
+    would have more than MAX_BYTES. The same masks are the same bytes: ZipInfo's time is fixed.
     """
     if clip.masks is None or not clip.masks.are_found or clip.masks.share == 0:
         return None
@@ -36,7 +34,7 @@ def zipped_masks(clip: DepthClip) -> bytes | None:
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
         for index, tool in enumerate(_recorded_tools(clip)):
             png = cv2.imencode(".png", tool.view(np.uint8) * np.uint8(255), [cv2.IMWRITE_PNG_BILEVEL, 1])[1]
-            archive.writestr(zipfile.ZipInfo(f"{index:06d}.png", EARLIEST), png.tobytes())
+            archive.writestr(zipfile.ZipInfo(f"{index:06d}.png"), png.tobytes())
             if content.tell() > MAX_BYTES:
                 return None
     return content.getvalue()
@@ -45,7 +43,7 @@ def zipped_masks(clip: DepthClip) -> bytes | None:
 def _recorded_tools(clip: DepthClip) -> Iterator[NDArray[np.bool_]]:
     """Where the recorded left eye shows instruments [H, W], frame by frame."""
     maps = None if clip.rectification is None else clip.rectification.maps(*clip.tissue.shape[1:])
-    looked_at = np.setdiff1d(np.arange(clip.frame_count), clip.left_out)
+    looked_at = np.array(clip.used)
     for index in range(clip.frame_count):
         nearest = int(looked_at[np.abs(looked_at - index).argmin()])
         tool = ~clip.tissue[nearest]

@@ -25,12 +25,11 @@ MAX_WIDTH = 400
 QUALITY = 70
 MARK, MARK_SHARE = (0, 220, 255), 0.45
 """RGB that no tissue has, and how much of it the masked parts get; their outline gets all of it."""
-EARLIEST = (1980, 1, 1, 0, 0, 0)
 
 
 def marked_frame(clip: DepthClip, t: float) -> tuple[int, bytes]:
     """The frame nearest to model time t that has masks, and its picture as JPEG."""
-    index = _nearest(_looked_at(clip), t, clip.frame_count)
+    index = _nearest(clip.used, t, clip.frame_count)
     return index, _marked(clip, index)
 
 
@@ -40,8 +39,8 @@ def marked_frames(clip: DepthClip) -> bytes | None:
         return None
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
-        for index in spread(_looked_at(clip), MAX_KEPT):
-            archive.writestr(zipfile.ZipInfo(f"{index:06d}.jpg", EARLIEST), _marked(clip, index))
+        for index in spread(clip.used, MAX_KEPT):
+            archive.writestr(zipfile.ZipInfo(f"{index:06d}.jpg"), _marked(clip, index))
     return content.getvalue()
 
 
@@ -60,11 +59,6 @@ def stored_frame(path: Path, t: float, frame_count: int) -> tuple[int, bytes]:
         raise SceneError("This scene keeps no recorded frames: its masks were given, or it has none.") from None
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise SceneError(f"The recorded frames of this scene cannot be read ({type(error).__name__}).") from error
-
-
-def _looked_at(clip: DepthClip) -> list[int]:
-    """The frames that have masks."""
-    return sorted(set(range(clip.frame_count)) - set(clip.left_out))
 
 
 def _nearest(frames: Sequence[int], t: float, frame_count: int) -> int:

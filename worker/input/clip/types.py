@@ -122,6 +122,11 @@ class DepthClip(Eye):
         """Left, and right if there is one."""
         return (self,) if self.right is None else (self, self.right)
 
+    @property
+    def used(self) -> list[int]:
+        """The frames that are not left out, in order."""
+        return sorted(set(range(self.frame_count)) - set(self.left_out))
+
     def moment(self, index: int) -> DepthClip:
         """A clip of one frame of both eyes, which views this one's arrays."""
         only = slice(index, index + 1)
