@@ -39,9 +39,12 @@ class AwaitedScores:
         self._log = logging.LoggerAdapter(logger, _named(job_id, attempt))
 
     def take(self, child: DeviceChild, stop: Callable[[], bool], *, gives_up: bool = False) -> bool:
-        """Until the child has scored the scene, is stopped, hangs or dies. Whether nothing is expected any more.
+        """Wait until the child has scored the scene, is stopped, hangs or dies.
 
         gives_up: a child that hangs or dies is the scene's fault, and its report says that there will be no scores.
+
+        Returns:
+            Whether the scene is settled: its scores are added, or no longer expected.
         """
         detector, asked_s = HangDetector(), None
         while not isinstance(report := child.next_report(LOOK_PERIOD_S), Scored | Stopped | Ended):
