@@ -13,8 +13,9 @@ from client.connected import KEY_VARIABLE, Remedies, connected
 from contract.runtime.arguments import Commands, add_command, add_options, count, finite, given_options
 from contract.runtime.exits import ExitCode
 from contract.runtime.progress_bar import ProgressBar
-from contract.wire.errors import InputError
+from contract.wire.errors import InputError, SceneError
 from contract.wire.job import JobProgress
+from contract.wire.names import MANIFEST
 from contract.wire.options import JobOptions
 from intrasplat_client import Client, Conflict, JobState, JobView
 from intrasplat_client.connection import DEFAULT_URL
@@ -72,6 +73,9 @@ def _add_fetch(commands: Commands) -> None:
         "(default: the endoscope's own)",
     )
     parser.add_argument("--no-ply", action="store_true", help="leave the Gaussians out")
+    parser.add_argument(
+        "--scene", action="store_true", help="the stored scene, too, into DIR/scene: `intrasplat render` reads it"
+    )
     _add_service(parser)
 
 
@@ -153,14 +157,26 @@ def _fetch(options: argparse.Namespace) -> int:
             files["masks.zip"] = client.masks(options.job)
         if not options.no_ply:
             files["scene.ply"] = client.export(options.job, options.t)
+        if options.scene:
+            files |= {f"scene/{name}": content for name, content in _stored_files(client, options.job).items()}
     try:
-        options.out.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
+            (options.out / name).parent.mkdir(parents=True, exist_ok=True)
             (options.out / name).write_bytes(content)
             print(options.out / name)
     except OSError as error:
         raise InputError("--out", f"{options.out} cannot be written ({error.strerror}).", "Name a folder.") from error
     return ExitCode.OK
+
+
+def _stored_files(client: Client, scene: str) -> dict[str, bytes]:
+    """The scene's folder as it is stored, by name; the manifest last, without which there is no scene."""
+    manifest = client.file(scene, MANIFEST)
+    try:
+        names = [*json.loads(manifest)["files"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise SceneError(f"The manifest of scene {scene} is damaged.") from error
+    return {Path(name).name: client.file(scene, name) for name in names} | {MANIFEST: manifest}
 
 
 def _jobs(options: argparse.Namespace) -> int:

@@ -76,6 +76,20 @@ async def info(services: Services) -> dict[str, Any]:
     }
 
 
+class KeyView(BaseModel):
+    """What the caller may do; key_id is null for this machine's user, who needs no key."""
+
+    tenant: str
+    scopes: list[KeyScope]
+    key_id: str | None
+
+
+@router.get("/key", operation_id="get_key")
+async def get_key(caller: AnyCaller) -> KeyView:
+    """The tenant and the scopes of the caller's key."""
+    return KeyView(tenant=caller.tenant, scopes=sorted(caller.scopes), key_id=caller.key_id)
+
+
 @router.get("/metrics", operation_id="metrics", response_class=Response)
 def read_metrics(services: Services, caller: AnyCaller) -> Response:
     """Figures for Prometheus, in its text format."""

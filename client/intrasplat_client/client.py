@@ -189,9 +189,17 @@ class Client:
         """The scene's Gaussians at time t as a file."""
         return run(self._core.export(scene, t, format))
 
+    def file(self, scene: str, name: str = "scene.safetensors") -> bytes:
+        """A stored file of the scene: manifest.json, or one that it lists. Needs the scope download."""
+        return run(self._core.file(scene, name))
+
     def delete(self, scene: str) -> dict[str, Any]:
         """Remove clip, scene and record of a job that has ended; the receipt lists what was removed."""
         return run(self._core.delete(scene))
+
+    def key(self) -> dict[str, Any]:
+        """Tenant, scopes and id of the key that is used."""
+        return run(self._core.key())
 
     def info(self) -> dict[str, Any]:
         """Version, limits and accepted formats of the service."""

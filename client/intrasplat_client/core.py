@@ -179,11 +179,20 @@ class Core:
         """The scene's Gaussians at time t as a file."""
         return (await self._get("scenes", scene, "export", t=t, format=format)).content
 
+    async def file(self, scene: str, name: str = "scene.safetensors") -> bytes:
+        """A stored file of the scene: manifest.json, or one that it lists. Needs the scope download."""
+        return (await self._get("scenes", scene, "files", name)).content
+
     async def delete(self, scene: str) -> dict[str, Any]:
         """Remove clip, scene and record of a job that has ended; the receipt lists what was removed."""
         # Not repeated when its answer is lost: the second answer would be that there is no such scene.
         receipt: dict[str, Any] = _json_of(await self._session.request(Call("DELETE", _path("scenes", scene))))
         return receipt
+
+    async def key(self) -> dict[str, Any]:
+        """Tenant, scopes and id of the key that is used."""
+        key: dict[str, Any] = _json_of(await self._get("key"))
+        return key
 
     async def info(self) -> dict[str, Any]:
         """Version, limits and accepted formats of the service."""

@@ -32,6 +32,7 @@ class AuditAction(StrEnum):
     VIEWED = "viewed"
     """At most once a minute for each key and scene, not for each picture."""
     EXPORTED = "exported"
+    DOWNLOADED = "downloaded"
     CANCELLED = "cancelled"
     RETRIED = "retried"
     PURGED = "purged"

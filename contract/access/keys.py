@@ -40,6 +40,8 @@ class KeyScope(StrEnum):
     """Upload, cancel, retry."""
     VIEW = "view"
     """Jobs, scenes, renders, exports."""
+    DOWNLOAD = "download"
+    """The stored files of scenes, with which a scene is shown and kept elsewhere."""
     PURGE = "purge"
     """Delete scenes and all that belongs to them."""
     OPERATE = "operate"

@@ -65,6 +65,19 @@ def test_fetch_saves_masks_that_were_found(
     assert (tmp_path / MASKS).read_bytes() == b"PK"
 
 
+def test_fetch_saves_the_stored_scene_if_asked(
+    service: LocalService, client: Client, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    job_id = submitted(service, clip, capsys)
+    service.finish()
+    service.store.add_scores("worker-1", job_id, 1, REPORT_OF_A_SCENE)
+    assert run_in(service, "fetch", job_id, "--out", str(tmp_path), "--no-ply", "--scene") == ExitCode.OK
+    stored = service.store.scene_folder(job_id, 1)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "scene").iterdir()} == {
+        name: (stored / name).read_bytes() for name in ("manifest.json", "report.json", "curve.csv")
+    }
+
+
 def test_jobs_lists_cancel_stops_and_retry_queues_again(
     service: LocalService, client: Client, clip: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

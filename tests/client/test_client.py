@@ -52,6 +52,10 @@ def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(
     assert client.export(job.id) == b"ply\n"
     (service.store.scene_folder(job.id, 1) / MASKS).write_bytes(b"PK")
     assert client.masks(job.id) == b"PK"
+    assert client.file(job.id, "manifest.json") == b'{"files": {}}'
+    with pytest.raises(NotFound, match=r"no file 'scene\.safetensors'"):
+        client.file(job.id)
+    assert set(client.key()["scopes"]) == set(KeyScope)
     assert client.recorded(job.id, 0.5) == b"jpeg"
     assert job.id in {scene["id"] for scene in client.scenes()}
     receipt = client.delete(job.id)
