@@ -1,6 +1,6 @@
 """The `intrasplat` command.
 
-reconstruct, render, phantom, evaluate, stability, doctor and worker run the worker's program on this machine
+reconstruct, render, export, phantom, evaluate, stability, doctor and worker run the worker's program on this machine
 (`python -m worker ...`), and nothing that they do not need is imported here. up starts a service, keys manages its API
 keys. submit, watch, fetch, jobs, cancel, retry and delete talk to a service (client/commands.py).
 """

@@ -36,10 +36,11 @@ logger = logging.getLogger("intrasplat.service")
 
 @dataclass(frozen=True)
 class Answer:
-    """A worker's answer: its head, and the encoded image or file."""
+    """A worker's answer: its head, the encoded image or file, and the endpoint of the worker, where it is known."""
 
     head: WorkerReply
     body: bytes
+    worker: str | None = None
 
 
 class WorkerGoneError(Exception):

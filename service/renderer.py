@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import hashlib
 import logging
 import math
@@ -34,8 +35,12 @@ logger = logging.getLogger("intrasplat.service")
 class Renderer(Protocol):
     """Whoever can answer render and export requests."""
 
-    async def ask(self, request: SceneRequest) -> Answer:
-        """The answer; raises UnavailableError if no worker gives one in time."""
+    async def ask(self, request: SceneRequest, worker: str | None = None) -> Answer:
+        """The answer, of the worker of that endpoint if one is named.
+
+        Raises:
+            UnavailableError: there is none in time.
+        """
         ...
 
     async def run(self) -> None:
@@ -64,8 +69,12 @@ class ZmqRenderer:
         self._read_s = self._heard_s = -math.inf
         self._reading: asyncio.Task[None] | None = None
 
-    async def ask(self, request: SceneRequest) -> Answer:
+    async def ask(self, request: SceneRequest, worker: str | None = None) -> Answer:
         workers = await self._workers_for(request)
+        if worker is not None:
+            workers = [each for each in workers if each.endpoint == worker]
+            if not workers:
+                raise UnavailableError("The worker is gone.", WORKER_REMEDY)
         if not workers:
             problem = f"No worker runs job {request.scene_id} yet."
             not_yet = ReplyError(kind="not-yet", problem=problem, field="scene", remedy="Ask again in a second.")
@@ -88,7 +97,8 @@ class ZmqRenderer:
 
     async def _ask(self, address: WorkerAddress, request: SceneRequest, *, patiently: bool = True) -> Answer:
         connection = await self._connection(address)
-        return await connection.ask(request, patiently=patiently)
+        answer = await connection.ask(request, patiently=patiently)
+        return dataclasses.replace(answer, worker=address.endpoint)
 
     async def run(self) -> None:
         while True:

@@ -1,10 +1,8 @@
-"""Finished scenes: their report, curve, exports and removal."""
+"""Finished scenes: their report, curve and removal."""
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Response
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
@@ -16,7 +14,7 @@ from contract.store.shelf import is_job_id
 from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.names import CURVE, MASKS
-from contract.wire.rendering import ExportName, ExportRequest, RecordedRequest
+from contract.wire.rendering import RecordedRequest
 from contract.wire.report import Report
 from service.access import Caller
 from service.deps import AnyCaller, Deps, ListingLimit, Services, no_such_scene, owned_scene
@@ -107,30 +105,6 @@ async def get_recorded(scene_id: str, services: Services, caller: AnyCaller, t: 
     request = RecordedRequest(scene_id=scene_id, attempt=shown.attempt, t=t)
     response = image_response(scene_id, await services.renderer.ask(request))
     response.headers["Cache-Control"] = "no-store"
-    return response
-
-
-@router.get("/{scene_id}/export", operation_id="export_scene", response_class=Response)
-async def export_scene(
-    scene_id: str,
-    services: Services,
-    caller: AnyCaller,
-    t: ModelTime = 0.0,
-    format: Annotated[
-        ExportName,
-        Query(
-            description="ply: the Gaussians at time t, in the property order common splat viewers read; tum: the "
-            "endoscope's path"
-        ),
-    ] = "ply",
-) -> Response:
-    """The scene's Gaussians at time t, or the endoscope's path, as a file."""
-    caller.require(KeyScope.VIEW)
-    record = await run_in_threadpool(finished_job, services, caller, scene_id)
-    await run_in_threadpool(services.audit.record, AuditAction.EXPORTED, caller, scene_id)
-    request = ExportRequest(scene_id=scene_id, attempt=record.attempt, t=t, format=format)
-    response = image_response(scene_id, await services.renderer.ask(request))
-    response.headers["Content-Disposition"] = f'attachment; filename="{scene_id}.{format}"'
     return response
 
 

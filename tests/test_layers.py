@@ -41,6 +41,7 @@ ROOMS = {
         "scene",
         "train",
         "render",
+        "export",
         "report",
         "outcome",
         "pipeline",

@@ -185,9 +185,9 @@ class Client:
         """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains."""
         return run(self._core.recorded(scene, t))
 
-    def export(self, scene: str, t: float = 0.0, format: str = "ply") -> bytes:
-        """The scene's Gaussians at time t as a file."""
-        return run(self._core.export(scene, t, format))
+    def export(self, scene: str, t: float | None = None, format: str = "ply", **options: float | str) -> bytes:
+        """The scene as a file of a format; docs/export.md lists the formats and their options."""
+        return run(self._core.export(scene, t, format, **options))
 
     def file(self, scene: str, name: str = "scene.safetensors") -> bytes:
         """A stored file of the scene: manifest.json, or one that it lists. Needs the scope download."""

@@ -175,9 +175,9 @@ class Core:
         """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains."""
         return (await self._get("scenes", scene, "recorded", t=t)).content
 
-    async def export(self, scene: str, t: float = 0.0, format: str = "ply") -> bytes:
-        """The scene's Gaussians at time t as a file."""
-        return (await self._get("scenes", scene, "export", t=t, format=format)).content
+    async def export(self, scene: str, t: float | None = None, format: str = "ply", **options: float | str) -> bytes:
+        """The scene as a file of a format; docs/export.md lists the formats and their options."""
+        return (await self._get("scenes", scene, "export", t=t, format=format, **options)).content
 
     async def file(self, scene: str, name: str = "scene.safetensors") -> bytes:
         """A stored file of the scene: manifest.json, or one that it lists. Needs the scope download."""

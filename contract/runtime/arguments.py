@@ -9,6 +9,7 @@ from types import NoneType
 from typing import Any, Literal, TypeAlias, get_args, get_origin
 
 from contract.runtime.exits import EXIT_CODES_HELP, flag_of
+from contract.wire.exports import ExportOptions
 from contract.wire.options import ClipOptions, Options, parse_options
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -25,7 +26,9 @@ def add_command(
     return parser
 
 
-def add_options(parser: argparse.ArgumentParser, model: type[ClipOptions], *names: str, **overrides: Any) -> None:
+def add_options(
+    parser: argparse.ArgumentParser, model: type[ClipOptions] | type[ExportOptions], *names: str, **overrides: Any
+) -> None:
     """Add one command-line option for each named field of `model` (default: all): flag, type, choices and help.
 
     The namespace holds None for an option that was not given. The parser refuses more than one of `model.exclusive`. In

@@ -13,6 +13,7 @@ from typing import Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from contract.wire.exports import ExportOptions
 from contract.wire.job import JOB_ID_PATTERN
 from contract.wire.notices import Notice
 from contract.wire.pose import MatrixPose, OrbitPose
@@ -65,10 +66,6 @@ GAUSSIAN_PIXELS = 100_000
 """So many pixels take as long as moving and projecting the Gaussians (estimated from bm_raster)."""
 
 
-ExportName: TypeAlias = Literal["ply", "tum"]
-"""What GET /scenes/{id}/export offers: the names of worker/scene/export, which the service must not import."""
-
-
 class IntrinsicsOverride(BaseModel):
     """Parts of the camera the caller wants otherwise than the clip's left eye; what is None follows the scene.
 
@@ -119,15 +116,21 @@ class RenderRequest(BaseModel):
 
 
 class ExportRequest(BaseModel):
-    """The scene's Gaussians at time t, or its path, as a file of one of the formats of worker/scene/export."""
+    """One part of a scene as a file of one of EXPORT_FORMATS, asked for one after the other while `more` follow.
+
+    A worker forgets an export whose next part nobody asks for. An empty part says that the worker is at work.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["export"] = "export"
     scene_id: str = Field(pattern=JOB_ID_PATTERN)
     attempt: int
-    t: float = Field(ge=0, le=1e6)
     format: str = Field(default="ply", max_length=32)
+    options: ExportOptions = ExportOptions()
+    export_id: str = Field(pattern=r"^[0-9a-f]{32}$")
+    """Chosen by the asker, the same for all parts."""
+    part: int = Field(default=0, ge=0)
 
 
 class RecordedRequest(BaseModel):
@@ -187,6 +190,8 @@ class WorkerReply(BaseModel):
     """Of the scene that is shown; 0: not known."""
     clip_size: tuple[int, int] | None = None
     """Width and height of the clip in pixels: the image's where the request names none."""
+    more: bool = False
+    """More parts of the export follow."""
 
 
 TYPICAL_GAUSSIANS, TYPICAL_SIZE = 50_000, (640, 512)

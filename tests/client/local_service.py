@@ -47,7 +47,7 @@ def paint(request: SceneRequest) -> Reply:
     A quarter of it is unseen, unless guesses are asked for.
     """
     if isinstance(request, ExportRequest):
-        return Reply(b"ply\n", "application/octet-stream", request.t)
+        return Reply(b"ply\n", "application/octet-stream", request.options.t or 0.0)
     if isinstance(request, RecordedRequest):
         return Reply(b"jpeg", "image/jpeg", request.t)
     buffer = io.BytesIO()

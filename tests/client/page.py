@@ -104,7 +104,7 @@ class Painter:
 
     def answer(self, request: SceneRequest) -> Reply:
         if isinstance(request, ExportRequest):
-            return Reply(b"ply\n", "application/octet-stream", request.t)
+            return Reply(b"ply\n", "application/octet-stream", request.options.t or 0.0)
         if isinstance(request, RecordedRequest):
             picture = cv2.imencode(".jpg", np.full((48, 60, 3), RECORDED_SHADE, np.uint8))[1].tobytes()
             return Reply(picture, "image/jpeg", request.t, iteration=0 if request.attempt is None else None)

@@ -50,7 +50,7 @@ class Painter:
     def answer(self, request: SceneRequest) -> Reply:
         self.requests.append(request)
         if isinstance(request, ExportRequest):
-            return Reply(b"ply\n", "application/octet-stream", request.t)
+            return Reply(b"ply\n", "application/octet-stream", request.options.t or 0.0)
         if isinstance(request, RecordedRequest):
             return Reply(b"jpeg", "image/jpeg", 0.25, iteration=7 if request.attempt is None else None)
         if request.camera.width == 8:

@@ -78,7 +78,8 @@ class Reply:
     unseen: share of a render's pixels that no training frame saw.
     gaussians, clip_size: of the scene, as in WorkerReply.
     level: of detail at which it was drawn (worker/render/detail.py); 0 shows all.
-    is_kept: it was made for an earlier request.
+    is_kept: it was made for an earlier request, or its time tells nothing of that of renders.
+    more: further parts of the export follow.
     """
 
     body: bytes
@@ -91,6 +92,7 @@ class Reply:
     clip_size: tuple[int, int] | None = None
     level: int = 0
     is_kept: bool = False
+    more: bool = False
 
 
 class RequestServer:
@@ -318,6 +320,7 @@ class RequestServer:
             unseen=view.unseen,
             gaussians=view.gaussians,
             clip_size=view.clip_size,
+            more=view.more,
             render_ms=(time.perf_counter() - start) * 1e3,
         )
         return head, view.body, not view.is_kept
@@ -339,6 +342,8 @@ def _reply_error(error: Exception) -> ReplyError:
         return ReplyError(kind="scene", problem=str(error), field="scene", remedy=remedy)
     if isinstance(error, NotYetError):
         return ReplyError(kind="not-yet", problem=str(error), field="scene", remedy="Ask again in a second.")
+    if isinstance(error, UnavailableError):
+        return ReplyError(kind="busy", problem=error.problem, remedy=error.remedy)
     where = "".join(traceback.format_tb(error.__traceback__))
     logger.error("a request could not be answered: %s\n%s", type(error).__name__, where)
     return ReplyError(kind="internal", problem=f"The worker could not render ({type(error).__name__}).")

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from contract.runtime.settings import GIB
 from contract.store.store import Store
-from contract.wire.errors import InputError, LimitError
+from contract.wire.errors import LimitError
+from contract.wire.exports import EXPORT_FORMATS
 from contract.wire.names import RECORDED
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import MatrixPose, OrbitPose, world_from_camera
@@ -30,9 +31,11 @@ from contract.wire.rendering import (
     SceneRequest,
     render_cost,
 )
+from worker.daemon.exports import OpenExports
 from worker.daemon.kept import KeptReplies
 from worker.daemon.serve import NotYetError, Reply
 from worker.daemon.snapshot import Snapshot, Snapshots
+from worker.export import DRAWN, export_parts
 from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
 from worker.render.detail import LEVELS, thinned
@@ -40,13 +43,14 @@ from worker.render.encode import FOR_EYES, encode_layer
 from worker.render.recorded import marked_frame, stored_frame
 from worker.render.view import ROUNDING, Frame, no_pause, render_frame
 from worker.scene.checkpoint import load_scene
-from worker.scene.export import EXPORTS
 from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS
 
 COPIES = 3
 """A loaded scene takes memory three times: its tensors, the arrays of its renderer, and about as much in buffers
 (measured: 100 MB more for each scene of 32 MB, of 36,000 Gaussians with 17 bases, shown at 640 x 512)."""
+
+MEDIA_TYPE_OF_BYTES = "application/octet-stream"
 
 MAX_HELD_SCENES = 64
 """However small they are: each announcement of the worker names all of them."""
@@ -73,6 +77,7 @@ class Views:
         self._device = device
         self._scenes: OrderedDict[tuple[str, int], Scene] = OrderedDict()
         self._kept = KeptReplies()
+        self._exports = OpenExports()
         self._snapshot: Snapshot | None = None  # the last that was shown, of the job
         self._job_id = ""
         self.held: tuple[str, ...] = ()
@@ -86,12 +91,13 @@ class Views:
             SceneError: the scene is missing or damaged.
             NotYetError: the running job has no snapshot here yet.
             LimitError: the image would exceed request.max_pixels.
-            InputError: the export format does not exist.
+            InputError: the scene cannot be exported so.
+            UnavailableError: too many exports are under way.
         """
         if isinstance(request, RecordedRequest):
             return self._recorded(request)
         if isinstance(request, ExportRequest):
-            return _export(self._stored(request.scene_id, request.attempt), request)
+            return self._export(self._stored(request.scene_id, request.attempt), request)
         if request.attempt is not None:
             scene, snapshot = self._stored(request.scene_id, request.attempt), None
         else:
@@ -123,9 +129,9 @@ class Views:
             snapshot = self._snapshots.shown(request.scene_id)
             scene = snapshot.scene if snapshot is not None else None
         gaussians = len(scene.gaussians) if scene is not None else TYPICAL_GAUSSIANS
-        if isinstance(request, ExportRequest):
-            return render_cost(0, gaussians)
         size = (scene.intrinsics.width, scene.intrinsics.height) if scene is not None else TYPICAL_SIZE
+        if isinstance(request, ExportRequest):
+            return render_cost(DRAWN.get(request.format, 0) * size[0] * size[1], gaussians)
         width, height = request.camera.size(*size)
         return render_cost(width * height, gaussians)
 
@@ -133,6 +139,7 @@ class Views:
         """Drop scenes whose folders are gone, and jobs that have ended. Call it now and then."""
         for key in [key for key in self._scenes if not self._store.has_scene(*key)]:
             self._forget(key)
+        self._exports.forget(lambda *key: not self._store.has_scene(*key))
         if self._snapshot is not None and self._snapshots.shown(self._job_id) is not self._snapshot:
             self._kept.drop(lambda request: request.attempt is None)
             self._snapshot = None
@@ -192,6 +199,19 @@ class Views:
         frame = render_frame(drawn, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
         return _reply(scene, frame.enlarged(*size) if level else frame, request, snapshot, level)
 
+    def _export(self, scene: Scene, request: ExportRequest) -> Reply:
+        """One part of an export. It tells nothing of the time of renders."""
+        content, more = self._exports.part(
+            request, lambda: export_parts(scene, request.format, request.options, self._device)
+        )
+        known, t = EXPORT_FORMATS.get(request.format), request.options.t or 0.0
+        shown, warnings = shown_time(scene, t), scene.pose_warnings
+        if t > shown + ROUNDING:
+            outside = f"t = {t:g} lies outside the clip; t = {shown:.4g} is exported."
+            warnings = (Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, outside), *warnings)
+        media_type = MEDIA_TYPE_OF_BYTES if known is None else known.media_type
+        return Reply(content, media_type, shown, warnings, is_kept=True, more=more)
+
     def _forget(self, key: tuple[str, int]) -> None:
         self._scenes.pop(key, None)
         self._kept.drop(lambda request: (request.scene_id, request.attempt) == key)
@@ -220,17 +240,6 @@ def _reply(scene: Scene, frame: Frame, request: RenderRequest, snapshot: Snapsho
     clip_size = scene.intrinsics.width, scene.intrinsics.height
     media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
     return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size, level)
-
-
-def _export(scene: Scene, request: ExportRequest) -> Reply:
-    """The Gaussians at time t in the requested format."""
-    export_format = EXPORTS.get(request.format)
-    if export_format is None:
-        raise InputError("format", f"{request.format} is not an export format.", f"Use one of: {', '.join(EXPORTS)}.")
-    shown = shown_time(scene, request.t)
-    outside = f"t = {request.t:g} lies outside the clip; t = {shown:.4g} is exported."
-    warnings = (Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, outside),) if request.t > shown + ROUNDING else ()
-    return Reply(export_format.encode(scene, shown), export_format.media_type, shown, warnings)
 
 
 def shown_time(scene: Scene, t: float) -> float:

@@ -1,6 +1,6 @@
-"""Keep a trained scene on disk, exact or compact, and give it to other programs.
+"""Keep a trained scene on disk, exact or compact.
 
 In: a Scene (scene.py). Out: scene.safetensors and manifest.json, and the Scene again; the state of a stopped run.
 Verbs: checkpoint.save_scene, load_scene; resume_file.begin_resume, load_resume; quantize.prepare, rounding;
-compact.unpack; EXPORTS of export/.
+compact.unpack.
 """

@@ -19,7 +19,6 @@ from contract.wire.names import RECORDED, REPORT
 from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose
 from contract.wire.rendering import (
-    ExportRequest,
     Highlights,
     ImageFormat,
     IntrinsicsOverride,
@@ -30,6 +29,7 @@ from contract.wire.rendering import (
 )
 from contract.wire.report import Masks
 from tests.reports import REPORT_OF_A_SCENE
+from tests.worker.exports import export_request, exported
 from worker.daemon.serve import GivenUpError, NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import COPIES, Views, camera_of, pose_of, shown_time
@@ -221,16 +221,16 @@ def test_a_finished_scene_is_not_taken_for_a_running_job(store: Store, scene_id:
 
 
 def test_an_export_holds_every_gaussian(store: Store, scene_id: str) -> None:
-    view = Views(store).answer(ExportRequest(scene_id=scene_id, attempt=1, t=0.5))
-    assert b"element vertex 120\n" in view.body
+    view, content = exported(Views(store).answer, export_request(scene_id, t=0.5))
+    assert b"element vertex 120\n" in content
     assert (view.t, view.warnings) == (0.5, ())
 
 
 def test_an_export_after_the_clip_is_of_its_last_frame_and_says_so(store: Store, scene_id: str) -> None:
-    view = Views(store).answer(ExportRequest(scene_id=scene_id, attempt=1, t=1))
-    last = Views(store).answer(ExportRequest(scene_id=scene_id, attempt=1, t=(FRAMES - 1) / FRAMES))
+    view, content = exported(Views(store).answer, export_request(scene_id, t=1))
+    last, same = exported(Views(store).answer, export_request(scene_id, t=(FRAMES - 1) / FRAMES))
     assert view.t == last.t == (FRAMES - 1) / FRAMES
-    assert view.body == last.body
+    assert content == same
     assert view.warnings
     assert not last.warnings
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from worker.scene.scene import Scene
 
 
-def export_tum(scene: Scene, t: float) -> bytes:
-    """A line `timestamp tx ty tz qx qy qz qw` for every frame, in seconds and metres, whatever t is.
+def export_tum(scene: Scene) -> bytes:
+    """A line `timestamp tx ty tz qx qy qz qw` for every frame, in seconds and metres.
 
     The pose is world_from_camera of the left eye.
     """
     from worker.poses.trajectory import tum_lines  # renders need none of what it imports
 
-    del t
     return tum_lines(scene.frame_times_s, scene.world_from_camera).encode()

@@ -1,0 +1,124 @@
+"""GET /scenes/{id}/export: a stored scene as a file for other programs, sent while the worker makes it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+import uuid
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Response
+from pydantic import ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import StreamingResponse
+
+from contract.access.audit import AuditAction
+from contract.access.keys import KeyScope
+from contract.wire.errors import UnavailableError
+from contract.wire.exports import EXPORT_FORMATS, ExportOptions, check_export
+from contract.wire.rendering import ExportRequest
+from service.connection import Answer
+from service.deps import AnyCaller, Deps, Services
+from service.renders import image_response, problem_of_reply
+from service.scenes import finished_job
+
+router = APIRouter(prefix="/scenes", tags=["scenes"])
+
+MAX_EXPORT_S = 3600.0
+"""An export that takes longer is cut off."""
+FIRST_BYTES_S = 10.0
+"""How long the head of an answer waits for the first bytes, so that an error has its status."""
+BUSY_PAUSE_S = 1.0
+
+logger = logging.getLogger("intrasplat.service")
+
+
+class ExportQuery(ExportOptions):
+    """An export as a caller asks for it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format: str = Field(
+        default="ply",
+        max_length=32,
+        description="; ".join(f"{name}: {each.about}" for name, each in EXPORT_FORMATS.items()),
+        json_schema_extra={"enum": list(EXPORT_FORMATS)},
+    )
+
+
+@router.get(
+    "/{scene_id}/export",
+    operation_id="export_scene",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "the file",
+            "content": {each: {} for each in sorted({each.media_type for each in EXPORT_FORMATS.values()})},
+        }
+    },
+)
+async def export_scene(
+    scene_id: str, services: Services, caller: AnyCaller, query: Annotated[ExportQuery, Query()]
+) -> Response:
+    """The scene as a file in one of many formats (docs/export.md). Long ones are sent while they are made.
+
+    An export that fails after its first bytes is cut off, so that its transfer is not complete.
+    """
+    caller.require(KeyScope.VIEW)
+    options = check_export(query.format, query.model_dump(exclude={"format"}))
+    record = await run_in_threadpool(finished_job, services, caller, scene_id)
+    await run_in_threadpool(services.audit.record, AuditAction.EXPORTED, caller, scene_id)
+    request = ExportRequest(
+        scene_id=scene_id,
+        attempt=record.attempt,
+        format=query.format,
+        options=options,
+        export_id=uuid.uuid4().hex,
+    )
+    first, part, until_s = await services.renderer.ask(request), 0, time.monotonic() + FIRST_BYTES_S
+    while first.head.error is None and first.head.more and not first.body and time.monotonic() < until_s:
+        part += 1
+        first = await _part(services, request.model_copy(update={"part": part}), first.worker)
+    response = image_response(scene_id, first)
+    if first.head.more:
+        head = {name: value for name, value in response.headers.items() if name != "content-length"}
+        response = StreamingResponse(_parts(services, request, first, part), headers=head)
+    export_format = EXPORT_FORMATS[query.format]
+    response.headers["Content-Disposition"] = f'attachment; filename="{scene_id}{export_format.suffix}"'
+    return response
+
+
+async def _parts(services: Deps, request: ExportRequest, answer: Answer, part: int) -> AsyncIterator[bytes]:
+    """The rest of an export from this answer on, which is its part of this number.
+
+    Raises:
+        UnavailableError: it cannot go on. The transfer is cut off then, for its head has been sent.
+    """
+    until_s = time.monotonic() + MAX_EXPORT_S
+    yield answer.body
+    while answer.head.more:
+        if time.monotonic() > until_s:
+            raise UnavailableError(f"The export took more than {MAX_EXPORT_S:g} s.", "Ask for fewer frames.")
+        part += 1
+        answer = await _part(services, request.model_copy(update={"part": part}), answer.worker)
+        if answer.head.error is not None:
+            logger.warning("an export was cut off: %s", answer.head.error.kind)
+            raise problem_of_reply(answer.head.error)
+        yield answer.body
+
+
+async def _part(services: Deps, request: ExportRequest, worker: str | None) -> Answer:
+    """The worker's answer, when it has time for it.
+
+    Raises:
+        UnavailableError: the worker is gone or mute.
+    """
+    until_s = time.monotonic() + MAX_EXPORT_S
+    while True:
+        answer = await services.renderer.ask(request, worker)
+        error = answer.head.error
+        if error is None or error.kind != "busy" or time.monotonic() > until_s:
+            return answer
+        await asyncio.sleep(error.retry_after_s or BUSY_PAUSE_S)

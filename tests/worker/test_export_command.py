@@ -1,0 +1,46 @@
+"""`intrasplat export` writes what the worker sends, and names the option at fault."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from contract.runtime.exits import ExitCode
+from contract.wire.exports import EXPORT_FORMATS, ExportOptions
+from tests.worker.scenes import random_scene
+from worker.__main__ import main
+from worker.export import export_parts
+from worker.scene.checkpoint import save_scene
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    save_scene(tmp_path / "scene", random_scene())
+    return tmp_path / "scene"
+
+
+def test_a_file_is_written_beside_the_scene_or_where_it_is_wanted(scene: Path, tmp_path: Path) -> None:
+    assert main(["export", str(scene), "--format", "points", "--t", "0.4"]) == 0
+    expected = b"".join(export_parts(random_scene(), "points", ExportOptions(t=0.4)))
+    assert (tmp_path / f"scene{EXPORT_FORMATS['points'].suffix}").read_bytes() == expected
+    assert main(["export", str(scene), "--format", "tracks", "--every", "2", "--out", str(tmp_path / "a.npz")]) == 0
+    assert (tmp_path / "a.npz").read_bytes().startswith(b"PK")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "scene", "scene-points.ply"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--format", "splatz"], "--format: 'splatz' is not an export format. Did you mean splat?"),
+        (["--every", "2"], "--every: every does not fit the format ply"),
+        (["--out", "missing/a.ply"], "--out: "),
+    ],
+)
+def test_what_cannot_be_written_is_told(
+    scene: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    if "--out" in arguments:
+        arguments = ["--out", str(scene / arguments[1])]
+    assert main(["export", str(scene), *arguments]) == ExitCode.BAD_INPUT
+    assert words in capsys.readouterr().err

@@ -1,0 +1,57 @@
+"""`intrasplat export`: writes a scene that is on this machine as a file for other programs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from contract.runtime.arguments import add_options
+from contract.runtime.exits import ExitCode, flag_of
+from contract.wire.errors import InputError
+from contract.wire.exports import EXPORT_FORMATS, ExportOptions, check_export
+from contract.wire.names import MANIFEST
+from worker.commands.device import add_device
+
+
+def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of `export`; run_cli reads them."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="the folder that reconstruct wrote")
+    formats = "; ".join(f"{name}: {each.about}" for name, each in EXPORT_FORMATS.items())
+    parser.add_argument("--format", default="ply", metavar="FORMAT", help=f"{formats} (default: ply)")
+    add_options(parser, ExportOptions)
+    parser.add_argument("--out", type=Path, metavar="PATH", help="the file (default: beside SCENE, under its name)")
+    add_device(parser, "cpu")  # a GPU needs longer to begin than the CPU for a few images
+
+
+def run_cli(options: argparse.Namespace) -> int:
+    """Writes the file and returns the exit code. A file that could not be finished is removed.
+
+    Raises:
+        InputError: there is no scene, or an option cannot be used with it.
+        UnavailableError: the device is not there.
+    """
+    try:
+        chosen = check_export(options.format, {name: getattr(options, name) for name in ExportOptions.model_fields})
+    except InputError as error:
+        raise InputError(flag_of(error.field), error.problem, error.remedy) from error
+    if not (options.scene / MANIFEST).is_file():
+        raise InputError("SCENE", f"{options.scene} holds no scene.", "Name a folder that `reconstruct --out` wrote.")
+    from worker.export import export_parts
+    from worker.raster.backend import choose_device
+    from worker.scene.checkpoint import load_scene
+
+    scene = load_scene(options.scene)
+    folder = options.scene.resolve()
+    path = options.out or folder.with_name(folder.name + EXPORT_FORMATS[options.format].suffix)
+    unfinished = path.with_name(f".{path.name}.part")
+    try:
+        with unfinished.open("wb") as file:
+            for part in export_parts(scene, options.format, chosen, choose_device(options.device)):
+                file.write(part)
+        unfinished.replace(path)
+    except OSError as error:
+        raise InputError("--out", f"{path} cannot be written ({error.strerror}).", "Name another file.") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
+    print(path)
+    return ExitCode.OK

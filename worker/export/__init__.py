@@ -1,0 +1,73 @@
+"""A stored scene as a file for other programs, in parts.
+
+In: a Scene, the name of a format and its options. Out: the file's bytes, part by part. Verb: export_parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator, Mapping
+from types import MappingProxyType
+from typing import TypeAlias
+
+from contract.wire.errors import InputError
+from contract.wire.exports import ExportOptions
+from worker.export.depth import depth_parts
+from worker.export.ply import export_ply, ply_zip_parts
+from worker.export.points import export_points
+from worker.export.splat import export_splat
+from worker.export.target import Target
+from worker.export.tracks import tracks_parts
+from worker.export.tum import export_tum
+from worker.raster.backend import CPU, Device
+from worker.scene.scene import Scene
+
+Writer: TypeAlias = Callable[[Target], Iterator[bytes]]
+
+PART_BYTES = 1 << 20
+
+
+def _moment(encode: Callable[[Scene, float], bytes]) -> Writer:
+    """A writer of a function from a scene and a model time to a whole file."""
+    return lambda target: iter((encode(target.scene, target.t),))
+
+
+EXPORTS: dict[str, Writer] = {
+    "ply": _moment(export_ply),
+    "ply-zip": ply_zip_parts,
+    "splat": _moment(export_splat),
+    "points": _moment(export_points),
+    "depth": depth_parts,
+    "tracks": tracks_parts,
+    "tum": lambda target: iter((export_tum(target.scene),)),
+}
+"""The writers by the names of EXPORT_FORMATS (contract/wire/exports.py)."""
+
+DRAWN: Mapping[str, int] = MappingProxyType({"depth": 1})
+"""Formats whose parts take renders of the clip's size, and how many."""
+
+
+def export_parts(scene: Scene, name: str, options: ExportOptions, device: Device = CPU) -> Generator[bytes]:
+    """The file in parts of at most PART_BYTES. An empty part means that the work goes on.
+
+    Raises, at the first part:
+        InputError: there is no such format, or the scene cannot be written in it with these options.
+        LimitError: the file would be larger than MAX_EXPORT_BYTES.
+    """
+    writer = EXPORTS.get(name)
+    if writer is None:
+        raise InputError("format", f"{name} is not an export format.", f"Use one of: {', '.join(EXPORTS)}.")
+    return _cut(writer(Target(scene, options, device)))
+
+
+def _cut(pieces: Iterator[bytes]) -> Generator[bytes]:
+    """Pieces of any size as parts: large ones cut, small ones joined; empty where nothing is ready."""
+    ready = bytearray()
+    for piece in pieces:
+        ready += piece
+        if not piece:
+            yield b""
+        for first in range(0, len(ready) - PART_BYTES + 1, PART_BYTES):
+            yield bytes(ready[first : first + PART_BYTES])
+        del ready[: len(ready) // PART_BYTES * PART_BYTES]
+    if ready:
+        yield bytes(ready)
