@@ -60,6 +60,12 @@ EXPORT_FORMATS = {
     "ply": ExportFormat(".ply", _BYTES, ("t",), "the Gaussians at time t as splat viewers read them, mm"),
     "ply-zip": ExportFormat("-ply.zip", "application/zip", ("every",), "a ply for each frame, in a zip"),
     "splat": ExportFormat(".splat", _BYTES, ("t",), "the Gaussians at time t in 32 bytes each, mm"),
+    "gltf": ExportFormat(
+        ".glb",
+        "model/gltf-binary",
+        ("t",),
+        "the Gaussians at time t as glTF splats, metres, +Y up",
+    ),
     "points": ExportFormat("-points.ply", _BYTES, ("t",), "the Gaussians' centres at time t as coloured points, mm"),
     "depth": ExportFormat("-depth.npy", _BYTES, ("every",), "depth of each frame, [T, H, W] float32 mm"),
     "tracks": ExportFormat("-tracks.npz", "application/zip", ("every",), "where each Gaussian is over time, mm"),

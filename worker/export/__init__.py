@@ -12,6 +12,7 @@ from typing import TypeAlias
 from contract.wire.errors import InputError
 from contract.wire.exports import ExportOptions
 from worker.export.depth import depth_parts
+from worker.export.gltf import export_gltf
 from worker.export.ply import export_ply, ply_zip_parts
 from worker.export.points import export_points
 from worker.export.splat import export_splat
@@ -35,6 +36,7 @@ EXPORTS: dict[str, Writer] = {
     "ply": _moment(export_ply),
     "ply-zip": ply_zip_parts,
     "splat": _moment(export_splat),
+    "gltf": _moment(export_gltf),
     "points": _moment(export_points),
     "depth": depth_parts,
     "tracks": tracks_parts,
