@@ -8,7 +8,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -210,14 +210,18 @@ def site_at(data_dir: Path, **changes: Any) -> Iterator[Site]:
             site.stop()
 
 
+GRAPHICS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""WebGL2 on the processor."""
+
+
 @contextmanager
-def browser() -> Iterator[webdriver.Chrome]:
+def browser(graphics: Sequence[str] = ("--disable-gpu",)) -> Iterator[webdriver.Chrome]:
     """Chromium without a window; skips where there is none."""
     if CHROMIUM is None or CHROMEDRIVER is None:
         pytest.skip("no browser: install chromium and chromedriver (Debian: chromium, chromium-driver)")
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
+    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", *graphics):
         options.add_argument(argument)
     options.add_argument("--window-size=1280,800")
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})

@@ -13,7 +13,7 @@ from client.generate_page import PAGE_TYPES, generate
 from client.up import DASHBOARD
 from contract.wire.options import JobOptions
 
-SCRIPTS = sorted(DASHBOARD.glob("*.js"))
+SCRIPTS = sorted(DASHBOARD.rglob("*.js"))
 
 
 class Page(HTMLParser):
@@ -59,12 +59,22 @@ def test_the_page_says_that_it_is_no_medical_device() -> None:
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
-def test_a_script_imports_only_scripts_beside_it_and_names_that_they_export(script: Path) -> None:
-    for names, module in re.findall(r'import \{([^}]+)\} from "\./([^"]+)"', script.read_text()):
-        source = (DASHBOARD / module).read_text()
+def test_a_script_imports_only_scripts_of_the_page_and_names_that_they_export(script: Path) -> None:
+    for names, module in re.findall(r'import \{([^}]+)\} from "([^"]+)"', script.read_text()):
+        source = (script.parent / module).resolve()
+        assert source.is_relative_to(DASHBOARD)
         for name in (each.strip() for each in names.split(",")):
-            assert re.search(rf"export (async )?(const|function|class) {name}\b", source), f"{module} exports no {name}"
-    assert [module for module in imports_of(script) if not module.startswith("./")] == []
+            exported = rf"export (async )?(const|function|class) {name}\b"
+            assert re.search(exported, source.read_text()), f"{module} exports no {name}"
+    assert [module for module in imports_of(script) if not module.startswith(("./", "../"))] == []
+
+
+def test_the_player_knows_nothing_of_the_page() -> None:
+    for script in (DASHBOARD / "player").glob("*.js"):
+        assert [module for module in imports_of(script) if not module.startswith("./")] == [], script.name
+        assert not re.search(r"document\.(query|getElement|body)", script.read_text()), script.name
+        workers = re.findall(r'new URL\("\./([^"]+)"', script.read_text())
+        assert [each for each in workers if not (script.parent / each).is_file()] == []
 
 
 def test_every_element_that_a_script_asks_for_is_on_the_page() -> None:
