@@ -67,6 +67,11 @@ EXPORT_FORMATS = {
         "the Gaussians at time t as glTF splats, metres, +Y up",
     ),
     "points": ExportFormat("-points.ply", _BYTES, ("t",), "the Gaussians' centres at time t as coloured points, mm"),
+    "mesh-stl": ExportFormat("-mesh.stl", "model/stl", ("t",), "the surface at time t as STL without colours, mm"),
+    "mesh-ply": ExportFormat("-mesh.ply", _BYTES, ("t",), "the surface at time t as a coloured mesh, mm"),
+    "mesh-glb": ExportFormat(
+        "-mesh.glb", "model/gltf-binary", ("t",), "the surface at time t as glTF, coloured, metres, +Y up"
+    ),
     "depth": ExportFormat("-depth.npy", _BYTES, ("every",), "depth of each frame, [T, H, W] float32 mm"),
     "tracks": ExportFormat("-tracks.npz", "application/zip", ("every",), "where each Gaussian is over time, mm"),
     "tum": ExportFormat(".tum", "text/plain", (), "the endoscope's path as a TUM file, seconds and metres"),

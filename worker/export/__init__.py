@@ -11,8 +11,10 @@ from typing import TypeAlias
 
 from contract.wire.errors import InputError
 from contract.wire.exports import ExportOptions
+from worker.export import mesh
 from worker.export.depth import depth_parts
 from worker.export.gltf import export_gltf
+from worker.export.mesh import mesh_parts
 from worker.export.ply import export_ply, ply_zip_parts
 from worker.export.points import export_points
 from worker.export.splat import export_splat
@@ -38,13 +40,16 @@ EXPORTS: dict[str, Writer] = {
     "splat": _moment(export_splat),
     "gltf": _moment(export_gltf),
     "points": _moment(export_points),
+    "mesh-stl": mesh_parts(mesh.stl),
+    "mesh-ply": mesh_parts(mesh.ply),
+    "mesh-glb": mesh_parts(mesh.glb),
     "depth": depth_parts,
     "tracks": tracks_parts,
     "tum": lambda target: iter((export_tum(target.scene),)),
 }
 """The writers by the names of EXPORT_FORMATS (contract/wire/exports.py)."""
 
-DRAWN: Mapping[str, int] = MappingProxyType({"depth": 1})
+DRAWN: Mapping[str, int] = MappingProxyType(dict.fromkeys(("depth", "mesh-stl", "mesh-ply", "mesh-glb"), 1))
 """Formats whose parts take renders of the clip's size, and how many."""
 
 

@@ -57,8 +57,8 @@ class Glb:
         self._accessors.append(accessor)
         return len(self._accessors) - 1
 
-    def file(self, primitive: dict[str, Any], extensions: tuple[str, ...] = ()) -> bytes:
-        """The file of a scene with one node that shows a mesh of this primitive."""
+    def file(self, primitive: dict[str, Any], extensions: tuple[str, ...] = (), **more: Any) -> bytes:
+        """The file of a scene with one node that shows a mesh of this primitive; `more` goes into its JSON."""
         document: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": GENERATOR},
             "scene": 0,
@@ -68,6 +68,7 @@ class Glb:
             "buffers": [{"byteLength": len(self._buffer)}],
             "bufferViews": self._views,
             "accessors": self._accessors,
+            **more,
         }
         if extensions:
             document["extensionsUsed"] = list(extensions)

@@ -1,0 +1,141 @@
+"""Meshes, read by trimesh: they lie where renders show the tissue, in its colours, and face the endoscope."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import sys
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.ndimage import binary_dilation
+
+from contract.wire.errors import InputError
+from contract.wire.exports import ExportOptions
+from tests.worker.scenes import random_scene
+from worker.export import export_parts, surface
+from worker.model.deformation import SharedBasis
+from worker.model.gaussians import Gaussians, sh_from_rgb
+from worker.render.camera import endoscope_pose
+from worker.render.view import render_frame
+from worker.scene.scene import Scene
+
+SIDE = 60
+T = 0.5
+
+
+def tissue() -> Scene:
+    """A bent sheet of red and green tissue 60 units before the camera that moves towards it, and a speck before it."""
+    base = random_scene()
+    across, down = torch.meshgrid(torch.linspace(-30, 30, SIDE), torch.linspace(-25, 25, SIDE), indexing="ij")
+    x, y = across.ravel(), down.ravel()
+    mean = torch.stack([x, y, 60 + 0.006 * (x * x + y * y)], dim=1)
+    mean = torch.cat([mean, torch.tensor([[0.0, 0.0, 30.0]])])
+    count = len(mean)
+    rgb = torch.full((count, 3), 0.2)
+    rgb[:, 0] += 0.6 * (mean[:, 0] > 0)
+    rgb[:, 1] += 0.6 * (mean[:, 0] <= 0)
+    size = torch.full((count, 3), 0.9)
+    size[:, 2], size[-1] = 0.05, 0.2
+    gaussians = Gaussians(
+        mean=mean,
+        quaternion=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        log_scale=size.log(),
+        opacity_logit=torch.full((count,), 4.0),
+        sh=sh_from_rgb(rgb)[:, None],
+    )
+    start = SharedBasis.initial(count, bases=5)
+    weight = torch.zeros(count, *start.weight.shape[1:])
+    weight[:, 2] = 1.0  # z
+    return dataclasses.replace(
+        base,
+        gaussians=gaussians,
+        deformation=SharedBasis(weight, start.centre, start.width),
+        seen=torch.full((count,), 0.9),
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return tissue()
+
+
+def read(scene: Scene, name: str) -> trimesh.Trimesh:
+    data = b"".join(export_parts(scene, f"mesh-{name}", ExportOptions(t=T)))
+    return trimesh.load(io.BytesIO(data), file_type=name, force="mesh", process=False)
+
+
+def test_vertices_lie_where_the_endoscope_sees_the_tissue(scene: Scene) -> None:
+    mesh, frame, k = read(scene, "ply"), render_frame(scene, T), scene.intrinsics
+    assert len(mesh.faces) > 1000
+    own = mesh.vertices @ np.linalg.inv(endoscope_pose(scene, T))[:3, :3].T
+    own += np.linalg.inv(endoscope_pose(scene, T))[:3, 3]
+    column = np.floor(k.fx * own[:, 0] / own[:, 2] + k.cx).astype(int)
+    row = np.floor(k.fy * own[:, 1] / own[:, 2] + k.cy).astype(int)
+    inside = (column >= 1) & (column < k.width - 1) & (row >= 1) & (row < k.height - 1)
+    depth_mm = frame.depth_mm[row[inside], column[inside]]
+    error_mm = np.abs(own[inside, 2] - depth_mm)[depth_mm > 0]
+    pixel_mm = np.median(frame.depth_mm[frame.depth_mm > 0]) / k.fx
+    assert np.median(error_mm) < 0.2 * pixel_mm
+    assert np.percentile(error_mm, 95) < 1.0 * pixel_mm
+    # All that it sees is covered, but for the borders.
+    covered = np.zeros((k.height, k.width), bool)
+    covered[row[inside], column[inside]] = True
+    middle = (frame.depth_mm > 0)[6:-6, 6:-6]
+    around = binary_dilation(covered, np.ones((3, 3)))  # a voxel is larger than a pixel
+    assert around[6:-6, 6:-6][middle].mean() > 0.97
+
+
+def test_a_mesh_shows_its_own_moment(scene: Scene) -> None:
+    data = b"".join(export_parts(scene, "mesh-ply", ExportOptions(t=0.0)))
+    first = trimesh.load(io.BytesIO(data), file_type="ply", force="mesh", process=False)
+    moved = [
+        float(np.median(scene.deformation.deform(scene.gaussians, t).mean[:, 2])) / scene.units_per_mm for t in (0, T)
+    ]
+    shift_mm = np.median(read(scene, "ply").vertices[:, 2]) - np.median(first.vertices[:, 2])
+    assert shift_mm == pytest.approx(moved[1] - moved[0], abs=0.3)
+
+
+def test_vertices_have_the_tissues_colours(scene: Scene) -> None:
+    mesh = read(scene, "ply")
+    colour = mesh.visual.vertex_colors[:, :3].astype(int)
+    right, left = mesh.vertices[:, 0] > 5, mesh.vertices[:, 0] < -5
+    assert np.abs(np.median(colour[right], axis=0) - [204, 51, 51]).max() <= 3
+    assert np.abs(np.median(colour[left], axis=0) - [51, 204, 51]).max() <= 3
+
+
+def test_faces_look_at_the_endoscope_and_strays_are_left_out(scene: Scene) -> None:
+    mesh = read(scene, "ply")
+    towards = endoscope_pose(scene, T)[:3, 3] - mesh.triangles_center
+    assert (np.einsum("ij,ij->i", mesh.face_normals, towards) > 0).mean() > 0.99
+    assert mesh.vertices[:, 2].min() > 50 / scene.units_per_mm
+
+
+def test_all_formats_hold_the_same_mesh(scene: Scene) -> None:
+    ply, stl, glb = (read(scene, name) for name in ("ply", "stl", "glb"))
+    np.testing.assert_allclose(stl.triangles, ply.triangles, rtol=1e-6)
+    assert glb.faces.shape == ply.faces.shape
+    np.testing.assert_allclose(glb.vertices, ply.vertices * [1e-3, -1e-3, -1e-3], rtol=1e-6)
+    normals = stl.face_normals * [1, -1, -1]
+    np.testing.assert_allclose(glb.face_normals, normals, atol=1e-3)
+
+
+def test_without_scikit_image_the_remedy_is_told(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
+    with pytest.raises(InputError, match=r"intrasplat\[mesh\]"):
+        read(scene, "ply")
+
+
+def test_a_moment_without_tissue_is_refused() -> None:
+    scene = tissue()
+    away = dataclasses.replace(scene.gaussians, opacity_logit=torch.full((len(scene.gaussians),), -9.0))
+    with pytest.raises(InputError, match="Nothing solid"):
+        read(dataclasses.replace(scene, gaussians=away), "ply")
+
+
+def test_the_volume_is_bounded(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    fine = read(scene, "ply")
+    monkeypatch.setattr(surface, "MAX_VOXELS", 1_000)
+    assert 0 < len(read(scene, "ply").faces) < len(fine.faces) / 2
