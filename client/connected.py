@@ -6,6 +6,7 @@ was refused, never from the words of the service.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http import HTTPStatus
@@ -15,6 +16,7 @@ from typing import TypeAlias
 import intrasplat_client
 from contract.wire.errors import Cancelled, InputError, IntrasplatError, UnavailableError
 from intrasplat_client import Client
+from intrasplat_client.session import DEFAULT_PATIENCE_S
 
 KEY_VARIABLE = "INTRASPLAT_API_KEY"
 
@@ -37,10 +39,23 @@ def connected(url: str, api_key: str | None = None, remedies: Remedies | None = 
         InputError, UnavailableError, Cancelled, IntrasplatError: in place of the client's errors.
     """
     try:
-        with Client(url, api_key=api_key) as client:
+        with Client(url, api_key=api_key, on_wait=_Waiting().tell) as client:
             yield client
     except intrasplat_client.IntrasplatError as error:
         raise command_error(error, {**REMEDIES, **(remedies or {})}) from error
+
+
+class _Waiting:
+    """Says once why a command waits, so that nobody takes it for dead."""
+
+    def __init__(self) -> None:
+        self._is_told = False
+
+    def tell(self, failure: intrasplat_client.IntrasplatError, pause_s: float) -> None:
+        if not self._is_told:
+            self._is_told = True
+            again = f"Asking again for up to {DEFAULT_PATIENCE_S:g} s."
+            print(f"intrasplat: {getattr(failure, 'problem', failure)} {again}", file=sys.stderr, flush=True)
 
 
 def command_error(error: intrasplat_client.IntrasplatError, remedies: Remedies = REMEDIES) -> IntrasplatError:

@@ -17,6 +17,10 @@ from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
 
+QUEUE_PATIENCE_S = 2.7
+"""Callers hear within 3 s that the queue does not answer."""
+KNOWN_WORKERS = "workers.json"
+
 logger = logging.getLogger("intrasplat.service")
 
 
@@ -30,18 +34,30 @@ def main() -> int:
     if settings.redis_url is None:
         return end_by(UnavailableError("REDIS_URL is not set.", "`intrasplat up` starts a queue of its own."))
     configure(settings, "service")
-    queue = RedisQueue(settings.redis_url)
+    queue = RedisQueue(settings.redis_url, patience_s=QUEUE_PATIENCE_S)
     try:
-        queue.ping()
-        renderer = ZmqRenderer(queue, settings.render_timeout_s, settings.render_secret)
-        app = create_app(settings, queue, open_store(settings), renderer)
+        _ask(queue)
+        store = open_store(settings)
     except UnavailableError as error:
         return end_by(error)
+    known = store.run_dir / KNOWN_WORKERS
+    renderer = ZmqRenderer(queue, settings.render_timeout_s, settings.render_secret, known)
+    app = create_app(settings, queue, store, renderer)
     logger.info("listening on port %d", settings.port)
     server = Server(app, settings)
     with contextlib.suppress(KeyboardInterrupt):
         server.run()
     return ExitCode.OK if server.started else ExitCode.UNAVAILABLE
+
+
+def _ask(queue: RedisQueue) -> None:
+    """Return if the queue answers, or may do so later: finished scenes need none. UnavailableError if it never will."""
+    try:
+        queue.ping()
+    except UnavailableError as error:
+        if not error.may_return:
+            raise
+        logger.warning("starting without the queue: %s", error.problem)
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
             task.cancel()
         await asyncio.wait(tasks)
         await renderer.close()
-        deps.done.close()
+        deps.questions.close()
         queue.close()
 
     app = DescribedApp(

@@ -93,7 +93,7 @@ class Connection:
             UnavailableError: it is not one that this version can read.
         """
         document = WorkerRequest(request=request).model_dump_json().encode()
-        await self._reach(patiently)
+        await self.reach(patiently=patiently)
         request_id = next(self._ids).to_bytes(8, "big")
         future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         self._waiting[request_id] = future
@@ -130,7 +130,8 @@ class Connection:
             document = WorkerRequest(request=CancelRequest()).model_dump_json().encode()
             await self._socket.send_multipart([request_id, document])
 
-    async def _reach(self, patiently: bool) -> None:
+    async def reach(self, *, patiently: bool) -> None:
+        """Return when the worker is there; WorkerGoneError if it is not. patiently: as in ask()."""
         hopeless = {Reached.REFUSED} if patiently else {Reached.REFUSED, Reached.DOWN}
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT_S):

@@ -29,6 +29,7 @@ from service.limits import Limiter
 from service.metrics import Metrics
 from service.problems import SCENES_REMEDY, Problem
 from service.purge import Purger
+from service.questions import Questions
 from service.render_limits import RenderLimits
 from service.renderer import Renderer
 from service.retention import Retention
@@ -56,7 +57,8 @@ class Deps:
         self.intake = Intake(settings, store)
         self.sweep = Sweep(queue, store)
         self.feeds = Feeds(queue)
-        self.done = DoneJobs(queue, store)
+        self.questions = Questions()
+        self.done = DoneJobs(queue, store, self.questions)
         self.purger = Purger(queue, store, self.audit, self.done)
         self.retention = Retention(settings, queue, store, self.purger)
 

@@ -7,14 +7,12 @@ other finished scene is made of what the store knows: the submission names the t
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, TypeVar
 
 from contract.queue.interface import Queue
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord, JobState
+from service.questions import Questions
 
 REMEMBERED = 1_000
 """Records, of a few kilobytes each."""
@@ -25,23 +23,16 @@ PATIENCE_S = 1.0
 LIST_PATIENCE_S = 5.0
 """The same for the list of all jobs."""
 
-THREADS = 8
-"""Look-ups at a time."""
-
-
-Answer = TypeVar("Answer")
-
 
 class DoneJobs:
     """The queue's records, those of done jobs out of memory or from the store; for many threads."""
 
-    def __init__(self, queue: Queue, store: Store) -> None:
+    def __init__(self, queue: Queue, store: Store, questions: Questions) -> None:
         self._queue = queue
         self._store = store
         self._lock = threading.Lock()
         self._records: dict[str, JobRecord] = {}
-        self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="records")
-        self._unanswered: Future[Any] | None = None
+        self._questions = questions
         self._submitted: dict[str, JobRecord] = {}
 
     def record(self, job_id: str) -> JobRecord | None:
@@ -53,7 +44,7 @@ class DoneJobs:
         record = self._records.get(job_id)
         if record is None:
             try:
-                record = self._ask(lambda: self._queue.get(job_id), PATIENCE_S)
+                record = self._questions.ask(lambda: self._queue.get(job_id), PATIENCE_S)
             except UnavailableError:
                 stored = self._stored(job_id)
                 if stored is None:
@@ -76,7 +67,7 @@ class DoneJobs:
         While it is away they are those with a finished scene in the store.
         """
         try:
-            records = self._ask(lambda: self._queue.records(tenant, None), LIST_PATIENCE_S)
+            records = self._questions.ask(lambda: self._queue.records(tenant, None), LIST_PATIENCE_S)
         except UnavailableError:
             return self._stored_of(tenant), False
         return [record for record in records if record.state is JobState.DONE], True
@@ -85,22 +76,6 @@ class DoneJobs:
         """Remember no more of a job that was purged."""
         with self._lock:
             self._records.pop(job_id, None)
-
-    def close(self) -> None:
-        """Look up nothing more."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-    def _ask(self, question: Callable[[], Answer], patience_s: float) -> Answer:
-        """The queue's answer; UnavailableError if it, or one to an earlier question, does not come in time."""
-        unanswered = self._unanswered
-        if unanswered is None or unanswered.done():
-            asked = self._pool.submit(question)
-            try:
-                return asked.result(patience_s)
-            except TimeoutError:
-                self._unanswered = asked
-        remedy = "Start it with `intrasplat up`, or correct REDIS_URL."
-        raise UnavailableError("The queue does not answer.", remedy, may_return=True)
 
     def _stored(self, job_id: str) -> JobRecord | None:
         """The record of a finished scene as the store knows it; None if there is none.

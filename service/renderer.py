@@ -9,12 +9,16 @@ import hashlib
 import logging
 import math
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Protocol
 
 import zmq.asyncio
+from pydantic import TypeAdapter, ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from contract.queue.interface import WORKER_TTL_S, Queue
+from contract.store.durable import replace_file
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ReplyError, SceneRequest, WorkerAddress, WorkerReply
 from service.connection import Answer, Connection, Reached, WorkerGoneError
@@ -29,6 +33,8 @@ KNOWN_PERIOD_S = 5.0
 READ_PATIENCE_S = 0.5
 """How long a render waits for a newer list where the known one is older than an announcement lasts."""
 
+ADDRESSES = TypeAdapter(list[WorkerAddress])
+
 logger = logging.getLogger("intrasplat.service")
 
 
@@ -41,6 +47,10 @@ class Renderer(Protocol):
         Raises:
             UnavailableError: there is none in time.
         """
+        ...
+
+    async def reachable(self, workers: Sequence[WorkerAddress], timeout_s: float) -> list[WorkerAddress]:
+        """Those that are there, or come within timeout_s."""
         ...
 
     async def run(self) -> None:
@@ -57,15 +67,20 @@ class ZmqRenderer:
 
     A running job is shown by the worker that runs it. A finished scene any worker can show: one that trains nothing
     and holds it is asked, or else always the same one, which will. If that one is gone, mute or busy, another is, once.
+
+    known: a file that keeps the workers' addresses, so that a service that starts while the queue is away has them.
     """
 
-    def __init__(self, queue: Queue, timeout_s: float, render_secret: str | None = None) -> None:
+    def __init__(
+        self, queue: Queue, timeout_s: float, render_secret: str | None = None, known: Path | None = None
+    ) -> None:
         self._queue = queue
         self._timeout_s = timeout_s
         self._render_secret = render_secret
         self._context: zmq.asyncio.Context | None = None
         self._connections: dict[str, Connection] = {}
-        self._addresses: list[WorkerAddress] = []
+        self._known = known
+        self._addresses: list[WorkerAddress] = [] if known is None else _read_known(known)
         self._read_s = self._heard_s = -math.inf
         self._reading: asyncio.Task[None] | None = None
 
@@ -99,6 +114,18 @@ class ZmqRenderer:
         connection = await self._connection(address)
         answer = await connection.ask(request, patiently=patiently)
         return dataclasses.replace(answer, worker=address.endpoint)
+
+    async def reachable(self, workers: Sequence[WorkerAddress], timeout_s: float) -> list[WorkerAddress]:
+        there = await asyncio.gather(*(self._is_there(each, timeout_s) for each in workers))
+        return [worker for worker, is_there in zip(workers, there, strict=True) if is_there]
+
+    async def _is_there(self, address: WorkerAddress, timeout_s: float) -> bool:
+        try:
+            async with asyncio.timeout(timeout_s):
+                await (await self._connection(address)).reach(patiently=False)
+        except (WorkerGoneError, UnavailableError, TimeoutError):
+            return False
+        return True
 
     async def run(self) -> None:
         while True:
@@ -172,11 +199,32 @@ class ZmqRenderer:
         now_s = self._read_s = time.monotonic()
         # A queue that was away knows of no worker either until they have spoken again.
         if addresses or now_s - self._heard_s > WORKER_TTL_S:
+            await self._remember(addresses)
             self._addresses, self._heard_s = addresses, now_s
         live = {address.endpoint for address in self._addresses}
         for endpoint in self._connections.keys() - live:
             if self._connections[endpoint].is_idle:
                 await self._connections.pop(endpoint).close()
+
+    async def _remember(self, addresses: list[WorkerAddress]) -> None:
+        """Write down where the workers are, unless there are none or the same as before."""
+        if self._known is None or not addresses or _places(addresses) == _places(self._addresses):
+            return
+        content = ADDRESSES.dump_json(_places(addresses))
+        with contextlib.suppress(OSError):  # a full disk: they are known until this service ends
+            await run_in_threadpool(replace_file, self._known, content)
+
+
+def _places(addresses: list[WorkerAddress]) -> list[WorkerAddress]:
+    """What of the addresses lasts: not what the workers do just now."""
+    return [each.model_copy(update={"job_id": None, "scenes": ()}) for each in addresses]
+
+
+def _read_known(path: Path) -> list[WorkerAddress]:
+    try:
+        return ADDRESSES.validate_json(path.read_bytes())
+    except (OSError, ValidationError):
+        return []
 
 
 def _remedy(address: WorkerAddress) -> str:

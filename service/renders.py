@@ -163,6 +163,7 @@ async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown
     Raises:
         Problem: 400: no scene is named and the tenant has not exactly one (never show another patient by accident).
             403: the key lacks the scope. 404: the tenant has no such scene. 409: the job has nothing to show.
+            503: it had, and waits for another worker.
     """
     caller.require(KeyScope.VIEW)
     shown = await run_in_threadpool(_find, services, caller, scene)
@@ -178,6 +179,9 @@ def _find(services: Deps, caller: Caller, scene: str | None) -> Shown:
         return Shown(scene, record.attempt)
     if record.state is JobState.RUNNING:
         return Shown(scene, None)
+    if record.state is JobState.QUEUED and record.attempt > 0:
+        remedy = "Ask again in some seconds: a worker goes on with it."
+        raise Problem(503, "The job has lost its worker and waits for another.", field="scene", remedy=remedy)
     detail = f"The job is {record.state}; there is nothing to show."
     raise Problem(409, detail, field="scene", remedy=f"See GET /jobs/{scene}.")
 

@@ -7,14 +7,14 @@ from typing import Any
 from fastapi import APIRouter
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import BaseModel
-from starlette.responses import JSONResponse, Response
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import Response
 
 from contract import CONTRACT_VERSION
 from contract.access.keys import KeyScope
-from contract.queue.interface import trainers
 from contract.wire.errors import UnavailableError
-from contract.wire.rendering import ImageFormat, Layer
-from service.deps import AnyCaller, Deps, Services
+from contract.wire.rendering import ImageFormat, Layer, WorkerAddress
+from service.deps import AnyCaller, EarlyCaller, Services
 from service.problems import Problem, no_room
 from service.renderer import WORKER_REMEDY
 from service.upload import SUFFIXES
@@ -22,6 +22,8 @@ from service.version import version
 
 router = APIRouter(tags=["system"])
 
+QUEUE_PATIENCE_S, WORKER_PATIENCE_S = 0.5, 0.3
+"""How long /readyz waits for the queue, and for a worker that it lists."""
 
 LIMITS = (
     *("max_upload_bytes", "max_frames", "max_frame_pixels", "max_clip_s", "min_free_bytes"),
@@ -32,12 +34,12 @@ LIMITS = (
 
 
 class Readiness(BaseModel):
-    """What a ready service has; workers that only render are not counted."""
+    """What a ready service has; workers that only render are not counted. Callers without a key hear less."""
 
     ready: bool = True
-    workers: list[str]
     devices: list[str]
-    free_bytes: int
+    workers: list[str] | None = None
+    free_bytes: int | None = None
 
 
 @router.get("/healthz", operation_id="healthz")
@@ -46,18 +48,28 @@ async def healthz() -> dict[str, bool]:
     return {"alive": True}
 
 
-@router.get("/readyz", operation_id="readyz", response_model=Readiness)
-def readyz(services: Services) -> Readiness | JSONResponse:
-    """200 if a clip sent now would be trained: the queue answers, a worker is ready, the disk has room."""
-    trouble = _trouble(services)
-    if trouble is not None:
-        return trouble.response()
-    workers = [worker for worker in services.queue.workers() if not worker.renders_only]
-    return Readiness(
-        workers=[worker.name for worker in workers],
-        devices=[worker.device for worker in workers],
-        free_bytes=services.store.free_bytes(),
-    )
+@router.get("/readyz", operation_id="readyz")
+async def readyz(services: Services, caller: EarlyCaller) -> Readiness:
+    """200 if a clip sent now would be trained: the queue answers, a worker is there, the disk has room.
+
+    It answers within a second, also while the queue does not.
+    """
+    # A full disk comes first, for the queue may be away with it.
+    if not await run_in_threadpool(services.intake.has_room):
+        raise no_room("The disk is full.", status=503, field="disk")
+    try:
+        workers = await run_in_threadpool(services.questions.ask, services.queue.workers, QUEUE_PATIENCE_S)
+    except UnavailableError as error:
+        raise Problem(503, error.problem, field="queue", remedy=error.remedy) from error
+    trainers = [worker for worker in workers if not worker.renders_only]
+    there = await services.renderer.reachable(trainers, WORKER_PATIENCE_S)
+    if not there:
+        raise _nobody_trains(workers)
+    readiness = Readiness(devices=[worker.device for worker in there])
+    if caller is None:
+        return readiness
+    free_bytes = await run_in_threadpool(services.store.free_bytes)
+    return readiness.model_copy(update={"workers": [worker.name for worker in there], "free_bytes": free_bytes})
 
 
 @router.get("/info", operation_id="info")
@@ -97,15 +109,8 @@ def read_metrics(services: Services, caller: AnyCaller) -> Response:
     return Response(services.metrics.exposition(), media_type=CONTENT_TYPE_LATEST)
 
 
-def _trouble(services: Deps) -> Problem | None:
-    """The first reason why work would not get done now. A full disk comes first, for the queue may be away with it."""
-    if not services.intake.has_room():
-        return no_room("The disk is full.", status=503, field="disk")
-    try:
-        services.queue.ping()
-        workers = services.queue.workers()
-    except UnavailableError as error:
-        return Problem(503, error.problem, field="queue", remedy=error.remedy)
-    if not trainers(workers):
-        return Problem(503, "No worker is ready yet.", field="worker", remedy=f"Wait for it. {WORKER_REMEDY}")
-    return None
+def _nobody_trains(workers: list[WorkerAddress]) -> Problem:
+    if any(worker.renders_only for worker in workers):
+        detail = "The workers that are there only render."
+        return Problem(503, detail, field="worker", remedy="Start one that trains: `intrasplat worker`.")
+    return Problem(503, "No worker is ready yet.", field="worker", remedy=f"Wait for it. {WORKER_REMEDY}")

@@ -8,7 +8,7 @@ import httpx
 
 from intrasplat_client.connection import DEFAULT_URL, AwaitedConnection, http_settings
 from intrasplat_client.core import Core
-from intrasplat_client.session import DEFAULT_PATIENCE_S
+from intrasplat_client.session import DEFAULT_PATIENCE_S, OnWait
 from intrasplat_client.viewer import AsyncViewer, StreamMessages
 
 
@@ -21,12 +21,13 @@ class AsyncClient(Core):
         *,
         api_key: str | None = None,
         patience_s: float = DEFAULT_PATIENCE_S,
+        on_wait: OnWait | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         url = url.rstrip("/")
         self._http = httpx.AsyncClient(transport=transport, **http_settings(url, api_key))
         self._api_key = api_key
-        super().__init__(AwaitedConnection(self._http), url, patience_s)
+        super().__init__(AwaitedConnection(self._http), url, patience_s, on_wait)
 
     def stream(self, scene: str) -> AsyncViewer:
         """A connection for many views: `async with client.stream(scene) as viewer: await viewer.render(t, pose)`."""

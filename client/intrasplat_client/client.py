@@ -13,7 +13,7 @@ from typing_extensions import Unpack
 from intrasplat_client.connection import DEFAULT_URL, BlockingConnection, http_settings, iterate, run
 from intrasplat_client.core import SCORES_WITHIN_S, Core
 from intrasplat_client.models import GivenOptions, JobState, JobView, Report
-from intrasplat_client.session import DEFAULT_PATIENCE_S
+from intrasplat_client.session import DEFAULT_PATIENCE_S, OnWait
 from intrasplat_client.submission import OnUpload
 from intrasplat_client.viewer import StreamMessages, Viewer
 from intrasplat_client.views import Image
@@ -28,6 +28,7 @@ class Client:
     api_key: from `intrasplat keys create`; needed unless the service runs on this machine for its user alone.
     patience_s: how long, in all, a call waits while the service is busy (429, 503) or the connection is lost. Where
     nobody answers at all, a call fails at once.
+    on_wait(error, pause_s): is called before each of these waits.
     transport: instead of the network, for tests.
     """
 
@@ -37,12 +38,13 @@ class Client:
         *,
         api_key: str | None = None,
         patience_s: float = DEFAULT_PATIENCE_S,
+        on_wait: OnWait | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         self.url = url.rstrip("/")
         self._http = httpx.Client(transport=transport, **http_settings(self.url, api_key))
         self._api_key = api_key
-        self._core = Core(BlockingConnection(self._http), self.url, patience_s)
+        self._core = Core(BlockingConnection(self._http), self.url, patience_s, on_wait)
 
     def reconstruct(
         self,

@@ -16,7 +16,7 @@ from intrasplat_client import events, submission, views
 from intrasplat_client.connection import Call, Connection
 from intrasplat_client.errors import Unreachable
 from intrasplat_client.models import GivenOptions, JobState, JobView, Report
-from intrasplat_client.session import Session, parsed
+from intrasplat_client.session import OnWait, Session, parsed
 from intrasplat_client.submission import OnUpload
 from intrasplat_client.views import Image, view_query
 
@@ -30,9 +30,9 @@ SCORES_WITHIN_S, LOOK_PERIOD_S = 30.0, 0.3
 class Core:
     """Every route of a service as a coroutine."""
 
-    def __init__(self, connection: Connection, url: str, patience_s: float) -> None:
+    def __init__(self, connection: Connection, url: str, patience_s: float, on_wait: OnWait | None = None) -> None:
         self.url = url
-        self._session = Session(connection, url, patience_s)
+        self._session = Session(connection, url, patience_s, on_wait)
 
     async def reconstruct(
         self,

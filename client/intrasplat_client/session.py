@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import httpx
 
@@ -25,6 +25,8 @@ NEVER_CONNECTED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.UnsupportedPr
 
 Content = TypeVar("Content")
 Parsed = TypeVar("Parsed")
+OnWait: TypeAlias = Callable[[IntrasplatError, float], None]
+"""Is told of each failure after which a call waits and is repeated, and of the seconds that it waits."""
 
 
 class Patience:
@@ -60,10 +62,11 @@ class Session:
     patience_s: how long, in all, a call waits while the service is busy or the connection is lost.
     """
 
-    def __init__(self, connection: Connection, url: str, patience_s: float) -> None:
+    def __init__(self, connection: Connection, url: str, patience_s: float, on_wait: OnWait | None = None) -> None:
         self._connection = connection
         self._url = url
         self._patience_s = patience_s
+        self._on_wait = on_wait
         self.sleep = connection.sleep
 
     def patience(self) -> Patience:
@@ -72,7 +75,10 @@ class Session:
 
     async def wait(self, patience: Patience, failure: IntrasplatError) -> None:
         """Wait after a failure; raises it once patience is used up."""
-        await self.sleep(patience.pause_s(failure))
+        pause_s = patience.pause_s(failure)
+        if self._on_wait is not None:
+            self._on_wait(failure, pause_s)
+        await self.sleep(pause_s)
 
     async def send(self, call: Call) -> httpx.Response:
         """Send a call once; its answer, whatever the status.

@@ -12,9 +12,10 @@ from redis.retry import Retry
 
 from contract.wire.errors import UnavailableError
 
-SOCKET_TIMEOUT_S = 4.0
-CONNECT_TIMEOUT_S = 2.0
+PATIENCE_S = 12.0
+"""How long to try, in all, until the server counts as away."""
 RETRIES = 2
+MAX_CONNECT_TIMEOUT_S = 2.0
 
 REFUSALS = (
     "MISCONF",
@@ -30,15 +31,16 @@ REFUSALS = (
 """Codes (the first word of an error) with which a server says that it cannot, or may not, serve now."""
 
 
-def connect(url: str) -> Any:
+def connect(url: str, patience_s: float = PATIENCE_S) -> Any:
     """A client of that server. It states every default that has changed between releases of redis-py."""
+    timeout_s = patience_s / (RETRIES + 1)
     return redis.Redis.from_url(
         url,
         decode_responses=True,
         protocol=2,
         retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), RETRIES),
-        socket_timeout=SOCKET_TIMEOUT_S,
-        socket_connect_timeout=CONNECT_TIMEOUT_S,
+        socket_timeout=timeout_s,
+        socket_connect_timeout=min(timeout_s, MAX_CONNECT_TIMEOUT_S),
     )
 
 

@@ -66,7 +66,7 @@ from contract.queue.interface import (
     trainers,
 )
 from contract.queue.lua import UNREADABLE, Scripts
-from contract.queue.redis_client import connect, reachable
+from contract.queue.redis_client import PATIENCE_S, connect, reachable
 from contract.queue.redis_hash import new_record, record_of, table_of
 from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES, Forecast, JobError, JobProgress, JobRecord, JobState
@@ -91,11 +91,20 @@ logger = logging.getLogger("intrasplat.queue")
 class RedisQueue:
     """A Queue on a Redis 7+ or Valkey server (`redis://`, `rediss://` or `unix://`); safe to share among threads.
 
+    patience_s: how long, in all, a call waits for a server that does not answer. Who claims needs more than BLOCK_S for
+    each of the client's tries, which is what the default allows.
     lease_s and preempt_after_s are for tests that cannot wait. All clients of one queue must agree on them.
     """
 
-    def __init__(self, url: str, *, lease_s: float = LEASE_S, preempt_after_s: float = PREEMPT_AFTER_S) -> None:
-        self._client: Any = connect(url)
+    def __init__(
+        self,
+        url: str,
+        *,
+        patience_s: float = PATIENCE_S,
+        lease_s: float = LEASE_S,
+        preempt_after_s: float = PREEMPT_AFTER_S,
+    ) -> None:
+        self._client: Any = connect(url, patience_s)
         self._scripts = Scripts(self._client, PREFIX, lease_s, preempt_after_s)
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:

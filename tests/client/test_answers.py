@@ -113,9 +113,13 @@ class Busy:
 @pytest.mark.parametrize("status", [429, 503])
 def test_a_busy_service_is_asked_again_until_patience_ends(status: int) -> None:
     busy = Busy(status, times=2)
-    with Client(transport=httpx.MockTransport(busy)) as client:
+    waits: list[str] = []
+    on_wait = lambda error, pause_s: waits.append(str(error))  # noqa: E731
+    with Client(transport=httpx.MockTransport(busy), on_wait=on_wait) as client:
         assert client.jobs() == []
     assert len(busy.requests) == 3
+    assert len(waits) == 2
+    assert all("Busy." in wait for wait in waits)
     busy = Busy(status, times=9)
     with Client(transport=httpx.MockTransport(busy), patience_s=0.3) as client, pytest.raises(ServiceUnavailable):
         client.jobs()

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import httpx
 import pytest
 
 import client as client_package
@@ -113,6 +114,22 @@ def test_url_and_key_come_from_the_environment(
         assert "Bearer" not in told
         monkeypatch.setenv("INTRASPLAT_API_KEY", key)
         assert main(["jobs"]) == ExitCode.OK
+
+
+def test_a_command_that_waits_for_the_service_says_so_at_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told: list[str] = []
+
+    def sleep(seconds: float) -> None:
+        told.append(capsys.readouterr().err)
+
+    monkeypatch.setattr("intrasplat_client.connection.time.sleep", sleep)
+    away = httpx.Response(503, json={"status": 503, "detail": "The queue does not answer.", "remedy": "Start it."})
+    monkeypatch.setattr(httpx.HTTPTransport, "handle_request", lambda *_: away)
+    assert main(["jobs"]) == ExitCode.UNAVAILABLE
+    assert told[0] == "intrasplat: The queue does not answer. Asking again for up to 30 s.\n"
+    assert set(told[1:]) == {""}
 
 
 @pytest.mark.parametrize(

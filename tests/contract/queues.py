@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import shutil
+import signal
 import socket
 import subprocess
 import threading
@@ -90,6 +91,10 @@ class RunningServer:
 
     def client(self) -> redis.Redis:
         return redis.Redis.from_url(self.url, decode_responses=True)
+
+    def freeze(self, by: signal.Signals = signal.SIGSTOP) -> None:
+        """The server neither ends nor answers; by SIGCONT it goes on."""
+        self._process.send_signal(by)
 
     def stop(self) -> None:
         self._process.terminate()

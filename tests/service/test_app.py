@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 
+from contract.queue.embedded import short_socket_path
 from contract.wire.errors import UnavailableError
-from tests.service.under_test import ServiceUnderTest, assert_problem, running_service
+from contract.wire.rendering import WorkerAddress
+from tests.service.under_test import ServiceUnderTest, assert_problem, bearer, running_service
 
 
 @pytest.mark.parametrize(("method", "path", "status"), [("GET", "/nothing", 404), ("PUT", "/jobs", 405)])
@@ -89,7 +92,7 @@ def test_an_unforeseen_error_is_a_problem_that_tells_nothing(
     def broken(*_: object) -> None:
         raise RuntimeError("patient Smith")
 
-    monkeypatch.setattr(service.queue, "ping", broken)
+    monkeypatch.setattr(service.queue, "workers", broken)
     response = service.http.get("/readyz")
     assert "X-Request-Id" in assert_problem(response, 500)["remedy"]
     assert "Smith" not in response.text
@@ -107,14 +110,37 @@ def test_the_service_is_not_ready_without_queue_worker_or_room(
 ) -> None:
     assert service.http.get("/readyz").json()["ready"] is True
 
-    def away() -> None:
+    def away() -> list[WorkerAddress]:
         raise UnavailableError("The queue does not answer.", "Start it.")
 
+    (worker,) = service.queue.workers()
+    service.queue.announce(worker.model_copy(update={"renders_only": True}))
+    assert "only render" in assert_problem(service.http.get("/readyz"), 503, "worker")["detail"]
     service.queue.withdraw("worker-1")
     assert_problem(service.http.get("/readyz"), 503, "worker")
-    monkeypatch.setattr(service.queue, "ping", away)
+    monkeypatch.setattr(service.queue, "workers", away)
     assert_problem(service.http.get("/readyz"), 503, "queue")
     assert service.http.get("/healthz").json() == {"alive": True}
+
+
+def test_the_service_is_not_ready_as_soon_as_its_only_worker_has_died(
+    service: ServiceUnderTest, tmp_path: Path
+) -> None:
+    (worker,) = service.queue.workers()
+    nobody = f"ipc://{short_socket_path(tmp_path, 'nobody.sock')}"
+    service.queue.announce(worker.model_copy(update={"endpoint": nobody}))  # which lasts for WORKER_TTL_S
+    began_s = time.monotonic()
+    assert_problem(service.http.get("/readyz"), 503, "worker")
+    assert time.monotonic() - began_s < 1.0
+
+
+def test_who_has_no_key_hears_no_names_of_workers_nor_how_full_the_disk_is(tmp_path: Path) -> None:
+    for service in running_service(tmp_path, host="0.0.0.0", hosts=("127.0.0.1",)):
+        told = service.http.get("/readyz").json()
+        assert (told["ready"], told["devices"], told["workers"], told["free_bytes"]) == (True, ["cpu"], None, None)
+        told = service.http.get("/readyz", headers=bearer(service, "ward-3")).json()
+        assert told["workers"] == ["worker-1"]
+        assert told["free_bytes"] > 0
 
 
 def test_the_dashboard_is_served_at_the_root(tmp_path: Path) -> None:

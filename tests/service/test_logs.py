@@ -103,7 +103,7 @@ def test_a_fault_is_logged_with_where_it_was_and_without_its_text(
         raise RuntimeError(MARKER)
 
     for service in running_service(tmp_path):
-        monkeypatch.setattr(service.queue, "ping", broken)
+        monkeypatch.setattr(service.queue, "workers", broken)
         answer = service.http.get("/readyz")
         assert (answer.status_code, answer.headers["content-type"]) == (500, "application/problem+json")
         assert MARKER not in answer.text

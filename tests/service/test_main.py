@@ -9,6 +9,8 @@ import pytest
 from contract.access.keys import KeyFile, KeyScope
 from contract.runtime.exits import ExitCode
 from service.__main__ import main
+from service.server import Server
+from tests.contract.queues import RunningServer, valkey_binary
 
 
 @pytest.fixture(autouse=True)
@@ -24,9 +26,26 @@ def test_a_host_that_others_can_reach_is_not_served_without_keys(
     monkeypatch.setenv("INTRASPLAT_HOST", "0.0.0.0")
     assert main() == ExitCode.UNAVAILABLE
     assert "intrasplat keys create" in capsys.readouterr().err
+    served: list[Server] = []
+    monkeypatch.setattr(Server, "run", lambda server: served.append(server))
     KeyFile(tmp_path).create("clinic", frozenset(KeyScope))
+    main()
+    assert len(served) == 1
+
+
+def test_a_queue_that_is_away_is_not_waited_for_but_a_wrong_password_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    served: list[Server] = []
+    monkeypatch.setattr(Server, "run", lambda server: served.append(server))
+    main()
+    assert len(served) == 1
+    server = RunningServer(valkey_binary(), tmp_path / "queue", requirepass="secret")
+    monkeypatch.setenv("REDIS_URL", f"unix://:wrong@{server.socket}")
     assert main() == ExitCode.UNAVAILABLE
-    assert "queue" in capsys.readouterr().err
+    assert "REDIS_URL" in capsys.readouterr().err
+    assert len(served) == 1
+    server.stop()
 
 
 @pytest.mark.parametrize(

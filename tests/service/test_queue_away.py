@@ -119,6 +119,21 @@ def test_a_queue_that_says_nothing_is_waited_for_once(tmp_path: Path, monkeypatc
         queue.speaks.set()
 
 
+def test_a_service_that_starts_while_the_queue_is_away_shows_finished_scenes_and_says_that_it_is_not_ready(
+    tmp_path: Path,
+) -> None:
+    queue = LeavingQueue()
+    for service in running_service(tmp_path, queue):
+        scene = service.finished_scene()
+        assert service.http.get("/render", params={"scene": scene}).status_code == 200
+    queue.is_away = True
+    for service in running_service(tmp_path, queue):
+        assert service.http.get("/healthz").status_code == 200
+        assert_problem(service.http.get("/readyz"), 503, "queue")
+        assert service.http.get("/render", params={"scene": scene}).status_code == 200
+        assert_problem(service.http.get("/jobs"), 503)
+
+
 class MuteQueue(MemoryQueue):
     """Takes every question for a record and answers none until it speaks again."""
 

@@ -202,6 +202,20 @@ def test_a_running_job_that_no_worker_shows_yet_is_to_be_asked_for_again_in_a_se
     assert response.headers["retry-after"] == "1"
 
 
+@pytest.mark.parametrize("died", [True, False])
+def test_a_job_that_has_lost_its_worker_is_to_be_asked_for_again_until_it_is_claimed(
+    service: ServiceUnderTest, died: bool
+) -> None:
+    job_id = service.running_job()
+    assert service.http.get("/render", params={"scene": job_id}).status_code == 200
+    assert service.queue.release(Claim(job_id, 1, "worker-1"), died=died)
+    response = service.http.get("/render", params={"scene": job_id})
+    assert_problem(response, 503, "scene")
+    assert response.headers["Retry-After"]
+    service.claimed()
+    assert service.http.get("/render", params={"scene": job_id}).status_code == 200
+
+
 def test_a_job_that_has_nothing_to_show_says_where_it_stands(service: ServiceUnderTest) -> None:
     job_id = service.upload().json()["id"]
     assert "queued" in assert_problem(service.http.get("/render", params={"scene": job_id}), 409, "scene")["detail"]

@@ -11,7 +11,7 @@ import httpx
 
 from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
 from contract.queue.embedded import short_socket_path
-from contract.queue.interface import Claim
+from contract.queue.interface import Claim, Queue
 from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.store import Store
@@ -20,6 +20,7 @@ from contract.wire.job import JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.rendering import ExportRequest, RecordedRequest, SceneRequest, WorkerAddress
+from service.__main__ import KNOWN_WORKERS
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from tests.reports import REPORT_OF_A_SCENE, a_warning
@@ -71,7 +72,7 @@ class ServiceUnderTest:
     """A running service and what it stands on."""
 
     http: AsgiClient
-    queue: MemoryQueue
+    queue: Queue
     store: Store
     painter: Painter
 
@@ -112,10 +113,11 @@ class ServiceUnderTest:
         return [path for area in ("incoming", "spool") for path in (self.store.data_dir / area).iterdir()]
 
 
-def running_service(data_dir: Path, queue: MemoryQueue | None = None, **changes: Any) -> Iterator[ServiceUnderTest]:
+def running_service(data_dir: Path, queue: Queue | None = None, **changes: Any) -> Iterator[ServiceUnderTest]:
     queue, store, painter = queue or MemoryQueue(), Store(data_dir), Painter()
     settings = Settings(data_dir=data_dir, render_timeout_s=5.0, min_free_bytes=0).model_copy(update=changes)
-    app = create_app(settings, queue, store, ZmqRenderer(queue, settings.render_timeout_s))
+    known = store.run_dir / KNOWN_WORKERS
+    app = create_app(settings, queue, store, ZmqRenderer(queue, settings.render_timeout_s, known=known))
     endpoint = f"ipc://{short_socket_path(store.run_dir, 'worker-1.sock')}"
     with (
         RequestServer(endpoint, painter.answer),
