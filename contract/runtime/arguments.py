@@ -44,6 +44,8 @@ def add_options(
         settings: dict[str, Any] = {"default": None, "help": field.description}
         if get_origin(field.annotation) is Literal:
             settings["choices"] = kinds
+        elif get_origin(kinds[0]) is Literal:
+            settings["choices"] = get_args(kinds[0])
         else:
             is_positive = any(getattr(bound, "gt", None) == 0 for bound in field.metadata)
             settings["type"] = (positive if is_positive else finite) if kinds == [float] else kinds[0]

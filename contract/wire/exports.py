@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from contract.wire.errors import InputError
 
+VideoView = Literal["endoscope", "orbit", "stereo"]
 FORMAT_REMEDY = "docs/export.md lists the formats and their options."
 
 
@@ -34,6 +35,18 @@ class ExportOptions(BaseModel):
     every: int | None = Field(
         default=None, ge=1, le=1000, description="of formats over time: one of so many frames (default: 1, all)"
     )
+    view: VideoView | None = Field(
+        default=None,
+        description="of a video: endoscope: as it saw the clip; orbit: circling about it, about one moment if t is "
+        "given; stereo: both eyes side by side (default: endoscope)",
+    )
+    baseline_mm: float | None = Field(
+        default=None,
+        gt=0,
+        le=50,
+        allow_inf_nan=False,
+        description="distance of the eyes of view=stereo in mm (default: the endoscope's own)",
+    )
 
     def given(self) -> dict[str, object]:
         """The options that were chosen, by name."""
@@ -49,12 +62,8 @@ class ExportFormat:
     options: tuple[str, ...]
     about: str
 
-    @property
-    def of_one_moment(self) -> bool:
-        """Whether it shows one moment, and not the whole clip."""
-        return "t" in self.options
 
-
+_VIDEO = ("view", "every", "t", "baseline_mm")
 _BYTES = "application/octet-stream"
 EXPORT_FORMATS = {
     "ply": ExportFormat(".ply", _BYTES, ("t",), "the Gaussians at time t as splat viewers read them, mm"),
@@ -74,9 +83,14 @@ EXPORT_FORMATS = {
     ),
     "depth": ExportFormat("-depth.npy", _BYTES, ("every",), "depth of each frame, [T, H, W] float32 mm"),
     "tracks": ExportFormat("-tracks.npz", "application/zip", ("every",), "where each Gaussian is over time, mm"),
+    "webm": ExportFormat(".webm", "video/webm", _VIDEO, "a video without instruments (VP8)"),
+    "mp4": ExportFormat(".mp4", "video/mp4", _VIDEO, "a video without instruments (VP9)"),
     "tum": ExportFormat(".tum", "text/plain", (), "the endoscope's path as a TUM file, seconds and metres"),
 }
 """The formats by name."""
+
+_OF_VIEW = {"t": "orbit", "baseline_mm": "stereo"}
+"""Options of a video that fit one view alone."""
 
 
 def check_export(name: str, given: Mapping[str, object]) -> ExportOptions:
@@ -96,6 +110,11 @@ def check_export(name: str, given: Mapping[str, object]) -> ExportOptions:
             takes = f"It takes {' and '.join(export_format.options)}." if export_format.options else "It takes none."
             remedy = f"Leave it out. {takes}"
             raise InputError(option, f"{option} does not fit the format {name}: {export_format.about}.", remedy)
+    for option, view in _OF_VIEW.items():
+        if option in chosen and "view" in export_format.options and chosen.get("view") != view:
+            raise InputError(option, f"{option} is for view={view} alone.", f"Leave it out, or add view={view}.")
+    if "t" in chosen and "every" in chosen:
+        raise InputError("every", "With t one moment is shown, and every frame is of it.", "Leave out every or t.")
     try:
         return ExportOptions.model_validate(chosen)
     except ValidationError as error:

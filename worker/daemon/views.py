@@ -131,7 +131,7 @@ class Views:
         gaussians = len(scene.gaussians) if scene is not None else TYPICAL_GAUSSIANS
         size = (scene.intrinsics.width, scene.intrinsics.height) if scene is not None else TYPICAL_SIZE
         if isinstance(request, ExportRequest):
-            return render_cost(DRAWN.get(request.format, 0) * size[0] * size[1], gaussians)
+            return render_cost(size[0] * size[1] if request.format in DRAWN else 0, gaussians)
         width, height = request.camera.size(*size)
         return render_cost(width * height, gaussians)
 

@@ -5,8 +5,7 @@ In: a Scene, the name of a format and its options. Out: the file's bytes, part b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Mapping
-from types import MappingProxyType
+from collections.abc import Callable, Generator, Iterator
 from typing import TypeAlias
 
 from contract.wire.errors import InputError
@@ -21,6 +20,7 @@ from worker.export.splat import export_splat
 from worker.export.target import Target
 from worker.export.tracks import tracks_parts
 from worker.export.tum import export_tum
+from worker.export.video import video_parts
 from worker.raster.backend import CPU, Device
 from worker.scene.scene import Scene
 
@@ -45,12 +45,14 @@ EXPORTS: dict[str, Writer] = {
     "mesh-glb": mesh_parts(mesh.glb),
     "depth": depth_parts,
     "tracks": tracks_parts,
+    "webm": video_parts("webm"),
+    "mp4": video_parts("mp4"),
     "tum": lambda target: iter((export_tum(target.scene),)),
 }
 """The writers by the names of EXPORT_FORMATS (contract/wire/exports.py)."""
 
-DRAWN: Mapping[str, int] = MappingProxyType(dict.fromkeys(("depth", "mesh-stl", "mesh-ply", "mesh-glb"), 1))
-"""Formats whose parts take renders of the clip's size, and how many."""
+DRAWN = frozenset({"depth", "webm", "mp4", "mesh-stl", "mesh-ply", "mesh-glb"})
+"""Formats whose parts take renders of the clip's size."""
 
 
 def export_parts(scene: Scene, name: str, options: ExportOptions, device: Device = CPU) -> Generator[bytes]:
