@@ -14,7 +14,7 @@ from contract.runtime.settings import Settings
 from contract.store.store import Store
 from contract.wire.errors import LimitError
 from service.partial import promised_bytes
-from service.problems import LENGTH_REMEDY, Problem, no_room
+from service.problems import LENGTH_REMEDY, Problem, no_room_for, room_remedy
 from service.upload import LIMIT_REMEDY
 
 MIN_BYTES = 4096
@@ -63,11 +63,19 @@ class Intake:
             raise LimitError("clip", problem, LIMIT_REMEDY)
         room_bytes = self.room_bytes()
         if declared_bytes > room_bytes:
-            raise no_room(f"The disk has room for {max(room_bytes, 0)} bytes of an upload.")
+            raise no_room_for(declared_bytes, room_bytes, self._settings.min_free_bytes)
 
     def has_room(self) -> bool:
         """Whether the disk has what must stay free: without it no clip is accepted."""
-        return self._store.free_bytes() >= self._settings.min_free_bytes
+        return self.missing_bytes() <= 0
+
+    def missing_bytes(self) -> int:
+        """How much more must be free before clips are accepted."""
+        return self._settings.min_free_bytes - self._store.free_bytes()
+
+    def room_remedy(self) -> str:
+        """What to do when there is no room, with the bytes that are missing."""
+        return room_remedy(self.missing_bytes(), self._settings.min_free_bytes)
 
     def room_bytes(self) -> int:
         """What may be written now: not what must stay free, nor what is kept for uploads that are on their way."""

@@ -21,6 +21,7 @@ RETRY_AFTER_S = 2
 """Said with 423, 429 and 503, unless the problem knows better."""
 API_REMEDY = "The API is described at /openapi.json."
 ROOM_REMEDY = "Delete scenes (DELETE /scenes/{id}) or give it more room."
+MIN_FREE = "INTRASPLAT_MIN_FREE_BYTES"
 LENGTH_REMEDY = "Send Content-Length once, as a number, or chunks without it."
 SCENES_REMEDY = "GET /scenes lists what there is."
 FAULT_REMEDY = "Report it with the log's lines of this X-Request-Id."
@@ -143,6 +144,18 @@ def fault() -> Problem:
 def no_room(detail: str, remedy: str = ROOM_REMEDY, *, status: int = 507, field: str | None = None) -> Problem:
     """The answer to what the disk has no room for; its member `code` is "store_full"."""
     return Problem(status, detail, field=field, remedy=remedy, extensions={"code": ErrorCode.STORE_FULL.value})
+
+
+def no_room_for(upload_bytes: int, room_bytes: int, min_free_bytes: int) -> Problem:
+    """The answer to an upload of so many bytes where there is room for room_bytes beside what must stay free."""
+    detail = f"The disk has room for {max(room_bytes, 0)} bytes of an upload, and {upload_bytes} are needed."
+    return no_room(detail, room_remedy(upload_bytes - room_bytes, min_free_bytes))
+
+
+def room_remedy(missing_bytes: int | None, min_free_bytes: int) -> str:
+    """What to do about a disk with too little room. missing_bytes None: the caller is not to know."""
+    amount = "space" if missing_bytes is None else f"{missing_bytes} bytes"
+    return f"Free {amount}, such as by DELETE /scenes/{{id}}: {min_free_bytes} must stay free ({MIN_FREE})."
 
 
 def _problem_of_validation(error: RequestValidationError) -> Problem:

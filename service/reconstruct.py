@@ -122,7 +122,8 @@ async def _receive_form(request: Request, services: Deps, caller: Caller, key: s
         job_id = new_job_id()
         folder = store.open_incoming(job_id)
         try:
-            limits = UploadLimits(settings.max_upload_bytes, services.intake.room_bytes() + place.kept_bytes)
+            room_bytes = services.intake.room_bytes() + place.kept_bytes
+            limits = UploadLimits(settings.max_upload_bytes, room_bytes, settings.min_free_bytes)
             content_type = request.headers.get("content-type", "")
             received = await receive_upload(content_type, services.intake.body(request, place), folder, limits)
             return await run_in_threadpool(_accept, services, caller, job_id, received, key)
@@ -181,7 +182,7 @@ def _make_job_of(
         Problem: 507: the disk is full; the uploads stay.
     """
     if not services.intake.has_room():
-        raise no_room("The disk is full; the uploads are kept.")
+        raise no_room("The disk has too little room; the uploads are kept.", services.intake.room_remedy())
     job_id = new_job_id()
     folder = services.store.open_incoming(job_id)
     try:

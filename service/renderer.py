@@ -23,9 +23,7 @@ from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ReplyError, SceneRequest, WorkerAddress, WorkerReply
 from service.connection import Answer, Connection, Reached, WorkerGoneError
 
-WORKER_REMEDY = (
-    "Ask again in some seconds; if it stays so, start one with `intrasplat up` or `python -m worker consume`."
-)
+WORKER_REMEDY = "Ask again in some seconds; if it stays so, start one with `intrasplat up` or `intrasplat worker`."
 ADDRESSES_VALID_S = 1.0
 """How long the list of live workers is used before the queue is asked again, while renders go on."""
 KNOWN_PERIOD_S = 5.0

@@ -15,7 +15,7 @@ from contract.access.keys import KeyScope
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ImageFormat, Layer, WorkerAddress
 from service.deps import AnyCaller, EarlyCaller, Services
-from service.problems import Problem, no_room
+from service.problems import Problem, no_room, room_remedy
 from service.renderer import WORKER_REMEDY
 from service.upload import SUFFIXES
 from service.version import version
@@ -55,8 +55,10 @@ async def readyz(services: Services, caller: EarlyCaller) -> Readiness:
     It answers within a second, also while the queue does not.
     """
     # A full disk comes first, for the queue may be away with it.
-    if not await run_in_threadpool(services.intake.has_room):
-        raise no_room("The disk is full.", status=503, field="disk")
+    missing_bytes = await run_in_threadpool(services.intake.missing_bytes)
+    if missing_bytes > 0:
+        remedy = room_remedy(None if caller is None else missing_bytes, services.settings.min_free_bytes)
+        raise no_room("The disk has too little room.", remedy, status=503, field="disk")
     try:
         workers = await run_in_threadpool(services.questions.ask, services.queue.workers, QUEUE_PATIENCE_S)
     except UnavailableError as error:

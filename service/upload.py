@@ -17,7 +17,7 @@ from starlette.concurrency import run_in_threadpool
 from contract.intake.limits import MAX_CALIBRATION_BYTES
 from contract.wire.errors import InputError, LimitError
 from contract.wire.job import JobFiles
-from service.problems import Problem, no_room
+from service.problems import Problem, no_room_for
 
 CLIP_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".zip")
 SUFFIXES = {
@@ -45,10 +45,11 @@ FORM_REMEDY = (
 
 @dataclass(frozen=True)
 class UploadLimits:
-    """What an upload may take: bytes at all, and bytes before the disk has less left than it must."""
+    """What an upload may take: bytes at all, and bytes before the disk has less than min_free_bytes left."""
 
     upload_bytes: int
     room_bytes: int
+    min_free_bytes: int
 
 
 @dataclass
@@ -164,7 +165,8 @@ class _Receiver:
             problem = f"the upload is larger than {self._limits.upload_bytes} bytes."
             raise LimitError("clip", problem, LIMIT_REMEDY)
         if self._received.total_bytes > self._limits.room_bytes:
-            raise no_room(f"The disk has room for {self._limits.room_bytes} bytes of an upload.")
+            limits = self._limits
+            raise no_room_for(self._received.total_bytes, limits.room_bytes, limits.min_free_bytes)
         self._parser.write(chunk)
 
     def finish(self) -> Received:

@@ -62,6 +62,7 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
         else:
             add_command(commands, name, LOCAL_COMMANDS[name], _not_chosen)
     consume = add_command(commands, "consume", WORKER_SUMMARY, _consume)
+    consume.prog = "intrasplat worker"
     consume.add_argument(
         "--renders-only", action="store_true", help="claim no jobs, only answer renders of finished scenes"
     )

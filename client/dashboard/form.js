@@ -6,8 +6,20 @@ import { Upload } from "./upload.js";
 import { LIMITS } from "./wire.js";
 
 const PARTS = ["clip", "right", "calibration", "masks"];
-const OPTIONS = ["budget_s", "layout", "eyes", "poses", "priority", "mask_source", "mask_polarity"];
+const OPTIONS = ["preset", "budget_s", "layout", "eyes", "poses", "priority", "mask_source", "mask_polarity"];
 const LABELS = {
+  preset: {
+    instant: "instant: a scene within seconds",
+    fast: "fast",
+    quality: "quality: sharper, takes longer",
+    small: "small: a small file",
+    paper: "paper: the method as published",
+    "paper-released": "paper, as its code was released",
+    "paper-wide": "paper, with more bases",
+    pfs: "baseline: pfs",
+    hexplane: "baseline: hexplane",
+    without_mapf: "baseline: without mapf",
+  },
   mask_source: { given: "as given", auto: "as given, or found", none: "not at all" },
   poses: {
     auto: "may move: to be found out",

@@ -241,9 +241,11 @@ def test_every_help_tells_the_exit_codes(
     assert "isp_secret" not in told
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "render", "phantom", "evaluate", "doctor"])
+@pytest.mark.parametrize("command", ["reconstruct", "render", "phantom", "evaluate", "doctor", "worker"])
 def test_local_commands_have_help_too(command: str) -> None:
-    assert "exit codes" in run_here(Path.cwd(), command, "--help").stdout
+    told = run_here(Path.cwd(), command, "--help").stdout
+    assert told.startswith(f"usage: intrasplat {command} ")
+    assert "exit codes" in told
 
 
 def run_here(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -99,4 +99,4 @@ def test_the_form_has_a_label_for_each_choice_and_a_field_for_options_alone() ->
     for name in re.findall(r'"(\w+)"', listed):
         assert f'name="{name}"' in page
         choices = get_args(JobOptions.model_fields[name].annotation)
-        assert [each for each in choices if isinstance(each, str) and not re.search(rf"\b{each}:", script)] == []
+        assert [each for each in choices if isinstance(each, str) and not re.search(rf'\b{each}"?:', script)] == []

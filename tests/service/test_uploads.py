@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import os
+import re
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -23,6 +24,11 @@ from tests.service.asgi import serving
 from tests.service.under_test import CLIP, EMPTY_ZIP, ServiceUnderTest, assert_problem, running_service
 
 PATIENCE_S = 10.0
+UPLOAD_HEADERS = {
+    "Tus-Resumable": "1.0.0",
+    "Upload-Length": str(len(CLIP)),
+    "Upload-Metadata": "part Y2xpcA==,suffix Lm1wNA==",
+}
 
 
 def test_an_accepted_clip_is_on_disk_and_queued_before_the_answer(service: ServiceUnderTest) -> None:
@@ -141,7 +147,7 @@ def test_an_upload_over_the_limit_is_cut_off_while_it_is_counted(tmp_path: Path)
 
 
 def test_an_upload_leaves_the_room_on_disk_that_must_stay_free(tmp_path: Path) -> None:
-    limits = UploadLimits(upload_bytes=10**9, room_bytes=1000)
+    limits = UploadLimits(upload_bytes=10**9, room_bytes=1000, min_free_bytes=77)
 
     async def body() -> AsyncIterator[bytes]:
         yield b'--x\r\nContent-Disposition: form-data; name="clip"; filename="a.mp4"\r\n\r\n' + b"x" * 1000
@@ -149,6 +155,7 @@ def test_an_upload_leaves_the_room_on_disk_that_must_stay_free(tmp_path: Path) -
     with pytest.raises(Problem, match="room for 1000 bytes") as caught:
         asyncio.run(receive_upload("multipart/form-data; boundary=x", body(), tmp_path, limits))
     assert caught.value.status == 507
+    assert "77 must stay free (INTRASPLAT_MIN_FREE_BYTES)" in str(caught.value.remedy)
 
 
 def test_a_disk_that_fills_up_is_told_as_such() -> None:
@@ -166,8 +173,17 @@ def test_a_disk_that_fills_up_is_told_as_such() -> None:
 
 def test_nothing_is_accepted_on_a_full_disk(tmp_path: Path) -> None:
     for service in running_service(tmp_path, min_free_bytes=2**62):
-        assert assert_problem(service.upload(), 507)["code"] == ErrorCode.STORE_FULL
-        assert assert_problem(service.http.get("/readyz"), 503, "disk")["code"] == ErrorCode.STORE_FULL
+        for problem in (
+            assert_problem(service.upload(), 507),
+            assert_problem(service.http.get("/readyz"), 503, "disk"),
+            assert_problem(service.http.post("/uploads", headers=UPLOAD_HEADERS), 507),
+        ):
+            assert problem["code"] == ErrorCode.STORE_FULL
+            assert f"{2**62} must stay free (INTRASPLAT_MIN_FREE_BYTES)" in problem["remedy"]
+            (missing,) = re.findall(r"Free (\d+) bytes", problem["remedy"])
+            assert 2**61 < int(missing) <= 2**62 + len(CLIP) + 1000
+    for service in running_service(tmp_path, min_free_bytes=2**62, host="0.0.0.0", hosts=("127.0.0.1",)):
+        assert "Free space" in assert_problem(service.http.get("/readyz"), 503, "disk")["remedy"]
 
 
 def test_a_declared_length_that_is_too_large_is_refused_before_the_body_is_read(tmp_path: Path) -> None:

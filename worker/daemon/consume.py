@@ -247,6 +247,8 @@ class _Job:
         if is_full or (died and self._room.is_short()):
             if self._room.ran_out(self._claim.job_id):
                 return Died("found the disk full", excused=True)
+            if isinstance(result, Failed):
+                return result.model_copy(update={"error": self._room.full_error()})
         elif isinstance(result, Finished | Failed):
             self._room.sufficed(self._claim.job_id)
         return result

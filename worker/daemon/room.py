@@ -8,7 +8,8 @@ from collections import Counter
 
 from contract.store.disk import Disk
 from contract.store.store import Store
-from contract.wire.errors import UnavailableError
+from contract.wire.errors import ErrorCode, UnavailableError
+from contract.wire.job import JobError
 
 MIN_ROOM_BYTES = 16 * 2**20
 MAX_SHORTAGES = 3
@@ -26,6 +27,7 @@ class Room:
 
     def __init__(self, store: Store, min_free_bytes: int) -> None:
         self._store = store
+        self._min_free_bytes = min_free_bytes
         self._enough_bytes = max(min_free_bytes, MIN_ROOM_BYTES)
         self._needed_bytes = self._least_bytes = max(min_free_bytes // 4, MIN_ROOM_BYTES)
         self._began_bytes: float = 0
@@ -51,6 +53,16 @@ class Room:
         if not may_run_again:  # a caller may retry it, and it begins anew then
             del self._shortages[job_id]
         return may_run_again
+
+    def full_error(self) -> JobError:
+        """Why a job fails that has run out of room for good."""
+        began_mib = round(self._began_bytes / 2**20) if math.isfinite(self._began_bytes) else 0
+        problem = f"The worker's disk was full {MAX_SHORTAGES} times; {began_mib} MiB were free when the job began."
+        remedy = (
+            f"Free more than {began_mib} MiB on it, send a shorter clip, or raise INTRASPLAT_MIN_FREE_BYTES "
+            f"({self._min_free_bytes}), which keeps room free for jobs; then retry the job."
+        )
+        return JobError(code=ErrorCode.STORE_FULL, problem=problem, remedy=remedy)
 
     def sufficed(self, job_id: str) -> None:
         """Note that the job did not find the disk full."""

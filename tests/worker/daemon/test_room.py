@@ -111,6 +111,8 @@ def test_a_job_that_is_larger_than_the_disk_fails_as_such(tmp_path: Path, no_pau
     assert (record.state, record.attempt) == (JobState.FAILED, MAX_SHORTAGES)
     assert record.error is not None
     assert record.error.code is ErrorCode.STORE_FULL
+    assert "MiB were free when the job began" in record.error.problem
+    assert "INTRASPLAT_MIN_FREE_BYTES" in str(record.error.remedy)
 
 
 def test_a_job_that_is_retried_after_it_was_given_up_begins_anew(tmp_path: Path, free_bytes: list[int]) -> None:
