@@ -28,6 +28,7 @@ from contract.wire.options import JobOptions
 from service.audit import Audit
 from service.done import DoneJobs
 from service.purge import LOG_CLEARED_AFTER_S, NOTES, Purger
+from service.questions import Questions
 from service.retention import HOUR_S, Retention, check_retention, kept_hours
 from tests.service.test_tus import uploaded
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, running_service
@@ -64,9 +65,8 @@ def failed_job(service: ServiceUnderTest, job_id: str) -> str:
 
 def parts(service: ServiceUnderTest) -> tuple[Purger, Retention]:
     settings = Settings(data_dir=service.store.data_dir, retention_hours=1.0)
-    purger = Purger(
-        service.queue, service.store, Audit(AuditLog(service.store.data_dir)), DoneJobs(service.queue, service.store)
-    )
+    done = DoneJobs(service.queue, service.store, Questions())
+    purger = Purger(service.queue, service.store, Audit(AuditLog(service.store.data_dir)), done)
     return purger, Retention(settings, service.queue, service.store, purger)
 
 
@@ -248,7 +248,7 @@ def valkey(tmp_path: Path) -> Iterator[EmbeddedServer]:
 
 def test_a_purge_leaves_no_key_in_the_queues_server_that_names_the_job(valkey: EmbeddedServer, tmp_path: Path) -> None:
     queue, store = RedisQueue(valkey.url), Store(tmp_path / "data")
-    purger = Purger(queue, store, Audit(AuditLog(store.data_dir)), DoneJobs(queue, store))
+    purger = Purger(queue, store, Audit(AuditLog(store.data_dir)), DoneJobs(queue, store, Questions()))
     kept, purged = new_job_id(), new_job_id()
     for job_id in (kept, purged):
         files = JobFiles(clip="clip.mp4")
