@@ -1,6 +1,6 @@
 """How exactly is a moving camera's path found, of each path and motion of the phantom and of a real fixed camera?
 
-    python benchmarks/bm_poses.py [--motions breathing pull] [--paths pan ...] [--frames 64] [--out poses.csv]
+    python benchmarks/bm_poses.py [--motions breathing pull] [--paths pan ...] [--frames 64] [--seeds 0] [--out poses.csv]
 
 Draws stereo clips of 320x256 whose poses are withheld, and estimates them (`--poses estimate`). Prints and writes of
 each: absolute trajectory error in mm and degrees, root mean square after rigid alignment, of training frames and of
@@ -37,11 +37,13 @@ def main() -> None:
     parser.add_argument("--motions", nargs="+", default=["breathing", "pull"])
     parser.add_argument("--paths", nargs="+", choices=PATHS, default=PATHS)
     parser.add_argument("--frames", type=int, default=64)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--holdout", default="every8")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     clips = [
-        f"phantom:{motion}{'' if path == 'still' else '+' + path}:{arguments.frames}frames:stereo"
+        f"phantom:{motion}{'' if path == 'still' else '+' + path}:{arguments.frames}frames:seed{seed}:stereo"
+        for seed in arguments.seeds
         for motion in arguments.motions
         for path in arguments.paths
     ]

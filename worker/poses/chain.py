@@ -15,7 +15,7 @@ import numpy as np
 
 from worker.input.clip import spread
 from worker.poses.links import Frames, Link
-from worker.poses.rigid import Reals, align, inverse
+from worker.poses.rigid import Reals, align, exp, inverse, log
 
 KEY_OVERLAP = 0.6
 KEY_FRAMES = 16
@@ -45,23 +45,47 @@ class Chain:
 
 def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None) -> Chain:
     """Follow the training frames, link by link."""
-    key, flow, poses, links, keys = train[0], None, {train[0]: np.eye(4)}, list[Link](), [train[0]]
-    done = 0
+    poses, links, keys = {train[0]: np.eye(4)}, list[Link](), [train[0]]
+    flow = None
+
+    def linked(i: int, last: int) -> tuple[Link, float]:
+        """The link from the present keyframe, which places frame i, and the share of the keyframe that it explains."""
+        key, start = keys[-1], inverse(_ahead(poses, last, i)) @ poses[keys[-1]]
+        link = frames.link(key, i, frames.predicted(key, start)[0] if flow is None else flow)
+        aligned = align(frames.camera, link.before, link.after, link.trust, start)
+        poses[i] = poses[key] @ inverse(aligned.motion)
+        return link, link.agreeing(aligned.residual_px)
+
+    def turn_to(i: int) -> None:
+        """Make frame i the present keyframe."""
+        links.extend(_from_behind(frames, i, [each for each in train if keys[-1] < each < i]))
+        keys.append(i)
+
     for last, i in pairwise(train):
-        link = frames.link(key, i, flow)
-        start = inverse(poses[last]) @ poses[key]
-        poses[i] = poses[key] @ inverse(align(frames.camera, link.before, link.after, link.trust, start).motion)
+        link, share = linked(i, last)
+        if share < MIN_OVERLAP and keys[-1] != last:  # most was lost: the last frame shows more of it
+            turn_to(last)
+            flow = None
+            link, _ = linked(i, last)
         links.append(link)
-        flow, done = link.flow, done + 1
-        if link.overlap < KEY_OVERLAP or done == KEY_FRAMES:
-            links += _from_behind(frames, i, [each for each in train if key < each < i])
-            key, flow, done = i, None, 0
-            keys.append(i)
+        flow = link.flow
+        if link.overlap < KEY_OVERLAP or train.index(i) - train.index(keys[-1]) == KEY_FRAMES:
+            turn_to(i)
+            flow = None
         on_progress(train.index(i) / (len(train) - 1))
     links += _loops(frames, keys, poses)
     return Chain(
         train, np.stack([poses[i] for i in train]), [each for each in links if each.overlap >= MIN_OVERLAP], keys
     )
+
+
+def _ahead(poses: dict[int, Reals], last: int, index: int) -> Reals:
+    """Where the camera is in a frame after the last one if it goes on as it went."""
+    before = max((each for each in poses if each < last), default=last)
+    if before == last:
+        return poses[last]
+    step = log(poses[last] @ inverse(poses[before]))
+    return exp(step * (index - last) / (last - before)) @ poses[last]
 
 
 def _from_behind(frames: Frames, key: int, between: Sequence[int]) -> list[Link]:

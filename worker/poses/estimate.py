@@ -12,26 +12,31 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from worker.input.clip import DepthClip, spread
 from worker.machine.opencv import one_opencv_thread
+from worker.poses.certainty import aligned_sigma, by_place_and_turn
 from worker.poses.chain import chained
 from worker.poses.fitting import Fit, fitted
-from worker.poses.gauge import Gauged, gauged
+from worker.poses.gauge import RIGID_PER_BENT, Gauged, gauged
 from worker.poses.links import Frames, Link
-from worker.poses.rigid import Reals, align, exp, inverse, log
+from worker.poses.rigid import Reals, align, between, inverse, log
 
 MAX_FITTED = 128
 """Frames that are fitted together; in a longer clip the others are placed between them."""
 CHAINING, FITTING = 0.45, 0.45
 """Shares of the progress."""
-AGREES_PX, MIN_AGREEING, GOOD = 1.5, 0.15, 0.4
-"""A frame is sure if such a share of a keyframe's tissue is found in it this near to where the fit expects it.
+MIN_AGREEING, GOOD = 0.15, 0.4
+"""A frame is sure if such a share of a keyframe's tissue is found in it where the fit expects it.
 A frame that is placed asks no second one with the last share."""
 MOVED_MM, MOVED_DEG = 1.2, 0.6
 """Root mean square about its mean below which a camera counts as fixed."""
-MAX_DEFORMED_PX, LARGE_MM, LARGE_DEG = 0.6, 12.0, 6.0
-"""Without a course to go by, tissue that deforms by more than this may be all that moves, up to these sizes."""
+UNSURE_MM, UNSURE_DEG = 1.25, 1.0
+"""Standard deviations beyond which camera and tissue may have been confused."""
+LARGE_MM, LARGE_DEG = 12.0, 6.0
+"""Without a course to go by, such tissue may be all that moves, up to these sizes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +44,7 @@ class FoundPath:
     """The camera's path.
 
     world_from_camera  [T, 4, 4] mm; the world is the first training frame's camera
-    sigma_mm, sigma_deg  typical standard deviation
+    sigma_mm, sigma_deg  standard deviation that is expected of it, after one rigid motion laid it on the truth
     alone_mm, alone_deg  the same without what follows the tissue's courses
     extent_mm, extent_deg  largest distance and angle between two cameras; path_mm: length of the path
     spread_mm, spread_deg  root mean square about the mean
@@ -47,7 +52,6 @@ class FoundPath:
     tissue_mm   root mean square of the common motion that was given to the tissue
     period_frames  of the tissue's motion, or None
     unsure      frames whose pose is not to be relied on
-    told_apart  False: tissue deforms, and the clip is too short to tell its motion from the camera's
     """
 
     world_from_camera: Reals
@@ -64,13 +68,17 @@ class FoundPath:
     tissue_mm: float
     period_frames: float | None
     unsure: tuple[int, ...]
-    told_apart: bool
+
+    @property
+    def confused(self) -> bool:
+        """Whether the tissue's motion may have been taken for the camera's, or the camera's for the tissue's."""
+        return self.sigma_mm > UNSURE_MM or self.sigma_deg > UNSURE_DEG
 
     @property
     def moves(self) -> bool:
         """Whether the camera moved, beyond doubt."""
         large = self.extent_mm > LARGE_MM or self.extent_deg > LARGE_DEG
-        return self.seems_to_move and (self.told_apart or large)
+        return self.seems_to_move and (self.period_frames is not None or large or not self.confused)
 
     @property
     def seems_to_move(self) -> bool:
@@ -105,8 +113,7 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
     gauge = gauged(fit.poses, t, fit.field.courses, fit.field.sizes_mm(float(fit.middle_mm[2])), fit.middle_mm, half_mm)
     path = np.tile(np.eye(4), (clip.frame_count, 1, 1))
     path[list(used)] = gauge.poses
-    agreeing = _agreeing(fit, chain.links)
-    unsure = [i for i in used[1:] if agreeing.get(i, 0.0) < MIN_AGREEING]
+    unsure = _apart(used, fit, chain.links)
     others = sorted(set(range(clip.frame_count)) - set(used) - set(clip.left_out))
     for done, i in enumerate(others):
         pose, share = _placed(frames, used, fit, gauge, i)
@@ -114,40 +121,47 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
         frames.forget(i)
         unsure += [i] if share < MIN_AGREEING else []
         on_progress(1 - (1 - CHAINING - FITTING) * (1 - done / len(others)))
-    _fill(path, sorted({*used, *others}), clip.left_out)
-    return _told(path, used, fit, gauge, frames, unsure)
+    known = sorted({*used, *others})
+    for i in clip.left_out:
+        path[i] = between(known, path[known], i)
+    return _told(path, used, fit, gauge, half_mm, frames, unsure)
 
 
 def _unknown(count: int) -> FoundPath:
     """No path: no two frames show the same tissue."""
     still = np.tile(np.eye(4), (count, 1, 1))
     nothing = dict.fromkeys((each.name for each in fields(FoundPath) if each.type == "float"), 0.0)
-    return FoundPath(still, period_frames=None, unsure=tuple(range(count)), told_apart=False, **nothing)
+    return FoundPath(still, period_frames=None, unsure=tuple(range(count)), **nothing)
 
 
-def _agreeing(fit: Fit, links: Sequence[Link]) -> dict[int, float]:
-    """For each frame, the largest share of a keyframe's tissue that a link finds where the fit expects it."""
-    found: dict[int, float] = {}
-    for link, residual in zip(links, fit.residual_px, strict=True):
-        share = link.overlap * float(np.mean(residual < AGREES_PX)) if len(residual) else 0.0
-        for end in (link.a, link.b):
-            found[end] = max(found.get(end, 0.0), share)
-    return found
+def _apart(used: Sequence[int], fit: Fit, links: Sequence[Link]) -> list[int]:
+    """The frames that no chain of links, each of which finds enough tissue where the fit expects it, ties to most."""
+    place = {index: k for k, index in enumerate(used)}
+    tied = [
+        (place[link.a], place[link.b])
+        for link, residual_px in zip(links, fit.residual_px, strict=True)
+        if link.agreeing(residual_px) >= MIN_AGREEING
+    ]
+    ends = np.array(tied, np.intp).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(tied)), (ends[0], ends[1])), shape=(len(used), len(used)))
+    _, piece = connected_components(graph, directed=False)
+    most = np.bincount(piece).argmax()
+    return [index for index, each in zip(used, piece, strict=True) if each != most]
 
 
 def _placed(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, index: int) -> tuple[Reals, float]:
     """A frame's camera, from its own picture against the nearest fitted frames; the share that agrees."""
-    course = fit.field.course_at(index, used)
+    course, guess = fit.field.course_at(index, used), between(used, fit.poses, index)
     found = []
     for number in np.argsort(np.abs(np.asarray(used) - index), kind="stable")[:2]:
-        link = frames.link(used[number], index)
         pose = fit.poses[number]
+        link = frames.link(used[number], index, frames.predicted(used[number], inverse(guess) @ pose)[0])
         points = frames.camera.points_mm(link.before)
         world = points @ pose[:3, :3].T + pose[:3, 3]
         moved = world + fit.field.displacement(world, course - fit.field.courses[number])
         seen = frames.camera.seen((moved - pose[:3, 3]) @ pose[:3, :3])  # as that frame would see it
         aligned = align(frames.camera, seen, link.after, link.trust, np.eye(4))
-        share = link.overlap * float(np.mean(aligned.residual_px < AGREES_PX)) if len(link.cells) else 0.0
+        share = link.agreeing(aligned.residual_px)
         found.append((share, gauge.tissue_at(course) @ pose @ inverse(aligned.motion)))
         if share > GOOD:
             break
@@ -155,34 +169,22 @@ def _placed(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, index:
     return pose, share
 
 
-def _fill(path: Reals, known: Sequence[int], left_out: Sequence[int]) -> None:
-    """Give frames that nobody looks at poses between their neighbours'."""
-    for i in left_out:
-        before = max((each for each in known if each < i), default=None)
-        after = min((each for each in known if each > i), default=None)
-        if before is None or after is None:
-            path[i] = path[after if before is None else before]
-            continue
-        step = log(path[after] @ inverse(path[before]))
-        path[i] = exp(step * (i - before) / (after - before)) @ path[before]
-
-
 def _told(
-    path: Reals, used: Sequence[int], fit: Fit, gauge: Gauged, frames: Frames, unsure: Sequence[int]
+    path: Reals, used: Sequence[int], fit: Fit, gauge: Gauged, half_mm: float, frames: Frames, unsure: Sequence[int]
 ) -> FoundPath:
     mine = path[list(used)]
     places = mine[:, :3, 3]
     turns = np.degrees([log(inverse(mine[0]) @ each)[3:] for each in mine])
     residual, weight = np.concatenate(fit.residual_px), np.concatenate(fit.weight)
     px = float(np.median(residual[weight > 0.25])) if (weight > 0.25).any() else float("inf")
-    deformed_px = float(np.median(residual))
     twists = np.stack([log(each) for each in gauge.tissue])
     shifts = twists[:, :3] + np.cross(twists[:, 3:], fit.middle_mm)
-    sigma = np.sqrt(np.square(gauge.sigma).mean(0))
+    sure = [k for k, index in enumerate(used) if index not in unsure]
+    sigma_mm, sigma_deg = _sigma(fit, gauge, half_mm, sure)
     return FoundPath(
         world_from_camera=path,
-        sigma_mm=float(np.linalg.norm(sigma[:3])),
-        sigma_deg=float(np.degrees(np.linalg.norm(sigma[3:]))),
+        sigma_mm=sigma_mm,
+        sigma_deg=sigma_deg,
         path_mm=float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()),
         extent_mm=_extent(places),
         extent_deg=_extent(turns),
@@ -194,8 +196,21 @@ def _told(
         tissue_mm=float(np.sqrt(np.square(shifts - shifts.mean(0)).sum(1).mean())),
         period_frames=fit.field.period,
         unsure=tuple(sorted(unsure)),
-        told_apart=fit.field.period is not None or deformed_px < MAX_DEFORMED_PX,
     )
+
+
+def _sigma(fit: Fit, gauge: Gauged, half_mm: float, sure: Sequence[int]) -> tuple[float, float]:
+    """(mm, degrees) expected of the path where it is sure: by the noise of the links, and by the choice of the gauge.
+
+    If no course explains what deforms, nothing tells the tissue's rigid motion, of the size usual for such a
+    deformation, from the camera's.
+    """
+    covariance = by_place_and_turn(fit.grams.covariance(fit.field), fit.poses) + gauge.covariance
+    mm, deg = aligned_sigma(covariance, fit.poses, sure)
+    if fit.field.period is None:
+        common_mm = RIGID_PER_BENT * np.sqrt(3) * fit.grams.bent_mm(fit.field, float(fit.middle_mm[2]))
+        mm, deg = np.hypot(mm, common_mm), np.hypot(deg, np.degrees(common_mm / half_mm))
+    return float(mm), float(deg)
 
 
 def _alone(values: Reals, courses: Reals) -> float:

@@ -56,6 +56,16 @@ class Field:
         """[3 F] inverse variance that each coefficient is expected to have."""
         return np.asarray(np.square(SMOOTH**self.degrees / USUAL_MM))
 
+    @property
+    def rigid(self) -> Reals:
+        """[3 F, 6] the coefficients of six motions that move a flat tissue rigidly: along the axes, and about them."""
+        found = np.zeros((3 * powers_of(self.degree), 6))
+        found[:3, :3] = np.eye(3)
+        for axis, turn in enumerate(np.eye(3)):  # the polynomials 1, y, x
+            found[3:6, 3 + axis] = np.cross(turn, [0, self.half[1], 0])
+            found[6:9, 3 + axis] = np.cross(turn, [self.half[0], 0, 0])
+        return found
+
     def powers(self, places_mm: Reals) -> Reals:
         """[M, F] the polynomials: 1, y, x, y^2, x y, x^2, ..."""
         x, y = ((places_mm[:, :2] - self.middle) / self.half).T

@@ -24,6 +24,8 @@ from worker.poses.rigid import Reals, StereoCamera, exp
 ROUGH_PX, FINE_PX = (4.0, 3.0, 2.0), (2.0, 1.5, 1.0, 0.8, 0.8)
 """Largest residual at which a match has a quarter of its weight, round by round: before the tissue's motion is known,
 and with it."""
+SETTLING = 4
+"""Rounds with the last of them until a wide pan has settled: without them it is 0.1 degrees farther off."""
 TUNED, FOLLOWED = (2, 4), (1, 2, 3)
 """Of the fine rounds: those that tune the period, and those that follow the courses where they are free."""
 DEGREE, WIDE_DEGREE, WIDE = 3, 5, 1.5
@@ -46,7 +48,7 @@ class Fit:
     field        the tissue's motion
     middle_mm    [3] the middle of the tissue seen
     residual_px, weight  of each link [M]: lengths of the residuals, robust weights
-    loss         mean of r^2 / (1 + r^2) over the matches
+    grams        what the links say of what is left to explain
     """
 
     poses: Reals
@@ -54,27 +56,28 @@ class Fit:
     middle_mm: Reals
     residual_px: Sequence[Reals]
     weight: Sequence[Reals]
-    loss: float
+    grams: Grams
 
 
 def fitted(camera: StereoCamera, chain: Chain, on_progress: Callable[[float], None] = lambda share: None) -> Fit:
     """Cameras and the tissue's motion. on_progress gets the share of the rounds done, and what it raises is raised."""
-    fitting, rounds = _Fitting(camera, chain), len(ROUGH_PX) + len(FINE_PX)
+    fitting, rounds = _Fitting(camera, chain), len(ROUGH_PX) + len(FINE_PX) + SETTLING
     for done, scale_px in enumerate(ROUGH_PX):
         on_progress(done / rounds)
         fitting.improve(scale_px)
-    if not fitting.find_period(FINE_PX[0]):
-        for done, scale_px in enumerate(FINE_PX, len(ROUGH_PX)):
-            on_progress(done / rounds)
-            fitting.improve(scale_px)
-        return fitting.result()
-    periodic, free = fitting, copy(fitting)  # nothing is changed in place
+    best, periodic = fitting, fitting.find_period(FINE_PX[0])
+    free = copy(fitting)  # nothing is changed in place
     for place, scale_px in enumerate(FINE_PX):
         on_progress((len(ROUGH_PX) + place) / rounds)
-        (periodic.tune if place in TUNED else periodic.improve)(scale_px)
-        (free.follow if place in FOLLOWED else free.improve)(scale_px)
-    one, two = periodic.result(), free.result()
-    return two if two.loss < (1 - MIN_GAIN) * one.loss else one
+        (fitting.tune if periodic and place in TUNED else fitting.improve)(scale_px)
+        if periodic:
+            (free.follow if place in FOLLOWED else free.improve)(scale_px)
+    if periodic and free.loss() < (1 - MIN_GAIN) * fitting.loss():
+        best = free
+    for place in range(SETTLING):
+        on_progress((len(ROUGH_PX) + len(FINE_PX) + place) / rounds)
+        best.improve(FINE_PX[-1])
+    return best.result()
 
 
 class _Fitting:
@@ -135,11 +138,16 @@ class _Fitting:
         self._start_with(grams, periods[best] * NEAR)
         return True
 
-    def result(self) -> Fit:
+    def loss(self) -> float:
+        """Mean of r^2 / (1 + r^2) over the matches before the last step."""
         squared = np.square(np.concatenate(self.residual_px))
         trust = np.concatenate([each.trust for each in self.links])
-        loss = float((trust * squared / (1 + squared)).sum() / trust.sum())
-        return Fit(self.poses, self.field, self.middle_mm, self.residual_px, self.weight, loss)
+        return float((trust * squared / (1 + squared)).sum() / trust.sum())
+
+    def result(self) -> Fit:
+        """The fit as it is now."""
+        grams = self._measured(FINE_PX[-1])
+        return Fit(self.poses, self.field, self.middle_mm, self.residual_px, self.weight, grams)
 
     def _start_with(self, grams: Grams, periods: Reals) -> None:
         """Take the best of the periods and solve for the field anew. grams: as without any field."""

@@ -20,7 +20,7 @@ from worker.poses.rigid import Reals, cross, exp, log
 RIGID_PER_BENT = 3.0
 """Standard deviation of the tissue's rigid motion over the size of its deformation of the same course."""
 NOISE_MM = 0.05
-SLOW, QUICK = 0.4, 0.25
+SLOW, QUICK = 0.6, 0.25
 """Least length of the trend and largest of the shake, over the deformation's period."""
 USUAL_MM, USUAL_SHAKE_MM, USUAL_QUICK = 5.0, 0.3, 0.12
 """Of the path: size of the trend and of the shake; the shake's length over the deformation's period. The trend's usual
@@ -32,6 +32,8 @@ STARTS = ((0.5, 0.2), (0.5, 2.0), (2.0, 0.2), (2.0, 2.0))
 SEARCHED = 48
 """Frames, spread over the clip, on which that search looks."""
 TRIALS, ROUNDS = 150, 3
+MIN_FURTHER = 0.25
+"""Periods beyond the first that a clip is taken to show, at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +42,14 @@ class Gauged:
 
     poses    [K, 4, 4] world_from_camera; the first is as it was
     tissue   [K, 4, 4] the rigid motion that was given to the tissue, 1 in the first frame
-    sigma    [K, 6]    standard deviation of each camera by this choice: mm, radians
+    covariance  [6 K, 6 K]  of the cameras' places (mm) and turns (radians) by this choice
     first    [S]       the courses in the first frame
     given    [S, 6]    (mm, radians) about pivot_mm [3] for a course of 1
     """
 
     poses: Reals
     tissue: Reals
-    sigma: Reals
+    covariance: Reals
     first: Reals
     given: Reals
     pivot_mm: Reals
@@ -71,7 +73,7 @@ def gauged(poses: Reals, frames: Reals, courses: Reals, bent_mm: Reals, pivot_mm
     count, kinds = courses.shape
     still = np.tile(np.eye(4), (count, 1, 1))
     if not kinds:
-        return Gauged(poses, still, np.zeros((count, 6)), np.zeros(0), np.zeros((0, 6)), pivot_mm)
+        return Gauged(poses, still, np.zeros((6 * count, 6 * count)), np.zeros(0), np.zeros((0, 6)), pivot_mm)
     far_mm = float(np.linalg.norm(pivot_mm))
     h = courses - courses[:1]
     sigma = np.outer(bent_mm * RIGID_PER_BENT, np.repeat([1.0, 1 / half_mm], 3))  # [S, 6]
@@ -91,10 +93,11 @@ def gauged(poses: Reals, frames: Reals, courses: Reals, bent_mm: Reals, pivot_mm
         covariance = np.linalg.inv(normal)
         given = given + (covariance @ right).reshape(kinds, 6)
         now = _moved(poses, h, given, pivot_mm)
-    slopes = _slopes(now[:, :3, 3] - pivot_mm, h, 1.0)
-    variance = np.einsum("kci,ij,kcj->kc", slopes, covariance, slopes)
+    periods = (frames[-1] - frames[0]) / period
+    covariance *= (periods / max(periods - 1, MIN_FURTHER)) ** 2  # what is likely was learnt from this clip alone
+    slopes = _slopes(now[:, :3, 3] - pivot_mm, h, 1.0).reshape(6 * count, -1)
     tissue = _moved(still, h, given, pivot_mm)
-    return Gauged(now, tissue, np.sqrt(np.maximum(variance, 0)), courses[0], given, pivot_mm)
+    return Gauged(now, tissue, slopes @ covariance @ slopes.T, courses[0], given, pivot_mm)
 
 
 def _period(frames: Reals, sized: Reals) -> float:

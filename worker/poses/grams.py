@@ -142,6 +142,30 @@ class Grams:
         found = np.linalg.solve(normal, right.ravel()).reshape(count, size)
         return found[:, :6], found[:, 6:]
 
+    def covariance(self, field: Field) -> Reals:
+        """[6 K, 6 K] of the cameras' twists, whatever the field does but for rigid motions of all tissue.
+
+        Those and the cameras are told apart by the gauge, not by links.
+        """
+        normal, kinds = self._twists(), len(field.weight)
+        if kinds:
+            bends, mixed, _ = self._bends(field.courses)
+            even, _ = np.linalg.qr(field.rigid, mode="complete")
+            bent = np.kron(np.eye(kinds), even[:, field.rigid.shape[1] :])
+            mixed = mixed @ bent
+            ridge = np.diag(np.tile(field.ridge, kinds))
+            normal -= mixed @ np.linalg.solve(bent.T @ (bends + ridge) @ bent, mixed.T)
+        return np.asarray(np.linalg.inv(normal))
+
+    def bent_mm(self, field: Field, depth_mm: float) -> float:
+        """Root mean square over the links of the deformation that the field does not explain, mm."""
+        squares = []
+        for gram in self.gram:
+            normal = gram[:-1, :-1] + np.diag(np.concatenate([np.full(6, FREE), field.ridge]))
+            left = replace(field, weight=np.linalg.solve(normal, -gram[:-1, -1])[None, 6:])
+            squares.append(left.sizes_mm(depth_mm)[0] ** 2)
+        return float(np.sqrt(np.mean(squares)))
+
     def without(self, field: Field) -> Grams:
         """What the links would say if the field were not there."""
         return self.shifted(-(self.change(field) @ field.weight))

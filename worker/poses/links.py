@@ -35,6 +35,8 @@ ROUND_TRIP_PX = 1.0
 """A difference of this much between a patch's way there and back halves the trust in its match."""
 MIN_TRUST, MIN_MATCH_TRUST = 0.5, 0.1
 """Confidence of depth that a match needs at both ends; what is left of it for a match to count."""
+AGREES_PX = 1.5
+"""Residual below which a match is where it is expected."""
 PSEUDO_BASELINE_MM = 4.3
 """Where depth was given: as of a stereo camera whose eyes stand so far apart."""
 
@@ -74,6 +76,10 @@ class Link:
     trust: Reals
     overlap: float
     flow: Floats = field(repr=False)
+
+    def agreeing(self, residual_px: Reals) -> float:
+        """The share of a's cells with depth found where they were expected; residual_px [M] of the matches."""
+        return self.overlap * float(np.mean(residual_px < AGREES_PX)) if len(residual_px) else 0.0
 
 
 class Frames:
@@ -117,9 +123,17 @@ class Frames:
         flow = self._solver.calc(one.grey, two.grey, None if start is None else start.copy())
         columns, rows = self._matched(one)
         places = np.stack([columns, rows], axis=1).astype(np.float32)
-        guess = places + flow[rows, columns]
-        there = _patches(one.even, two.even, places, guess)
-        back = _patches(two.even, one.even, there, places)
+        height, width = one.grey.shape
+        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+        warped = cv2.remap(
+            two.even, grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=128
+        )
+        near = _patches(one.even, warped, places, places)
+        back = _patches(warped, one.even, near, places)
+        moved = cv2.remap(
+            flow, near[:, :1], near[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=LOST
+        )
+        there = near + moved[:, 0]
         x, y = there.T[:, :, None]
 
         def at(values: Floats) -> Floats:

@@ -24,8 +24,6 @@ STAGE = "poses"
 MIN_FRAMES = 2
 MAX_UNSURE = 0.5
 """Share of a clip's frames whose pose may be unsure; with more, there is no path."""
-UNSURE_MM, UNSURE_DEG = 1.5, 1.0
-"""Standard deviations beyond which camera and tissue may have been confused."""
 
 
 def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, timings: Timings) -> DepthClip:
@@ -63,7 +61,7 @@ def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) 
         text = f"The camera's pose could not be found in {len(found.unsure)} of {clip.frame_count} frames: too little "
         text += "tissue with texture and depth is common to them. The camera was taken as fixed."
         return _fixed(clip, "was taken as fixed", None, Notice.warning(NoticeCode.POSES_UNSURE, text))
-    if not found.seems_to_move:
+    if not found.seems_to_move and not found.confused:
         return _fixed(clip, f"is fixed: its path would spread by {found.spread_mm:.1f} mm", found)
     if options.poses == "auto" and not found.moves:
         text = (
@@ -72,18 +70,19 @@ def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) 
         )
         return _fixed(clip, "was taken as fixed", found, Notice.warning(NoticeCode.CAMERA_OR_TISSUE, text))
     warnings = []
-    if found.sigma_mm > UNSURE_MM or found.sigma_deg > UNSURE_DEG or not found.told_apart:
+    if found.confused:
         text = (
-            f"The tissue moves as a whole in step with the camera: poses may be off by {found.sigma_mm:.1f} mm and "
-            f"{found.sigma_deg:.1f} degrees, and the tissue's motion by as much."
+            "The clip hardly tells the camera's motion from the tissue's: poses may be off by "
+            f"{found.sigma_mm:.1f} mm and {found.sigma_deg:.1f} degrees, and the tissue's motion by as much."
         )
         warnings.append(Notice.warning(NoticeCode.CAMERA_OR_TISSUE, text))
     if found.unsure:
         text = f"The camera's pose could not be found in {len(found.unsure)} of {clip.frame_count} frames."
         warnings.append(Notice.warning(NoticeCode.POSES_UNSURE, text))
     text = (
-        f"poses: the camera moved by {found.extent_mm:.1f} mm and {found.extent_deg:.1f} degrees; "
-        f"its path fits the rigid parts within {found.rigid_fit_mm:.2f} mm"
+        f"poses: the camera moved by {found.extent_mm:.1f} mm and {found.extent_deg:.1f} degrees; its path fits the "
+        f"rigid parts within {found.rigid_fit_mm:.2f} mm, and is good to {found.sigma_mm:.1f} mm and "
+        f"{found.sigma_deg:.1f} degrees"
     )
     told = _told(clip, "estimated", found)
     clip = placed(clip, found.world_from_camera)

@@ -7,6 +7,7 @@ of about one size in all three, which depth in mm has not (its noise grows with 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,8 @@ STEPS = 8
 """Gauss-Newton steps at most for one link."""
 MIN_SCALE_PX, MAX_SCALE_PX = 0.25, 2.0
 """Of the residual, in px of the coarse grid, at which a match has half its weight: least and largest."""
+LONGEST = np.repeat([20.0, 0.2], 3)
+"""The most that one step changes a coordinate, mm and radians: matches that contradict each other lead nowhere."""
 CONVERGED = 1e-5
 """Length of a twist (mm, and radians times 100) at which the steps end."""
 
@@ -63,6 +66,18 @@ def inverse(motion: Reals) -> Reals:
     back[..., :3, 3] = -(rotation @ motion[..., :3, 3:])[..., 0]
     back[..., 3, 3] = 1
     return back
+
+
+def between(frames: Sequence[int], poses: Reals, index: int) -> Reals:
+    """The pose [4, 4] at a frame if the camera moves evenly between those before and after it.
+
+    frames [K] rise; poses are [K, 4, 4].
+    """
+    after = int(np.searchsorted(frames, index))
+    if after in {0, len(frames)}:
+        return np.asarray(poses[min(after, len(frames) - 1)])
+    share = (index - frames[after - 1]) / (frames[after] - frames[after - 1])
+    return exp(log(poses[after] @ inverse(poses[after - 1])) * share) @ poses[after - 1]
 
 
 @dataclass(frozen=True)
@@ -124,32 +139,34 @@ class Aligned:
 def align(camera: StereoCamera, before: Reals, after: Reals, trust: Reals, start: Reals) -> Aligned:
     """The rigid motion that takes measurements before [M, 3] to those after [M, 3].
 
-    Iteratively reweighted least squares with the weights of Geman and McClure, whose scale follows the median residual.
+    Iteratively reweighted least squares with the weights of Geman and McClure, whose scale follows the median residual,
+    and is at most half as large from step to step until it is small: a start far off must not hold on to matches that
+    are wrong and fit by chance.
     trust [M] multiplies the weights; start [4, 4] is the first guess.
     """
     points = camera.points_mm(before)
     motion, there = start, camera.slopes(camera.points_mm(after))
     damping = np.diag([1e-6] * 3 + [1e-3] * 3)
+    largest_px = float("inf")
     for _ in range(STEPS):
         moved = points @ motion[:3, :3].T + motion[:3, 3]
         off = camera.seen(moved) - after
         squared = np.square(off).sum(1)
-        weight = trust * weights(squared, trust)
+        scale_px = np.clip(2 * np.sqrt(weighted_median(squared, trust)), MIN_SCALE_PX, largest_px)
+        weight = trust / np.square(1 + squared / scale_px**2)
+        largest_px = max(scale_px / 2, MAX_SCALE_PX)
         slopes = there
         weighted = slopes * weight[:, None, None]
         normal = np.einsum("mki,mkj->ij", weighted, slopes)
         step = -np.linalg.solve(normal + damping, np.einsum("mki,mk->i", weighted, off))
+        step /= max(1.0, *np.abs(step / LONGEST))
         motion = exp(step) @ motion
         if np.linalg.norm(step * [1, 1, 1, 100, 100, 100]) < CONVERGED:
             break
     spread = float((weight * squared).sum() / max(3 * weight.sum(), 1e-9))
+    u, _, vt = np.linalg.svd(motion[:3, :3])
+    motion[:3, :3] = u @ vt  # rounding would double from one frame to the next
     return Aligned(motion, np.sqrt(squared), weight, normal / max(spread, 1e-4))
-
-
-def weights(squared: Reals, trust: Reals) -> Reals:
-    """[M] Geman-McClure weights of squared residuals; their scale is that of the trusted matches' median."""
-    scale = np.clip(2 * np.sqrt(weighted_median(squared, trust)), MIN_SCALE_PX, MAX_SCALE_PX)
-    return np.asarray(1 / np.square(1 + squared / scale**2))
 
 
 def weighted_median(values: Reals, weight: Reals) -> float:

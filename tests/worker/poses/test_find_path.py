@@ -25,7 +25,7 @@ FRAMES = 24
 
 
 @cache
-def clip_of(motion: Motion, *camera: CameraPath) -> tuple[DepthClip, Reals]:
+def clip_of(motion: Motion, *camera: CameraPath, period_frames: float = 12.0) -> tuple[DepthClip, Reals]:
     """A stereo clip without poses, and the true ones. Callers share the arrays."""
     settings = PhantomSettings(
         width=160,
@@ -34,7 +34,7 @@ def clip_of(motion: Motion, *camera: CameraPath) -> tuple[DepthClip, Reals]:
         motion=motion,
         tools=(),
         camera=camera,
-        period_frames=12.0,
+        period_frames=period_frames,
         frame_rate_hz=10.0,
     )
     phantom = make_phantom(settings)
@@ -103,6 +103,36 @@ def test_a_camera_that_cannot_be_followed_is_told() -> None:
     assert found.poses is not None
     assert found.poses.source == "fixed"
     assert NoticeCode.POSES_UNSURE in [each.code for each in found.warnings]
+
+
+def test_a_fast_pan_is_followed() -> None:
+    clip, true = clip_of("still", "pan")
+    path = find_path(clip, training_frames(FRAMES, "every8"))
+    error = trajectory_error(path.world_from_camera, true)
+    assert error.mm < 1.5  # of 127 mm in a second; frames share half of their view with the next but one
+    assert error.deg < 1
+
+
+@pytest.mark.parametrize("camera", ["advance", "turn", "shake"])
+def test_less_than_a_breath_tells_no_camera_from_tissue_and_says_so(camera: CameraPath) -> None:
+    clip, true = clip_of("breathing", camera, period_frames=36.0)
+    train = training_frames(FRAMES, "every8")
+    path = find_path(clip, train)
+    error = trajectory_error(path.world_from_camera[train], true[train])
+    assert error.mm > 1.5
+    assert path.sigma_mm > error.mm / 2
+    assert path.confused
+    assert NoticeCode.CAMERA_OR_TISSUE in [each.code for each in posed(clip).warnings]
+
+
+def test_frames_that_show_nothing_of_the_others_are_told() -> None:
+    clip, _ = clip_of("still", "turn")
+    random = np.random.default_rng(0)
+    rgb = clip.rgb.copy()
+    rgb[10] = random.integers(0, 255, rgb[10].shape, np.uint8)
+    path = find_path(replace(clip, rgb=rgb), training_frames(FRAMES, "every8"))
+    assert path.unsure == (10,)
+    assert not path.confused
 
 
 def test_poses_that_are_not_there_cannot_be_asked_for() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from worker.poses.certainty import aligned_sigma
 from worker.poses.field import waves
 from worker.poses.gauge import gauged
 from worker.poses.rigid import Reals, exp, inverse
@@ -32,7 +33,7 @@ def found(camera: Reals, breath: Reals) -> tuple[Reals, float]:
     """The cameras that are found, and their standard deviation in mm."""
     bent_mm = np.array([0.6, 0.1, 0.6, 0.1])
     result = gauged(seen_as(camera, breath), FRAMES, waves(FRAMES, PERIOD), bent_mm, PIVOT_MM, 45.0)
-    return result.poses, float(np.sqrt(np.square(result.sigma[:, :3]).sum(1).mean()))
+    return result.poses, aligned_sigma(result.covariance, result.poses)[0]
 
 
 def test_a_fixed_camera_over_tissue_that_breathes_is_at_rest() -> None:

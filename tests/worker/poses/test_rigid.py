@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from worker.poses.rigid import StereoCamera, align, exp, inverse, log
+from worker.poses.rigid import StereoCamera, align, between, exp, inverse, log
 
 CAMERA = StereoCamera(fx=285.0, fy=285.0, cx=159.5, cy=127.5, baseline_mm=4.3)
 
@@ -40,3 +40,11 @@ def test_alignment_finds_the_motion_of_most_matches() -> None:
     assert np.linalg.norm(off[:3]) < 0.3
     assert np.linalg.norm(off[3:]) < np.radians(0.25)
     assert found.weight[:200].mean() < 0.1 < found.weight[200:].mean()
+
+
+def test_between_two_frames_the_camera_moves_evenly() -> None:
+    end = exp(np.array([4.0, 0.0, 0.0, 0.0, 0.4, 0.0]))
+    poses = np.stack([np.eye(4), end])
+    assert between([2, 6], poses, 3) == pytest.approx(exp(np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.0])))
+    assert (between([2, 6], poses, 1) == np.eye(4)).all()
+    assert (between([2, 6], poses, 9) == end).all()
