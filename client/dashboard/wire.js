@@ -6,6 +6,7 @@
  *   path_mm?: number | null,
  *   extent_mm?: number | null,
  *   extent_deg?: number | null,
+ *   steadied_mm?: number | null,
  *   sigma_mm?: number | null,
  *   sigma_deg?: number | null,
  *   rigid_fit_mm?: number | null,

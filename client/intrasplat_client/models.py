@@ -148,8 +148,10 @@ class CameraPoses(Model):
     """largest distance between two frames' cameras"""
     extent_deg: float | None = None
     """largest turn between two frames' cameras"""
+    steadied_mm: float | None = None
+    """how far given poses jumped at the tissue before they were steadied; None: they were not"""
     sigma_mm: float | None = None
-    """standard deviation by which camera and tissue may have been confused"""
+    """standard deviation that is expected of the path, laid on the true one"""
     sigma_deg: float | None = None
     """the same of the turn"""
     rigid_fit_mm: float | None = None

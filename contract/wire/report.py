@@ -111,8 +111,13 @@ class CameraPoses(BaseModel):
     )
     extent_mm: float | None = Field(default=None, ge=0, description="largest distance between two frames' cameras")
     extent_deg: float | None = Field(default=None, ge=0, description="largest turn between two frames' cameras")
+    steadied_mm: float | None = Field(
+        default=None,
+        ge=0,
+        description="how far given poses jumped at the tissue before they were steadied; None: they were not",
+    )
     sigma_mm: float | None = Field(
-        default=None, ge=0, description="standard deviation by which camera and tissue may have been confused"
+        default=None, ge=0, description="standard deviation that is expected of the path, laid on the true one"
     )
     sigma_deg: float | None = Field(default=None, ge=0, description="the same of the turn")
     rigid_fit_mm: float | None = Field(

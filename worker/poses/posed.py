@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
@@ -15,6 +16,7 @@ from contract.wire.report import CameraPoses
 from worker.input.clip import DepthClip, training_frames
 from worker.machine.hooks import Hooks
 from worker.machine.timing import Timings
+from worker.poses.given import MAX_JITTER, MIN_JITTER, jitter_mm, steadied
 from worker.poses.still import camera_rests
 
 if TYPE_CHECKING:  # a fixed camera needs none of it
@@ -22,6 +24,8 @@ if TYPE_CHECKING:  # a fixed camera needs none of it
 
 STAGE = "poses"
 MIN_FRAMES = 2
+WORTH = 0.7
+"""Share of the jumps that steadied poses may still be off by; with more, the given ones stay."""
 MAX_UNSURE = 0.5
 """Share of a clip's frames whose pose may be unsure; with more, there is no path."""
 
@@ -41,10 +45,12 @@ def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, ti
     if options.poses == "given" and not brought:
         problem = "asks for poses that come with the clip, and stereo clips bring none."
         raise InputError("options.poses", f"it {problem}", 'Say "auto" or "estimate", or give the EndoNeRF layout.')
-    if options.poses == "given" or (options.poses == "auto" and brought):
+    if options.poses == "given":
         return replace(clip, poses=CameraPoses(source="given"))
     train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.left_out))
     with timings.measure("poses_s"):
+        if options.poses == "auto" and brought:
+            return _given(clip, train, hooks)
         hooks.report_stage(STAGE, 0.0)
         if options.poses == "fixed" or len(train) < MIN_FRAMES:
             return _fixed(clip, "was taken as fixed")
@@ -53,6 +59,31 @@ def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, ti
         from worker.poses.estimate import find_path
 
         return _settled(clip, find_path(clip, train, lambda share: hooks.report_stage(STAGE, share)), options)
+
+
+def _given(clip: DepthClip, train: Sequence[int], hooks: Hooks) -> DepthClip:
+    """The clip with the poses that it brought, without their jumps if they jump to and fro and the pictures tell."""
+    told = CameraPoses(source="given")
+    jumps_mm, depth_mm = jitter_mm(clip, train)
+    if clip.intrinsics.fx * jumps_mm <= MIN_JITTER * clip.intrinsics.width * depth_mm:
+        return replace(clip, poses=told)
+    from worker.poses.estimate import find_path
+
+    found = find_path(clip, train, lambda share: hooks.report_stage(STAGE, share))
+    steady = steadied(clip.world_from_camera, found.world_from_camera, found.unsure)
+    if steady.jumps_mm < WORTH * jumps_mm:  # the pictures show the same: the camera itself shakes
+        return replace(clip, poses=told)
+    text = f"poses: the given ones jump to and fro by about {jumps_mm:.2f} mm at the tissue from frame to frame; "
+    if len(found.unsure) > MAX_UNSURE * clip.frame_count or steady.left_mm > WORTH * jumps_mm:
+        notice = Notice.info(NoticeCode.POSES, f"{text}the pictures do not place the frames better, so they stay")
+        return replace(clip, poses=told, assumptions=(*clip.assumptions, notice))
+    text += "each frame was moved to where its picture places it between its neighbours, which may leave "
+    notice = Notice.info(NoticeCode.POSES, f"{text}{steady.left_mm:.2f} mm")
+    clip = replace(clip, assumptions=(*clip.assumptions, notice))
+    if clip.intrinsics.fx * steady.left_mm > MAX_JITTER * clip.intrinsics.width * depth_mm:
+        text = f"The camera's poses, once steadied, may still be off by {steady.left_mm:.1f} mm at the tissue."
+        clip = replace(clip, warnings=(*clip.warnings, Notice.warning(NoticeCode.POSE_JITTER, text)))
+    return replace(placed(clip, steady.world_from_camera), poses=told.model_copy(update={"steadied_mm": jumps_mm}))
 
 
 def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) -> DepthClip:

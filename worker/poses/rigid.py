@@ -77,7 +77,7 @@ def between(frames: Sequence[int], poses: Reals, index: int) -> Reals:
     if after in {0, len(frames)}:
         return np.asarray(poses[min(after, len(frames) - 1)])
     share = (index - frames[after - 1]) / (frames[after] - frames[after - 1])
-    return exp(log(poses[after] @ inverse(poses[after - 1])) * share) @ poses[after - 1]
+    return np.asarray(exp(log(poses[after] @ inverse(poses[after - 1])) * share) @ poses[after - 1])
 
 
 @dataclass(frozen=True)

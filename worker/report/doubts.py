@@ -18,6 +18,7 @@ from contract.wire.notices import Notice, NoticeCode
 from worker.fusion import CLEAR_CONFIDENCE
 from worker.input.clip.split import REPEAT_LEVELS
 from worker.input.clip.types import DepthClip
+from worker.poses.given import MAX_JITTER, jitter_mm
 from worker.train.scoring import sample_frames
 
 MIN_FRAMES = 16
@@ -56,10 +57,6 @@ SURE = 128
 DEPTH_JUMP, MAX_JUMPING_SHARE = 0.1, 0.03
 """Of the depth from frame to frame, and of the tissue: 0.012 at most in clean clips, 0.05 with gross errors on 0.05."""
 MAX_PAIRS = 8
-MAX_JITTER = 0.003
-"""Of the picture's width: how far poses that jump to and fro move the tissue in it, 2 px of 640."""
-MAX_ROUGHNESS = 1.0
-"""Median change of step over median step: a smooth path has far less than 1, independent errors have 1.7."""
 
 
 def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
@@ -237,30 +234,14 @@ def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
 
 
 def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
-    """Poses that err independently jump to and fro: the change of step is larger than the step itself.
-
-    Looked at is the point on the optical axis at the tissue's median depth, which errors of place and of angle move.
-    """
-    wanted, pose = set(train), clip.world_from_camera
-    runs = [index for index in train if {index - 1, index + 1} <= wanted]
-    if (pose == pose[:1]).all():  # the camera stands still
-        return []
-    depths = (clip.depth_mm[index][clip.tissue[index] & (clip.depth_mm[index] > 0)] for index in clip.one_by_one(runs))
-    known = [float(np.median(each)) for each in depths if each.size]
-    if len(runs) < MIN_DOUBTFUL_FRAMES or not known:
-        return []
-    depth_mm = float(np.median(known))
-    looked_at = pose[:, :3, 3] + depth_mm * pose[:, :3, 2]
-    step = np.array([np.linalg.norm(looked_at[i + 1] - looked_at[i]) for i in runs])
-    change = np.array([np.linalg.norm(looked_at[i + 1] - 2 * looked_at[i] + looked_at[i - 1]) for i in runs])
-    jitter_mm = float(np.median(change)) / np.sqrt(6)  # of independent errors: the deviation of each, over its axes
-    jitter_px = clip.intrinsics.fx * jitter_mm / depth_mm
-    if jitter_px < MAX_JITTER * clip.intrinsics.width or np.median(change) < MAX_ROUGHNESS * np.median(step):
+    """Poses that jump to and fro still."""
+    jumps_mm, depth_mm = jitter_mm(clip, train)
+    if clip.intrinsics.fx * jumps_mm <= MAX_JITTER * clip.intrinsics.width * depth_mm:
         return []
     return [
         Notice.warning(
             NoticeCode.POSE_JITTER,
-            f"The camera's poses jump to and fro by about {jitter_mm:.1f} mm at the tissue from frame to frame: they "
+            f"The camera's poses jump to and fro by about {jumps_mm:.1f} mm at the tissue from frame to frame: they "
             "seem to be inexact, and the model takes their errors for motion.",
         )
     ]

@@ -121,12 +121,18 @@ def noisy_poses(clean: CleanClip, level: float, random: np.random.Generator) -> 
     again at the tissue. Frame 0, which defines the world, is right.
     """
     swinging = clean_of(_swinging(clean.phantom, POSE_SWING_DEG))
-    poses = swinging.clip.world_from_camera.copy()
-    for pose in poses[1:]:
-        rotation, _ = cv2.Rodrigues(random.normal(0, level / MEAN_DEPTH_MM, 3))
-        pose[:3, :3] = rotation @ pose[:3, :3]
-        pose[:3, 3] += random.normal(0, level, 3)
+    poses = noisy(swinging.clip.world_from_camera, level, random)
     return given(swinging, dataclasses.replace(swinging.clip, world_from_camera=poses))
+
+
+def noisy(world_from_camera: NDArray[np.float64], level_mm: float, random: np.random.Generator) -> NDArray[np.float64]:
+    """Poses [T, 4, 4], each but the first off by level_mm (one sigma per axis), and as much at the tissue by angle."""
+    poses = world_from_camera.copy()
+    for pose in poses[1:]:
+        rotation, _ = cv2.Rodrigues(random.normal(0, level_mm / MEAN_DEPTH_MM, 3))
+        pose[:3, :3] = rotation @ pose[:3, :3]
+        pose[:3, 3] += random.normal(0, level_mm, 3)
+    return poses
 
 
 def no_texture(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
