@@ -42,13 +42,21 @@ def add_remote(commands: Commands) -> None:
 
 def _add_submit(commands: Commands) -> None:
     parser = add_command(commands, "submit", "send a clip to a service and print its job's id", _submit)
-    parser.add_argument("clip", type=Path, metavar="INPUT", help="a video or a zip; both eyes, or the left one")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument(
+        "clip", type=Path, metavar="INPUT", nargs="?", help="a video or a zip; both eyes, or the left one"
+    )
     parser.add_argument(
         "right", type=Path, metavar="RIGHT", nargs="?", help="the right eye, if it is a file of its own"
     )
     parser.add_argument("--calibration", type=Path, metavar="F", help="JSON, OpenCV YAML or XML, or ini")
     parser.add_argument(
         "--masks", type=Path, metavar="F", help="zip of PNGs or a video: the instruments, of the left eye or of both"
+    )
+    source.add_argument(
+        "--clip-of",
+        metavar="JOB",
+        help="instead of INPUT: use this job's clip again, with its calibration and masks unless others are given",
     )
     add_options(parser, JobOptions)
     parser.add_argument("--idempotency-key", metavar="TEXT", help="the same key with the same clip is the same job")
@@ -103,6 +111,7 @@ def _submit(options: argparse.Namespace) -> int:
             job = client.reconstruct(
                 options.clip,
                 options.right,
+                clip_of=options.clip_of,
                 calibration=options.calibration,
                 masks=options.masks,
                 idempotency_key=options.idempotency_key,

@@ -84,17 +84,22 @@ class Partial:
 
     def sha256(self) -> str:
         """The SHA-256 of the file."""
-        digest = hashlib.sha256()
-        with self.path.open("rb") as file:
-            while piece := file.read(HASHED_AT_ONCE_BYTES):
-                digest.update(piece)
-        return digest.hexdigest()
+        return sha256_of(self.path)
 
     def give_to(self, job_id: str) -> None:
         """Say which job has the file, and let go of it here."""
         taken = self.declaration.model_copy(update={"job_id": job_id})
         replace_file(self.folder / DECLARATION, taken.model_dump_json().encode())
         self.path.unlink(missing_ok=True)
+
+
+def sha256_of(path: Path) -> str:
+    """The SHA-256 of a file, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while piece := file.read(HASHED_AT_ONCE_BYTES):
+            digest.update(piece)
+    return digest.hexdigest()
 
 
 def append(file: RawIOBase, piece: bytes) -> None:

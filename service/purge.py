@@ -45,6 +45,7 @@ class Receipt(BaseModel):
     bytes: dict[str, int] = Field(description="removed bytes by area")
     record: bool = Field(description="the queue holds no record, event or idempotency key of it")
     verified: bool = Field(description="it was looked whether anything is left, and nothing is")
+    clip_kept_by: list[str] = Field(default=[], description="other jobs that have the same clip (clip_of), and keep it")
 
 
 class Purger:

@@ -1,4 +1,4 @@
-"""POST /reconstruct: a clip, in one form or as finished uploads, becomes a job."""
+"""POST /reconstruct: a clip, in one form, as finished uploads or of an earlier job, becomes a job."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ from service.openapi import EXAMPLE_ID
 from service.partial import Partial, find_partial
 from service.problems import RETRY_AFTER_S, Problem, no_room
 from service.retention import check_retention
-from service.upload import LIMIT_REMEDY, PARTS, Received, UploadLimits, receive_upload
+from service.reuse import add_files_of, earlier_job, first_job
+from service.upload import CLIP_OF, LIMIT_REMEDY, PARTS, Received, UploadLimits, receive_upload
 
 router = APIRouter(tags=["jobs"])
 
@@ -40,20 +41,25 @@ MAX_SUBMISSION_BYTES = 128 * 1024
 """The limit of a JSON body."""
 JSON_REMEDY = 'Send ids of finished uploads by part, and options: {"clip": ID, "options": {"budget_s": 20}}.'
 UPLOAD_ID = {"type": "string", "pattern": JOB_ID_PATTERN, "description": "a finished upload (POST /uploads)"}
+CLIP_OF_ID = {
+    "type": "string",
+    "pattern": JOB_ID_PATTERN,
+    "description": "a job whose clip is used again, with its calibration and masks unless others are sent",
+}
 FILE = {"type": "string", "format": "binary"}
 
 
 def _body_schema(part: dict[str, str]) -> dict[str, Any]:
     parts = dict.fromkeys(PARTS, part)
-    one_clip = [{"required": ["clip"]}, {"required": ["left", "right"]}]
-    properties = {**parts, "options": JobOptions.model_json_schema()}
+    one_clip = [{"required": ["clip"]}, {"required": ["left", "right"]}, {"required": [CLIP_OF]}]
+    properties = {**parts, CLIP_OF: CLIP_OF_ID, "options": JobOptions.model_json_schema()}
     return {"type": "object", "properties": properties, "additionalProperties": False, "oneOf": one_clip}
 
 
 REQUEST_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "description": "clip, or left and right; a file name's ending tells the format",
+        "description": "clip, or left and right, or clip_of; a file name's ending tells the format",
         "content": {
             "multipart/form-data": {
                 "schema": _body_schema(FILE),
@@ -74,7 +80,7 @@ IdempotencyKey = Annotated[
 
 
 class Submission(BaseModel):
-    """The JSON body: ids of finished uploads by their part, and the options."""
+    """The JSON body: ids of finished uploads by their part, the job whose clip is used again, and the options."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -83,6 +89,7 @@ class Submission(BaseModel):
     right: str | None = None
     calibration: str | None = None
     masks: str | None = None
+    clip_of: str | None = None
     options: dict[str, object] = Field(default={})
 
     def uploads(self) -> dict[str, str]:
@@ -163,10 +170,10 @@ def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key:
     partials = {part: _finished(services, caller, part, upload_id) for part, upload_id in given.items()}
     job_ids = {partial.declaration.job_id for partial in partials.values()}
     if job_ids - {None}:
-        return _taken_before(services, job_ids, options)
-    received = Received(options=options.model_dump_json())
+        return _taken_before(services, job_ids, submission, options)
+    received = Received(options=options.model_dump_json(), clip_of=submission.clip_of)
     received.names = {part: partial.path.name for part, partial in partials.items()}
-    received.files()  # names what is missing before anything is read
+    received.check_clip()  # before anything is read
     with contextlib.ExitStack() as held:
         for partial in partials.values():
             held.enter_context(_held(partial))
@@ -227,12 +234,13 @@ def _finished(services: Deps, caller: Caller, part: str, upload_id: str) -> Part
     return partial
 
 
-def _taken_before(services: Deps, job_ids: set[str | None], options: JobOptions) -> JobRecord:
-    """The job that has the uploads, if all of them went into this one job and it has the same options."""
+def _taken_before(services: Deps, job_ids: set[str | None], submission: Submission, options: JobOptions) -> JobRecord:
+    """The job that has the uploads, if all of them went into this one job and it has the same clip and options."""
     job_id = next(job_id for job_id in job_ids if job_id is not None)
     known = services.queue.get(job_id)
     record = known or services.store.submission(job_id)
-    if len(job_ids) > 1 or record is None or record.options != options:
+    clip_of = submission.clip_of and first_job(services.store, submission.clip_of)
+    if len(job_ids) > 1 or record is None or (record.options, record.clip_of) != (options, clip_of):
         detail = f"An upload was used for the job {job_id} already."
         raise Problem(409, detail, remedy="Upload it again.", extensions={"job_id": job_id})
     # A clip that was accepted is never refused for want of room in a queue that has lost its record.
@@ -246,19 +254,28 @@ def _give(partials: Mapping[str, Partial], job_id: str) -> None:
 
 def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key: str | None) -> JobRecord:
     """Spool first, then queue: a job exists only for a clip that is on disk."""
+    options = parse_options(JobOptions, received.options)
+    check_retention(options, services.settings)
+    received.check_clip()
+    clip_of = None
+    if received.clip_of is not None:
+        earlier = earlier_job(services, caller, received.clip_of)
+        clip_of = first_job(services.store, earlier.job_id)
+        add_files_of(services, earlier, services.store.incoming_folder(job_id), received)
     record = JobRecord(
         job_id=job_id,
         tenant=caller.tenant,
         files=received.files(),
-        options=parse_options(JobOptions, received.options),
+        options=options,
         input_bytes=received.total_bytes,
         input_sha256=received.sha256(),
+        clip_of=clip_of,
         idempotency_key=key,
         created_at_s=time.time(),
     )
-    check_retention(record.options, services.settings)
     _look_at(services, job_id, received)
-    services.audit.record(AuditAction.ACCEPTED, caller, job_id)
+    outcome = "ok" if clip_of is None else f"ok (clip of {clip_of})"
+    services.audit.record(AuditAction.ACCEPTED, caller, job_id, outcome)
     with services.sweep.in_hand(job_id):
         services.store.accept(record)
         return _enqueue(services, record)

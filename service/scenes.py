@@ -21,6 +21,7 @@ from service.deps import AnyCaller, Deps, ListingLimit, Services, no_such_scene,
 from service.problems import Problem
 from service.purge import Receipt
 from service.renders import ModelTime, find_shown, image_response
+from service.reuse import others_with_clip
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
@@ -76,7 +77,8 @@ async def get_curve(scene_id: str, services: Services, caller: AnyCaller) -> Fil
 
 @router.get("/{scene_id}/masks", operation_id="get_masks", response_class=FileResponse)
 async def get_masks(scene_id: str, services: Services, caller: AnyCaller) -> FileResponse:
-    """The masks that were found, as a zip that POST /reconstruct takes as `masks`: correct them, send the clip again.
+    """The masks that were found, as a zip that POST /reconstruct takes as `masks`: correct them, and send
+    them with `clip_of`, which uses this scene's clip again.
 
     One PNG a frame in the pixels of the recorded left eye, 255 on instruments.
     """
@@ -118,7 +120,8 @@ def purge_scene(scene_id: str, services: Services, caller: AnyCaller) -> Receipt
     record = _known(services, scene_id)
     if record is None or not caller.owns(record):
         raise no_such_scene(scene_id, caller, record)
-    return services.purger.purge(scene_id, caller)
+    others = others_with_clip(services, record)
+    return services.purger.purge(scene_id, caller).model_copy(update={"clip_kept_by": others})
 
 
 def finished_job(services: Deps, caller: Caller, scene_id: str) -> JobRecord:

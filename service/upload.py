@@ -32,14 +32,17 @@ SUFFIXES = {
 PARTS = tuple(SUFFIXES)
 
 OPTIONS = "options"
+CLIP_OF = "clip_of"
+TEXTS = (OPTIONS, CLIP_OF)
+"""Parts that are text."""
 MAX_OPTIONS_BYTES = 64 * 1024
-MAX_BYTES = {OPTIONS: MAX_OPTIONS_BYTES, "calibration": MAX_CALIBRATION_BYTES}
+MAX_BYTES = {OPTIONS: MAX_OPTIONS_BYTES, CLIP_OF: 256, "calibration": MAX_CALIBRATION_BYTES}
 """Maximum bytes of the parts that are small by their nature."""
 LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
 MAX_HEADER_BYTES = 8 * 1024
 FORM_REMEDY = (
-    "Send multipart/form-data with clip, or left and right, and optionally calibration, masks and options; "
-    'options is JSON, such as {"budget_s": 20}.'
+    "Send multipart/form-data with clip, or left and right, or clip_of, and optionally calibration, masks and options; "
+    'options is JSON, such as {"budget_s": 20}, and clip_of the id of a job whose clip is used again.'
 )
 
 
@@ -54,20 +57,28 @@ class UploadLimits:
 
 @dataclass
 class Received:
-    """What arrived: stored names by part, digests by part, and the options as text."""
+    """What arrived: stored names by part, digests by part, the options as text, and whose clip is used again."""
 
     names: dict[str, str] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     options: str = "{}"
+    clip_of: str | None = None
     total_bytes: int = 0
 
-    def files(self) -> JobFiles:
-        """The parts by their role.
+    def check_clip(self) -> None:
+        """Return if there is one clip.
 
         Raises:
-            InputError: there is no clip, or both ways of giving one, or one eye only.
+            InputError: there is none, or it is given in several ways, or one eye is missing.
         """
         given = set(self.names)
+        if self.clip_of is not None:
+            if came := [part for part in ("clip", "left", "right") if part in given]:
+                problem = f"it came together with {' and '.join(came)}."
+                raise InputError(
+                    CLIP_OF, problem, "Send either a clip, or clip_of to use that of an earlier job again."
+                )
+            return
         if "clip" in given and given & {"left", "right"}:
             raise InputError("clip", "it came together with left or right.", "Send either clip, or left and right.")
         if "clip" not in given:
@@ -75,6 +86,9 @@ class Received:
                 if eye not in given:
                     problem = f"there is {other} but no {eye}." if other in given else "there is no clip."
                     raise InputError(eye if other in given else "clip", problem, FORM_REMEDY)
+
+    def files(self) -> JobFiles:
+        """The parts by their role, once all files are there."""
         return JobFiles(
             clip=self.names.get("clip") or self.names["left"],
             right=self.names.get("right"),
@@ -143,7 +157,7 @@ class _Receiver:
         self._part_bytes = 0
         self._file: BinaryIO | None = None
         self._digest = hashlib.sha256()
-        self._options = b""
+        self._texts: dict[str, bytes] = {}
         self._parser = MultipartParser(
             boundary,
             {
@@ -205,12 +219,14 @@ class _Receiver:
     def _on_headers_finished(self) -> None:
         _, parameters = parse_options_header(self._headers.get(b"content-disposition", b""))
         part = parameters.get(b"name", b"").decode("utf-8", "replace")
-        if part != OPTIONS and part not in SUFFIXES:
+        if part not in (*TEXTS, *SUFFIXES):
             raise InputError(part[:40] or "clip", "there is no such part.", FORM_REMEDY)
-        if part in self._received.names or (part == OPTIONS and self._options):
+        if part in self._received.names or part in self._texts:
             raise InputError(part, "it came twice.", "Send each part once.")
         self._part = part
-        if part != OPTIONS:
+        if part in TEXTS:
+            self._texts[part] = b""
+        else:
             self._open_file(part, parameters.get(b"filename", b"").decode("utf-8", "replace"))
 
     def _open_file(self, part: str, filename: str) -> None:
@@ -224,7 +240,7 @@ class _Receiver:
         check_part_size(self._part, self._part_bytes)
         piece = data[start:end]
         if self._file is None:
-            self._options += piece
+            self._texts[self._part] += piece
         else:
             self._file.write(piece)
             self._digest.update(piece)
@@ -232,9 +248,13 @@ class _Receiver:
     def _on_part_end(self) -> None:
         if self._file is None:
             try:
-                self._received.options = self._options.decode()
+                text = self._texts[self._part].decode()
             except UnicodeDecodeError:
-                raise InputError(OPTIONS, "it is not UTF-8 text.", "Send a JSON object.") from None
+                raise InputError(self._part, "it is not UTF-8 text.", FORM_REMEDY) from None
+            if self._part == OPTIONS:
+                self._received.options = text
+            else:
+                self._received.clip_of = text
             return
         if self._part_bytes == 0:
             raise InputError(self._part, "the file is empty.", "Send a file with content.")

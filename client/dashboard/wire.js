@@ -76,6 +76,7 @@
  *   attempt?: number,
  *   options: JobOptions,
  *   input_bytes: number,
+ *   clip_of?: string | null,
  *   created_at_s: number,
  *   started_at_s?: number | null,
  *   finished_at_s?: number | null,

@@ -36,9 +36,10 @@ class Core:
 
     async def reconstruct(
         self,
-        clip: Path,
+        clip: Path | None = None,
         right: Path | None = None,
         *,
+        clip_of: str | None = None,
         calibration: Path | None = None,
         masks: Path | None = None,
         idempotency_key: str | None = None,
@@ -48,17 +49,27 @@ class Core:
     ) -> JobView:
         """Upload a clip and get its queued job; `right` is the right eye's file, if there are two.
 
+        `clip_of`, instead of a clip, is the id of a job or scene whose clip is used again, with its calibration and
+        masks unless others are given here: so better masks need no second upload of the clip.
         A large clip is sent in pieces, and its upload resumes where a lost connection cut it off; `in_pieces` forces
         or forbids that. on_upload(sent_bytes, total_bytes) is called while the clip is sent. The same idempotency_key
         with the same clip and options always yields the same job, also later and from another process.
         `options` say how to reconstruct: preset, budget_s or iterations, holdout and others (GivenOptions).
 
         Raises:
-            InputError: a file cannot be read, or an option cannot be used; nothing was sent.
+            InputError: a file cannot be read, there is no clip or both clip and clip_of, or an option cannot be used;
+                nothing was sent.
         """
         others = {"calibration": calibration, "masks": masks}
         prepared = submission.prepare(
-            clip, right, others, options, idempotency_key=idempotency_key, in_pieces=in_pieces, on_upload=on_upload
+            clip,
+            right,
+            clip_of,
+            others,
+            options,
+            idempotency_key=idempotency_key,
+            in_pieces=in_pieces,
+            on_upload=on_upload,
         )
         return await submission.submit(self._session, prepared)
 

@@ -251,6 +251,8 @@ class JobView(Model):
     attempt: int = 0
     options: JobOptions
     input_bytes: int
+    clip_of: str | None = None
+    """the job that the clip came with first, if not with this one"""
     created_at_s: float
     started_at_s: float | None = None
     finished_at_s: float | None = None

@@ -41,10 +41,14 @@ OnUpload = Callable[[int, int], object]
 
 @dataclass(frozen=True)
 class Submission:
-    """A clip that is ready to go: files and their sizes by part, options as JSON can have them."""
+    """A clip that is ready to go: files and their sizes by part, options as JSON can have them.
+
+    texts: what is sent as it is: the id of the job whose clip is used again, if there is no file of one.
+    """
 
     paths: dict[str, Path]
     sizes: dict[str, int]
+    texts: dict[str, str]
     options: dict[str, Any]
     idempotency_key: str
     in_pieces: bool
@@ -57,13 +61,14 @@ class Submission:
 
     def report(self, sent_bytes: int) -> None:
         """Call on_upload."""
-        if self.on_upload is not None:
+        if self.on_upload is not None and self.total_bytes:
             self.on_upload(min(sent_bytes, self.total_bytes), self.total_bytes)
 
 
 def prepare(
-    clip: Path,
+    clip: Path | None,
     right: Path | None,
+    clip_of: str | None,
     others: Mapping[str, Path | None],
     options: Mapping[str, Any],
     *,
@@ -74,16 +79,20 @@ def prepare(
     """Check everything before anything is sent.
 
     Raises:
-        InputError: a file cannot be read or is empty, or an option cannot be used.
+        InputError: a file cannot be read or is empty, there is not one clip, or an option cannot be used.
     """
     document = checked_options(options)
+    if clip_of is None and clip is None:
+        raise InputError("clip", "there is no clip.", "Give its file, or clip_of, the job whose clip is used again.")
+    if clip_of is not None and (clip is not None or right is not None):
+        raise InputError("clip_of", "it came together with a clip.", "Give either of them.")
     given = {"clip": clip} if right is None else {"left": clip, "right": right}
-    given |= {part: path for part, path in others.items() if path is not None}
-    paths = {part: Path(path) for part, path in given.items()}
+    paths = {part: Path(path) for part, path in {**given, **others}.items() if path is not None}
     sizes = {part: _size_of(part, path) for part, path in paths.items()}
     if in_pieces is None:
         in_pieces = sum(sizes.values()) >= IN_PIECES_FROM_BYTES
-    return Submission(paths, sizes, document, idempotency_key or str(uuid.uuid4()), in_pieces, on_upload)
+    texts = {} if clip_of is None else {"clip_of": clip_of}
+    return Submission(paths, sizes, texts, document, idempotency_key or str(uuid.uuid4()), in_pieces, on_upload)
 
 
 def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -112,7 +121,8 @@ async def submit(session: Session, submission: Submission) -> JobView:
     headers = {"Idempotency-Key": submission.idempotency_key}
     try:
         if submission.in_pieces:
-            document = {**await _upload_all(session, submission), "options": submission.options}
+            uploads = await _upload_all(session, submission)
+            document = {**uploads, **submission.texts, "options": submission.options}
             call = Call("POST", "/reconstruct", headers=headers, json=document, is_repeatable=True)
         else:
             boundary = uuid.uuid4().hex
@@ -200,8 +210,11 @@ def _report_piece(submission: Submission, sent_before: int, sent_bytes: int) -> 
 
 def _form(submission: Submission, boundary: str) -> Body:
     """multipart/form-data with the options and all files, never in memory as a whole."""
-    options = json.dumps(submission.options)
-    head = f'--{boundary}\r\nContent-Disposition: form-data; name="options"\r\n\r\n{options}\r\n'.encode()
+    texts = {**submission.texts, "options": json.dumps(submission.options)}
+    head = "".join(
+        f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{text}\r\n'
+        for name, text in texts.items()
+    ).encode()
     heads = {
         part: f'--{boundary}\r\nContent-Disposition: form-data; name="{part}"; filename="{part}{path.suffix}"\r\n'
         f"Content-Type: application/octet-stream\r\n\r\n".encode()

@@ -105,6 +105,8 @@ class JobRecord(BaseModel):
     input_bytes: int = Field(default=0, ge=0)
     input_sha256: str = ""
     """The digest of all files, sorted by part."""
+    clip_of: str | None = Field(default=None, pattern=JOB_ID_PATTERN)
+    """The job that the clip came with first, if it was not sent with this one."""
     idempotency_key: str | None = None
     """SHA-256 of the caller's Idempotency-Key: a second submission under it yields this job."""
     created_at_s: float
@@ -149,6 +151,7 @@ class JobView(BaseModel):
     attempt: int = 0
     options: JobOptions
     input_bytes: int
+    clip_of: str | None = Field(default=None, description="the job that the clip came with first, if not with this one")
     created_at_s: float
     started_at_s: float | None = None
     finished_at_s: float | None = None
@@ -166,7 +169,7 @@ class JobView(BaseModel):
             links["scene"] = f"/scenes/{record.job_id}"
         progress = record.progress.model_dump() if record.progress else {}
         shared = record.model_dump(
-            include={"state", "error", "cancel_requested", "attempt", "options", "input_bytes"}
+            include={"state", "error", "cancel_requested", "attempt", "options", "input_bytes", "clip_of"}
             | {"created_at_s", "started_at_s", "finished_at_s"}
         )
         progress |= {"position": forecast.position, "eta_s": forecast.eta_s} if forecast else {}

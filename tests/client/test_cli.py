@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from zipfile import ZipFile
 
 import httpx
 import pytest
@@ -52,6 +53,17 @@ def test_submit_watch_fetch_and_delete(
     capsys.readouterr()
     assert run_in(service, "delete", job_id) == ExitCode.OK
     assert json.loads(capsys.readouterr().out)["job_id"] == job_id
+
+
+def test_submit_uses_the_clip_of_an_earlier_job_with_other_masks(
+    service: LocalService, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = submitted(service, clip, capsys)
+    ZipFile(tmp_path / "better.zip", "w").close()
+    assert run_in(service, "submit", "--clip-of", first, "--masks", str(tmp_path / "better.zip")) == ExitCode.OK
+    folder = service.store.spool_folder(capsys.readouterr().out.strip())
+    assert (folder / "clip.mp4").read_bytes() == clip.read_bytes()
+    assert (folder / "masks.zip").read_bytes() == (tmp_path / "better.zip").read_bytes()
 
 
 def test_fetch_saves_masks_that_were_found(
@@ -137,6 +149,7 @@ def test_a_command_that_waits_for_the_service_says_so_at_once(
     [
         (["submit", "nothing.mp4"], ExitCode.BAD_INPUT),
         (["submit", "clip.mp4", "--holdout", "every9"], ExitCode.BAD_INPUT),
+        (["submit", "--clip-of", "0" * 32], ExitCode.BAD_INPUT),
         (["watch", "0" * 32], ExitCode.BAD_INPUT),
         (["watch", "0" * 32, "--url", "http://127.0.0.1:9"], ExitCode.UNAVAILABLE),
         (["jobs", "--url", "http://127.0.0.1:none"], ExitCode.BAD_INPUT),
@@ -215,6 +228,7 @@ def test_an_answer_decides_the_exit_code(status: int, code: ExitCode) -> None:
         [],
         ["unknown"],
         ["submit"],
+        ["submit", "a", "--clip-of", "b"],
         ["submit", "a", "--budget-s", "1", "--iterations", "1"],
         ["submit", "a", "--retention-hours", "0"],
         ["fetch", "a", "--out", "b", "--t", "nan"],

@@ -65,6 +65,24 @@ def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(
     assert caught.value.status == 404
 
 
+@pytest.mark.parametrize("in_pieces", [False, True])
+def test_a_clip_is_used_again_with_better_masks(
+    service: LocalService, client: Client, clip: Path, tmp_path: Path, in_pieces: bool
+) -> None:
+    first = client.reconstruct(clip)
+    (tmp_path / "better.zip").write_bytes(b"PK\x05\x06" + bytes(18))
+    again = client.reconstruct(clip_of=first.id, masks=tmp_path / "better.zip", seed=2, in_pieces=in_pieces)
+    assert (again.clip_of, again.options.seed) == (first.id, 2)
+    folder = service.store.spool_folder(again.id)
+    assert (folder / "clip.mp4").read_bytes() == clip.read_bytes()
+    assert (folder / "masks.zip").read_bytes() == (tmp_path / "better.zip").read_bytes()
+    assert client.reconstruct(clip_of=first.id, in_pieces=in_pieces, on_upload=lambda *_: None).clip_of == first.id
+    for given in ({}, {"clip": clip, "clip_of": first.id}):
+        with pytest.raises(InputError) as caught:
+            client.reconstruct(**given)
+        assert caught.value.field == ("clip_of" if given else "clip")
+
+
 def test_a_report_waits_for_its_scores(service: LocalService, client: Client, clip: Path) -> None:
     job = client.reconstruct(clip, iterations=30)
     claim = service.claim()
