@@ -7,7 +7,7 @@ import { connectionLost, Problem, problemOf } from "./problem.js";
 /**
  * What a purge removed.
  * @typedef {{job_id: string, purged_at: string, files: Record<string, number>, bytes: Record<string, number>,
- *   record: boolean, verified: boolean}} Receipt
+ *   record: boolean, verified: boolean, clip_kept_by: string[]}} Receipt
  */
 
 /**

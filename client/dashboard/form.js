@@ -68,6 +68,12 @@ function optionsOf(form) {
   return options;
 }
 
+/** Options that the form has no field for, as the job had them. @param {import("./api.js").Job | null} job */
+function carriedFrom(job) {
+  const options = Object.entries(job?.options ?? {});
+  return Object.fromEntries(options.filter(([name, value]) => value != null && !OPTIONS.includes(name)));
+}
+
 /** Give the form's fields the choices and limits of the service's options. @param {HTMLFormElement} form */
 function limit(form) {
   for (const name of OPTIONS) {
@@ -82,12 +88,15 @@ function limit(form) {
 
 export class ClipForm {
   /**
-   * @param {{form: HTMLFormElement, message: HTMLElement, progress: HTMLElement, stop: HTMLElement}} parts
+   * @param {{form: HTMLFormElement, again: HTMLElement, message: HTMLElement, progress: HTMLElement,
+   *   stop: HTMLElement}} parts
    * @param {(id: string) => void} onJob told of the job that was made
    */
   constructor(parts, onJob) {
     Object.assign(this, parts);
     this.onJob = onJob;
+    /** @type {import("./api.js").Job | null} the job whose clip is used again, in place of a file */
+    this.earlier = null;
     limit(this.form);
     this.submit = this.form.querySelector("[type=submit]");
     this.form.addEventListener("submit", (event) => {
@@ -95,7 +104,45 @@ export class ClipForm {
       this.#send();
     });
     this.stop.addEventListener("click", () => this.controller?.abort());
+    this.again.querySelector("button").addEventListener("click", () => this.#startAnew());
     this.#takeDrops();
+  }
+
+  /**
+   * Use a job's clip again with better masks: its options are chosen, and masks are asked for.
+   * @param {import("./api.js").Job} job
+   */
+  sendMasks(job) {
+    this.#startAnew();
+    this.earlier = job;
+    for (const name of OPTIONS) {
+      const value = name === "mask_source" ? "given" : job.options[name];
+      if (value != null) this.form.elements[name].value = value;
+    }
+    this.#showSource();
+    this.form.scrollIntoView();
+    this.form.elements.masks.focus({ preventScroll: true });
+  }
+
+  #startAnew() {
+    this.form.reset();
+    this.earlier = null;
+    this.#showSource();
+    this.#say("");
+  }
+
+  /** The pickers of clip and calibration, or whose are used again and, beside that, the masks' picker. */
+  #showSource() {
+    const isAgain = this.earlier !== null;
+    const { clip, right, calibration, masks, poses } = this.form.elements;
+    if (isAgain) this.again.after(masks.closest("label"));
+    else poses.closest("label").before(masks.closest("label"));
+    for (const picker of [clip, right, calibration]) picker.closest("label").hidden = isAgain;
+    clip.required = !isAgain;
+    this.again.hidden = !isAgain;
+    this.again.querySelector("p").textContent = isAgain
+      ? `The clip of ${this.earlier.id.slice(0, 8)} again, with its calibration.`
+      : "";
   }
 
   #takeDrops() {
@@ -113,7 +160,9 @@ export class ClipForm {
 
   /** @param {File[]} files put into the pickers */
   take(files) {
-    for (const [part, file] of partsOf(files)) {
+    const parts = partsOf(files);
+    if (this.earlier && (parts.has("clip") || parts.has("right"))) this.#startAnew();
+    for (const [part, file] of parts) {
       const transfer = new DataTransfer();
       transfer.items.add(file);
       this.form.elements[part].files = transfer.files;
@@ -128,8 +177,7 @@ export class ClipForm {
     try {
       await this.#sendAll(uploads);
       this.onJob(await this.#submitAll(uploads, signal));
-      this.form.reset();
-      this.#say("");
+      this.#startAnew();
     } catch (error) {
       this.#say(signal.aborted ? "Stopped. Nothing of it is kept." : error.message, "bad");
       for (const upload of uploads) upload.discard();
@@ -157,7 +205,9 @@ export class ClipForm {
 
   /** @returns {Promise<string>} the job's id */
   async #submitAll(uploads, signal) {
-    const submission = { options: optionsOf(this.form) };
+    const submission = { options: { ...carriedFrom(this.earlier), ...optionsOf(this.form) } };
+    if (this.earlier) submission.clip_of = this.earlier.id;
+    if (submission.options.budget_s) delete submission.options.iterations; // they exclude each other
     for (const upload of uploads) submission[upload.part] = upload.id;
     const key = newKey();
     const submit = async () => {

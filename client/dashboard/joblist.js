@@ -40,8 +40,10 @@ function describeReceipt(receipt) {
   const sum = (counts) => Object.values(counts).reduce((total, count) => total + count, 0);
   const megabytes = (sum(receipt.bytes) / 1e6).toFixed(1);
   const proof = receipt.verified ? "It was checked that nothing is left." : "";
+  const others = receipt.clip_kept_by.map((id) => id.slice(0, 8)).join(" and ");
+  const kept = others && ` The same clip stays with ${others}.`;
   const what = `${sum(receipt.files)} files, ${megabytes} MB, and its record`;
-  return `${receipt.job_id.slice(0, 8)} is deleted for good: ${what}. ${proof}`;
+  return `${receipt.job_id.slice(0, 8)} is deleted for good: ${what}. ${proof}${kept}`;
 }
 
 export class JobList {

@@ -56,7 +56,7 @@ async function report(id) {
   try {
     const found = await getReport(id);
     if (!isStill()) return;
-    showReport(get("report"), id, found);
+    showReport(get("report"), id, found, sendMasks);
     const csv = await getCurve(id).catch(() => "");
     if (!isStill()) return;
     drawCurve(get("curve"), pointsOfCsv(csv), baselinesOf(found));
@@ -70,7 +70,19 @@ async function report(id) {
   }
 }
 
+function sendMasks(id) {
+  const job = jobs.byId.get(id);
+  if (job) form.sendMasks(job);
+}
+
+function offerMasks() {
+  const isOffered = viewer.scene !== null && get("layer").value === "recorded";
+  get("better-masks").hidden = !isOffered;
+  get("home").hidden = isOffered; // recorded frames are the endoscope's
+}
+
 function showJobs() {
+  offerMasks();
   list.show([...jobs.byId.values()], viewer.scene);
   const expected = jobs.byId.get(awaited);
   if (expected?.state === "running" || expected?.state === "done") view(expected.id);
@@ -100,13 +112,21 @@ const list = new JobList(
 );
 const jobs = new Jobs(showJobs, showConnection);
 
-new ClipForm(
-  { form: get("upload"), message: get("upload-message"), progress: get("upload-progress"), stop: get("upload-stop") },
+const form = new ClipForm(
+  {
+    form: get("upload"),
+    again: get("upload-again"),
+    message: get("upload-message"),
+    progress: get("upload-progress"),
+    stop: get("upload-stop"),
+  },
   (id) => {
     awaited = id;
     if (!viewer.scene) viewer.open(null, "The scene opens here as soon as there is something to see.");
     jobs.poll();
   },
 );
+get("layer").addEventListener("change", offerMasks);
+get("better-masks").addEventListener("click", () => sendMasks(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
 keyEvents.addEventListener("changed", () => view(null, currentKey() ? "Choose a job." : "The key is forgotten."));

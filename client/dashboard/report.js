@@ -121,20 +121,23 @@ async function download(name, load, message) {
   }
 }
 
-/** How to send better masks, where they were found. */
-function correction(id, { masks }, message) {
-  if (!areFound(masks) || !masks.share) return [];
+/** How to send better masks. */
+function correction(id, { masks }, message, onMasks) {
+  if (!masks) return [];
+  const send = button(masks.source === "none" ? "Send masks" : "Send better masks", () => onMasks(id));
+  if (!areFound(masks) || !masks.share) return [send];
   const save = button("Save the masks (.zip)", () => download(`${id}-masks.zip`, () => getMasks(id), message));
-  const text = "To correct them: save them, paint instruments white and tissue black, and send the clip again with them as instrument masks.";
-  return [save, element("p", { class: "quiet", text })];
+  const text = "To correct them: save them, paint instruments white and tissue black, and send them. The clip itself need not be sent again.";
+  return [save, send, element("p", { class: "quiet", text })];
 }
 
 /**
  * @param {HTMLElement} target
  * @param {string} id
  * @param {import("./wire.js").Report} report
+ * @param {(id: string) => void} onMasks better masks are to be sent for this scene's clip
  */
-export function showReport(target, id, report) {
+export function showReport(target, id, report, onMasks) {
   const lines = element("dl");
   lines.append(element("dt", { text: "How far to trust it" }));
   lines.append(element("dd", { class: "verdict", text: verdict(report) }));
@@ -146,5 +149,5 @@ export function showReport(target, id, report) {
   const save = button("Save the first frame's Gaussians (.ply)", () =>
     download(`${id}.ply`, () => exportScene(id, 0), message),
   );
-  target.replaceChildren(lines, save, ...correction(id, report, message), message);
+  target.replaceChildren(lines, save, ...correction(id, report, message, onMasks), message);
 }

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 from selenium.webdriver.support.select import Select
 
 from contract.wire.names import MASKS
 from contract.wire.report import Masks
+from tests.client.local_service import CLIP
 from tests.client.page import RECORDED_SHADE, REPORT_OF_THE_PAGE, Page, Site
 
 
@@ -38,6 +40,46 @@ def test_recorded_frames_show_the_masks_while_a_job_trains_and_afterwards(site: 
         assert page.view == "recorded, masks marked, t 0.000"
     Select(page.find("#layer")).select_by_value("rgb")
     page.until(lambda: page.text("#badge") == "CURRENT" and page.shade > RECORDED_SHADE)
+
+
+def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path: Path) -> None:
+    page.choose("clip", CLIP)
+    page.click("#upload summary")
+    Select(page.find("#upload [name=mask_source]")).select_by_value("auto")
+    Select(page.find("#upload [name=poses]")).select_by_value("fixed")
+    page.click("#upload [type=submit]")
+    page.until_text("#jobs", "queued")
+    claim = site.claim()
+    site.train(claim, 20, 24.0)
+    page.until_state("training")
+    Select(page.find("#layer")).select_by_value("recorded")
+    page.click("#better-masks")
+    page.until_text("#upload-again", f"The clip of {claim.job_id[:8]} again")
+    page.click("#upload-again button")
+    page.until(lambda: page.find("#upload [name=clip]").is_displayed())
+    Select(page.find("#layer")).select_by_value("rgb")
+    page.until(lambda: not page.find("#better-masks").is_displayed())
+    scene = site.finish(claim)
+    masks = Masks(source="found", share=0.123, sure=0.41)
+    site.store.add_scores("worker-1", scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"masks": masks}))
+    page.click('#report button[aria-label="Send better masks"]')
+    page.until(lambda: not page.find("#upload [name=clip]").is_displayed())
+    with ZipFile(tmp_path / "better.zip", "w"):
+        pass
+    page.choose("masks", tmp_path / "better.zip")
+    page.click("#upload [type=submit]")
+    page.until_text("#jobs", "queued")
+    again = site.claim()
+    (record,) = (each for each in site.queue.records() if each.job_id == again.job_id)
+    assert record.clip_of == scene
+    assert (record.options.poses, record.options.mask_source) == ("fixed", "given")
+    folder = site.store.spool_folder(record.job_id)
+    assert (folder / "clip.mp4").read_bytes() == CLIP.read_bytes()
+    assert (folder / "masks.zip").read_bytes() == (tmp_path / "better.zip").read_bytes()
+    page.until(lambda: page.find("#upload [name=clip]").is_displayed())
+    page.press(scene, "Delete")
+    page.click("#confirm [value=yes]")
+    page.until_text("#jobs-message", f"The same clip stays with {record.job_id[:8]}.")
 
 
 @pytest.mark.parametrize(
