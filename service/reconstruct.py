@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from io import RawIOBase
 from typing import Annotated, Any
@@ -18,6 +18,7 @@ from starlette.requests import ClientDisconnect
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
+from contract.intake.fit import check_fit
 from contract.intake.limits import MAX_MEMORY_BYTES, ClipLimits
 from contract.intake.sniff import check_file
 from contract.queue.interface import Admission, QueueFullError
@@ -257,6 +258,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
     options = parse_options(JobOptions, received.options)
     check_retention(options, services.settings)
     received.check_clip()
+    sent = set(received.names)
     clip_of = None
     if received.clip_of is not None:
         earlier = earlier_job(services, caller, received.clip_of)
@@ -273,7 +275,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         idempotency_key=key,
         created_at_s=time.time(),
     )
-    _look_at(services, job_id, received)
+    _look_at(services, record, received.names, sent)
     outcome = "ok" if clip_of is None else f"ok (clip of {clip_of})"
     services.audit.record(AuditAction.ACCEPTED, caller, job_id, outcome)
     with services.sweep.in_hand(job_id):
@@ -281,11 +283,18 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         return _enqueue(services, record)
 
 
-def _look_at(services: Deps, job_id: str, received: Received) -> None:
-    """Refuse what cannot be a clip. How much memory it may take is for the worker to say, which may be elsewhere."""
+def _look_at(services: Deps, record: JobRecord, names: Mapping[str, str], sent: Collection[str]) -> None:
+    """Refuse what cannot be a clip, and options that cannot go with it.
+
+    How much memory it may take is for the worker to say, which may be elsewhere. names: of all files, by part. sent:
+    the parts that are not an earlier job's.
+    """
     limits = replace(ClipLimits.of(services.settings), decoded_bytes=MAX_MEMORY_BYTES)
-    for part, name in received.names.items():
-        check_file(services.store.incoming_folder(job_id) / name, part, limits)
+    folder = services.store.incoming_folder(record.job_id)
+    files = {part: folder / name for part, name in names.items()}
+    for part, path in files.items():
+        check_file(path, part, limits)
+    check_fit(record.options, files, sent)
 
 
 def _enqueue(services: Deps, record: JobRecord) -> JobRecord:

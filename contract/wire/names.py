@@ -41,6 +41,9 @@ UsedFrames = Literal["new", "all"]
 DeviceName = Literal["auto", "cpu", "cuda"]
 """Where to compute; auto chooses the GPU if all of its requirements are met, otherwise the CPU."""
 
+POSES_FILE = "poses_bounds.npy"
+"""The poses that a clip in EndoNeRF layout brings."""
+
 SUBMISSION = "submission.json"
 MANIFEST = "manifest.json"
 SCENE = "scene.safetensors"

@@ -143,6 +143,16 @@ def test_all_files_together_are_no_larger_than_an_upload_may_be(tmp_path: Path) 
         assert "INTRASPLAT_MAX_UPLOAD_BYTES" in assert_problem(large, 413, "clip_of")["remedy"]
 
 
+def test_options_that_cannot_go_with_the_clip_are_refused_at_once(service: ServiceUnderTest) -> None:
+    masks = {"clip": ("a.mp4", CLIP), "masks": ("m.zip", EMPTY_ZIP)}
+    assert_problem(service.upload('{"poses": "given"}'), 422, "options.poses")
+    assert_problem(service.upload('{"mask_source": "none"}', parts=masks), 422, "options.mask_source")
+    first = service.upload(parts=masks).json()["id"]
+    for options, status in (({"mask_source": "none"}, 202), ({"poses": "given"}, 422)):
+        assert service.http.post("/reconstruct", json={"clip_of": first, "options": options}).status_code == status
+    assert len(service.spooled()) == 2
+
+
 def test_a_clip_that_is_removed_while_it_is_linked_is_not_half_used(
     service: ServiceUnderTest, monkeypatch: pytest.MonkeyPatch
 ) -> None:

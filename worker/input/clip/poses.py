@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
-from contract.wire.names import PoseConvention
+from contract.wire.names import POSES_FILE, PoseConvention
 
-POSES_FILE = "poses_bounds.npy"
 RIGID_TOLERANCE = 1e-3  # on the entries of R^T R: float32 files and rounding pass, scaled or sheared matrices do not
 _ROW_LENGTH = 17
 _REMEDY = "Write it as [T, 17] floating-point numbers, 3x5 [R | t | (H, W, f)] and two bounds per row."

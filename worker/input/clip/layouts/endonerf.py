@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from contract.intake.limits import MAX_POSES_BYTES
 from contract.wire.errors import InputError
-from contract.wire.names import PoseConvention
+from contract.wire.names import POSES_FILE, PoseConvention
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import Masks
 from worker.input.camera import Intrinsics
@@ -24,7 +24,7 @@ from worker.input.clip.images import ImageSequence, as_depth_mm, as_rgb, open_im
 from worker.input.clip.layouts.layout import ClipFiles, InputLayout
 from worker.input.clip.masks import MaskFrames, TissueMasks, no_masks, tissue_from_masks
 from worker.input.clip.naming import check_aligned
-from worker.input.clip.poses import POSES_FILE, Poses, parse_poses
+from worker.input.clip.poses import Poses, parse_poses
 from worker.input.clip.types import DepthClip
 from worker.input.clip.video import FALLBACK_RATE_HZ
 
