@@ -17,6 +17,7 @@ import torch
 
 from contract.runtime.exits import ExitCode
 from contract.wire.names import CURVE, REPORT, PresetName
+from contract.wire.notices import NoticeCode
 from contract.wire.report import Report
 from worker.__main__ import main
 from worker.scene.resume_file import RESUME_FILE, load_resume
@@ -67,6 +68,9 @@ def test_reconstruct_tells_the_right_eyes_score_of_a_clip_that_has_one(
     assert main(["reconstruct", str(drawn), "--eyes", "left", "--iterations", "5", "--out", str(out)]) == ExitCode.OK
     report = Report.model_validate_json((out / REPORT).read_text())
     told = capsys.readouterr().out
+    (poses,) = (notice.text for notice in report.assumptions if notice.code == NoticeCode.POSES)
+    assert f"{poses}\n" in told
+    assert poses.startswith("poses: the camera ")
     assert f"psnr_right: {report.psnr_right_db:.2f} dB on held-out frames of the right eye (the left eye's" in told
     assert f"{report.baseline_warp_db:.2f} dB)" in told
     assert (out / CURVE).read_text().splitlines()[0].endswith(",psnr_right_db")

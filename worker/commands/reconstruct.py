@@ -20,6 +20,7 @@ from contract.runtime.progress_bar import ProgressBar
 from contract.store.durable import aside_of
 from contract.wire.errors import Cancelled, InputError
 from contract.wire.names import CURVE, KEPT, MANIFEST, MASKS, RECORDED, REPORT, SCENE
+from contract.wire.notices import NoticeCode
 from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
 from worker.commands.device import add_device
@@ -162,9 +163,9 @@ def _print_report(report: Report, out: Path) -> None:
         warped = f" (the left eye's picture, warped by its depth: {report.baseline_warp_db:.2f} dB)"
         known = warped if report.baseline_warp_db is not None else ""
         print(f"psnr_right: {report.psnr_right_db:.2f} dB on held-out frames of the right eye{known}")
-    if report.poses is not None and report.poses.source == "estimated":
-        told = report.poses
-        print(f"camera: moved by {told.extent_mm:.1f} mm and {told.extent_deg:.1f} degrees (poses estimated)")
+    for notice in report.assumptions:
+        if notice.code == NoticeCode.POSES:
+            print(notice.text)
     if report.masks is not None and report.masks.sure is not None:
         masks = report.masks
         print(f"instruments: in {masks.share:.1%} of the picture; {masks.sure:.0%} of what may be one told clearly")

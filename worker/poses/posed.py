@@ -93,7 +93,8 @@ def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) 
         text += "tissue with texture and depth is common to them. The camera was taken as fixed."
         return _fixed(clip, "was taken as fixed", None, Notice.warning(NoticeCode.POSES_UNSURE, text))
     if not found.seems_to_move and not found.confused:
-        return _fixed(clip, f"is fixed: its path would spread by {found.spread_mm:.1f} mm", found)
+        how = f"is fixed: placed frame by frame, it stays within about {found.spread_mm:.1f} mm of one place"
+        return _fixed(clip, how, found)
     if options.poses == "auto" and not found.moves:
         text = (
             f"Camera or tissue moved as a whole, by up to {found.extent_mm:.1f} mm and {found.extent_deg:.1f} degrees; "
