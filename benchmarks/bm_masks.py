@@ -1,8 +1,11 @@
 """How well are instruments found in clips without masks, what does it cost, and what does the model lose?
 
     python benchmarks/bm_masks.py [--seeds 11 12] [--frames 64] [--size 640x512] [--iterations 300] [--out masks.csv]
+        [--places moving rests lies inside small]
 
 Draws stereo clips of each kind of instrument and of none, withholds their masks and finds them (`--mask-source auto`).
+--places: the instrument moves above the tissue, rests there, lies on the tissue, hovers wholly inside the picture, or
+is small: only its jaws are in view. `told`: the notices that say that instruments may not be masked.
 Prints and writes of each: intersection over union with the true masks, over all frames and in the worst one; the share
 of true instruments that is found and of found ones that is true; the shares of the picture that are true and found; how
 sure the report is; and the seconds of one core that finding takes in all frames. With --iterations it trains `fast`
@@ -21,26 +24,30 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
 from worker.evaluate.rows import commit
-from worker.input.clip import DepthClip, StereoClip
+from worker.input.clip import DepthClip, StereoClip, training_frames
 from worker.instruments import Finder, FoundMask
 from worker.machine.hooks import Hooks
 from worker.machine.timing import Timings
-from worker.phantom import TOOLS, PhantomSettings, make_phantom
+from worker.phantom import TOOLS, PhantomSettings, instrument, make_phantom
 from worker.pipeline import judge, make
+from worker.report.doubts import clip_warnings
 from worker.stereo import ClipPaths, match_eyes, open_with_depth
 from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
 
 HOLDOUT = "every8"
+TELLING = (NoticeCode.MASKS_UNSURE, NoticeCode.NO_INSTRUMENT_MASKED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +63,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--motions", nargs="+", default=["breathing", "pull"])
     parser.add_argument("--tools", nargs="*", default=[*TOOLS, "none"])
+    parser.add_argument("--places", nargs="+", choices=[*PLACES], default=["moving"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[11])
     parser.add_argument("--frames", type=int, default=64)
     parser.add_argument("--size", default="640x512")
@@ -74,7 +82,7 @@ def main() -> None:
         if arguments.out:
             write(arguments.out, rows)
 
-    for motion in arguments.motions:
+    for motion, place in product(arguments.motions, arguments.places):
         for tools in arguments.tools:
             for seed in arguments.seeds:
                 settings = PhantomSettings(
@@ -85,11 +93,43 @@ def main() -> None:
                     seed=seed,
                     tools=() if tools == "none" else tuple(tools.split("+")),
                 )
-                add(f"phantom:{motion}:{width}x{height}:seed{seed}:{tools}", drawn(settings))
+                where = "" if place == "moving" else f":{place}"
+                with patch.multiple(instrument, **PLACES[place](settings)):
+                    add(f"phantom:{motion}:{width}x{height}:seed{seed}:{tools}{where}", drawn(settings))
     if os.environ.get("INTRASPLAT_DATA"):
         folder = Path(os.environ["INTRASPLAT_DATA"])
         for name, paths in recorded(folder).items():
             add(name, opened_files(paths))
+
+
+def _at(u_mm: float, v_mm: float, above_mm: float) -> Callable[..., tuple[NDArray[np.float64], float]]:
+    """An instrument whose tip stays so far above one place of the tissue."""
+    return lambda surface, frame, settings: (surface.point_mm(u_mm, v_mm, 0.0) - (0.0, 0.0, above_mm), 0.2)
+
+
+def _peeping(settings: PhantomSettings) -> dict[str, object]:
+    camera, depth_mm = settings.intrinsics, 70.0
+    right_mm, down_mm = (depth_mm * side / 2 / camera.fx for side in (camera.width, camera.height))
+    tip_mm = np.array([0.8 * right_mm, 0.78 * down_mm, depth_mm])
+    return {"_tip_and_opening": lambda *_: (tip_mm, 0.1)}
+
+
+def _from(*port_mm: float) -> NDArray[np.float64]:
+    return np.vstack([port_mm, instrument.PORTS_MM[1:]])
+
+
+PLACES: Mapping[str, Callable[[PhantomSettings], dict[str, object]]] = {
+    "moving": lambda _: {"HOVER_MM": instrument.HOVER_MM},
+    "rests": lambda _: {"_tip_and_opening": _at(4.0, 3.0, 3.0)},
+    "lies": lambda _: {"_tip_and_opening": _at(8.0, -2.0, 1.0), "PORTS_MM": _from(110.0, 60.0, 68.0)},
+    "inside": lambda _: {
+        "_tip_and_opening": _at(-4.0, -6.0, 3.0),
+        "PORTS_MM": _from(90.0, 60.0, 62.0),
+        "SHAFT_MM": 26.0,
+    },
+    "small": _peeping,
+}
+"""What of the phantom's first instrument is changed, by where it is."""
 
 
 def recorded(folder: Path) -> dict[str, ClipPaths]:
@@ -176,8 +216,15 @@ def measured(opened: Opened) -> dict[str, object]:
     return row | {
         "found_share": f"{found.masks.share:.4f}",
         "sure": f"{found.masks.sure or 0:.2f}",
+        "told": " ".join(each.code for each in doubts_of(found) if each.code in TELLING),
         "cost_s": f"{opened.cost_s:.2f}",
     }
+
+
+def doubts_of(clip: DepthClip) -> Sequence[Notice]:
+    """What the report of the clip would warn of."""
+    split = sorted(set(training_frames(clip.frame_count, HOLDOUT)) - set(clip.left_out))
+    return [*clip.warnings, *clip_warnings(clip, split)]
 
 
 def _counts(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> tuple[int, int, int, int]:

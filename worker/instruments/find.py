@@ -5,7 +5,7 @@ Symbols: H W pixels; h w pixels of the coarse picture; nearness: proportional to
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -42,6 +42,12 @@ ZONE_SHARE, TIP_SHARE, TIP_QUANTILE, LOCAL_SHARE = 0.0125, 0.05, 0.85, 0.2
 MAX_LOCAL_REDNESS, TIP_FRONT = 1.2, 0.05
 """Redness of the tissue around counts as so much at most; around a tip, only what is so much in front may be its."""
 CLOSED_PX, GROWN_PX = 3, 3
+COLOURLESS, MAX_LIGHT, MIN_COLOURED = 0.18, 1.25, 0.9
+"""What is not in front may be an instrument that lies on the tissue: redness at most, relative to the tissue's; light
+at most, relative to the picture's, as highlights have no colour either; share of its outline with a step in redness."""
+REDDISH, REDDISH_STEP, MIN_REDDISH_OUTLINE, MIN_IN_FRONT = 0.7, 0.15, 0.6, 0.7
+"""What is in front may be an instrument that mirrors the tissue: its redness at most; the step in redness and the share
+of its outline that has it; how much its depth looks like an instrument's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +86,13 @@ class FoundMask:
     tool    [H, W]
     seen    share of the picture that might be instruments
     clear   of that, what was told clearly: from 0 to `seen`
+    missed  share of the picture that has one sign of an instrument, strongly, and is not masked
     """
 
     tool: Mask
     seen: float
     clear: float
+    missed: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,26 +125,51 @@ def find_instruments(picture: Looked, nearness: Image, look: TissueLook) -> Foun
     clear = sum(area * abs(2 * each.likely - 1) for area, each in zip(areas, candidates, strict=True))
     in_front = _in_front(nearness) > TIP_FRONT
     tool = _outlined(picture, found, in_front, look) if found else np.zeros(picture.size, np.bool_)
-    return FoundMask(tool, sum(areas), clear)
+    return FoundMask(tool, sum(areas), clear, _missed(picture, nearness, look, tool))
 
 
 def _candidates(picture: Looked, nearness: Image, look: TissueLook) -> list[_Candidate]:
     """What has no tissue's colour, is not behind its surroundings and touches the border."""
-    height, width = nearness.shape
     redness = cv2.GaussianBlur(_redness(picture.coarse), (3, 3), 0)
     grey = cv2.morphologyEx((redness < GREY * look.redness).astype(np.uint8), cv2.MORPH_OPEN, _box(2))
     front = _in_front(nearness)
     part = _closed(grey, 5) & (front > SLIGHTLY_FRONT)
     part = cv2.morphologyEx(part.astype(np.uint8), cv2.MORPH_OPEN, _box(3))
+    redness /= np.float32(look.redness)
+    areas = _areas(part, at_border=True)
+    return [_Candidate(pixels, _likely(pixels, front, nearness, redness)) for pixels in areas]
+
+
+def _areas(part: Bits, *, at_border: bool) -> Iterator[Mask]:
+    """The connected areas [h, w] of MIN_AREA and more; at_border: only those that touch the picture's border."""
+    height, width = part.shape
     count, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
-    found = []
     for j in range(1, count):
         left, top, across, down, area = stats[j]
         touches = left <= 1 or top <= 1 or left + across >= width - 1 or top + down >= height - 1
-        if touches and area >= MIN_AREA * height * width:
-            pixels = label == j
-            found.append(_Candidate(pixels, _likely(pixels, front, nearness, redness / np.float32(look.redness))))
-    return found
+        if (touches or not at_border) and area >= MIN_AREA * height * width:
+            yield label == j
+
+
+def _missed(picture: Looked, nearness: Image, look: TissueLook, tool: Mask) -> float:
+    """Share of the picture outside the masks that has an instrument's colour but not its depth, or the other way."""
+    height, width = nearness.shape
+    masked = cv2.resize(tool.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0
+    free = cv2.dilate(masked.astype(np.uint8), _box(OUTLINE_PX // 2 + 1)) == 0
+    redness = cv2.GaussianBlur(_redness(picture.coarse), (3, 3), 0) / np.float32(look.redness)
+    light = cv2.GaussianBlur(picture.coarse.max(axis=2).astype(np.float32), (3, 3), 0)
+    front, share = _in_front(nearness), 0.0
+    colourless = cv2.morphologyEx((redness < COLOURLESS).astype(np.uint8), cv2.MORPH_OPEN, _box(3))
+    for pixels in _areas(colourless & free, at_border=False):
+        ((own, around),) = _across_outline(pixels, redness)
+        if own.size and float((around - own > REDNESS_STEP).mean()) > MIN_COLOURED:
+            share += float(pixels.mean()) * float(np.median(light[pixels]) < MAX_LIGHT * np.median(light))
+    reddish = _closed((redness < REDDISH).astype(np.uint8), 5) & (front > SLIGHTLY_FRONT) & free
+    for pixels in _areas(cv2.morphologyEx(reddish.astype(np.uint8), cv2.MORPH_OPEN, _box(3)), at_border=True):
+        (near, beyond), (own, around) = _across_outline(pixels, nearness, redness)
+        if near.size and float((around - own > REDDISH_STEP).mean()) > MIN_REDDISH_OUTLINE:
+            share += float(pixels.mean()) * float(_by_depth(front[pixels], near, beyond) >= MIN_IN_FRONT)
+    return share
 
 
 def _in_front(nearness: Image) -> Image:
@@ -151,14 +184,19 @@ def _likely(pixels: Mask, front: Image, nearness: Image, redness: Image) -> floa
     (near, beyond), (own, around) = _across_outline(pixels, nearness, redness)
     if not near.size:
         return 0.0
+    by_colour = _ramp(float((around - own > REDNESS_STEP).mean()), COLOURED_BETWEEN)
+    return min(_by_depth(front[pixels], near, beyond), by_colour)
+
+
+def _by_depth(front: Image, near: Image, beyond: Image) -> float:
+    """How much an area's depth looks like an instrument's: front [n] of its pixels, nearness across its outline."""
     steps = (near - beyond) / np.maximum(beyond, np.float32(1e-6))
-    by_depth = (
-        _ramp(float((front[pixels] > FRONT).mean()), FRONT_BETWEEN),
+    signs = (
+        _ramp(float((front > FRONT).mean()), FRONT_BETWEEN),
         _ramp(float((steps > STEP).mean()), STEPS_BETWEEN),
         _ramp(float(np.median(steps)), STEP_BETWEEN),
     )
-    by_colour = _ramp(float((around - own > REDNESS_STEP).mean()), COLOURED_BETWEEN)
-    return min(sum(by_depth) / len(by_depth), by_colour)
+    return sum(signs) / len(signs)
 
 
 def _across_outline(pixels: Mask, *images: Image) -> list[tuple[Image, Image]]:

@@ -122,7 +122,7 @@ def estimate_depth(
     masks, assumptions = Masks(source="given", share=share), clip.assumptions
     doubts: tuple[Notice, ...] = ()
     if finder is not None:
-        masks, told, doubts = finder.told(share, work.sure)
+        masks, told, doubts = finder.told(share, work.sure[wanted])
         assumptions = (*(each for each in assumptions if each.code is not NoticeCode.MASKS), told)
     return replace(
         work.matched,

@@ -44,7 +44,7 @@ class FrameWork:
     label    [H, W] what is painted into both eyes' pictures
     finder   finds the instruments of a clip without masks; None: the clip's own tell
     counts   [T, 3] pixels of tissue, those with depth, those with sure depth
-    sure     [T, 2] `seen` and `clear` of what the finder found
+    sure     [T, 3] `seen`, `clear` and `missed` of what the finder found
     """
 
     clip: RectifiedClip
@@ -59,7 +59,7 @@ class FrameWork:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "counts", np.zeros((self.clip.frame_count, 3), np.int64))
-        object.__setattr__(self, "sure", np.zeros((self.clip.frame_count, 2)))
+        object.__setattr__(self, "sure", np.zeros((self.clip.frame_count, 3)))
 
     @classmethod
     def begin(
@@ -117,7 +117,7 @@ class FrameWork:
             rgb, offset_px = self.matched.rgb[i], self.clip.disparity_offset_px
             found = self.finder(rgb, lambda coarse: nearness(coarse, right, self.plan, offset_px))
             tissue &= ~found.tool
-            self.sure[i] = found.seen, found.clear
+            self.sure[i] = found.seen, found.clear, found.missed
         return tissue
 
     def match(self, i: int) -> None:

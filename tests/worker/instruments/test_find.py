@@ -11,7 +11,9 @@ import pytest
 from contract.wire.notices import NoticeCode
 from worker.input.clip import DepthClip
 from worker.input.clip.kept import load_clip, save_clip
-from worker.instruments import Looked, TissueLook, find_instruments, with_instruments_found
+from worker.instruments import Finder, FoundMask, Looked, TissueLook, find_instruments, with_instruments_found
+from worker.instruments.depth_clip import nearness_of
+from worker.instruments.finder import MAX_MISSED
 from worker.machine.hooks import Hooks
 from worker.machine.timing import Timings
 from worker.phantom import TOOLS, DrawnStereo, PhantomSettings, Tool, make_phantom
@@ -92,6 +94,45 @@ def test_a_clip_with_depth_has_its_instruments_found() -> None:
     assert overlap(clip.tissue, exact.tissue) > 0.8
     assert clip.masks is not None
     assert clip.masks.source == "found"
+
+
+def looked_at_with(column: slice, colour: float, nearer: float) -> FoundMask:
+    """What is found in a picture of tissue in which a rectangle is `colour` grey and `nearer` times as near."""
+    frame = make_phantom(PhantomSettings(width=320, height=256, frames=1, seed=5, tools=())).frame(0)
+    rgb, depth_mm = frame.left.copy(), frame.depth_mm.copy()
+    place = (slice(110, 126), column)
+    grey = rgb[place].mean(axis=2, keepdims=True) * 0.7
+    rgb[place] = (colour * grey + (1 - colour) * rgb[place]).astype(np.uint8)
+    depth_mm[place] /= nearer
+    picture = Looked.at(rgb)
+    return find_instruments(picture, nearness_of(picture.coarse, depth_mm), TissueLook.of([frame.left]))
+
+
+INSIDE, FROM_BORDER = slice(120, 220), slice(0, 120)
+
+
+@pytest.mark.parametrize(
+    ("column", "colour", "nearer"),
+    [(INSIDE, 1.0, 1.0), (FROM_BORDER, 1.0, 1.0), (INSIDE, 1.0, 1.25), (FROM_BORDER, 0.5, 1.25)],
+    ids=["inside", "lies on the tissue", "inside, in front", "mirrors the tissue"],
+)
+def test_an_instrument_that_is_not_masked_is_counted_as_missed(column: slice, colour: float, nearer: float) -> None:
+    found = looked_at_with(column, colour, nearer)
+    assert not found.tool.any()
+    assert found.missed > 3 * MAX_MISSED
+
+
+def test_tissue_and_masked_instruments_are_not_counted_as_missed() -> None:
+    assert looked_at_with(INSIDE, 0.0, 1.0).missed < 0.5 * MAX_MISSED
+    found = looked_at_with(FROM_BORDER, 1.0, 1.25)
+    assert found.tool.any()
+    assert found.missed < 0.5 * MAX_MISSED
+
+
+@pytest.mark.parametrize(("missed", "codes"), [(0.0, []), (2 * MAX_MISSED, [NoticeCode.MASKS_UNSURE])])
+def test_what_was_missed_is_told(missed: float, codes: list[NoticeCode]) -> None:
+    _, _, doubts = Finder(TissueLook(0.3)).told(0.1, np.array([[0.1, 0.1, missed], [0.1, 0.1, missed]]))
+    assert [each.code for each in doubts] == codes
 
 
 def test_a_picture_without_colours_is_masked_nowhere_and_unsure() -> None:
