@@ -17,6 +17,7 @@ from service import exports, jobs, reconstruct, renders, scene_files, scenes, st
 from service.audit import install_refusal_handler
 from service.deps import Deps
 from service.guard import Guard
+from service.head import HeadAsGet
 from service.metrics import Measure
 from service.openapi import DescribedApp
 from service.problems import install_handlers
@@ -59,6 +60,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
         lifespan=lifespan,
     )
     app.state.deps = deps
+    app.add_middleware(HeadAsGet)
     app.add_middleware(Guard, hosts=LOOPBACK_NAMES | {settings.host, *settings.hosts}, origins=settings.cors_origins)
     app.add_middleware(RequestLog)
     app.add_middleware(Measure, metrics=deps.metrics)

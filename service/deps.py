@@ -29,6 +29,7 @@ from service.limits import Limiter
 from service.metrics import Metrics
 from service.problems import SCENES_REMEDY, Problem
 from service.purge import Purger
+from service.query import check_query
 from service.questions import Questions
 from service.render_limits import RenderLimits
 from service.renderer import Renderer
@@ -92,6 +93,7 @@ async def _caller_if_known(connection: HTTPConnection, services: Services) -> Ca
 async def _caller(connection: HTTPConnection, caller: Annotated[Caller | None, Depends(_caller_if_known)]) -> Caller:
     if caller is None:
         raise key_missing(address_of(connection))
+    check_query(connection)
     return caller
 
 

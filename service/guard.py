@@ -34,7 +34,10 @@ ANSWER_HEADERS = {
 EXPOSED_HEADERS = (
     *("Location", "Retry-After", "ETag", "Server-Timing", "X-Request-Id"),
     *("Upload-Offset", "Upload-Length", "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Max-Size"),
-    *(f"X-Intrasplat-{name}" for name in ("Scene", "State", "T", "Iteration", "Unseen", "Warning", "Warning-Codes")),
+    *(
+        f"X-Intrasplat-{name}"
+        for name in ("Scene", "State", "T", "Iteration", "Unseen", "Depth-Unit", "Warning", "Warning-Codes")
+    ),
 )
 """What a page from elsewhere may read of an answer."""
 FOREIGN_SITES = frozenset({"cross-site", "same-site"})

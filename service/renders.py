@@ -45,11 +45,17 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
                 "description": "share of the view that no training frame saw, hatched unless unseen=guess",
                 "required": True,
                 "schema": {"type": "number", "minimum": 0, "maximum": 1},
-            }
+            },
+            "X-Intrasplat-Depth-Unit": {
+                "description": "of layer=depth, what a value of 1 is; 0 is invalid. False colours have no unit",
+                "schema": {"type": "string", "enum": ["0.01 mm", "mm"]},
+            },
         },
     },
     304: {"description": "it is the one that the caller has"},
 }
+DEPTH_UNITS = {ImageFormat.PNG: "0.01 mm", ImageFormat.NPY: "mm"}
+"""What a value of 1 of layer=depth is."""
 STATUS_OF_REPLY = {"input": 422, "scene": 404, "not-yet": 503, "busy": 503, "internal": 500}
 NOT_YET_RETRY_S = "1"
 GONE = 499
@@ -152,6 +158,8 @@ async def render(
     is_coarse = NoticeCode.COARSE in [each.code for each in answer.head.warnings]
     response.headers.update(cache_headers(shown, tag, is_coarse=is_coarse))
     response.headers["X-Intrasplat-Unseen"] = f"{answer.head.unseen:.3f}"
+    if query.layer is Layer.DEPTH and query.format in DEPTH_UNITS:
+        response.headers["X-Intrasplat-Depth-Unit"] = DEPTH_UNITS[query.format]
     total_ms = (time.perf_counter() - start) * 1e3
     response.headers["Server-Timing"] = f"render;dur={answer.head.render_ms:.1f}, total;dur={total_ms:.1f}"
     return response

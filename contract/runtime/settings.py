@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,6 +15,10 @@ from contract.wire.names import DeviceName
 
 GIB = 2**30
 ENVIRONMENT_PREFIX = "INTRASPLAT_"
+OTHER_VARIABLES = frozenset({"API_KEY", "CACHE", "CHAOS_FOLDER", "DATA", "LAST_WORDS", "THREADS", "URL"})
+"""Of commands, tests and processes among themselves."""
+MISSPELT = 0.75
+"""How alike a name and a setting's are, from 0 to 1, if the one is taken for the other."""
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 """Only this machine can reach a service at one of these."""
 
@@ -39,6 +44,23 @@ def _value(source: Mapping[str, str], variable: str) -> str:
     except (OSError, UnicodeError) as error:
         problem = f"{path} cannot be read ({type(error).__name__})."
         raise InputError(f"{variable}_FILE", problem, "Name a text file that this user may read.") from error
+
+
+def _check_names(source: Mapping[str, str], fields: Collection[str]) -> None:
+    """Return if no variable looks like a misspelt setting; others are ignored, for Kubernetes adds some of its own.
+
+    Raises:
+        InputError: names the first such variable, and the one that is meant.
+    """
+    known = [name.upper() for name in fields]
+    settings = {*known, *(f"{name}_FILE" for name in known), *OTHER_VARIABLES}
+    for variable in sorted(source):
+        name = variable.removeprefix(ENVIRONMENT_PREFIX)
+        if name == variable or name in settings or not source[variable]:
+            continue
+        if near := get_close_matches(name, known, 1, MISSPELT):
+            remedy = f"Did you mean {ENVIRONMENT_PREFIX}{near[0]}? Else unset it."
+            raise InputError(variable, "there is no such setting.", remedy)
 
 
 class Settings(BaseModel):
@@ -75,6 +97,10 @@ class Settings(BaseModel):
     """The service drops a request whose body brings nothing for this long."""
     max_queued: int = Field(default=200, gt=0)
     max_queued_per_tenant: int = Field(default=50, gt=0)
+    tenant_share: float = Field(default=0.5, gt=0, le=1)
+    """Share of max_uploads, and of the disk's room, that the uploads of one tenant may hold; its first always may."""
+    long_training_s: float = Field(default=600.0, gt=0)
+    """Only keys with the scope `long` may ask for longer trainings."""
     requests_per_s: float = Field(default=400.0, gt=0)
     """Maximum rate of one key, or of one address without a key; each process of the service counts for itself."""
 
@@ -108,9 +134,11 @@ class Settings(BaseModel):
         """Read the settings from environment variables; empty ones count as unset.
 
         Raises:
-            InputError: a variable holds a value that its setting does not accept, or names a file that cannot be read.
+            InputError: a variable holds a value that its setting does not accept, names a file that cannot be read, or
+                looks like a misspelt setting.
         """
         source = os.environ if environment is None else environment
+        _check_names(source, cls.model_fields)
         variables = {name: ENVIRONMENT_PREFIX + name.upper() for name in cls.model_fields}
         values = {name: _value(source, variable) for name, variable in variables.items()}
         values["redis_url"] = _value(source, "REDIS_URL") or values["redis_url"]

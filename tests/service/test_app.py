@@ -151,3 +151,48 @@ def test_the_dashboard_is_served_at_the_root(tmp_path: Path) -> None:
         assert "intrasplat" in service.http.get("/").text
         assert service.http.get("/jobs").json() == []
         assert_problem(service.http.get("/nothing.js"), 404)
+
+
+@pytest.mark.parametrize(
+    ("path", "field", "remedy"),
+    [
+        ("/render?scene=SCENE&layers=depth", "layers", "Did you mean layer?"),
+        ("/render?scene=SCENE&t=0.2&t=0.3", "t", "Send it once."),
+        ("/jobs?stat=done", "stat", "Did you mean state?"),
+        ("/jobs/SCENE?verbose=1", "verbose", "Leave it out."),
+        ("/scenes/SCENE/export?fromat=splat", "fromat", "Did you mean format?"),
+    ],
+)
+def test_a_query_name_that_is_unknown_or_comes_twice_is_refused(
+    service: ServiceUnderTest, path: str, field: str, remedy: str
+) -> None:
+    scene = service.finished_scene()
+    problem = assert_problem(service.http.get(path.replace("SCENE", scene)), 422, field)
+    assert problem["remedy"].startswith(remedy)
+
+
+def test_head_is_answered_wherever_get_is_with_its_headers_and_without_a_body(service: ServiceUnderTest) -> None:
+    scene, job = service.finished_scene(), service.upload().json()["id"]
+    paths = ["/healthz", "/readyz", "/info", "/jobs", f"/jobs/{job}", f"/jobs/{job}/events", "/scenes", "/nowhere"]
+    paths += [f"/scenes/{scene}", f"/scenes/{scene}/export?format=ply", f"/render?scene={scene}", "/openapi.json"]
+    for path in paths:
+        head = service.http.request("HEAD", path, timeout=5)
+        assert head.content == b"", path
+        if not path.endswith("/events"):  # which GET would go on to tell
+            get = service.http.get(path)
+            assert head.status_code == get.status_code, path
+            assert head.headers.get("content-type") == get.headers.get("content-type"), path
+            assert head.headers.get("content-length") == get.headers.get("content-length"), path
+        else:
+            assert head.status_code == 200
+    assert service.http.request("HEAD", "/reconstruct").status_code == 405
+
+
+@pytest.mark.parametrize(
+    ("layer", "format", "unit"),
+    [("depth", "png", "0.01 mm"), ("depth", "npy", "mm"), ("depth", "jpeg", None), ("rgb", "png", None)],
+)
+def test_a_render_of_depth_tells_its_unit(service: ServiceUnderTest, layer: str, format: str, unit: str | None) -> None:
+    scene = service.finished_scene()
+    response = service.http.get("/render", params={"scene": scene, "layer": layer, "format": format})
+    assert response.headers.get("X-Intrasplat-Depth-Unit") == unit

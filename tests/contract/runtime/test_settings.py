@@ -46,3 +46,19 @@ def test_a_value_that_is_not_accepted_is_named_with_its_variable(variable: str, 
 def test_a_child_process_reads_the_settings_of_its_parent(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path, redis_url="redis://here", hosts=("a.example",), retention_hours=2.5)
     assert Settings.from_environment(settings.to_environment()) == settings
+
+
+@pytest.mark.parametrize(
+    ("variable", "meant"),
+    [("INTRASPLAT_HSOTS", "INTRASPLAT_HOSTS"), ("INTRASPLAT_DATADIR", "INTRASPLAT_DATA_DIR")],
+)
+def test_a_misspelt_variable_is_refused_with_the_setting_that_is_meant(variable: str, meant: str) -> None:
+    with pytest.raises(InputError, match=variable) as refused:
+        Settings.from_environment({variable: "a.example"})
+    assert refused.value.remedy == f"Did you mean {meant}? Else unset it."
+
+
+def test_variables_of_commands_and_those_that_kubernetes_adds_are_no_settings() -> None:
+    others = ("URL", "API_KEY", "DATA", "CACHE", "THREADS", "SERVICE_HOST", "SERVICE_PORT", "PORT_8765_TCP_ADDR")
+    read = Settings.from_environment({f"INTRASPLAT_{name}": "x" for name in others} | {"INTRASPLAT_HSOTS": ""})
+    assert read == Settings()
