@@ -26,6 +26,7 @@ class Place:
     """One of the uploads that are being received, and the bytes on disk that are kept for what it has yet to bring."""
 
     kept_bytes: int
+    tenant: str
 
 
 class Intake:
@@ -37,33 +38,46 @@ class Intake:
         self._places: set[Place] = set()
 
     @contextmanager
-    def place(self, declared_bytes: int = 0) -> Iterator[Place]:
+    def place(self, tenant: str, declared_bytes: int = 0) -> Iterator[Place]:
         """A place among the uploads that are received at once, with room for `declared_bytes`.
 
         Raises:
-            Problem: 503: all places are taken. 507: the disk has no room for it.
+            Problem: 429: the tenant holds its share. 503: all places are taken. 507: the disk has no room for it.
             LimitError: it is larger than any upload may be.
         """
+        own, share = sum(place.tenant == tenant for place in self._places), self._settings.tenant_share
+        if own and own + 1 > self._settings.max_uploads * share:
+            detail = f"{own} of your uploads are being received, as many as one tenant may send at once."
+            raise Problem(429, detail, field="uploads", remedy="Come back when one of them is through.")
         if len(self._places) >= self._settings.max_uploads:
             detail = f"{len(self._places)} uploads are being received, as many as may be."
             raise Problem(503, detail, field="uploads", remedy="Come back when one of them is through.")
         if declared_bytes:
-            self.check(declared_bytes)
-        place = Place(declared_bytes)
+            self.check(tenant, declared_bytes)
+        place = Place(declared_bytes, tenant)
         self._places.add(place)
         try:
             yield place
         finally:
             self._places.discard(place)
 
-    def check(self, declared_bytes: int) -> None:
-        """Return if an upload of this size is allowed and has room; raises as place()."""
+    def check(self, tenant: str, declared_bytes: int) -> None:
+        """Return if an upload of this size is allowed and has room; raises as place().
+
+        A tenant that has been promised room already gets no more of the disk's than its share.
+        """
         if declared_bytes > self._settings.max_upload_bytes:
             problem = f"{declared_bytes} bytes are more than the {self._settings.max_upload_bytes} of an upload."
             raise LimitError("clip", problem, LIMIT_REMEDY)
         room_bytes = self.room_bytes()
         if declared_bytes > room_bytes:
             raise no_room_for(declared_bytes, room_bytes, self._settings.min_free_bytes)
+        own_bytes = self._kept_bytes(tenant)
+        allowed_bytes = self._settings.tenant_share * (room_bytes + own_bytes)
+        if own_bytes and own_bytes + declared_bytes > allowed_bytes:
+            detail = f"Your uploads have been promised {own_bytes} bytes that have not come, and {declared_bytes} more "
+            detail += f"are beyond the {allowed_bytes:.0f} of one tenant."
+            raise Problem(429, detail, field="uploads", remedy="Send them, or give some up: DELETE /uploads/{id}.")
 
     def has_room(self) -> bool:
         """Whether the disk has what must stay free: without it no clip is accepted."""
@@ -79,8 +93,12 @@ class Intake:
 
     def room_bytes(self) -> int:
         """What may be written now: not what must stay free, nor what is kept for uploads that are on their way."""
-        kept_bytes = sum(place.kept_bytes for place in self._places) + promised_bytes(self._store)
-        return self._store.free_bytes() - self._settings.min_free_bytes - kept_bytes
+        return self._store.free_bytes() - self._settings.min_free_bytes - self._kept_bytes()
+
+    def _kept_bytes(self, tenant: str | None = None) -> int:
+        """What is kept for uploads that are on their way, of one tenant or of all."""
+        places = sum(place.kept_bytes for place in self._places if tenant in (None, place.tenant))
+        return places + promised_bytes(self._store, tenant)
 
     async def body(self, request: Request, place: Place | None = None) -> AsyncIterator[bytes]:
         """The pieces of a request's body as they come.

@@ -144,9 +144,10 @@ def partials_of(store: Store, job_id: str) -> list[Partial]:
     return [each for each in _all(store) if each.declaration.job_id == job_id or _identity(each.path) in taken]
 
 
-def promised_bytes(store: Store) -> int:
-    """What uploads have declared and not sent yet: room on disk that is theirs."""
-    return sum(partial.declaration.length_bytes - partial.offset_bytes for partial in open_partials(store))
+def promised_bytes(store: Store, tenant: str | None = None) -> int:
+    """What uploads, of one tenant or of all, have declared and not sent yet: room on disk that is theirs."""
+    partials = [each for each in open_partials(store) if tenant in (None, each.declaration.tenant)]
+    return sum(partial.declaration.length_bytes - partial.offset_bytes for partial in partials)
 
 
 def _all(store: Store) -> list[Partial]:

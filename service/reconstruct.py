@@ -22,6 +22,7 @@ from contract.intake.fit import check_fit
 from contract.intake.limits import MAX_MEMORY_BYTES, ClipLimits
 from contract.intake.sniff import check_file
 from contract.queue.interface import Admission, QueueFullError
+from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.wire.errors import InputError, LimitError, UnavailableError
 from contract.wire.job import JOB_ID_PATTERN, Forecast, JobRecord, JobView
@@ -38,6 +39,8 @@ from service.upload import CLIP_OF, LIMIT_REMEDY, PARTS, Received, UploadLimits,
 
 router = APIRouter(tags=["jobs"])
 
+STEPS_PER_S = 10.0
+"""By which `iterations` are taken for seconds of training; of a plain machine with `paper`."""
 MAX_SUBMISSION_BYTES = 128 * 1024
 """The limit of a JSON body."""
 JSON_REMEDY = 'Send ids of finished uploads by part, and options: {"clip": ID, "options": {"budget_s": 20}}.'
@@ -126,7 +129,7 @@ def forecast_of(services: Deps, record: JobRecord) -> Forecast | None:
 async def _receive_form(request: Request, services: Deps, caller: Caller, key: str | None) -> JobRecord:
     """The whole clip in one request."""
     store, settings = services.store, services.settings
-    with services.intake.place(declared_length(request)) as place:
+    with services.intake.place(caller.tenant, declared_length(request)) as place:
         job_id = new_job_id()
         folder = store.open_incoming(job_id)
         try:
@@ -257,6 +260,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
     """Spool first, then queue: a job exists only for a clip that is on disk."""
     options = parse_options(JobOptions, received.options)
     check_retention(options, services.settings)
+    _check_scopes(options, caller, services.settings)
     received.check_clip()
     sent = set(received.names)
     clip_of = None
@@ -281,6 +285,15 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
     with services.sweep.in_hand(job_id):
         services.store.accept(record)
         return _enqueue(services, record)
+
+
+def _check_scopes(options: JobOptions, caller: Caller, settings: Settings) -> None:
+    """Return if the caller may ask for this priority, and for so long a training; Problem 403 otherwise."""
+    if options.priority == "high":
+        caller.require(KeyScope.PRIORITY)
+    training_s = options.budget_s or (options.iterations or 0) / STEPS_PER_S
+    if training_s > settings.long_training_s:
+        caller.require(KeyScope.LONG)
 
 
 def _look_at(services: Deps, record: JobRecord, names: Mapping[str, str], sent: Collection[str]) -> None:

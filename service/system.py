@@ -28,6 +28,7 @@ QUEUE_PATIENCE_S, WORKER_PATIENCE_S = 0.5, 0.3
 LIMITS = (
     *("max_upload_bytes", "max_frames", "max_frame_pixels", "max_clip_s", "min_free_bytes"),
     *("max_uploads", "upload_silence_s", "max_queued", "max_queued_per_tenant", "requests_per_s"),
+    *("tenant_share", "long_training_s"),
     *("max_render_pixels", "render_timeout_s", "retention_hours", "max_retention_hours"),
 )
 """Settings that callers are told; None where there is no limit."""

@@ -147,7 +147,7 @@ async def append_to_upload(
     if content_type != CONTENT_TYPE:
         raise Problem(415, f"The content type is {content_type[:80]!r}.", field="Content-Type", remedy=CONTENT_TYPE)
     partial = await run_in_threadpool(_owned, services, caller, upload_id)
-    with services.intake.place() as place:
+    with services.intake.place(caller.tenant) as place:
         file = await run_in_threadpool(_open_at, partial, upload_offset)
         try:
             left_bytes = partial.declaration.length_bytes - upload_offset
@@ -210,7 +210,7 @@ def _check_version(request: Request) -> None:
 
 def _check_size(services: Deps, caller: Caller, part: str, length_bytes: int) -> None:
     check_part_size(part, length_bytes)
-    services.intake.check(length_bytes)
+    services.intake.check(caller.tenant, length_bytes)
     count = sum(partial.declaration.tenant == caller.tenant for partial in open_partials(services.store))
     if count >= MAX_OPEN_UPLOADS:
         raise Problem(429, f"{count} uploads are open.", remedy="Use or delete some: DELETE /uploads/{id}.")

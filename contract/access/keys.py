@@ -44,6 +44,10 @@ class KeyScope(StrEnum):
     """The stored files of scenes, with which a scene is shown and kept elsewhere."""
     PURGE = "purge"
     """Delete scenes and all that belongs to them."""
+    PRIORITY = "priority"
+    """Jobs of high priority, which go before others' and in place of them."""
+    LONG = "long"
+    """Jobs that train longer than others may (Settings.long_training_s)."""
     OPERATE = "operate"
     """Read the metrics."""
 
