@@ -11,6 +11,8 @@ is the fencing token.
 from __future__ import annotations
 
 import re
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from statistics import median
@@ -136,9 +138,9 @@ class Queue(Protocol):
         """The next job, now running and owned by `owner`; None after timeout_s.
 
         The order is: high priority before standard; within each, jobs that were released or whose lease has run out
-        before new ones. An owner holds one job at a time. If it holds one already (because the answer to its claim was
-        lost), it gets the same attempt again. A job whose workers have died MAX_ATTEMPTS times fails instead. One with
-        cancel_requested ends as cancelled instead.
+        before new ones, and these by tenant (claim_order). An owner holds one job at a time. If it holds one already
+        (because the answer to its claim was lost), it gets the same attempt again. A job whose workers have died
+        MAX_ATTEMPTS times fails instead. One with cancel_requested ends as cancelled instead.
         """
         ...
 
@@ -220,6 +222,46 @@ class Queue(Protocol):
     def close(self) -> None:
         """Close all connections."""
         ...
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A queued job. returned: a worker gave it back, or died."""
+
+    job_id: str
+    tenant: str
+    returned: bool
+
+
+def claim_order(waiting: Sequence[Waiting], running: Mapping[str, int], served: Mapping[str, float]) -> list[str]:
+    """The ids of the waiting jobs of one priority, in the order in which they will be claimed if none ends meanwhile.
+
+    Jobs that came back are first. Then comes, again and again, the oldest job of the tenant with the fewest running;
+    among equals, of the one that was given a job longest ago. scripts/claim.lua chooses the same.
+
+    Args:
+        waiting: oldest first.
+        running: how many jobs of each tenant run.
+        served: when each tenant was last given a job that had not come back, on any clock that starts above 0.
+    """
+    returned = [job for job in waiting if job.returned]
+    counts = Counter(running) + Counter(job.tenant for job in returned)
+    served_at, place = dict(served), max(served.values(), default=0.0)
+    lines: dict[str, deque[str]] = {}
+    for job in waiting:
+        if not job.returned:
+            lines.setdefault(job.tenant, deque()).append(job.job_id)
+    order = [job.job_id for job in returned]
+    places = {job.job_id: i for i, job in enumerate(waiting)}
+    while lines:
+        tenant = min(lines, key=lambda each: (counts[each], served_at.get(each, 0.0), places[lines[each][0]]))
+        order.append(lines[tenant].popleft())
+        counts[tenant] += 1
+        place += 1
+        served_at[tenant] = place
+        if not lines[tenant]:
+            del lines[tenant]
+    return order
 
 
 def worker_died() -> JobError:

@@ -21,7 +21,9 @@ from contract.queue.interface import (
     Event,
     Order,
     QueueFigures,
+    Waiting,
     check_admission,
+    claim_order,
     estimate_forecast,
     event_order,
     trainers,
@@ -54,6 +56,9 @@ class MemoryQueue:
         self._event_count = 0
         self._ended: Counter[JobState] = Counter()
         self._durations_s: deque[float] = deque(maxlen=MAX_DURATIONS)
+        self._returned: set[str] = set()
+        self._served: Counter[str] = Counter()
+        """By tenant: the number of the last claim that gave it a new job."""
         self._workers: dict[str, tuple[WorkerAddress, float]] = {}
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
@@ -62,7 +67,7 @@ class MemoryQueue:
             if known is not None:
                 return known
             if admission is not None:
-                waiting = self._waiting()
+                waiting = self._queued()
                 of_tenant = sum(other.tenant == record.tenant for other in waiting)
                 check_admission(admission, len(waiting), of_tenant)
             self._remember(record, IDEMPOTENCY_S)
@@ -124,6 +129,7 @@ class MemoryQueue:
                 self._count_death(record)
             else:
                 self._change(record, JobState.QUEUED, progress=None, released=record.released + 1)
+                self._returned.add(record.job_id)
             return True
 
     def cancel(self, job_id: str) -> JobRecord | None:
@@ -215,13 +221,20 @@ class MemoryQueue:
     def _in(self, state: JobState) -> list[JobRecord]:
         return [record for record in self._records.values() if record.state is state]
 
+    def _queued(self) -> list[JobRecord]:
+        """Queued jobs, oldest first."""
+        return sorted(self._in(JobState.QUEUED), key=lambda record: self._places[record.job_id])
+
     def _waiting(self) -> list[JobRecord]:
         """Queued jobs in the order in which they will be claimed."""
-
-        def turn(record: JobRecord) -> tuple[bool, int]:
-            return record.options.priority == "standard", self._places[record.job_id]
-
-        return sorted(self._in(JobState.QUEUED), key=turn)
+        queued = self._queued()
+        running = Counter(record.tenant for record in self._in(JobState.RUNNING))
+        order: list[str] = []
+        for priority in ("high", "standard"):
+            chosen = [each for each in queued if each.options.priority == priority]
+            waiting = [Waiting(each.job_id, each.tenant, each.job_id in self._returned) for each in chosen]
+            order += claim_order(waiting, running, self._served)
+        return [self._records[job_id] for job_id in order]
 
     def _next(self, owner: str) -> JobRecord | None:
         """The job that `owner` holds already, else the first in line, now running."""
@@ -232,6 +245,8 @@ class MemoryQueue:
             if self._lease_ends_s[record.job_id] <= time.monotonic():
                 self._count_death(record)
         for record in self._waiting():
+            if record.job_id not in self._returned:
+                self._served[record.tenant] = max(self._served.values(), default=0) + 1
             update = {"owner": owner, "attempt": record.attempt + 1, "started_at_s": time.time(), "progress": None}
             return self._change(record, JobState.RUNNING, **update)
         return None
@@ -244,6 +259,7 @@ class MemoryQueue:
             self._change(record, JobState.FAILED, error=worker_died())
         else:
             self._change(record, JobState.QUEUED, progress=None)
+            self._returned.add(record.job_id)
 
     def _settle(self, claim: Claim, target: JobState, **update: object) -> bool:
         """End the job. If a cancel was requested, only CANCELLED is accepted; otherwise anything but CANCELLED."""
@@ -270,9 +286,9 @@ class MemoryQueue:
         """Whether a high-priority job has waited long enough, and no other worker was told to make way for it."""
         if record.options.priority == "high":
             return False
-        for waiting in self._waiting():
+        for waiting in self._queued():
             if waiting.options.priority != "high":
-                break
+                continue
             if time.time() - self._queued_at_s[waiting.job_id] < self._preempt_after_s:
                 continue
             asked, until_s = self._asked_to_yield.get(waiting.job_id, ("", 0.0))
@@ -310,6 +326,8 @@ class MemoryQueue:
         now_s = time.time()
         if target is JobState.QUEUED:
             self._queued_at_s[record.job_id] = now_s
+        if target is not JobState.QUEUED:
+            self._returned.discard(record.job_id)
         if target is JobState.RUNNING:
             self._asked_to_yield.pop(record.job_id, None)
         if target in TERMINAL_STATES:

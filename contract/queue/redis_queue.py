@@ -44,6 +44,7 @@ import json
 import logging
 import time
 import uuid
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -60,7 +61,9 @@ from contract.queue.interface import (
     Event,
     Order,
     QueueFigures,
+    Waiting,
     check_admission,
+    claim_order,
     estimate_forecast,
     event_order,
     trainers,
@@ -172,15 +175,19 @@ class RedisQueue:
         if record is None or record.state in TERMINAL_STATES:
             return Forecast(position=None, eta_s=None)
         with reachable(), self._client.pipeline(transaction=True) as batch:
-            batch.zrank(f"{PREFIX}waiting:{record.options.priority}", job_id)
+            batch.zrange(f"{PREFIX}waiting:{record.options.priority}", 0, -1)
             batch.zcard(f"{PREFIX}waiting:high")
             batch.hvals(HELD)
             batch.lrange(f"{PREFIX}durations", 0, -1)
             batch.time()
-            rank, high, held, durations, (clock_s, _) = batch.execute()
-        before = high if rank is not None and record.options.priority == "standard" else 0
-        position = None if rank is None else rank + before
+            batch.zrange(f"{PREFIX}served", 0, -1, withscores=True)
+            waiting, high, held, durations, (clock_s, _), served = batch.execute()
         running = self._get_all(held)
+        position = None
+        if job_id in waiting:
+            tenants = Counter(each.tenant for each in running.values())
+            position = claim_order(self._waiting(waiting), tenants, dict(served)).index(job_id)
+            position += high if record.options.priority == "standard" else 0
         ran_s = {other: clock_s - (of.started_at_s or clock_s) for other, of in running.items()}
         durations_s = [float(duration) for duration in durations]
         return estimate_forecast(record, position, durations_s, ran_s, trainers(self.workers()))
@@ -251,6 +258,15 @@ class RedisQueue:
 
     def _settle(self, claim: Claim, target: JobState, error: str = "") -> bool:
         return bool(self._scripts.run("settle", claim.job_id, claim.owner, claim.attempt, target.value, error))
+
+    def _waiting(self, job_ids: list[str]) -> list[Waiting]:
+        """What decides when these jobs, all queued, will be claimed."""
+        with reachable(), self._client.pipeline(transaction=False) as batch:
+            for job_id in job_ids:
+                batch.hmget(_job_key(job_id), "tenant", "returned")
+            answers = batch.execute(raise_on_error=False)
+        found = [("", None) if isinstance(answer, redis.RedisError) else answer for answer in answers]
+        return [Waiting(each, tenant or "", bool(back)) for each, (tenant, back) in zip(job_ids, found, strict=True)]
 
     def _usable(self, owner: str, job_id: str, answer: Sequence[str]) -> JobRecord | None:
         """The claimed record. A job whose record cannot be read fails, so that it does not block the queue."""

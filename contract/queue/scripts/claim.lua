@@ -2,10 +2,12 @@
 -- CLAIM: give a worker the next job and a lease on it. The lease is the idle time of the job's stream entry: claiming
 -- and beating (beat.lua) set it to 0 (common.lua: renew). Any worker may claim an entry that was idle for lease_ms.
 -- ARGV   2 owner
--- Keys   held, jobs:high|standard, job:<id>, the indexes of its state, yield:<id>, ended, events:<id>
+-- Keys   held, jobs:high|standard, job:<id>, the indexes of its state, yield:<id>, ended, events:<id>, served
 -- Answer {1, id, hash}: the owner's now. {0, last id of jobs:high, of jobs:standard, how many entries are pending}: none.
 
 local owner = ARGV[2]
+-- When each tenant was given a job, and for how long that is remembered.
+local SERVED, SERVED_S = P .. 'served', 86400
 
 local function answer(job)
   renew(job)
@@ -39,7 +41,7 @@ local function take(priority, entry, fields)
   local known = job and RULES.sources[job.state]
   if known and job.entry == entry then
     if job.state == 'running' then count_death(job) end
-    local claim = {owner = owner, attempt = job.attempt + 1, started = now(), progress = false}
+    local claim = {owner = owner, attempt = job.attempt + 1, started = now(), progress = false, returned = false}
     if change(job, 'running', claim) then return answer(job) end
   elseif id and not known and redis.call('EXISTS', document(id)) == 1 then
     set_aside(id, priority)
@@ -48,28 +50,61 @@ local function take(priority, entry, fields)
   return nil
 end
 
--- An entry that was released, or whose lease has run out.
-local function take_pending(priority)
-  local cursor = '0-0'
-  repeat
-    local found = redis.call(
-      'XAUTOCLAIM', stream(priority), GROUP, CONSUMER, RULES.lease_ms, cursor, 'COUNT', 1)
-    cursor = found[1]
-    for _, entry in ipairs(found[2]) do
-      local taken = take(priority, entry[1], entry[2])
-      if taken then return taken end
-    end
-  until cursor == '0-0'
+-- Make the entries that nobody has read pending, and anybody's at once: all that wait can then be chosen from.
+local function deliver(priority)
+  while true do
+    local found = redis.call('XREADGROUP', 'GROUP', GROUP, CONSUMER, 'COUNT', 100, 'STREAMS', stream(priority), '>')
+    if not found or #found == 0 then return end
+    for _, entry in ipairs(found[1][2]) do offer({priority = priority, entry = entry[1]}) end
+  end
 end
 
-local function take_new(priority)
+-- A job that came back to the queue, or whose lease has run out. nil and the other waiting jobs, oldest first: none.
+local function take_returned(priority)
+  local fresh, from = {}, '-'
   while true do
-    local found = redis.call('XREADGROUP', 'GROUP', GROUP, CONSUMER, 'COUNT', 1, 'STREAMS', stream(priority), '>')
-    if not found or #found == 0 then return nil end
-    local entry = found[1][2][1]
-    local taken = take(priority, entry[1], entry[2])
-    if taken then return taken end
+    local found = redis.call('XPENDING', stream(priority), GROUP, 'IDLE', RULES.lease_ms, from, '+', 100)
+    if #found == 0 then return nil, fresh end
+    for _, pending in ipairs(found) do
+      local entry = pending[1]
+      local row = redis.call('XRANGE', stream(priority), entry, entry)[1]
+      local fields = row and row[2] or {}
+      local id = table_of(fields).job
+      local job = id and read(id)
+      if job and job.state == 'queued' and job.entry == entry and not job.returned then
+        fresh[#fresh + 1] = job
+      else
+        local taken = take(priority, entry, fields)
+        if taken then return taken end
+      end
+      from = '(' .. entry
+    end
   end
+end
+
+-- The first job of the tenant that has the fewest running; among equals, of the one that was given a job longest ago.
+-- contract/queue/interface.py: claim_order says the same.
+local function take_fresh(priority, fresh)
+  local running, heads = {}, {}
+  for _, id in ipairs(redis.call('HVALS', P .. 'held')) do
+    local job = read(id)
+    if job then running[job.tenant] = (running[job.tenant] or 0) + 1 end
+  end
+  for _, job in ipairs(fresh) do
+    if not heads[job.tenant] then
+      heads[job.tenant], heads[#heads + 1] = true, job
+      job.running, job.served = running[job.tenant] or 0, tonumber(redis.call('ZSCORE', SERVED, job.tenant) or 0)
+    end
+  end
+  local best
+  for _, job in ipairs(heads) do
+    local is_before = not best or job.running < best.running or (job.running == best.running and job.served < best.served)
+    if is_before then best = job end
+  end
+  if not best then return nil end
+  redis.call('ZADD', SERVED, now(), best.tenant)
+  redis.call('EXPIRE', SERVED, SERVED_S)
+  return take(priority, best.entry, {'job', best.id})
 end
 
 for _, priority in ipairs(PRIORITIES) do group_of(priority) end
@@ -78,7 +113,9 @@ local held = redis.call('HGET', P .. 'held', owner)
 local mine = held and read(held)
 if mine and mine.state == 'running' and mine.owner == owner then return answer(mine) end
 for _, priority in ipairs(PRIORITIES) do
-  local taken = take_pending(priority) or take_new(priority)
+  deliver(priority)
+  local taken, fresh = take_returned(priority)
+  taken = taken or take_fresh(priority, fresh)
   if taken then return taken end
 end
 local high, standard = group_of('high'), group_of('standard')

@@ -107,7 +107,7 @@ local function count_death(job)
   elseif job.attempt - job.released >= RULES.max_attempts then
     change(job, 'failed', {error = RULES.worker_died})
   else
-    change(job, 'queued', {progress = false})
+    change(job, 'queued', {progress = false, returned = '1'})
   end
 end
 

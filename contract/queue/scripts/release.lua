@@ -10,7 +10,7 @@ if job.state == 'queued' or (died and job.state == 'failed' and job.error == RUL
 if job.state ~= 'running' or job.cancel then return 0 end
 if died then
   count_death(job)
-elseif not change(job, 'queued', {progress = false, released = job.released + 1}) then
+elseif not change(job, 'queued', {progress = false, returned = '1', released = job.released + 1}) then
   return 0
 end
 if job.state == 'queued' then offer(job) end

@@ -203,3 +203,34 @@ def test_nobody_makes_way_for_a_job_that_has_not_waited_long_enough(queues: Make
     _, claim = claimed(queue)
     queue.submit(job(priority="high"))
     assert queue.beat(claim) is Order.GO_ON
+
+
+def test_tenants_take_turns_however_many_jobs_each_has_waiting(queue: Queue) -> None:
+    many = [queue.submit(job(tenant="ward-1")).job_id for _ in range(5)]
+    _, claim = claimed(queue)
+    first, second = (queue.submit(job(tenant="ward-2")).job_id for _ in range(2))
+    other = queue.submit(job(tenant="ward-3")).job_id
+    expected = [first, other, many[1], second, many[2], many[3], many[4]]
+    assert [queue.forecast(each).position for each in expected] == [*range(7)]
+    for job_id in expected:
+        assert queue.finish(claim)
+        record, claim = claimed(queue)
+        assert record.job_id == job_id
+
+
+def test_the_tenant_with_the_fewest_running_jobs_is_next(queue: Queue) -> None:
+    for tenant in ("ward-1", "ward-1", "ward-1", "ward-2", "ward-2"):
+        queue.submit(job(tenant=tenant))
+    owned = [claimed(queue, f"worker-{i}") for i in range(3)]
+    assert [record.tenant for record, _ in owned] == ["ward-1", "ward-2", "ward-1"]
+    assert queue.finish(owned[1][1])
+    assert claimed(queue, "worker-3")[0].tenant == "ward-2"
+
+
+def test_a_job_that_came_back_goes_before_another_tenants_turn(queue: Queue) -> None:
+    mine = queue.submit(job(tenant="ward-1"))
+    queue.submit(job(tenant="ward-2"))
+    _, claim = claimed(queue)
+    assert queue.release(claim)
+    assert queue.forecast(mine.job_id).position == 0
+    assert claimed(queue)[0].job_id == mine.job_id
