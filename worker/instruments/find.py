@@ -48,6 +48,8 @@ at most, relative to the picture's, as highlights have no colour either; share o
 REDDISH, REDDISH_STEP, MIN_REDDISH_OUTLINE, MIN_IN_FRONT = 0.7, 0.15, 0.6, 0.7
 """What is in front may be an instrument that mirrors the tissue: its redness at most; the step in redness and the share
 of its outline that has it; how much its depth looks like an instrument's."""
+UNSURE = 0.5
+"""How likely such a one is: enough to be masked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +88,7 @@ class FoundMask:
     tool    [H, W]
     seen    share of the picture that might be instruments
     clear   of that, what was told clearly: from 0 to `seen`
-    missed  share of the picture that has one sign of an instrument, strongly, and is not masked
+    missed  share of the picture that has an instrument's colour and is not masked
     """
 
     tool: Mask
@@ -120,24 +122,39 @@ def find_instruments(picture: Looked, nearness: Image, look: TissueLook) -> Foun
     if look.redness < MIN_REDNESS:
         return FoundMask(np.zeros(picture.size, np.bool_), 1.0, 0.0)
     candidates = _candidates(picture, nearness, look)
-    found = [each for each in candidates if each.likely >= 0.5]
+    found = [each for each in candidates if each.likely >= UNSURE]
     areas = [float(each.pixels.mean()) for each in candidates]
     clear = sum(area * abs(2 * each.likely - 1) for area, each in zip(areas, candidates, strict=True))
     in_front = _in_front(nearness) > TIP_FRONT
     tool = _outlined(picture, found, in_front, look) if found else np.zeros(picture.size, np.bool_)
-    return FoundMask(tool, sum(areas), clear, _missed(picture, nearness, look, tool))
+    return FoundMask(tool, sum(areas), clear, _missed(picture, look, tool))
 
 
 def _candidates(picture: Looked, nearness: Image, look: TissueLook) -> list[_Candidate]:
-    """What has no tissue's colour, is not behind its surroundings and touches the border."""
+    """What has no tissue's colour, is not behind its surroundings and touches the border; and what mirrors tissue."""
     redness = cv2.GaussianBlur(_redness(picture.coarse), (3, 3), 0)
     grey = cv2.morphologyEx((redness < GREY * look.redness).astype(np.uint8), cv2.MORPH_OPEN, _box(2))
     front = _in_front(nearness)
     part = _closed(grey, 5) & (front > SLIGHTLY_FRONT)
     part = cv2.morphologyEx(part.astype(np.uint8), cv2.MORPH_OPEN, _box(3))
     redness /= np.float32(look.redness)
-    areas = _areas(part, at_border=True)
-    return [_Candidate(pixels, _likely(pixels, front, nearness, redness)) for pixels in areas]
+    found = [_Candidate(each, _likely(each, front, nearness, redness)) for each in _areas(part, at_border=True)]
+    taken = np.zeros(part.shape, np.uint8)
+    for each in found:
+        taken |= each.pixels & (each.likely >= UNSURE)
+    free = cv2.dilate(taken, _box(2 * GAP_PX + 1)) == 0
+    part = _closed((redness < REDDISH).astype(np.uint8), 5) & (front > SLIGHTLY_FRONT) & free
+    part = cv2.morphologyEx(part.astype(np.uint8), cv2.MORPH_OPEN, _box(3))
+    reddish = (each for each in _areas(part, at_border=True) if _mirrors(each, front, nearness, redness))
+    return found + [_Candidate(each, UNSURE) for each in reddish]
+
+
+def _mirrors(pixels: Mask, front: Image, nearness: Image, redness: Image) -> bool:
+    """Whether an area looks like an instrument in the tissue's colour: by its depth, and a slight step in redness."""
+    (near, beyond), (own, around) = _across_outline(pixels, nearness, redness)
+    if not near.size or float((around - own > REDDISH_STEP).mean()) < MIN_REDDISH_OUTLINE:
+        return False
+    return _by_depth(front[pixels], near, beyond) >= MIN_IN_FRONT
 
 
 def _areas(part: Bits, *, at_border: bool) -> Iterator[Mask]:
@@ -151,24 +168,19 @@ def _areas(part: Bits, *, at_border: bool) -> Iterator[Mask]:
             yield label == j
 
 
-def _missed(picture: Looked, nearness: Image, look: TissueLook, tool: Mask) -> float:
-    """Share of the picture outside the masks that has an instrument's colour but not its depth, or the other way."""
-    height, width = nearness.shape
+def _missed(picture: Looked, look: TissueLook, tool: Mask) -> float:
+    """Share of the picture outside the masks that has no colour, as instruments have none and hardly any tissue."""
+    height, width = picture.coarse.shape[:2]
     masked = cv2.resize(tool.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0
     free = cv2.dilate(masked.astype(np.uint8), _box(OUTLINE_PX // 2 + 1)) == 0
     redness = cv2.GaussianBlur(_redness(picture.coarse), (3, 3), 0) / np.float32(look.redness)
     light = cv2.GaussianBlur(picture.coarse.max(axis=2).astype(np.float32), (3, 3), 0)
-    front, share = _in_front(nearness), 0.0
     colourless = cv2.morphologyEx((redness < COLOURLESS).astype(np.uint8), cv2.MORPH_OPEN, _box(3))
+    share = 0.0
     for pixels in _areas(colourless & free, at_border=False):
         ((own, around),) = _across_outline(pixels, redness)
         if own.size and float((around - own > REDNESS_STEP).mean()) > MIN_COLOURED:
             share += float(pixels.mean()) * float(np.median(light[pixels]) < MAX_LIGHT * np.median(light))
-    reddish = _closed((redness < REDDISH).astype(np.uint8), 5) & (front > SLIGHTLY_FRONT) & free
-    for pixels in _areas(cv2.morphologyEx(reddish.astype(np.uint8), cv2.MORPH_OPEN, _box(3)), at_border=True):
-        (near, beyond), (own, around) = _across_outline(pixels, nearness, redness)
-        if near.size and float((around - own > REDDISH_STEP).mean()) > MIN_REDDISH_OUTLINE:
-            share += float(pixels.mean()) * float(_by_depth(front[pixels], near, beyond) >= MIN_IN_FRONT)
     return share
 
 

@@ -15,6 +15,9 @@ from worker.instruments.segmenter import Segmenter
 
 MIN_SURE = 0.7
 """Of what might be instruments, told clearly; below it the report warns."""
+MAX_UNSURE = 0.012
+"""Share of the picture that looks like instruments and is not told clearly; above it the report warns, however much of
+it is clear."""
 MAX_MISSED = 0.001
 """Share of the picture that may be instruments and is not masked; above it the report warns. Clips whose instruments
 are all found or that have none have 0.0005 at most, those with one missed 0.002 and more."""
@@ -55,7 +58,7 @@ class Finder:
         told = Masks(source="found" if self.segmenter is None else "segmenter", share=share, sure=sure)
         text = f"masks: none given; instruments were {how} in {share:.1%} of the picture"
         warnings = []
-        if sure < MIN_SURE:
+        if sure < MIN_SURE or seen - clear > MAX_UNSURE:
             doubt = (
                 f"No masks were given, and of what looks like instruments only {sure:.0%} is told clearly from tissue: "
                 "some may be modelled as tissue, or tissue left out. Give masks."
@@ -64,8 +67,8 @@ class Finder:
         elif missed > MAX_MISSED:
             doubt = (
                 f"No masks were given, and {missed:.1%} of the picture may be instruments that were not found: they "
-                "lie on the tissue, mirror its colour or are wholly inside the picture. Whatever is not masked is "
-                "modelled as tissue: if they are instruments, give masks."
+                "lie on the tissue or are wholly inside the picture. Whatever is not masked is modelled as tissue: if "
+                "they are instruments, give masks."
             )
             warnings.append(Notice.warning(NoticeCode.MASKS_UNSURE, doubt))
         return told, Notice.info(NoticeCode.MASKS, text), tuple(warnings)

@@ -13,7 +13,7 @@ from worker.input.clip import DepthClip
 from worker.input.clip.kept import load_clip, save_clip
 from worker.instruments import Finder, FoundMask, Looked, TissueLook, find_instruments, with_instruments_found
 from worker.instruments.depth_clip import nearness_of
-from worker.instruments.finder import MAX_MISSED
+from worker.instruments.finder import MAX_MISSED, MAX_UNSURE
 from worker.machine.hooks import Hooks
 from worker.machine.timing import Timings
 from worker.phantom import TOOLS, DrawnStereo, PhantomSettings, Tool, make_phantom
@@ -113,13 +113,20 @@ INSIDE, FROM_BORDER = slice(120, 220), slice(0, 120)
 
 @pytest.mark.parametrize(
     ("column", "colour", "nearer"),
-    [(INSIDE, 1.0, 1.0), (FROM_BORDER, 1.0, 1.0), (INSIDE, 1.0, 1.25), (FROM_BORDER, 0.5, 1.25)],
-    ids=["inside", "lies on the tissue", "inside, in front", "mirrors the tissue"],
+    [(INSIDE, 1.0, 1.0), (FROM_BORDER, 1.0, 1.0), (INSIDE, 1.0, 1.25)],
+    ids=["inside", "lies on the tissue", "inside, in front"],
 )
 def test_an_instrument_that_is_not_masked_is_counted_as_missed(column: slice, colour: float, nearer: float) -> None:
     found = looked_at_with(column, colour, nearer)
     assert not found.tool.any()
     assert found.missed > 3 * MAX_MISSED
+
+
+def test_an_instrument_that_mirrors_the_tissue_is_masked_and_unsure() -> None:
+    found = looked_at_with(FROM_BORDER, 0.5, 1.25)
+    assert found.tool[114:122, 4:116].mean() > 0.9
+    assert found.tool.mean() < 0.05
+    assert found.clear < 0.3 * found.seen
 
 
 def test_tissue_and_masked_instruments_are_not_counted_as_missed() -> None:
@@ -129,9 +136,17 @@ def test_tissue_and_masked_instruments_are_not_counted_as_missed() -> None:
     assert found.missed < 0.5 * MAX_MISSED
 
 
-@pytest.mark.parametrize(("missed", "codes"), [(0.0, []), (2 * MAX_MISSED, [NoticeCode.MASKS_UNSURE])])
-def test_what_was_missed_is_told(missed: float, codes: list[NoticeCode]) -> None:
-    _, _, doubts = Finder(TissueLook(0.3)).told(0.1, np.array([[0.1, 0.1, missed], [0.1, 0.1, missed]]))
+@pytest.mark.parametrize(
+    ("clear", "missed", "codes"),
+    [
+        (0.1, 0.0, []),
+        (0.1, 2 * MAX_MISSED, [NoticeCode.MASKS_UNSURE]),
+        (0.1 - 2 * MAX_UNSURE, 0.0, [NoticeCode.MASKS_UNSURE]),
+        (0.05, 2 * MAX_MISSED, [NoticeCode.MASKS_UNSURE]),
+    ],
+)
+def test_what_was_missed_or_is_unsure_is_told(clear: float, missed: float, codes: list[NoticeCode]) -> None:
+    _, _, doubts = Finder(TissueLook(0.3)).told(0.1, np.array([[0.1, clear, missed], [0.1, clear, missed]]))
     assert [each.code for each in doubts] == codes
 
 
