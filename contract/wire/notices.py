@@ -54,6 +54,7 @@ class NoticeCode(StrEnum):
     EYES_COLOURED_APART = "eyes_coloured_apart"
     EYES_DISAGREE = "eyes_disagree"
     FEW_FRAMES = "few_frames"
+    FIELD_OF_VIEW_UNUSUAL = "field_of_view_unusual"
     FRAMES_WITHOUT_TISSUE = "frames_without_tissue"
     FRAME_COUNT_UNKNOWN = "frame_count_unknown"
     HIDDEN_AT_FIRST = "hidden_at_first"

@@ -5,6 +5,7 @@ Symbols: T frames, H W pixels of one eye.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -23,6 +24,9 @@ from worker.machine.mapped import let_go, mapped_zeros
 
 OPENCV_PIXEL_CENTRE = 0.5  # OpenCV puts pixel centres at whole numbers, this project at +0.5 (docs/conventions.md)
 WARN_ZOOM, MAX_ZOOM = 1.2, 2.0  # of the focal length; a sound endoscope calibration stays below 1.1
+
+USUAL_VIEW_DEG = 35.0, 95.0
+"""What an endoscope's picture shows from side to side. 59 is usual: twice or half the focal length lies outside."""
 
 GRID_POINTS = 17  # a side, on which it is asked how far rectification moves rows
 
@@ -107,7 +111,7 @@ def _pass_through(clip: StereoClip, calibration: RectifiedCalibration) -> Rectif
         tissue=_all_tissue(clip) if clip.tissue is None else clip.tissue,
         frame_times_s=clip.frame_times_s,
         assumptions=_assumptions(clip, c, "frames: rectified already, as the calibration says"),
-        warnings=clip.warnings + _scale_warning(c),
+        warnings=clip.warnings + _scale_warning(c) + _view_warning(c.fx_px, c.width),
         tissue_right=clip.tissue_right,
     )
 
@@ -141,6 +145,7 @@ def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
         assumptions=_assumptions(clip, calibration, "frames: as recorded, rectified by the calibration"),
         warnings=clip.warnings
         + _scale_warning(calibration)
+        + _view_warning(calibration.left.fx_px, clip.width)
         + _zoom_warning(float(left_p[0, 0]) / calibration.left.fx_px),
         equal_rows_px=float(
             np.median(_rows(size, *cameras[1], right_r, right_p) - _rows(size, *cameras[0], left_r, left_p))
@@ -208,6 +213,19 @@ def _scale_warning(calibration: StereoCalibration) -> tuple[Notice, ...]:
         "distance is wrong"
     )
     return (Notice.warning(NoticeCode.CALIBRATION_SCALED, text),)
+
+
+def _view_warning(fx_px: float, width: int) -> tuple[Notice, ...]:
+    """What to say of a picture that shows less or more than endoscopes do."""
+    view_deg = math.degrees(2 * math.atan(width / (2 * fx_px)))
+    low_deg, high_deg = USUAL_VIEW_DEG
+    if low_deg <= view_deg <= high_deg:
+        return ()
+    text = (
+        f"by the calibration the picture is {view_deg:.0f} degrees wide, and endoscopes show {low_deg:.0f} to "
+        f"{high_deg:.0f}: check the image size and the focal length that it names, on which every distance depends"
+    )
+    return (Notice.warning(NoticeCode.FIELD_OF_VIEW_UNUSUAL, text),)
 
 
 def _zoom_warning(zoom: float) -> tuple[Notice, ...]:
