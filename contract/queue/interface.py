@@ -20,6 +20,8 @@ from typing import Protocol
 
 from contract.wire.errors import ErrorCode, UnavailableError
 from contract.wire.job import Forecast, JobError, JobProgress, JobRecord, JobState
+from contract.wire.names import BUDGETS_S
+from contract.wire.options import ReconstructionOptions
 from contract.wire.rendering import WorkerAddress
 
 MAX_ATTEMPTS = 3
@@ -289,42 +291,54 @@ def check_admission(admission: Admission, queued: int, queued_of_tenant: int) ->
         )
 
 
+@dataclass(frozen=True)
+class Pace:
+    """How long the last done jobs ran, for forecasts.
+
+    durations_s: in all. rests_s: beyond the seconds of training that each asked for, less than 0 if it ended sooner.
+    """
+
+    durations_s: Sequence[float]
+    rests_s: Sequence[float]
+
+
+def asked_training_s(options: ReconstructionOptions) -> float | None:
+    """The seconds of training that options ask for; None if they count steps, or the preset has no budget."""
+    return None if options.iterations is not None else options.budget_s or BUDGETS_S.get(options.preset)
+
+
 def estimate_forecast(
-    record: JobRecord, position: int | None, durations_s: list[float], ran_s: dict[str, float], workers: int
+    record: JobRecord, position: int | None, pace: Pace, ran_s: Mapping[str, float], workers: int
 ) -> Forecast:
     """Where a queued or running job is in the queue, and when it may be done.
 
-    The job's own progress decides if it tells how long is left. Otherwise every job is taken to last the median of the
-    last durations; a job that has not begun and has a budget lasts that at least.
+    The job's own progress decides if it tells how long is left. Otherwise it is taken to last what it asks for and the
+    median of the rests; a job that has not begun and has a budget lasts that at least. The others are taken to last
+    the median of the last durations, as is a job that asks for no time.
 
     Args:
         position: how many jobs wait before it; None: it runs.
-        durations_s: how long the last done jobs ran.
+        pace: of the last done jobs.
         ran_s: how long each running job has run so far, by its id.
         workers: how many are live and share the work.
     """
     progress = record.progress
     if progress is not None and progress.seconds_left is not None:
         return Forecast(position=position, eta_s=progress.seconds_left)
-    eta_s = _estimate_s(position, durations_s, ran_s.get(record.job_id, 0.0), list(ran_s.values()), workers)
-    if eta_s is not None and progress is None and record.options.budget_s is not None:
+    if not pace.durations_s or (position is not None and workers == 0):
+        return Forecast(position=position, eta_s=None)
+    usual_s = own_s = median(pace.durations_s)
+    asked_s = asked_training_s(record.options)
+    if asked_s is not None and pace.rests_s:
+        own_s = max(0.0, asked_s + median(pace.rests_s))
+    if position is None:
+        eta_s = max(0.0, own_s - ran_s.get(record.job_id, 0.0))
+    else:
+        left_s = sum(max(0.0, usual_s - each_s) for each_s in ran_s.values())
+        eta_s = (left_s + position * usual_s) / workers + own_s
+    if progress is None and record.options.budget_s is not None:
         eta_s = max(eta_s, record.options.budget_s)
     return Forecast(position=position, eta_s=eta_s)
-
-
-def _estimate_s(
-    position: int | None, durations_s: list[float], own_s: float, running_s: list[float], workers: int
-) -> float | None:
-    """Seconds until the job is done if every job lasts the median of the last; None: unknown."""
-    if not durations_s:
-        return None
-    usual_s = median(durations_s)
-    if position is None:
-        return max(0.0, usual_s - own_s)
-    if workers == 0:
-        return None
-    left_s = sum(max(0.0, usual_s - ran_s) for ran_s in running_s)
-    return (left_s + position * usual_s) / workers + usual_s
 
 
 def trainers(workers: list[WorkerAddress]) -> int:

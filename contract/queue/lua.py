@@ -16,6 +16,7 @@ from contract.queue.redis_client import reachable
 from contract.queue.redis_hash import EVENT_FIELDS
 from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError, JobState, sources_of
+from contract.wire.names import BUDGETS_S
 
 NAMES = ("submit", "restore", "claim", "beat", "settle", "release", "cancel", "retry", "forget", "announce")
 
@@ -65,5 +66,6 @@ def _rules(lease_s: float, preempt_after_s: float) -> str:
         "max_events": MAX_EVENTS,
         "event_fields": EVENT_FIELDS,
         "max_durations": MAX_DURATIONS,
+        "budgets_s": dict(BUDGETS_S),
     }
     return json.dumps(rules)

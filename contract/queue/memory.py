@@ -20,8 +20,10 @@ from contract.queue.interface import (
     Claim,
     Event,
     Order,
+    Pace,
     QueueFigures,
     Waiting,
+    asked_training_s,
     check_admission,
     claim_order,
     estimate_forecast,
@@ -56,6 +58,7 @@ class MemoryQueue:
         self._event_count = 0
         self._ended: Counter[JobState] = Counter()
         self._durations_s: deque[float] = deque(maxlen=MAX_DURATIONS)
+        self._rests_s: deque[float] = deque(maxlen=MAX_DURATIONS)
         self._returned: set[str] = set()
         self._served: Counter[str] = Counter()
         """By tenant: the number of the last claim that gave it a new job."""
@@ -163,7 +166,8 @@ class MemoryQueue:
             ran_s = {each.job_id: now_s - (each.started_at_s or now_s) for each in self._in(JobState.RUNNING)}
             waiting = [other.job_id for other in self._waiting()]
             position = waiting.index(job_id) if job_id in waiting else None
-            return estimate_forecast(record, position, list(self._durations_s), ran_s, trainers(self.workers()))
+            pace = Pace(list(self._durations_s), list(self._rests_s))
+            return estimate_forecast(record, position, pace, ran_s, trainers(self.workers()))
 
     def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
         with self._changed:
@@ -335,6 +339,9 @@ class MemoryQueue:
             self._ended[target] += 1
         if target is JobState.DONE and record.started_at_s is not None:
             self._durations_s.append(now_s - record.started_at_s)
+            asked_s = asked_training_s(record.options)
+            if asked_s is not None:
+                self._rests_s.append(now_s - record.started_at_s - asked_s)
         return self._write(self._moved(record, target, **update))
 
     def _write(self, record: JobRecord) -> JobRecord:

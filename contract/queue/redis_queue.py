@@ -60,6 +60,7 @@ from contract.queue.interface import (
     Claim,
     Event,
     Order,
+    Pace,
     QueueFigures,
     Waiting,
     check_admission,
@@ -181,7 +182,8 @@ class RedisQueue:
             batch.lrange(f"{PREFIX}durations", 0, -1)
             batch.time()
             batch.zrange(f"{PREFIX}served", 0, -1, withscores=True)
-            waiting, high, held, durations, (clock_s, _), served = batch.execute()
+            batch.lrange(f"{PREFIX}rests", 0, -1)
+            waiting, high, held, durations, (clock_s, _), served, rests = batch.execute()
         running = self._get_all(held)
         position = None
         if job_id in waiting:
@@ -189,8 +191,8 @@ class RedisQueue:
             position = claim_order(self._waiting(waiting), tenants, dict(served)).index(job_id)
             position += high if record.options.priority == "standard" else 0
         ran_s = {other: clock_s - (of.started_at_s or clock_s) for other, of in running.items()}
-        durations_s = [float(duration) for duration in durations]
-        return estimate_forecast(record, position, durations_s, ran_s, trainers(self.workers()))
+        pace = Pace([float(each) for each in durations], [float(each) for each in rests])
+        return estimate_forecast(record, position, pace, ran_s, trainers(self.workers()))
 
     def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
         index = INDEX if tenant is None else f"{PREFIX}tenant:{tenant}:index"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from typing import Any
 
 import pytest
 
@@ -15,7 +16,7 @@ from contract.queue.interface import (
     Queue,
 )
 from contract.store.shelf import new_job_id
-from contract.wire.job import JobState
+from contract.wire.job import JobRecord, JobState
 from contract.wire.options import JobOptions
 from contract.wire.rendering import WorkerAddress
 from tests.contract.queues import ERROR, TRAINING, claimed, job, known, state_of
@@ -312,6 +313,29 @@ def test_the_end_of_a_job_is_estimated_from_those_that_were_done(queue: Queue) -
     _, claim = claimed(queue)
     queue.beat(claim, TRAINING)
     assert queue.forecast(generous.job_id).eta_s == TRAINING.seconds_left
+
+
+def test_a_job_is_estimated_by_what_it_asks_for(queue: Queue) -> None:
+    queue.announce(WorkerAddress(name="worker-1", endpoint="ipc:///run/worker-1.sock", device="cpu"))
+    queue.submit(with_options(preset="instant"))
+    record, claim = claimed(queue)
+    time.sleep(0.05)
+    assert queue.finish(claim)
+    done = known(queue, record.job_id)
+    assert done.finished_at_s is not None
+    assert done.started_at_s is not None
+    took_s = done.finished_at_s - done.started_at_s
+    expected_s = {"instant": took_s, "fast": took_s + 54.5, "quality": took_s + 234.5, "paper": took_s}
+    for preset, seconds in expected_s.items():
+        waiting = queue.submit(with_options(preset=preset))
+        assert queue.forecast(waiting.job_id).eta_s == pytest.approx(seconds, abs=1e-3)
+        queue.cancel(waiting.job_id)
+    counted = queue.submit(with_options(preset="quality", iterations=30))
+    assert queue.forecast(counted.job_id).eta_s == pytest.approx(took_s, abs=1e-3)
+
+
+def with_options(**options: Any) -> JobRecord:
+    return job().model_copy(update={"options": JobOptions(**options)})
 
 
 def test_the_figures_count_what_waits_runs_and_has_ended(queue: Queue) -> None:

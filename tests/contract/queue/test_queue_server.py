@@ -64,7 +64,7 @@ def test_ended_jobs_leave_nothing_in_the_streams_and_forgotten_ones_no_key(
         assert client.xpending(f"{PREFIX}jobs:{priority}", "workers")["pending"] == 0
     for record in served.records():
         assert served.forget(record.job_id)
-    lasting = {"jobs:high", "jobs:standard", "sequence", "ended", "durations"}
+    lasting = {"jobs:high", "jobs:standard", "sequence", "ended", "durations", "rests"}
     assert {key for key in keys_of(client) if not key.startswith("forgotten:")} == lasting | {"served"}
     assert all(client.ttl(PREFIX + key) > 0 for key in keys_of(client) - lasting)
 
