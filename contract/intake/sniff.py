@@ -5,6 +5,7 @@ It reads only a few bytes. The files that pass are decoded in a confined process
 
 from __future__ import annotations
 
+import re
 import zipfile
 from pathlib import Path, PurePosixPath
 
@@ -26,6 +27,9 @@ MAX_NESTING = 64  # of a calibration, whose own levels are four
 _PLAIN_TEXT_REMEDY = "Give numbers only: our JSON, OpenCV YAML or XML, or StereoMIS ini."
 _ACTIVE_TEXT = {"<!entity": "declares XML entities", "<!doctype": "has an XML document type", "!!python": "names code"}
 
+_NOT_FINITE = re.compile(r"(?<![\w\"'./-])[-+]?\.?(nan|inf|infinity)(?![\w\"'.=:-])", re.IGNORECASE)
+_COMMENT = re.compile(r"[#;].*|<!--.*?-->")
+
 
 def check_file(path: Path, part: str, limits: ClipLimits) -> None:
     """Check one part of an upload. The sender declares its kind by the ending of its name.
@@ -37,7 +41,9 @@ def check_file(path: Path, part: str, limits: ClipLimits) -> None:
     if path.stat().st_size == 0:
         raise InputError(part, f"{path.name} is empty (0 bytes).", "Send the file again.")
     if part == "calibration":
-        check_calibration_text(_text_of(path, part), part, path.name)
+        text = _text_of(path, part)
+        check_calibration_text(text, part, path.name)
+        _check_numbers(text, part, path.name)
     elif path.suffix.lower() == ZIP_SUFFIX:
         _check_zip(path, part, limits)
     else:
@@ -62,6 +68,14 @@ def check_calibration_text(text: str, field: str, label: str) -> None:
     if levels > MAX_NESTING:
         problem = f"{label} is nested {levels} levels deep; the limit is {MAX_NESTING}."
         raise InputError(field, problem, _PLAIN_TEXT_REMEDY)
+
+
+def _check_numbers(text: str, field: str, label: str) -> None:
+    """InputError for a number that is none or not finite, as a calibration that failed writes it."""
+    for number, line in enumerate(text.splitlines(), 1):
+        if found := _NOT_FINITE.search(_COMMENT.sub("", line)):
+            problem = f"{label} holds {found.group()[:20]}, which is not a finite number, in line {number}."
+            raise InputError(field, problem, "Calibrate again, or give the calibration of this recording.")
 
 
 def _text_of(path: Path, part: str) -> str:

@@ -1,0 +1,49 @@
+"""A calibration with a number that is none is refused when it arrives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from contract.intake.limits import ClipLimits
+from contract.intake.sniff import check_file
+from contract.wire.errors import InputError
+
+YAML = "%YAML:1.0\nM1: !!opencv-matrix\n   rows: 1\n   data: [ 570., {}, 1. ]\n"
+XML = "<?xml version='1.0'?><opencv_storage><T><data>-4.1 {} 0.1</data></T></opencv_storage>"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("c.json", '{"fx_px": NaN}'),
+        ("c.json", '{"fx_px": -Infinity}'),
+        ("c.yaml", YAML.format(".Nan")),
+        ("c.yaml", YAML.format("-.Inf")),
+        ("c.xml", XML.format("nan")),
+        ("c.ini", "[StereoLeft]\nfc_x=nan\n"),
+    ],
+)
+def test_a_calibration_with_what_is_no_number_is_refused_at_upload(tmp_path: Path, name: str, text: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(InputError, match="not a finite number") as refused:
+        check_file(path, "calibration", ClipLimits())
+    assert refused.value.field == "calibration"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("c.json", '{"model": "rectified", "info": "inf"}'),
+        ("c.yaml", "# nan where unknown\n" + YAML.format("0.")),
+        ("c.xml", XML.format("0.0") + "<!-- nan -->"),
+        ("c.ini", "; inf\n[StereoLeft]\nfc_x=570\n"),
+        ("c.yaml", YAML.format("0.") + "nan_count: 0\ninf: 1\n"),
+    ],
+)
+def test_words_and_comments_are_no_numbers(tmp_path: Path, name: str, text: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    check_file(path, "calibration", ClipLimits())
