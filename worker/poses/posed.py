@@ -45,12 +45,12 @@ def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, ti
     if options.poses == "given" and not brought:
         problem = "asks for poses that come with the clip, and stereo clips bring none."
         raise InputError("options.poses", f"it {problem}", 'Say "auto" or "estimate", or give the EndoNeRF layout.')
-    if options.poses == "given":
-        return replace(clip, poses=CameraPoses(source="given"))
     train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.left_out))
     with timings.measure("poses_s"):
+        if options.poses == "given":
+            return _as_given(clip, *jitter_mm(clip, train))
         if options.poses == "auto" and brought:
-            return _given(clip, train, hooks)
+            return _steadied(clip, train, hooks)
         hooks.report_stage(STAGE, 0.0)
         if options.poses == "fixed" or len(train) < MIN_FRAMES:
             return _fixed(clip, "was taken as fixed")
@@ -61,29 +61,41 @@ def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, ti
         return _settled(clip, find_path(clip, train, lambda share: hooks.report_stage(STAGE, share)), options)
 
 
-def _given(clip: DepthClip, train: Sequence[int], hooks: Hooks) -> DepthClip:
+def _as_given(clip: DepthClip, jumps_mm: float, depth_mm: float) -> DepthClip:
+    """The clip with the poses that it brought, and a warning if they jump by so much that the model suffers."""
+    clip = replace(clip, poses=CameraPoses(source="given"))
+    if clip.intrinsics.fx * jumps_mm <= MAX_JITTER * clip.intrinsics.width * depth_mm:
+        return clip
+    text = (
+        f"The camera's poses jump to and fro by about {jumps_mm:.1f} mm at the tissue from frame to frame: they seem "
+        "to be inexact, and the model takes their errors for motion."
+    )
+    return replace(clip, warnings=(*clip.warnings, Notice.warning(NoticeCode.POSE_JITTER, text)))
+
+
+def _steadied(clip: DepthClip, train: Sequence[int], hooks: Hooks) -> DepthClip:
     """The clip with the poses that it brought, without their jumps if they jump to and fro and the pictures tell."""
-    told = CameraPoses(source="given")
     jumps_mm, depth_mm = jitter_mm(clip, train)
     if clip.intrinsics.fx * jumps_mm <= MIN_JITTER * clip.intrinsics.width * depth_mm:
-        return replace(clip, poses=told)
+        return _as_given(clip, 0.0, depth_mm)
     from worker.poses.estimate import find_path
 
     found = find_path(clip, train, lambda share: hooks.report_stage(STAGE, share))
     steady = steadied(clip.world_from_camera, found.world_from_camera, found.unsure)
     if steady.jumps_mm < WORTH * jumps_mm:  # the pictures show the same: the camera itself shakes
-        return replace(clip, poses=told)
+        return _as_given(clip, 0.0, depth_mm)
     text = f"poses: the given ones jump to and fro by about {jumps_mm:.2f} mm at the tissue from frame to frame; "
     if len(found.unsure) > MAX_UNSURE * clip.frame_count or steady.left_mm > WORTH * jumps_mm:
         notice = Notice.info(NoticeCode.POSES, f"{text}the pictures do not place the frames better, so they stay")
-        return replace(clip, poses=told, assumptions=(*clip.assumptions, notice))
+        return _as_given(replace(clip, assumptions=(*clip.assumptions, notice)), jumps_mm, depth_mm)
     text += "each frame was moved to where its picture places it between its neighbours, which may leave "
     notice = Notice.info(NoticeCode.POSES, f"{text}{steady.left_mm:.2f} mm")
-    clip = replace(clip, assumptions=(*clip.assumptions, notice))
+    clip = replace(placed(clip, steady.world_from_camera), assumptions=(*clip.assumptions, notice))
+    clip = replace(clip, poses=CameraPoses(source="given", steadied_mm=jumps_mm))
     if clip.intrinsics.fx * steady.left_mm > MAX_JITTER * clip.intrinsics.width * depth_mm:
         text = f"The camera's poses, once steadied, may still be off by {steady.left_mm:.1f} mm at the tissue."
         clip = replace(clip, warnings=(*clip.warnings, Notice.warning(NoticeCode.POSE_JITTER, text)))
-    return replace(placed(clip, steady.world_from_camera), poses=told.model_copy(update={"steadied_mm": jumps_mm}))
+    return clip
 
 
 def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) -> DepthClip:

@@ -1,4 +1,4 @@
-"""What in the pictures, masks and poses of a clip makes its scene doubtful, in plain words.
+"""What in the pictures, masks and depth of a clip makes its scene doubtful, in plain words.
 
 Symbols: T frames, H W pixels. Each check is one number and one bound. The bounds lie between what clean clips show,
 real and synthetic, and what harms a scene (docs/decisions/016-stability.md). Held-out frames are not looked at.
@@ -18,7 +18,6 @@ from contract.wire.notices import Notice, NoticeCode
 from worker.fusion import CLEAR_CONFIDENCE
 from worker.input.clip.split import REPEAT_LEVELS
 from worker.input.clip.types import DepthClip
-from worker.poses.given import MAX_JITTER, jitter_mm
 from worker.train.scoring import sample_frames
 
 MIN_FRAMES = 16
@@ -122,7 +121,7 @@ def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
 
 
 def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
-    """Doubts about how the training frames follow each other: repeated, hidden at first, masks or poses that jump."""
+    """Doubts about how the training frames follow each other: repeated, hidden at first, masks or depth that jump."""
     found = []
     pairs = list(itertools.pairwise(train))
     repeated = 0
@@ -158,7 +157,7 @@ def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
                 "as if it were tissue.",
             )
         )
-    return found + _depth_doubts(clip, train) + _pose_doubts(clip, train)
+    return found + _depth_doubts(clip, train)
 
 
 def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
@@ -229,20 +228,6 @@ def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
             NoticeCode.DEPTH_JUMPS,
             f"Depth jumps by more than {DEPTH_JUMP:.0%} from one frame to the next on {jumps / total:.0%} of the "
             "tissue: much of it is wrong, and so are distances in this scene.",
-        )
-    ]
-
-
-def _pose_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
-    """Poses that jump to and fro still."""
-    jumps_mm, depth_mm = jitter_mm(clip, train)
-    if clip.intrinsics.fx * jumps_mm <= MAX_JITTER * clip.intrinsics.width * depth_mm:
-        return []
-    return [
-        Notice.warning(
-            NoticeCode.POSE_JITTER,
-            f"The camera's poses jump to and fro by about {jumps_mm:.1f} mm at the tissue from frame to frame: they "
-            "seem to be inexact, and the model takes their errors for motion.",
         )
     ]
 

@@ -24,7 +24,7 @@ from worker.model.deformation import Deformation
 from worker.model.gaussians import Gaussians
 from worker.scene.files import dtype_name
 
-POSE_DOUBTS = frozenset({NoticeCode.POSES_UNSURE, NoticeCode.CAMERA_OR_TISSUE})
+POSE_DOUBTS = frozenset({NoticeCode.POSES_UNSURE, NoticeCode.CAMERA_OR_TISSUE, NoticeCode.POSE_JITTER})
 """Warnings of a clip that every view of its scene repeats: a view is as right as the poses it was made with."""
 
 

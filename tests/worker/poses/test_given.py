@@ -20,6 +20,7 @@ from worker.phantom import PhantomSettings, make_phantom
 from worker.phantom.scene import Phantom
 from worker.poses import with_poses
 from worker.poses.trajectory import trajectory_error
+from worker.scene.scene import POSE_DOUBTS
 
 
 def brought(path: str, noise_mm: float) -> tuple[DepthClip, DepthClip]:
@@ -58,10 +59,12 @@ def test_poses_that_jump_are_refined_to_half_of_their_noise_and_the_rest_is_told
     assert [notice.code for notice in result.assumptions if notice not in clip.assumptions] == [NoticeCode.POSES]
 
 
-def test_poses_that_must_be_given_stay_as_they_are() -> None:
+def test_poses_that_must_be_given_stay_as_they_are_and_their_jumps_are_told() -> None:
     _, given = brought("swing", 1.0)
     result = posed(given, "given")
     np.testing.assert_array_equal(result.world_from_camera, given.world_from_camera)
+    assert [notice.code for notice in result.warnings if notice not in given.warnings] == [NoticeCode.POSE_JITTER]
+    assert NoticeCode.POSE_JITTER in POSE_DOUBTS  # so every view repeats it
 
 
 @dataclass(frozen=True)

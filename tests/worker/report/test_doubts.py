@@ -57,7 +57,6 @@ def test_a_real_clip_is_not_doubted() -> None:
         ("duplicated_frames", 3, "repeat the one before"),
         ("hidden_at_start", 5, "in the first frame that later ones show"),
         ("masks_missing", 3, "have no mask although those before and after have"),
-        ("noisy_poses", 3, "poses jump to and fro"),
         ("depth_outliers", 2, "Depth jumps by more than 10%"),
         ("depth_noise", 4, "Depth jumps by more than 10%"),
     ],
