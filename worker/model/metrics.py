@@ -26,6 +26,8 @@ HIGHLIGHT_LEVEL, HIGHLIGHT_PX = 0.6, 7
 """A pixel whose least channel exceeds this is a highlight, and with it a square of so many pixels around it."""
 COVERED_ALPHA = 0.5
 """Least sum of blending weights at which a pixel counts as covered and its depth as valid."""
+MASK_OVERREAD = 32
+"""Bytes kept behind a mask: cv2.norm of OpenCV 4.14 reads up to 8 past its end with AVX2, which may lie in no page."""
 
 
 def psnr_tissue(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> float:
@@ -134,7 +136,9 @@ def _squared(
     first: Image, second: Image, chosen: NDArray[np.bool_], as_compared: Callable[[Image], NDArray[np.float32]]
 ) -> float:
     """The squared differences of two images [H, W, 3] at the chosen pixels, added up; NaN where one of them is NaN."""
-    mask = np.ascontiguousarray(chosen).view(np.uint8)
+    room = np.empty(chosen.size + MASK_OVERREAD, np.uint8)
+    mask = room[: chosen.size].reshape(chosen.shape)
+    np.copyto(mask, chosen)
     pairs = ((as_compared(first[..., place]), as_compared(second[..., place])) for place in range(3))
     return float(sum(cv2.norm(*pair, cv2.NORM_L2SQR, mask) for pair in pairs))
 

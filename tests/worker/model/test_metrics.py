@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -20,6 +22,18 @@ from worker.model.metrics import (
 )
 
 H, W = 40, 52
+BEFORE_NO_PAGE = """
+import ctypes, mmap
+import numpy as np
+from worker.model.metrics import psnr_tissue
+page, count = mmap.PAGESIZE, 64 * 64
+memory = np.frombuffer(mmap.mmap(-1, count + page), np.uint8)
+assert not ctypes.CDLL(None).mprotect(ctypes.c_void_p(memory.ctypes.data + count), page, 0)  # PROT_NONE
+tissue = memory[:count].view(np.bool_).reshape(64, 64)
+tissue[:] = True
+print(psnr_tissue(np.zeros((64, 64, 3), np.float32), np.full((64, 64, 3), 255, np.uint8), tissue))
+"""
+"""A mask that ends where the next byte belongs to no page: reading past it is a segmentation fault."""
 
 
 def pictures(seed: int = 0) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.bool_]]:
@@ -36,6 +50,12 @@ def test_psnr_tissue_is_the_mean_squared_error_of_tissue_alone_after_clamping() 
     rendered[~tissue] = 7.0
     squared = (np.clip(rendered, 0, 1) - truth / 255)[tissue] ** 2
     assert psnr_tissue(rendered, truth, tissue) == pytest.approx(-10 * math.log10(squared.mean()), abs=1e-4)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="protects a page as Linux does")
+def test_nothing_behind_a_mask_is_read() -> None:
+    run = subprocess.run([sys.executable, "-c", BEFORE_NO_PAGE], capture_output=True, text=True, check=False)
+    assert (run.returncode, float(run.stdout or "nan")) == (0, 0.0), run.stderr
 
 
 def test_psnr_paper_counts_the_zeroed_instrument_as_right() -> None:
