@@ -55,11 +55,10 @@ The model that `intrasplat reconstruct CLIP --iterations 600 --out s600` ends wi
 _MASKS = """
 ## Instruments found without masks
 
-`python benchmarks/bm_masks.py --seeds 31 --size 320x256`, with `--iterations 300` for the first steel clip and the
-real ones ([masks.csv](masks.csv)): masks that are found against true ones, of every kind of instrument, and what a
-model loses by them. [Decision 048](../decisions/048-instruments-found.md) has the table and what it means. The rows
-of phantoms name commits from before this was rebased: its finder is that of 44fb769, which gave the real clips the
-same figures again.
+`python benchmarks/bm_masks.py --size 320x256 --seeds 31 --iterations 300 --out docs/results/masks.csv`
+([masks.csv](masks.csv)): masks that are found against true ones, of every kind of instrument, and what a model loses by
+them. [Decision 048](../decisions/048-instruments-found.md) says what it means. The rows ran beside other programs, so
+their seconds are too many.
 """
 _STEREO = """
 ## Depth from stereo
