@@ -16,23 +16,24 @@ _PATHS = """
 `python benchmarks/bm_poses.py --frames 128 --seeds 0 1 --out docs/results/poses.csv` and, for the last three rows,
 `--frames 64 --motions breathing --paths pan advance shake --seeds 1` ([poses.csv](poses.csv)): stereo clips of 320x256
 without poses. The absolute trajectory error of the estimated path, of training frames and of held-out ones, and what
-the report says of it. `d4d_stereo` has no true path; its camera is fixed, and its error is the distance from rest of the
-path before `estimate` decides that the camera is fixed. The rows ran beside other programs, so their seconds are too
-many ([decision 049](../decisions/049-what-is-camera-and-what-is-tissue.md)).
+the report says of it. `d4d_stereo` has no true path; its camera is fixed, and its error is the distance from rest of
+the path before `estimate` decides that the camera is fixed. The rows ran beside other programs, so their seconds are
+too many ([decision 049](../decisions/049-what-is-camera-and-what-is-tissue.md)).
 """
 _NOISY = """
 ### Given poses that jump
 
-`python benchmarks/bm_poses.py --frames 64 --paths pan advance roll turn shake swing --seeds 1 --noise 0.1 0.25 1.0 --out
-docs/results/noisy_poses.csv` ([noisy_poses.csv](noisy_poses.csv)): clips with depth whose poses err by so many mm along
-each axis, and by as much again at the tissue by their angles; the absolute trajectory error as given and as trained on.
-Each report says by how much the given poses jump and what steadying may leave; warned is from two pixels of 640 on
-([decision 051](../decisions/051-given-poses-that-jump.md)).
+`python benchmarks/bm_poses.py --frames 64 --paths pan advance roll turn shake swing --seeds 1 --noise 0.1 0.25 1.0
+--out docs/results/noisy_poses.csv` ([noisy_poses.csv](noisy_poses.csv)): clips with depth whose poses err by so many mm
+along each axis, and by as much again at the tissue by their angles; the absolute trajectory error as given and as
+trained on. Each report says by how much the given poses jump and what steadying may leave; warned is from two
+pixels of 640 on ([decision 051](../decisions/051-given-poses-that-jump.md)).
 """
 _TISSUE = """
 ### Tissue that comes into view later
 
-`python -m benchmarks.bm_keyframes --motions breathing pull --seeds 1 --out docs/results/keyframes.csv` ([keyframes.csv](keyframes.csv)):
+`python -m benchmarks.bm_keyframes --motions breathing pull --seeds 1 --out docs/results/keyframes.csv`
+([keyframes.csv](keyframes.csv)):
 `fast` on stereo clips of 320x256, with the true poses and with those that `auto` finds. Held-out psnr_tissue in dB,
 left and right eye; the share of the tissue seen by any frame that the scene covers. Then what has left the view, from
 where the camera was a quarter of the clip before: the median error of its depth in mm, had it stayed as it was, and
