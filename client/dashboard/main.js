@@ -1,7 +1,9 @@
 // The page: wires form, jobs, picture, curve and report together.
 
 import { getCurve, getReport } from "./api.js";
+import { stepBackWhileIdle } from "./awake.js";
 import { drawCurve, pointsOfCsv } from "./curve.js";
+import { Drawers } from "./drawers.js";
 import { ClipForm } from "./form.js";
 import { JobList } from "./joblist.js";
 import { Jobs } from "./jobs.js";
@@ -16,7 +18,9 @@ const WHAT_REPORTS_ARE = "Of the scene in view: how good it is, and what was ass
 const viewer = new Viewer({
   stage: get("stage"),
   canvas: get("picture"),
+  status: get("status"),
   badge: get("badge"),
+  statusText: get("status-text"),
   message: get("stage-message"),
   warning: get("picture-warning"),
   sceneId: get("scene-id"),
@@ -29,6 +33,8 @@ const viewer = new Viewer({
   home: get("home"),
   play: get("play"),
 });
+
+const drawers = new Drawers(get("tools"));
 
 /** @type {string | null} the job that opens by itself as soon as there is something to see of it */
 let awaited = null;
@@ -45,6 +51,7 @@ function view(id, words) {
   awaited = null;
   reported = null;
   viewer.open(id, words);
+  if (id !== null && drawers.isOpen !== "report-drawer") drawers.close();
   say(WHAT_REPORTS_ARE);
   drawCurve(get("curve"), [], []);
   showJobs();
@@ -72,7 +79,9 @@ async function report(id) {
 
 function sendMasks(id) {
   const job = jobs.byId.get(id);
-  if (job) form.sendMasks(job);
+  if (!job) return;
+  drawers.open("drawer", false);
+  form.sendMasks(job);
 }
 
 function offerMasks() {
@@ -130,3 +139,5 @@ get("layer").addEventListener("change", offerMasks);
 get("better-masks").addEventListener("click", () => sendMasks(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
 keyEvents.addEventListener("changed", () => view(null, currentKey() ? "Choose a job." : "The key is forgotten."));
+stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen === null);
+drawers.open("library", false);

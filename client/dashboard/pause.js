@@ -12,13 +12,16 @@ const MAX_PAUSE_MS = 8000;
  */
 export function pause(ms, signal) {
   return new Promise((resolve, reject) => {
-    const timer = setTimeout(resolve, ms);
     const giveUp = () => {
       clearTimeout(timer);
       reject(signal.reason);
     };
+    const timer = setTimeout(() => {
+      signal?.removeEventListener("abort", giveUp); // else they pile up while a signal lives
+      resolve();
+    }, ms);
     if (signal?.aborted) giveUp();
-    signal?.addEventListener("abort", giveUp, { once: true });
+    else signal?.addEventListener("abort", giveUp, { once: true });
   });
 }
 

@@ -11,8 +11,8 @@ const FIRST_PICTURE = "first_picture";
 
 export class Screen {
   /**
-   * @param {{stage: HTMLElement, canvas: HTMLCanvasElement, badge: HTMLElement, message: HTMLElement,
-   *   warning: HTMLElement, sceneId: HTMLElement}} parts
+   * @param {{stage: HTMLElement, canvas: HTMLCanvasElement, status: HTMLElement, badge: HTMLElement,
+   *   statusText: HTMLElement, message: HTMLElement, warning: HTMLElement, sceneId: HTMLElement}} parts
    */
   constructor(parts) {
     Object.assign(this, parts);
@@ -42,12 +42,15 @@ export class Screen {
     this.#look();
   }
 
-  /** @param {Picture} picture @param {ImageBitmap} bitmap of it @param {string} name what it shows */
+  /** @param {Picture} picture @param {ImageBitmap} bitmap of it, closed here @param {string} name what it shows */
   show(picture, bitmap, name) {
-    this.canvas.width = bitmap.width;
-    this.canvas.height = bitmap.height;
-    this.canvas.getContext("2d").drawImage(bitmap, 0, 0);
-    this.canvas.setAttribute("aria-label", name);
+    const { canvas } = this;
+    if (canvas.width !== bitmap.width) canvas.width = bitmap.width; // setting it clears and allocates anew
+    if (canvas.height !== bitmap.height) canvas.height = bitmap.height;
+    canvas.getContext("2d").drawImage(bitmap, 0, 0);
+    bitmap.close();
+    canvas.setAttribute("aria-label", name);
+    this.name = name;
     this.shown = picture;
     this.shownAt = Date.now();
     this.awaitedUntil = 0;
@@ -70,10 +73,11 @@ export class Screen {
 
   #look() {
     const [state, badge, message] = this.#state();
-    this.stage.dataset.state = state;
+    this.stage.dataset.state = this.status.dataset.state = state;
     this.canvas.hidden = this.shown === null;
     setText(this.badge, badge);
     this.badge.hidden = badge === "";
+    setText(this.statusText, this.shown && state !== "stale" ? this.name : "");
     setText(this.message, message);
     this.message.hidden = message === "";
     setText(this.warning, state === "stale" ? "" : (this.shown?.warning ?? ""));

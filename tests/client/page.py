@@ -244,6 +244,8 @@ class Page:
         self.driver.get(self.url)
 
     def find(self, css: str) -> WebElement:
+        """An element to use; what has stepped back returns, as it does for whoever reaches for it."""
+        self.script("document.dispatchEvent(new PointerEvent('pointermove'))")
         return self.driver.find_element(By.CSS_SELECTOR, css)
 
     def text(self, css: str) -> str:
@@ -291,8 +293,14 @@ class Page:
         found: str = self.script("return document.querySelector('#picture').getAttribute('aria-label')")
         return found
 
+    def show(self, drawer: str) -> None:
+        """Open one of the drawers in front of the picture: library, drawer (a new clip) or report-drawer."""
+        if self.script("return document.getElementById(arguments[0]).hidden", drawer):
+            self.click(f"#tools [data-drawer={drawer}]")
+
     def choose(self, name: str, *paths: Path) -> None:
         """Files in one of the form's pickers."""
+        self.show("drawer")
         self.find(f'#upload [name="{name}"]').send_keys("\n".join(map(str, paths)))
 
     def messages(self) -> dict[str, str]:

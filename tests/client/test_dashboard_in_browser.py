@@ -275,6 +275,7 @@ def test_a_job_is_cancelled_and_a_failed_one_tried_again_by_keyboard(site: Site,
     assert site.queue.fail(claim, JobError(problem="The clip is dark.", field="clip", remedy="Send a brighter one."))
     page.until_text("#jobs", "clip: The clip is dark. Send a brighter one.")
     job = f'[data-job="{claim.job_id}"]'
+    page.show("library")
     page.until(lambda: page.find(f'{job} button[aria-label^="Try again"]').is_displayed())
     page.find(f'{job} button[aria-label^="Try again"]').send_keys(Keys.ENTER)
     page.until_text("#jobs", "next")
@@ -322,7 +323,7 @@ def test_the_viewer_fits_the_screen(site: Site, page: Page, width: int) -> None:
     page.until_state("live")
     page.until_text("#report", "How far to trust it")
     bottom, right = page.script(
-        "const box = document.querySelector('.viewer').getBoundingClientRect(); return [box.bottom, box.right]"
+        "const box = document.querySelector('#theatre').getBoundingClientRect(); return [box.bottom, box.right]"
     )
     assert bottom <= 800
     assert right <= width

@@ -1,0 +1,104 @@
+"""The theatre view in a real browser: the picture fills the screen, and all else steps back from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from selenium.webdriver.common.keys import Keys
+
+from tests.client.page import Page, Site
+
+SIZES = [(1280, 800), (1920, 1080), (820, 1180), (390, 844)]
+"""A laptop, the screen of an operating room, a tablet held upright, a phone."""
+
+
+@contextmanager
+def screen_of(page: Page, width: int, height: int) -> Iterator[None]:
+    page.driver.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False},
+    )
+    try:
+        yield
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def box_of(page: Page, css: str) -> tuple[float, float, float, float]:
+    """Left, top, right, bottom on the screen, in pixels."""
+    left, top, right, bottom = page.script(
+        "const box = document.querySelector(arguments[0]).getBoundingClientRect();"
+        "return [box.left, box.top, box.right, box.bottom]",
+        css,
+    )
+    return left, top, right, bottom
+
+
+def is_on_screen(page: Page, css: str) -> bool:
+    """Whether all of an element is on the screen, and nothing lies over its middle."""
+    return bool(
+        page.script(
+            """
+            const found = document.querySelector(arguments[0]);
+            const { left, top, right, bottom, width, height } = found.getBoundingClientRect();
+            if (width * height === 0 || left < 0 || top < 0 || right > innerWidth + 1 || bottom > innerHeight + 1)
+              return false;
+            const over = document.elementFromPoint(left + width / 2, top + height / 2);
+            return found.contains(over);
+            """,
+            css,
+        )
+    )
+
+
+def test_a_drawer_opens_beside_the_picture_and_gives_the_focus_back(site: Site, page: Page) -> None:
+    page.press(site.scene(), "View")
+    page.until_state("live")
+    assert not page.find("#library").is_displayed()  # it was open at first, to choose a scene
+    button = page.find("#tools [data-drawer=drawer]")
+    button.click()
+    assert page.find("#drawer").is_displayed()
+    assert button.get_attribute("aria-expanded") == "true"
+    page.find("#tools [data-drawer=library]").click()
+    assert not page.find("#drawer").is_displayed()
+    page.find("#library [data-close]").send_keys(Keys.ENTER)
+    assert not page.find("#library").is_displayed()
+    assert page.script("return document.activeElement.dataset.drawer") == "library"
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_the_picture_fills_the_screen_and_a_refusal_is_seen_whatever_is_open(
+    site: Site, page: Page, tmp_path: Path, width: int, height: int
+) -> None:
+    notes = tmp_path / "notes.mp4"
+    notes.write_text("no film")
+    with screen_of(page, width, height):
+        page.press(site.scene(), "View")
+        page.until_state("live")
+        left, top, right, bottom = box_of(page, "#stage")
+        assert (right - left) * (bottom - top) > 0.85 * width * height
+        page.choose("clip", notes)
+        page.script("document.querySelector('#upload details').open = true")
+        page.click("#upload [type=submit]")
+        page.until_text("#upload-message", "clip:")
+        assert is_on_screen(page, "#upload-message")
+        page.click("#drawer [data-close]")
+        assert is_on_screen(page, "#upload-message")
+        assert is_on_screen(page, ".notice")
+        assert page.script("return document.documentElement.scrollWidth") <= width
+
+
+def test_controls_step_back_while_idle_and_return(site: Site, page: Page) -> None:
+    page.press(site.scene(), "View")
+    page.until_state("live")
+    idle = "return document.querySelector('#theatre').hasAttribute('data-idle')"
+    page.until(lambda: page.script(idle))
+    page.until(lambda: page.script("return getComputedStyle(document.querySelector('#tools')).opacity") == "0")
+    assert is_on_screen(page, "#badge")
+    for sign in ("pointermove", "pointerdown", "keydown"):
+        page.script("document.querySelector('#theatre').toggleAttribute('data-idle', true)")
+        page.script("document.body.dispatchEvent(new Event(arguments[0], { bubbles: true }))", sign)
+        assert not page.script(idle), sign
