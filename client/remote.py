@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from contextlib import AbstractContextManager
+from datetime import datetime
 from pathlib import Path
 
 from client.connected import KEY_VARIABLE, Remedies, connected
@@ -15,6 +16,7 @@ from contract.runtime.exits import ExitCode
 from contract.runtime.progress_bar import ProgressBar
 from contract.wire.errors import InputError, SceneError
 from contract.wire.job import JobProgress
+from contract.wire.labels import NO_NAMES
 from contract.wire.names import MANIFEST
 from contract.wire.options import JobOptions
 from intrasplat_client import Client, Conflict, JobState, JobView
@@ -31,12 +33,21 @@ def add_remote(commands: Commands) -> None:
     jobs = add_command(commands, "jobs", "list the newest jobs, newest first", _jobs)
     jobs.add_argument("--state", choices=[state.value for state in JobState], help="only jobs in this state")
     jobs.add_argument("--limit", type=count, metavar="N", help="at most N jobs (default: 200)")
+    jobs.add_argument("--find", metavar="WORDS", help="only jobs with these words in label, metadata or id")
+    jobs.add_argument("--preset", help="only jobs of this preset")
+    jobs.add_argument("--since", type=_date, metavar="DATE", help="only jobs submitted then or later: 2026-05-04")
+    jobs.add_argument("--until", type=_date, metavar="DATE", help="only jobs submitted before: 2026-05-05T12:00")
+    _add_metadata(jobs, "only jobs with this in their metadata; may come several times")
+    label = add_command(commands, "label", "change a job's label and metadata", _label)
+    label.add_argument("--label", metavar="TEXT", help=f"the new label; '' removes it. {NO_NAMES}")
+    _add_metadata(label, "in place of all metadata that was there; may come several times")
+    label.add_argument("--no-metadata", action="store_true", help="remove all metadata")
     cancel = add_command(commands, "cancel", "stop a job and remove its clip", _cancel)
     retry = add_command(commands, "retry", "queue a failed job again", _retry)
     delete = add_command(commands, "delete", "remove clip, scene and record of a job that has ended", _delete)
-    for parser in (watch, cancel, retry, delete):
+    for parser in (watch, label, cancel, retry, delete):
         parser.add_argument("job", metavar="JOB", help="the id that submit printed")
-    for parser in (watch, jobs, cancel, retry, delete):
+    for parser in (watch, jobs, label, cancel, retry, delete):
         _add_service(parser)
 
 
@@ -59,6 +70,8 @@ def _add_submit(commands: Commands) -> None:
         help="instead of INPUT: use this job's clip again, with its calibration and masks unless others are given",
     )
     add_options(parser, JobOptions)
+    parser.add_argument("--label", metavar="TEXT", help=f"a text to find the job by. {NO_NAMES}")
+    _add_metadata(parser, f"a text to find the job by; may come several times. {NO_NAMES}")
     parser.add_argument("--idempotency-key", metavar="TEXT", help="the same key with the same clip is the same job")
     parser.add_argument("--watch", action="store_true", help="wait for the scene, with a progress bar")
     _add_service(parser)
@@ -85,6 +98,24 @@ def _add_fetch(commands: Commands) -> None:
         "--scene", action="store_true", help="the stored scene, too, into DIR/scene: `intrasplat render` reads it"
     )
     _add_service(parser)
+
+
+def _add_metadata(parser: argparse.ArgumentParser, help_text: str) -> None:
+    parser.add_argument("--metadata", type=_entry, action="append", metavar="NAME=VALUE", help=help_text)
+
+
+def _entry(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise argparse.ArgumentTypeError(f"{text!r} has no =.")
+    return name, value
+
+
+def _date(text: str) -> float:
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no date such as 2026-05-04 or 2026-05-04T12:00.") from None
 
 
 def _add_service(parser: argparse.ArgumentParser) -> None:
@@ -114,6 +145,8 @@ def _submit(options: argparse.Namespace) -> int:
                 clip_of=options.clip_of,
                 calibration=options.calibration,
                 masks=options.masks,
+                label=options.label,
+                metadata=dict(options.metadata or ()),
                 idempotency_key=options.idempotency_key,
                 on_upload=lambda sent, total: bar.show(JobProgress(stage="upload", fraction=sent / total)),
                 **chosen,
@@ -190,8 +223,29 @@ def _stored_files(client: Client, scene: str) -> dict[str, bytes]:
 
 def _jobs(options: argparse.Namespace) -> int:
     with _client(options) as client:
-        for job in client.jobs(options.state, options.limit):
-            print(f"{job.id}  {job.state.value:<9}  {_detail_of(job)}".rstrip())
+        found = client.jobs(
+            options.state,
+            options.limit,
+            q=options.find,
+            metadata=dict(options.metadata or ()),
+            preset=options.preset,
+            created_from_s=options.since,
+            created_until_s=options.until,
+        )
+    for job in found:
+        label = "" if job.label is None else f"[{job.label}]  "
+        print(f"{job.id}  {job.state.value:<9}  {label}{_detail_of(job)}".rstrip())
+    return ExitCode.OK
+
+
+def _label(options: argparse.Namespace) -> int:
+    metadata = {} if options.no_metadata else dict(options.metadata) if options.metadata else None
+    if options.label is None and metadata is None:
+        raise InputError("--label", "there is nothing to change.", "Give --label, --metadata or --no-metadata.")
+    with _client(options) as client:
+        job = client.label(options.job, options.label, metadata)
+    for line in (job.label or "", *(f"{name}={value}" for name, value in job.metadata.items())):
+        print(line)
     return ExitCode.OK
 
 

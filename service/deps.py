@@ -11,11 +11,11 @@ from __future__ import annotations
 from ipaddress import ip_address
 from typing import Annotated
 
-from fastapi import Depends, Query
+from fastapi import Depends
 from starlette.requests import HTTPConnection
 
 from contract.access.audit import AuditLog
-from contract.queue.interface import MAX_LISTED, Queue
+from contract.queue.interface import Queue
 from contract.runtime.settings import Settings
 from contract.store.shelf import is_job_id
 from contract.store.store import Store
@@ -103,9 +103,6 @@ AnyCaller = Annotated[Caller, Depends(_caller)]
 EarlyCaller = Annotated[Caller | None, Depends(_caller_if_known)]
 """For a WebSocket whose key may come in its first message, since browsers send no header: None means that it must.
 services.access.caller_of_key(text, address) then says whose it is."""
-
-
-ListingLimit = Annotated[int, Query(ge=1, le=MAX_LISTED, description="maximum number of entries")]
 
 
 def owned_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:

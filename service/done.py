@@ -6,12 +6,15 @@ other finished scene is made of what the store knows: the submission names the t
 
 from __future__ import annotations
 
+import functools
 import threading
+from collections.abc import Sequence
 
-from contract.queue.interface import Queue
+from contract.queue.interface import Queue, place_of
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord, JobState
+from service.listing import Page, SceneSearch, find_among, find_page
 from service.questions import Questions
 
 REMEMBERED = 1_000
@@ -61,16 +64,18 @@ class DoneJobs:
                 del self._records[next(iter(self._records))]
         return record if there else None
 
-    def of_tenant(self, tenant: str) -> tuple[list[JobRecord], bool]:
-        """The tenant's done jobs, newest first, and whether the queue named them.
+    def page_of(self, tenant: str, search: SceneSearch) -> tuple[Page, bool]:
+        """A page of the tenant's done jobs, and whether the queue named them.
 
         While it is away they are those with a finished scene in the store.
         """
+        find = functools.partial(self._queue.records, tenant)
         try:
-            records = self._questions.ask(lambda: self._queue.records(tenant, None), LIST_PATIENCE_S)
+            told = self._questions.ask(lambda: find_page(search, tenant, find, JobState.DONE), LIST_PATIENCE_S)
         except UnavailableError:
-            return self._stored_of(tenant), False
-        return [record for record in records if record.state is JobState.DONE], True
+            stored = find_among(self._stored_of(tenant))
+            return find_page(search, tenant, lambda limit, before: self._labelled(stored(limit, before))), False
+        return told, True
 
     def forget(self, job_id: str) -> None:
         """Remember no more of a job that was purged."""
@@ -90,7 +95,10 @@ class DoneJobs:
         found = {job_id: self._submitted.get(job_id) or self._store.submission(job_id) for job_id in attempts}
         self._submitted = {job_id: each for job_id, each in found.items() if each is not None}  # they never change
         done = (_as_done(each, attempts[job_id]) for job_id, each in self._submitted.items() if each.tenant == tenant)
-        return sorted(filter(None, done), key=lambda record: record.created_at_s, reverse=True)
+        return sorted(filter(None, done), key=place_of, reverse=True)
+
+    def _labelled(self, records: Sequence[JobRecord]) -> list[JobRecord]:
+        return [each.model_copy(update={"labels": self._store.labels(each.job_id)}) for each in records]
 
 
 def _as_done(submitted: JobRecord | None, attempts: list[int]) -> JobRecord | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Response
@@ -10,10 +11,12 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.queue.interface import MAX_LISTED, event_order
+from contract.queue.interface import event_order
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState, JobView
-from service.deps import AnyCaller, Deps, ListingLimit, Services, owned_job
+from contract.wire.labels import LabelChange
+from service.deps import AnyCaller, Deps, Services, owned_job
 from service.events import NOTHING_SEEN
+from service.listing import PAGED, JobQuery, find_page, tell_next
 from service.problems import RETRY_AFTER_S, Problem
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
@@ -27,14 +30,14 @@ STREAM_RESPONSES: dict[int | str, dict[str, object]] = {
 }
 
 
-@router.get("", operation_id="list_jobs")
-def list_jobs(
-    services: Services, caller: AnyCaller, state: JobState | None = None, limit: ListingLimit = MAX_LISTED
-) -> list[JobView]:
-    """The newest jobs, newest first; of one state if it is given. Positions in the queue are told of each by itself."""
+@router.get("", operation_id="list_jobs", responses=PAGED)
+def list_jobs(services: Services, caller: AnyCaller, response: Response, search: JobQuery) -> list[JobView]:
+    """The jobs, newest first, a page at a time. Positions in the queue are told of each by itself."""
     caller.require(KeyScope.VIEW)
-    records = services.queue.records(caller.tenant, limit if state is None else None)
-    return [JobView.of(record) for record in records if state in (None, record.state)][:limit]
+    find = functools.partial(services.queue.records, caller.tenant)
+    page = find_page(search, caller.tenant, find, search.state)
+    tell_next(response, page, caller.tenant)
+    return [JobView.of(record) for record in page.records]
 
 
 @router.get("/{job_id}", operation_id="get_job")
@@ -42,6 +45,21 @@ def get_job(job_id: str, response: Response, services: Services, caller: AnyCall
     """State, position, stage, progress, held-out dB so far, seconds left, and the error if it failed."""
     caller.require(KeyScope.VIEW)
     return _view(services, owned_job(services, caller, job_id), response)
+
+
+@router.patch("/{job_id}", operation_id="label_job")
+def label_job(job_id: str, change: LabelChange, response: Response, services: Services, caller: AnyCaller) -> JobView:
+    """Change label and metadata, in whatever state the job is. A field that is left out stays, null removes it.
+
+    `metadata` takes the place of all that was there. Neither is for names of persons.
+    """
+    caller.require(KeyScope.RECONSTRUCT)
+    before = owned_job(services, caller, job_id)
+    services.audit.record(AuditAction.LABELLED, caller, job_id)
+    services.store.keep_labels(job_id, before.labels.changed(change))
+    record = services.queue.relabel(job_id, change) or owned_job(services, caller, job_id)
+    services.purger.log_is_stale()
+    return _view(services, record, response)
 
 
 @router.delete("/{job_id}", operation_id="cancel_job")

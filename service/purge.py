@@ -75,11 +75,15 @@ class Purger:
         self._audit.record(AuditAction.PURGED, caller, job_id, f"done ({reason})")
         self._queue.forget(job_id)
         self._done.forget(job_id)
-        self._log_stale_since_s = time.monotonic()
+        self.log_is_stale()
         self._refuse_live(job_id)
         receipt = self._receipt(job_id, removed, uploads)
         note.unlink(missing_ok=True)
         return receipt
+
+    def log_is_stale(self) -> None:
+        """Say that the queue's log on disk holds what must not stay there."""
+        self._log_stale_since_s = time.monotonic()
 
     def clear_log(self, now_s: float | None = None) -> None:
         """Rid the queue's log on disk of what was purged, once its notes of that have expired. now_s: monotonic."""

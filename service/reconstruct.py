@@ -26,6 +26,7 @@ from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.wire.errors import InputError, LimitError, UnavailableError
 from contract.wire.job import JOB_ID_PATTERN, Forecast, JobRecord, JobView
+from contract.wire.labels import Labels, parse_labels
 from contract.wire.options import JobOptions, parse_options
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
@@ -56,7 +57,8 @@ FILE = {"type": "string", "format": "binary"}
 def _body_schema(part: dict[str, str]) -> dict[str, Any]:
     parts = dict.fromkeys(PARTS, part)
     one_clip = [{"required": ["clip"]}, {"required": ["left", "right"]}, {"required": [CLIP_OF]}]
-    properties = {**parts, CLIP_OF: CLIP_OF_ID, "options": JobOptions.model_json_schema()}
+    labels = Labels.model_json_schema()["properties"]
+    properties = {**parts, CLIP_OF: CLIP_OF_ID, **labels, "options": JobOptions.model_json_schema()}
     return {"type": "object", "properties": properties, "additionalProperties": False, "oneOf": one_clip}
 
 
@@ -67,7 +69,7 @@ REQUEST_BODY: dict[str, Any] = {
         "content": {
             "multipart/form-data": {
                 "schema": _body_schema(FILE),
-                "encoding": {"options": {"contentType": "application/json"}},
+                "encoding": {name: {"contentType": "application/json"} for name in ("options", "metadata")},
             },
             "application/json": {
                 "schema": _body_schema(UPLOAD_ID),
@@ -94,6 +96,8 @@ class Submission(BaseModel):
     calibration: str | None = None
     masks: str | None = None
     clip_of: str | None = None
+    label: str | None = None
+    metadata: dict[str, object] | None = None
     options: dict[str, object] = Field(default={})
 
     def uploads(self) -> dict[str, str]:
@@ -175,7 +179,8 @@ def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key:
     job_ids = {partial.declaration.job_id for partial in partials.values()}
     if job_ids - {None}:
         return _taken_before(services, job_ids, submission, options)
-    received = Received(options=options.model_dump_json(), clip_of=submission.clip_of)
+    labels = parse_labels(submission.label, submission.metadata)
+    received = Received(options=options.model_dump_json(), clip_of=submission.clip_of, labels=labels)
     received.names = {part: partial.path.name for part, partial in partials.items()}
     received.check_clip()  # before anything is read
     with contextlib.ExitStack() as held:
@@ -242,7 +247,7 @@ def _taken_before(services: Deps, job_ids: set[str | None], submission: Submissi
     """The job that has the uploads, if all of them went into this one job and it has the same clip and options."""
     job_id = next(job_id for job_id in job_ids if job_id is not None)
     known = services.queue.get(job_id)
-    record = known or services.store.submission(job_id)
+    record = known or services.store.labelled_submission(job_id)
     clip_of = submission.clip_of and first_job(services.store, submission.clip_of)
     if len(job_ids) > 1 or record is None or (record.options, record.clip_of) != (options, clip_of):
         detail = f"An upload was used for the job {job_id} already."
@@ -273,6 +278,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         tenant=caller.tenant,
         files=received.files(),
         options=options,
+        labels=received.labels,
         input_bytes=received.total_bytes,
         input_sha256=received.sha256(),
         clip_of=clip_of,

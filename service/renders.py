@@ -31,6 +31,7 @@ from contract.wire.rendering import (
 from service.access import Caller
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services, owned_scene
+from service.listing import SceneSearch
 from service.problems import Problem
 from service.version import version
 
@@ -195,10 +196,10 @@ def _find(services: Deps, caller: Caller, scene: str | None) -> Shown:
 
 
 def _only(services: Deps, caller: Caller) -> Shown:
-    done, _ = services.done.of_tenant(caller.tenant)
-    there = [record for record in done if services.store.has_scene(record.job_id, record.attempt)]
-    if len(there) != 1:
-        detail = f"There are {len(there)} scenes and none was named."
+    page, _ = services.done.page_of(caller.tenant, SceneSearch())
+    there = [record for record in page.records if services.store.has_scene(record.job_id, record.attempt)]
+    if len(there) != 1 or page.end is not None:
+        detail = f"There are {len(there)}{' or more' if page.end else ''} scenes and none was named."
         raise Problem(400, detail, field="scene", remedy="Add scene=ID; GET /scenes lists them.")
     return Shown(there[0].job_id, there[0].attempt)
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from fastapi import APIRouter, Response
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.queue.interface import MAX_LISTED
 from contract.store.shelf import is_job_id
 from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
@@ -17,7 +16,8 @@ from contract.wire.names import CURVE, MASKS
 from contract.wire.rendering import RecordedRequest
 from contract.wire.report import Report
 from service.access import Caller
-from service.deps import AnyCaller, Deps, ListingLimit, Services, no_such_scene, owned_scene
+from service.deps import AnyCaller, Deps, Services, no_such_scene, owned_scene
+from service.listing import PAGED, SceneQuery, tell_next
 from service.problems import Problem
 from service.purge import Receipt
 from service.renders import ModelTime, find_shown, image_response
@@ -33,25 +33,28 @@ class SceneSummary(BaseModel):
     """
 
     id: str
+    label: str | None = Field(default=None, description="what its caller calls it; PATCH /jobs/{id} changes it")
+    metadata: dict[str, str] = Field(default={}, description="what its caller noted on it")
+    preset: str
+    created_at_s: float = Field(description="when its job was submitted, UNIX s")
     scored: bool = True
     psnr_tissue_db: float | None = None
     error: str | None = None
     links: dict[str, str]
 
 
-@router.get("", operation_id="list_scenes")
-def list_scenes(
-    services: Services, caller: AnyCaller, response: Response, limit: ListingLimit = MAX_LISTED
-) -> list[SceneSummary]:
-    """The newest finished scenes, newest first.
+@router.get("", operation_id="list_scenes", responses=PAGED)
+def list_scenes(services: Services, caller: AnyCaller, response: Response, search: SceneQuery) -> list[SceneSummary]:
+    """The finished scenes, newest first, a page at a time.
 
     While the queue is away they are those in the store, and the header `X-Intrasplat-Queue: away` says so.
     """
     caller.require(KeyScope.VIEW)
-    done, is_told = services.done.of_tenant(caller.tenant)
+    page, is_told = services.done.page_of(caller.tenant, search)
     if not is_told:
         response.headers["X-Intrasplat-Queue"] = "away"
-    return [_summary(services, record) for record in done[:limit]]
+    tell_next(response, page, caller.tenant)
+    return [_summary(services, record) for record in page.records]
 
 
 @router.get("/{scene_id}", operation_id="get_scene")
@@ -147,9 +150,16 @@ def _known(services: Deps, scene_id: str) -> JobRecord | None:
 def _summary(services: Deps, record: JobRecord) -> SceneSummary:
     """A scene's line in the list; a damaged one hides no other."""
     scene_id = record.job_id
-    links = {"report": f"/scenes/{scene_id}", "render": f"/render?scene={scene_id}"}
+    links = {"report": f"/scenes/{scene_id}", "render": f"/render?scene={scene_id}", "job": f"/jobs/{scene_id}"}
+    summary = SceneSummary(
+        id=scene_id,
+        **record.labels.model_dump(),
+        preset=record.options.preset,
+        created_at_s=record.created_at_s,
+        links=links,
+    )
     try:
         report = services.store.newest_report(scene_id, record.attempt)
-        return SceneSummary(id=scene_id, scored=report.scored, psnr_tissue_db=report.psnr_tissue_db, links=links)
     except SceneError as error:
-        return SceneSummary(id=scene_id, error=str(error), links=links)
+        return summary.model_copy(update={"error": str(error)})
+    return summary.model_copy(update={"scored": report.scored, "psnr_tissue_db": report.psnr_tissue_db})

@@ -119,7 +119,7 @@ class Sweep:
 
     def _recover(self, job_id: str) -> None:
         """Make the queue know a job again: as done if its scene is there, else to be run."""
-        submitted = self._store.submission(job_id)
+        submitted = self._store.labelled_submission(job_id)
         if submitted is None:  # removed since it was listed, or damaged
             return
         attempt = self._store.published_attempt(job_id)

@@ -17,6 +17,7 @@ from starlette.concurrency import run_in_threadpool
 from contract.intake.limits import MAX_CALIBRATION_BYTES
 from contract.wire.errors import InputError, LimitError
 from contract.wire.job import JobFiles
+from contract.wire.labels import LABEL_FIELD, METADATA_FIELD, Labels, parse_labels
 from service.problems import Problem, no_room_for
 
 CLIP_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".zip")
@@ -33,15 +34,22 @@ PARTS = tuple(SUFFIXES)
 
 OPTIONS = "options"
 CLIP_OF = "clip_of"
-TEXTS = (OPTIONS, CLIP_OF)
+TEXTS = (OPTIONS, CLIP_OF, LABEL_FIELD, METADATA_FIELD)
 """Parts that are text."""
 MAX_OPTIONS_BYTES = 64 * 1024
-MAX_BYTES = {OPTIONS: MAX_OPTIONS_BYTES, CLIP_OF: 256, "calibration": MAX_CALIBRATION_BYTES}
+MAX_BYTES = {
+    OPTIONS: MAX_OPTIONS_BYTES,
+    CLIP_OF: 256,
+    LABEL_FIELD: 4096,
+    METADATA_FIELD: MAX_OPTIONS_BYTES,
+    "calibration": MAX_CALIBRATION_BYTES,
+}
 """Maximum bytes of the parts that are small by their nature."""
 LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
 MAX_HEADER_BYTES = 8 * 1024
 FORM_REMEDY = (
-    "Send multipart/form-data with clip, or left and right, or clip_of, and optionally calibration, masks and options; "
+    "Send multipart/form-data with clip, or left and right, or clip_of, and optionally calibration, masks, options, "
+    "label and metadata; "
     'options is JSON, such as {"budget_s": 20}, and clip_of the id of a job whose clip is used again.'
 )
 
@@ -57,12 +65,13 @@ class UploadLimits:
 
 @dataclass
 class Received:
-    """What arrived: stored names by part, digests by part, the options as text, and whose clip is used again."""
+    """What arrived: stored names by part, digests by part, options as text, labels, whose clip is used again."""
 
     names: dict[str, str] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     options: str = "{}"
     clip_of: str | None = None
+    labels: Labels = field(default_factory=Labels)
     total_bytes: int = 0
 
     def check_clip(self) -> None:
@@ -188,6 +197,10 @@ class _Receiver:
         self._parser.finalize()
         if not self._ended:
             raise Problem(400, "The body ended before its last boundary.", remedy="Send the upload again.")
+        texts = {name: self._text(name) for name in self._texts}
+        self._received.options = texts.get(OPTIONS, self._received.options)
+        self._received.clip_of = texts.get(CLIP_OF)
+        self._received.labels = parse_labels(texts.get(LABEL_FIELD), texts.get(METADATA_FIELD))
         return self._received
 
     def close(self) -> None:
@@ -247,14 +260,7 @@ class _Receiver:
 
     def _on_part_end(self) -> None:
         if self._file is None:
-            try:
-                text = self._texts[self._part].decode()
-            except UnicodeDecodeError:
-                raise InputError(self._part, "it is not UTF-8 text.", FORM_REMEDY) from None
-            if self._part == OPTIONS:
-                self._received.options = text
-            else:
-                self._received.clip_of = text
+            self._text(self._part)
             return
         if self._part_bytes == 0:
             raise InputError(self._part, "the file is empty.", "Send a file with content.")
@@ -262,6 +268,12 @@ class _Receiver:
         os.fsync(self._file.fileno())
         self.close()
         self._received.digests[self._part] = self._digest.hexdigest()
+
+    def _text(self, part: str) -> str:
+        try:
+            return self._texts[part].decode()
+        except UnicodeDecodeError:
+            raise InputError(part, "it is not UTF-8 text.", FORM_REMEDY) from None
 
     def _on_end(self) -> None:
         self._ended = True

@@ -61,6 +61,8 @@
 /**
  * @typedef {{
  *   id: string,
+ *   label?: string | null,
+ *   metadata?: Record<string, string>,
  *   state: JobState,
  *   stage?: string | null,
  *   fraction?: number | null,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -54,6 +54,8 @@ class Client:
         clip_of: str | None = None,
         calibration: Path | None = None,
         masks: Path | None = None,
+        label: str | None = None,
+        metadata: Mapping[str, str] | None = None,
         idempotency_key: str | None = None,
         in_pieces: bool | None = None,
         on_upload: OnUpload | None = None,
@@ -66,6 +68,7 @@ class Client:
         A large clip is sent in pieces, and its upload resumes where a lost connection cut it off; `in_pieces` forces
         or forbids that. on_upload(sent_bytes, total_bytes) is called while the clip is sent. The same idempotency_key
         with the same clip and options always yields the same job, also later and from another process.
+        `label` and `metadata` are texts to find the job by; write no names of persons into them.
         `options` say how to reconstruct: preset, budget_s or iterations, holdout and others (GivenOptions).
 
         Raises:
@@ -79,6 +82,8 @@ class Client:
                 clip_of=clip_of,
                 calibration=calibration,
                 masks=masks,
+                label=label,
+                metadata=metadata,
                 idempotency_key=idempotency_key,
                 in_pieces=in_pieces,
                 on_upload=on_upload,
@@ -90,9 +95,37 @@ class Client:
         """A job's state and progress."""
         return run(self._core.job(job_id))
 
-    def jobs(self, state: JobState | None = None, limit: int | None = None) -> list[JobView]:
-        """The newest jobs, newest first; only those in `state`, if it is given."""
-        return run(self._core.jobs(state, limit))
+    def jobs(
+        self,
+        state: JobState | None = None,
+        limit: int | None = None,
+        *,
+        q: str | None = None,
+        metadata: Mapping[str, str] | None = None,
+        preset: str | None = None,
+        created_from_s: float | None = None,
+        created_until_s: float | None = None,
+    ) -> list[JobView]:
+        """The newest jobs, newest first: at most `limit`, 200 if it is not given.
+
+        state: only those in it. q: words, each part of the label or of a value of metadata, or the beginning of the id.
+        metadata: what theirs must have. preset: only those of it. created_from_s, created_until_s: UNIX s.
+        """
+        return run(
+            self._core.jobs(
+                state,
+                limit,
+                q=q,
+                metadata=metadata,
+                preset=preset,
+                created_from_s=created_from_s,
+                created_until_s=created_until_s,
+            )
+        )
+
+    def label(self, job_id: str, label: str | None = None, metadata: Mapping[str, str] | None = None) -> JobView:
+        """Change a job's label, or its metadata as a whole; "" and {} remove them, what is not given stays."""
+        return run(self._core.label(job_id, label, metadata))
 
     def cancel(self, job_id: str) -> JobView:
         """Cancel a job; a running one stops a moment later."""
@@ -172,9 +205,27 @@ class Client:
         """A connection for many views: `with client.stream(scene) as viewer: viewer.render(t, pose)`."""
         return Viewer(StreamMessages(self.url, scene, self._api_key))
 
-    def scenes(self, limit: int | None = None) -> list[dict[str, Any]]:
-        """Finished scenes, newest first."""
-        return run(self._core.scenes(limit))
+    def scenes(
+        self,
+        limit: int | None = None,
+        *,
+        q: str | None = None,
+        metadata: Mapping[str, str] | None = None,
+        preset: str | None = None,
+        created_from_s: float | None = None,
+        created_until_s: float | None = None,
+    ) -> list[dict[str, Any]]:
+        """Finished scenes, newest first: at most `limit`, 200 if it is not given. The rest as `jobs` has it."""
+        return run(
+            self._core.scenes(
+                limit,
+                q=q,
+                metadata=metadata,
+                preset=preset,
+                created_from_s=created_from_s,
+                created_until_s=created_until_s,
+            )
+        )
 
     def report(self, scene: str, scores_within_s: float = SCORES_WITHIN_S) -> Report:
         """The scene's quality report. Waits at most so long for its scores, which follow a job's end within seconds."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 SCORES_WITHIN_S, LOOK_PERIOD_S = 30.0, 0.3
 """Another scene may have to be scored first."""
 
+MAX_PAGE = 200
+NEXT_HEADER = "X-Intrasplat-Next"
+"""The cursor of the next page of a list."""
+
 
 class Core:
     """Every route of a service as a coroutine."""
@@ -42,6 +46,8 @@ class Core:
         clip_of: str | None = None,
         calibration: Path | None = None,
         masks: Path | None = None,
+        label: str | None = None,
+        metadata: Mapping[str, str] | None = None,
         idempotency_key: str | None = None,
         in_pieces: bool | None = None,
         on_upload: OnUpload | None = None,
@@ -54,6 +60,7 @@ class Core:
         A large clip is sent in pieces, and its upload resumes where a lost connection cut it off; `in_pieces` forces
         or forbids that. on_upload(sent_bytes, total_bytes) is called while the clip is sent. The same idempotency_key
         with the same clip and options always yields the same job, also later and from another process.
+        `label` and `metadata` are texts to find the job by; write no names of persons into them.
         `options` say how to reconstruct: preset, budget_s or iterations, holdout and others (GivenOptions).
 
         Raises:
@@ -67,6 +74,7 @@ class Core:
             clip_of,
             others,
             options,
+            submission.labels_of(label, metadata),
             idempotency_key=idempotency_key,
             in_pieces=in_pieces,
             on_upload=on_upload,
@@ -77,10 +85,31 @@ class Core:
         """A job's state and progress."""
         return await self._job(Call("GET", _path("jobs", job_id), is_repeatable=True))
 
-    async def jobs(self, state: JobState | None = None, limit: int | None = None) -> list[JobView]:
-        """The newest jobs, newest first; only those in `state`, if it is given."""
-        response = await self._get("jobs", state=None if state is None else JobState(state).value, limit=limit)
-        return parsed(response, _jobs_of, response.content)
+    async def jobs(
+        self,
+        state: JobState | None = None,
+        limit: int | None = None,
+        *,
+        q: str | None = None,
+        metadata: Mapping[str, str] | None = None,
+        preset: str | None = None,
+        created_from_s: float | None = None,
+        created_until_s: float | None = None,
+    ) -> list[JobView]:
+        """The newest jobs, newest first: at most `limit`, 200 if it is not given.
+
+        state: only those in it. q: words, each part of the label or of a value of metadata, or the beginning of the id.
+        metadata: what theirs must have. preset: only those of it. created_from_s, created_until_s: UNIX s.
+        """
+        chosen = None if state is None else JobState(state).value
+        search = _search(q, metadata, preset, created_from_s, created_until_s)
+        found = await self._pages("jobs", limit, {"state": chosen, **search})
+        return [JobView.model_validate(job) for job in found]
+
+    async def label(self, job_id: str, label: str | None = None, metadata: Mapping[str, str] | None = None) -> JobView:
+        """Change a job's label, or its metadata as a whole; "" and {} remove them, what is not given stays."""
+        change = submission.labels_of(label, metadata)
+        return await self._job(Call("PATCH", _path("jobs", job_id), json=change, is_repeatable=True))
 
     async def cancel(self, job_id: str) -> JobView:
         """Cancel a job; a running one stops a moment later."""
@@ -156,10 +185,18 @@ class Core:
         query = view_query(t, scene, pose, layer, "npy", None, unseen, highlights, camera)
         return (await views.render(self._session, query, None)).array()
 
-    async def scenes(self, limit: int | None = None) -> list[dict[str, Any]]:
-        """Finished scenes, newest first."""
-        scenes: list[dict[str, Any]] = _json_of(await self._get("scenes", limit=limit))
-        return scenes
+    async def scenes(
+        self,
+        limit: int | None = None,
+        *,
+        q: str | None = None,
+        metadata: Mapping[str, str] | None = None,
+        preset: str | None = None,
+        created_from_s: float | None = None,
+        created_until_s: float | None = None,
+    ) -> list[dict[str, Any]]:
+        """Finished scenes, newest first: at most `limit`, 200 if it is not given. The rest as `jobs` has it."""
+        return await self._pages("scenes", limit, _search(q, metadata, preset, created_from_s, created_until_s))
 
     async def report(self, scene: str, scores_within_s: float = SCORES_WITHIN_S) -> Report:
         """The scene's quality report. Waits at most so long for its scores, which follow a job's end within seconds.
@@ -221,6 +258,20 @@ class Core:
         given = {name: value for name, value in query.items() if value is not None}
         return await self._session.request(Call("GET", _path(*path), given, is_repeatable=True))
 
+    async def _pages(self, path: str, limit: int | None, search: Mapping[str, Any]) -> list[Any]:
+        """The first so many entries of a list, page by page."""
+        left, cursor = limit or MAX_PAGE, None
+        found: list[Any] = []
+        while left > 0:
+            response = await self._get(path, limit=min(left, MAX_PAGE), cursor=cursor, **search)
+            page: list[Any] = _json_of(response)
+            found += page
+            left -= len(page)
+            cursor = response.headers.get(NEXT_HEADER)
+            if cursor is None:
+                break
+        return found
+
     async def _job(self, call: Call) -> JobView:
         response = await self._session.request(call)
         return parsed(response, JobView.model_validate_json, response.content)
@@ -230,8 +281,17 @@ def _json_of(response: httpx.Response) -> Any:
     return parsed(response, json.loads, response.content)
 
 
-def _jobs_of(content: bytes) -> list[JobView]:
-    return [JobView.model_validate(job) for job in json.loads(content)]
+def _search(
+    q: str | None,
+    metadata: Mapping[str, str] | None,
+    preset: str | None,
+    created_from_s: float | None,
+    created_until_s: float | None,
+) -> dict[str, Any]:
+    """The query of a list, with None for what is not asked for."""
+    wanted = [f"{name}={value}" for name, value in (metadata or {}).items()]
+    dates = {"created_from_s": created_from_s, "created_until_s": created_until_s}
+    return {"q": q, "metadata": wanted or None, "preset": preset, **dates}
 
 
 def _path(*parts: str) -> str:

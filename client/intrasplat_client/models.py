@@ -233,6 +233,10 @@ class JobView(Model):
     """A job as the API shows it."""
 
     id: str
+    label: str | None = None
+    """what its caller calls it; PATCH /jobs/{id} changes it"""
+    metadata: dict[str, str] = Field(default={})
+    """what its caller noted on it"""
     state: JobState
     stage: str | None = None
     fraction: float | None = None

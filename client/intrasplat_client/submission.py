@@ -41,7 +41,7 @@ OnUpload = Callable[[int, int], object]
 
 @dataclass(frozen=True)
 class Submission:
-    """A clip that is ready to go: files and their sizes by part, options as JSON can have them.
+    """A clip that is ready to go: files and their sizes by part, options and labels as JSON can have them.
 
     texts: what is sent as it is: the id of the job whose clip is used again, if there is no file of one.
     """
@@ -50,6 +50,7 @@ class Submission:
     sizes: dict[str, int]
     texts: dict[str, str]
     options: dict[str, Any]
+    labels: dict[str, Any]
     idempotency_key: str
     in_pieces: bool
     on_upload: OnUpload | None
@@ -71,6 +72,7 @@ def prepare(
     clip_of: str | None,
     others: Mapping[str, Path | None],
     options: Mapping[str, Any],
+    labels: dict[str, Any],
     *,
     idempotency_key: str | None,
     in_pieces: bool | None,
@@ -92,7 +94,13 @@ def prepare(
     if in_pieces is None:
         in_pieces = sum(sizes.values()) >= IN_PIECES_FROM_BYTES
     texts = {} if clip_of is None else {"clip_of": clip_of}
-    return Submission(paths, sizes, texts, document, idempotency_key or str(uuid.uuid4()), in_pieces, on_upload)
+    return Submission(paths, sizes, texts, document, labels, idempotency_key or str(uuid.uuid4()), in_pieces, on_upload)
+
+
+def labels_of(label: str | None, metadata: Mapping[str, str] | None) -> dict[str, Any]:
+    """What is given of a job's labels, as JSON can have it."""
+    given = {"label": label, "metadata": None if metadata is None else dict(metadata)}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -122,7 +130,7 @@ async def submit(session: Session, submission: Submission) -> JobView:
     try:
         if submission.in_pieces:
             uploads = await _upload_all(session, submission)
-            document = {**uploads, **submission.texts, "options": submission.options}
+            document = {**uploads, **submission.texts, **submission.labels, "options": submission.options}
             call = Call("POST", "/reconstruct", headers=headers, json=document, is_repeatable=True)
         else:
             boundary = uuid.uuid4().hex
@@ -210,7 +218,9 @@ def _report_piece(submission: Submission, sent_before: int, sent_bytes: int) -> 
 
 def _form(submission: Submission, boundary: str) -> Body:
     """multipart/form-data with the options and all files, never in memory as a whole."""
-    texts = {**submission.texts, "options": json.dumps(submission.options)}
+    texts = {**submission.texts, **submission.labels, "options": json.dumps(submission.options)}
+    if "metadata" in texts:
+        texts["metadata"] = json.dumps(texts["metadata"])
     head = "".join(
         f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{text}\r\n'
         for name, text in texts.items()

@@ -33,6 +33,8 @@ class AuditAction(StrEnum):
     """At most once a minute for each key and scene, not for each picture."""
     EXPORTED = "exported"
     DOWNLOADED = "downloaded"
+    LABELLED = "labelled"
+    """Its label or metadata were changed; the audit does not hold them."""
     CANCELLED = "cancelled"
     RETRIED = "retried"
     PURGED = "purged"

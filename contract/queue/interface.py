@@ -20,6 +20,7 @@ from typing import Protocol
 
 from contract.wire.errors import ErrorCode, UnavailableError
 from contract.wire.job import Forecast, JobError, JobProgress, JobRecord, JobState
+from contract.wire.labels import LabelChange
 from contract.wire.names import BUDGETS_S
 from contract.wire.options import ReconstructionOptions
 from contract.wire.rendering import WorkerAddress
@@ -93,6 +94,14 @@ class Event:
 
     number: str
     record: JobRecord
+
+
+@dataclass(frozen=True, order=True)
+class Place:
+    """A job's place in listings, which are in falling order of these."""
+
+    created_at_s: float
+    job_id: str
 
 
 @dataclass(frozen=True)
@@ -177,6 +186,13 @@ class Queue(Protocol):
         """failed -> queued, with no deaths counted. Returns the record, None if there is none."""
         ...
 
+    def relabel(self, job_id: str, change: LabelChange) -> JobRecord | None:
+        """Change a job's labels, in whatever state it is. Returns the record, None if there is none.
+
+        Its events, the earlier ones too, have the new labels from then on.
+        """
+        ...
+
     def get(self, job_id: str) -> JobRecord | None:
         """The job's record."""
         ...
@@ -185,8 +201,13 @@ class Queue(Protocol):
         """Position in the queue and when the job may be done, estimated from the last jobs' durations."""
         ...
 
-    def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
-        """The newest jobs of a tenant, or of all, newest first."""
+    def records(
+        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: Place | None = None
+    ) -> list[JobRecord]:
+        """The newest jobs of a tenant, or of all, newest first; those that come after a place, if it is given.
+
+        Empty only where there is no further job: records that cannot be read are left out.
+        """
         ...
 
     def events(self, job_id: str, after: str = "0") -> list[Event]:
@@ -344,6 +365,11 @@ def estimate_forecast(
 def trainers(workers: list[WorkerAddress]) -> int:
     """How many of the workers claim jobs."""
     return sum(not worker.renders_only for worker in workers)
+
+
+def place_of(record: JobRecord) -> Place:
+    """The job's place in listings."""
+    return Place(record.created_at_s, record.job_id)
 
 
 def event_order(number: str) -> tuple[int, int]:

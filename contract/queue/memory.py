@@ -21,6 +21,7 @@ from contract.queue.interface import (
     Event,
     Order,
     Pace,
+    Place,
     QueueFigures,
     Waiting,
     asked_training_s,
@@ -28,10 +29,12 @@ from contract.queue.interface import (
     claim_order,
     estimate_forecast,
     event_order,
+    place_of,
     trainers,
     worker_died,
 )
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, Forecast, JobError, JobProgress, JobRecord, JobState
+from contract.wire.labels import LabelChange
 from contract.wire.rendering import WorkerAddress
 
 LEASE_CHECK_S = 0.05
@@ -153,6 +156,13 @@ class MemoryQueue:
             fresh = {"error": None, "progress": None, "started_at_s": None, "finished_at_s": None}
             return self._enqueue(self._moved(record, JobState.QUEUED, released=record.attempt, **fresh))
 
+    def relabel(self, job_id: str, change: LabelChange) -> JobRecord | None:
+        with self._changed:
+            record = self._records.get(job_id)
+            if record is None or record.labels == record.labels.changed(change):
+                return record
+            return self._write(record.model_copy(update={"labels": record.labels.changed(change)}))
+
     def get(self, job_id: str) -> JobRecord | None:
         with self._changed:
             return self._records.get(job_id)
@@ -169,15 +179,19 @@ class MemoryQueue:
             pace = Pace(list(self._durations_s), list(self._rests_s))
             return estimate_forecast(record, position, pace, ran_s, trainers(self.workers()))
 
-    def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
+    def records(
+        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: Place | None = None
+    ) -> list[JobRecord]:
         with self._changed:
             chosen = [record for record in self._records.values() if tenant in (None, record.tenant)]
-        chosen.sort(key=lambda record: (record.created_at_s, record.job_id), reverse=True)
-        return chosen[:limit]
+        chosen.sort(key=place_of, reverse=True)
+        return [record for record in chosen if before is None or place_of(record) < before][:limit]
 
     def events(self, job_id: str, after: str = "0") -> list[Event]:
         with self._changed:
-            kept = list(self._events.get(job_id, ()))
+            events, record = list(self._events.get(job_id, ())), self._records.get(job_id)
+        labels = {"labels": record.labels} if record else {}
+        kept = [Event(event.number, event.record.model_copy(update=labels)) for event in events]
         return [event for event in kept if event_order(event.number) > event_order(after)]
 
     def forget(self, job_id: str) -> bool:

@@ -8,9 +8,13 @@ from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 from contract.wire.job import JobError, JobProgress, JobRecord, JobState
+from contract.wire.labels import LABEL_FIELD, METADATA_FIELD, LabelChange, Labels
 
 EVENT_FIELDS = ("state", "attempt", "released", "owner", "cancel", "progress", "error", "started", "finished")
-"""The fields that change. Together with the document they make the record."""
+"""The fields that change. Together with the document and the labels they make the record."""
+
+LABEL_FIELDS = (LABEL_FIELD, METADATA_FIELD)
+"""They change too, and no event has them: whoever removes a text finds it in no earlier event."""
 
 Model = TypeVar("Model", JobProgress, JobError)
 
@@ -20,7 +24,7 @@ logger = logging.getLogger("intrasplat.queue")
 def new_record(record: JobRecord) -> tuple[str, str, str, str]:
     """ARGV 2 to 5 of submit.lua and restore.lua: id, hash as JSON, time of submission, idempotency hash."""
     fields = {
-        "document": record.model_dump_json(),
+        "document": record.model_dump_json(exclude={"labels"}),
         "state": record.state.value,
         "attempt": str(record.attempt),
         "released": str(record.released),
@@ -33,8 +37,15 @@ def new_record(record: JobRecord) -> tuple[str, str, str, str]:
         "started": record.started_at_s and repr(record.started_at_s),
         "finished": record.finished_at_s and repr(record.finished_at_s),
     }
+    fields |= {name: value or None for name, value in label_fields(LabelChange(**record.labels.model_dump())).items()}
     known = {name: value for name, value in fields.items() if value is not None}
     return record.job_id, json.dumps(known), repr(record.created_at_s), record.idempotency_key or ""
+
+
+def label_fields(change: LabelChange) -> dict[str, str]:
+    """The fields of a job's hash that a change of its labels sets; those that become empty are to be removed."""
+    fields = {LABEL_FIELD: change.label or "", METADATA_FIELD: json.dumps(change.metadata) if change.metadata else ""}
+    return {name: fields[name] for name in LABEL_FIELDS if name in change.model_fields_set}
 
 
 def table_of(answer: Sequence[str]) -> dict[str, str]:
@@ -58,6 +69,7 @@ def _changed(fields: Mapping[str, str]) -> dict[str, object]:
     """The values of a record that have changed since it was submitted."""
     return {
         "state": JobState(fields["state"]),
+        "labels": Labels(label=fields.get(LABEL_FIELD), metadata=json.loads(fields.get(METADATA_FIELD) or "{}")),
         "attempt": int(fields["attempt"]),
         "released": int(fields["released"]),
         "owner": fields.get("owner"),

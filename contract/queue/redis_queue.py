@@ -10,6 +10,7 @@ Keys (the braces put all of them in one cluster slot, so that a script may touch
         cancel                          "1" once a cancel was asked for
         progress, error                 JSON of JobProgress, JobError
         started, finished, queued       UNIX s by the server's clock; queued: since when it waits
+        label, metadata                 of its labels; metadata as JSON. They stand in neither document nor events
         tenant, priority                of the document, for the scripts
         entry, sequence                 its stream entry, and its place among the jobs of its priority
         restored                        token of the call that put it back
@@ -61,6 +62,7 @@ from contract.queue.interface import (
     Event,
     Order,
     Pace,
+    Place,
     QueueFigures,
     Waiting,
     check_admission,
@@ -71,9 +73,10 @@ from contract.queue.interface import (
 )
 from contract.queue.lua import UNREADABLE, Scripts
 from contract.queue.redis_client import PATIENCE_S, connect, reachable
-from contract.queue.redis_hash import new_record, record_of, table_of
+from contract.queue.redis_hash import LABEL_FIELDS, label_fields, new_record, record_of, table_of
 from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES, Forecast, JobError, JobProgress, JobRecord, JobState
+from contract.wire.labels import LabelChange
 from contract.wire.rendering import WorkerAddress
 
 PREFIX = "{intrasplat}:"
@@ -168,6 +171,9 @@ class RedisQueue:
         record = self.get(job_id)
         return record and record_of(job_id, table_of(self._scripts.run("retry", job_id, record.attempt)))
 
+    def relabel(self, job_id: str, change: LabelChange) -> JobRecord | None:
+        return record_of(job_id, table_of(self._scripts.run("relabel", job_id, json.dumps(label_fields(change)))))
+
     def get(self, job_id: str) -> JobRecord | None:
         return self._get_all([job_id]).get(job_id)
 
@@ -194,21 +200,24 @@ class RedisQueue:
         pace = Pace([float(each) for each in durations], [float(each) for each in rests])
         return estimate_forecast(record, position, pace, ran_s, trainers(self.workers()))
 
-    def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
+    def records(
+        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: Place | None = None
+    ) -> list[JobRecord]:
         index = INDEX if tenant is None else f"{PREFIX}tenant:{tenant}:index"
-        if limit == 0:
-            return []
-        with reachable():
-            job_ids = self._client.zrevrange(index, 0, -1 if limit is None else limit - 1)
-        return list(self._get_all(job_ids).values())
+        while places := self._places(index, limit, before):
+            if found := self._get_all([each.job_id for each in places]):
+                return list(found.values())
+            before = places[-1]  # none of them can be read
+        return []
 
     def events(self, job_id: str, after: str = "0") -> list[Event]:
         milliseconds, count = event_order(after)
         with reachable(), self._client.pipeline(transaction=True) as batch:
-            batch.hget(_job_key(job_id), "document")
+            batch.hmget(_job_key(job_id), "document", *LABEL_FIELDS)
             batch.xrange(f"{PREFIX}events:{job_id}", min=f"({milliseconds}-{count}")
-            document, entries = batch.execute()
-        found = ((number, record_of(job_id, {**fields, "document": document})) for number, fields in entries)
+            of_all, entries = batch.execute()
+        shared = {name: text for name, text in zip(("document", *LABEL_FIELDS), of_all, strict=True) if text}
+        found = ((number, record_of(job_id, {**fields, **shared})) for number, fields in entries)
         return [Event(number, record) for number, record in found if record is not None]
 
     def forget(self, job_id: str) -> bool:
@@ -257,6 +266,21 @@ class RedisQueue:
 
     def close(self) -> None:
         self._client.close()
+
+    def _places(self, index: str, limit: int | None, before: Place | None) -> list[Place]:
+        """At most `limit` places of an index, newest first, that come after a place."""
+        if limit == 0:
+            return []
+        most = -1 if limit is None else limit
+        with reachable(), self._client.pipeline(transaction=True) as batch:
+            if before is None:
+                batch.zrevrange(index, 0, -1 if limit is None else limit - 1, withscores=True)
+            else:
+                at = repr(before.created_at_s)
+                batch.zrevrangebyscore(index, at, at, withscores=True)
+                batch.zrevrangebyscore(index, f"({at}", "-inf", start=0, num=most, withscores=True)
+            found = [Place(score, job_id) for answer in batch.execute() for job_id, score in answer]
+        return [place for place in found if before is None or place < before][:limit]
 
     def _settle(self, claim: Claim, target: JobState, error: str = "") -> bool:
         return bool(self._scripts.run("settle", claim.job_id, claim.owner, claim.attempt, target.value, error))

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from contract.store.disk_errors import disk_errors
-from contract.store.durable import flush, move_folder
+from contract.store.durable import flush, move_folder, replace_file
 from contract.store.shelf import MARKERS, Area, Removed, ShelfEntry, checked, entry_of
 
 
@@ -37,6 +37,12 @@ class LocalShelf:
     def put_files(self, entry: ShelfEntry, names: Sequence[str]) -> None:
         """Nothing: what lies here is the entry itself."""
 
+    @disk_errors()
+    def put_text(self, entry: ShelfEntry, name: str, content: bytes) -> None:
+        if self.holds(entry):
+            with contextlib.suppress(FileNotFoundError):  # it has just been removed
+                replace_file(self.path(entry) / name, content)
+
     def get(self, entry: ShelfEntry) -> Path | None:
         return self.path(entry) if self.holds(entry) else None
 
@@ -44,10 +50,13 @@ class LocalShelf:
     def holds(self, entry: ShelfEntry) -> bool:
         return (self.path(entry) / entry.marker).is_file()
 
-    @disk_errors()
     def read_marker(self, entry: ShelfEntry) -> bytes | None:
+        return self.read(entry, entry.marker)
+
+    @disk_errors()
+    def read(self, entry: ShelfEntry, name: str) -> bytes | None:
         with contextlib.suppress(FileNotFoundError):
-            return (self.path(entry) / entry.marker).read_bytes()
+            return (self.path(entry) / name).read_bytes()
         return None
 
     def entries(self, area: Area, job_id: str | None = None) -> list[ShelfEntry]:

@@ -88,6 +88,11 @@ class Bucket:
         with _bucket_errors():
             self._files.put_file(str(path), self._path(key))
 
+    def write(self, key: str, content: bytes) -> None:
+        """Make an object of a few bytes."""
+        with _bucket_errors():
+            self._files.pipe_file(self._path(key), content)
+
     def get(self, key: str, path: Path) -> None:
         """Download an object."""
         with _bucket_errors():
@@ -191,6 +196,13 @@ class S3Shelf:
         if all(each.key.rpartition("/")[2] in names for each in self._bucket.objects(_key(entry))):
             self.remove(entry.area, entry.job_id, entry.attempt)  # the rest has been removed, before or meanwhile
 
+    def put_text(self, entry: ShelfEntry, name: str, content: bytes) -> None:
+        if not self._bucket.holds(_key(entry) + entry.marker):
+            return
+        self._bucket.write(_key(entry) + name, content)
+        if not self._bucket.holds(_key(entry) + entry.marker):
+            self._bucket.remove(_key(entry) + name)  # the rest has been removed meanwhile
+
     @disk_errors()
     def get(self, entry: ShelfEntry) -> Path | None:
         if not self.holds(entry):
@@ -212,7 +224,10 @@ class S3Shelf:
         return True
 
     def read_marker(self, entry: ShelfEntry) -> bytes | None:
-        return self._bucket.read(_key(entry) + entry.marker)
+        return self.read(entry, entry.marker)
+
+    def read(self, entry: ShelfEntry, name: str) -> bytes | None:
+        return self._bucket.read(_key(entry) + name)
 
     def entries(self, area: Area, job_id: str | None = None) -> list[ShelfEntry]:
         start = f"{FOLDERS[area]}/{checked(job_id) if job_id is not None else ''}"

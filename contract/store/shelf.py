@@ -124,6 +124,13 @@ class Shelf(Protocol):
         """
         ...
 
+    def put_text(self, entry: ShelfEntry, name: str, content: bytes) -> None:
+        """Keep one small file of the entry, which is not its marker, in place of an earlier one.
+
+        Nothing happens if the entry has been removed, or is being removed.
+        """
+        ...
+
     def get(self, entry: ShelfEntry) -> Path | None:
         """The entry's folder on this machine, fetched if need be; None if there is no such entry.
 
@@ -138,6 +145,10 @@ class Shelf(Protocol):
 
     def read_marker(self, entry: ShelfEntry) -> bytes | None:
         """The content of the entry's marker; None if there is no such entry."""
+        ...
+
+    def read(self, entry: ShelfEntry, name: str) -> bytes | None:
+        """The content of one of the entry's files; None if there is no such file."""
         ...
 
     def entries(self, area: Area, job_id: str | None = None) -> list[ShelfEntry]:

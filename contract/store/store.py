@@ -2,7 +2,8 @@
 
     data_dir/
     ├── incoming/<id>/      an upload, whole or resumable, before it is a job; removed when it is refused or given up
-    ├── spool/<job>/        an accepted clip: clip.mp4, calibration.json, ..., submission.json (the first JobRecord)
+    ├── spool/<job>/        an accepted clip: clip.mp4, calibration.json, ..., submission.json (the first JobRecord),
+    │                       and labels.json if its caller has labelled the job
     ├── work/<job>.<n>/     what attempt n has written of its scene so far
     ├── kept/<job>.<n>/     what goes on from attempt n: resume.safetensors, and prepared/, the clip with depth
     ├── work/tmp-<name>/    what worker <name> has unpacked; emptied whenever it starts
@@ -39,7 +40,8 @@ from contract.store.s3 import S3Shelf
 from contract.store.shelf import ABANDONED_AFTER_S, Area, Removed, Shelf, ShelfEntry, entry_of, is_job_id
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
-from contract.wire.names import KEPT, REPORT, SUBMISSION
+from contract.wire.labels import Labels
+from contract.wire.names import KEPT, LABELS, REPORT, SUBMISSION
 from contract.wire.report import Report
 
 UNSCORED = "unscored"
@@ -100,7 +102,9 @@ class Store:
         """
         folder, clip = self.incoming_folder(record.job_id), ShelfEntry(Area.SPOOL, record.job_id)
         with disk_errors():
-            (folder / SUBMISSION).write_text(record.model_dump_json(indent=1))
+            (folder / SUBMISSION).write_text(record.model_dump_json(indent=1, exclude={"labels"}))
+            if record.labels != Labels():
+                (folder / LABELS).write_text(record.labels.model_dump_json())
         self._shelf.put(folder, clip)
         with contextlib.suppress(UnavailableError):  # tidy() drops it later
             self._shelf.drop_copy(clip)  # the worker that needs it may be on another machine
@@ -115,6 +119,22 @@ class Store:
         with contextlib.suppress(ValidationError):
             return JobRecord.model_validate_json(content) if content is not None else None
         return None
+
+    def labels(self, job_id: str) -> Labels:
+        """What the caller has written on a job; nothing if its clip is gone, or if it cannot be read."""
+        content = self._shelf.read(ShelfEntry(Area.SPOOL, job_id), LABELS)
+        with contextlib.suppress(ValidationError):
+            return Labels.model_validate_json(content) if content is not None else Labels()
+        return Labels()
+
+    def keep_labels(self, job_id: str, labels: Labels) -> None:
+        """Put other labels into the spool; nothing happens if the clip is gone."""
+        self._shelf.put_text(ShelfEntry(Area.SPOOL, job_id), LABELS, labels.model_dump_json().encode())
+
+    def labelled_submission(self, job_id: str) -> JobRecord | None:
+        """submission(), with the labels that the job has now."""
+        record = self.submission(job_id)
+        return record and record.model_copy(update={"labels": self.labels(job_id)})
 
     def spool_folder(self, job_id: str) -> Path:
         """Where the job's clip lies, or would lie, on this machine."""

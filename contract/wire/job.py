@@ -9,6 +9,7 @@ from types import MappingProxyType
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.errors import ErrorCode
+from contract.wire.labels import Labels
 from contract.wire.options import JobOptions
 
 JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
@@ -99,6 +100,7 @@ class JobRecord(BaseModel):
     job_id: str = Field(pattern=JOB_ID_PATTERN)
     state: JobState = JobState.QUEUED
     options: JobOptions = JobOptions()
+    labels: Labels = Labels()
     files: JobFiles
     tenant: str = Field(default=LOCAL_TENANT, pattern=TENANT_PATTERN)
     """Whose it is; nobody else learns that it exists."""
@@ -136,6 +138,8 @@ class JobView(BaseModel):
     """A job as the API shows it."""
 
     id: str
+    label: str | None = Field(default=None, description="what its caller calls it; PATCH /jobs/{id} changes it")
+    metadata: dict[str, str] = Field(default={}, description="what its caller noted on it")
     state: JobState
     stage: str | None = None
     fraction: float | None = None
@@ -173,4 +177,4 @@ class JobView(BaseModel):
             | {"created_at_s", "started_at_s", "finished_at_s"}
         )
         progress |= {"position": forecast.position, "eta_s": forecast.eta_s} if forecast else {}
-        return cls(id=record.job_id, links=links, **shared, **progress)
+        return cls(id=record.job_id, links=links, **record.labels.model_dump(), **shared, **progress)

@@ -45,6 +45,8 @@ POSES_FILE = "poses_bounds.npy"
 """The poses that a clip in EndoNeRF layout brings."""
 
 SUBMISSION = "submission.json"
+LABELS = "labels.json"
+"""Of a job in the spool, if its caller has labelled it."""
 MANIFEST = "manifest.json"
 SCENE = "scene.safetensors"
 REPORT = "report.json"

@@ -11,6 +11,7 @@ import redis
 from contract.queue.interface import Admission, Claim, Order, Queue
 from contract.queue.redis_queue import PREFIX, RedisQueue
 from contract.wire.job import JobRecord, JobState
+from contract.wire.labels import LabelChange
 from tests.contract.queues import ERROR, TRAINING, LossyProxy, RunningServer, claimed, job, known, state_of
 
 Act = Callable[[Queue], object]
@@ -63,6 +64,11 @@ def _retry(queue: Queue) -> tuple[Act, str]:
     return lambda lossy: lossy.retry(record.job_id), record.job_id
 
 
+def _relabel(queue: Queue) -> tuple[Act, str]:
+    record = queue.submit(job())
+    return lambda lossy: lossy.relabel(record.job_id, LabelChange(label="b")), record.job_id
+
+
 def _restore(queue: Queue) -> tuple[Act, str]:
     record = job().model_copy(update={"state": JobState.DONE, "attempt": 1, "finished_at_s": 1060.0})
     return lambda lossy: lossy.restore(record), record.job_id
@@ -87,6 +93,7 @@ LOST_ANSWERS: dict[str, tuple[Lost, object, int]] = {
     "confirm_cancel": (_confirm_cancel, True, 4),
     "cancel": (_cancel, JobRecord, 2),
     "retry": (_retry, JobRecord, 4),
+    "relabel": (_relabel, JobRecord, 2),
     "restore": (_restore, True, 1),
     "forget": (_forget, True, 0),
 }

@@ -15,10 +15,11 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
-from contract.queue.interface import Admission, Claim, Event, QueueFullError
+from contract.queue.interface import Admission, Claim, Event, QueueFullError, place_of
 from contract.queue.memory import MemoryQueue
 from contract.queue.redis_queue import HELD, PREFIX, QUEUED, RedisQueue
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, JobRecord, JobState
+from contract.wire.labels import LabelChange
 from tests.contract.conftest import emptied
 from tests.contract.queues import ERROR, TRAINING, job
 
@@ -77,7 +78,7 @@ class BothQueues(RuleBasedStateMachine):
         limited=st.booleans(),
     )
     def submit(self, urgent: bool, tenant: str, key: str | None, limited: bool) -> None:
-        created_at_s = 1000.0 + len(self.submitted)
+        created_at_s = 1000.0 + len(self.submitted) // 2
         record = job(created_at_s, priority="high" if urgent else "standard", tenant=tenant, idempotency_key=key)
         self.submitted.append(record)
         self.both("submit", record, ADMISSION if limited else None)
@@ -110,6 +111,19 @@ class BothQueues(RuleBasedStateMachine):
     @rule(pick=PICK, change=st.sampled_from(["cancel", "retry", "forget"]))
     def change(self, pick: int, change: str) -> None:
         self.both(change, self.some_job(pick))
+
+    @rule(
+        pick=PICK,
+        label=st.sampled_from([{}, {"label": None}, {"label": "a"}, {"label": "b"}]),
+        metadata=st.sampled_from([{}, {"metadata": None}, {"metadata": {"c": "d"}}]),
+    )
+    def relabel(self, pick: int, label: dict[str, Any], metadata: dict[str, Any]) -> None:
+        self.both("relabel", self.some_job(pick), LabelChange(**label, **metadata))
+
+    @rule(pick=PICK, limit=st.sampled_from([1, 2, None]), tenant=st.sampled_from(["ward-1", None]))
+    def page(self, pick: int, limit: int | None, tenant: str | None) -> None:
+        if self.submitted:
+            self.both("records", tenant, limit, place_of(self.submitted[pick % len(self.submitted)]))
 
     @rule(pick=PICK, state=st.sampled_from(sorted(TERMINAL_STATES)))
     def restore(self, pick: int, state: JobState) -> None:

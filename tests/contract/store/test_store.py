@@ -13,9 +13,10 @@ from contract.store.shelf import ABANDONED_AFTER_S, is_job_id, new_job_id
 from contract.store.store import Store
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
+from contract.wire.labels import Labels
 from contract.wire.names import MANIFEST, PREPARED, RESUME, SUBMISSION
 from tests.contract.store.conftest import MakeStore
-from tests.contract.stores import accepted, published
+from tests.contract.stores import accepted, published, received
 
 
 def publish(store: Store, job_id: str, attempt: int, content: str = "{}") -> Path:
@@ -46,6 +47,22 @@ def test_the_accepted_clips_can_be_listed_and_read_again(store: Store) -> None:
     assert store.spooled_ids() == sorted(records)
     assert {job_id: store.submission(job_id) for job_id in store.spooled_ids()} == records
     assert (store.fetch_clip(store.spooled_ids()[0]) / "clip.mp4").read_bytes() == b"frames"
+
+
+def test_labels_lie_beside_the_clip_change_alone_and_go_with_it(machine: MakeStore) -> None:
+    here, other = machine("service"), machine("other")
+    record = received(here).model_copy(update={"labels": Labels(label="a")})
+    here.accept(record)
+    assert other.labels(record.job_id) == Labels(label="a")
+    other.keep_labels(record.job_id, Labels(label="b", metadata={"c": "d"}))
+    assert here.labelled_submission(record.job_id) == record.model_copy(update={"labels": other.labels(record.job_id)})
+    assert here.labels(record.job_id) == Labels(label="b", metadata={"c": "d"})
+    here.purge(record.job_id)
+    other.keep_labels(record.job_id, Labels(label="late"))
+    assert other.labels(record.job_id) == Labels()
+    assert other.spooled_ids() == []
+    unlabelled = accepted(here)
+    assert here.labels(unlabelled.job_id) == Labels()
 
 
 def test_a_clip_that_is_not_there_cannot_be_fetched(store: Store) -> None:
