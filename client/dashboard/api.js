@@ -1,7 +1,7 @@
 // The service's routes that this page uses. What goes wrong is thrown as a Problem.
 
 import { askForKey, currentKey, keyHeaders } from "./key.js";
-import { connectionLost, Problem, problemOf } from "./problem.js";
+import { connectionLost, errorWords, Problem, problemOf } from "./problem.js";
 
 /** @typedef {import("./wire.js").JobView} Job */
 /**
@@ -27,7 +27,7 @@ export async function request(path, options = {}) {
   }
   if (response.ok) return response;
   const problem = await problemOf(response);
-  if (problem.status === 401 && sent === currentKey()) askForKey(problem.message);
+  if (problem.status === 401 && sent === currentKey()) askForKey(sent ? errorWords("http_401", "wrong") : problem.message);
   throw problem;
 }
 
@@ -40,6 +40,8 @@ async function json(path, options) {
   }
 }
 
+/** @returns {Promise<{tenant: string, scopes: string[], key_id: string | null}>} */
+export const getKey = () => json("/key");
 /** @returns {Promise<Job[]>} */
 export const listJobs = () => json("/jobs");
 /** @param {string} id @returns {Promise<Job>} */
@@ -66,7 +68,7 @@ export async function trouble() {
     await request("/readyz");
     return "";
   } catch (error) {
-    if (error instanceof Problem && error.status === 503) return error.document.detail ?? error.message;
+    if (error instanceof Problem && error.status === 503) return error.message;
     throw error;
   }
 }

@@ -1,6 +1,8 @@
 // The curve: likeness to frames that training never sees, over iterations; the right eye's is thinner. Dashed is what
 // copying neighbours reaches.
 
+import { figure, words } from "./messages.js";
+
 const WIDTH = 300;
 const HEIGHT = 120;
 const LEFT = 30;
@@ -60,7 +62,7 @@ export function drawCurve(svg, points, baselines) {
   }
   for (const { name, db } of baselines) {
     draw(svg, "line", { class: "baseline", x1: LEFT, x2: WIDTH - RIGHT, y1: y(db), y2: y(db) });
-    draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: y(db) - 3 }, `${name} ${db.toFixed(1)}`);
+    draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: y(db) - 3 }, `${name} ${figure(db, 1)}`);
   }
   const line = (name, corners, radius) => {
     const places = corners.map(([iteration, db]) => [x(iteration).toFixed(1), y(db).toFixed(1)]);
@@ -69,10 +71,10 @@ export function drawCurve(svg, points, baselines) {
   };
   if (right.length > 0) line("beside", right.map((each) => [each.iteration, each.rightDb]), 1.8);
   line("score", points.map((each) => [each.iteration, each.db]), 2.5);
-  const what = `dB on unseen frames${right.length > 0 ? ", thin: right eye" : ""}, over iterations`;
+  const what = words(right.length > 0 ? "curve.axes_both" : "curve.axes");
   draw(svg, "text", { class: "tick", x: LEFT, y: HEIGHT - 4 }, what);
   draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: HEIGHT - 4 }, String(last));
-  const beside = right.length > 0 ? `, right eye ${right.at(-1).rightDb.toFixed(1)} dB` : "";
-  const score = `${points.at(-1).db.toFixed(1)} dB${beside}`;
-  svg.setAttribute("aria-label", `Likeness over training: ${score} after ${last} iterations`);
+  const beside = right.length > 0 ? words("curve.beside", { db: figure(right.at(-1).rightDb, 1) }) : "";
+  const score = `${figure(points.at(-1).db, 1)} dB${beside}`;
+  svg.setAttribute("aria-label", words("curve.name", { score, last }));
 }

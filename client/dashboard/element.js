@@ -1,5 +1,7 @@
 // Elements of the page, made by script. Text is set as text, so nothing that the service sends becomes markup.
 
+import { language } from "./messages.js";
+
 /**
  * @template {keyof HTMLElementTagNameMap} K
  * @param {K} tag
@@ -29,5 +31,11 @@ export function button(text, onClick, name = text) {
   return made;
 }
 
+const LOCALES = { en: "en-GB", de: "de-DE" };
+
 /** @param {number} ms since 1970 */
-export const clockTime = (ms) => new Date(ms).toLocaleTimeString("en-GB");
+export const clockTime = (ms) => new Date(ms).toLocaleTimeString(LOCALES[language()]);
+
+/** @param {number} ms since 1970 */
+export const dateTime = (ms) =>
+  new Date(ms).toLocaleString(LOCALES[language()], { dateStyle: "medium", timeStyle: "medium" });

@@ -1,7 +1,9 @@
 // The form that sends a clip: files by picker or by drop, options, progress, and what was wrong with it.
 
 import { reconstruct } from "./api.js";
+import { words } from "./messages.js";
 import { insist } from "./pause.js";
+import { showProblem } from "./problem.js";
 import { Upload } from "./upload.js";
 import { LIMITS } from "./wire.js";
 
@@ -179,7 +181,8 @@ export class ClipForm {
       this.onJob(await this.#submitAll(uploads, signal));
       this.#startAnew();
     } catch (error) {
-      this.#say(signal.aborted ? "Stopped. Nothing of it is kept." : error.message, "bad");
+      if (signal.aborted) this.#say(words("upload.stopped"), "bad");
+      else showProblem(this.message, error);
       for (const upload of uploads) upload.discard();
     } finally {
       this.#show(false);
@@ -197,7 +200,7 @@ export class ClipForm {
     const showProgress = () => {
       const share = uploads.reduce((sum, upload) => sum + upload.offset, 0) / total;
       this.progress.value = share;
-      this.#say(`Sending, ${Math.round(share * 100)} %`);
+      this.#say(words("upload.sending", { share: Math.round(share * 100) }));
     };
     showProgress();
     for (const upload of uploads) await upload.send(showProgress, (problem) => this.#wait(problem));
@@ -222,7 +225,7 @@ export class ClipForm {
   }
 
   #wait(problem) {
-    this.#say(`${problem.message} What was sent is kept; trying again.`, "bad");
+    showProblem(this.message, problem, words("upload.kept"));
   }
 
   #say(text, kind = "") {

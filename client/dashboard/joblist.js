@@ -1,58 +1,33 @@
 // The list of jobs: where each stands, and what may be done about it.
 
 import { cancelJob, purgeScene, retryJob } from "./api.js";
-import { button, clockTime, element } from "./element.js";
+import { button, dateTime, element } from "./element.js";
+import { TimesLeft } from "./left.js";
+import { figure, words } from "./messages.js";
+import { details, apiWords, errorWords, showProblem } from "./problem.js";
 
 /** @typedef {import("./api.js").Job} Job */
 
-/** What the worker's stages are to somebody who waits. */
-const STAGES = {
-  fetching: "fetching the clip",
-  decode: "reading the clip",
-  calibrate: "checking the calibration",
-  stereo: "measuring depth",
-  compile: "preparing the kernels",
-  fusion: "collecting points",
-  motion: "following the tissue",
-  start: "starting the model",
-  train: "training",
-  finish: "cleaning up",
-  score: "scoring",
-  publishing: "publishing",
-};
+/** Errors after which the same clip may well succeed; after any other, the clip or the service must change first. */
+const MAY_SUCCEED = ["attempts_exhausted", "fault", "out_of_memory", "queue_full", "store_full", "decoder_killed", "unavailable", "unclassified"];
 
-const seconds = (value) => (value < 90 ? `${Math.max(1, Math.round(value))} s` : `${Math.round(value / 60)} min`);
-
-/** @param {Job} job @returns {string} what it is doing, in one line */
-function describe(job) {
-  if (job.state === "queued") {
-    const before = job.position == null ? null : job.position === 0 ? "next" : `${job.position} before it`;
-    return ["queued", before, job.eta_s != null && `done in about ${seconds(job.eta_s)}`].filter(Boolean).join(" · ");
-  }
-  if (job.state !== "running") return job.state;
-  const stage = job.cancel_requested ? "cancelling" : (STAGES[job.stage] ?? job.stage ?? "starting");
-  const db = job.psnr_db != null && `${job.psnr_db.toFixed(1)} dB`;
-  return [stage, db, job.seconds_left != null && `${seconds(job.seconds_left)} left`].filter(Boolean).join(" · ");
-}
-
-/** @param {import("./api.js").Receipt} receipt @returns {string} */
+/** @param {import("./api.js").Receipt} receipt @returns {string} for whoever keeps books */
 function describeReceipt(receipt) {
   const sum = (counts) => Object.values(counts).reduce((total, count) => total + count, 0);
-  const megabytes = (sum(receipt.bytes) / 1e6).toFixed(1);
-  const proof = receipt.verified ? "It was checked that nothing is left." : "";
-  const others = receipt.clip_kept_by.map((id) => id.slice(0, 8)).join(" and ");
-  const kept = others && ` The same clip stays with ${others}.`;
-  const what = `${sum(receipt.files)} files, ${megabytes} MB, and its record`;
-  return `${receipt.job_id.slice(0, 8)} is deleted for good: ${what}. ${proof}${kept}`;
+  const others = receipt.clip_kept_by.map((id) => `clip_kept_by ${id}`);
+  return [`${receipt.job_id}: ${sum(receipt.files)} files, ${sum(receipt.bytes)} bytes, ${receipt.purged_at}`, ...others].join("; ");
 }
 
 export class JobList {
   /**
    * @param {{list: HTMLElement, nothing: HTMLElement, message: HTMLElement, confirm: HTMLDialogElement}} parts
+   * @param {import("./scopes.js").Scopes} scopes
    * @param {{onView: (id: string) => void, onChange: () => void, onPurged: (id: string) => void}} told
    */
-  constructor(parts, told) {
+  constructor(parts, scopes, told) {
     Object.assign(this, parts, told);
+    this.scopes = scopes;
+    this.times = new TimesLeft();
     /** @type {Map<string, {item: HTMLElement, bar: HTMLProgressElement, words: HTMLElement, key: string}>} */
     this.rows = new Map();
     this.confirm.querySelector("[value=no]").addEventListener("click", () => this.confirm.close());
@@ -66,6 +41,7 @@ export class JobList {
   show(jobs, chosen) {
     this.nothing.hidden = jobs.length > 0;
     const here = new Set(jobs.map((job) => job.id));
+    this.times.keepOnly(here);
     for (const [id, row] of this.rows) {
       if (here.has(id)) continue;
       row.item.remove();
@@ -77,9 +53,15 @@ export class JobList {
     });
   }
 
+  /** Make every row anew, as in another language. */
+  forget() {
+    for (const row of this.rows.values()) row.item.remove();
+    this.rows.clear();
+  }
+
   /** The job's row, made again only if its actions change, so that focus and half-made clicks stay. */
   #row(job, chosen) {
-    const key = JSON.stringify([job.state, job.cancel_requested, job.error]);
+    const key = JSON.stringify([job.state, job.cancel_requested, job.error, this.#actions(job)]);
     let row = this.rows.get(job.id);
     if (row?.key !== key) {
       const made = this.#make(job, key);
@@ -89,7 +71,7 @@ export class JobList {
       row = made;
       this.rows.set(job.id, row);
     }
-    row.words.textContent = describe(job);
+    row.words.textContent = this.#describe(job);
     row.bar.value = job.fraction ?? 0;
     row.item.classList.toggle("chosen", job.id === chosen);
     if (job.id === chosen) row.item.setAttribute("aria-current", "true");
@@ -97,63 +79,93 @@ export class JobList {
     return row;
   }
 
+  /** @param {Job} job @returns {string} what it is doing, in one line */
+  #describe(job) {
+    const left = this.times.of(job);
+    if (job.state === "queued") {
+      const before = job.position == null ? "" : words(job.position === 0 ? "job.next" : "job.before", { count: job.position });
+      return [words("state.queued"), before, left].filter(Boolean).join(" · ");
+    }
+    if (job.state !== "running") return words(`state.${job.state}`);
+    const stage = job.cancel_requested ? words("job.cancelling") : words(`stage.${job.stage ?? "start"}`);
+    const db = job.psnr_db != null && `${figure(job.psnr_db, 1)} dB`;
+    return [stage, db, left].filter(Boolean).join(" · ");
+  }
+
   #make(job, key) {
-    const name = `${clockTime(job.created_at_s * 1000)} · ${job.id.slice(0, 8)}`;
-    const words = element("strong");
+    const name = dateTime(job.created_at_s * 1000);
+    const state = element("strong");
     const bar = element("progress");
-    bar.setAttribute("aria-label", `progress of ${name}`);
+    bar.setAttribute("aria-label", words("job.progress_of", { name }));
     bar.hidden = job.state !== "running";
-    const head = element("div", { class: "head" }, element("span", { text: name }), words);
+    const head = element("div", { class: "head" }, element("span", { text: name }), state);
     const item = element("li", { class: `job ${job.state}` }, head, bar);
     item.dataset.job = job.id;
     if (job.error) {
-      const { field, problem, remedy } = job.error;
-      const text = [field && `${field}:`, problem, remedy].filter(Boolean).join(" ");
-      item.append(element("p", { class: "failed", text }));
+      const { code, field } = job.error;
+      item.append(element("p", { class: "failed", text: errorWords(code ?? "unclassified", field) }), ...details(apiWords(job.error)));
     }
     item.append(element("div", { class: "actions" }, ...this.#buttons(job, name)));
-    return { item, bar, words, key };
+    return { item, bar, words: state, key };
+  }
+
+  /** @param {Job} job @returns {("watch"|"view"|"retry"|"cancel"|"delete")[]} what may be done, and would not be refused */
+  #actions(job) {
+    const isLive = job.state === "queued" || job.state === "running";
+    const mayChange = this.scopes.has("reconstruct");
+    const may = {
+      watch: job.state === "running",
+      view: job.state === "done",
+      retry: job.state === "failed" && mayChange && MAY_SUCCEED.includes(job.error?.code ?? "unclassified"),
+      cancel: isLive && mayChange,
+      delete: !isLive && this.scopes.has("purge"),
+    };
+    return Object.keys(may).filter((action) => may[action]);
   }
 
   #buttons(job, name) {
-    const buttons = [];
-    const add = (text, onClick) => buttons.push(button(text, onClick, `${text} ${name}`));
-    if (job.state === "running") add("Watch", () => this.onView(job.id));
-    if (job.state === "done") add("View", () => this.onView(job.id));
-    if (job.state === "failed") add("Try again", () => this.#do(() => retryJob(job.id)));
-    if (job.state === "queued" || job.state === "running") {
-      add("Cancel", () => this.#ask("Cancel job", `Cancel ${name}? Its clip is removed.`, () => this.#do(() => cancelJob(job.id))));
-      buttons.at(-1).disabled = job.cancel_requested;
-    } else {
-      add("Delete", () => this.#ask("Delete", `Delete the clip and the scene of ${name} for good?`, () => this.#purge(job.id)));
-    }
-    return buttons;
+    const work = {
+      watch: () => this.onView(job.id),
+      view: () => this.onView(job.id),
+      retry: () => this.#do(() => retryJob(job.id)),
+      cancel: () => this.#ask("cancel", name, () => this.#do(() => cancelJob(job.id))),
+      delete: () => this.#ask("delete", name, () => this.#purge(job.id, name)),
+    };
+    return this.#actions(job).map((action) => {
+      const text = words(`job.${action}`);
+      const made = button(text, work[action], `${text} ${name}`);
+      made.dataset.action = action;
+      made.disabled = action === "cancel" && job.cancel_requested;
+      return made;
+    });
   }
 
-  /** Ask before what cannot be taken back. @param {string} yes @param {string} question @param {() => void} onYes */
-  #ask(yes, question, onYes) {
+  /** Ask before what cannot be taken back. @param {"cancel"|"delete"} action @param {string} name @param {() => void} onYes */
+  #ask(action, name, onYes) {
     this.onYes = onYes;
-    this.confirm.querySelector("[value=yes]").textContent = yes;
-    this.confirm.querySelector("p").textContent = question;
+    this.confirm.querySelector("[value=yes]").textContent = words(`job.${action}`);
+    this.confirm.querySelector("p").textContent = words(`job.ask_${action}`, { name });
     this.confirm.showModal();
   }
 
-  #purge(id) {
+  #purge(id, name) {
     this.#do(async () => {
       const receipt = await purgeScene(id);
       this.onPurged(id);
-      return describeReceipt(receipt);
+      const checked = receipt.verified && words("job.purge_checked");
+      const kept = receipt.clip_kept_by.length > 0 && words("job.clip_kept");
+      const said = [words("job.purged", { name }), checked, kept].filter(Boolean).join(" ");
+      this.message.replaceChildren(element("p", { text: said }), ...details(describeReceipt(receipt)));
     });
   }
 
   async #do(work) {
     this.message.className = "message";
+    this.message.replaceChildren();
     try {
-      const words = await work();
-      this.message.textContent = typeof words === "string" ? words : "";
+      await work();
     } catch (error) {
-      this.message.textContent = error.message;
-      this.message.classList.add("bad");
+      showProblem(this.message, error);
     }
     this.onChange();
   }

@@ -3,6 +3,7 @@
 import { getJob, listJobs, trouble } from "./api.js";
 import { JobEvents } from "./events.js";
 import { keyEvents } from "./key.js";
+import { words } from "./messages.js";
 
 /** @typedef {import("./api.js").Job} Job */
 
@@ -35,7 +36,7 @@ class Scores {
 export class Jobs {
   /**
    * @param {() => void} onChange after any change of the jobs
-   * @param {(words: string, kind: "good"|"bad") => void} onConnection how the service is
+   * @param {(text: string, kind: "good"|"bad") => void} onConnection how the service is
    */
   constructor(onChange, onConnection) {
     this.onChange = onChange;
@@ -62,6 +63,7 @@ export class Jobs {
   forget(id) {
     this.byId.delete(id);
     this.scores.delete(id);
+    this.told.delete(id);
     this.onChange();
   }
 
@@ -74,10 +76,10 @@ export class Jobs {
       if (round !== this.round) return; // a newer answer is there, or comes
       this.#replace(jobs, askedAt);
       await this.#askForPosition();
-      const words = await trouble();
-      if (round === this.round) this.onConnection(words || "ready", words ? "bad" : "good");
+      const wrong = await trouble();
+      if (round === this.round) this.onConnection(wrong || words("page.ready"), wrong ? "bad" : "good");
     } catch (error) {
-      if (round === this.round) this.onConnection(error.status ? error.message : "no connection", "bad");
+      if (round === this.round) this.onConnection(error.status ? error.message : words("page.no_connection"), "bad");
     }
   }
 
@@ -86,6 +88,7 @@ export class Jobs {
     this.followed.clear();
     this.byId.clear();
     this.scores.clear();
+    this.told.clear();
     this.onChange();
     this.poll();
   }
@@ -99,6 +102,7 @@ export class Jobs {
       this.byId.set(job.id, isOlder ? known : { ...job, ...positionIn(known, job) });
       this.#note(job);
     }
+    for (const known of [this.scores, this.told]) for (const id of known.keys()) if (!this.byId.has(id)) known.delete(id);
     this.#follow();
     this.onChange();
   }

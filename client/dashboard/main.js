@@ -4,16 +4,19 @@ import { getCurve, getReport } from "./api.js";
 import { stepBackWhileIdle } from "./awake.js";
 import { drawCurve, pointsOfCsv } from "./curve.js";
 import { Drawers } from "./drawers.js";
+import { dateTime } from "./element.js";
+import { baselinesOf } from "./figures.js";
 import { ClipForm } from "./form.js";
 import { JobList } from "./joblist.js";
 import { Jobs } from "./jobs.js";
 import { currentKey, keyEvents, showKeyForm } from "./key.js";
+import { languageEvents, showWords, words } from "./messages.js";
 import { pause } from "./pause.js";
-import { baselinesOf, showReport } from "./report.js";
+import { showReport } from "./report.js";
+import { Scopes } from "./scopes.js";
 import { Viewer } from "./viewer.js";
 
 const get = (id) => document.getElementById(id);
-const WHAT_REPORTS_ARE = "Of the scene in view: how good it is, and what was assumed.";
 
 const viewer = new Viewer({
   stage: get("stage"),
@@ -43,16 +46,16 @@ const UNSCORED_PAUSE_MS = 1000;
 /** @type {string | null} the scene whose report and final curve are shown */
 let reported = null;
 
-function say(words) {
-  get("report").replaceChildren(Object.assign(document.createElement("p"), { className: "quiet", textContent: words }));
+function say(text) {
+  get("report").replaceChildren(Object.assign(document.createElement("p"), { className: "quiet", textContent: text }));
 }
 
-function view(id, words) {
+function view(id, message) {
   awaited = null;
   reported = null;
-  viewer.open(id, words);
+  viewer.open(id, message);
   if (id !== null && drawers.isOpen !== "report-drawer") drawers.close();
-  say(WHAT_REPORTS_ARE);
+  say(words("page.report_of"));
   drawCurve(get("curve"), [], []);
   showJobs();
 }
@@ -91,11 +94,13 @@ function offerMasks() {
 }
 
 function showJobs() {
+  scopes.refresh();
   offerMasks();
   list.show([...jobs.byId.values()], viewer.scene);
   const expected = jobs.byId.get(awaited);
   if (expected?.state === "running" || expected?.state === "done") view(expected.id);
   const viewed = jobs.byId.get(viewer.scene);
+  get("scene-id").textContent = viewed ? dateTime(viewed.created_at_s * 1000) : "";
   if (viewed?.state === "done" && reported !== viewed.id) {
     viewer.refresh(); // what is shown may be of its training still
     report(viewed.id);
@@ -103,18 +108,20 @@ function showJobs() {
   if (viewed && viewed.state !== "done") drawCurve(get("curve"), jobs.pointsOf(viewed.id), []);
 }
 
-function showConnection(words, kind) {
-  get("connection").textContent = words;
+function showConnection(text, kind) {
+  get("connection").textContent = text;
   get("connection").className = `pill ${kind}`;
 }
 
+const scopes = new Scopes(() => showJobs());
 const list = new JobList(
   { list: get("jobs"), nothing: get("no-jobs"), message: get("jobs-message"), confirm: get("confirm") },
+  scopes,
   {
     onView: view,
     onChange: () => jobs.poll(),
     onPurged: (id) => {
-      if (viewer.scene === id) view(null, "This scene is deleted.");
+      if (viewer.scene === id) view(null, words("page.deleted"));
       jobs.forget(id);
     },
   },
@@ -131,13 +138,19 @@ const form = new ClipForm(
   },
   (id) => {
     awaited = id;
-    if (!viewer.scene) viewer.open(null, "The scene opens here as soon as there is something to see.");
+    if (!viewer.scene) viewer.open(null, words("page.awaited"));
     jobs.poll();
   },
 );
 get("layer").addEventListener("change", offerMasks);
 get("better-masks").addEventListener("click", () => sendMasks(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
-keyEvents.addEventListener("changed", () => view(null, currentKey() ? "Choose a job." : "The key is forgotten."));
+languageEvents.addEventListener("changed", () => {
+  list.forget();
+  reported = null;
+  showJobs();
+});
+showWords(document);
+keyEvents.addEventListener("changed", () => view(null, words(currentKey() ? "page.choose" : "page.key_forgotten")));
 stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen === null);
 drawers.open("library", false);

@@ -2,6 +2,7 @@
 
 import { request } from "./api.js";
 import { keyEvents } from "./key.js";
+import { noticeWords, words } from "./messages.js";
 import { connectionLost } from "./problem.js";
 import { Stream } from "./stream.js";
 
@@ -15,6 +16,8 @@ const MAX_RETRY_MS = 15000;
 /** Not a layer of the model, but what the endoscope saw, with the masked parts marked. */
 const RECORDED = "recorded";
 
+const GUESSES = ["pose_far", "time_outside_clip"];
+
 /** @param {string} path @param {AbortSignal} signal @returns {Promise<Picture>} */
 async function askOnce(path, signal) {
   const response = await request(path, { signal });
@@ -27,12 +30,30 @@ async function askOnce(path, signal) {
     t: Number(header("T")),
     iteration: header("Iteration") === null ? null : Number(header("Iteration")),
     unseen: Number(header("Unseen")),
-    warning: header("Warning") ?? "",
+    warning: "",
     codes: header("Warning-Codes")?.split(", ") ?? [],
     totalMs: total ? Number(total[1]) : NaN,
     way: "single pictures",
   };
 }
+
+/**
+ * Whether a notice says that a picture shows a guess. What is hatched is none, and at the endoscope's own pose the clip
+ * saw what is shown, hardly or well.
+ * @param {string} code @param {View} view
+ */
+function isGuess(code, view) {
+  if (code === "unseen") return view.unseen === "guess";
+  if (code === "hardly_seen") return view.pose !== undefined;
+  return GUESSES.includes(code);
+}
+
+/** What to know of a picture, in the page's words. @param {string[]} codes @param {View} view */
+const warningOf = (codes, view) =>
+  codes
+    .map((code) => (code === "unseen" && view.unseen === "guess" ? words("picture.guessed") : noticeWords({ code, text: "" })))
+    .filter(Boolean)
+    .join(" ");
 
 /** @param {View} view */
 const pathOf = (view) =>
@@ -66,11 +87,10 @@ export class Pictures {
     const isRecorded = view.layer === RECORDED;
     const isStreamed = this.stream.isOpen && !isRecorded;
     const picture = isStreamed ? await this.#fromStream(view) : await this.#fromPath(pathOf(view));
-    if (picture.scene !== view.scene) throw new Error("The service sent another scene's picture; it is not shown.");
-    // What is hatched is no guess, and highlights that stay were seen: the rest of the picture is as good as ever.
-    const harmless = ["coarse", "highlights_unknown", ...(view.unseen === "mark" ? ["unseen"] : [])];
+    if (picture.scene !== view.scene) throw new Error(words("page.other_scene"));
+    picture.warning = warningOf(picture.codes, view);
     picture.isRecorded = isRecorded;
-    picture.isExtrapolated = picture.codes.some((code) => !harmless.includes(code));
+    picture.isExtrapolated = picture.codes.some((code) => isGuess(code, view));
     return picture;
   }
 

@@ -38,7 +38,7 @@ export class Screen {
     this.trouble = "";
     this.words = words;
     this.canvas.width = this.canvas.height = 0; // its pixels are gone, not only hidden
-    this.sceneId.textContent = scene ?? "";
+    this.sceneId.dataset.scene = scene ?? "";
     this.#look();
   }
 

@@ -1,7 +1,7 @@
 // Pictures over one WebSocket: a view is asked for, its picture comes back, then the next.
 
 import { askForKey, currentKey } from "./key.js";
-import { connectionLost, Problem } from "./problem.js";
+import { connectionLost, errorWords, Problem } from "./problem.js";
 
 /**
  * What is asked for; the query of GET /render.
@@ -76,7 +76,7 @@ export class Stream {
     if (typeof data === "string") {
       const document = JSON.parse(data);
       const problem = new Problem(document.status, document, document.retry_after_s);
-      if (problem.status === 401 && key === currentKey()) askForKey(problem.message);
+      if (problem.status === 401 && key === currentKey()) askForKey(key ? errorWords("http_401", "wrong") : problem.message);
       if (document.id === undefined || document.id === null || document.id === this.pending?.id) this.#fail(problem);
       return;
     }
@@ -85,9 +85,8 @@ export class Stream {
     const { resolve } = this.pending;
     this.pending = null;
     const { scene, state, t, iteration, unseen, warnings, total_ms: totalMs } = head;
-    const warning = warnings.map(({ text }) => text).join(" ");
     const codes = warnings.map(({ code }) => code);
-    resolve({ blob, scene, state, t, iteration, unseen, warning, codes, totalMs, way: "stream" });
+    resolve({ blob, scene, state, t, iteration, unseen, warning: "", codes, totalMs, way: "stream" });
   }
 
   #fail(problem) {

@@ -99,6 +99,8 @@ class Painter:
 
     def __init__(self) -> None:
         self.pause_s = 0.0
+        self.warnings: list[Notice] = []
+        """Of every picture."""
         self.shown_unseen: Unseen | None = None
         self.shown_highlights: Highlights | None = None
 
@@ -111,7 +113,7 @@ class Painter:
         time.sleep(self.pause_s)
         self.shown_unseen, self.shown_highlights = request.unseen, request.highlights
         picture = np.full((48, 60, 3), grey_of(request.scene_id), np.uint8)
-        warnings = []
+        warnings = list(self.warnings)
         if isinstance(request.pose, OrbitPose) and abs(request.pose.yaw_deg) > FAR_DEG:
             warnings.append(a_warning(FAR, NoticeCode.POSE_FAR))
         if isinstance(request.pose, OrbitPose) and request.pose.zoom < FAR_OUT_ZOOM:
@@ -173,12 +175,21 @@ class Site:
         self.announce(record.job_id)
         return Claim(record.job_id, record.attempt, WORKER)
 
-    def train(self, claim: Claim, iteration: int, psnr_db: float, psnr_right_db: float | None = None) -> None:
+    def train(
+        self,
+        claim: Claim,
+        iteration: int,
+        psnr_db: float,
+        psnr_right_db: float | None = None,
+        seconds_left: float = 20.0,
+    ) -> None:
         """Tell that training has come so far, of 100."""
         progress = JobProgress(
             stage="train", fraction=iteration / 100, iteration=iteration, iterations=100, psnr_db=psnr_db
         )
-        self.queue.beat(claim, progress.model_copy(update={"seconds_left": 20.0, "psnr_right_db": psnr_right_db}))
+        self.queue.beat(
+            claim, progress.model_copy(update={"seconds_left": seconds_left, "psnr_right_db": psnr_right_db})
+        )
 
     def finish(self, claim: Claim, *, scored: bool = True) -> str:
         folder = self.store.work_folder(claim.job_id, claim.attempt)

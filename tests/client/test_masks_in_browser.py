@@ -12,6 +12,7 @@ from contract.wire.names import MASKS
 from contract.wire.report import Masks
 from tests.client.local_service import CLIP
 from tests.client.page import RECORDED_SHADE, REPORT_OF_THE_PAGE, Page, Site
+from tests.client.words import say
 
 
 def test_found_masks_are_told_of_and_saved_to_be_corrected(site: Site, page: Page, tmp_path: Path) -> None:
@@ -21,6 +22,7 @@ def test_found_masks_are_told_of_and_saved_to_be_corrected(site: Site, page: Pag
     site.store.add_scores("worker-1", scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"masks": masks}))
     (site.store.scene_folder(scene, 1) / MASKS).write_bytes(b"PK")
     page.press(scene, "View")
+    page.click("#report .figures summary")
     page.until_text("#report", "Found by their colour and depth; 12.3 % of the picture. Not sure: of what looks")
     page.click('#report button[aria-label^="Save the masks"]')
     page.until(lambda: (tmp_path / f"{scene}-masks.zip").exists())
@@ -48,7 +50,7 @@ def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path
     Select(page.find("#upload [name=mask_source]")).select_by_value("auto")
     Select(page.find("#upload [name=poses]")).select_by_value("fixed")
     page.click("#upload [type=submit]")
-    page.until_text("#jobs", "queued")
+    page.until_text("#jobs", "waiting")
     claim = site.claim()
     site.train(claim, 20, 24.0)
     page.until_state("training")
@@ -68,7 +70,7 @@ def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path
         pass
     page.choose("masks", tmp_path / "better.zip")
     page.click("#upload [type=submit]")
-    page.until_text("#jobs", "queued")
+    page.until_text("#jobs", "waiting")
     again = site.claim()
     (record,) = (each for each in site.queue.records() if each.job_id == again.job_id)
     assert record.clip_of == scene
@@ -80,7 +82,9 @@ def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path
     page.until(lambda: page.find("#upload [name=clip]").is_displayed())
     page.press(scene, "Delete")
     page.click("#confirm [value=yes]")
-    page.until_text("#jobs-message", f"The same clip stays with {record.job_id[:8]}.")
+    page.until_text("#jobs-message", say("job.clip_kept"))
+    page.click("#jobs-message summary")
+    page.until_text("#jobs-message", f"clip_kept_by {record.job_id}")
 
 
 @pytest.mark.parametrize(
@@ -94,5 +98,6 @@ def test_masks_that_were_not_found_are_not_offered(site: Site, page: Page, masks
     scene = site.scene()
     site.store.add_scores("worker-1", scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"masks": masks}))
     page.press(scene, "View")
+    page.click("#report .figures summary")
     page.until_text("#report", words)
     assert "Save the masks" not in page.text("#report")

@@ -10,6 +10,7 @@ import pytest
 from selenium.webdriver.common.keys import Keys
 
 from tests.client.page import Page, Site
+from tests.client.words import say
 
 SIZES = [(1280, 800), (1920, 1080), (820, 1180), (390, 844)]
 """A laptop, the screen of an operating room, a tablet held upright, a phone."""
@@ -83,7 +84,7 @@ def test_the_picture_fills_the_screen_and_a_refusal_is_seen_whatever_is_open(
         page.choose("clip", notes)
         page.script("document.querySelector('#upload details').open = true")
         page.click("#upload [type=submit]")
-        page.until_text("#upload-message", "clip:")
+        page.until_text("#upload-message", say("problem.input:clip"))
         assert is_on_screen(page, "#upload-message")
         page.click("#drawer [data-close]")
         assert is_on_screen(page, "#upload-message")
