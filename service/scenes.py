@@ -13,6 +13,7 @@ from contract.store.shelf import is_job_id
 from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.names import CURVE, MASKS
+from contract.wire.notices import NoticeCode, Severity
 from contract.wire.rendering import RecordedRequest
 from contract.wire.report import Report
 from service.access import Caller
@@ -29,7 +30,7 @@ router = APIRouter(prefix="/scenes", tags=["scenes"])
 class SceneSummary(BaseModel):
     """A scene in the list; `error` says why its report, and so its quality, cannot be read.
 
-    scored: False while its scores are still being measured.
+    scored: False while its scores are still being measured. warnings: the codes of its report's warnings.
     """
 
     id: str
@@ -39,6 +40,7 @@ class SceneSummary(BaseModel):
     created_at_s: float = Field(description="when its job was submitted, UNIX s")
     scored: bool = True
     psnr_tissue_db: float | None = None
+    warnings: list[NoticeCode] = []
     error: str | None = None
     links: dict[str, str]
 
@@ -151,6 +153,7 @@ def _summary(services: Deps, record: JobRecord) -> SceneSummary:
     """A scene's line in the list; a damaged one hides no other."""
     scene_id = record.job_id
     links = {"report": f"/scenes/{scene_id}", "render": f"/render?scene={scene_id}", "job": f"/jobs/{scene_id}"}
+    links["thumbnail"] = f"/scenes/{scene_id}/thumbnail"
     summary = SceneSummary(
         id=scene_id,
         **record.labels.model_dump(),
@@ -162,4 +165,6 @@ def _summary(services: Deps, record: JobRecord) -> SceneSummary:
         report = services.store.newest_report(scene_id, record.attempt)
     except SceneError as error:
         return summary.model_copy(update={"error": str(error)})
-    return summary.model_copy(update={"scored": report.scored, "psnr_tissue_db": report.psnr_tissue_db})
+    codes = [each.code for each in report.warnings if each.severity is Severity.WARNING]
+    known = {"scored": report.scored, "psnr_tissue_db": report.psnr_tissue_db, "warnings": codes}
+    return summary.model_copy(update=known)

@@ -239,6 +239,10 @@ class Client:
         """The masks that were found, as a zip to correct and to send with the clip again."""
         return run(self._core.masks(scene))
 
+    def thumbnail(self, scene: str) -> bytes:
+        """A small JPEG of a finished scene's first moment."""
+        return run(self._core.thumbnail(scene))
+
     def recorded(self, scene: str, t: float = 0.0) -> bytes:
         """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains."""
         return run(self._core.recorded(scene, t))

@@ -219,6 +219,10 @@ class Core:
         """The masks that were found, as a zip to correct and to send with the clip again."""
         return (await self._get("scenes", scene, "masks")).content
 
+    async def thumbnail(self, scene: str) -> bytes:
+        """A small JPEG of a finished scene's first moment."""
+        return (await self._get("scenes", scene, "thumbnail")).content
+
     async def recorded(self, scene: str, t: float = 0.0) -> bytes:
         """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains."""
         return (await self._get("scenes", scene, "recorded", t=t)).content

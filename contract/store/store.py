@@ -8,7 +8,7 @@
     ├── kept/<job>.<n>/     what goes on from attempt n: resume.safetensors, and prepared/, the clip with depth
     ├── work/tmp-<name>/    what worker <name> has unpacked; emptied whenever it starts
     ├── scenes/<job>.<n>/   what attempt n has finished: manifest.json, scene.safetensors, report.json, curve.csv
-    │                       and, of a clip whose masks were found, masks.zip, recorded.zip
+    │                       and, of a clip whose masks were found, masks.zip, recorded.zip; thumbnail.jpg once asked for
     ├── unscored/<name>/    an empty file <job>.<n> for each scene that worker <name> has finished and not scored yet
     ├── run/                sockets of live workers
     └── valkey/             the embedded queue's log
@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import threading
 import time
 from pathlib import Path
 
@@ -41,7 +42,7 @@ from contract.store.shelf import ABANDONED_AFTER_S, Area, Removed, Shelf, ShelfE
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.labels import Labels
-from contract.wire.names import KEPT, LABELS, REPORT, SUBMISSION
+from contract.wire.names import KEPT, LABELS, REPORT, SUBMISSION, THUMBNAIL
 from contract.wire.report import Report
 
 UNSCORED = "unscored"
@@ -66,6 +67,7 @@ class Store:
         self._here = LocalShelf(self.data_dir)
         self._shelf: Shelf = self._here if store_url is None else S3Shelf(self._here, store_url)
         self.run_dir.mkdir(mode=0o700, exist_ok=True)
+        self._keeping = threading.Lock()
 
     @property
     def run_dir(self) -> Path:
@@ -264,6 +266,25 @@ class Store:
         if folder is None:
             raise SceneError(f"There is no scene {job_id[:40]!r}.")
         return folder
+
+    def thumbnail(self, job_id: str, attempt: int) -> bytes | None:
+        """The small picture that is kept of the attempt's scene; None if there is none yet.
+
+        Raises:
+            SceneError: the scene does not exist, or the bucket's copy is damaged.
+        """
+        path = self.scene_folder(job_id, attempt) / THUMBNAIL
+        with disk_errors(), contextlib.suppress(FileNotFoundError):
+            return path.read_bytes()
+        return None
+
+    def keep_thumbnail(self, job_id: str, attempt: int, content: bytes) -> None:
+        """Keep a small picture beside a published scene, with which it is removed. One that is gone stays so."""
+        entry = ShelfEntry(Area.SCENES, job_id, attempt)
+        if (folder := self._shelf.get(entry)) is not None:
+            with self._keeping, disk_errors(), contextlib.suppress(FileNotFoundError, FileExistsError):
+                replace_file(folder / THUMBNAIL, content)  # another process may be about to keep the same
+                self._shelf.put_files(entry, (THUMBNAIL,))
 
     def has_scene(self, job_id: str, attempt: int) -> bool:
         """Whether the attempt's scene is there."""

@@ -57,6 +57,7 @@ def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(
         client.file(job.id)
     assert set(client.key()["scopes"]) == set(KeyScope)
     assert client.recorded(job.id, 0.5) == b"jpeg"
+    assert client.thumbnail(job.id) == service.store.thumbnail(job.id, 1)
     assert job.id in {scene["id"] for scene in client.scenes()}
     receipt = client.delete(job.id)
     assert receipt["verified"]

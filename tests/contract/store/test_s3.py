@@ -153,6 +153,18 @@ def test_a_scene_purged_elsewhere_before_its_scores_come_does_not_come_back(tmp_
     assert worker.unscored("worker-1") == []
 
 
+def test_a_thumbnail_is_kept_in_the_bucket_and_goes_with_its_scene(tmp_path: Path, bucket: Any) -> None:
+    service, worker = on(tmp_path, "service"), on(tmp_path, "worker")
+    job_id, _ = unscored(worker)
+    service.scene_folder(job_id, 1)
+    worker.keep_thumbnail(job_id, 1, b"jpeg")
+    assert service.thumbnail(job_id, 1) is None  # its copy is older
+    assert on(tmp_path, "another").thumbnail(job_id, 1) == b"jpeg"
+    service.purge(job_id)
+    service.keep_thumbnail(job_id, 1, b"late")
+    assert keys(bucket) == []
+
+
 def test_an_unscored_scene_is_fetched_again_only_when_another_machine_has_scored_it(
     tmp_path: Path, bucket: Any
 ) -> None:
