@@ -19,6 +19,7 @@ from contract.access.keys import KeyScope
 from contract.wire.errors import UnavailableError
 from contract.wire.exports import EXPORT_FORMATS, ExportOptions, check_export
 from contract.wire.rendering import ExportRequest
+from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
 from service.renders import image_response, problem_of_reply
@@ -55,7 +56,7 @@ class ExportQuery(ExportOptions):
     responses={
         200: {
             "description": "the file",
-            "content": {each: {} for each in sorted({each.media_type for each in EXPORT_FORMATS.values()})},
+            "content": dict.fromkeys(sorted({each.media_type for each in EXPORT_FORMATS.values()}), BINARY),
         }
     },
 )

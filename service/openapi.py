@@ -8,9 +8,9 @@ from typing import Any
 from fastapi import FastAPI
 from pydantic import BaseModel, ConfigDict, Field
 
+from service.bodies import BODIES, EXAMPLE_ID
 from service.problems import MEDIA_TYPE
 
-EXAMPLE_ID = "0123456789abcdef0123456789abcdef"
 EXAMPLES: dict[str, dict[str, Any]] = {
     "JobView": {
         "id": EXAMPLE_ID,
@@ -72,6 +72,7 @@ def _completed(document: dict[str, Any]) -> dict[str, Any]:
     for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which nobody is answered here
         schemas.pop(name, None)
     schemas["Problem"] = ProblemDocument.model_json_schema()
+    schemas |= BODIES
     for name, example in EXAMPLES.items():
         if name in schemas:
             schemas[name]["examples"] = [example]

@@ -9,7 +9,7 @@ import time
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from io import RawIOBase
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Header, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -25,18 +25,18 @@ from contract.queue.interface import Admission, QueueFullError
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.wire.errors import InputError, LimitError, UnavailableError
-from contract.wire.job import JOB_ID_PATTERN, Forecast, JobRecord, JobView
-from contract.wire.labels import Labels, parse_labels
+from contract.wire.job import Forecast, JobRecord, JobView
+from contract.wire.labels import parse_labels
 from contract.wire.options import JobOptions, parse_options
 from service.access import Caller
+from service.bodies import REQUEST_BODY
 from service.deps import AnyCaller, Deps, Services
 from service.intake import declared_length
-from service.openapi import EXAMPLE_ID
 from service.partial import Partial, find_partial
 from service.problems import RETRY_AFTER_S, Problem, no_room
 from service.retention import check_retention
 from service.reuse import add_files_of, earlier_job, first_job
-from service.upload import CLIP_OF, LIMIT_REMEDY, PARTS, Received, UploadLimits, receive_upload
+from service.upload import LIMIT_REMEDY, PARTS, Received, UploadLimits, receive_upload
 
 router = APIRouter(tags=["jobs"])
 
@@ -45,39 +45,6 @@ STEPS_PER_S = 10.0
 MAX_SUBMISSION_BYTES = 128 * 1024
 """The limit of a JSON body."""
 JSON_REMEDY = 'Send ids of finished uploads by part, and options: {"clip": ID, "options": {"budget_s": 20}}.'
-UPLOAD_ID = {"type": "string", "pattern": JOB_ID_PATTERN, "description": "a finished upload (POST /uploads)"}
-CLIP_OF_ID = {
-    "type": "string",
-    "pattern": JOB_ID_PATTERN,
-    "description": "a job whose clip is used again, with its calibration and masks unless others are sent",
-}
-FILE = {"type": "string", "format": "binary"}
-
-
-def _body_schema(part: dict[str, str]) -> dict[str, Any]:
-    parts = dict.fromkeys(PARTS, part)
-    one_clip = [{"required": ["clip"]}, {"required": ["left", "right"]}, {"required": [CLIP_OF]}]
-    labels = Labels.model_json_schema()["properties"]
-    properties = {**parts, CLIP_OF: CLIP_OF_ID, **labels, "options": JobOptions.model_json_schema()}
-    return {"type": "object", "properties": properties, "additionalProperties": False, "oneOf": one_clip}
-
-
-REQUEST_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "description": "clip, or left and right, or clip_of; a file name's ending tells the format",
-        "content": {
-            "multipart/form-data": {
-                "schema": _body_schema(FILE),
-                "encoding": {name: {"contentType": "application/json"} for name in ("options", "metadata")},
-            },
-            "application/json": {
-                "schema": _body_schema(UPLOAD_ID),
-                "example": {"clip": EXAMPLE_ID, "options": {"budget_s": 20}},
-            },
-        },
-    }
-}
 
 IdempotencyKey = Annotated[
     str | None,

@@ -29,6 +29,7 @@ from contract.wire.rendering import (
     Unseen,
 )
 from service.access import Caller
+from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services, owned_scene
 from service.listing import SceneSearch
@@ -40,7 +41,7 @@ router = APIRouter(tags=["renders"])
 IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
     200: {
         "description": "the image",
-        "content": {media_type: {} for media_type in MEDIA_TYPES.values()},
+        "content": dict.fromkeys(MEDIA_TYPES.values(), BINARY),
         "headers": {
             "X-Intrasplat-Unseen": {
                 "description": "share of the view that no training frame saw, hatched unless unseen=guess",

@@ -16,6 +16,7 @@ from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
 from contract.wire.errors import SceneError
 from contract.wire.names import MANIFEST, SCENE
+from service.bodies import BINARY
 from service.deps import AnyCaller, Services
 from service.problems import Problem
 from service.renders import matches
@@ -24,13 +25,13 @@ from service.scenes import finished_job
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
 MEDIA_TYPES = {".json": "application/json", ".csv": "text/csv"}
-BINARY = "application/octet-stream"
+ANY_FILE = "application/octet-stream"
 NEVER_CHANGES = "private, max-age=31536000, immutable"
 CHANGES_ONCE = "private, no-cache"
 """Of the other files, because the scores are added to a finished scene."""
 RESPONSES: dict[int | str, dict[str, object]] = {
-    200: {"description": "the file", "content": {each: {} for each in (BINARY, *MEDIA_TYPES.values())}},
-    206: {"description": "the part that Range asks for", "content": {BINARY: {}}},
+    200: {"description": "the file", "content": dict.fromkeys((ANY_FILE, *MEDIA_TYPES.values()), BINARY)},
+    206: {"description": "the part that Range asks for", "content": {ANY_FILE: BINARY}},
     304: {"description": "it is the one that the caller has"},
     416: {"description": "Range lies beyond the file's end"},
 }
@@ -74,7 +75,7 @@ async def get_file(
         return Response(status_code=304, headers=headers)
     if request.method == "GET":
         await run_in_threadpool(services.audit.record, AuditAction.DOWNLOADED, caller, scene_id)
-    media_type = MEDIA_TYPES.get(found.path.suffix, BINARY)
+    media_type = MEDIA_TYPES.get(found.path.suffix, ANY_FILE)
     return FileResponse(found.path, headers=headers, media_type=media_type)
 
 

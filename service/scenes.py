@@ -17,6 +17,7 @@ from contract.wire.notices import NoticeCode, Severity
 from contract.wire.rendering import RecordedRequest
 from contract.wire.report import Report
 from service.access import Caller
+from service.bodies import BINARY, TEXT
 from service.deps import AnyCaller, Deps, Services, no_such_scene, owned_scene
 from service.listing import PAGED, SceneQuery, tell_next
 from service.problems import Problem
@@ -68,7 +69,12 @@ async def get_scene(scene_id: str, services: Services, caller: AnyCaller) -> Rep
     return await run_in_threadpool(services.store.newest_report, scene_id, record.attempt)
 
 
-@router.get("/{scene_id}/curve", operation_id="get_curve", response_class=FileResponse)
+@router.get(
+    "/{scene_id}/curve",
+    operation_id="get_curve",
+    response_class=FileResponse,
+    responses={200: {"description": "the curve", "content": {"text/csv": TEXT}}},
+)
 async def get_curve(scene_id: str, services: Services, caller: AnyCaller) -> FileResponse:
     """Held-out psnr_tissue over seconds of training, as CSV."""
     caller.require(KeyScope.VIEW)
@@ -80,7 +86,12 @@ async def get_curve(scene_id: str, services: Services, caller: AnyCaller) -> Fil
     return FileResponse(folder / CURVE, media_type="text/csv")
 
 
-@router.get("/{scene_id}/masks", operation_id="get_masks", response_class=FileResponse)
+@router.get(
+    "/{scene_id}/masks",
+    operation_id="get_masks",
+    response_class=FileResponse,
+    responses={200: {"description": "the masks", "content": {"application/zip": BINARY}}},
+)
 async def get_masks(scene_id: str, services: Services, caller: AnyCaller) -> FileResponse:
     """The masks that were found, as a zip that POST /reconstruct takes as `masks`: correct them, and send
     them with `clip_of`, which uses this scene's clip again.
@@ -101,7 +112,7 @@ async def get_masks(scene_id: str, services: Services, caller: AnyCaller) -> Fil
     "/{scene_id}/recorded",
     operation_id="get_recorded",
     response_class=Response,
-    responses={200: {"description": "the frame", "content": {"image/jpeg": {}}}},
+    responses={200: {"description": "the frame", "content": {"image/jpeg": BINARY}}},
 )
 async def get_recorded(scene_id: str, services: Services, caller: AnyCaller, t: ModelTime = 0.0) -> Response:
     """The recorded frame nearest to t, with the masked parts marked; also while the job trains.

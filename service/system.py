@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fastapi import APIRouter
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
@@ -14,6 +12,7 @@ from contract import CONTRACT_VERSION
 from contract.access.keys import KeyScope
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ImageFormat, Layer, WorkerAddress
+from service.bodies import TEXT
 from service.deps import AnyCaller, EarlyCaller, Services
 from service.problems import Problem, no_room, room_remedy
 from service.renderer import WORKER_REMEDY
@@ -75,20 +74,25 @@ async def readyz(services: Services, caller: EarlyCaller) -> Readiness:
     return readiness.model_copy(update={"workers": [worker.name for worker in there], "free_bytes": free_bytes})
 
 
+class Info(BaseModel):
+    """What the service is and takes."""
+
+    name: str = "intrasplat"
+    version: str
+    contract_version: int = CONTRACT_VERSION
+    notice: str = "Research use only. Not a medical device."
+    limits: dict[str, int | float | None] = Field(description="settings by name; null where there is no limit")
+    accepts: dict[str, list[str]] = Field(description="endings of file names by part")
+    layers: list[Layer] = list(Layer)
+    formats: list[ImageFormat] = list(ImageFormat)
+
+
 @router.get("/info", operation_id="info")
-async def info(services: Services) -> dict[str, Any]:
+async def info(services: Services) -> Info:
     """Version, limits and accepted formats."""
-    settings = services.settings
-    return {
-        "name": "intrasplat",
-        "version": version(),
-        "contract_version": CONTRACT_VERSION,
-        "notice": "Research use only. Not a medical device.",
-        "limits": {name: getattr(settings, name) for name in LIMITS},
-        "accepts": {part: list(suffixes) for part, suffixes in SUFFIXES.items()},
-        "layers": [layer.value for layer in Layer],
-        "formats": [format.value for format in ImageFormat],
-    }
+    limits = {name: getattr(services.settings, name) for name in LIMITS}
+    accepts = {part: list(suffixes) for part, suffixes in SUFFIXES.items()}
+    return Info(version=version(), limits=limits, accepts=accepts)
 
 
 class KeyView(BaseModel):
@@ -105,7 +109,12 @@ async def get_key(caller: AnyCaller) -> KeyView:
     return KeyView(tenant=caller.tenant, scopes=sorted(caller.scopes), key_id=caller.key_id)
 
 
-@router.get("/metrics", operation_id="metrics", response_class=Response)
+@router.get(
+    "/metrics",
+    operation_id="metrics",
+    response_class=Response,
+    responses={200: {"description": "the figures", "content": {"text/plain": TEXT}}},
+)
 def read_metrics(services: Services, caller: AnyCaller) -> Response:
     """Figures for Prometheus, in its text format."""
     caller.require(KeyScope.OPERATE)

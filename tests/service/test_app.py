@@ -56,10 +56,10 @@ def test_the_api_describes_itself_with_stable_operation_ids(service: ServiceUnde
 
 
 def test_the_api_describes_every_choice_of_a_render_and_of_a_reconstruction(service: ServiceUnderTest) -> None:
-    paths = service.http.get("/openapi.json").json()["paths"]
+    document = service.http.get("/openapi.json").json()
+    paths = document["paths"]
     render = {each["name"]: each for each in paths["/render"]["get"]["parameters"] if each["in"] == "query"}
-    form = paths["/reconstruct"]["post"]["requestBody"]["content"]["multipart/form-data"]["schema"]
-    options = form["properties"]["options"]["properties"]
+    options = document["components"]["schemas"]["JobOptions"]["properties"]
     assert {"unseen", "highlights"} <= render.keys()
     assert "eyes" in options
     for name, described in (render | options).items():

@@ -1,0 +1,79 @@
+"""The bodies of POST /reconstruct as /openapi.json describes them: schemas with names, for generators of clients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from contract.wire.job import JOB_ID_PATTERN
+from contract.wire.labels import Labels
+from service.upload import CLIP_OF, PARTS, SUFFIXES
+
+EXAMPLE_ID = "0123456789abcdef0123456789abcdef"
+BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+"""The content of an answer that is a file."""
+TEXT: dict[str, Any] = {"schema": {"type": "string"}}
+ONE_CLIP = "clip, or left and right, or clip_of"
+ABOUT = {
+    "clip": "both eyes in one file, or the left one alone with its depth",
+    "left": "the left eye, with right",
+    "right": "the right eye, with left",
+    "calibration": "of the cameras",
+    "masks": "where instruments are",
+}
+CLIP_OF_ID = {
+    "type": "string",
+    "pattern": JOB_ID_PATTERN,
+    "description": "a job whose clip is used again, with its calibration and masks unless others are sent",
+}
+OPTIONS = {"$ref": "#/components/schemas/JobOptions"}
+
+
+def _of_file(part: str) -> dict[str, Any]:
+    endings = ", ".join(SUFFIXES[part])
+    return {"type": "string", "format": "binary", "description": f"{ABOUT[part]}; its name ends in {endings}"}
+
+
+def _of_upload(part: str) -> dict[str, Any]:
+    return {"type": "string", "pattern": JOB_ID_PATTERN, "description": f"{ABOUT[part]}: a finished upload's id"}
+
+
+def _body(title: str, about: str, parts: dict[str, Any]) -> dict[str, Any]:
+    labels = Labels.model_json_schema()["properties"]
+    text = next(each for each in labels["label"]["anyOf"] if each["type"] == "string")  # a form has no null
+    labels["label"] = {**text, "description": labels["label"]["description"]}
+    properties = {**parts, CLIP_OF: CLIP_OF_ID, **labels, "options": OPTIONS}
+    description = f"{about}: {ONE_CLIP}, and what else is known."
+    return {
+        "title": title,
+        "description": description,
+        "type": "object",
+        "properties": properties,
+        "additionalProperties": False,
+    }
+
+
+BODIES: dict[str, dict[str, Any]] = {
+    "ClipForm": _body("ClipForm", "A clip in one request", {part: _of_file(part) for part in PARTS}),
+    "ClipOfUploads": _body(
+        "ClipOfUploads", "A clip of finished uploads (POST /uploads)", {part: _of_upload(part) for part in PARTS}
+    ),
+}
+"""Schemas by name. Which parts go together is no part of them, for generators read no conditions."""
+
+REQUEST_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": f"{ONE_CLIP}; a file name's ending tells the format",
+        "content": {
+            "multipart/form-data": {
+                "schema": {"$ref": "#/components/schemas/ClipForm"},
+                "encoding": {name: {"contentType": "application/json"} for name in ("options", "metadata")},
+            },
+            "application/json": {
+                "schema": {"$ref": "#/components/schemas/ClipOfUploads"},
+                "example": {"clip": EXAMPLE_ID, "options": {"budget_s": 20}},
+            },
+        },
+    }
+}
+"""What the route adds to its description."""
