@@ -38,7 +38,7 @@ OPERATIONS = {
     *("reconstruct", "list_jobs", "get_job", "label_job", "cancel_job", "retry_job", "watch_job"),
     *("describe_uploads", "create_upload", "get_upload", "append_to_upload", "delete_upload"),
     *("render", "list_scenes", "get_scene", "get_curve", "get_masks", "get_recorded", "export_scene", "purge_scene"),
-    *("get_file", "get_key"),
+    *("get_file", "get_thumbnail", "get_key"),
     *("healthz", "readyz", "info", "metrics"),
 }
 """What clients are generated from: renaming or removing one breaks them."""
