@@ -90,7 +90,8 @@ def _add_fetch(commands: Commands) -> None:
     )
     parser.add_argument(
         "--pose",
-        help="world_from_camera, 12 or 16 numbers in mm, or orbit:YAW,PITCH,ZOOM in degrees and times nearer "
+        help="world_from_camera, 12 or 16 numbers in mm, or orbit:YAW,PITCH,ZOOM[,X,Y,Z]: degrees, times nearer, "
+        "and the point looked at in mm "
         "(default: the endoscope's own)",
     )
     parser.add_argument("--no-ply", action="store_true", help="leave the Gaussians out")

@@ -94,9 +94,9 @@ class RenderQuery(BaseModel):
     pose: str | None = Field(
         default=None,
         max_length=1000,
-        description="12 or 16 numbers, row-major world_from_camera in mm, or orbit:yaw,pitch,zoom; default: the "
-        "endoscope's own pose at t",
-        examples=["orbit:10,0,1"],
+        description="12 or 16 numbers, row-major world_from_camera in mm, or orbit:yaw,pitch,zoom in degrees, or "
+        "orbit:yaw,pitch,zoom,x,y,z with the point looked at in mm; default: the endoscope's own pose at t",
+        examples=["orbit:10,0,1", "orbit:10,0,1.5,-4,2,60"],
     )
     width: Pixels = None
     height: Pixels = None

@@ -152,7 +152,8 @@ class Core:
 
         t: time as a fraction of the clip, in [0, 1].
         scene: the job's id; needed unless the service holds one scene only.
-        pose: orbit:YAW,PITCH,ZOOM in degrees, or world_from_camera as 12 or 16 numbers in mm, row-major.
+        pose: orbit:YAW,PITCH,ZOOM in degrees, orbit:YAW,PITCH,ZOOM,X,Y,Z with the point looked at in mm, or
+            world_from_camera as 12 or 16 numbers in mm, row-major.
         layer: rgb, depth or confidence. format: png, jpeg, webp or npy. quality: of jpeg and webp, 1 to 100.
         unseen: mark (the default) hatches what no training frame saw, and makes it transparent in png and webp; guess
             shows what the model draws there.

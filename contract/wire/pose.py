@@ -1,6 +1,6 @@
-"""Where a caller may stand: a rigid transform, or an orbit about what the endoscope looked at.
+"""Where a caller may stand: a rigid transform, or an orbit about a point, such as what the endoscope looked at.
 
-Symbols: R rotation, C camera centre (mm), D depth of the pivot on frame 0's optical axis (mm).
+Symbols: R rotation, C camera centre (mm), P point looked at (mm), D median depth, at which frame 0 looks (mm).
 Axes are OpenCV's (x right, y down, z forward); the world is the endoscope's camera at frame 0.
 """
 
@@ -20,7 +20,7 @@ RIGID_TOLERANCE = 1e-3
 MAX_TRANSLATION_MM = 10_000.0
 POSE_REMEDY = (
     "Give 12 or 16 numbers, the row-major world_from_camera in mm, or orbit:yaw,pitch,zoom in degrees "
-    "(orbit:0,0,1 is frame 0)."
+    "(orbit:0,0,1 is frame 0), or orbit:yaw,pitch,zoom,x,y,z with the point looked at in mm."
 )
 
 Matrix = tuple[tuple[float, float, float, float], ...]
@@ -36,7 +36,7 @@ class MatrixPose(BaseModel):
 
 
 class OrbitPose(BaseModel):
-    """About the median-depth point on frame 0's axis: yaw moves the camera right, pitch up, zoom > 1 nearer."""
+    """About a point: yaw moves the camera right, pitch up, zoom > 1 nearer."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -44,6 +44,8 @@ class OrbitPose(BaseModel):
     yaw_deg: float = Field(ge=-180, le=180)
     pitch_deg: float = Field(ge=-90, le=90)
     zoom: float = Field(ge=0.1, le=10)
+    about_mm: tuple[float, float, float] | None = None
+    """The point looked at, in the world; None: the one at the median depth on frame 0's axis."""
 
 
 Pose = MatrixPose | OrbitPose
@@ -66,10 +68,10 @@ def parse_pose(text: str) -> Pose:
     return MatrixPose(rows=tuple(values[:12]))
 
 
-def world_from_camera(pose: Pose, pivot_depth_mm: float) -> Matrix:
-    """The 4 x 4 transform a pose means, translation in mm; the pivot matters to orbits only.
+def world_from_camera(pose: Pose, median_depth_mm: float) -> Matrix:
+    """The 4 x 4 transform a pose means, translation in mm; the median depth matters to orbits only.
 
-    An orbit is C = P - R z D / zoom with P = (0, 0, D) and R = Ry(-yaw) Rx(-pitch): it always looks at P.
+    An orbit is C = P - R z D / zoom with R = Ry(-yaw) Rx(-pitch): it always looks at P, by default (0, 0, D).
     """
     if isinstance(pose, MatrixPose):
         a = pose.rows
@@ -77,8 +79,8 @@ def world_from_camera(pose: Pose, pivot_depth_mm: float) -> Matrix:
     yaw, pitch = math.radians(-pose.yaw_deg), math.radians(-pose.pitch_deg)
     cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
     rotation = ((cy, sy * sp, sy * cp), (0.0, cp, -sp), (-sy, cy * sp, cy * cp))
-    distance_mm = pivot_depth_mm / pose.zoom
-    centre_mm = [p - row[2] * distance_mm for p, row in zip((0.0, 0.0, pivot_depth_mm), rotation, strict=True)]
+    distance_mm, about_mm = median_depth_mm / pose.zoom, pose.about_mm or (0.0, 0.0, median_depth_mm)
+    centre_mm = [p - row[2] * distance_mm for p, row in zip(about_mm, rotation, strict=True)]
     top = tuple((row[0], row[1], row[2], c) for row, c in zip(rotation, centre_mm, strict=True))
     return (*top, (0.0, 0.0, 0.0, 1.0))
 
@@ -94,13 +96,15 @@ def _numbers(text: str) -> list[float]:
 
 
 def _parse_orbit(values: list[float]) -> OrbitPose:
-    if len(values) != 3:
-        raise InputError("pose", f"an orbit has 3 numbers, {len(values)} were given.", POSE_REMEDY)
+    if len(values) not in (3, 6):
+        raise InputError("pose", f"an orbit has 3 or 6 numbers, {len(values)} were given.", POSE_REMEDY)
     limits = {"yaw": (-180.0, 180.0), "pitch": (-90.0, 90.0), "zoom": (0.1, 10.0)}
-    for value, (name, (low, high)) in zip(values, limits.items(), strict=True):
+    limits |= dict.fromkeys("xyz", (-MAX_TRANSLATION_MM, MAX_TRANSLATION_MM))
+    for value, (name, (low, high)) in zip(values, limits.items(), strict=False):
         if not low <= value <= high:
             raise InputError("pose", f"{name} is {value:g}.", f"Keep {name} between {low:g} and {high:g}.")
-    return OrbitPose(yaw_deg=values[0], pitch_deg=values[1], zoom=values[2])
+    about_mm = (values[3], values[4], values[5]) if len(values) == 6 else None
+    return OrbitPose(yaw_deg=values[0], pitch_deg=values[1], zoom=values[2], about_mm=about_mm)
 
 
 def _check_rigid(values: Sequence[float]) -> None:

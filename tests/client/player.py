@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from selenium import webdriver
 
 from client.up import DASHBOARD
+from contract.wire.pose import parse_pose
 from service.guard import ANSWER_HEADERS
 from tests.client.page import GRAPHICS, browser
+from worker.daemon.views import pose_of
 from worker.render.unseen import hatched
 from worker.render.view import render_frame
 from worker.scene.scene import Scene
@@ -73,10 +75,10 @@ return { ...drawn, pose, pixels: btoa(text), times: player.times };
 
 @dataclass(frozen=True)
 class Seen:
-    """A view: orbit (yaw, pitch in degrees, zoom), or one of the endoscope's eyes."""
+    """A view: orbit (yaw, pitch in degrees, zoom; x, y, z of the point looked at), or one of the endoscope's eyes."""
 
     t: float = 0.0
-    orbit: tuple[float, float, float] | None = None
+    orbit: tuple[float, ...] | None = None
     eye: str = "left"
     highlights: bool = True
     is_marked: bool = True
@@ -143,8 +145,9 @@ class PlayerPage:
         }
         answer = self.run(DRAW, asked)
         pixels = np.frombuffer(base64.b64decode(answer["pixels"]), np.uint8)
-        is_own = seen.orbit is None and seen.eye == "left"
-        pose = None if is_own else np.array(answer["pose"])
+        pose = None if seen.eye == "left" else np.array(answer["pose"])
+        if seen.orbit is not None:
+            pose = pose_of(scene, parse_pose(f"orbit:{','.join(map(str, seen.orbit))}"))
         frame = render_frame(scene, seen.t, pose, camera, highlights=seen.highlights)
         return Compared(
             drawn=pixels.reshape(camera.height, camera.width, 4)[..., :3],

@@ -33,7 +33,8 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     when.add_argument("--frames", type=_frames, metavar="LIST", help="frame numbers such as 1,9,17; writes a folder")
     parser.add_argument(
         "--pose",
-        help="world_from_camera, 12 or 16 numbers in mm, or orbit:YAW,PITCH,ZOOM in degrees and times nearer "
+        help="world_from_camera, 12 or 16 numbers in mm, or orbit:YAW,PITCH,ZOOM[,X,Y,Z]: degrees, times nearer, "
+        "and the point looked at in mm "
         "(default: the endoscope's own)",
     )
     camera = {"width": "of the image", "height": "of the image", "fx": "focal length", "fy": "focal length"}

@@ -59,13 +59,23 @@ export class Cameras {
     return left.map((row, i) => (i < 3 ? [...row.slice(0, 3), row[3] + dot(row.slice(0, 3), this.rightEyeMm)] : row));
   }
 
-  /** About the median-depth point on frame 0's axis; see contract/wire/pose.py. @returns {Matrix} */
-  orbit(yawDeg, pitchDeg, zoom) {
+  /** The median depth of the tissue, mm. */
+  get depthMm() {
+    return MEDIAN_DEPTH_UNITS / this.unitsPerMm;
+  }
+
+  /**
+   * See contract/wire/pose.py.
+   * @param {number[]} [about] x, y, z of the point looked at; by default the median-depth point on frame 0's axis
+   * @returns {Matrix}
+   */
+  orbit(yawDeg, pitchDeg, zoom, ...about) {
     const [yaw, pitch] = [-yawDeg, -pitchDeg].map((degrees) => (degrees * Math.PI) / 180);
     const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
-    const depthMm = MEDIAN_DEPTH_UNITS / this.unitsPerMm;
+    const { depthMm } = this;
+    const point = about.length === 3 ? about : [0, 0, depthMm];
     const rotation = [[cy, sy * sp, sy * cp], [0, cp, -sp], [-sy, cy * sp, cy * cp]];
-    return [...rotation.map((row, i) => [...row, (i === 2 ? depthMm : 0) - (row[2] * depthMm) / zoom]), [0, 0, 0, 1]];
+    return [...rotation.map((row, i) => [...row, point[i] - (row[2] * depthMm) / zoom]), [0, 0, 0, 1]];
   }
 
   /**

@@ -45,6 +45,23 @@ def test_every_orbit_is_rigid_and_looks_at_the_pivot_from_its_distance(yaw: floa
     assert looked_at == pytest.approx([0, 0, DEPTH_MM], abs=1e-6 * DEPTH_MM * 10)
 
 
+@given(st.floats(-180, 180), st.floats(-90, 90), st.floats(0.1, 10), st.tuples(*[st.floats(-200, 200)] * 3))
+def test_an_orbit_about_a_point_looks_at_it_from_the_same_side_and_distance(
+    yaw: float, pitch: float, zoom: float, about_mm: tuple[float, float, float]
+) -> None:
+    text = ",".join(map(repr, (yaw, pitch, zoom, *about_mm)))
+    rows = world_from_camera(parse_pose(f"orbit:{text}"), DEPTH_MM)[:3]
+    default = world_from_camera(OrbitPose(yaw_deg=yaw, pitch_deg=pitch, zoom=zoom), DEPTH_MM)[:3]
+    assert [row[:3] for row in rows] == [row[:3] for row in default]
+    looked_at = [row[3] + row[2] * DEPTH_MM / zoom for row in rows]
+    assert looked_at == pytest.approx(about_mm, abs=1e-9 * DEPTH_MM * 10)
+
+
+def test_the_default_point_may_be_named() -> None:
+    named = parse_pose(f"orbit:12,-7,1.5,0,0,{DEPTH_MM}")
+    assert world_from_camera(named, DEPTH_MM) == world_from_camera(parse_pose("orbit:12,-7,1.5"), DEPTH_MM)
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -56,7 +73,10 @@ def test_every_orbit_is_rigid_and_looks_at_the_pivot_from_its_distance(yaw: floa
         ("1 0 0 0  0 1 0 0  0 0 -1 0", "mirror image"),
         ("1 0 0 99999  0 1 0 0  0 0 1 0", "99999 mm"),
         (IDENTITY + " 0 0 0 2", "last row"),
-        ("orbit:1,2", "3 numbers, 2"),
+        ("orbit:1,2", "3 or 6 numbers, 2"),
+        ("orbit:1,2,1,5", "3 or 6 numbers, 4"),
+        ("orbit:0,0,1,0,20000,0", "y is 20000"),
+        ("orbit:0,0,1,0,0,inf", "not finite"),
         ("orbit:0,95,1", "pitch is 95"),
         ("orbit:0,0,0", "zoom is 0"),
         (f"orbit:{math.inf},0,1", "not finite"),
