@@ -10,6 +10,7 @@ from starlette.responses import FileResponse
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
 from contract.store.shelf import is_job_id
+from contract.wire.cameras import CamerasRequest, SceneCameras
 from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.names import CURVE, MASKS
@@ -121,6 +122,16 @@ async def get_recorded(scene_id: str, services: Services, caller: AnyCaller, t: 
     """
     shown = await find_shown(services, caller, scene_id)
     request = RecordedRequest(scene_id=scene_id, attempt=shown.attempt, t=t)
+    response = image_response(scene_id, await services.renderer.ask(request))
+    response.headers["Cache-Control"] = "no-store"
+    return response
+
+
+@router.get("/{scene_id}/cameras", operation_id="get_cameras", response_model=SceneCameras)
+async def get_cameras(scene_id: str, services: Services, caller: AnyCaller) -> Response:
+    """Where the endoscope was, frame by frame, and its lens; also while the job trains."""
+    shown = await find_shown(services, caller, scene_id)
+    request = CamerasRequest(scene_id=scene_id, attempt=shown.attempt)
     response = image_response(scene_id, await services.renderer.ask(request))
     response.headers["Cache-Control"] = "no-store"
     return response

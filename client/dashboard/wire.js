@@ -15,6 +15,16 @@
  *   unsure_frames?: number[],
  * }} CameraPoses
  */
+/**
+ * @typedef {{
+ *   width: number,
+ *   height: number,
+ *   fx: number,
+ *   fy: number,
+ *   cx: number,
+ *   cy: number,
+ * }} ClipCamera
+ */
 /** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"limit"|"not_yet"|"out_of_memory"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
 /**
  * @typedef {{
@@ -165,6 +175,16 @@
  *   offset: number[],
  *   colour_correlation: number | null,
  * }} RightEye
+ */
+/**
+ * @typedef {{
+ *   intrinsics: ClipCamera,
+ *   frame_times_s: number[],
+ *   world_from_camera: number[][][],
+ *   trained_t: number[],
+ *   units_per_mm: number,
+ *   right_eye_mm?: number[] | null,
+ * }} SceneCameras
  */
 /** @typedef {"info"|"warning"} Severity */
 /** Each option's default, choices and limits. */

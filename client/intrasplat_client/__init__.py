@@ -29,7 +29,7 @@ from intrasplat_client.errors import (
     Unauthorized,
     Unreachable,
 )
-from intrasplat_client.models import ErrorCode, JobOptions, JobState, JobView, Notice, NoticeCode, Report
+from intrasplat_client.models import ErrorCode, JobOptions, JobState, JobView, Notice, NoticeCode, Report, SceneCameras
 from intrasplat_client.views import Image
 
 __all__ = [
@@ -53,6 +53,7 @@ __all__ = [
     "RateLimited",
     "Report",
     "RequestRefused",
+    "SceneCameras",
     "ServiceFault",
     "ServiceUnavailable",
     "Unauthorized",

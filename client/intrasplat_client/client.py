@@ -12,7 +12,7 @@ from typing_extensions import Unpack
 
 from intrasplat_client.connection import DEFAULT_URL, BlockingConnection, http_settings, iterate, run
 from intrasplat_client.core import SCORES_WITHIN_S, Core
-from intrasplat_client.models import GivenOptions, JobState, JobView, Report
+from intrasplat_client.models import GivenOptions, JobState, JobView, Report, SceneCameras
 from intrasplat_client.session import DEFAULT_PATIENCE_S, OnWait
 from intrasplat_client.submission import OnUpload
 from intrasplat_client.viewer import StreamMessages, Viewer
@@ -246,6 +246,10 @@ class Client:
     def recorded(self, scene: str, t: float = 0.0) -> bytes:
         """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains."""
         return run(self._core.recorded(scene, t))
+
+    def cameras(self, scene: str) -> SceneCameras:
+        """Where the endoscope was, frame by frame, and its lens; also while the job trains."""
+        return run(self._core.cameras(scene))
 
     def export(self, scene: str, t: float | None = None, format: str = "ply", **options: float | str) -> bytes:
         """The scene as a file of a format; docs/export.md lists the formats and their options."""

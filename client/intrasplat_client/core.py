@@ -15,7 +15,7 @@ from typing_extensions import Unpack
 from intrasplat_client import events, submission, views
 from intrasplat_client.connection import Call, Connection
 from intrasplat_client.errors import Unreachable
-from intrasplat_client.models import GivenOptions, JobState, JobView, Report
+from intrasplat_client.models import GivenOptions, JobState, JobView, Report, SceneCameras
 from intrasplat_client.session import OnWait, Session, parsed
 from intrasplat_client.submission import OnUpload
 from intrasplat_client.views import Image, view_query
@@ -227,6 +227,11 @@ class Core:
     async def recorded(self, scene: str, t: float = 0.0) -> bytes:
         """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains."""
         return (await self._get("scenes", scene, "recorded", t=t)).content
+
+    async def cameras(self, scene: str) -> SceneCameras:
+        """Where the endoscope was, frame by frame, and its lens; also while the job trains."""
+        response = await self._get("scenes", scene, "cameras")
+        return parsed(response, SceneCameras.model_validate_json, response.content)
 
     async def export(self, scene: str, t: float | None = None, format: str = "ply", **options: float | str) -> bytes:
         """The scene as a file of a format; docs/export.md lists the formats and their options."""

@@ -165,6 +165,17 @@ class CameraPoses(Model):
     """frames whose pose is not to be relied on"""
 
 
+class ClipCamera(Model):
+    """The clip's pinhole camera in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
 class FrameScore(Model):
     """One held-out frame: the model's scores and those of copying its neighbours. None: no tissue to judge."""
 
@@ -402,6 +413,22 @@ class RightEye(Model):
     """in levels of 255"""
     colour_correlation: float | None
     """of the eyes where they match, the least of channels; None: too little matches"""
+
+
+class SceneCameras(Model):
+    """The cameras that a scene knows; while its job trains, so far as they are known."""
+
+    intrinsics: ClipCamera
+    frame_times_s: tuple[float, ...]
+    """of the T frames, from the first one"""
+    world_from_camera: tuple[tuple[tuple[float, ...], ...], ...]
+    """the endoscope's poses: T row-major 4x4, mm"""
+    trained_t: tuple[float, ...]
+    """times of the K frames that taught the scene, i / T"""
+    units_per_mm: float
+    """60 / the median depth in mm"""
+    right_eye_mm: tuple[float, ...] | None = None
+    """where the right eye is, in the left one's axes; null: one eye taught the scene"""
 
 
 TERMINAL_STATES = frozenset({JobState.CANCELLED, JobState.DONE, JobState.FAILED})

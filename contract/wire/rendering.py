@@ -13,6 +13,7 @@ from typing import Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from contract.wire.cameras import CamerasRequest
 from contract.wire.exports import ExportOptions
 from contract.wire.job import JOB_ID_PATTERN
 from contract.wire.notices import Notice
@@ -152,7 +153,7 @@ class CancelRequest(BaseModel):
     kind: Literal["cancel"] = "cancel"
 
 
-SceneRequest: TypeAlias = RenderRequest | ExportRequest | RecordedRequest
+SceneRequest: TypeAlias = RenderRequest | ExportRequest | RecordedRequest | CamerasRequest
 """What is asked of a scene."""
 
 

@@ -20,6 +20,7 @@ from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.store import Store
+from contract.wire.cameras import CamerasRequest
 from contract.wire.job import JobError
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.rendering import (
@@ -34,6 +35,7 @@ from contract.wire.rendering import (
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
+from tests.cameras import cameras_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.serve import Reply, RequestServer
 
@@ -46,6 +48,8 @@ def paint(request: SceneRequest) -> Reply:
 
     A quarter of it is unseen, unless guesses are asked for.
     """
+    if isinstance(request, CamerasRequest):
+        return cameras_reply(request)
     if isinstance(request, ExportRequest):
         return Reply(b"ply\n", "application/octet-stream", request.options.t or 0.0)
     if isinstance(request, RecordedRequest):

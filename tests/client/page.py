@@ -29,6 +29,7 @@ from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
+from contract.wire.cameras import CamerasRequest
 from contract.wire.job import JobFiles, JobProgress, JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode
@@ -46,6 +47,7 @@ from contract.wire.report import Report
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
+from tests.cameras import cameras_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.pace import Pace
 from worker.daemon.serve import Reply, RequestServer
@@ -105,6 +107,8 @@ class Painter:
         self.shown_highlights: Highlights | None = None
 
     def answer(self, request: SceneRequest) -> Reply:
+        if isinstance(request, CamerasRequest):
+            return cameras_reply(request)
         if isinstance(request, ExportRequest):
             return Reply(b"ply\n", "application/octet-stream", request.options.t or 0.0)
         if isinstance(request, RecordedRequest):

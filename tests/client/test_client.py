@@ -33,6 +33,7 @@ from intrasplat_client import (
     Unauthorized,
     submission,
 )
+from tests.cameras import CAMERAS
 from tests.client.local_service import SNAPSHOT_ITERATION, LocalService, line_to, local_service
 from tests.reports import REPORT_OF_A_SCENE
 
@@ -57,6 +58,7 @@ def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(
         client.file(job.id)
     assert set(client.key()["scopes"]) == set(KeyScope)
     assert client.recorded(job.id, 0.5) == b"jpeg"
+    assert client.cameras(job.id).model_dump() == CAMERAS.model_dump()
     assert client.thumbnail(job.id) == service.store.thumbnail(job.id, 1)
     assert job.id in {scene["id"] for scene in client.scenes()}
     receipt = client.delete(job.id)

@@ -37,7 +37,17 @@ def test_the_page_itself_may_use_the_service_and_nothing_from_elsewhere_may_run(
 OPERATIONS = {
     *("reconstruct", "list_jobs", "get_job", "label_job", "cancel_job", "retry_job", "watch_job"),
     *("describe_uploads", "create_upload", "get_upload", "append_to_upload", "delete_upload"),
-    *("render", "list_scenes", "get_scene", "get_curve", "get_masks", "get_recorded", "export_scene", "purge_scene"),
+    *(
+        "render",
+        "list_scenes",
+        "get_scene",
+        "get_curve",
+        "get_masks",
+        "get_recorded",
+        "get_cameras",
+        "export_scene",
+        "purge_scene",
+    ),
     *("get_file", "get_thumbnail", "get_key"),
     *("healthz", "readyz", "info", "metrics"),
 }

@@ -14,10 +14,12 @@ from contract.access.keys import KeyScope
 from contract.queue.embedded import short_socket_path
 from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue
+from contract.wire.cameras import CamerasRequest, SceneCameras
 from contract.wire.job import JobRecord
 from contract.wire.names import MANIFEST, MASKS, REPORT
 from contract.wire.rendering import RecordedRequest, RenderRequest, WorkerAddress, WorkerReply
 from contract.wire.report import Report
+from tests.cameras import CAMERAS
 from tests.reports import REPORT_OF_A_SCENE
 from tests.service.under_test import COARSE_WIDTH, IDENTITY, ServiceUnderTest, assert_problem, bearer, running_service
 
@@ -311,6 +313,17 @@ def test_recorded_frames_are_shown_while_a_job_trains_and_of_its_scene(service: 
     assert service.painter.requests == [RecordedRequest(scene_id=job_id, attempt=attempt, t=0.3)]
     stranger = bearer(service, "another")
     assert service.http.get(f"/scenes/{job_id}/recorded", headers=stranger).status_code == 404
+
+
+@pytest.mark.parametrize("state", ["running", "done"])
+def test_cameras_are_told_while_a_job_trains_and_of_its_scene(service: ServiceUnderTest, state: str) -> None:
+    job_id = service.running_job() if state == "running" else service.finished_scene()
+    cameras = service.http.get(f"/scenes/{job_id}/cameras")
+    assert SceneCameras.model_validate(cameras.json()) == CAMERAS
+    assert (cameras.headers["x-intrasplat-state"], cameras.headers["cache-control"]) == (state, "no-store")
+    attempt = None if state == "running" else 1
+    assert service.painter.requests == [CamerasRequest(scene_id=job_id, attempt=attempt)]
+    assert service.http.get(f"/scenes/{job_id}/cameras", headers=bearer(service, "another")).status_code == 404
 
 
 @pytest.mark.parametrize("report", [b"", b"[]", b"\xff", b'{"psnr_tissue_db": NaN}', b'{"psnr_tissue_db": "good"}'])

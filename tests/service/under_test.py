@@ -15,6 +15,7 @@ from contract.queue.interface import Claim, Queue
 from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.store import Store
+from contract.wire.cameras import CamerasRequest
 from contract.wire.errors import InputError, SceneError
 from contract.wire.job import JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
@@ -23,6 +24,7 @@ from contract.wire.rendering import ExportRequest, RecordedRequest, SceneRequest
 from service.__main__ import KNOWN_WORKERS
 from service.app import create_app
 from service.renderer import ZmqRenderer
+from tests.cameras import cameras_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from tests.service.asgi import AsgiClient, serving
 from worker.daemon.serve import Reply, RequestServer
@@ -50,6 +52,8 @@ class Painter:
 
     def answer(self, request: SceneRequest) -> Reply:
         self.requests.append(request)
+        if isinstance(request, CamerasRequest):
+            return cameras_reply(request)
         if isinstance(request, ExportRequest):
             return Reply(b"ply\n", "application/octet-stream", request.options.t or 0.0)
         if isinstance(request, RecordedRequest):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from contract.runtime.settings import GIB
 from contract.store.store import Store
+from contract.wire.cameras import CamerasRequest, SceneCameras
 from contract.wire.errors import LimitError
 from contract.wire.exports import EXPORT_FORMATS
 from contract.wire.names import RECORDED
@@ -50,7 +51,7 @@ COPIES = 3
 """A loaded scene takes memory three times: its tensors, the arrays of its renderer, and about as much in buffers
 (measured: 100 MB more for each scene of 32 MB, of 36,000 Gaussians with 17 bases, shown at 640 x 512)."""
 
-MEDIA_TYPE_OF_BYTES = "application/octet-stream"
+MEDIA_TYPE_OF_BYTES, MEDIA_TYPE_OF_JSON = "application/octet-stream", "application/json"
 
 MAX_HELD_SCENES = 64
 """However small they are: each announcement of the worker names all of them."""
@@ -85,7 +86,7 @@ class Views:
         self.level: Callable[[], int] = lambda: 0
 
     def answer(self, request: SceneRequest) -> Reply:
-        """The encoded image or file. A recorded frame counts as kept: it tells nothing of the time of renders.
+        """The encoded image or file. Recorded frames and cameras count as kept: they say nothing of renders' time.
 
         Raises:
             SceneError: the scene is missing or damaged.
@@ -103,6 +104,8 @@ class Views:
         else:
             snapshot = self._trained(request.scene_id)
             scene = snapshot.scene
+        if isinstance(request, CamerasRequest):
+            return _cameras(scene, snapshot)
         reply = self._kept.get(request)
         level = self.level() if request.format in FOR_EYES else 0
         if reply is None or reply.level > level:
@@ -121,7 +124,7 @@ class Views:
             kept = self._kept.get(request)
             if kept is not None and kept.level == 0:
                 return 0.0
-        if isinstance(request, RecordedRequest):
+        if isinstance(request, RecordedRequest | CamerasRequest):
             return 0.0
         if request.attempt is not None:
             scene = self._scenes.get((request.scene_id, request.attempt))
@@ -240,6 +243,22 @@ def _reply(scene: Scene, frame: Frame, request: RenderRequest, snapshot: Snapsho
     clip_size = scene.intrinsics.width, scene.intrinsics.height
     media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
     return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size, level)
+
+
+def _cameras(scene: Scene, snapshot: Snapshot | None) -> Reply:
+    """The scene's SceneCameras as JSON."""
+    cameras = SceneCameras.model_validate(
+        {
+            "intrinsics": scene.intrinsics.numbers(),
+            "frame_times_s": scene.frame_times_s.tolist(),
+            "world_from_camera": scene.world_from_camera.tolist(),
+            "trained_t": scene.trained_t,
+            "units_per_mm": scene.units_per_mm,
+            "right_eye_mm": scene.right_eye_mm,
+        }
+    )
+    iteration = None if snapshot is None else snapshot.iteration
+    return Reply(cameras.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, 0.0, iteration=iteration, is_kept=True)
 
 
 def shown_time(scene: Scene, t: float) -> float:

@@ -14,6 +14,7 @@ import torch
 
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
+from contract.wire.cameras import CamerasRequest, SceneCameras
 from contract.wire.errors import LimitError, SceneError
 from contract.wire.names import RECORDED, REPORT
 from contract.wire.notices import NoticeCode
@@ -213,6 +214,27 @@ def test_a_running_job_is_shown_by_its_snapshot_which_vouches_for_nothing(store:
     layer = RenderRequest(scene_id=running, t=0, layer=Layer.CONFIDENCE, format=ImageFormat.NPY)
     assert not np.load(io.BytesIO(views.answer(layer).body)).any()
     assert views.answer(request_of(scene_id)).iteration is None
+
+
+def test_cameras_are_those_of_the_scene_or_of_the_snapshot(store: Store) -> None:
+    stored = new_job_id()
+    made = publish(store, stored, gloss=0.1)
+    snapshots, running = Snapshots(), new_job_id()
+    snapshots.begin(running)
+    views = Views(store, snapshots)
+    with pytest.raises(NotYetError):
+        views.answer(CamerasRequest(scene_id=running))
+    snapshots.offer_first(made)
+    of_done, of_running = CamerasRequest(scene_id=stored, attempt=1), CamerasRequest(scene_id=running)
+    for request, iteration in ((of_done, None), (of_running, 0)):
+        reply = views.answer(request)
+        cameras = SceneCameras.model_validate_json(reply.body)
+        assert (reply.media_type, reply.iteration, views.cost(request)) == ("application/json", iteration, 0.0)
+        assert Intrinsics.parsed(cameras.intrinsics.model_dump()) == CLIP
+        np.testing.assert_array_equal(cameras.world_from_camera, made.world_from_camera)
+        np.testing.assert_array_equal(cameras.frame_times_s, made.frame_times_s)
+        assert (cameras.units_per_mm, cameras.right_eye_mm) == (UNITS_PER_MM, (4.0, 0.0, 0.0))
+        assert cameras.trained_t == made.trained_t
 
 
 def test_a_finished_scene_is_not_taken_for_a_running_job(store: Store, scene_id: str) -> None:
