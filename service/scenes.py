@@ -33,6 +33,7 @@ class SceneSummary(BaseModel):
     """A scene in the list; `error` says why its report, and so its quality, cannot be read.
 
     scored: False while its scores are still being measured. warnings: the codes of its report's warnings.
+    duration_s: of its clip, from the first frame to the last.
     """
 
     id: str
@@ -43,6 +44,7 @@ class SceneSummary(BaseModel):
     scored: bool = True
     psnr_tissue_db: float | None = None
     warnings: list[NoticeCode] = []
+    duration_s: float | None = None
     error: str | None = None
     links: dict[str, str]
 
@@ -188,5 +190,7 @@ def _summary(services: Deps, record: JobRecord) -> SceneSummary:
     except SceneError as error:
         return summary.model_copy(update={"error": str(error)})
     codes = [each.code for each in report.warnings if each.severity is Severity.WARNING]
+    times_s = report.frame_times_s
     known = {"scored": report.scored, "psnr_tissue_db": report.psnr_tissue_db, "warnings": codes}
+    known["duration_s"] = times_s[-1] - times_s[0] if times_s else None
     return summary.model_copy(update=known)

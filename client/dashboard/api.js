@@ -11,6 +11,16 @@ import { connectionLost, errorWords, Problem, problemOf } from "./problem.js";
  */
 
 /**
+ * A finished scene in the list.
+ * @typedef {{id: string, label?: string | null, created_at_s: number, scored: boolean, psnr_tissue_db?: number | null,
+ *   warnings: string[], duration_s?: number | null, error?: string | null}} SceneSummary
+ */
+/**
+ * What a list is narrowed to, and which page of it is asked for.
+ * @typedef {{q?: string, cursor?: string, limit?: number, created_from_s?: number, created_until_s?: number}} Search
+ */
+
+/**
  * Ask the service, with the key if there is one.
  * @param {string} path
  * @param {RequestInit} [options]
@@ -31,8 +41,9 @@ export async function request(path, options = {}) {
   throw problem;
 }
 
-async function json(path, options) {
-  const response = await request(path, options);
+const json = async (path, options) => bodyOf(await request(path, options));
+
+async function bodyOf(response) {
   try {
     return await response.json();
   } catch {
@@ -40,24 +51,50 @@ async function json(path, options) {
   }
 }
 
+/** @param {Record<string, string | number | undefined>} values what is undefined or "" is left out */
+const queryOf = (values) =>
+  new URLSearchParams(Object.entries(values).filter(([, value]) => value !== undefined && value !== ""));
+
 /** @returns {Promise<{tenant: string, scopes: string[], key_id: string | null}>} */
 export const getKey = () => json("/key");
-/** @returns {Promise<Job[]>} */
-export const listJobs = () => json("/jobs");
+/**
+ * A page of the jobs, newest first.
+ * @param {Search} search
+ * @returns {Promise<{jobs: Job[], next: string | null}>} next: the cursor of the page after it
+ */
+export async function listJobs(search) {
+  const response = await request(`/jobs?${queryOf(search)}`);
+  return { jobs: await bodyOf(response), next: response.headers.get("X-Intrasplat-Next") };
+}
+/** @param {Search} search @returns {Promise<SceneSummary[]>} */
+export const listScenes = (search) => json(`/scenes?${queryOf(search)}`);
 /** @param {string} id @returns {Promise<Job>} */
 export const getJob = (id) => json(`/jobs/${id}`);
 /** @param {string} id @returns {Promise<Job>} */
 export const cancelJob = (id) => json(`/jobs/${id}`, { method: "DELETE" });
 /** @param {string} id @returns {Promise<Job>} */
 export const retryJob = (id) => json(`/jobs/${id}/retry`, { method: "POST" });
+/** @param {string} id @param {string} label "" removes it @returns {Promise<Job>} */
+export const labelJob = (id, label) =>
+  json(`/jobs/${id}`, {
+    method: "PATCH",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify({ label: label || null }),
+  });
+/** @param {string} id @returns {Promise<Blob>} a JPEG, from the browser's own store where it is still the same */
+export const getThumbnail = async (id) => (await request(`/scenes/${id}/thumbnail`, { cache: "no-cache" })).blob();
 /** @param {string} id @returns {Promise<Receipt>} */
 export const purgeScene = (id) => json(`/scenes/${id}`, { method: "DELETE" });
 /** @param {string} id @returns {Promise<Record<string, any>>} */
 export const getReport = (id) => json(`/scenes/${id}`);
 /** @param {string} id @returns {Promise<string>} CSV */
 export const getCurve = async (id) => (await request(`/scenes/${id}/curve`)).text();
-/** @param {string} id @param {number} t @returns {Promise<Blob>} a .ply */
-export const exportScene = async (id, t) => (await request(`/scenes/${id}/export?format=ply&t=${t}`)).blob();
+/**
+ * @param {string} id
+ * @param {{format: string, t?: number}} wanted docs/export.md lists the formats
+ * @returns {Promise<Blob>}
+ */
+export const exportScene = async (id, wanted) => (await request(`/scenes/${id}/export?${queryOf(wanted)}`)).blob();
 
 /** @param {string} id @returns {Promise<Blob>} a zip of the masks that were found */
 export const getMasks = async (id) => (await request(`/scenes/${id}/masks`)).blob();

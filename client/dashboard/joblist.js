@@ -1,10 +1,12 @@
 // The list of jobs: where each stands, and what may be done about it.
 
 import { cancelJob, purgeScene, retryJob } from "./api.js";
-import { button, dateTime, element } from "./element.js";
+import { makeCard, nameOf, rename } from "./card.js";
+import { button, element } from "./element.js";
 import { TimesLeft } from "./left.js";
 import { figure, words } from "./messages.js";
-import { details, apiWords, errorWords, showProblem } from "./problem.js";
+import { details, showProblem } from "./problem.js";
+import { Thumbnails } from "./thumbnails.js";
 
 /** @typedef {import("./api.js").Job} Job */
 
@@ -22,14 +24,19 @@ export class JobList {
   /**
    * @param {{list: HTMLElement, nothing: HTMLElement, message: HTMLElement, confirm: HTMLDialogElement}} parts
    * @param {import("./scopes.js").Scopes} scopes
-   * @param {{onView: (id: string) => void, onChange: () => void, onPurged: (id: string) => void}} told
+   * @param {{onView: (id: string) => void, onChange: () => void, onPurged: (id: string) => void,
+   *   onLabelled: (job: Job) => void, onRedraw: () => void, onDownload: (id: string, name: string) => void,
+   *   summaryOf: (id: string) => import("./api.js").SceneSummary | null}} told
    */
   constructor(parts, scopes, told) {
     Object.assign(this, parts, told);
     this.scopes = scopes;
     this.times = new TimesLeft();
+    this.thumbnails = new Thumbnails();
     /** @type {Map<string, {item: HTMLElement, bar: HTMLProgressElement, words: HTMLElement, key: string}>} */
     this.rows = new Map();
+    /** @type {string | null} the job whose name is being changed: its row stays as it is */
+    this.renamed = null;
     this.confirm.querySelector("[value=no]").addEventListener("click", () => this.confirm.close());
     this.confirm.querySelector("[value=yes]").addEventListener("click", () => {
       this.confirm.close();
@@ -43,9 +50,7 @@ export class JobList {
     const here = new Set(jobs.map((job) => job.id));
     this.times.keepOnly(here);
     for (const [id, row] of this.rows) {
-      if (here.has(id)) continue;
-      row.item.remove();
-      this.rows.delete(id);
+      if (!here.has(id)) this.#remove(id, row);
     }
     jobs.forEach((job, place) => {
       const item = this.#row(job, chosen).item;
@@ -55,17 +60,25 @@ export class JobList {
 
   /** Make every row anew, as in another language. */
   forget() {
-    for (const row of this.rows.values()) row.item.remove();
-    this.rows.clear();
+    for (const [id, row] of this.rows) this.#remove(id, row);
+  }
+
+  #remove(id, row) {
+    if (this.renamed === id) this.renamed = null;
+    this.thumbnails.letGo(row.item);
+    row.item.remove();
+    this.rows.delete(id);
   }
 
   /** The job's row, made again only if its actions change, so that focus and half-made clicks stay. */
   #row(job, chosen) {
-    const key = JSON.stringify([job.state, job.cancel_requested, job.error, this.#actions(job)]);
+    const summary = job.state === "done" ? this.summaryOf(job.id) : null;
+    const key = JSON.stringify([job.state, job.cancel_requested, job.error, job.label, this.#actions(job), summary]);
     let row = this.rows.get(job.id);
-    if (row?.key !== key) {
-      const made = this.#make(job, key);
+    if (row?.key !== key && !(row && this.renamed === job.id)) {
+      const made = { ...makeCard(job, { summary, buttons: this.#buttons(job, nameOf(job)), thumbnails: this.thumbnails }), key };
       const hadFocus = row?.item.contains(document.activeElement);
+      if (row) this.thumbnails.letGo(row.item);
       row?.item.replaceWith(made.item);
       if (hadFocus) made.item.querySelector("button")?.focus();
       row = made;
@@ -92,30 +105,15 @@ export class JobList {
     return [stage, db, left].filter(Boolean).join(" · ");
   }
 
-  #make(job, key) {
-    const name = dateTime(job.created_at_s * 1000);
-    const state = element("strong");
-    const bar = element("progress");
-    bar.setAttribute("aria-label", words("job.progress_of", { name }));
-    bar.hidden = job.state !== "running";
-    const head = element("div", { class: "head" }, element("span", { text: name }), state);
-    const item = element("li", { class: `job ${job.state}` }, head, bar);
-    item.dataset.job = job.id;
-    if (job.error) {
-      const { code, field } = job.error;
-      item.append(element("p", { class: "failed", text: errorWords(code ?? "unclassified", field) }), ...details(apiWords(job.error)));
-    }
-    item.append(element("div", { class: "actions" }, ...this.#buttons(job, name)));
-    return { item, bar, words: state, key };
-  }
-
-  /** @param {Job} job @returns {("watch"|"view"|"retry"|"cancel"|"delete")[]} what may be done, and would not be refused */
+  /** @param {Job} job @returns {("watch"|"view"|"save"|"rename"|"retry"|"cancel"|"delete")[]} what may be done, and would not be refused */
   #actions(job) {
     const isLive = job.state === "queued" || job.state === "running";
     const mayChange = this.scopes.has("reconstruct");
     const may = {
       watch: job.state === "running",
       view: job.state === "done",
+      save: job.state === "done" && this.scopes.has("view"),
+      rename: mayChange,
       retry: job.state === "failed" && mayChange && MAY_SUCCEED.includes(job.error?.code ?? "unclassified"),
       cancel: isLive && mayChange,
       delete: !isLive && this.scopes.has("purge"),
@@ -127,6 +125,8 @@ export class JobList {
     const work = {
       watch: () => this.onView(job.id),
       view: () => this.onView(job.id),
+      save: () => this.onDownload(job.id, name),
+      rename: () => this.#rename(job),
       retry: () => this.#do(() => retryJob(job.id)),
       cancel: () => this.#ask("cancel", name, () => this.#do(() => cancelJob(job.id))),
       delete: () => this.#ask("delete", name, () => this.#purge(job.id, name)),
@@ -137,6 +137,18 @@ export class JobList {
       made.dataset.action = action;
       made.disabled = action === "cancel" && job.cancel_requested;
       return made;
+    });
+  }
+
+  #rename(job) {
+    this.renamed = job.id;
+    rename(this.rows.get(job.id).item, job, (labelled) => {
+      const row = this.rows.get(job.id);
+      this.renamed = null;
+      if (row) row.key = ""; // made again, with its name
+      if (labelled) this.onLabelled(labelled);
+      this.onRedraw();
+      this.rows.get(job.id)?.item.querySelector("[data-action=rename]")?.focus();
     });
   }
 

@@ -1,4 +1,5 @@
-// The jobs as the page knows them: asked for every other second, and told by their events the moment they change.
+// The jobs as the page knows them: the newest, asked for every other second, the one in view, and those of other pages of
+// the list. Their events tell the moment they change.
 
 import { getJob, listJobs, trouble } from "./api.js";
 import { JobEvents } from "./events.js";
@@ -8,6 +9,8 @@ import { words } from "./messages.js";
 /** @typedef {import("./api.js").Job} Job */
 
 const POLL_MS = 2000;
+/** Jobs in a page of the list. */
+export const PAGE_SIZE = 30;
 /** Browsers open six connections to a place, and uploads and pictures need some. */
 const MAX_FOLLOWED = 3;
 const isActive = (job) => job.state === "queued" || job.state === "running";
@@ -41,8 +44,16 @@ export class Jobs {
   constructor(onChange, onConnection) {
     this.onChange = onChange;
     this.onConnection = onConnection;
-    /** @type {Map<string, Job>} newest first */
+    /** @type {Map<string, Job>} */
     this.byId = new Map();
+    /** @type {string[]} ids of the newest jobs, newest first, as many as a page of the list has */
+    this.newest = [];
+    /** @type {string | null} the cursor of the page after them */
+    this.next = null;
+    /** @type {Set<string>} ids of jobs that stay known though they are not among the newest */
+    this.kept = new Set();
+    /** @type {string | null} the job in view */
+    this.viewed = null;
     /** @type {Map<string, Scores>} */
     this.scores = new Map();
     /** @type {Map<string, JobEvents>} */
@@ -59,9 +70,23 @@ export class Jobs {
     return this.scores.get(id)?.points ?? [];
   }
 
+  /** Know these as well, in place of those that were kept before. @param {Job[]} jobs of other pages of the list */
+  keep(jobs) {
+    this.kept = new Set(jobs.map((job) => job.id));
+    for (const job of jobs) if (!this.byId.has(job.id)) this.byId.set(job.id, job);
+    this.#prune();
+  }
+
+  /** @param {string | null} id of the job that comes into view; it stays known */
+  view(id) {
+    this.viewed = id;
+  }
+
   /** @param {string} id of a job that was purged */
   forget(id) {
     this.byId.delete(id);
+    this.kept.delete(id);
+    this.newest = this.newest.filter((each) => each !== id);
     this.scores.delete(id);
     this.told.delete(id);
     this.onChange();
@@ -72,10 +97,11 @@ export class Jobs {
     const round = ++this.round;
     const askedAt = performance.now();
     try {
-      const jobs = await listJobs();
+      const { jobs, next } = await listJobs({ limit: PAGE_SIZE });
       if (round !== this.round) return; // a newer answer is there, or comes
+      this.next = next;
       this.#replace(jobs, askedAt);
-      await this.#askForPosition();
+      await this.#askForOne();
       const wrong = await trouble();
       if (round === this.round) this.onConnection(wrong || words("page.ready"), wrong ? "bad" : "good");
     } catch (error) {
@@ -87,6 +113,9 @@ export class Jobs {
     for (const events of this.followed.values()) events.stop();
     this.followed.clear();
     this.byId.clear();
+    this.kept.clear();
+    this.newest = [];
+    this.next = null;
     this.scores.clear();
     this.told.clear();
     this.onChange();
@@ -94,21 +123,28 @@ export class Jobs {
   }
 
   #replace(jobs, askedAt) {
-    const before = this.byId;
-    this.byId = new Map();
+    this.newest = jobs.map((job) => job.id);
     for (const job of jobs) {
-      const known = before.get(job.id);
+      const known = this.byId.get(job.id);
       const isOlder = known && (this.told.get(job.id) ?? 0) > askedAt;
-      this.byId.set(job.id, isOlder ? known : { ...job, ...positionIn(known, job) });
+      if (!isOlder) this.byId.set(job.id, { ...job, ...positionIn(known, job) });
       this.#note(job);
     }
-    for (const known of [this.scores, this.told]) for (const id of known.keys()) if (!this.byId.has(id)) known.delete(id);
+    this.#prune();
     this.#follow();
     this.onChange();
   }
 
+  /** Forget what is neither among the newest, nor kept, nor in view. */
+  #prune() {
+    const wanted = new Set([...this.newest, ...this.kept, this.viewed]);
+    for (const known of [this.byId, this.scores, this.told]) {
+      for (const id of known.keys()) if (!wanted.has(id)) known.delete(id);
+    }
+  }
+
   #follow() {
-    const active = [...this.byId.values()].filter(isActive).reverse();
+    const active = [...this.byId.values()].filter(isActive).sort((a, b) => a.created_at_s - b.created_at_s);
     const chosen = active.sort((a, b) => (b.state === "running") - (a.state === "running")).slice(0, MAX_FOLLOWED);
     const wanted = new Set(chosen.map((job) => job.id));
     for (const [id, events] of this.followed) {
@@ -117,12 +153,12 @@ export class Jobs {
       this.followed.delete(id);
     }
     for (const id of wanted) {
-      if (!this.followed.has(id)) this.followed.set(id, new JobEvents(id, (job) => this.#take(job)));
+      if (!this.followed.has(id)) this.followed.set(id, new JobEvents(id, (job) => this.take(job)));
     }
   }
 
-  /** @param {Job} job as an event told it */
-  #take(job) {
+  /** @param {Job} job as the service has just told it */
+  take(job) {
     if (!this.byId.has(job.id)) return;
     this.told.set(job.id, performance.now());
     this.byId.set(job.id, { ...job, ...positionIn(this.byId.get(job.id), job) });
@@ -130,12 +166,23 @@ export class Jobs {
     this.onChange();
   }
 
-  /** The list tells no positions; one job after the other of those that no events tell of is asked for its own. */
-  async #askForPosition() {
-    const queued = [...this.byId.values()].filter((job) => job.state === "queued" && !this.followed.has(job.id));
-    if (queued.length === 0) return;
-    const job = await getJob(queued[this.round % queued.length].id);
-    if (this.byId.has(job.id)) this.byId.set(job.id, job);
+  /**
+   * One job a round is asked for by itself: the one in view if nothing is known of it, or one of those that neither events
+   * nor the list tell of. (The list tells no positions.)
+   */
+  async #askForOne() {
+    const isUntold = (job) => job.state === "queued" || (job.state === "running" && !this.newest.includes(job.id));
+    const untold = [...this.byId.values()].filter((job) => isUntold(job) && !this.followed.has(job.id)).map((job) => job.id);
+    if (this.viewed !== null && !this.byId.has(this.viewed)) untold.unshift(this.viewed);
+    if (untold.length === 0) return;
+    const id = untold[this.round % untold.length];
+    try {
+      const job = await getJob(id);
+      if (this.byId.has(id) || id === this.viewed) this.byId.set(id, job);
+    } catch (error) {
+      if (error.status !== 404) throw error;
+      this.byId.delete(id);
+    }
     this.onChange();
   }
 

@@ -2,9 +2,10 @@
 
 import { getCurve, getReport } from "./api.js";
 import { stepBackWhileIdle } from "./awake.js";
+import { nameOf } from "./card.js";
 import { drawCurve, pointsOfCsv } from "./curve.js";
+import { Downloads } from "./downloads.js";
 import { Drawers } from "./drawers.js";
-import { dateTime } from "./element.js";
 import { baselinesOf } from "./figures.js";
 import { ClipForm } from "./form.js";
 import { JobList } from "./joblist.js";
@@ -14,6 +15,7 @@ import { languageEvents, showWords, words } from "./messages.js";
 import { pause } from "./pause.js";
 import { showReport } from "./report.js";
 import { Scopes } from "./scopes.js";
+import { Shelf } from "./shelf.js";
 import { Viewer } from "./viewer.js";
 
 const get = (id) => document.getElementById(id);
@@ -54,6 +56,7 @@ function view(id, message) {
   awaited = null;
   reported = null;
   viewer.open(id, message);
+  jobs.view(id);
   if (id !== null && drawers.isOpen !== "report-drawer") drawers.close();
   say(words("page.report_of"));
   drawCurve(get("curve"), [], []);
@@ -96,11 +99,12 @@ function offerMasks() {
 function showJobs() {
   scopes.refresh();
   offerMasks();
-  list.show([...jobs.byId.values()], viewer.scene);
+  shelf.refresh();
+  list.show(shelf.shown, viewer.scene);
   const expected = jobs.byId.get(awaited);
   if (expected?.state === "running" || expected?.state === "done") view(expected.id);
   const viewed = jobs.byId.get(viewer.scene);
-  get("scene-id").textContent = viewed ? dateTime(viewed.created_at_s * 1000) : "";
+  get("scene-id").textContent = viewed ? nameOf(viewed) : "";
   if (viewed?.state === "done" && reported !== viewed.id) {
     viewer.refresh(); // what is shown may be of its training still
     report(viewed.id);
@@ -120,6 +124,10 @@ const list = new JobList(
   {
     onView: view,
     onChange: () => jobs.poll(),
+    onRedraw: () => showJobs(),
+    onLabelled: (job) => jobs.take(job),
+    onDownload: (id, name) => downloads.open(id, name),
+    summaryOf: (id) => shelf.summaryOf(id),
     onPurged: (id) => {
       if (viewer.scene === id) view(null, words("page.deleted"));
       jobs.forget(id);
@@ -127,6 +135,9 @@ const list = new JobList(
   },
 );
 const jobs = new Jobs(showJobs, showConnection);
+const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
+const momentOf = (id) => (viewer.scene === id ? viewer.timeline.t : 0);
+const downloads = new Downloads(get("download"), get("jobs-message"), momentOf);
 
 const form = new ClipForm(
   {

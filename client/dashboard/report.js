@@ -1,11 +1,11 @@
 // A scene's report in two layers: first what everybody understands, then codes and figures under "details".
 
-import { exportScene, getMasks } from "./api.js";
+import { getMasks } from "./api.js";
+import { download } from "./downloads.js";
 import { button, element } from "./element.js";
 import { figuresOf, percent } from "./figures.js";
 import { lightMark, reasonsOf, trustOf } from "./light.js";
 import { figure, words } from "./messages.js";
-import { showProblem } from "./problem.js";
 
 /** @typedef {import("./wire.js").Report} Report */
 
@@ -24,20 +24,6 @@ function seen({ frame_count: frames, frame_times_s: times, width, height, eyes, 
 }
 
 const listOf = (sentences, name) => element("ul", { class: name }, ...sentences.map((text) => element("li", { text })));
-
-/** Not a link: a link sends no key. */
-async function download(name, load, message) {
-  message.replaceChildren();
-  try {
-    const link = element("a");
-    link.href = URL.createObjectURL(await load());
-    link.download = name;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
-  } catch (error) {
-    showProblem(message, error);
-  }
-}
 
 /** How to send better masks. */
 function correction(id, { masks }, message, onMasks) {
@@ -58,7 +44,6 @@ export function showReport(target, id, report, onMasks) {
   const trust = trustOf(report);
   const reasons = reasonsOf(trust);
   const message = element("div", { class: "message bad" });
-  const save = button(words("report.save_ply"), () => download(`${id}.ply`, () => exportScene(id, 0), message));
   const isOpen = target.querySelector("details.figures")?.open ?? false;
   const figures = figuresOf(report);
   figures.open = isOpen;
@@ -68,7 +53,6 @@ export function showReport(target, id, report, onMasks) {
     element("h3", { text: words("report.seen") }),
     listOf(seen(report), "seen"),
     figures,
-    save,
     ...correction(id, report, message, onMasks),
     message,
   );

@@ -309,7 +309,7 @@ def test_a_key_is_asked_for_used_everywhere_and_forgotten(tmp_path: Path, driver
         page.press(scene, "View")
         page.until_state("live")
         page.until_text("#readout", "stream")
-        assert page.script(ACTIONS, scene) == ["view"]  # no Delete: the key may not
+        assert page.script(ACTIONS, scene) == ["view", "save"]  # no Delete: the key may not
         assert key not in page.script("return document.cookie + JSON.stringify(localStorage) + location.href")
         page.click("#forget-key")
         page.until_text("#key-message", "A key is needed.")

@@ -78,6 +78,7 @@ def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path
     folder = site.store.spool_folder(record.job_id)
     assert (folder / "clip.mp4").read_bytes() == CLIP.read_bytes()
     assert (folder / "masks.zip").read_bytes() == (tmp_path / "better.zip").read_bytes()
+    page.until_text("#jobs", say("stage.start"))  # and it opened by itself
     page.show("drawer")
     page.until(lambda: page.find("#upload [name=clip]").is_displayed())
     page.press(scene, "Delete")

@@ -72,10 +72,14 @@ def test_a_job_without_a_scene_has_no_thumbnail(service: ServiceUnderTest) -> No
     assert_problem(service.http.get(f"/scenes/{running}/thumbnail"), 409, "scene")
 
 
-def test_the_list_tells_the_codes_of_warnings_for_a_traffic_light(service: ServiceUnderTest, scene: str) -> None:
+def test_the_list_tells_length_and_the_codes_of_warnings_for_a_traffic_light(
+    service: ServiceUnderTest, scene: str
+) -> None:
     notices = (Notice.warning(NoticeCode.BLOOD, "x"), Notice.info(NoticeCode.COPYING_SCORES_MORE, "y"))
     report = REPORT_OF_A_SCENE.model_copy(update={"warnings": notices})
     (service.store.scene_folder(scene, 1) / REPORT).write_text(report.model_dump_json())
     (summary,) = service.http.get("/scenes").json()
     assert summary["warnings"] == ["blood"]
+    times_s = report.frame_times_s
+    assert summary["duration_s"] == times_s[-1] - times_s[0] > 0
     assert summary["links"]["thumbnail"] == f"/scenes/{scene}/thumbnail"

@@ -1,0 +1,102 @@
+// The menu of files that a scene can be saved as, in plain words, and the saving itself.
+
+import { exportScene } from "./api.js";
+import { button, element } from "./element.js";
+import { figure, words } from "./messages.js";
+import { showProblem } from "./problem.js";
+
+/** The formats of docs/export.md, and what their files' names end in; those of one moment are of the one in view. */
+const GROUPS = {
+  moment: {
+    "mesh-glb": "-mesh.glb",
+    "mesh-ply": "-mesh.ply",
+    "mesh-stl": "-mesh.stl",
+    "points": "-points.ply",
+    "ply": ".ply",
+    "splat": ".splat",
+    "gltf": ".glb",
+  },
+  clip: {
+    "webm": ".webm",
+    "mp4": ".mp4",
+    "depth": "-depth.npy",
+    "tracks": "-tracks.npz",
+    "ply-zip": "-ply.zip",
+    "tum": ".tum",
+  },
+};
+const KEPT_MS = 10_000;
+
+/**
+ * Save what is loaded under a name. Not a link: a link sends no key.
+ * @param {string} name
+ * @param {() => Promise<Blob>} load
+ */
+async function save(name, load) {
+  const link = element("a");
+  link.href = URL.createObjectURL(await load());
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), KEPT_MS);
+}
+
+/**
+ * Save it, and say how that goes.
+ * @param {string} name
+ * @param {() => Promise<Blob>} load
+ * @param {HTMLElement} message
+ */
+export async function download(name, load, message) {
+  message.classList.remove("bad");
+  message.replaceChildren(element("p", { text: words("download.making") }));
+  try {
+    await save(name, load);
+    message.replaceChildren();
+  } catch (error) {
+    showProblem(message, error);
+  }
+}
+
+export class Downloads {
+  /**
+   * @param {HTMLDialogElement} dialog
+   * @param {HTMLElement} message
+   * @param {(id: string) => number} momentOf the moment in view of a scene, 0 of any other
+   */
+  constructor(dialog, message, momentOf) {
+    Object.assign(this, { dialog, message, momentOf });
+    dialog.addEventListener("click", (event) => {
+      if (event.target === dialog) dialog.close(); // beside it
+    });
+  }
+
+  /** @param {string} id @param {string} name of the scene, as people call it */
+  open(id, name) {
+    const t = Number(this.momentOf(id).toFixed(4));
+    const close = button(words("download.close"), () => this.dialog.close());
+    this.dialog.setAttribute("aria-label", words("download.title", { name }));
+    this.dialog.replaceChildren(
+      element("header", {}, element("h2", { text: words("download.title", { name }) }), close),
+      ...this.#group("moment", id, t),
+      ...this.#group("clip", id),
+      element("p", { class: "quiet", text: words("download.research") }),
+    );
+    this.dialog.showModal();
+  }
+
+  #group(group, id, t) {
+    const title = group === "moment" ? words(t > 0 ? "download.moment" : "download.first", { t: figure(t, 3) }) : words("download.clip");
+    const buttons = Object.entries(GROUPS[group]).map(([format, suffix]) => {
+      const text = `${words(`download.${format}`)} (.${suffix.split(".").at(-1)})`;
+      const made = button(text, () => this.#save(id, format, suffix, t));
+      made.dataset.format = format;
+      return made;
+    });
+    return [element("h3", { text: title }), element("div", { class: "kinds" }, ...buttons)];
+  }
+
+  #save(id, format, suffix, t) {
+    this.dialog.close();
+    download(id + suffix, () => exportScene(id, { format, t }), this.message);
+  }
+}

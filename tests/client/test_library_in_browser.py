@@ -1,0 +1,190 @@
+"""The list of scenes in a real browser: found by name, told apart by picture, judged by a light, saved as files."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+from selenium import webdriver
+from selenium.webdriver.common.keys import Keys
+
+from client.up import DASHBOARD
+from contract.access.keys import KeyFile, KeyScope
+from contract.wire.exports import EXPORT_FORMATS
+from contract.wire.job import JobFiles, JobRecord
+from contract.wire.labels import LabelChange, Labels
+from contract.wire.notices import Notice, NoticeCode
+from tests.client.page import REPORT_OF_THE_PAGE, Page, Site, grey_of, site_at
+from tests.client.words import say
+
+NAMES = "return [...document.querySelectorAll('#jobs .name')].map((each) => each.textContent)"
+PICTURES = "return [...document.querySelectorAll('#jobs img.thumbnail')].map((each) => each.src)"
+SHADE_OF_THUMBNAIL = """
+const [scene] = arguments;
+const image = document.querySelector(`[data-job="${scene}"] img.thumbnail`);
+if (!image?.naturalWidth) return -1;
+const canvas = document.createElement("canvas");
+canvas.getContext("2d").drawImage(image, 0, 0, 1, 1);
+return canvas.getContext("2d").getImageData(0, 0, 1, 1).data[0];
+"""
+
+
+def card(job_id: str, inside: str = "") -> str:
+    return f'[data-job="{job_id}"] {inside}'.strip()
+
+
+def labelled(site: Site, job_id: str, label: str) -> str:
+    site.queue.relabel(job_id, LabelChange(label=label))
+    return job_id
+
+
+def many_done(site: Site, count: int) -> None:
+    """Jobs that are done, with names, without scenes of their own."""
+    for index in range(count):
+        record = JobRecord(
+            job_id=f"{index:032x}",
+            files=JobFiles(clip="clip.mp4"),
+            labels=Labels(label=f"case {index}"),
+            created_at_s=time.time() - 10_000 + index,
+        )
+        site.queue.submit(record)
+        assert site.queue.finish(site.claim())
+
+
+def test_each_scene_has_its_picture_its_name_its_length_and_its_light(site: Site, page: Page) -> None:
+    scenes = [labelled(site, site.scene(mark), f"liver {mark}") for mark in ("20", "c0")]
+    slow = REPORT_OF_THE_PAGE.model_copy(
+        update={"frame_times_s": (0.0, 1.5, 2.93), "warnings": (Notice.warning(NoticeCode.BLOOD, "GET /x"),)}
+    )
+    site.store.add_scores("worker-1", scenes[0], 1, slow)
+    for scene in scenes:
+        page.until(lambda scene=scene: page.text(card(scene, ".trust")))
+        page.until(lambda scene=scene: abs(page.script(SHADE_OF_THUMBNAIL, scene) - grey_of(scene)) <= 3)
+    assert page.script(NAMES) == ["liver c0", "liver 20"]
+    assert say("job.long", seconds="2.9") in page.text(card(scenes[0]))
+    page.until_text(card(scenes[0], ".trust"), say("notice.blood"))
+    assert say("light.care") in page.text(card(scenes[0], ".trust"))
+    assert re.search(r"\d{4}, \d\d:\d\d", page.text(card(scenes[0])))
+
+
+def test_a_scene_is_renamed_in_place_and_found_by_its_name(site: Site, page: Page) -> None:
+    first, second = site.scene("11"), site.scene("22")
+    page.press(first, say("job.rename"))
+    field = page.find(card(first, "input"))
+    assert say("label.no_names") in page.text(card(first))
+    field.send_keys("liver, left lobe", Keys.ENTER)
+    page.until_text(card(first, ".name"), "liver, left lobe")
+    record = site.queue.get(first)
+    assert record is not None
+    assert record.labels.label == "liver, left lobe"
+    page.press(first, say("job.rename"))
+    page.find(card(first, "input")).send_keys("something else", Keys.ESCAPE)
+    assert page.text(card(first, ".name")) == "liver, left lobe"
+    page.find("#search").send_keys("LOBE")
+    page.until(lambda: page.script(NAMES) == ["liver, left lobe"])
+    page.find("#search").send_keys("x")
+    page.until(lambda: page.script(NAMES) == [])
+    assert page.find("#no-jobs").is_displayed()
+    page.find("#search").send_keys(*[Keys.BACKSPACE] * 5)
+    page.until(lambda: len(page.script(NAMES)) == 2)
+    assert page.script("return document.querySelector('#jobs li').dataset.job") == second
+
+
+def test_a_name_that_is_refused_is_told_beside_its_field(site: Site, page: Page) -> None:
+    scene = site.scene()
+    page.press(scene, say("job.rename"))
+    page.script("document.querySelector('.rename input').maxLength = 500")
+    page.find(card(scene, "input")).send_keys("x" * 100, Keys.ENTER)
+    page.until_text(card(scene, ".message"), say("problem.input"))
+    assert page.find(card(scene, "input")).is_displayed()
+
+
+def test_a_thousand_scenes_are_listed_page_by_page_and_only_those_in_sight_have_pictures(
+    site: Site, page: Page
+) -> None:
+    many_done(site, 1000)
+    page.open()
+    page.until(lambda: len(page.script(NAMES)) == 30)
+    assert page.script(NAMES)[0] == "case 999"
+    page.click("#more-jobs")
+    page.until(lambda: len(page.script(NAMES)) == 60)
+    page.click("#more-jobs")
+    page.until(lambda: len(page.script(NAMES)) == 90)
+    assert page.script(NAMES)[-1] == "case 910"
+    page.find("#search").send_keys("case 12")
+    page.until(lambda: page.script(NAMES)[:2] == ["case 912", "case 812"])
+    asked = page.script("return performance.getEntriesByType('resource').map((entry) => entry.name)")
+    lists = [each for each in asked if re.search(r"/jobs\?", each)]
+    assert all("limit=30" in each for each in lists)
+    assert len({each for each in asked if "thumbnail" in each}) < 40
+
+
+def test_pictures_out_of_sight_are_let_go_of(site: Site, page: Page) -> None:
+    page.script(
+        "window.urls = new Set(); for (const [name, work] of [['createObjectURL', 'add'], ['revokeObjectURL', "
+        "'delete']]) { const before = URL[name]; URL[name] = (given) => { const url = before.call(URL, given); "
+        "urls[work](url ?? given); return url; }; }"
+    )
+    scene = site.scene()
+    page.until(lambda: "blob:" in str(page.script(PICTURES)))
+    assert page.script("return urls.size") == 1
+    page.click("#library [data-close]")
+    page.until(lambda: page.script("return urls.size") == 0)
+    page.show("library")
+    page.until(lambda: page.script("return urls.size") == 1)
+    site.queue.forget(scene)
+    site.store.purge(scene)
+    page.until(lambda: page.script("return urls.size") == 0)
+
+
+def test_a_scene_is_saved_in_every_format_of_the_service_at_the_moment_in_view(
+    site: Site, page: Page, tmp_path: Path
+) -> None:
+    page.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
+    scene = site.scene()
+    page.press(scene, "View")
+    page.until_state("live")
+    page.find("#time").send_keys(Keys.END)
+    page.press(scene, say("job.save"))
+    page.until(lambda: page.find("#download").is_displayed())
+    offered = page.script(
+        "return [...document.querySelectorAll('#download [data-format]')].map((b) => b.dataset.format)"
+    )
+    assert sorted(offered) == sorted(EXPORT_FORMATS)
+    assert say("download.moment", t="1.000") in page.text("#download")
+    page.click("#download [data-format=mesh-stl]")
+    page.until(lambda: (tmp_path / f"{scene}-mesh.stl").exists())
+    assert not page.find("#download").is_displayed()
+    asked = page.script("return performance.getEntriesByType('resource').map((entry) => entry.name)")
+    assert any(each.endswith(f"/scenes/{scene}/export?format=mesh-stl&t=1") for each in asked)
+
+
+def test_files_are_named_as_the_service_names_them() -> None:
+    source = (DASHBOARD / "downloads.js").read_text(encoding="utf-8")
+    (text,) = re.findall(r"const GROUPS = \{(.*?)\n\};", source, re.DOTALL)
+    suffixes = dict(re.findall(r'"?([\w-]+)"?: "([^"]+)"', text))
+    assert suffixes == {name: each.suffix for name, each in EXPORT_FORMATS.items()}
+
+
+def test_row_10_a_key_without_scopes_is_offered_nothing_that_would_be_refused(
+    tmp_path: Path, driver: webdriver.Chrome
+) -> None:
+    with site_at(tmp_path / "data", hosts=("127.0.0.1",)) as site:
+        _, key = KeyFile(tmp_path / "data").create("local", {KeyScope.VIEW}, "page")
+        scene = site.scene()
+        failed = site.queued_job()
+        page = Page(driver, site.url)
+        page.open()
+        page.until(lambda: page.find("#key-text").is_displayed())
+        page.find("#key-text").send_keys(key, Keys.ENTER)
+        page.until(lambda: actions(page, scene) == ["view", "save"])
+        assert actions(page, failed) == []
+        assert page.faults() == []
+        driver.get("about:blank")
+
+
+def actions(page: Page, job_id: str) -> Any:
+    source = "return [...document.querySelectorAll(`[data-job='${arguments[0]}'] button`)].map((b) => b.dataset.action)"
+    return page.script(source, job_id)
