@@ -52,6 +52,10 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
                 "description": "of layer=depth, what a value of 1 is; 0 is invalid. False colours have no unit",
                 "schema": {"type": "string", "enum": ["0.01 mm", "mm"]},
             },
+            "X-Intrasplat-Depth-Range-Mm": {
+                "description": "of layer=depth in false colours: depths of the brightest and of the darkest colour",
+                "schema": {"type": "string", "pattern": "^-?[0-9]+ -?[0-9]+$"},
+            },
         },
     },
     304: {"description": "it is the one that the caller has"},
@@ -160,6 +164,8 @@ async def render(
     is_coarse = NoticeCode.COARSE in [each.code for each in answer.head.warnings]
     response.headers.update(cache_headers(shown, tag, is_coarse=is_coarse))
     response.headers["X-Intrasplat-Unseen"] = f"{answer.head.unseen:.3f}"
+    if answer.head.depth_range_mm is not None:
+        response.headers["X-Intrasplat-Depth-Range-Mm"] = " ".join(f"{each:.0f}" for each in answer.head.depth_range_mm)
     if query.layer is Layer.DEPTH and query.format in DEPTH_UNITS:
         response.headers["X-Intrasplat-Depth-Unit"] = DEPTH_UNITS[query.format]
     total_ms = (time.perf_counter() - start) * 1e3

@@ -73,6 +73,7 @@ class StreamHead(BaseModel):
     unseen: float
     warnings: tuple[Notice, ...]
     media_type: str
+    depth_range_mm: tuple[float, float] | None
     render_ms: float
     total_ms: float
 
@@ -271,6 +272,7 @@ def packed(message: StreamMessage, shown: Shown, answer: Answer, total_ms: float
         unseen=round(answer.head.unseen, 3),
         warnings=answer.head.warnings,
         media_type=answer.head.media_type,
+        depth_range_mm=answer.head.depth_range_mm,
         render_ms=answer.head.render_ms,
         total_ms=total_ms,
     )

@@ -193,6 +193,8 @@ class WorkerReply(BaseModel):
     """Width and height of the clip in pixels: the image's where the request names none."""
     more: bool = False
     """More parts of the export follow."""
+    depth_range_mm: tuple[float, float] | None = None
+    """Of depth in false colours: the depths of the brightest and the darkest colour, the same throughout the clip."""
 
 
 TYPICAL_GAUSSIANS, TYPICAL_SIZE = 50_000, (640, 512)

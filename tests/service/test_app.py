@@ -206,3 +206,12 @@ def test_a_render_of_depth_tells_its_unit(service: ServiceUnderTest, layer: str,
     scene = service.finished_scene()
     response = service.http.get("/render", params={"scene": scene, "layer": layer, "format": format})
     assert response.headers.get("X-Intrasplat-Depth-Unit") == unit
+
+
+@pytest.mark.parametrize(("format", "expected"), [("jpeg", "41 78"), ("png", None)])
+def test_depth_in_false_colours_tells_between_which_depths(
+    service: ServiceUnderTest, format: str, expected: str | None
+) -> None:
+    scene = service.finished_scene()
+    response = service.http.get("/render", params={"scene": scene, "layer": "depth", "format": format})
+    assert response.headers.get("X-Intrasplat-Depth-Range-Mm") == expected

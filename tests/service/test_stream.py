@@ -107,6 +107,7 @@ def test_one_connection_shows_a_finished_scene_and_a_running_job(service: LiveSe
             "unseen": 0.123,
             "warnings": [LOOK_OUT.model_dump()],
             "media_type": "image/jpeg",
+            "depth_range_mm": None,
         }
         ask(viewer, scene=scene, unseen="guess")
         assert view(viewer)[0]["unseen"] == 0

@@ -20,7 +20,7 @@ from contract.wire.errors import InputError, SceneError
 from contract.wire.job import JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode
-from contract.wire.rendering import ExportRequest, RecordedRequest, SceneRequest, WorkerAddress
+from contract.wire.rendering import ExportRequest, ImageFormat, Layer, RecordedRequest, SceneRequest, WorkerAddress
 from service.__main__ import KNOWN_WORKERS
 from service.app import create_app
 from service.renderer import ZmqRenderer
@@ -35,6 +35,7 @@ IDENTITY = "1,0,0,0,0,1,0,0,0,0,1,0"
 
 
 UNSEEN_SHARE = 0.06251
+DEPTH_RANGE_MM = (41.0, 78.0)
 COARSE_WIDTH = 11
 AFTER_THE_END = a_warning("t is after the last frame", NoticeCode.TIME_OUTSIDE_CLIP)
 
@@ -68,7 +69,16 @@ class Painter:
         late = (AFTER_THE_END, a_warning("ansicht – geschätzt")) if request.t > 1 else ()
         iteration = 7 if request.attempt is None else None
         media_type, shown_t = f"image/{request.format.value}", min(request.t, 1.0)
-        return Reply(request.format.value.encode(), media_type, shown_t, coarse + late, iteration, UNSEEN_SHARE)
+        range_mm = DEPTH_RANGE_MM if request.layer is Layer.DEPTH and request.format is ImageFormat.JPEG else None
+        return Reply(
+            request.format.value.encode(),
+            media_type,
+            shown_t,
+            coarse + late,
+            iteration,
+            UNSEEN_SHARE,
+            depth_range_mm=range_mm,
+        )
 
 
 @dataclass

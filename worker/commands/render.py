@@ -88,7 +88,7 @@ def run_cli(options: argparse.Namespace) -> int:
     from worker.daemon.views import camera_of, pose_of
     from worker.raster.backend import choose_device
     from worker.render.encode import encode_layer
-    from worker.render.view import render_frame
+    from worker.render.view import render_frame, renderer_of
     from worker.scene.checkpoint import load_scene
 
     device = choose_device(options.device)
@@ -105,8 +105,11 @@ def run_cli(options: argparse.Namespace) -> int:
         if image_format is None:
             raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
         frame = render_frame(scene, t, pose, camera, device, highlights=highlights)
+        range_mm = renderer_of(scene, device).depth_range.before(pose) if layer is Layer.DEPTH else None
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encode_layer(frame, layer, image_format, unseen=Unseen(options.unseen)))
+        path.write_bytes(
+            encode_layer(frame, layer, image_format, unseen=Unseen(options.unseen), depth_range_mm=range_mm)
+        )
         print(path)
         for notice in frame.warnings:
             print(f"{notice.severity}: {notice.text}", file=sys.stderr)

@@ -80,6 +80,7 @@ class Reply:
     level: of detail at which it was drawn (worker/render/detail.py); 0 shows all.
     is_kept: it was made for an earlier request, or its time tells nothing of that of renders.
     more: further parts of the export follow.
+    depth_range_mm: of depth in false colours, as in WorkerReply.
     """
 
     body: bytes
@@ -93,6 +94,7 @@ class Reply:
     level: int = 0
     is_kept: bool = False
     more: bool = False
+    depth_range_mm: tuple[float, float] | None = None
 
 
 class RequestServer:
@@ -321,6 +323,7 @@ class RequestServer:
             gaussians=view.gaussians,
             clip_size=view.clip_size,
             more=view.more,
+            depth_range_mm=view.depth_range_mm,
             render_ms=(time.perf_counter() - start) * 1e3,
         )
         return head, view.body, not view.is_kept

@@ -27,6 +27,7 @@ from contract.wire.rendering import (
     ExportRequest,
     ImageFormat,
     IntrinsicsOverride,
+    Layer,
     RecordedRequest,
     RenderRequest,
     SceneRequest,
@@ -42,7 +43,7 @@ from worker.raster.backend import CPU, Device
 from worker.render.detail import LEVELS, thinned
 from worker.render.encode import FOR_EYES, encode_layer
 from worker.render.recorded import marked_frame, stored_frame
-from worker.render.view import ROUNDING, Frame, no_pause, render_frame
+from worker.render.view import ROUNDING, Frame, no_pause, render_frame, renderer_of
 from worker.scene.checkpoint import load_scene
 from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS
@@ -200,7 +201,10 @@ class Views:
         pose, highlights = pose_of(scene, request.pose), request.highlights.shown_in(request.layer)
         drawn = thinned(scene, detail.gaussians)
         frame = render_frame(drawn, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
-        return _reply(scene, frame.enlarged(*size) if level else frame, request, snapshot, level)
+        range_mm = None
+        if request.layer is Layer.DEPTH and request.format in FOR_EYES:
+            range_mm = renderer_of(drawn, self._device).depth_range.before(pose)
+        return _reply(scene, frame.enlarged(*size) if level else frame, request, snapshot, level, range_mm)
 
     def _export(self, scene: Scene, request: ExportRequest) -> Reply:
         """One part of an export. It tells nothing of the time of renders."""
@@ -224,10 +228,19 @@ class Views:
         return COPIES * sum(scene.byte_count for scene in self._scenes.values())
 
 
-def _reply(scene: Scene, frame: Frame, request: RenderRequest, snapshot: Snapshot | None, level: int) -> Reply:
+def _reply(
+    scene: Scene,
+    frame: Frame,
+    request: RenderRequest,
+    snapshot: Snapshot | None,
+    level: int,
+    depth_range_mm: tuple[float, float] | None,
+) -> Reply:
     """A frame as it is sent."""
     iteration = None if snapshot is None else snapshot.iteration
-    body = encode_layer(frame, request.layer, request.format, request.quality, request.unseen)
+    body = encode_layer(
+        frame, request.layer, request.format, request.quality, request.unseen, depth_range_mm=depth_range_mm
+    )
     warnings = frame.warnings
     if snapshot is not None:
         # What the clip shows of each place is counted when training has ended: until then nothing is vouched for.
@@ -242,7 +255,10 @@ def _reply(scene: Scene, frame: Frame, request: RenderRequest, snapshot: Snapsho
     shown = shown_time(scene, request.t)
     clip_size = scene.intrinsics.width, scene.intrinsics.height
     media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
-    return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size, level)
+    unseen = frame.unseen_share
+    return Reply(
+        body, media_type, shown, warnings, iteration, unseen, count, clip_size, level, depth_range_mm=depth_range_mm
+    )
 
 
 def _cameras(scene: Scene, snapshot: Snapshot | None) -> Reply:

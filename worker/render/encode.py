@@ -3,7 +3,9 @@
             png                         npy                   jpeg, webp
 rgb         8 bit                       uint8 [H, W, 3]       8 bit
 depth       16 bit, 0.01 mm, 0 invalid  float32 mm [H, W]     false colour, near bright, invalid black
-confidence  8 bit, 255 = 1              float32 [H, W]        false colour
+confidence  8 bit, 255 = 1              float32 [H, W]        false colour, high bright
+
+False colours are those of contract/wire/colours.py.
 
 Where unseen pixels are marked, depth and confidence are 0 there, and rgb shows a hatch; png and webp of rgb then have
 an alpha channel: 255 elsewhere, and there UNSEEN_ALPHA, as good as transparent. Whoever ignores alpha sees the hatch.
@@ -18,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.wire.colours import COLOUR_TABLE
 from contract.wire.rendering import ImageFormat, Layer, Unseen
 from worker.render.unseen import hatched
 
@@ -30,8 +33,8 @@ quality, and keeps what alpha 1 shows."""
 PNG_COMPRESSION = 1
 """Fast rather than small: renders travel over the loopback or a hospital's own network."""
 
-DEPTH_VIEW_PERCENTILES = (2.0, 98.0)
-"""Depths between these fill the false-colour range, so that a few strays do not flatten the picture."""
+FALSE_COLOURS = np.frombuffer(COLOUR_TABLE, np.uint8).reshape(256, 1, 3)[:, :, ::-1].copy()
+"""As OpenCV takes them, BGR."""
 
 
 class Layers(Protocol):
@@ -56,8 +59,15 @@ def encode_layer(
     image_format: ImageFormat,
     quality: int = DEFAULT_QUALITY,
     unseen: Unseen = Unseen.MARK,
+    *,
+    depth_range_mm: tuple[float, float] | None = None,
 ) -> bytes:
-    """The file's bytes; quality, 1 to 100, is that of jpeg and webp."""
+    """The file's bytes.
+
+    Args:
+        quality: 1 to 100, of jpeg and webp.
+        depth_range_mm: what false colours of depth reach from and to; they need it.
+    """
     marked = frame.unseen if unseen is Unseen.MARK else None
     if layer is Layer.RGB:
         return _encode_colour(frame.rgb, marked, image_format, quality)
@@ -67,7 +77,7 @@ def encode_layer(
     if image_format is ImageFormat.NPY:
         return _npy(values)
     if image_format in FOR_EYES:
-        return _image(view_depth(values) if layer is Layer.DEPTH else view_confidence(values), image_format, quality)
+        return _image(_in_false_colours(values, layer, depth_range_mm), image_format, quality)
     if layer is Layer.DEPTH:
         steps = np.clip(np.rint(values * DEPTH_PNG_PER_MM), 0, np.iinfo(np.uint16).max)
         return _image(steps.astype(np.uint16), image_format, quality)
@@ -89,23 +99,24 @@ def _encode_colour(
     return _image(pixels, image_format, quality)
 
 
-def view_depth(depth_mm: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """False colour, BGR uint8 [H, W, 3]: near is bright, invalid is black."""
-    valid = depth_mm > 0
-    if not valid.any():
-        return np.zeros((*depth_mm.shape, 3), np.uint8)
-    near_mm, far_mm = np.percentile(depth_mm[valid], DEPTH_VIEW_PERCENTILES)
-    nearness = (far_mm - depth_mm) / max(float(far_mm - near_mm), 1e-6)
-    grey = np.rint(np.clip(nearness, 0, 1) * 255).astype(np.uint8)
-    coloured = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_TURBO), np.uint8)
-    coloured[~valid] = 0
+def _in_false_colours(
+    values: NDArray[np.float32], layer: Layer, depth_range_mm: tuple[float, float] | None
+) -> NDArray[np.uint8]:
+    """BGR uint8 [H, W, 3]."""
+    if layer is Layer.CONFIDENCE:
+        return _coloured(values)
+    if depth_range_mm is None:
+        raise ValueError("depth in false colours needs depth_range_mm")
+    near_mm, far_mm = depth_range_mm
+    coloured = _coloured((np.float32(far_mm) - values) / np.float32(far_mm - near_mm))
+    coloured[values <= 0] = 0
     return coloured
 
 
-def view_confidence(confidence: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """False colour, BGR uint8 [H, W, 3]: dark where the model saw nothing."""
-    grey = np.rint(np.clip(confidence, 0, 1) * 255).astype(np.uint8)
-    return np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), np.uint8)
+def _coloured(shares: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """BGR uint8 [H, W, 3] of numbers in [0, 1]; those beyond have the colour of the nearer end."""
+    steps = np.rint(np.clip(shares, 0, 1) * 255).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(steps, FALSE_COLOURS), np.uint8)
 
 
 def _image(pixels: NDArray[np.uint8] | NDArray[np.uint16], image_format: ImageFormat, quality: int) -> bytes:

@@ -47,7 +47,7 @@ class OutOfView:
             return None
         frames = spread([round(t * scene.frame_count) for t in scene.trained_t], SAMPLED_FRAMES)
         seen_s = np.array([scene.frame_times_s[frame] for frame in frames], np.float32)
-        in_view = np.stack([_in_view(scene, model, frame) for frame in frames])
+        in_view = np.stack([seen_by_endoscope(scene, model, frame)[1] for frame in frames])
         nothing = np.full((1, in_view.shape[1]), np.inf, np.float32)
         known = np.where(in_view, seen_s[:, None], np.float32(np.nan))
         before = np.fmax.accumulate(np.concatenate([-nothing, known]))
@@ -68,10 +68,10 @@ class OutOfView:
         return float(self.seen_s[last] - self.seen_s[first])
 
 
-def _in_view(scene: Scene, model: Model, frame: int) -> NDArray[np.bool_]:
-    """[N] whether the centres lie within the endoscope's view at a frame."""
+def seen_by_endoscope(scene: Scene, model: Model, frame: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """[N] depths of the centres, in mm, before the endoscope at a frame, and whether they lie within its view."""
     points_mm = model.deformed_mean(frame / scene.frame_count).T / np.float32(scene.units_per_mm)
     k, (x, y, z) = scene.intrinsics, to_camera(points_mm, scene.world_from_camera[frame]).T
     ahead = np.maximum(z, 1e-6)
     column, row = k.fx * x / ahead + k.cx, k.fy * y / ahead + k.cy
-    return np.asarray((z > 0) & (column >= 0) & (column < k.width) & (row >= 0) & (row < k.height))
+    return z, np.asarray((z > 0) & (column >= 0) & (column < k.width) & (row >= 0) & (row < k.height))

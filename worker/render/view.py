@@ -21,6 +21,7 @@ from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
 from worker.render.camera import endoscope_pose, view_camera
 from worker.render.confidence import confidence, evidence, seen_from_endoscope
+from worker.render.depth_range import DepthRange
 from worker.render.left import OutOfView
 from worker.render.unseen import blended_values, unseen_pixels
 from worker.scene.model import model_of
@@ -102,6 +103,12 @@ class SceneRenderer:
         self._values = blended_values(scene.seen.numpy())
         self._out_of_view = None if self._values is None else OutOfView.of(self.scene, self._model)
         self._lock = RLock()  # who pauses a large render may make a small one
+
+    @cached_property
+    def depth_range(self) -> DepthRange:
+        """Of the false colours of depth, the same throughout the clip."""
+        with self._lock:
+            return DepthRange.of(self.scene, self._model)
 
     def layers(
         self,

@@ -115,6 +115,18 @@ def test_a_stored_scene_is_rendered_at_the_size_of_the_clip(store: Store, scene_
     assert np.median(depth_mm[depth_mm > 0]) == pytest.approx(60 / UNITS_PER_MM, rel=0.05)
 
 
+def test_depth_in_false_colours_says_between_which_depths_and_says_the_same_at_every_time(
+    store: Store, scene_id: str
+) -> None:
+    views, asked = Views(store), request_of(scene_id).model_copy(update={"layer": Layer.DEPTH})
+    false_colours = asked.model_copy(update={"format": ImageFormat.JPEG})
+    ranges = {views.answer(false_colours.model_copy(update={"t": t})).depth_range_mm for t in (0.0, 0.3, 0.9)}
+    assert len(ranges) == 1
+    near_mm, far_mm = ranges.pop() or (0.0, 0.0)
+    assert near_mm <= 60 / UNITS_PER_MM <= far_mm
+    assert views.answer(asked).depth_range_mm is None
+
+
 def test_a_time_after_the_clip_shows_its_last_frame_and_warns(store: Store, scene_id: str) -> None:
     view = Views(store).answer(request_of(scene_id, t=3))
     assert view.t == (FRAMES - 1) / FRAMES

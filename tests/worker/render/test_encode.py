@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from contract.wire.colours import COLOUR_TABLE
 from contract.wire.rendering import ImageFormat, Layer, Unseen
 from worker.render.encode import DEFAULT_QUALITY, encode_layer
 from worker.render.unseen import DARK_GREY, LIGHT_GREY
 
 HEIGHT, WIDTH = 12, 17
+RANGE_MM = (40.0, 90.0)
+DARKEST, BRIGHTEST = list(COLOUR_TABLE[:3]), list(COLOUR_TABLE[-3:])
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,8 @@ def test_npy_is_the_array_itself(images: Images, layer: Layer, name: str) -> Non
 def test_what_is_for_eyes_is_a_colour_picture_of_its_size(
     images: Images, layer: Layer, image_format: ImageFormat
 ) -> None:
-    assert decoded(guessed(images, layer, image_format)).shape == (HEIGHT, WIDTH, 3)
+    content = encode_layer(images, layer, image_format, unseen=Unseen.GUESS, depth_range_mm=RANGE_MM)
+    assert decoded(content).shape == (HEIGHT, WIDTH, 3)
 
 
 def test_a_png_shows_a_hatch_of_two_dark_greys_under_alpha_0_where_nothing_was_seen(images: Images) -> None:
@@ -144,4 +148,41 @@ def test_depth_beyond_the_range_of_a_png_is_held_at_its_end(images: Images) -> N
 
 def test_depth_that_is_invalid_everywhere_is_a_black_picture(images: Images) -> None:
     blind = Images(images.rgb, np.zeros_like(images.depth_mm), images.confidence, images.unseen)
-    assert not decoded(encode_layer(blind, Layer.DEPTH, ImageFormat.JPEG)).any()
+    assert not decoded(encode_layer(blind, Layer.DEPTH, ImageFormat.JPEG, depth_range_mm=RANGE_MM)).any()
+
+
+def in_false_colours(layer: Layer, value: float, depth_range_mm: tuple[float, float] | None = RANGE_MM) -> list[int]:
+    """R G B of the first pixel of a picture of this value alone."""
+    values = np.full((16, 16), value, np.float32)
+    image = Images(np.zeros((16, 16, 3), np.uint8), values, values, np.zeros((16, 16), np.bool_))
+    content = encode_layer(image, layer, ImageFormat.JPEG, 100, depth_range_mm=depth_range_mm)
+    return [int(each) for each in decoded(content)[0, 0, ::-1]]
+
+
+@pytest.mark.parametrize(
+    ("layer", "value", "colour"),
+    [
+        (Layer.DEPTH, 40.0, BRIGHTEST),
+        (Layer.DEPTH, 12.0, BRIGHTEST),
+        (Layer.DEPTH, 90.0, DARKEST),
+        (Layer.DEPTH, 300.0, DARKEST),
+        (Layer.CONFIDENCE, 1.0, BRIGHTEST),
+        (Layer.CONFIDENCE, 0.0, DARKEST),
+    ],
+)
+def test_false_colours_are_those_of_the_table_with_near_and_high_bright(
+    layer: Layer, value: float, colour: list[int]
+) -> None:
+    np.testing.assert_allclose(in_false_colours(layer, value), colour, atol=2)  # of the encoder
+
+
+def test_one_depth_has_one_colour_whatever_else_the_picture_shows(images: Images) -> None:
+    near = Images(images.rgb, np.full_like(images.depth_mm, 60.0), images.confidence, images.unseen)
+    near.depth_mm[:, 8:] = 45.0
+    shown = decoded(encode_layer(near, Layer.DEPTH, ImageFormat.WEBP, 100, Unseen.GUESS, depth_range_mm=RANGE_MM))
+    np.testing.assert_allclose(shown[0, 0, 2::-1], in_false_colours(Layer.DEPTH, 60.0), atol=3)
+
+
+def test_depth_in_false_colours_needs_a_range() -> None:
+    with pytest.raises(ValueError, match="depth_range_mm"):
+        in_false_colours(Layer.DEPTH, 60.0, None)

@@ -21,7 +21,7 @@ from worker.model.metrics import psnr_tissue
 from worker.outcome import scene_of, snapshot_of
 from worker.phantom import orbit_pose
 from worker.render.camera import endoscope_pose
-from worker.render.view import FAR_POSE, render_frame
+from worker.render.view import FAR_POSE, render_frame, renderer_of
 from worker.scene.checkpoint import load_scene, save_scene
 from worker.scene.scene import POSE_DOUBTS, Scene
 from worker.train.presets import PRESETS
@@ -200,3 +200,22 @@ def test_a_scene_of_one_frame_stands_still() -> None:
     )
     assert_close(endoscope_pose(scene, 0.7), np.eye(4))
     assert render_frame(scene, 0.7).rgb.shape == (48, 64, 3)
+
+
+def test_the_range_of_false_colours_holds_nearly_all_depths_of_the_clip_and_moves_with_the_camera(scene: Scene) -> None:
+    found = renderer_of(scene).depth_range
+    near_mm, far_mm = found.before(None)
+    for t in (0.0, 0.4, LAST):
+        depth_mm = render_frame(scene, t).depth_mm
+        assert ((near_mm <= depth_mm) & (depth_mm <= far_mm))[depth_mm > 0].mean() > 0.9
+    assert found.before(shifted(5.0)) == (near_mm, far_mm)
+    nearer = np.eye(4)
+    nearer[2, 3] = 10.0
+    assert found.before(nearer) == (near_mm - 10, far_mm - 10)
+
+
+def test_the_range_of_false_colours_has_a_width_where_nothing_is_in_view() -> None:
+    scene = random_scene()
+    scene.gaussians.mean[:, 2] = -60.0
+    near_mm, far_mm = renderer_of(scene).depth_range.before(None)
+    assert near_mm < far_mm
