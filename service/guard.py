@@ -36,7 +36,10 @@ EXPOSED_HEADERS = (
     *("Upload-Offset", "Upload-Length", "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Max-Size"),
     *(
         f"X-Intrasplat-{name}"
-        for name in ("Scene", "State", "Next", "T", "Iteration", "Unseen", "Depth-Unit", "Warning", "Warning-Codes")
+        for name in (
+            *("Scene", "State", "Next", "T", "Iteration", "Unseen", "Camera"),
+            *("Depth-Unit", "Warning", "Warning-Codes"),
+        )
     ),
 )
 """What a page from elsewhere may read of an answer."""

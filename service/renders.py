@@ -48,6 +48,11 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
                 "required": True,
                 "schema": {"type": "number", "minimum": 0, "maximum": 1},
             },
+            "X-Intrasplat-Camera": {
+                "description": "the picture's camera: a JSON object of width, height, fx, fy, cx, cy in pixels, and "
+                "world_from_camera, 12 numbers in mm, row-major",
+                "schema": {"type": "string"},
+            },
             "X-Intrasplat-Depth-Unit": {
                 "description": "of layer=depth, what a value of 1 is; 0 is invalid. False colours have no unit",
                 "schema": {"type": "string", "enum": ["0.01 mm", "mm"]},
@@ -166,6 +171,8 @@ async def render(
     response.headers["X-Intrasplat-Unseen"] = f"{answer.head.unseen:.3f}"
     if answer.head.depth_range_mm is not None:
         response.headers["X-Intrasplat-Depth-Range-Mm"] = " ".join(f"{each:.0f}" for each in answer.head.depth_range_mm)
+    if answer.head.camera is not None:
+        response.headers["X-Intrasplat-Camera"] = answer.head.camera.model_dump_json()
     if query.layer is Layer.DEPTH and query.format in DEPTH_UNITS:
         response.headers["X-Intrasplat-Depth-Unit"] = DEPTH_UNITS[query.format]
     total_ms = (time.perf_counter() - start) * 1e3

@@ -28,6 +28,7 @@ from starlette.types import Message
 from contract.access.keys import KeyScope
 from contract.wire.job import JobState
 from contract.wire.notices import Notice
+from contract.wire.rendering import PictureCamera
 from service.access import Caller, Refusal, key_missing
 from service.connection import Answer
 from service.deps import Deps, EarlyCaller, Services, address_of
@@ -76,6 +77,7 @@ class StreamHead(BaseModel):
     depth_range_mm: tuple[float, float] | None
     render_ms: float
     total_ms: float
+    camera: PictureCamera | None = None
 
 
 class _HangUp(Exception):
@@ -275,6 +277,7 @@ def packed(message: StreamMessage, shown: Shown, answer: Answer, total_ms: float
         depth_range_mm=answer.head.depth_range_mm,
         render_ms=answer.head.render_ms,
         total_ms=total_ms,
+        camera=answer.head.camera,
     )
     text = head.model_dump_json().encode()
     return len(text).to_bytes(LENGTH_BYTES, "big") + text + answer.body

@@ -20,7 +20,7 @@ import { Viewer } from "./viewer.js";
 
 const get = (id) => document.getElementById(id);
 
-const viewer = new Viewer({
+export const viewer = new Viewer({
   stage: get("stage"),
   canvas: get("picture"),
   status: get("status"),

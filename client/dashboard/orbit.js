@@ -18,11 +18,23 @@ export class Orbit {
     this.yaw = 0;
     this.pitch = 0;
     this.zoom = 1;
+    /** @type {string | null} a pose of another form, until somebody turns or approaches */
+    this.given = null;
+  }
+
+  /** @param {string | null} pose as the service spells it; null is the endoscope's own */
+  stand(pose) {
+    this.goHome();
+    if (pose === null) return;
+    this.isHome = false;
+    if (pose.startsWith("orbit:")) [this.yaw, this.pitch, this.zoom] = pose.slice(6).split(/[,\s]+/).map(Number);
+    else this.given = pose;
   }
 
   /** @param {number} dx pixels to the right @param {number} dy pixels down */
   turn(dx, dy) {
     this.isHome = false;
+    this.given = null;
     this.yaw = clamp(this.yaw - dx * DEGREES_A_PIXEL, -MAX_DEGREES, MAX_DEGREES);
     this.pitch = clamp(this.pitch + dy * DEGREES_A_PIXEL, -MAX_DEGREES, MAX_DEGREES);
   }
@@ -30,11 +42,13 @@ export class Orbit {
   /** @param {number} factor above 1: nearer */
   approach(factor) {
     this.isHome = false;
+    this.given = null;
     this.zoom = clamp(this.zoom * factor, MIN_ZOOM, MAX_ZOOM);
   }
 
   /** @returns {string | null} as the service spells a pose; null is the endoscope's own */
   get pose() {
+    if (this.given !== null) return this.given;
     return this.isHome ? null : `orbit:${this.yaw.toFixed(2)},${this.pitch.toFixed(2)},${this.zoom.toFixed(3)}`;
   }
 

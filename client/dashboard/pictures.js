@@ -33,6 +33,7 @@ async function askOnce(path, signal) {
     warning: "",
     codes: header("Warning-Codes")?.split(", ") ?? [],
     totalMs: total ? Number(total[1]) : NaN,
+    camera: JSON.parse(header("Camera") ?? "null"),
     way: "single pictures",
   };
 }

@@ -13,7 +13,13 @@ import { connectionLost, errorWords, Problem } from "./problem.js";
  * isRecorded: it is a frame of the clip, no render.
  * @typedef {{blob: Blob, scene: string, state: "running"|"done", t: number, iteration: number | null,
  *   unseen: number, warning: string, codes: string[], totalMs: number, way: string,
- *   isExtrapolated?: boolean, isRecorded?: boolean}} Picture
+ *   camera: Camera | null, isExtrapolated?: boolean, isRecorded?: boolean}} Picture
+ */
+/**
+ * Where a picture was taken from, and through which lens: pixels of the picture as it came, and world_from_camera as 12
+ * numbers, row by row, in mm.
+ * @typedef {{width: number, height: number, fx: number, fy: number, cx: number, cy: number,
+ *   world_from_camera: number[]}} Camera
  */
 
 const LENGTH_BYTES = 4;
@@ -84,9 +90,9 @@ export class Stream {
     if (head.id !== this.pending?.id) return; // of a view that nobody waits for any more
     const { resolve } = this.pending;
     this.pending = null;
-    const { scene, state, t, iteration, unseen, warnings, total_ms: totalMs } = head;
+    const { scene, state, t, iteration, unseen, camera, warnings, total_ms: totalMs } = head;
     const codes = warnings.map(({ code }) => code);
-    resolve({ blob, scene, state, t, iteration, unseen, warning: "", codes, totalMs, way: "stream" });
+    resolve({ blob, scene, state, t, iteration, unseen, warning: "", codes, totalMs, camera, way: "stream" });
   }
 
   #fail(problem) {

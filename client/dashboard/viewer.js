@@ -12,14 +12,24 @@ import { Timeline } from "./timeline.js";
 const AGAIN_MS = 1500;
 const AFTER_TROUBLE_MS = 700;
 const NOT_YET = "Its first picture comes when training begins.";
+/**
+ * What a view shows. t: as shown, within the clip; pose: as the service spells it, null for the endoscope's own;
+ * camera: null where it is not known, as of recorded frames; way: how the picture came.
+ * @typedef {{scene: string, t: number, pose: string | null, layer: string, unseen: "mark"|"guess",
+ *   highlights: "on"|"off", state: "running"|"done", way: string, camera: import("./stream.js").Camera | null}} Shown
+ */
 /** There is nothing to show, or not to this key; a picture that was there goes. */
 const NOTHING_TO_SHOW = [401, 403, 404, 409];
 
-export class Viewer {
+/** Tells "shown" (a CustomEvent whose detail is Shown) of every picture that has come to the screen. */
+export class Viewer extends EventTarget {
   /** @param {Record<string, HTMLElement>} parts by what they are; index.html has them */
   constructor(parts) {
+    super();
     this.parts = parts;
     this.scene = null;
+    /** @type {Shown | null} what is on the screen */
+    this.shown = null;
     this.visit = 0; // counts scenes opened: what was asked for in an earlier one is not shown in this
     this.isBusy = false;
     this.isWanted = false;
@@ -43,9 +53,25 @@ export class Viewer {
     this.visit += 1;
     this.pictures.giveUp(); // the other scene's
     this.orbit.goHome();
+    this.shown = null;
     this.screen.clear(scene, words);
     this.parts.readout.textContent = "";
     if (scene === null) this.timeline.play(false);
+    this.refresh();
+  }
+
+  /**
+   * Look elsewhere; what is left out stays.
+   * @param {{t?: number, pose?: string | null, layer?: string, unseen?: "mark"|"guess", highlights?: "on"|"off"}} wish
+   */
+  look({ t, pose, layer, unseen, highlights }) {
+    const { parts } = this;
+    if (pose !== undefined) this.orbit.stand(pose);
+    if (layer !== undefined) parts.layer.value = layer;
+    if (unseen !== undefined) parts.guess.checked = unseen === "guess";
+    if (highlights !== undefined) parts.highlights.checked = highlights === "on";
+    if (t !== undefined) this.timeline.set(t); // asks for the picture: all of the wish is set before
+    if (layer !== undefined) parts.layer.dispatchEvent(new Event("change"));
     this.refresh();
   }
 
@@ -80,6 +106,8 @@ export class Viewer {
       if (visit !== this.visit) return; // another was opened meanwhile: never its neighbour's picture
       this.screen.show(picture, bitmap, `${name}, t ${picture.t.toFixed(3)}`);
       this.pace.note();
+      this.shown = shownOf(view, picture);
+      this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
       this.#tell(name, picture, performance.now() - began);
     } catch (error) {
       if (visit !== this.visit) return;
@@ -112,8 +140,10 @@ export class Viewer {
 
   #fail(error) {
     const isNotYet = error.status === 503 && error.document.field === "scene" && !this.screen.hasPicture;
-    if (NOTHING_TO_SHOW.includes(error.status)) this.screen.clear(this.scene, error.message);
-    else this.screen.fail(isNotYet ? NOT_YET : error.message);
+    if (NOTHING_TO_SHOW.includes(error.status)) {
+      this.shown = null;
+      this.screen.clear(this.scene, error.message);
+    } else this.screen.fail(isNotYet ? NOT_YET : error.message);
   }
 
   #listen() {
@@ -134,4 +164,9 @@ export class Viewer {
     for (const choice of [layer, guess, highlights]) choice.addEventListener("change", () => this.refresh());
     home.addEventListener("click", goHome);
   }
+}
+
+/** @param {import("./stream.js").View} view @param {import("./stream.js").Picture} picture @returns {Shown} */
+function shownOf({ scene, pose = null, layer, unseen, highlights }, { t, state, way, camera }) {
+  return { scene, t, pose, layer, unseen, highlights, state, way, camera };
 }

@@ -93,6 +93,21 @@ class IntrinsicsOverride(BaseModel):
         return width, height
 
 
+class PictureCamera(BaseModel):
+    """Where a picture was taken from and through which lens, in pixels of that picture (docs/conventions.md)."""
+
+    model_config = ConfigDict(frozen=True)
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_from_camera: tuple[float, ...] = Field(min_length=12, max_length=12)
+    """The upper three rows, row-major, translation in mm."""
+
+
 class RenderRequest(BaseModel):
     """One view of one scene. t in [0, 1], later times clamp with a warning; pose None is the endoscope's own at t.
 
@@ -191,6 +206,8 @@ class WorkerReply(BaseModel):
     """Of the scene that is shown; 0: not known."""
     clip_size: tuple[int, int] | None = None
     """Width and height of the clip in pixels: the image's where the request names none."""
+    camera: PictureCamera | None = None
+    """Of a render."""
     more: bool = False
     """More parts of the export follow."""
     depth_range_mm: tuple[float, float] | None = None

@@ -38,6 +38,7 @@ from contract.wire.rendering import (
     MEDIA_TYPES,
     ExportRequest,
     Highlights,
+    PictureCamera,
     RecordedRequest,
     SceneRequest,
     Unseen,
@@ -58,6 +59,9 @@ MAX_WAIT_S = 1.0
 LOOK_S = 0.05
 WORKER = "worker-1"
 SNAPSHOT_ITERATION = 40
+CAMERA = PictureCamera(
+    width=60, height=48, fx=80, fy=80, cx=30, cy=24, world_from_camera=(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0)
+)
 RECORDED_SHADE = 8
 """Darker than any scene."""
 FAR_DEG = 25.0
@@ -133,6 +137,7 @@ class Painter:
             tuple(warnings),
             iteration,
             0.12 if NoticeCode.UNSEEN in [each.code for each in warnings] else 0.0,
+            camera=CAMERA,
         )
 
 

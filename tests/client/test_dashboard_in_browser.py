@@ -17,6 +17,7 @@ from contract.wire.job import JobError, JobState
 from contract.wire.rendering import Highlights, Unseen
 from tests.client.local_service import CLIP
 from tests.client.page import (
+    CAMERA,
     REPORT_OF_THE_PAGE,
     Page,
     Site,
@@ -154,6 +155,49 @@ def test_the_view_turns_by_mouse_and_keys_and_goes_back_to_the_endoscope(site: S
     page.click("#home")
     page.until_state("live")
     assert "endoscope's view" in page.view
+
+
+@pytest.mark.parametrize("way", ["stream", "single pictures"])
+def test_a_view_that_is_shown_is_told_with_its_camera_and_others_can_look_elsewhere(
+    site: Site, page: Page, way: str
+) -> None:
+    if way != "stream":
+        page.script("window.WebSocket = class { static OPEN = 1; readyState = 3; addEventListener() {} close() {} };")
+    scene = site.scene()
+    page.press(scene, "View")
+    page.until_text("#readout", way)
+    pose = "1 0 0 4 0 1 0 0 0 0 1 0"
+    shown = page.driver.execute_async_script(LOOK, {"t": 0.25, "pose": pose, "layer": "depth"})
+    assert shown == {
+        "scene": scene,
+        "t": 0.25,
+        "pose": pose,
+        "layer": "depth",
+        "unseen": "mark",
+        "highlights": "on",
+        "state": "done",
+        "way": way,
+        "camera": CAMERA.model_dump(mode="json"),
+    }
+    page.find("#stage").send_keys("+")  # a turn or an approach goes on from the endoscope
+    page.until(lambda: "1.10×" in page.view)
+    assert page.driver.execute_async_script(LOOK, {"pose": "orbit:10,-5,2"})["pose"] == "orbit:10.00,-5.00,2.000"
+    assert page.driver.execute_async_script(LOOK, {"pose": None})["pose"] is None
+
+
+LOOK = """
+const [wish, done] = arguments;
+import("/main.js").then(({ viewer }) => {
+  viewer.look(wish);
+  const take = ({ detail: { ...detail } }) => {
+    const isOrbit = wish.pose?.startsWith("orbit");
+    if (isOrbit ? !detail.pose.startsWith("orbit:10") : detail.pose !== wish.pose) return; // of an earlier wish
+    viewer.removeEventListener("shown", take);
+    done(detail);
+  };
+  viewer.addEventListener("shown", take);
+});
+"""
 
 
 @pytest.mark.parametrize("way", ["stream", "single pictures"])

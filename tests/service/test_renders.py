@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import threading
 from collections.abc import Callable
@@ -21,7 +22,15 @@ from contract.wire.rendering import RecordedRequest, RenderRequest, WorkerAddres
 from contract.wire.report import Report
 from tests.cameras import CAMERAS
 from tests.reports import REPORT_OF_A_SCENE
-from tests.service.under_test import COARSE_WIDTH, IDENTITY, ServiceUnderTest, assert_problem, bearer, running_service
+from tests.service.under_test import (
+    CAMERA,
+    COARSE_WIDTH,
+    IDENTITY,
+    ServiceUnderTest,
+    assert_problem,
+    bearer,
+    running_service,
+)
 
 
 def test_a_render_carries_scene_state_and_time_and_its_request_reaches_the_worker(service: ServiceUnderTest) -> None:
@@ -122,6 +131,7 @@ def test_a_render_says_how_much_of_it_nothing_saw_and_the_caller_chooses_what_is
     query = {"scene": service.finished_scene()}
     marked = service.http.get("/render", params=query)
     assert marked.headers["x-intrasplat-unseen"] == "0.063"
+    assert json.loads(marked.headers["x-intrasplat-camera"]) == CAMERA.model_dump(mode="json")
     guessed = service.http.get("/render", params=query | {"unseen": "guess"})
     assert guessed.headers["etag"] != marked.headers["etag"]
     assert [each.unseen for each in service.painter.requests if isinstance(each, RenderRequest)] == ["mark", "guess"]

@@ -18,6 +18,7 @@ from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
 from contract.wire.rendering import ExportRequest, Highlights, RenderRequest, Unseen
 from tests.reports import a_warning
 from tests.service.live import LiveService, live_service
+from tests.service.under_test import CAMERA
 from worker.daemon.serve import NotYetError, Reply
 
 TIMEOUT_S = 10.0
@@ -47,7 +48,7 @@ class Painter:
             self.highlights.append(request.highlights)
         iteration = 7 if request.attempt is None else None
         unseen = 0.0 if isinstance(request, ExportRequest) or request.unseen is Unseen.GUESS else 0.12345
-        return Reply(b"\xff" * self.bytes, "image/jpeg", request.t, (LOOK_OUT,), iteration, unseen)
+        return Reply(b"\xff" * self.bytes, "image/jpeg", request.t, (LOOK_OUT,), iteration, unseen, camera=CAMERA)
 
 
 LOOK_OUT = a_warning("look out")
@@ -108,6 +109,7 @@ def test_one_connection_shows_a_finished_scene_and_a_running_job(service: LiveSe
             "warnings": [LOOK_OUT.model_dump()],
             "media_type": "image/jpeg",
             "depth_range_mm": None,
+            "camera": CAMERA.model_dump(mode="json"),
         }
         ask(viewer, scene=scene, unseen="guess")
         assert view(viewer)[0]["unseen"] == 0

@@ -20,7 +20,15 @@ from contract.wire.errors import InputError, SceneError
 from contract.wire.job import JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import Notice, NoticeCode
-from contract.wire.rendering import ExportRequest, ImageFormat, Layer, RecordedRequest, SceneRequest, WorkerAddress
+from contract.wire.rendering import (
+    ExportRequest,
+    ImageFormat,
+    Layer,
+    PictureCamera,
+    RecordedRequest,
+    SceneRequest,
+    WorkerAddress,
+)
 from service.__main__ import KNOWN_WORKERS
 from service.app import create_app
 from service.renderer import ZmqRenderer
@@ -37,6 +45,7 @@ IDENTITY = "1,0,0,0,0,1,0,0,0,0,1,0"
 UNSEEN_SHARE = 0.06251
 DEPTH_RANGE_MM = (41.0, 78.0)
 COARSE_WIDTH = 11
+CAMERA = PictureCamera(width=64, height=48, fx=80, fy=81, cx=31.5, cy=24.25, world_from_camera=tuple(range(12)))
 AFTER_THE_END = a_warning("t is after the last frame", NoticeCode.TIME_OUTSIDE_CLIP)
 
 
@@ -78,6 +87,7 @@ class Painter:
             iteration,
             UNSEEN_SHARE,
             depth_range_mm=range_mm,
+            camera=CAMERA,
         )
 
 

@@ -27,6 +27,7 @@ from contract.wire.errors import ErrorCode, InputError, IntrasplatError, SceneEr
 from contract.wire.notices import Notice
 from contract.wire.rendering import (
     CancelRequest,
+    PictureCamera,
     RenderRequest,
     ReplyError,
     SceneRequest,
@@ -76,7 +77,7 @@ class Reply:
 
     iteration: of the snapshot that is shown; None: the scene is finished.
     unseen: share of a render's pixels that no training frame saw.
-    gaussians, clip_size: of the scene, as in WorkerReply.
+    gaussians, clip_size, camera: as in WorkerReply.
     level: of detail at which it was drawn (worker/render/detail.py); 0 shows all.
     is_kept: it was made for an earlier request, or its time tells nothing of that of renders.
     more: further parts of the export follow.
@@ -95,6 +96,7 @@ class Reply:
     is_kept: bool = False
     more: bool = False
     depth_range_mm: tuple[float, float] | None = None
+    camera: PictureCamera | None = None
 
 
 class RequestServer:
@@ -322,6 +324,7 @@ class RequestServer:
             unseen=view.unseen,
             gaussians=view.gaussians,
             clip_size=view.clip_size,
+            camera=view.camera,
             more=view.more,
             depth_range_mm=view.depth_range_mm,
             render_ms=(time.perf_counter() - start) * 1e3,

@@ -28,6 +28,7 @@ from contract.wire.rendering import (
     ImageFormat,
     IntrinsicsOverride,
     Layer,
+    PictureCamera,
     RecordedRequest,
     RenderRequest,
     SceneRequest,
@@ -40,6 +41,7 @@ from worker.daemon.snapshot import Snapshot, Snapshots
 from worker.export import DRAWN, export_parts
 from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
+from worker.render.camera import endoscope_pose
 from worker.render.detail import LEVELS, thinned
 from worker.render.encode import FOR_EYES, encode_layer
 from worker.render.recorded import marked_frame, stored_frame
@@ -196,15 +198,19 @@ class Views:
         """One render; snapshot: that the scene is of, None for a finished one; level: of detail."""
         camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
         size = camera.width, camera.height
+        pose, highlights = pose_of(scene, request.pose), request.highlights.shown_in(request.layer)
+        own = endoscope_pose(scene, shown_time(scene, request.t)) if pose is None else pose
+        pose_rows = tuple(own[:3].flatten().tolist())
+        taken_by = PictureCamera.model_validate({**camera.numbers(), "world_from_camera": pose_rows})
         detail = LEVELS[level]
         camera = camera.resized(-(-camera.width // detail.pixels), -(-camera.height // detail.pixels))
-        pose, highlights = pose_of(scene, request.pose), request.highlights.shown_in(request.layer)
         drawn = thinned(scene, detail.gaussians)
         frame = render_frame(drawn, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
         range_mm = None
         if request.layer is Layer.DEPTH and request.format in FOR_EYES:
             range_mm = renderer_of(drawn, self._device).depth_range.before(pose)
-        return _reply(scene, frame.enlarged(*size) if level else frame, request, snapshot, level, range_mm)
+        reply = _reply(scene, frame.enlarged(*size) if level else frame, request, snapshot, level, range_mm)
+        return dataclasses.replace(reply, camera=taken_by)
 
     def _export(self, scene: Scene, request: ExportRequest) -> Reply:
         """One part of an export. It tells nothing of the time of renders."""

@@ -127,6 +127,19 @@ def test_depth_in_false_colours_says_between_which_depths_and_says_the_same_at_e
     assert views.answer(asked).depth_range_mm is None
 
 
+def test_a_render_tells_its_camera(store: Store, scene_id: str) -> None:
+    from_near = request_of(scene_id, t=1.0).model_copy(
+        update={"pose": parse_pose("orbit:0,0,2"), "camera": IntrinsicsOverride(width=2 * CLIP.width)}
+    )
+    reply = Views(store).answer(from_near)
+    assert reply.camera is not None
+    assert (reply.camera.width, reply.camera.fx, reply.camera.cy) == (2 * CLIP.width, 2 * CLIP.fx, 2 * CLIP.cy)
+    assert reply.camera.world_from_camera[11] == pytest.approx(60 / UNITS_PER_MM / 2)
+    own = Views(store).answer(request_of(scene_id, t=1.0)).camera
+    assert own is not None
+    assert own.world_from_camera == tuple(scene().world_from_camera[-1, :3].flatten())
+
+
 def test_a_time_after_the_clip_shows_its_last_frame_and_warns(store: Store, scene_id: str) -> None:
     view = Views(store).answer(request_of(scene_id, t=3))
     assert view.t == (FRAMES - 1) / FRAMES
