@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from client.keys import add_keys
 from client.remote import add_remote
+from client.slicer.command import add_slicer
 from contract.runtime.arguments import Commands, add_command, count
 from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
 from contract.runtime.local import LOCAL_COMMANDS, WORKER_SUMMARY
@@ -58,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_up(commands)
     commands.add_parser("worker", help=WORKER_SUMMARY, add_help=False)
     add_remote(commands)
+    add_slicer(commands)
     add_keys(commands)
     return parser
 

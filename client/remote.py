@@ -48,7 +48,7 @@ def add_remote(commands: Commands) -> None:
     for parser in (watch, label, cancel, retry, delete):
         parser.add_argument("job", metavar="JOB", help="the id that submit printed")
     for parser in (watch, jobs, label, cancel, retry, delete):
-        _add_service(parser)
+        add_service(parser)
 
 
 def _add_submit(commands: Commands) -> None:
@@ -74,7 +74,7 @@ def _add_submit(commands: Commands) -> None:
     _add_metadata(parser, f"a text to find the job by; may come several times. {NO_NAMES}")
     parser.add_argument("--idempotency-key", metavar="TEXT", help="the same key with the same clip is the same job")
     parser.add_argument("--watch", action="store_true", help="wait for the scene, with a progress bar")
-    _add_service(parser)
+    add_service(parser)
 
 
 def _add_fetch(commands: Commands) -> None:
@@ -98,7 +98,7 @@ def _add_fetch(commands: Commands) -> None:
     parser.add_argument(
         "--scene", action="store_true", help="the stored scene, too, into DIR/scene: `intrasplat render` reads it"
     )
-    _add_service(parser)
+    add_service(parser)
 
 
 def _add_metadata(parser: argparse.ArgumentParser, help_text: str) -> None:
@@ -119,7 +119,8 @@ def _date(text: str) -> float:
         raise argparse.ArgumentTypeError(f"{text!r} is no date such as 2026-05-04 or 2026-05-04T12:00.") from None
 
 
-def _add_service(parser: argparse.ArgumentParser) -> None:
+def add_service(parser: argparse.ArgumentParser) -> None:
+    """Add --url and --api-key."""
     url = os.environ.get(URL_VARIABLE) or DEFAULT_URL
     parser.add_argument("--url", default=url, help=f"the service (default: {URL_VARIABLE}, or {DEFAULT_URL})")
     parser.add_argument(

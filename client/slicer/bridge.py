@@ -1,0 +1,301 @@
+"""Shows a scene to OpenIGTLink peers: picture, depth, camera and status at one moment and pose, and the surface.
+
+Views are asked for only while a peer is there, one after the other, each of the newest moment and pose. While nothing
+changes, the service is asked every CHECK_S whether the scene is still there; it answers without a picture.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import threading
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.slicer import messages
+from client.slicer.clip import Clip, Surface
+from client.slicer.frames import Camera, Matrix, ras_from_ijk, turned
+from client.slicer.link import Link
+from client.slicer.playback import Playback
+from client.slicer.status import Status
+from contract.wire.errors import InputError, SceneError
+from contract.wire.pose import parse_pose
+from intrasplat_client import (
+    AsyncClient,
+    Forbidden,
+    NotFound,
+    RequestRefused,
+    ServiceFault,
+    ServiceUnavailable,
+    Unauthorized,
+)
+from intrasplat_client.views import Image
+
+SurfaceWhen = Literal["standing", "always", "never"]
+
+CHECK_S = 5.0
+RETRY_S = 1.0
+FAREWELL_S = 3.0
+"""How long the last messages may take."""
+LOOK_S = 0.02
+"""How often a clip that plays is looked at for its next frame."""
+LOOK_AROUND_S = 1.0
+LOOK_AROUND_PX = 64
+"""The median depth and the confidence are measured on a view so wide, when the pose changes and at most so often."""
+GONE = (NotFound, Unauthorized, Forbidden)
+"""What no waiting mends: the scene is deleted, or the key may not see it."""
+AWAY = (ServiceUnavailable, ServiceFault)
+"""What may pass."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the user chose. width: of the picture in pixels; t: stand there instead of playing."""
+
+    scene: str
+    width: int | None = None
+    t: float | None = None
+    depth: bool = False
+    surface: SurfaceWhen = "standing"
+    pose_device: str = messages.POSE
+
+
+@dataclass(frozen=True)
+class _View:
+    """What is asked for: a frame, and world_from_camera; follows: the pose is a peer's."""
+
+    frame: int
+    pose: Matrix
+    follows: bool
+
+    def is_like(self, other: _View | None) -> bool:
+        return other is not None and self.frame == other.frame and self.has_pose_of(other)
+
+    def has_pose_of(self, other: _View | None) -> bool:
+        return other is not None and self.follows == other.follows and np.array_equal(self.pose, other.pose)
+
+
+class Bridge:
+    """One scene for all peers of `link`."""
+
+    def __init__(self, client: AsyncClient, clip: Clip, choice: Choice, status: Status) -> None:
+        self.link = Link(self._hear, self._wake_up)
+        self._client, self._clip, self._choice, self._status = client, clip, choice, status
+        self._camera = clip.camera if choice.width is None else clip.camera.resized(choice.width)
+        self._playback = Playback(clip, choice.t)
+        self._given: Matrix | None = None
+        self._woken, self._moment = asyncio.Event(), asyncio.Event()
+        self._shown: _View | None = None
+        self._image: Image | None = None
+        self._plane_mm = 0.0
+        self._looked_at_s = -math.inf
+
+    async def run(self, end: threading.Event) -> None:
+        """Show the scene until `end` is set.
+
+        Raises:
+            IntrasplatError: the scene is gone, or the key may not see it.
+        """
+        work = [self._show(), self._surfaces(), _until(end)]
+        tasks = [asyncio.create_task(each) for each in work]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        errors = [error for task in done if (error := task.exception()) is not None]
+        await self._farewell(errors[0] if errors else None)
+        if errors:
+            raise errors[0]
+
+    def _hear(self, heard: messages.Heard) -> None:
+        """A peer's pose or command."""
+        if heard.device == self._choice.pose_device and heard.matrix is not None:
+            try:
+                self._given = _checked(turned(heard.matrix))
+                self._status.refused = ""
+            except InputError as error:
+                self._status.refused = f"The pose from {heard.device} is refused: {error.problem}"
+                self._tell()
+        elif heard.device == messages.COMMAND and heard.text is not None:
+            self._obey(heard.text)
+        self._wake_up()
+
+    def _obey(self, command: str) -> None:
+        words = command.strip().lower()
+        self._status.refused = ""
+        if words == "play":
+            self._playback.play()
+        elif words == "pause":
+            self._playback.pause()
+        elif words == "endoscope":
+            self._given = None
+        elif (t := _time_of(words)) is not None:
+            self._playback.stand_at(t)
+        else:
+            self._status.refused = f"{words[:40]!r} is no command. Send play, pause, t=0.4 or endoscope."
+        self._tell()
+
+    def _wake_up(self) -> None:
+        self._woken.set()
+
+    def _tell(self) -> None:
+        self.link.send(messages.STATUS, messages.text(messages.STATUS, self._status.words()))
+
+    def _wanted(self) -> _View:
+        frame = self._playback.frame
+        follows = self._given is not None
+        return _View(frame, self._clip.path[frame] if self._given is None else self._given, follows)
+
+    async def _show(self) -> None:
+        """Pictures, one after the other."""
+        while True:
+            wanted = await self._next_view()
+            try:
+                await self._show_view(wanted)
+            except AWAY as error:
+                self._status.trouble = str(error)
+                self._tell()
+                await asyncio.sleep(RETRY_S)
+
+    async def _next_view(self) -> _View:
+        """The view that is wanted, once a peer is there and it is a new one; or the one that is shown, to check it."""
+        since_s = time.monotonic()
+        while True:
+            self._woken.clear()
+            wanted = self._wanted()
+            if self.link.has_peers and not wanted.is_like(self._shown):
+                return wanted
+            if self._shown is not None and time.monotonic() - since_s > CHECK_S:
+                return self._shown
+            with contextlib.suppress(TimeoutError):
+                plays = self.link.has_peers and self._playback.plays
+                await asyncio.wait_for(self._woken.wait(), LOOK_S if plays else CHECK_S)
+
+    async def _show_view(self, wanted: _View) -> None:
+        """Render a view and send it with what belongs to it; nothing if it is the one that was sent."""
+        known = self._image if wanted.is_like(self._shown) else None
+        image = await self._render(wanted, "rgb", self._camera, known)
+        if image is not known:
+            if not wanted.has_pose_of(self._shown) or time.monotonic() - self._looked_at_s > LOOK_AROUND_S:
+                await self._look_around(wanted)
+            place = ras_from_ijk(self._camera, wanted.pose, self._plane_mm)
+            depth = await self._render(wanted, "depth", self._camera) if self._choice.depth else None
+            await self._send(messages.PICTURE, image.array(), place)
+            if depth is not None:
+                await self._send(messages.DEPTH, depth.array(), place)
+            self.link.send(messages.CAMERA, messages.transform(messages.CAMERA, turned(wanted.pose)))
+            self._image, self._shown = image, wanted
+        self._status.show(image, wanted.frame, follows=wanted.follows, plays=self._playback.plays)
+        self._tell()
+        self._moment.set()
+
+    async def _look_around(self, view: _View) -> None:
+        """Measure where the picture is shown, the median depth of what is seen, and how far it can be trusted."""
+        camera = self._camera.resized(min(LOOK_AROUND_PX, self._camera.width))
+        depth_mm = (await self._render(view, "depth", camera)).array()
+        confidence = (await self._render(view, "confidence", camera)).array()
+        seen = depth_mm > 0
+        if seen.any():
+            self._plane_mm = float(np.median(depth_mm[seen]))
+        elif not self._plane_mm:
+            raise InputError("t", "nothing of the scene is seen from here.", "Choose another time with --t.")
+        self._status.confidence = float(confidence[seen].mean()) if seen.any() else None
+        self._looked_at_s = time.monotonic()
+
+    async def _render(self, view: _View, layer: str, camera: Camera, known: Image | None = None) -> Image:
+        return await self._client.render(
+            self._clip.t_of(view.frame),
+            scene=self._choice.scene,
+            pose=_text_of(view.pose),
+            layer=layer,
+            format="npy",
+            known=known,
+            **camera.model_dump(),
+        )
+
+    async def _send(self, device: str, values: NDArray[np.generic], place: Matrix) -> None:
+        self.link.send(device, await asyncio.to_thread(messages.image, device, values, place))
+
+    async def _surfaces(self) -> None:
+        """Surfaces, one after the other: of the moment that stands, or also of those that play."""
+        sent: int | None = None
+        while self._choice.surface != "never":
+            await self._moment.wait()
+            self._moment.clear()
+            shown = self._shown
+            if shown is None or shown.frame == sent:
+                continue
+            if self._playback.plays and self._choice.surface == "standing" and sent is not None:
+                continue
+            try:
+                await self._send_surface(shown.frame)
+            except AWAY as error:
+                self._status.surface = f"There is no new surface yet: {error}"
+                self._tell()
+                await asyncio.sleep(RETRY_S)
+            else:
+                sent = shown.frame
+        await asyncio.Event().wait()
+
+    async def _send_surface(self, frame: int) -> None:
+        """Send a frame's surface, or say why there is none."""
+        try:
+            content = await self._client.export(self._choice.scene, self._clip.t_of(frame), format="mesh-ply")
+            surface = await asyncio.to_thread(Surface.of_ply, content)
+        except GONE:
+            raise
+        except (RequestRefused, SceneError) as error:
+            self._status.surface = f"There is no surface of frame {frame}: {error}"
+        else:
+            self.link.send(messages.SURFACE, await asyncio.to_thread(messages.surface, messages.SURFACE, surface))
+            self._status.surface = f"The surface is that of frame {frame}."
+        self._tell()
+
+    async def _farewell(self, error: BaseException | None) -> None:
+        """Tell peers why nothing more comes; the picture of a scene that they may not see any more turns black."""
+        self._status.ended = "The bridge was ended." if error is None else str(error)
+        if isinstance(error, GONE) and self._shown is not None:
+            place = ras_from_ijk(self._camera, self._shown.pose, self._plane_mm)
+            size = (self._camera.height, self._camera.width)
+            await self._send(messages.PICTURE, np.zeros((*size, 3), np.uint8), place)
+            if self._choice.depth:
+                await self._send(messages.DEPTH, np.zeros(size, np.float32), place)
+        self._tell()
+        await self.link.flush(FAREWELL_S)
+
+
+def _checked(pose: Matrix) -> Matrix:
+    """The pose, if the service accepts it.
+
+    Raises:
+        InputError: it is not rigid, not finite or too far away.
+    """
+    parse_pose(_text_of(pose))
+    return pose
+
+
+def _text_of(pose: Matrix) -> str:
+    """As the API has it: 12 numbers, row-major world_from_camera in mm."""
+    return ",".join(repr(float(each)) for each in pose[:3].ravel())
+
+
+def _time_of(words: str) -> float | None:
+    """0.4 of t=0.4."""
+    name, _, value = words.partition("=")
+    try:
+        t = float(value)
+    except ValueError:
+        return None
+    return t if name.strip() == "t" and math.isfinite(t) else None
+
+
+async def _until(end: threading.Event) -> None:
+    while not end.is_set():
+        await asyncio.sleep(0.1)

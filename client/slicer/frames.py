@@ -1,0 +1,69 @@
+"""Our frames in Slicer's: where points, cameras and pictures of a scene lie in RAS, mm.
+
+Our world, and every camera, has OpenCV's axes (x right, y down, z forward). They are taken for LPS axes (x to the left,
+y to the posterior, z to the superior), so RAS is (-x, -y, z), as it is of the files that Slicer reads as LPS.
+
+Symbols: H W pixels (row i, column j), D depth of the plane on which a picture is shown (mm).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+Matrix = NDArray[np.float64]
+
+RAS_FROM_WORLD: Matrix = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""A half turn about z, and its own inverse."""
+
+SLICE_MM = 1.0
+"""Thickness of a picture, which is a volume of one slice."""
+
+
+class Camera(BaseModel):
+    """Intrinsics in pixels; pixel (i, j) is centred at (j + 0.5, i + 0.5)."""
+
+    model_config = ConfigDict(frozen=True)
+
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+
+    def resized(self, width: int) -> Camera:
+        """The same view, `width` pixels wide."""
+        height = max(1, round(self.height * width / self.width))
+        across, down = width / self.width, height / self.height
+        return Camera(
+            width=width, height=height, fx=self.fx * across, fy=self.fy * down, cx=self.cx * across, cy=self.cy * down
+        )
+
+
+def turned(pose: Matrix) -> Matrix:
+    """A rigid motion [4, 4] of ours as Slicer has it, and one of Slicer's as we have it."""
+    return RAS_FROM_WORLD @ pose @ RAS_FROM_WORLD
+
+
+def points_in_ras(points_mm: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Points [N, 3] of our world in RAS."""
+    return points_mm * RAS_FROM_WORLD.diagonal()[:3].astype(np.float32)
+
+
+def ras_from_ijk(camera: Camera, world_from_camera: Matrix, depth_mm: float) -> Matrix:
+    """Where the pixels of a picture lie in RAS: on the plane z = D of its camera, each on the ray that it shows.
+
+    [4, 4] takes (column j, row i, 0, 1), the centre of a pixel, to mm. Rows run down, as they do in the picture.
+    """
+    across_mm, down_mm = depth_mm / camera.fx, depth_mm / camera.fy
+    camera_from_ijk = np.array(
+        [
+            [across_mm, 0.0, 0.0, (0.5 - camera.cx) * across_mm],
+            [0.0, down_mm, 0.0, (0.5 - camera.cy) * down_mm],
+            [0.0, 0.0, SLICE_MM, depth_mm],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+    return np.asarray(RAS_FROM_WORLD @ world_from_camera @ camera_from_ijk, np.float64)
