@@ -55,7 +55,8 @@ async def get_file(
     request: Request,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """A stored file: manifest.json, or one of those that it lists, such as scene.safetensors. Answers Range.
+    """A stored file: manifest.json, or one of those that it lists, such as scene.safetensors or recorded.zip. Answers
+    Range.
 
     The ETag is the SHA-256 of the file.
     """
@@ -90,7 +91,8 @@ def _file_of(folder: Path, name: str) -> StoredFile | None:
         content = manifest.read_bytes()
         if name == MANIFEST:
             return StoredFile(manifest, hashlib.sha256(content).hexdigest())
-        listed: dict[str, Any] = json.loads(content)["files"]
+        told = json.loads(content)
+        listed: dict[str, Any] = told["files"] | told.get("beside", {})
         if name not in listed or name != Path(name).name:
             return None
         return StoredFile(folder / name, str(listed[name]["sha256"]))

@@ -15,7 +15,6 @@ from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.names import CURVE, MASKS
 from contract.wire.notices import NoticeCode, Severity
-from contract.wire.rendering import RecordedRequest
 from contract.wire.report import Report
 from service.access import Caller
 from service.bodies import BINARY, TEXT
@@ -23,7 +22,7 @@ from service.deps import AnyCaller, Deps, Services, no_such_scene, owned_scene
 from service.listing import PAGED, SceneQuery, tell_next
 from service.problems import Problem
 from service.purge import Receipt
-from service.renders import ModelTime, find_shown, image_response
+from service.renders import find_shown, image_response
 from service.reuse import others_with_clip
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
@@ -109,24 +108,6 @@ async def get_masks(scene_id: str, services: Services, caller: AnyCaller) -> Fil
         raise Problem(404, detail, field="scene_id", remedy=f"See masks in GET /scenes/{scene_id}.")
     await run_in_threadpool(services.audit.record, AuditAction.EXPORTED, caller, scene_id)
     return FileResponse(folder / MASKS, media_type="application/zip", filename=f"{scene_id}-masks.zip")
-
-
-@router.get(
-    "/{scene_id}/recorded",
-    operation_id="get_recorded",
-    response_class=Response,
-    responses={200: {"description": "the frame", "content": {"image/jpeg": BINARY}}},
-)
-async def get_recorded(scene_id: str, services: Services, caller: AnyCaller, t: ModelTime = 0.0) -> Response:
-    """The recorded frame nearest to t, with the masked parts marked; also while the job trains.
-
-    A finished scene keeps some frames if its masks were found, and none otherwise. X-Intrasplat-T is the frame's time.
-    """
-    shown = await find_shown(services, caller, scene_id)
-    request = RecordedRequest(scene_id=scene_id, attempt=shown.attempt, t=t)
-    response = image_response(scene_id, await services.renderer.ask(request))
-    response.headers["Cache-Control"] = "no-store"
-    return response
 
 
 @router.get("/{scene_id}/cameras", operation_id="get_cameras", response_model=SceneCameras)

@@ -14,12 +14,11 @@ from pathlib import Path
 
 import torch
 
-from contract.store.durable import FOR_ALL, replace_file
 from contract.store.results import add_scores, without_scores
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged
 from contract.wire.names import CURVE, MASKS, RECORDED, REPORT
 from contract.wire.notices import Notice
-from contract.wire.report import Report
+from contract.wire.report import Recorded, Report
 from worker.input.clip import DepthClip, FrameSplit, split_frames, training_frames
 from worker.input.clip.sampling import most_frames, sampled
 from worker.instruments import zipped_masks
@@ -33,7 +32,7 @@ from worker.outcome import scene_of, snapshot_of, training_of
 from worker.poses import placed, with_poses
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
 from worker.raster.cpu import compile_kernels
-from worker.render.recorded import marked_frames
+from worker.render.recorded import EYES, kept_frames
 from worker.render.view import SceneRenderer
 from worker.report.doubts import clip_warnings
 from worker.report.judge import judged
@@ -71,7 +70,8 @@ class Made:
 
 
 def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Report:
-    """Clip in; manifest.json, scene.safetensors, report.json and curve.csv out. If masks were found, masks.zip, too.
+    """Clip in; manifest.json, scene.safetensors, report.json and curve.csv out. Beside them recorded.zip, unless the
+    options say no, and masks.zip if masks were found.
 
     A run that is stopped or killed leaves in out_dir what the same request on the same folder goes on from.
 
@@ -107,10 +107,11 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
         optimise(run, keeper)
         with ThreadPoolExecutor(1) as aside:
             doubts = aside.submit(clip_warnings, setup.clip, setup.split.train)
-            files = {MASKS: aside.submit(zipped_masks, setup.clip), RECORDED: aside.submit(marked_frames, setup.clip)}
+            masks, recorded = aside.submit(zipped_masks, setup.clip), aside.submit(recorded_frames, run)
             scene, quantized = finish(run)
-        of_masks = {name: each.result() for name, each in files.items()}
-        report = publish(out_dir, run, scene, quantized, doubts.result(), of_masks)
+        frames, told = recorded.result()
+        beside = {name: each for name, each in {MASKS: masks.result(), RECORDED: frames}.items() if each is not None}
+        report = publish(out_dir, run, scene, quantized, doubts.result(), beside, told)
     return Made(setup.clip, setup.split, scene, report, setup.device)
 
 
@@ -243,22 +244,29 @@ def finish(run: Run) -> tuple[Scene, QuantizedScene | None]:
     return quantized.scene, quantized
 
 
+def recorded_frames(run: Run) -> tuple[bytes | None, Recorded | None]:
+    """The zip of recorded frames of the eyes that taught, and what the report says of it; nothing where that is off."""
+    if run.setup.options.keep_recorded == "off":
+        return None, None
+    with run.setup.timings.measure("recorded_s"):
+        return kept_frames(run.setup.clip, EYES[: len(run.eyes)])
+
+
 def publish(
     out_dir: Path,
     run: Run,
     scene: Scene,
     quantized: QuantizedScene | None,
     doubts: Sequence[Notice],
-    of_masks: Mapping[str, bytes | None],
+    beside: Mapping[str, bytes],
+    recorded: Recorded | None,
 ) -> Report:
-    """Write the report, the curve, files of the masks that were found and the scene. The report has no scores yet."""
+    """Write the report, the curve, and the scene with the files beside it. The report has no scores yet."""
     setup = run.setup
     setup.timings.seconds["t_post_s"] = time.time() - setup.accepted_at_s
     report = first_report(setup.clip, setup.split, training_of(run, scene, quantized), doubts)
+    report = report.model_copy(update={"recorded": recorded})
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)
-    for name, content in of_masks.items():
-        if content is not None:
-            replace_file(out_dir / name, content, FOR_ALL)
-    save_scene(out_dir, scene)
+    save_scene(out_dir, scene, beside)
     return report

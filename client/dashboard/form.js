@@ -8,7 +8,9 @@ import { Upload } from "./upload.js";
 import { LIMITS } from "./wire.js";
 
 const PARTS = ["clip", "right", "calibration", "masks"];
-const OPTIONS = ["preset", "budget_s", "layout", "eyes", "poses", "priority", "mask_source", "mask_polarity"];
+const OPTIONS = [
+  ...["preset", "budget_s", "layout", "eyes", "poses", "priority", "mask_source", "mask_polarity", "keep_recorded"],
+];
 const LABELS = {
   preset: {
     instant: "instant: a scene within seconds",
@@ -39,6 +41,7 @@ const LABELS = {
     stereomis: "StereoMIS",
   },
   eyes: { both: "both eyes", left: "the left eye; the right one judges" },
+  keep_recorded: { on: "kept, to compare the model with", off: "not kept" },
   priority: { standard: "standard", high: "high: before all others" },
 };
 const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;

@@ -63,6 +63,7 @@
  *   iterations?: number | null,
  *   budget_s?: number | null,
  *   seed?: number,
+ *   keep_recorded?: "on"|"off",
  *   priority?: "standard"|"high",
  *   retention_hours?: number | null,
  * }} JobOptions
@@ -112,6 +113,16 @@
 /** @typedef {"baseline"|"calibration"|"decoding"|"depth_unit"|"frame_times"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"poses"|"rectification"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"few_frames"|"field_of_view_unusual"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"masks_unsure"|"mask_gaps"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
 /**
  * @typedef {{
+ *   frames: number[],
+ *   eyes: "left"|"right"[],
+ *   width: number,
+ *   height: number,
+ *   masks: boolean,
+ *   size_bytes: number,
+ * }} Recorded
+ */
+/**
+ * @typedef {{
  *   report_version?: number,
  *   notice?: string,
  *   versions?: Record<string, string>,
@@ -135,6 +146,7 @@
  *   right_eye?: RightEye | null,
  *   masks?: Masks | null,
  *   poses?: CameraPoses | null,
+ *   recorded?: Recorded | null,
  *   measurements?: Record<string, number>,
  *   preset: string,
  *   eyes?: "left"|"both" | null,
@@ -203,6 +215,7 @@ export const LIMITS = {
   iterations: {"default": null, "min": 1, "max": 1000000},
   budget_s: {"default": null, "above": 0, "max": 7200},
   seed: {"default": 0, "min": 0, "below": 2147483648},
+  keep_recorded: {"default": "on", "choices": ["on", "off"]},
   priority: {"default": "standard", "choices": ["standard", "high"]},
   retention_hours: {"default": null, "above": 0, "max": 87600},
 };

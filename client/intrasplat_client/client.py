@@ -243,9 +243,12 @@ class Client:
         """A small JPEG of a finished scene's first moment."""
         return run(self._core.thumbnail(scene))
 
-    def recorded(self, scene: str, t: float = 0.0) -> bytes:
-        """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains."""
-        return run(self._core.recorded(scene, t))
+    def recorded(self, scene: str, t: float = 0.0, eye: str = "left", masks: str = "marked") -> bytes:
+        """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains.
+
+        `masks="off"` marks nothing; `masks="only"` is the mask, a PNG. `report(scene).recorded` lists the frames.
+        """
+        return run(self._core.recorded(scene, t, eye, masks))
 
     def cameras(self, scene: str) -> SceneCameras:
         """Where the endoscope was, frame by frame, and its lens; also while the job trains."""

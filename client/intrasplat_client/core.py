@@ -224,9 +224,12 @@ class Core:
         """A small JPEG of a finished scene's first moment."""
         return (await self._get("scenes", scene, "thumbnail")).content
 
-    async def recorded(self, scene: str, t: float = 0.0) -> bytes:
-        """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains."""
-        return (await self._get("scenes", scene, "recorded", t=t)).content
+    async def recorded(self, scene: str, t: float = 0.0, eye: str = "left", masks: str = "marked") -> bytes:
+        """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains.
+
+        `masks="off"` marks nothing; `masks="only"` is the mask, a PNG. `report(scene).recorded` lists the frames.
+        """
+        return (await self._get("scenes", scene, "recorded", t=t, eye=eye, masks=masks)).content
 
     async def cameras(self, scene: str) -> SceneCameras:
         """Where the endoscope was, frame by frame, and its lens; also while the job trains."""

@@ -234,6 +234,8 @@ class JobOptions(Model):
     """about how many seconds to train, often less; not with iterations"""
     seed: int = 0
     """seed of all random numbers"""
+    keep_recorded: str = "on"
+    """whether recorded frames and their masks are kept with the scene, to compare the model with"""
     priority: str = "standard"
     """high: before standard jobs, and in place of a running one"""
     retention_hours: float | None = None
@@ -296,6 +298,23 @@ class Notice(Model):
     text: str
 
 
+class Recorded(Model):
+    """Which recorded frames a scene keeps, as its cameras see them: rectified, with corrected colours."""
+
+    frames: tuple[int, ...]
+    """the clip's frames that are kept, rising"""
+    eyes: tuple[str, ...]
+    """of which they are kept"""
+    width: int
+    """of a picture, in pixels"""
+    height: int
+    """the same"""
+    masks: bool
+    """whether masks are kept with them; False: every pixel counts as tissue"""
+    size_bytes: int
+    """what they take on the disk"""
+
+
 class Report(Model):
     """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why;
     or while `scored` is False: a scene is finished before its scores are.
@@ -345,6 +364,8 @@ class Report(Model):
     """of instruments; None: a report of version 0.2"""
     poses: CameraPoses | None = None
     """of the endoscope; None: a report of version 0.2"""
+    recorded: Recorded | None = None
+    """recorded frames kept with the scene; None: keep_recorded was off, or version 0.2"""
     measurements: dict[str, float] = Field(default={})
     """measured on the input, such as misalignment in px"""
     preset: str
@@ -484,6 +505,8 @@ class GivenOptions(TypedDict, total=False):
     """about how many seconds to train, often less; not with iterations"""
     seed: Annotated[int, Field(lt=2147483648, ge=0)]
     """seed of all random numbers"""
+    keep_recorded: Literal["on", "off"]
+    """whether recorded frames and their masks are kept with the scene, to compare the model with"""
     priority: Literal["standard", "high"]
     """high: before standard jobs, and in place of a running one"""
     retention_hours: Annotated[float, Field(gt=0, le=87600)] | None

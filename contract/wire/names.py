@@ -35,6 +35,12 @@ auto takes the clip's; without any it looks whether the camera is fixed, and est
 Eyes = Literal["left", "both"]
 """The eyes of a stereo clip that a model is trained on."""
 
+Eye = Literal["left", "right"]
+"""One of them."""
+
+Keep = Literal["on", "off"]
+"""Whether something is kept with a scene."""
+
 UsedFrames = Literal["new", "all"]
 """The frames of a clip that a model may be trained on."""
 
@@ -54,7 +60,7 @@ CURVE = "curve.csv"
 MASKS = "masks.zip"
 """The masks that were found, if any were: a PNG a frame, as `masks` of a clip are given."""
 RECORDED = "recorded.zip"
-"""Some recorded frames with the masked parts marked, if masks were found."""
+"""Recorded frames and their masks, unless the caller wanted none (contract/store/recorded.py)."""
 THUMBNAIL = "thumbnail.jpg"
 """A small picture for lists, once somebody has asked for it."""
 RESUME = "resume.safetensors"

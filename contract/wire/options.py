@@ -14,7 +14,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from pydantic_core.core_schema import ValidationInfo
 
 from contract.wire.errors import InputError
-from contract.wire.names import Eyes, Layout, MaskPolarity, MaskSource, PoseConvention, Poses, PresetName, UsedFrames
+from contract.wire.names import (
+    Eyes,
+    Keep,
+    Layout,
+    MaskPolarity,
+    MaskSource,
+    PoseConvention,
+    Poses,
+    PresetName,
+    UsedFrames,
+)
 
 Priority = Literal["standard", "high"]
 """high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
@@ -84,6 +94,10 @@ class ReconstructionOptions(ClipOptions):
         default=None, gt=0, le=7200, description="about how many seconds to train, often less; not with iterations"
     )
     seed: int = Field(default=0, ge=0, lt=2**31, description="seed of all random numbers")
+    keep_recorded: Keep = Field(
+        default="on",
+        description="whether recorded frames and their masks are kept with the scene, to compare the model with",
+    )
 
     @field_validator("holdout", mode="before")
     @classmethod

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from contract.wire.cameras import CamerasRequest
 from contract.wire.exports import ExportOptions
 from contract.wire.job import JOB_ID_PATTERN
+from contract.wire.names import Eye
 from contract.wire.notices import Notice
 from contract.wire.pose import MatrixPose, OrbitPose
 
@@ -149,8 +150,16 @@ class ExportRequest(BaseModel):
     part: int = Field(default=0, ge=0)
 
 
+class RecordedMasks(StrEnum):
+    """What a recorded frame shows of its mask: the masked parts marked, nothing, or the mask alone."""
+
+    MARKED = "marked"
+    OFF = "off"
+    ONLY = "only"
+
+
 class RecordedRequest(BaseModel):
-    """The recorded frame nearest to time t, as JPEG, with the masked parts marked; attempt as in RenderRequest."""
+    """The recorded frame nearest to time t, as JPEG, or its mask as PNG; attempt as in RenderRequest."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -158,6 +167,8 @@ class RecordedRequest(BaseModel):
     scene_id: str = Field(pattern=JOB_ID_PATTERN)
     attempt: int | None = None
     t: float = Field(ge=0, le=1e6)
+    eye: Eye = "left"
+    masks: RecordedMasks = RecordedMasks.MARKED
 
 
 class CancelRequest(BaseModel):

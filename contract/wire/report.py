@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
-from contract.wire.names import Eyes
+from contract.wire.names import Eye, Eyes
 from contract.wire.notices import Notice, NoticeCode, Severity
 
 REPORT_VERSION = 2
@@ -130,6 +130,19 @@ class CameraPoses(BaseModel):
     unsure_frames: tuple[int, ...] = Field(default=(), description="frames whose pose is not to be relied on")
 
 
+class Recorded(BaseModel):
+    """Which recorded frames a scene keeps, as its cameras see them: rectified, with corrected colours."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    frames: tuple[int, ...] = Field(min_length=1, description="the clip's frames that are kept, rising")
+    eyes: tuple[Eye, ...] = Field(min_length=1, description="of which they are kept")
+    width: int = Field(gt=0, description="of a picture, in pixels")
+    height: int = Field(gt=0, description="the same")
+    masks: bool = Field(description="whether masks are kept with them; False: every pixel counts as tissue")
+    size_bytes: int = Field(ge=0, description="what they take on the disk")
+
+
 class Report(BaseModel):
     """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why; or
     while `scored` is False: a scene is finished before its scores are.
@@ -175,6 +188,9 @@ class Report(BaseModel):
     )
     masks: Masks | None = Field(default=None, description="of instruments; None: a report of version 0.2")
     poses: CameraPoses | None = Field(default=None, description="of the endoscope; None: a report of version 0.2")
+    recorded: Recorded | None = Field(
+        default=None, description="recorded frames kept with the scene; None: keep_recorded was off, or version 0.2"
+    )
     measurements: dict[str, float] = Field(default={}, description="measured on the input, such as misalignment in px")
 
     preset: str

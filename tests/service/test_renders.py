@@ -18,7 +18,7 @@ from contract.queue.memory import MemoryQueue
 from contract.wire.cameras import CamerasRequest, SceneCameras
 from contract.wire.job import JobRecord
 from contract.wire.names import MANIFEST, MASKS, REPORT
-from contract.wire.rendering import RecordedRequest, RenderRequest, WorkerAddress, WorkerReply
+from contract.wire.rendering import RenderRequest, WorkerAddress, WorkerReply
 from contract.wire.report import Report
 from tests.cameras import CAMERAS
 from tests.reports import REPORT_OF_A_SCENE
@@ -309,20 +309,6 @@ def test_found_masks_are_there_until_the_scene_is_deleted(service: ServiceUnderT
     assert service.http.get(f"/scenes/{scene}/masks", headers=stranger).status_code == 404
     assert service.http.delete(f"/scenes/{scene}").status_code == 200
     assert service.http.get(f"/scenes/{scene}/masks").status_code == 404
-
-
-@pytest.mark.parametrize("state", ["running", "done"])
-def test_recorded_frames_are_shown_while_a_job_trains_and_of_its_scene(service: ServiceUnderTest, state: str) -> None:
-    job_id = service.running_job() if state == "running" else service.finished_scene()
-    frame = service.http.get(f"/scenes/{job_id}/recorded", params={"t": 0.3})
-    assert (frame.status_code, frame.content) == (200, b"jpeg"), frame.text
-    assert frame.headers["content-type"] == "image/jpeg"
-    assert frame.headers["cache-control"] == "no-store"
-    assert (frame.headers["x-intrasplat-state"], frame.headers["x-intrasplat-t"]) == (state, "0.25")
-    attempt = None if state == "running" else 1
-    assert service.painter.requests == [RecordedRequest(scene_id=job_id, attempt=attempt, t=0.3)]
-    stranger = bearer(service, "another")
-    assert service.http.get(f"/scenes/{job_id}/recorded", headers=stranger).status_code == 404
 
 
 @pytest.mark.parametrize("state", ["running", "done"])

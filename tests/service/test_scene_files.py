@@ -9,7 +9,7 @@ import pytest
 
 from contract.access.audit import AUDIT_FILE
 from contract.access.keys import KeyScope
-from contract.wire.names import CURVE, MANIFEST, REPORT, SCENE
+from contract.wire.names import CURVE, MANIFEST, RECORDED, REPORT, SCENE
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer
 
 CONTENT = bytes(range(256)) * 40
@@ -25,7 +25,9 @@ def scene(service: ServiceUnderTest) -> str:
     (folder / SCENE).write_bytes(CONTENT)
     (folder / "masks.zip").write_bytes(b"PK")
     listed = {SCENE: {"bytes": len(CONTENT), "sha256": SHA256}, REPORT: {"bytes": 1, "sha256": "ab"}}
-    (folder / MANIFEST).write_text(json.dumps({"files": listed}))
+    beside = {RECORDED: {"bytes": 2, "sha256": hashlib.sha256(b"PK").hexdigest()}}
+    (folder / RECORDED).write_bytes(b"PK")
+    (folder / MANIFEST).write_text(json.dumps({"files": listed, "beside": beside}))
     return scene_id
 
 
@@ -47,7 +49,9 @@ def test_a_scenes_files_come_as_they_are_stored_and_are_recorded(service: Servic
     assert manifest.headers["cache-control"] == "private, no-cache"  # the scores come later
     assert manifest.headers["etag"] == f'"{hashlib.sha256(manifest.content).hexdigest()}"'
     assert [*manifest.json()["files"]] == [SCENE, REPORT]
-    assert downloads(service) == [("downloaded", scene)] * 2
+    recorded = service.http.get(f"/scenes/{scene}/files/{RECORDED}", headers=headers)
+    assert (recorded.status_code, recorded.content) == (200, b"PK")
+    assert downloads(service) == [("downloaded", scene)] * 3
 
 
 def test_a_download_goes_on_where_it_was_cut_off(service: ServiceUnderTest, scene: str) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import hashlib
+import json
 import shutil
 from collections.abc import Callable
 from functools import cache
@@ -16,10 +18,11 @@ import numpy as np
 import pytest
 import torch
 
-from contract.wire.errors import Cancelled, InputError, TrainingDiverged, UnavailableError
-from contract.wire.names import KEPT, RESUME
+from contract.wire.errors import Cancelled, InputError, SceneError, TrainingDiverged, UnavailableError
+from contract.wire.names import KEPT, MANIFEST, RECORDED, REPORT, RESUME
 from contract.wire.notices import NoticeCode
 from contract.wire.options import ReconstructionOptions, parse_options
+from contract.wire.rendering import RecordedMasks
 from contract.wire.report import Masks, Report
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared_on, trained, view
 from worker.input.clip import DepthClip, open_clip, split_frames
@@ -30,6 +33,7 @@ from worker.outcome import scene_of
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
 from worker.pipeline import judge, judge_again, make, reconstruct
 from worker.raster.step import camera_vector
+from worker.render.recorded import stored_frame
 from worker.render.view import render_frame
 from worker.scene.checkpoint import load_scene
 from worker.scene.model import model_of
@@ -40,7 +44,7 @@ from worker.train.rate_distortion import TOLERANCE_DB, round_model
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units
 
-SCENE_FILES = {"manifest.json", "scene.safetensors", "report.json", "curve.csv"}
+SCENE_FILES = {"manifest.json", "scene.safetensors", "report.json", "curve.csv", RECORDED}
 ITERATIONS = 20
 STEREO = PhantomSettings(width=192, height=160, frames=10, period_frames=12)
 Drawn = Callable[..., Path]
@@ -440,8 +444,60 @@ def test_found_masks_are_kept_with_the_scene_as_a_file_to_correct(tmp_path: Path
     drawn = make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=3, period_frames=12)).depth_clip()
     found = dataclasses.replace(drawn, masks=Masks(source="found", share=0.1, sure=0.9))
     shown: list[DepthClip] = []
-    for clip, files in ((found, {*SCENE_FILES, "masks.zip", "recorded.zip"}), (drawn, SCENE_FILES)):
+    for clip, files in ((found, {*SCENE_FILES, "masks.zip"}), (drawn, SCENE_FILES)):
         out = tmp_path / str(len(files))
         reconstruct(request(clip, iterations=2, holdout="none"), out, TrainingHooks(on_clip=shown.append))  # type: ignore[arg-type]
         assert {path.name for path in out.iterdir()} == files
     assert [clip.masks for clip in shown] == [found.masks, drawn.masks]
+
+
+@pytest.mark.parametrize(("eyes", "kept"), [("both", ("left", "right")), ("left", ("left",))])
+def test_recorded_frames_of_the_eyes_that_taught_are_kept_with_the_scene(
+    stereo: Path, tmp_path: Path, eyes: str, kept: tuple[str, ...]
+) -> None:
+    shown: list[DepthClip] = []
+    files_of_clip = {"calibration": stereo / "calibration.json", "masks": stereo / "masks.zip"}
+    given = request(stereo / "stereo.webm", iterations=2, eyes=eyes, **files_of_clip)
+    report = reconstruct(given, tmp_path, TrainingHooks(on_clip=shown.append))  # type: ignore[arg-type]
+    told = report.recorded
+    assert told is not None
+    assert (told.eyes, told.frames, told.masks) == (kept, tuple(range(STEREO.frames)), True)
+    assert told.size_bytes == (tmp_path / RECORDED).stat().st_size
+    assert Report.model_validate_json((tmp_path / REPORT).read_bytes()).recorded == told
+    listed = json.loads((tmp_path / MANIFEST).read_bytes())["beside"][RECORDED]
+    assert listed == {
+        "bytes": told.size_bytes,
+        "sha256": hashlib.sha256((tmp_path / RECORDED).read_bytes()).hexdigest(),
+    }
+    for eye, name in zip(shown[0].eyes, told.eyes, strict=False):
+        for index in (0, 5, 9):
+            off = RecordedMasks.OFF, RecordedMasks.ONLY
+            (_, jpeg), (_, png) = (stored_frame(tmp_path / RECORDED, 10, index / 10, name, each) for each in off)
+            rgb = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+            assert cv2.PSNR(np.ascontiguousarray(rgb), eye.rgb[index]) > 30
+            mask = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+            np.testing.assert_array_equal(mask > 0, ~eye.tissue[index])
+
+
+def test_nothing_of_the_recording_is_kept_where_that_is_off(clip: Path, tmp_path: Path) -> None:
+    report = run(clip, tmp_path, iterations=2, keep_recorded="off")
+    assert report.recorded is None
+    assert files(tmp_path) == SCENE_FILES - {RECORDED}
+    assert json.loads((tmp_path / MANIFEST).read_bytes())["beside"] == {}
+    with pytest.raises(InputError, match="keep_recorded"):
+        request(clip, keep_recorded="perhaps")
+
+
+def test_a_run_that_ends_between_its_recorded_frames_and_its_scene_can_be_made_again(
+    clip: Path, tmp_path: Path
+) -> None:
+    run(clip, tmp_path / "whole", iterations=2)
+    cut = tmp_path / "cut"
+    shutil.copytree(tmp_path / "whole", cut)
+    (cut / MANIFEST).unlink()  # it is written last, so a scene without it is none
+    (cut / RECORDED).write_bytes(b"PK")
+    with pytest.raises(SceneError):
+        load_scene(cut)
+    run(clip, cut, iterations=2)
+    assert (cut / RECORDED).read_bytes() == (tmp_path / "whole" / RECORDED).read_bytes()
+    assert tensor_bits(cut) == tensor_bits(tmp_path / "whole")

@@ -29,6 +29,7 @@ from contract.wire.rendering import (
     IntrinsicsOverride,
     Layer,
     PictureCamera,
+    RecordedMasks,
     RecordedRequest,
     RenderRequest,
     SceneRequest,
@@ -44,7 +45,7 @@ from worker.raster.backend import CPU, Device
 from worker.render.camera import endoscope_pose
 from worker.render.detail import LEVELS, thinned
 from worker.render.encode import FOR_EYES, encode_layer
-from worker.render.recorded import marked_frame, stored_frame
+from worker.render.recorded import live_frame, stored_frame
 from worker.render.view import ROUNDING, Frame, no_pause, render_frame, renderer_of
 from worker.scene.checkpoint import load_scene
 from worker.scene.scene import Scene
@@ -151,19 +152,21 @@ class Views:
             self._snapshot = None
 
     def _recorded(self, request: RecordedRequest) -> Reply:
-        """A recorded frame with the masked parts marked: of the job that trains, or of those that a scene keeps."""
+        """A recorded frame or its mask: of the job that trains, or of those that a scene keeps."""
+        media_type = MEDIA_TYPES[ImageFormat.PNG if request.masks is RecordedMasks.ONLY else ImageFormat.JPEG]
+        wanted = request.t, request.eye, request.masks
         if request.attempt is not None:
             path = self._store.scene_folder(request.scene_id, request.attempt) / RECORDED
             count = self._store.newest_report(request.scene_id, request.attempt).frame_count
-            index, picture = stored_frame(path, request.t, count)
-            return Reply(picture, MEDIA_TYPES[ImageFormat.JPEG], index / count, is_kept=True)
+            index, picture = stored_frame(path, count, *wanted)
+            return Reply(picture, media_type, index / count, is_kept=True)
         clip, snapshot = self._snapshots.clip(request.scene_id), self._snapshots.shown(request.scene_id)
         if clip is None:
             raise NotYetError(f"The clip of job {request.scene_id} is not prepared yet.")
-        index, picture = marked_frame(clip, request.t)
+        index, picture = live_frame(clip, *wanted)
         iteration = 0 if snapshot is None else snapshot.iteration
         shown = index / clip.frame_count
-        return Reply(picture, MEDIA_TYPES[ImageFormat.JPEG], shown, iteration=iteration, is_kept=True)
+        return Reply(picture, media_type, shown, iteration=iteration, is_kept=True)
 
     def _trained(self, job_id: str) -> Snapshot:
         """The newest snapshot; may wait for training, without slowing it."""

@@ -1,6 +1,7 @@
-"""Recorded frames in which the masked parts are marked: what a user judges masks by.
+"""Recorded frames as the model's cameras see them, with their masks: what a user judges model and masks by.
 
-A scene whose masks were found keeps MAX_KEPT of them in one file. Symbols: T frames, h w pixels of a picture.
+A scene keeps at most MAX_KEPT moments of them in one file, which contract/store/recorded.py reads.
+Symbols: h w pixels of a picture.
 """
 
 from __future__ import annotations
@@ -14,72 +15,153 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.wire.errors import SceneError
-from worker.input.clip import DepthClip
+from contract.store.recorded import MASK, PICTURE, name_of, nearest, read_frame
+from contract.wire.errors import InputError, SceneError
+from contract.wire.names import Eye as EyeName
+from contract.wire.rendering import RecordedMasks
+from contract.wire.report import Recorded
+from worker.input.clip import DepthClip, Eye
 from worker.input.clip.split import spread
 from worker.machine.mapped import let_go
 
-MAX_KEPT = 24
-MAX_WIDTH = 400
-"""Px of a picture. 24 of them take some 600 kB."""
-QUALITY = 70
+MAX_KEPT = 120
+"""Moments of a clip."""
+MAX_WIDTH = 720
+"""Px of a picture: a wider frame is made smaller by a whole factor, which takes a third of the time of any other."""
+QUALITY = 60
 MARK, MARK_SHARE = (0, 220, 255), 0.45
 """RGB that no tissue has, and how much of it the masked parts get; their outline gets all of it."""
+AFTER_HEADER = 33
+"""Bytes of a PNG before its second chunk."""
+BLACK_IS_CLEAR = b"\x00\x00\x00\x02tRNS\x00\x00\x76\x93\xcd\x38"
+"""A PNG's chunk by which grey level 0 is transparent."""
+EYES: tuple[EyeName, EyeName] = ("left", "right")
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 
-def marked_frame(clip: DepthClip, t: float) -> tuple[int, bytes]:
-    """The frame nearest to model time t that has masks, and its picture as JPEG."""
-    index = _nearest(clip.used, t, clip.frame_count)
-    return index, _marked(clip, index)
+def kept_frames(clip: DepthClip, eyes: Sequence[EyeName]) -> tuple[bytes, Recorded]:
+    """The zip of a clip's recorded frames, and what the report says of it. The same clip gives the same bytes.
 
-
-def marked_frames(clip: DepthClip) -> bytes | None:
-    """A zip of JPEGs named by their frames, such as 000012.jpg, for stored_frame; None if masks were not found."""
-    if clip.masks is None or not clip.masks.are_found:
-        return None
-    content = io.BytesIO()
+    All frames are kept, or MAX_KEPT that are spread evenly. Where masks were found, frames that nobody looked at have
+    none, and are not kept.
+    """
+    looked_at = clip.used if clip.masks is not None and clip.masks.are_found else range(clip.frame_count)
+    frames = spread(looked_at, MAX_KEPT)
+    content, is_masked, size = io.BytesIO(), False, (0, 0)
+    masks: dict[str, bytes] = {}
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
-        for index in spread(clip.used, MAX_KEPT):
-            archive.writestr(zipfile.ZipInfo(f"{index:06d}.jpg"), _marked(clip, index))
-    return content.getvalue()
+        for name in eyes:
+            for index in frames:
+                rgb, tool = _picture(_eye(clip, name), index)
+                size, is_masked = tool.shape, is_masked or bool(tool.any())
+                archive.writestr(zipfile.ZipInfo(name_of(name, index, PICTURE)), _jpeg(rgb))
+                masks[name_of(name, index, MASK)] = _png(tool)
+        for path, png in masks.items() if is_masked else ():
+            archive.writestr(zipfile.ZipInfo(path), png)
+    height, width = size
+    told = Recorded(
+        frames=tuple(frames),
+        eyes=tuple(eyes),
+        width=width,
+        height=height,
+        masks=is_masked,
+        size_bytes=content.tell(),
+    )
+    return content.getvalue(), told
 
 
-def stored_frame(path: Path, t: float, frame_count: int) -> tuple[int, bytes]:
-    """As marked_frame, of those that marked_frames kept in a file.
+def live_frame(
+    clip: DepthClip, t: float, eye: EyeName = "left", masks: RecordedMasks = RecordedMasks.MARKED
+) -> tuple[int, bytes]:
+    """The frame nearest to model time t that has a mask, as JPEG; or its mask alone, as PNG.
+
+    Raises:
+        InputError: the clip has no such eye.
+    """
+    index = nearest(clip.used, t, clip.frame_count)
+    rgb, tool = _picture(_eye(clip, eye), index)
+    if masks is RecordedMasks.ONLY:
+        return index, _png(tool)
+    return index, _jpeg(_marked(rgb, tool) if masks is RecordedMasks.MARKED else rgb)
+
+
+def stored_frame(
+    path: Path,
+    frame_count: int,
+    t: float,
+    eye: EyeName = "left",
+    masks: RecordedMasks = RecordedMasks.MARKED,
+) -> tuple[int, bytes]:
+    """As live_frame, of those that kept_frames has put into a file.
 
     Raises:
         SceneError: there is no such file, or it is damaged.
+        InputError: it has no such eye, or no masks.
     """
+    if masks is RecordedMasks.ONLY:
+        return read_frame(path, frame_count, t, eye, MASK)
+    index, jpeg = read_frame(path, frame_count, t, eye)
+    if masks is RecordedMasks.OFF:
+        return index, jpeg
     try:
-        with zipfile.ZipFile(path) as archive:
-            names = {int(Path(name).stem): name for name in archive.namelist()}
-            index = _nearest(sorted(names), t, frame_count)
-            return index, archive.read(names[index])
-    except FileNotFoundError:
-        raise SceneError("This scene keeps no recorded frames: its masks were given, or it has none.") from None
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise SceneError(f"The recorded frames of this scene cannot be read ({type(error).__name__}).") from error
+        _, png = read_frame(path, frame_count, t, eye, MASK)
+    except InputError:  # nothing is masked
+        return index, jpeg
+    rgb, tool = _decoded(jpeg, cv2.IMREAD_COLOR)[..., ::-1], _decoded(png, cv2.IMREAD_GRAYSCALE) > 0
+    if rgb.shape[:2] != tool.shape:
+        raise SceneError("A recorded frame of this scene does not fit its mask.")
+    return index, _jpeg(_marked(np.ascontiguousarray(rgb), tool))
 
 
-def _nearest(frames: Sequence[int], t: float, frame_count: int) -> int:
-    wanted = min(t, 1.0) * frame_count
-    return min(frames, key=lambda index: abs(index - wanted))
+def _eye(clip: DepthClip, name: EyeName) -> Eye:
+    try:
+        return clip.eyes[EYES.index(name)]
+    except IndexError:
+        raise InputError("eye", f"this clip has no {name} eye.", "Ask for eye=left.") from None
 
 
-def _marked(clip: DepthClip, index: int) -> bytes:
-    """A frame as JPEG, at most MAX_WIDTH wide."""
-    rgb, tool = clip.rgb[index], (~clip.tissue[index]).view(np.uint8)
+def _picture(eye: Eye, index: int) -> tuple[Picture, Mask]:
+    """A frame [h, w, 3] and where it shows instruments [h, w]."""
+    rgb, tool = eye.rgb[index].copy(), ~eye.tissue[index]
+    let_go(eye.rgb[index])
+    let_go(eye.tissue[index])
     height, width = tool.shape
-    if width > MAX_WIDTH:
-        size = MAX_WIDTH, max(1, round(height * MAX_WIDTH / width))
+    factor = -(-width // MAX_WIDTH)
+    if factor > 1:
+        size = width // factor, max(1, height // factor)
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-        tool = np.asarray(cv2.resize(tool, size, interpolation=cv2.INTER_NEAREST), np.uint8)
-    else:
-        rgb = rgb.copy()
-    let_go(clip.rgb[index])
-    let_go(clip.tissue[index])
+        tool = cv2.resize(tool.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return rgb, tool
+
+
+def _marked(rgb: Picture, tool: Mask) -> Picture:
+    """The picture with the instruments marked; it writes on the given one."""
     mark: NDArray[np.float32] = np.array(MARK, np.float32)
-    masked, outline = tool > 0, cv2.morphologyEx(tool, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
-    rgb[masked] = (1 - MARK_SHARE) * rgb[masked] + MARK_SHARE * mark
+    outline = cv2.morphologyEx(tool.view(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
+    rgb[tool] = (1 - MARK_SHARE) * rgb[tool] + MARK_SHARE * mark
     rgb[outline] = mark
+    return rgb
+
+
+def _jpeg(rgb: Picture) -> bytes:
     return cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+
+
+def _decoded(content: bytes, flags: int) -> Picture:
+    """A picture or a mask from a scene's file.
+
+    Raises:
+        SceneError: it is none.
+    """
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+    if picture is None:
+        raise SceneError("A recorded frame of this scene is damaged.")
+    return np.asarray(picture, np.uint8)
+
+
+def _png(tool: Mask) -> bytes:
+    """255 on instruments, transparent elsewhere, 1 bit a pixel."""
+    png = cv2.imencode(".png", tool.view(np.uint8) * np.uint8(255), [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes()
+    return png[:AFTER_HEADER] + BLACK_IS_CLEAR + png[AFTER_HEADER:]

@@ -2,6 +2,7 @@
 
     directory/
     ├── scene.safetensors   "exact": every tensor, gaussians.*, deformation.*, seen; "compact": those of compact.py
+    ├── ...                 files that rendering does not need, such as recorded.zip
     └── manifest.json       format, camera, poses, times, settings; shape and type of each tensor, SHA-256 of each file
 
 The manifest is written last, so a folder without one holds no scene. docs/scene-file.md describes both files.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +38,10 @@ MISFITS = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError
 """Errors that reading raises where a manifest's entry or a tensor has the wrong shape or type."""
 
 
-def save_scene(directory: Path, scene: Scene) -> None:
+def save_scene(directory: Path, scene: Scene, beside: Mapping[str, bytes] | None = None) -> None:
     """Write the scene into a directory, which is made if need be; a scene that is there is replaced.
+
+    beside: the contents of further files, by name.
 
     Raises:
         SceneError: a number is not finite or out of its range, or the tensors do not belong together. Nothing is
@@ -63,11 +67,19 @@ def save_scene(directory: Path, scene: Scene) -> None:
         "trained_t": list(scene.trained_t),
         "right_eye_mm": scene.right_eye_mm,
         "tensors": {name: {"shape": list(each.shape), "dtype": dtype_name(each)} for name, each in tensors.items()},
-        "files": {SCENE_FILE: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}},
+        "files": {SCENE_FILE: _listed(content)},
+        "beside": {name: _listed(each) for name, each in (beside or {}).items()},
     }
     text = json.dumps(manifest, indent=1, allow_nan=False)
+    for name, each in (beside or {}).items():
+        replace_file(directory / name, each, FOR_ALL)
     replace_file(directory / SCENE_FILE, content, FOR_ALL)
     replace_file(directory / MANIFEST_FILE, text.encode(), FOR_ALL)
+
+
+def _listed(content: bytes) -> dict[str, Any]:
+    """What the manifest says of a file."""
+    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def load_scene(directory: Path) -> Scene:

@@ -16,7 +16,6 @@ from contract.store.shelf import new_job_id
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest, SceneCameras
 from contract.wire.errors import LimitError, SceneError
-from contract.wire.names import RECORDED, REPORT
 from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose
 from contract.wire.rendering import (
@@ -24,21 +23,16 @@ from contract.wire.rendering import (
     ImageFormat,
     IntrinsicsOverride,
     Layer,
-    RecordedRequest,
     RenderRequest,
     Unseen,
 )
-from contract.wire.report import Masks
-from tests.reports import REPORT_OF_A_SCENE
 from tests.worker.exports import export_request, exported
 from worker.daemon.serve import GivenUpError, NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import COPIES, Views, camera_of, pose_of, shown_time
 from worker.input.camera import Intrinsics
-from worker.input.clip import DepthClip
 from worker.model.deformation import GaussianFdm
 from worker.model.gaussians import Gaussians
-from worker.render.recorded import marked_frames
 from worker.scene.checkpoint import save_scene
 from worker.scene.scene import Scene
 
@@ -396,50 +390,3 @@ def test_a_picture_of_a_scene_that_is_purged_while_it_is_rendered_is_not_kept(st
     views.answer(large)
     assert views.held == ()
     assert views.cost(large) > 0
-
-
-def test_recorded_frames_are_of_the_job_that_trains_and_of_its_scene(store: Store) -> None:
-    job_id, snapshots = new_job_id(), Snapshots(patience_s=0)
-    clip, views = clip_with_masks(), Views(store, snapshots)
-    live, kept = (RecordedRequest(scene_id=job_id, attempt=attempt, t=0.5) for attempt in (None, 1))
-    snapshots.begin(job_id)
-    with pytest.raises(NotYetError):
-        views.answer(live)
-    snapshots.offer_clip(clip)
-    shown = views.answer(live)
-    assert (shown.t, shown.iteration, shown.media_type) == (0.5, 0, "image/jpeg")
-    work = store.work_folder(job_id, 1)
-    (work / REPORT).write_text(REPORT_OF_A_SCENE.model_copy(update={"frame_count": FRAMES}).model_dump_json())
-    (work / RECORDED).write_bytes(marked_frames(clip) or b"")
-    save_scene(work, scene())
-    store.publish_scene(job_id, 1)
-    assert views.answer(kept) == dataclasses.replace(shown, iteration=None)
-    assert views.held == ()  # no model is loaded for it
-    snapshots.drop(job_id)
-    with pytest.raises(NotYetError):
-        views.answer(live)
-    store.purge(job_id)
-    with pytest.raises(SceneError):
-        views.answer(kept)
-
-
-def test_a_scene_without_found_masks_keeps_no_recorded_frames(store: Store, scene_id: str) -> None:
-    folder = store.scene_folder(scene_id, 1)
-    (folder / REPORT).write_text(REPORT_OF_A_SCENE.model_dump_json())
-    with pytest.raises(SceneError, match="keeps no recorded frames"):
-        Views(store).answer(RecordedRequest(scene_id=scene_id, attempt=1, t=0.0))
-
-
-def clip_with_masks() -> DepthClip:
-    tissue = np.ones((FRAMES, CLIP.height, CLIP.width), np.bool_)
-    tissue[:, :, :20] = False
-    return DepthClip(
-        rgb=np.full((*tissue.shape, 3), 120, np.uint8),
-        tissue=tissue,
-        depth_mm=np.zeros(tissue.shape, np.float32),
-        depth_confidence=np.zeros(tissue.shape, np.uint8),
-        intrinsics=CLIP,
-        world_from_camera=np.tile(np.eye(4), (FRAMES, 1, 1)),
-        frame_times_s=np.arange(FRAMES) / 25,
-        masks=Masks(source="found", share=0.3, sure=0.9),
-    )

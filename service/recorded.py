@@ -1,0 +1,70 @@
+"""GET /scenes/{id}/recorded: recorded frames and their masks, to compare the model with and to judge masks by."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Response
+from starlette.concurrency import run_in_threadpool
+
+from contract.store.recorded import MASK, PICTURE, read_frame
+from contract.wire.names import RECORDED, Eye
+from contract.wire.rendering import MEDIA_TYPES, ImageFormat, RecordedMasks, RecordedRequest, WorkerReply
+from service.bodies import BINARY
+from service.connection import Answer
+from service.deps import AnyCaller, Deps, Services
+from service.renders import ModelTime, find_shown, image_response
+
+router = APIRouter(prefix="/scenes", tags=["scenes"])
+
+OfEye = Annotated[Eye, Query(description="a scene keeps the right eye's frames if both eyes taught it")]
+Masks = Annotated[
+    RecordedMasks,
+    Query(
+        description="marked: JPEG, instruments marked; off: JPEG as recorded; only: PNG, 255 on instruments, else clear"
+    ),
+]
+
+
+@router.get(
+    "/{scene_id}/recorded",
+    operation_id="get_recorded",
+    response_class=Response,
+    responses={200: {"description": "the frame", "content": {"image/jpeg": BINARY, "image/png": BINARY}}},
+)
+async def get_recorded(
+    scene_id: str,
+    services: Services,
+    caller: AnyCaller,
+    t: ModelTime = 0.0,
+    eye: OfEye = "left",
+    masks: Masks = RecordedMasks.MARKED,
+) -> Response:
+    """The recorded frame nearest to t as the model's camera sees it; also while the job trains.
+
+    X-Intrasplat-T is the frame's time. `recorded` of GET /scenes/{id} lists the frames that a finished scene keeps.
+    """
+    shown = await find_shown(services, caller, scene_id)
+    request = RecordedRequest(scene_id=scene_id, attempt=shown.attempt, t=t, eye=eye, masks=masks)
+    if request.attempt is None or request.masks is RecordedMasks.MARKED:
+        answer = await services.renderer.ask(request)
+    else:
+        answer = await run_in_threadpool(_as_stored, services, request, request.attempt)
+    response = image_response(scene_id, answer)
+    response.headers["Cache-Control"] = "no-store"
+    return response
+
+
+def _as_stored(services: Deps, request: RecordedRequest, attempt: int) -> Answer:
+    """A frame or mask of a finished scene as it lies on the disk. No worker is asked: one that trains has little time.
+
+    Raises:
+        SceneError: the scene keeps none, or the file is damaged.
+        InputError: none of this eye, or no masks.
+    """
+    is_mask = request.masks is RecordedMasks.ONLY
+    path = services.store.scene_folder(request.scene_id, attempt) / RECORDED
+    count = services.store.newest_report(request.scene_id, attempt).frame_count
+    index, body = read_frame(path, count, request.t, request.eye, MASK if is_mask else PICTURE)
+    media_type = MEDIA_TYPES[ImageFormat.PNG if is_mask else ImageFormat.JPEG]
+    return Answer(WorkerReply(media_type=media_type, t=index / count), body)
