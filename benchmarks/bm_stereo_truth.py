@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
+from contract.intake.calibration.types import RawCalibration, RawEye, parse_calibration
 from worker.evaluate.rows import commit, machine, read_rows, write_rows
 from worker.fusion import CLEAR_CONFIDENCE
 from worker.input.calibration import RectifiedClip, rectify
-from worker.input.calibration.types import RawCalibration, RawEye, parse_calibration
 from worker.input.camera import Intrinsics
 from worker.input.clip import StereoClip
 from worker.phantom import PhantomSettings, make_phantom

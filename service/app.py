@@ -13,7 +13,20 @@ from fastapi.staticfiles import StaticFiles
 from contract.queue.interface import Queue
 from contract.runtime.settings import LOOPBACK_NAMES, Settings
 from contract.store.store import Store
-from service import exports, jobs, reconstruct, recorded, renders, scene_files, scenes, stream, system, thumbnails, tus
+from service import (
+    check,
+    exports,
+    jobs,
+    reconstruct,
+    recorded,
+    renders,
+    scene_files,
+    scenes,
+    stream,
+    system,
+    thumbnails,
+    tus,
+)
 from service.audit import install_refusal_handler
 from service.deps import Deps
 from service.guard import Guard
@@ -66,7 +79,8 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     app.add_middleware(Measure, metrics=deps.metrics)
     install_handlers(app)
     install_refusal_handler(app, deps.audit)
-    for part in (reconstruct, tus, jobs, renders, stream, scenes, scene_files, recorded, thumbnails, exports, system):
+    scene_parts = (scenes, scene_files, recorded, thumbnails, exports)
+    for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, system):
         app.include_router(part.router)
     if settings.dashboard_dir is not None:
         app.mount("/", StaticFiles(directory=settings.dashboard_dir, html=True), name="dashboard")

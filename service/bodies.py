@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from pydantic.json_schema import models_json_schema
+
+from contract.wire.checks import DescribedClip
 from contract.wire.job import JOB_ID_PATTERN
 from contract.wire.labels import Labels
 from service.upload import CLIP_OF, PARTS, SUFFIXES
@@ -57,6 +60,7 @@ BODIES: dict[str, dict[str, Any]] = {
     "ClipOfUploads": _body(
         "ClipOfUploads", "A clip of finished uploads (POST /uploads)", {part: _of_upload(part) for part in PARTS}
     ),
+    **models_json_schema([(DescribedClip, "validation")], ref_template="#/components/schemas/{model}")[1]["$defs"],
 }
 """Schemas by name. Which parts go together is no part of them, for generators read no conditions."""
 

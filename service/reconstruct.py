@@ -9,7 +9,7 @@ import time
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from io import RawIOBase
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from fastapi import APIRouter, Header, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -46,6 +46,8 @@ MAX_SUBMISSION_BYTES = 128 * 1024
 """The limit of a JSON body."""
 JSON_REMEDY = 'Send ids of finished uploads by part, and options: {"clip": ID, "options": {"budget_s": 20}}.'
 
+Body = TypeVar("Body", bound=BaseModel)
+
 IdempotencyKey = Annotated[
     str | None,
     Header(min_length=1, max_length=200, description="the same key with the same clip and options is the same job"),
@@ -80,7 +82,7 @@ async def reconstruct(
     caller.require(KeyScope.RECONSTRUCT)
     key = None if idempotency_key is None else hashlib.sha256(idempotency_key.encode()).hexdigest()
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() == "application/json":
-        submission = await _read_submission(request, services)
+        submission = await read_json(request, services, Submission, MAX_SUBMISSION_BYTES, JSON_REMEDY)
         record = await run_in_threadpool(_accept_uploads, services, caller, submission, key)
     else:
         record = await _receive_form(request, services, caller, key)
@@ -116,26 +118,26 @@ async def _receive_form(request: Request, services: Deps, caller: Caller, key: s
             await run_in_threadpool(store.discard_incoming, job_id)
 
 
-async def _read_submission(request: Request, services: Deps) -> Submission:
-    """The JSON body.
+async def read_json(request: Request, services: Deps, model: type[Body], max_bytes: int, remedy: str) -> Body:
+    """The JSON body of a request.
 
     Raises:
-        Problem: 400: the body is not JSON. 413: it is larger than MAX_SUBMISSION_BYTES.
+        Problem: 400: the body is not JSON. 413: it is larger than max_bytes.
         InputError: a field is unknown or of the wrong type.
     """
     body = b""
     async for piece in services.intake.body(request):
         body += piece
-        if len(body) > MAX_SUBMISSION_BYTES:
-            raise Problem(413, f"The JSON body is larger than {MAX_SUBMISSION_BYTES} bytes.", remedy=JSON_REMEDY)
+        if len(body) > max_bytes:
+            raise Problem(413, f"The JSON body is larger than {max_bytes} bytes.", remedy=remedy)
     try:
-        return Submission.model_validate_json(body)
+        return model.model_validate_json(body)
     except ValidationError as error:
         first = error.errors()[0]
         if first["type"] == "json_invalid":
-            raise Problem(400, "The body is not JSON.", field="body", remedy=JSON_REMEDY) from None
+            raise Problem(400, "The body is not JSON.", field="body", remedy=remedy) from None
         field = ".".join(str(part) for part in first["loc"]) or "body"
-        raise InputError(field, f"{first['msg']}.", JSON_REMEDY) from None
+        raise InputError(field, f"{first['msg']}.", remedy) from None
 
 
 def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key: str | None) -> JobRecord:
@@ -232,7 +234,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
     """Spool first, then queue: a job exists only for a clip that is on disk."""
     options = parse_options(JobOptions, received.options)
     check_retention(options, services.settings)
-    _check_scopes(options, caller, services.settings)
+    check_scopes(options, caller, services.settings)
     received.check_clip()
     sent = set(received.names)
     clip_of = None
@@ -260,7 +262,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         return _enqueue(services, record)
 
 
-def _check_scopes(options: JobOptions, caller: Caller, settings: Settings) -> None:
+def check_scopes(options: JobOptions, caller: Caller, settings: Settings) -> None:
     """Return if the caller may ask for this priority, and for so long a training; Problem 403 otherwise."""
     if options.priority == "high":
         caller.require(KeyScope.PRIORITY)

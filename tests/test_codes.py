@@ -8,11 +8,13 @@ from collections.abc import Iterator
 import contract.queue.interface
 import contract.store.disk_errors  # noqa: F401
 import worker.daemon.serve  # noqa: F401
+from contract.wire.checks import FindingCode
 from contract.wire.errors import ErrorCode, IntrasplatError
 from contract.wire.notices import NoticeCode
 from tests.test_repository import REPOSITORY
 
-NOTICES, ERRORS = (REPOSITORY / "docs" / "codes.md").read_text(encoding="utf-8").split("## Errors")
+PAGE, ERRORS = (REPOSITORY / "docs" / "codes.md").read_text(encoding="utf-8").split("## Errors")
+NOTICES, FINDINGS = PAGE.split("## Findings")
 SOURCES = [path for room in ("contract", "worker", "service") for path in (REPOSITORY / room).rglob("*.py")]
 
 
@@ -32,6 +34,10 @@ def test_every_code_of_a_notice_is_explained_once_and_no_other() -> None:
 
 def test_every_code_of_an_error_is_explained_once_and_no_other() -> None:
     assert sorted(listed(ERRORS)) == sorted(ErrorCode)
+
+
+def test_every_code_of_a_finding_is_explained_once_and_no_other() -> None:
+    assert sorted(listed(FINDINGS)) == sorted(FindingCode)
 
 
 def test_every_class_of_error_has_a_code_of_its_own() -> None:

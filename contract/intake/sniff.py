@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from contract.intake.limits import MAX_CALIBRATION_BYTES, ClipLimits
 from contract.intake.nesting import nesting
-from contract.intake.video_header import EBML, check_video, is_video
+from contract.intake.video_header import EBML, check_is_video, check_video, is_video
 from contract.intake.zips import UNREADABLE, open_zip
 from contract.wire.errors import InputError, LimitError
 
@@ -41,13 +41,12 @@ def check_file(path: Path, part: str, limits: ClipLimits) -> None:
     if path.stat().st_size == 0:
         raise InputError(part, f"{path.name} is empty (0 bytes).", "Send the file again.")
     if part == "calibration":
-        text = _text_of(path, part)
-        check_calibration_text(text, part, path.name)
-        _check_numbers(text, part, path.name)
+        check_calibration_file(_text_of(path, part), part, path.name)
     elif path.suffix.lower() == ZIP_SUFFIX:
         _check_zip(path, part, limits)
     else:
-        _check_ending(path, part)
+        with path.open("rb") as file:
+            check_head(file.read(_HEAD_BYTES), path.suffix, part, path.name)
         check_video(path, part, path.name, limits)
 
 
@@ -68,6 +67,12 @@ def check_calibration_text(text: str, field: str, label: str) -> None:
     if levels > MAX_NESTING:
         problem = f"{label} is nested {levels} levels deep; the limit is {MAX_NESTING}."
         raise InputError(field, problem, _PLAIN_TEXT_REMEDY)
+
+
+def check_calibration_file(text: str, field: str, label: str) -> None:
+    """InputError for what check_calibration_text() refuses, and for a number that is none or not finite."""
+    check_calibration_text(text, field, label)
+    _check_numbers(text, field, label)
 
 
 def _check_numbers(text: str, field: str, label: str) -> None:
@@ -92,16 +97,18 @@ def _text_of(path: Path, part: str) -> str:
     return text
 
 
-def _check_ending(path: Path, part: str) -> None:
-    """InputError if the file's content and its ending disagree."""
-    with path.open("rb") as file:
-        head = file.read(12)
+def check_head(head: bytes, suffix: str, part: str, label: str) -> None:
+    """InputError if a file is no video, or its first bytes and the ending of its name disagree.
+
+    head: the first 12 bytes or more.
+    """
     found = "a zip" if head.startswith(b"PK") else "a Matroska or WebM file" if head.startswith(EBML) else None
     if found is None and is_video(head):
         found = "an mp4 or mov file"
-    wanted = "a Matroska or WebM file" if path.suffix.lower() in _MATROSKA_SUFFIXES else "an mp4 or mov file"
+    wanted = "a Matroska or WebM file" if suffix.lower() in _MATROSKA_SUFFIXES else "an mp4 or mov file"
     if found is not None and found != wanted:
-        raise InputError(part, f"{path.name} is {found}.", "Give the file the ending of what it is.")
+        raise InputError(part, f"{label} is {found}.", "Give the file the ending of what it is.")
+    check_is_video(head, part, label)
 
 
 def _check_zip(path: Path, part: str, limits: ClipLimits) -> None:

@@ -66,6 +66,12 @@ def is_video(head: bytes) -> bool:
     return head[4:8] in _FIRST_BOXES or head.startswith(EBML)
 
 
+def check_is_video(head: bytes, field: str, label: str) -> None:
+    """InputError if a file with these first bytes is no video."""
+    if not is_video(head):
+        raise InputError(field, f"{label} is not an mp4, mov, mkv or webm file.", REMEDY)
+
+
 def is_matroska(path: Path) -> bool:
     """Whether the file is Matroska or WebM."""
     with path.open("rb") as file:
@@ -80,8 +86,7 @@ def check_video(path: Path, field: str, label: str, limits: ClipLimits) -> Video
         LimitError: by its header it is too large, too long, or has too many frames.
     """
     with path.open("rb") as file:
-        if not is_video(file.read(12)):
-            raise InputError(field, f"{label} is not an mp4, mov, mkv or webm file.", REMEDY)
+        check_is_video(file.read(12), field, label)
         try:
             tracks = video_tracks(file)
         except (ValueError, struct.error) as error:

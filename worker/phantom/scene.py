@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.intake.calibration.types import RectifiedCalibration
 from contract.wire.notices import Notice, NoticeCode
-from worker.input.calibration.types import RectifiedCalibration
 from worker.input.camera import Intrinsics
 from worker.input.clip.types import DepthClip, StereoClip
 from worker.phantom.camera import endoscope_pose, right_eye

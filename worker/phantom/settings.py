@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from contract.intake.calibration.types import RectifiedCalibration
 from contract.wire.errors import InputError
-from worker.input.calibration.types import RectifiedCalibration
 from worker.input.camera import Intrinsics
 
 Motion = Literal["still", "breathing", "pull", "cut"]

@@ -10,11 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from contract.intake.calibration.types import StereoCalibration
 from contract.wire.names import MaskSource
 from contract.wire.options import MAX_DEPTH_MM, MIN_DEPTH_MM, ReconstructionOptions
 from contract.wire.report import Masks
 from worker.input.calibration import rectify
-from worker.input.calibration.types import StereoCalibration
 from worker.input.clip import ClipLimits, DepthClip, StereoClip, training_frames
 from worker.input.clip.sampling import most_frames, sampled
 from worker.input.decode import DecoderKilledError, decode_clip

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from contract.wire.errors import InputError
-from worker.input.calibration import load_calibration, rectify
-from worker.input.calibration.types import (
+from contract.intake.calibration.types import (
     RawCalibration,
     RectifiedCalibration,
     StereoCalibration,
     calibration_schema,
     parse_calibration,
 )
+from contract.wire.errors import InputError
+from worker.input.calibration import load_calibration, rectify
 from worker.input.clip.types import StereoClip
 
 CONVENTIONS = Path(__file__).parents[3] / "docs/conventions.md"
@@ -119,7 +119,7 @@ def test_the_json_schema_names_both_kinds_and_their_units() -> None:
 
 
 def test_the_module_prints_the_schema() -> None:
-    command = [sys.executable, "-m", "worker.input.calibration.types"]
+    command = [sys.executable, "-m", "contract.intake.calibration.types"]
     printed = subprocess.run(command, cwd=CONVENTIONS.parents[1], capture_output=True, text=True, check=True)
     assert json.loads(printed.stdout) == json.loads(json.dumps(calibration_schema()))
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from contract.intake.calibration.types import StereoCalibration, parse_calibration
 from tests.worker.input.test_calibration import HEIGHT, RECTIFIED, WIDTH, clip_of, raw_calibration
 from worker.input.calibration import rectify
-from worker.input.calibration.types import StereoCalibration, parse_calibration
 
 
 @pytest.mark.parametrize("kind", ["rectified", "raw"])

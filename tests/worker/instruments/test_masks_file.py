@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from contract.intake.calibration.types import RawCalibration, RawEye
 from contract.wire.report import Masks
 from worker.input.calibration.rectify import rectify
-from worker.input.calibration.types import RawCalibration, RawEye
 from worker.input.clip import ClipLimits, DepthClip, StereoClip
 from worker.input.clip.kept import load_clip, save_clip
 from worker.input.clip.masks import open_masks, tissue_from_masks

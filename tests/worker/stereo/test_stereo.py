@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from contract.intake.calibration.types import StereoCalibration, parse_calibration
 from contract.wire.errors import Cancelled, InputError
 from contract.wire.options import ClipOptions
 from worker.input.calibration import RectifiedClip, load_calibration, rectify
-from worker.input.calibration.types import StereoCalibration, parse_calibration
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip, StereoClip, held_out_frames, open_clip
 from worker.input.clip.types import PIXELS

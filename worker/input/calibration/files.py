@@ -5,8 +5,6 @@ The format is told by the content, not by the file's name: a service stores uplo
 
 from __future__ import annotations
 
-import configparser
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,22 +12,14 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
+from contract.intake.calibration.check import FIELD
+from contract.intake.calibration.fit import check_centred, fitted
+from contract.intake.calibration.text import FORMATS_REMEDY, checked_calibration, parse_text
+from contract.intake.calibration.types import StereoCalibration
 from contract.intake.limits import MAX_CALIBRATION_BYTES
 from contract.intake.sniff import check_calibration_text
 from contract.wire.errors import InputError
-from worker.input.calibration.check import FIELD, check_calibration
-from worker.input.calibration.types import RectifiedCalibration, StereoCalibration, parse_calibration
-
-MAX_ASPECT_CHANGE = 0.005  # 1348x1080 read as 640x512 is still one scale; a cropped image is not
-MAX_SCALE = 8.0
-"""4K reduced to 480 columns; what is scaled by more, either way, is not this recording's."""
-
-FORMATS_REMEDY = (
-    "Give our JSON (model rectified or raw), an OpenCV YAML or XML with M1 D1 M2 D2 R T, "
-    "or an ini with [StereoLeft] and [StereoRight]."
-)
 
 OPENCV_KEYS = {
     "left_k": "m1 k1 kl kleft cameramatrix1 cameramatrixleft cameramatrixl leftcameramatrix",
@@ -58,22 +48,16 @@ def load_calibration(path: Path | str, *, eye_width: int, eye_height: int) -> St
             the clip's, with an implausible baseline, or with a principal point that does not fit the image.
     """
     text = _read_text(Path(path))
-    value, size_known = _parse(text, eye_width, eye_height)
-    try:
-        calibration = parse_calibration(value)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise InputError(
-            FIELD, f"{where}: {first['msg']} (given {str(first['input'])[:80]}).", FORMATS_REMEDY
-        ) from None
-    check_calibration(calibration)
+    value, size_known = parse_text(text), True
+    if value is None:
+        value, size_known = _parse_opencv(text, eye_width, eye_height)
+    calibration = checked_calibration(value)
     if not size_known:
-        _check_centred(calibration)
+        check_centred(calibration)
         return calibration.model_copy(
             update={"assumptions": (f"calibration names no image size: taken as {eye_width}x{eye_height}",)}
         )
-    return _fit(calibration, eye_width, eye_height)
+    return fitted(calibration, eye_width, eye_height)
 
 
 def _read_text(path: Path) -> str:
@@ -88,54 +72,6 @@ def _read_text(path: Path) -> str:
         raise InputError(FIELD, problem, "Name a file that exists and may be read.") from None
     check_calibration_text(text, FIELD, path.name)
     return text
-
-
-def _parse(text: str, eye_width: int, eye_height: int) -> tuple[dict[str, Any], bool]:
-    """The file as a JSON-like value, and whether it names an image size."""
-    start = text.lstrip()
-    if start.startswith("{") and "opencv-matrix" not in text:
-        return _parse_json(text), True
-    if start.lower().startswith("[stereo") or "\n[stereo" in text.lower():
-        return _parse_ini(text), True
-    return _parse_opencv(text, eye_width, eye_height)
-
-
-def _parse_json(text: str) -> dict[str, Any]:
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(FIELD, f"it is not valid JSON: {error}.", FORMATS_REMEDY) from None
-    assert isinstance(value, dict)  # it starts with a brace
-    return value
-
-
-def _parse_ini(text: str) -> dict[str, Any]:
-    """StereoMIS and SCARED: [StereoLeft], [StereoRight] with res, fc, cc, kc; the right one's R and T (mm) count."""
-    parser = configparser.ConfigParser(interpolation=None)
-    try:
-        parser.read_string(text)
-        left, right = parser["StereoLeft"], parser["StereoRight"]
-        value = {
-            "model": "raw",
-            "width": round(float(left["res_x"])),
-            "height": round(float(left["res_y"])),
-            "left": _ini_eye(left),
-            "right": _ini_eye(right),
-            "right_from_left_rotation": [[float(right[f"R_{3 * i + j}"]) for j in range(3)] for i in range(3)],
-            "right_from_left_translation_mm": [float(right[f"T_{i}"]) for i in range(3)],
-        }
-    except (configparser.Error, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(FIELD, f"the ini lacks a number or a section: {error}.", FORMATS_REMEDY) from None
-    if any(left[key] != right[key] for key in ("res_x", "res_y") if key in right):
-        raise InputError(FIELD, "left and right eye differ in res_x or res_y.", "Give eyes of one size.")
-    return value
-
-
-def _ini_eye(section: configparser.SectionProxy) -> dict[str, Any]:
-    names = {"fx_px": "fc_x", "fy_px": "fc_y", "cx_px": "cc_x", "cy_px": "cc_y"}
-    eye: dict[str, Any] = {ours: float(section[theirs]) for ours, theirs in names.items()}
-    coefficients = [float(section.get(f"kc_{i}", "0")) for i in range(8)]
-    return eye | {"distortion": coefficients if any(coefficients[5:]) else coefficients[:5]}
 
 
 def _parse_opencv(text: str, eye_width: int, eye_height: int) -> tuple[dict[str, Any], bool]:
@@ -211,40 +147,3 @@ def _opencv_eye(matrix: NDArray[np.float64], distortion: NDArray[np.float64] | N
     k = matrix.reshape(3, 3)
     eye: dict[str, Any] = {"fx_px": k[0, 0], "fy_px": k[1, 1], "cx_px": k[0, 2], "cy_px": k[1, 2]}
     return eye | {"distortion": [] if distortion is None else distortion.ravel().tolist()}
-
-
-def _check_centred(calibration: StereoCalibration) -> None:
-    """A file without image size fits only if both principal points lie in the middle half of the clip's eye."""
-    if isinstance(calibration, RectifiedCalibration):
-        return
-    for name, eye in (("left", calibration.left), ("right", calibration.right)):
-        if not (0.25 <= eye.cx_px / calibration.width <= 0.75 and 0.25 <= eye.cy_px / calibration.height <= 0.75):
-            raise InputError(
-                FIELD,
-                f"it names no image size, and the {name} principal point ({eye.cx_px:.0f}, {eye.cy_px:.0f}) is not in "
-                f"the middle half of {calibration.width}x{calibration.height} pixels.",
-                "Give the calibration of these frames, or add image_width and image_height to the file.",
-            )
-
-
-def _fit(calibration: StereoCalibration, eye_width: int, eye_height: int) -> StereoCalibration:
-    """Scale to the clip's size; refuse another aspect, which would mean a crop nobody described."""
-    if (calibration.width, calibration.height) == (eye_width, eye_height):
-        return calibration
-    sx, sy = eye_width / calibration.width, eye_height / calibration.height
-    if abs(sx / sy - 1) > MAX_ASPECT_CHANGE:
-        raise InputError(
-            FIELD,
-            f"it is for {calibration.width}x{calibration.height} pixels an eye, the clip has {eye_width}x{eye_height}: "
-            "not one uniform scale.",
-            "Give the calibration of these frames, one eye's width and height, or the frames uncropped.",
-        )
-    if not 1 / MAX_SCALE <= sx <= MAX_SCALE:
-        raise InputError(
-            FIELD,
-            f"it is for {calibration.width}x{calibration.height} pixels an eye, the clip has {eye_width}x{eye_height}: "
-            f"more than {MAX_SCALE:g} times apart.",
-            "Give the calibration of these frames; check its width and height.",
-        )
-    resized = calibration.resized(eye_width, eye_height)
-    return resized.model_copy(update={"scaled_from": (calibration.width, calibration.height)})

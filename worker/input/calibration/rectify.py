@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.intake.calibration.check import FIELD, check_calibration
+from contract.intake.calibration.types import RawCalibration, RawEye, RectifiedCalibration, StereoCalibration
 from contract.wire.errors import InputError
 from contract.wire.notices import Notice, NoticeCode
-from worker.input.calibration.check import FIELD, check_calibration
-from worker.input.calibration.types import RawCalibration, RawEye, RectifiedCalibration, StereoCalibration
 from worker.input.camera import Intrinsics
 from worker.input.clip.types import PairSource, RgbFrame, StereoClip
 from worker.input.recorded import Rectification

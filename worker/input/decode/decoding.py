@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.intake.calibration.check import check_calibration
+from contract.intake.calibration.types import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
 from contract.wire.errors import InputError
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import ClipOptions
 from contract.wire.report import Masks
-from worker.input.calibration import check_calibration
-from worker.input.calibration.types import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
 from worker.input.camera import Intrinsics
 from worker.input.clip import ClipLimits, DepthClip, StereoClip
 from worker.input.clip.files import MAX_FOLDER_DEPTH

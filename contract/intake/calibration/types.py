@@ -2,7 +2,7 @@
 
 Two kinds share the key `model`: "rectified" (rows already match; one focal length, one baseline) and "raw" (both eyes
 with their distortion and the rigid transform between them). Lengths are mm, image lengths are pixels of one eye.
-docs/conventions.md shows one of each; `python -m worker.input.calibration.types` prints their JSON schema.
+docs/conventions.md shows one of each; `python -m contract.intake.calibration.types` prints their JSON schema.
 """
 
 from __future__ import annotations

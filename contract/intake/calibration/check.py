@@ -5,10 +5,10 @@ Symbols: R rotation and T translation (mm) from the left to the right eye, x_rig
 
 from __future__ import annotations
 
-import numpy as np
+import math
 
+from contract.intake.calibration.types import RectifiedCalibration, Row, StereoCalibration
 from contract.wire.errors import InputError
-from worker.input.calibration.types import RectifiedCalibration, StereoCalibration
 
 FIELD = "calibration"
 MIN_BASELINE_MM, MAX_BASELINE_MM = 0.5, 50.0  # da Vinci 4 to 5 mm, rigid 3D laparoscopes up to about 15 mm
@@ -24,16 +24,15 @@ def check_calibration(calibration: StereoCalibration) -> None:
     if isinstance(calibration, RectifiedCalibration):
         _check_baseline(calibration.baseline_mm)
         return
-    rotation = np.array(calibration.right_from_left_rotation)
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+    off, determinant = _off_rigid(calibration.right_from_left_rotation)
+    if off > RIGID_TOLERANCE or determinant < 0:
         raise InputError(
             FIELD,
-            f"R is not a rotation: R R^T differs from 1 by {np.abs(rotation @ rotation.T - np.eye(3)).max():.3g}, "
-            f"its determinant is {np.linalg.det(rotation):.3g}.",
+            f"R is not a rotation: R R^T differs from 1 by {off:.3g}, its determinant is {determinant:.3g}.",
             "Give R as OpenCV's stereoCalibrate returned it, row by row.",
         )
     x, y, z = calibration.right_from_left_translation_mm
-    _check_baseline(float(np.linalg.norm((x, y, z))))
+    _check_baseline(math.hypot(x, y, z))
     if abs(x) <= max(abs(y), abs(z)):
         raise InputError(
             FIELD,
@@ -46,6 +45,14 @@ def check_calibration(calibration: StereoCalibration) -> None:
             f"T = ({x:.3g}, {y:.3g}, {z:.3g}) mm puts the right eye to the left of the left one.",
             "Swap the eyes, or invert R and T: x_right = R x_left + T, as OpenCV's stereoCalibrate means it.",
         )
+
+
+def _off_rigid(rows: tuple[Row, Row, Row]) -> tuple[float, float]:
+    """The largest entry of |R R^T - 1|, and the determinant of R."""
+    products = ((i, j, sum(x * y for x, y in zip(rows[i], rows[j], strict=True))) for i in range(3) for j in range(3))
+    off = max(abs(value - (i == j)) for i, j, value in products)
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    return off, a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
 
 
 def _check_baseline(baseline_mm: float) -> None:

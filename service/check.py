@@ -1,0 +1,192 @@
+"""POST /reconstruct/check: what speaks against a clip, before it is sent. Nothing is kept of it.
+
+The rules are those of POST /reconstruct, and those of the worker that need no decoder. What POST /reconstruct would
+refuse is told as refused; what rests on numbers that the caller has measured, or fails in the worker, is told as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+from fastapi import APIRouter, Request
+from pydantic import BaseModel
+from starlette.concurrency import run_in_threadpool
+
+from contract.access.keys import KeyScope
+from contract.intake.calibration.fit import fitted
+from contract.intake.calibration.text import read_calibration
+from contract.intake.calibration.types import StereoCalibration
+from contract.intake.limits import ClipLimits
+from contract.intake.sniff import ZIP_SUFFIX, check_calibration_file, check_head
+from contract.wire.checks import DescribedClip, DescribedFile, Finding, FindingCode
+from contract.wire.errors import InputError, LimitError
+from contract.wire.options import JobOptions, parse_options
+from service.access import Caller
+from service.deps import AnyCaller, Deps, Services
+from service.problems import Problem
+from service.reconstruct import check_scopes, read_json
+from service.retention import check_retention
+from service.upload import check_part_size, checked_suffix
+
+router = APIRouter(tags=["jobs"])
+
+MAX_BODY_BYTES = 3 * 1024 * 1024
+"""Of a description; a calibration's text may double in JSON."""
+REMEDY = 'Send {"clip": {"suffix": ".mp4", "size_bytes": N}} and what else is known of its files.'
+MAX_APART_S = 0.1
+"""Two eyes whose durations differ by more have not the same number of frames."""
+EYES_OF = {
+    "sbs": ((2, 1),),
+    "tb": ((1, 2),),
+    "auto": ((2, 1), (1, 2)),
+}
+"""How many eyes lie beside and below each other in a video, by layout."""
+
+
+class Findings(BaseModel):
+    """Everything that was found, in the order of the form; an empty list is no promise."""
+
+    findings: list[Finding]
+
+
+@router.post(
+    "/reconstruct/check",
+    operation_id="check_clip",
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/json": {"schema": {"$ref": "#/components/schemas/DescribedClip"}}},
+        }
+    },
+)
+async def check_clip(request: Request, services: Services, caller: AnyCaller) -> Findings:
+    """What speaks against a clip, told before it is sent. Send what its files are, and the calibration's text."""
+    caller.require(KeyScope.RECONSTRUCT)
+    described = await read_json(request, services, DescribedClip, MAX_BODY_BYTES, REMEDY)
+    return Findings(findings=await run_in_threadpool(lambda: list(_findings(services, caller, described))))
+
+
+def _findings(services: Deps, caller: Caller, described: DescribedClip) -> Iterator[Finding]:
+    files = described.files()
+    total_bytes = sum(file.size_bytes for file in files.values())
+    for part, file in files.items():
+        yield from _of_file(part, file)
+    if total_bytes:
+        yield from _found(FindingCode.NO_ROOM, lambda: services.intake.check(caller.tenant, total_bytes))
+    yield from _of_sizes(ClipLimits.of(services.settings), files)
+    yield from _of_calibration(described)
+    yield from _of_options(services, caller, described)
+
+
+def _of_file(part: str, file: DescribedFile) -> Iterator[Finding]:
+    if file.size_bytes == 0:
+        yield _finding(part, FindingCode.EMPTY, "the file is empty.", "Send a file with content.")
+        return
+    yield from _found(FindingCode.ENDING, lambda: checked_suffix(part, file.suffix))
+    yield from _found(FindingCode.TOO_LARGE, lambda: check_part_size(part, file.size_bytes))
+    head = bytes.fromhex(file.head)
+    if part == "calibration" or not head:
+        return
+    if file.suffix.lower() != ZIP_SUFFIX:
+        yield from _found(FindingCode.KIND, lambda: check_head(head, file.suffix, part, "the file"))
+    elif not head.startswith(b"PK"):
+        yield _finding(part, FindingCode.KIND, "the file is not a zip.", "Zip the files again.", refused=False)
+
+
+def _of_sizes(limits: ClipLimits, files: dict[str, DescribedFile]) -> Iterator[Finding]:
+    """What the numbers that the caller measured say."""
+    for part in files.keys() & {"clip", "left", "right"}:
+        file = files[part]
+        if file.width and file.height:
+            check = partial(limits.check_frame, part, "it", file.width, file.height)
+            yield from _found(FindingCode.TOO_LARGE, check, refused=False)
+        if file.duration_s is not None:
+            check = partial(limits.check_duration, part, "it", file.duration_s)
+            yield from _found(FindingCode.TOO_LONG, check, refused=False)
+    left, right = files.get("left"), files.get("right")
+    if left is None or right is None:
+        return
+    sizes = {(file.width, file.height) for file in (left, right) if file.width and file.height}
+    if len(sizes) > 1:
+        problem = "the eyes are of different sizes: " + " and ".join(f"{w}x{h}" for w, h in sorted(sizes)) + "."
+        yield _finding("right", FindingCode.EYES_DIFFER, problem, "Give both eyes of one recording.", refused=False)
+    durations_s = [file.duration_s for file in (left, right) if file.duration_s is not None]
+    if len(durations_s) > 1 and abs(durations_s[0] - durations_s[1]) > MAX_APART_S:
+        problem = f"the left eye lasts {durations_s[0]:.2f} s, the right one {durations_s[1]:.2f} s."
+        yield _finding("right", FindingCode.EYES_DIFFER, problem, "Cut both to the same frames.", refused=False)
+
+
+def _of_calibration(described: DescribedClip) -> Iterator[Finding]:
+    file, clip = described.calibration, described.clip or described.left
+    if file is None:
+        if clip is not None and described.clip_of is None and clip.suffix.lower() != ZIP_SUFFIX:
+            remedy = "Add the calibration of this endoscope."
+            problem = "a video of two eyes needs a calibration."
+            yield _finding("calibration", FindingCode.CALIBRATION_MISSING, problem, remedy, refused=False)
+        return
+    if file.text is None:
+        return
+    try:
+        check_calibration_file(file.text, "calibration", "it")
+    except InputError as error:
+        yield _of_error(FindingCode.CALIBRATION_UNREADABLE, error)
+        return
+    try:
+        calibration = read_calibration(file.text)
+    except InputError as error:
+        yield _of_error(FindingCode.CALIBRATION_UNREADABLE, error, refused=False)
+        return
+    if calibration is not None:
+        yield from _of_fit(calibration, described)
+
+
+def _of_fit(calibration: StereoCalibration, described: DescribedClip) -> Iterator[Finding]:
+    """A finding if the calibration fits none of the sizes that the clip's eyes may have."""
+    clip = described.clip or described.left
+    if clip is None or clip.width is None or clip.height is None:
+        return
+    layout = str(described.options.get("layout", "auto"))
+    packings = ((1, 1),) if described.left is not None else EYES_OF.get(layout, ())
+    errors = []
+    for beside, below in packings:
+        try:
+            fitted(calibration, clip.width // beside, clip.height // below)
+        except InputError as error:
+            errors.append(error)
+    if packings and len(errors) == len(packings):
+        yield _of_error(FindingCode.CALIBRATION_SIZE, errors[0], refused=False)
+
+
+def _of_options(services: Deps, caller: Caller, described: DescribedClip) -> Iterator[Finding]:
+    try:
+        options = parse_options(JobOptions, described.options)
+        check_retention(options, services.settings)
+    except InputError as error:
+        yield _of_error(FindingCode.OPTION, error)
+        return
+    try:
+        check_scopes(options, caller, services.settings)
+    except Problem as problem:
+        yield _finding("options", FindingCode.NOT_ALLOWED, problem.detail, problem.remedy or "")
+
+
+def _found(code: FindingCode, check: Callable[[], Any], *, refused: bool = True) -> Iterator[Finding]:
+    """What a check that raises has found."""
+    try:
+        check()
+    except LimitError as error:
+        yield _of_error(FindingCode.TOO_LARGE if code is FindingCode.NO_ROOM else code, error, refused=refused)
+    except InputError as error:
+        yield _of_error(code, error, refused=refused)
+    except Problem as problem:
+        yield _finding(problem.field or "clip", code, problem.detail, problem.remedy or "", refused=refused)
+
+
+def _of_error(code: FindingCode, error: InputError, *, refused: bool = True) -> Finding:
+    return _finding(error.field, code, error.problem, error.remedy, refused=refused)
+
+
+def _finding(field: str, code: FindingCode, problem: str, remedy: str, *, refused: bool = True) -> Finding:
+    return Finding(field=field, code=code, refused=refused, problem=problem, remedy=remedy)
