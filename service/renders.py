@@ -16,6 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from contract.access.keys import KeyScope
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
+from contract.wire.names import Eye
 from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose
 from contract.wire.rendering import (
@@ -106,6 +107,11 @@ class RenderQuery(BaseModel):
         description="12 or 16 numbers, row-major world_from_camera in mm, or orbit:yaw,pitch,zoom in degrees, or "
         "orbit:yaw,pitch,zoom,x,y,z with the point looked at in mm; default: the endoscope's own pose at t",
         examples=["orbit:10,0,1", "orbit:10,0,1.5,-4,2,60"],
+    )
+    eye: Eye = Field(
+        default="left",
+        description="right: seen from the right eye of a stereo clip and through its lens, as recorded?eye=right is; "
+        "not with pose",
     )
     width: Pixels = None
     height: Pixels = None
@@ -265,6 +271,7 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
         attempt=shown.attempt,
         t=query.t,
         pose=None if query.pose is None else parse_pose(query.pose),
+        eye=query.eye,
         camera=IntrinsicsOverride(**query.model_dump(include=set(IntrinsicsOverride.model_fields))),
         layer=query.layer,
         format=query.format,

@@ -122,6 +122,8 @@ class RenderRequest(BaseModel):
     attempt: int | None = None
     t: float = Field(ge=0, le=1e6)
     pose: MatrixPose | OrbitPose | None = Field(default=None, discriminator="kind")
+    eye: Eye = "left"
+    """Whose pose and lens are taken where the caller gives none; with a pose it must be left."""
     camera: IntrinsicsOverride = IntrinsicsOverride()
     layer: Layer = Layer.RGB
     format: ImageFormat = ImageFormat.PNG

@@ -297,6 +297,15 @@ def test_scenes_have_report_curve_and_export_until_they_are_deleted(service: Ser
     assert [path for path in service.store.data_dir.rglob("*") if scene in path.name] == []
 
 
+def test_the_right_eye_is_asked_of_the_worker(service: ServiceUnderTest) -> None:
+    scene = service.finished_scene()
+    assert service.http.get("/render", params={"scene": scene, "eye": "right"}).status_code == 200
+    (asked,) = service.painter.requests
+    assert isinstance(asked, RenderRequest)
+    assert (asked.eye, asked.pose) == ("right", None)
+    assert_problem(service.http.get("/render", params={"scene": scene, "eye": "third"}), 422, "eye")
+
+
 def test_found_masks_are_there_until_the_scene_is_deleted(service: ServiceUnderTest) -> None:
     scene = service.finished_scene()
     assert_problem(service.http.get(f"/scenes/{scene}/masks"), 404, "scene_id")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from contract.runtime.settings import GIB
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest, SceneCameras
-from contract.wire.errors import LimitError
+from contract.wire.errors import InputError, LimitError
 from contract.wire.exports import EXPORT_FORMATS
 from contract.wire.names import RECORDED
 from contract.wire.notices import Notice, NoticeCode
@@ -42,7 +42,7 @@ from worker.daemon.snapshot import Snapshot, Snapshots
 from worker.export import DRAWN, export_parts
 from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
-from worker.render.camera import endoscope_pose
+from worker.render.camera import endoscope_pose, right_eye
 from worker.render.detail import LEVELS, thinned
 from worker.render.encode import FOR_EYES, encode_layer
 from worker.render.recorded import live_frame, stored_frame
@@ -96,7 +96,7 @@ class Views:
             SceneError: the scene is missing or damaged.
             NotYetError: the running job has no snapshot here yet.
             LimitError: the image would exceed request.max_pixels.
-            InputError: the scene cannot be exported so.
+            InputError: the scene cannot be exported so, or has no such eye.
             UnavailableError: too many exports are under way.
         """
         if isinstance(request, RecordedRequest):
@@ -199,9 +199,9 @@ class Views:
 
     def _render(self, scene: Scene, request: RenderRequest, snapshot: Snapshot | None, level: int) -> Reply:
         """One render; snapshot: that the scene is of, None for a finished one; level: of detail."""
-        camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
-        size = camera.width, camera.height
-        pose, highlights = pose_of(scene, request.pose), request.highlights.shown_in(request.layer)
+        pose, lens = self._standing(scene, request)
+        camera = camera_of(lens, request.camera, request.max_pixels)
+        size, highlights = (camera.width, camera.height), request.highlights.shown_in(request.layer)
         own = endoscope_pose(scene, shown_time(scene, request.t)) if pose is None else pose
         pose_rows = tuple(own[:3].flatten().tolist())
         taken_by = PictureCamera.model_validate({**camera.numbers(), "world_from_camera": pose_rows})
@@ -214,6 +214,26 @@ class Views:
             range_mm = renderer_of(drawn, self._device).depth_range.before(pose)
         reply = _reply(scene, frame.enlarged(*size) if level else frame, request, snapshot, level, range_mm)
         return dataclasses.replace(reply, camera=taken_by)
+
+    def _standing(self, scene: Scene, request: RenderRequest) -> tuple[NDArray[np.float64] | None, Intrinsics]:
+        """Where the caller stands, None at the endoscope's left eye, and the lens unless another is given.
+
+        Raises:
+            InputError: it is the right eye's, and that is not known, or a pose is given, too.
+        """
+        if request.eye == "left":
+            return pose_of(scene, request.pose), scene.intrinsics
+        if request.pose is not None:
+            raise InputError("eye", "an eye and a pose exclude each other.", "Leave out one of them.")
+        if request.attempt is not None:
+            told = self._store.newest_report(request.scene_id, request.attempt).right_eye
+        else:
+            clip = self._snapshots.clip(request.scene_id)
+            told = None if clip is None else clip.registration
+        if told is None:
+            problem = "the right eye's camera is not known: the clip has one eye, or came with its depth."
+            raise InputError("eye", problem, "Ask for eye=left.")
+        return right_eye(scene, shown_time(scene, request.t), told)
 
     def _export(self, scene: Scene, request: ExportRequest) -> Reply:
         """One part of an export. It tells nothing of the time of renders."""

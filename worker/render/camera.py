@@ -7,10 +7,13 @@ with the distance from both eyes the view turns to the mean of the two, which is
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from contract.wire.report import RightEye
 from worker.input.camera import Intrinsics
 from worker.raster.step import camera_vector
 from worker.scene.scene import Scene
@@ -32,6 +35,12 @@ def endoscope_pose(scene: Scene, t: float) -> NDArray[np.float64]:
     pose[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(poses[before : before + 2, :3, :3]))(share).as_matrix()
     pose[:3, 3] = (1 - share) * poses[before, :3, 3] + share * poses[before + 1, :3, 3]
     return pose
+
+
+def right_eye(scene: Scene, t: float, told: RightEye) -> tuple[NDArray[np.float64], Intrinsics]:
+    """world_from_camera [4, 4] (mm) and lens of the endoscope's right eye at model time t, as a report tells of it."""
+    lens = dataclasses.replace(scene.intrinsics, fx=told.fx_px, fy=told.fy_px, cx=told.cx_px, cy=told.cy_px)
+    return endoscope_pose(scene, t) @ np.array(told.left_from_right).reshape(4, 4), lens
 
 
 def view_camera(
