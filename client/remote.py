@@ -1,4 +1,4 @@
-"""The commands that talk to a service: submit, watch, fetch, jobs, cancel, retry, delete."""
+"""The commands that talk to a service: submit, import, watch, fetch, jobs, cancel, retry, delete."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ def add_remote(commands: Commands) -> None:
     _add_submit(commands)
     watch = add_command(commands, "watch", "wait for a job, with a progress bar", _watch)
     _add_fetch(commands)
+    _add_import(commands)
     jobs = add_command(commands, "jobs", "list the newest jobs, newest first", _jobs)
     jobs.add_argument("--state", choices=[state.value for state in JobState], help="only jobs in this state")
     jobs.add_argument("--limit", type=count, metavar="N", help="at most N jobs (default: 200)")
@@ -101,6 +102,19 @@ def _add_fetch(commands: Commands) -> None:
     add_service(parser)
 
 
+def _add_import(commands: Commands) -> None:
+    parser = add_command(
+        commands, "import", "send a scene that another installation exported, and print its job's id", _import
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="made there with format=scene")
+    parser.add_argument("--retention-hours", type=finite, metavar="H", help="purge the scene so many hours later")
+    parser.add_argument("--label", metavar="TEXT", help=f"a text to find the scene by. {NO_NAMES}")
+    _add_metadata(parser, f"a text to find the scene by; may come several times. {NO_NAMES}")
+    parser.add_argument("--idempotency-key", metavar="TEXT", help="the same key with the same file is the same scene")
+    parser.add_argument("--watch", action="store_true", help="wait for the scene, with a progress bar")
+    add_service(parser)
+
+
 def _add_metadata(parser: argparse.ArgumentParser, help_text: str) -> None:
     parser.add_argument("--metadata", type=_entry, action="append", metavar="NAME=VALUE", help=help_text)
 
@@ -152,6 +166,21 @@ def _submit(options: argparse.Namespace) -> int:
                 idempotency_key=options.idempotency_key,
                 on_upload=lambda sent, total: bar.show(JobProgress(stage="upload", fraction=sent / total)),
                 **chosen,
+            )
+        print(job.id, flush=True)
+        return _show_until_done(client, job.id) if options.watch else ExitCode.OK
+
+
+def _import(options: argparse.Namespace) -> int:
+    with _client(options) as client:
+        with ProgressBar(sys.stderr) as bar:
+            job = client.import_scene(
+                options.file,
+                label=options.label,
+                metadata=dict(options.metadata or ()),
+                retention_hours=options.retention_hours,
+                idempotency_key=options.idempotency_key,
+                on_upload=lambda sent, total: bar.show(JobProgress(stage="upload", fraction=sent / total)),
             )
         print(job.id, flush=True)
         return _show_until_done(client, job.id) if options.watch else ExitCode.OK

@@ -12,10 +12,12 @@ from fastapi.staticfiles import StaticFiles
 
 from contract.queue.interface import Queue
 from contract.runtime.settings import LOOPBACK_NAMES, Settings
+from contract.runtime.version import version
 from contract.store.store import Store
 from service import (
     check,
     exports,
+    imports,
     jobs,
     reconstruct,
     recorded,
@@ -36,7 +38,6 @@ from service.openapi import DescribedApp
 from service.problems import install_handlers
 from service.renderer import Renderer
 from service.request_log import RequestLog
-from service.version import version
 
 DESCRIPTION = (
     "A stereo endoscope clip goes in, a dynamic model of the tissue answers renders at any time and pose. "
@@ -79,7 +80,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     app.add_middleware(Measure, metrics=deps.metrics)
     install_handlers(app)
     install_refusal_handler(app, deps.audit)
-    scene_parts = (scenes, scene_files, recorded, thumbnails, exports)
+    scene_parts = (scenes, scene_files, recorded, thumbnails, exports, imports)
     for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, system):
         app.include_router(part.router)
     if settings.dashboard_dir is not None:

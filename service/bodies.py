@@ -1,4 +1,4 @@
-"""The bodies of POST /reconstruct as /openapi.json describes them: schemas with names, for generators of clients."""
+"""The bodies of POST /reconstruct and POST /scenes as /openapi.json describes them: schemas with names."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 from pydantic.json_schema import models_json_schema
 
 from contract.wire.checks import DescribedClip
-from contract.wire.job import JOB_ID_PATTERN
 from contract.wire.labels import Labels
+from contract.wire.names import JOB_ID_PATTERN
 from service.upload import CLIP_OF, PARTS, SUFFIXES
 
 EXAMPLE_ID = "0123456789abcdef0123456789abcdef"
@@ -55,15 +55,36 @@ def _body(title: str, about: str, parts: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+SCENE_FORM: dict[str, Any] = {
+    **_body("SceneForm", "A scene of another installation", {}),
+    "description": "A scene that another installation exported with format=scene, and what else is known.",
+    "required": ["scene"],
+}
+SCENE_FORM["properties"] = {
+    "scene": {"type": "string", "format": "binary", "description": "the archive; its name ends in .zip"},
+    **{name: each for name, each in SCENE_FORM["properties"].items() if name != CLIP_OF},
+}
+
 BODIES: dict[str, dict[str, Any]] = {
     "ClipForm": _body("ClipForm", "A clip in one request", {part: _of_file(part) for part in PARTS}),
     "ClipOfUploads": _body(
         "ClipOfUploads", "A clip of finished uploads (POST /uploads)", {part: _of_upload(part) for part in PARTS}
     ),
     **models_json_schema([(DescribedClip, "validation")], ref_template="#/components/schemas/{model}")[1]["$defs"],
+    "SceneForm": SCENE_FORM,
 }
 """Schemas by name. Which parts go together is no part of them, for generators read no conditions."""
 
+JSON_PARTS = {name: {"contentType": "application/json"} for name in ("options", "metadata")}
+SCENE_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "the archive; options may hold priority and retention_hours alone",
+        "content": {
+            "multipart/form-data": {"schema": {"$ref": "#/components/schemas/SceneForm"}, "encoding": JSON_PARTS}
+        },
+    }
+}
 REQUEST_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
@@ -71,7 +92,7 @@ REQUEST_BODY: dict[str, Any] = {
         "content": {
             "multipart/form-data": {
                 "schema": {"$ref": "#/components/schemas/ClipForm"},
-                "encoding": {name: {"contentType": "application/json"} for name in ("options", "metadata")},
+                "encoding": JSON_PARTS,
             },
             "application/json": {
                 "schema": {"$ref": "#/components/schemas/ClipOfUploads"},

@@ -16,9 +16,11 @@ from starlette.responses import StreamingResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
+from contract.store.archive import archive_parts
 from contract.wire.errors import UnavailableError
 from contract.wire.exports import EXPORT_FORMATS, ExportOptions, check_export
 from contract.wire.rendering import ExportRequest
+from service.access import Caller
 from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
@@ -67,8 +69,10 @@ async def export_scene(
 
     An export that fails after its first bytes is cut off, so that its transfer is not complete.
     """
-    caller.require(KeyScope.VIEW)
     options = check_export(query.format, query.model_dump(exclude={"format"}))
+    if EXPORT_FORMATS[query.format].is_stored:
+        return await _stored(scene_id, query.format, services, caller)
+    caller.require(KeyScope.VIEW)
     record = await run_in_threadpool(finished_job, services, caller, scene_id)
     await run_in_threadpool(services.audit.record, AuditAction.EXPORTED, caller, scene_id)
     request = ExportRequest(
@@ -86,9 +90,23 @@ async def export_scene(
     if first.head.more:
         head = {name: value for name, value in response.headers.items() if name != "content-length"}
         response = StreamingResponse(_parts(services, request, first, part), headers=head)
-    export_format = EXPORT_FORMATS[query.format]
-    response.headers["Content-Disposition"] = f'attachment; filename="{scene_id}{export_format.suffix}"'
+    response.headers["Content-Disposition"] = _disposition(scene_id, query.format)
     return response
+
+
+async def _stored(scene_id: str, name: str, services: Deps, caller: Caller) -> Response:
+    """The file of a format that needs no worker."""
+    caller.require(KeyScope.DOWNLOAD)
+    record = await run_in_threadpool(finished_job, services, caller, scene_id)
+    folder = await run_in_threadpool(services.store.scene_folder, scene_id, record.attempt)
+    parts = await run_in_threadpool(archive_parts, folder, scene_id)
+    await run_in_threadpool(services.audit.record, AuditAction.DOWNLOADED, caller, scene_id)
+    headers = {"Content-Disposition": _disposition(scene_id, name), "Cache-Control": "no-store"}
+    return StreamingResponse(parts, media_type=EXPORT_FORMATS[name].media_type, headers=headers)
+
+
+def _disposition(scene_id: str, name: str) -> str:
+    return f'attachment; filename="{scene_id}{EXPORT_FORMATS[name].suffix}"'
 
 
 async def _parts(services: Deps, request: ExportRequest, answer: Answer, part: int) -> AsyncIterator[bytes]:

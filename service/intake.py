@@ -38,8 +38,8 @@ class Intake:
         self._places: set[Place] = set()
 
     @contextmanager
-    def place(self, tenant: str, declared_bytes: int = 0) -> Iterator[Place]:
-        """A place among the uploads that are received at once, with room for `declared_bytes`.
+    def place(self, tenant: str, declared_bytes: int = 0, part: str = "clip") -> Iterator[Place]:
+        """A place among the uploads that are received at once, with room for `declared_bytes`. part: what is sent.
 
         Raises:
             Problem: 429: the tenant holds its share. 503: all places are taken. 507: the disk has no room for it.
@@ -53,7 +53,7 @@ class Intake:
             detail = f"{len(self._places)} uploads are being received, as many as may be."
             raise Problem(503, detail, field="uploads", remedy="Come back when one of them is through.")
         if declared_bytes:
-            self.check(tenant, declared_bytes)
+            self.check(tenant, declared_bytes, part)
         place = Place(declared_bytes, tenant)
         self._places.add(place)
         try:
@@ -61,14 +61,14 @@ class Intake:
         finally:
             self._places.discard(place)
 
-    def check(self, tenant: str, declared_bytes: int) -> None:
+    def check(self, tenant: str, declared_bytes: int, part: str = "clip") -> None:
         """Return if an upload of this size is allowed and has room; raises as place().
 
         A tenant that has been promised room already gets no more of the disk's than its share.
         """
         if declared_bytes > self._settings.max_upload_bytes:
             problem = f"{declared_bytes} bytes are more than the {self._settings.max_upload_bytes} of an upload."
-            raise LimitError("clip", problem, LIMIT_REMEDY)
+            raise LimitError(part, problem, LIMIT_REMEDY)
         room_bytes = self.room_bytes()
         if declared_bytes > room_bytes:
             raise no_room_for(declared_bytes, room_bytes, self._settings.min_free_bytes)

@@ -14,9 +14,9 @@ from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from contract.queue.interface import Queue
+from contract.runtime.version import version
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
-from service.version import version
 
 NO_ROUTE = "none"
 """The page's files, and all that does not exist: paths are a caller's to choose, so they are no label."""

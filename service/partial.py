@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from contract.store.durable import flush, replace_file
 from contract.store.shelf import is_job_id, new_job_id
 from contract.store.store import Store
-from contract.wire.job import JOB_ID_PATTERN
+from contract.wire.names import JOB_ID_PATTERN
 
 DECLARATION = "upload.json"
 HASHED_AT_ONCE_BYTES = 2**20

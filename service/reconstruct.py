@@ -6,10 +6,10 @@ import contextlib
 import hashlib
 import os
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from io import RawIOBase
-from typing import Annotated, TypeVar
+from typing import Annotated, TypeAlias, TypeVar
 
 from fastapi import APIRouter, Header, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -36,7 +36,7 @@ from service.partial import Partial, find_partial
 from service.problems import RETRY_AFTER_S, Problem, no_room
 from service.retention import check_retention
 from service.reuse import add_files_of, earlier_job, first_job
-from service.upload import LIMIT_REMEDY, PARTS, Received, UploadLimits, receive_upload
+from service.upload import CLIP_FORM, LIMIT_REMEDY, PARTS, Form, Received, UploadLimits, receive_upload
 
 router = APIRouter(tags=["jobs"])
 
@@ -52,6 +52,10 @@ IdempotencyKey = Annotated[
     str | None,
     Header(min_length=1, max_length=200, description="the same key with the same clip and options is the same job"),
 ]
+
+
+Accept: TypeAlias = Callable[[Deps, Caller, str, Received, str | None], JobRecord]
+"""Makes a job of what was received: services, caller, the job's id, the parts, the hash of the idempotency key."""
 
 
 class Submission(BaseModel):
@@ -80,15 +84,20 @@ async def reconstruct(
 ) -> JobView:
     """Send a clip. 202 means that it is safely on disk and queued; Location is the job."""
     caller.require(KeyScope.RECONSTRUCT)
-    key = None if idempotency_key is None else hashlib.sha256(idempotency_key.encode()).hexdigest()
+    key = hash_of(idempotency_key)
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() == "application/json":
         submission = await read_json(request, services, Submission, MAX_SUBMISSION_BYTES, JSON_REMEDY)
         record = await run_in_threadpool(_accept_uploads, services, caller, submission, key)
     else:
-        record = await _receive_form(request, services, caller, key)
+        record = await receive_form(request, services, caller, key, _accept)
     response.headers["Location"] = f"/jobs/{record.job_id}"
     response.headers["Retry-After"] = str(RETRY_AFTER_S)
     return JobView.of(record, await run_in_threadpool(forecast_of, services, record))
+
+
+def hash_of(idempotency_key: str | None) -> str | None:
+    """What a record keeps of an idempotency key."""
+    return None if idempotency_key is None else hashlib.sha256(idempotency_key.encode()).hexdigest()
 
 
 def forecast_of(services: Deps, record: JobRecord) -> Forecast | None:
@@ -99,18 +108,20 @@ def forecast_of(services: Deps, record: JobRecord) -> Forecast | None:
         return None
 
 
-async def _receive_form(request: Request, services: Deps, caller: Caller, key: str | None) -> JobRecord:
-    """The whole clip in one request."""
+async def receive_form(
+    request: Request, services: Deps, caller: Caller, key: str | None, accept: Accept, form: Form = CLIP_FORM
+) -> JobRecord:
+    """The job that `accept` makes of what came in one request."""
     store, settings = services.store, services.settings
-    with services.intake.place(caller.tenant, declared_length(request)) as place:
+    with services.intake.place(caller.tenant, declared_length(request), form.main_part) as place:
         job_id = new_job_id()
         folder = store.open_incoming(job_id)
         try:
             room_bytes = services.intake.room_bytes() + place.kept_bytes
             limits = UploadLimits(settings.max_upload_bytes, room_bytes, settings.min_free_bytes)
             content_type = request.headers.get("content-type", "")
-            received = await receive_upload(content_type, services.intake.body(request, place), folder, limits)
-            return await run_in_threadpool(_accept, services, caller, job_id, received, key)
+            received = await receive_upload(content_type, services.intake.body(request, place), folder, limits, form)
+            return await run_in_threadpool(accept, services, caller, job_id, received, key)
         except ClientDisconnect:
             detail = "The connection was closed before the upload was complete."
             raise Problem(400, detail, remedy="Send it again.") from None
@@ -259,7 +270,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
     services.audit.record(AuditAction.ACCEPTED, caller, job_id, outcome)
     with services.sweep.in_hand(job_id):
         services.store.accept(record)
-        return _enqueue(services, record)
+        return enqueue(services, record)
 
 
 def check_scopes(options: JobOptions, caller: Caller, settings: Settings) -> None:
@@ -285,7 +296,7 @@ def _look_at(services: Deps, record: JobRecord, names: Mapping[str, str], sent: 
     check_fit(record.options, files, sent)
 
 
-def _enqueue(services: Deps, record: JobRecord) -> JobRecord:
+def enqueue(services: Deps, record: JobRecord) -> JobRecord:
     """The record that stands in the queue for a clip in the spool.
 
     Raises:

@@ -15,6 +15,7 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.access.keys import KeyScope
 from contract.runtime.settings import Settings
+from contract.runtime.version import version
 from contract.wire.job import JobState
 from contract.wire.names import Eye
 from contract.wire.notices import NoticeCode
@@ -35,7 +36,6 @@ from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services, owned_scene
 from service.listing import SceneSearch
 from service.problems import Problem
-from service.version import version
 
 router = APIRouter(tags=["renders"])
 

@@ -62,6 +62,9 @@ def earlier_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:
         raise not_found(f"There is no job {job_id!r} whose clip could be used.", CLIP_OF, remedy, caller, record)
     if services.store.submission(job_id) is None:
         raise _no_clip(job_id)
+    if record.imported is not None:
+        problem = f"the scene {job_id} was imported, and its clip stayed where it was made."
+        raise InputError(CLIP_OF, problem, "Give a job that reconstructed a clip here, or send the clip itself.")
     return record
 
 

@@ -10,6 +10,7 @@ from starlette.responses import Response
 
 from contract import CONTRACT_VERSION
 from contract.access.keys import KeyScope
+from contract.runtime.version import version
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ImageFormat, Layer, WorkerAddress
 from service.bodies import TEXT
@@ -17,7 +18,6 @@ from service.deps import AnyCaller, EarlyCaller, Services
 from service.problems import Problem, no_room, room_remedy
 from service.renderer import WORKER_REMEDY
 from service.upload import SUFFIXES
-from service.version import version
 
 router = APIRouter(tags=["system"])
 

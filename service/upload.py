@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -31,6 +31,8 @@ SUFFIXES = {
 """File parts and the endings they may have; the ending is all that is kept of the caller's file name."""
 
 PARTS = tuple(SUFFIXES)
+SCENE_PART = "scene"
+SCENE_SUFFIXES = {SCENE_PART: (".zip",)}
 
 OPTIONS = "options"
 CLIP_OF = "clip_of"
@@ -51,6 +53,28 @@ FORM_REMEDY = (
     "Send multipart/form-data with clip, or left and right, or clip_of, and optionally calibration, masks, options, "
     "label and metadata; "
     'options is JSON, such as {"budget_s": 20}, and clip_of the id of a job whose clip is used again.'
+)
+
+
+@dataclass(frozen=True)
+class Form:
+    """A multipart form: its file parts and the endings they may have, its parts that are text, how to send it."""
+
+    suffixes: Mapping[str, tuple[str, ...]]
+    texts: tuple[str, ...]
+    remedy: str
+
+    @property
+    def main_part(self) -> str:
+        """What all of it is about."""
+        return next(iter(self.suffixes))
+
+
+CLIP_FORM = Form(SUFFIXES, TEXTS, FORM_REMEDY)
+SCENE_FORM = Form(
+    SCENE_SUFFIXES,
+    (OPTIONS, LABEL_FIELD, METADATA_FIELD),
+    "Send multipart/form-data with scene, a file of format=scene, and optionally options, label and metadata.",
 )
 
 
@@ -113,14 +137,14 @@ class Received:
         return hashlib.sha256(lines.encode()).hexdigest()
 
 
-def checked_suffix(part: str, suffix: str) -> str:
+def checked_suffix(part: str, suffix: str, suffixes: Mapping[str, tuple[str, ...]] = SUFFIXES) -> str:
     """The ending of a part's file in lower case.
 
     Raises:
         InputError: this part may not have it.
     """
-    if suffix.lower() not in SUFFIXES[part]:
-        accepted = ", ".join(SUFFIXES[part])
+    if suffix.lower() not in suffixes[part]:
+        accepted = ", ".join(suffixes[part])
         raise InputError(part, f"a file that ends in {suffix[:20]!r} is not accepted.", f"Send {accepted}.")
     return suffix.lower()
 
@@ -131,7 +155,9 @@ def check_part_size(part: str, part_bytes: int) -> None:
         raise LimitError(part, f"it is larger than {MAX_BYTES[part]} bytes.", "Send a smaller one.")
 
 
-async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: Path, limits: UploadLimits) -> Received:
+async def receive_upload(
+    content_type: str, body: AsyncIterator[bytes], folder: Path, limits: UploadLimits, form: Form = CLIP_FORM
+) -> Received:
     """Write the parts of a multipart body into folder.
 
     Raises:
@@ -141,20 +167,21 @@ async def receive_upload(content_type: str, body: AsyncIterator[bytes], folder: 
     """
     kind, parameters = parse_options_header(content_type)
     if kind != b"multipart/form-data" or not parameters.get(b"boundary"):
-        raise Problem(400, f"The content type is {content_type[:80]!r}.", field="Content-Type", remedy=FORM_REMEDY)
+        raise Problem(400, f"The content type is {content_type[:80]!r}.", field="Content-Type", remedy=form.remedy)
     try:
-        with closing(_Receiver(parameters[b"boundary"], folder, limits)) as receiver:
+        with closing(_Receiver(parameters[b"boundary"], folder, limits, form)) as receiver:
             async for chunk in body:
                 await run_in_threadpool(receiver.write, chunk)
             return receiver.finish()
     except FormParserError as error:
-        raise Problem(400, f"The multipart body is malformed: {error}", remedy=FORM_REMEDY) from error
+        raise Problem(400, f"The multipart body is malformed: {error}", remedy=form.remedy) from error
 
 
 class _Receiver:
     """The parser's callbacks, and the one part that is being received."""
 
-    def __init__(self, boundary: bytes, folder: Path, limits: UploadLimits) -> None:
+    def __init__(self, boundary: bytes, folder: Path, limits: UploadLimits, form: Form) -> None:
+        self._form = form
         self._folder = folder
         self._limits = limits
         self._received = Received()
@@ -186,7 +213,7 @@ class _Receiver:
         self._received.total_bytes += len(chunk)
         if self._received.total_bytes > self._limits.upload_bytes:
             problem = f"the upload is larger than {self._limits.upload_bytes} bytes."
-            raise LimitError("clip", problem, LIMIT_REMEDY)
+            raise LimitError(self._form.main_part, problem, LIMIT_REMEDY)
         if self._received.total_bytes > self._limits.room_bytes:
             limits = self._limits
             raise no_room_for(self._received.total_bytes, limits.room_bytes, limits.min_free_bytes)
@@ -227,23 +254,23 @@ class _Receiver:
 
     def _check_header(self) -> None:
         if len(self._header_name) + len(self._header_value) > MAX_HEADER_BYTES:
-            raise Problem(400, "A part's header is too long.", remedy=FORM_REMEDY)
+            raise Problem(400, "A part's header is too long.", remedy=self._form.remedy)
 
     def _on_headers_finished(self) -> None:
         _, parameters = parse_options_header(self._headers.get(b"content-disposition", b""))
         part = parameters.get(b"name", b"").decode("utf-8", "replace")
-        if part not in (*TEXTS, *SUFFIXES):
-            raise InputError(part[:40] or "clip", "there is no such part.", FORM_REMEDY)
+        if part not in (*self._form.texts, *self._form.suffixes):
+            raise InputError(part[:40] or "clip", "there is no such part.", self._form.remedy)
         if part in self._received.names or part in self._texts:
             raise InputError(part, "it came twice.", "Send each part once.")
         self._part = part
-        if part in TEXTS:
+        if part in self._form.texts:
             self._texts[part] = b""
         else:
             self._open_file(part, parameters.get(b"filename", b"").decode("utf-8", "replace"))
 
     def _open_file(self, part: str, filename: str) -> None:
-        name = part + checked_suffix(part, PurePosixPath(filename).suffix)
+        name = part + checked_suffix(part, PurePosixPath(filename).suffix, self._form.suffixes)
         self._file = (self._folder / name).open("xb")
         self._digest = hashlib.sha256()
         self._received.names[part] = name
@@ -273,7 +300,7 @@ class _Receiver:
         try:
             return self._texts[part].decode()
         except UnicodeDecodeError:
-            raise InputError(part, "it is not UTF-8 text.", FORM_REMEDY) from None
+            raise InputError(part, "it is not UTF-8 text.", self._form.remedy) from None
 
     def _on_end(self) -> None:
         self._ended = True

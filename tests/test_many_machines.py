@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import socket
 import subprocess
@@ -13,10 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
 from contract.queue.embedded import EmbeddedServer
 from contract.runtime.settings import Settings
+from tests.archives import archived, files_of, small_scene
+from worker.render.view import render_frame
 
 pytest.importorskip("s3fs")
 moto_server: Any = pytest.importorskip("moto.server")
@@ -158,4 +162,27 @@ def test_a_job_moves_from_machine_to_machine_and_its_purge_reaches_all(site: Sit
 
     assert http.delete(f"/scenes/{job_id}").json()["verified"]
     assert http.get("/render", params={"scene": job_id, "t": 0.5}).status_code == 404
+    assert [each.key for each in site.bucket.object_versions.all()] == []
+
+
+def test_a_scene_imported_on_one_machine_is_shown_and_exported_on_others(site: Site, tmp_path: Path) -> None:
+    scene = small_scene()
+    archive = archived(tmp_path / "there", scene)
+    http = site.start_service()
+    first = site.machine("first", "worker", "consume")
+    sent = http.post("/scenes", files={"scene": ("a.zip", archive)})
+    assert sent.status_code == 202, sent.text
+    job_id = sent.json()["id"]
+    eventually(lambda: http.get(f"/jobs/{job_id}").json()["state"] == "done")
+    end_process(first, 60.0)
+
+    site.machine("second", "worker", "consume")
+    eventually(lambda: http.get("/readyz").json().get("workers") == ["second"])
+    view = http.get("/render", params={"scene": job_id, "t": 0.5, "layer": "depth", "format": "npy"})
+    assert view.status_code == 200, view.text
+    np.testing.assert_array_equal(np.load(io.BytesIO(view.content)), render_frame(scene, 0.5).depth_mm)
+    exported = http.get(f"/scenes/{job_id}/export", params={"format": "scene"})
+    assert files_of(exported.content)["scene.safetensors"] == files_of(archive)["scene.safetensors"]
+
+    assert http.delete(f"/scenes/{job_id}").json()["verified"]
     assert [each.key for each in site.bucket.object_versions.all()] == []

@@ -7,6 +7,7 @@ export const DE = {
     "decoding": "Der Clip wurde in einem geschützten Prozess gelesen.",
     "depth_unit": "Die Tiefenbilder enthalten Millimeter.",
     "frame_times": "Der Clip nennt keine Zeiten; eine Bildrate wurde angenommen.",
+    "imported": "Diese Szene wurde von einer anderen Installation erstellt; ihre Messwerte stammen von dort.",
     "intrinsics": "Die optische Achse wurde in der Bildmitte angenommen.",
     "layout": "Wie die beiden Augen im Clip liegen, wurde ermittelt.",
     "masks": "Wie Instrumente maskiert sind, wurde ermittelt.",

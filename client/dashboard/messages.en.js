@@ -7,6 +7,7 @@ export const EN = {
     "decoding": "The clip was read in a protected process.",
     "depth_unit": "The depth pictures hold millimetres.",
     "frame_times": "The clip tells no times, so a frame rate was assumed.",
+    "imported": "This scene was made by another installation, which measured its figures.",
     "intrinsics": "The optical axis was taken to be in the middle of the picture.",
     "layout": "How the two eyes lie in the clip was found out.",
     "masks": "How instruments are masked was found out.",

@@ -81,6 +81,33 @@ class Core:
         )
         return await submission.submit(self._session, prepared)
 
+    async def import_scene(
+        self,
+        path: Path,
+        *,
+        label: str | None = None,
+        metadata: Mapping[str, str] | None = None,
+        retention_hours: float | None = None,
+        idempotency_key: str | None = None,
+        on_upload: OnUpload | None = None,
+    ) -> JobView:
+        """Import a scene that another installation exported with format="scene", and get its queued job.
+
+        The job is done when a worker has read the scene; its id is the scene's here. The same idempotency_key with the
+        same file always yields the same job. label, metadata, on_upload: as reconstruct has them.
+
+        Raises:
+            InputError: the file cannot be read; nothing was sent.
+        """
+        prepared = submission.prepare_scene(
+            Path(path),
+            retention_hours,
+            submission.labels_of(label, metadata),
+            idempotency_key=idempotency_key,
+            on_upload=on_upload,
+        )
+        return await submission.submit(self._session, prepared)
+
     async def job(self, job_id: str) -> JobView:
         """A job's state and progress."""
         return await self._job(Call("GET", _path("jobs", job_id), is_repeatable=True))

@@ -55,6 +55,7 @@ class NoticeCode(StrEnum):
     DECODING = "decoding"
     DEPTH_UNIT = "depth_unit"
     FRAME_TIMES = "frame_times"
+    IMPORTED = "imported"
     INTRINSICS = "intrinsics"
     LAYOUT = "layout"
     MASKS = "masks"
@@ -192,6 +193,19 @@ class FrameScore(Model):
     """None for a clip of one eye, too"""
 
 
+class Imported(Model):
+    """Where a scene came from that was made by another installation."""
+
+    scene_id: str | None = None
+    """its id there; None: it was exported from a folder"""
+    version: str
+    """of the intrasplat that exported it"""
+    exported_at_s: float
+    """when it was exported, UNIX s, by the clock there"""
+    imported_at_s: float
+    """when it was imported, UNIX s"""
+
+
 class JobError(Model):
     """Why a job failed: its kind, one sentence, the field at fault if it was the input, and what to do about it."""
 
@@ -271,6 +285,8 @@ class JobView(Model):
     input_bytes: int
     clip_of: str | None = None
     """the job that the clip came with first, if not with this one"""
+    imported: bool = False
+    """it takes in a scene that another installation made"""
     created_at_s: float
     started_at_s: float | None = None
     finished_at_s: float | None = None
@@ -326,6 +342,8 @@ class Report(Model):
 
     report_version: int = 2
     notice: str = "Research use only. Not a medical device; it must not guide treatment."
+    imported: Imported | None = None
+    """where the scene came from; None: it was made here"""
     versions: dict[str, str] = Field(default={})
     """versions of intrasplat and of what it computes with"""
     scored: bool = True

@@ -54,6 +54,7 @@ class Submission:
     idempotency_key: str
     in_pieces: bool
     on_upload: OnUpload | None
+    route: str = "/reconstruct"
 
     @property
     def total_bytes(self) -> int:
@@ -97,6 +98,24 @@ def prepare(
     return Submission(paths, sizes, texts, document, labels, idempotency_key or str(uuid.uuid4()), in_pieces, on_upload)
 
 
+def prepare_scene(
+    path: Path,
+    retention_hours: float | None,
+    labels: dict[str, Any],
+    *,
+    idempotency_key: str | None,
+    on_upload: OnUpload | None,
+) -> Submission:
+    """As prepare(), of a scene that another installation exported; it is sent in one form.
+
+    Raises:
+        InputError: the file cannot be read or is empty, or the option cannot be used.
+    """
+    document = checked_options({} if retention_hours is None else {"retention_hours": retention_hours})
+    sizes, key = {"scene": _size_of("scene", path)}, idempotency_key or str(uuid.uuid4())
+    return Submission({"scene": path}, sizes, {}, document, labels, key, False, on_upload, "/scenes")
+
+
 def labels_of(label: str | None, metadata: Mapping[str, str] | None) -> dict[str, Any]:
     """What is given of a job's labels, as JSON can have it."""
     given = {"label": label, "metadata": None if metadata is None else dict(metadata)}
@@ -135,7 +154,7 @@ async def submit(session: Session, submission: Submission) -> JobView:
         else:
             boundary = uuid.uuid4().hex
             headers["Content-Type"] = f"multipart/form-data; boundary={boundary}"
-            call = Call("POST", "/reconstruct", headers=headers, body=_form(submission, boundary), is_repeatable=True)
+            call = Call("POST", submission.route, headers=headers, body=_form(submission, boundary), is_repeatable=True)
         response = await session.request(call)
     except ServiceUnavailable as failure:
         if failure.job_id is None:

@@ -29,6 +29,8 @@ class AuditAction(StrEnum):
     """The acts that are recorded."""
 
     ACCEPTED = "accepted"
+    IMPORTED = "imported"
+    """A scene of another installation was accepted."""
     VIEWED = "viewed"
     """At most once a minute for each key and scene, not for each picture."""
     EXPORTED = "exported"

@@ -11,6 +11,7 @@ import stat
 import struct
 import zipfile
 import zlib
+from collections.abc import Collection
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
@@ -34,8 +35,10 @@ _LOCAL_HEADER_BYTES = 30
 _AGAIN = "Zip the files again."
 
 
-def open_zip(path: Path, field: str, label: str, limits: ClipLimits) -> tuple[zipfile.ZipFile, list[zipfile.ZipInfo]]:
-    """The zip, open for reading, and its files without folders.
+def open_zip(
+    path: Path, field: str, label: str, limits: ClipLimits, nested: Collection[str] = ()
+) -> tuple[zipfile.ZipFile, list[zipfile.ZipInfo]]:
+    """The zip, open for reading, and its files without folders. nested: names of members that may be archives.
 
     Raises:
         InputError: it is damaged, or a member is refused. The error names `field` and `label`.
@@ -47,19 +50,24 @@ def open_zip(path: Path, field: str, label: str, limits: ClipLimits) -> tuple[zi
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, struct.error) as error:
         raise InputError(field, f"{label} is not a readable zip ({error}).", _AGAIN) from error
     try:
-        return archive, _checked(archive.infolist(), path, field, label, limits)
+        return archive, _checked(archive.infolist(), path, field, label, limits, nested)
     except BaseException:
         archive.close()
         raise
 
 
 def _checked(
-    entries: list[zipfile.ZipInfo], path: Path, field: str, label: str, limits: ClipLimits
+    entries: list[zipfile.ZipInfo],
+    path: Path,
+    field: str,
+    label: str,
+    limits: ClipLimits,
+    nested: Collection[str],
 ) -> list[zipfile.ZipInfo]:
     check_member_count(len(entries), field, label)
     names: set[str] = set()
     for entry in entries:
-        _check_member(entry, field, label)
+        _check_member(entry, field, label, nested)
         known = entry.filename.lower()  # two names that differ in case are one file on some systems
         if known in names:
             raise InputError(field, f"{label} holds {entry.filename!r} twice.", _AGAIN)
@@ -106,7 +114,7 @@ def _directory_size(file: BinaryIO, file_bytes: int) -> tuple[int, int]:
     return (end_64[8], end_64[7]) if locator == b"PK\6\7" else (size, count)
 
 
-def _check_member(entry: zipfile.ZipInfo, field: str, label: str) -> None:
+def _check_member(entry: zipfile.ZipInfo, field: str, label: str, nested: Collection[str]) -> None:
     """InputError for a member that could reach outside the archive or hide what it holds."""
     name = entry.filename
     problem = None
@@ -124,7 +132,7 @@ def _check_member(entry: zipfile.ZipInfo, field: str, label: str) -> None:
         problem = "is not a plain file"
     elif entry.flag_bits & 0x1:
         problem = "is encrypted"
-    elif PurePosixPath(name).suffix.lower() in ARCHIVE_SUFFIXES:
+    elif PurePosixPath(name).suffix.lower() in ARCHIVE_SUFFIXES and name not in nested:
         problem = "is an archive inside the archive"
     if problem is not None:
         raise InputError(field, f"{name!r} in {label} {problem}.", "Zip plain files only, without links or passwords.")

@@ -350,7 +350,9 @@ def estimate_forecast(
         return Forecast(position=position, eta_s=None)
     usual_s = own_s = median(pace.durations_s)
     asked_s = asked_training_s(record.options)
-    if asked_s is not None and pace.rests_s:
+    if record.imported is not None:
+        own_s = 0.0  # nothing is trained
+    elif asked_s is not None and pace.rests_s:
         own_s = max(0.0, asked_s + median(pace.rests_s))
     if position is None:
         eta_s = max(0.0, own_s - ran_s.get(record.job_id, 0.0))

@@ -351,7 +351,7 @@ class MemoryQueue:
         if target in TERMINAL_STATES:
             update["finished_at_s"] = now_s
             self._ended[target] += 1
-        if target is JobState.DONE and record.started_at_s is not None:
+        if target is JobState.DONE and record.started_at_s is not None and record.imported is None:
             self._durations_s.append(now_s - record.started_at_s)
             asked_s = asked_training_s(record.options)
             if asked_s is not None:

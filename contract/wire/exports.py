@@ -61,6 +61,8 @@ class ExportFormat:
     media_type: str
     options: tuple[str, ...]
     about: str
+    is_stored: bool = False
+    """Made of the stored files, by the service itself; for keys that may download them."""
 
 
 _VIDEO = ("view", "every", "t", "baseline_mm")
@@ -85,6 +87,9 @@ EXPORT_FORMATS = {
     "tracks": ExportFormat("-tracks.npz", "application/zip", ("every",), "where each Gaussian is over time, mm"),
     "webm": ExportFormat(".webm", "video/webm", _VIDEO, "a video without instruments (VP8)"),
     "mp4": ExportFormat(".mp4", "video/mp4", _VIDEO, "a video without instruments (VP9)"),
+    "scene": ExportFormat(
+        ".scene.zip", "application/zip", (), "the scene itself, to be imported elsewhere", is_stored=True
+    ),
     "tum": ExportFormat(".tum", "text/plain", (), "the endoscope's path as a TUM file, seconds and metres"),
 }
 """The formats by name."""

@@ -10,10 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.errors import ErrorCode
 from contract.wire.labels import Labels
+from contract.wire.names import JOB_ID_PATTERN
 from contract.wire.options import JobOptions
-
-JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
-"""Job ids are made by the service, never by a caller, so they are safe as file names and key parts."""
+from contract.wire.report import Imported
 
 LOCAL_TENANT = "local"
 """Whose jobs they are where no key is asked for."""
@@ -54,7 +53,10 @@ def sources_of(target: JobState) -> frozenset[JobState]:
 
 
 class JobFiles(BaseModel):
-    """File names inside the job's spool folder, made by the service (`clip.mp4`), never the caller's."""
+    """File names inside the job's spool folder, made by the service (`clip.mp4`), never the caller's.
+
+    clip: of an imported scene, its archive.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -109,6 +111,8 @@ class JobRecord(BaseModel):
     """The digest of all files, sorted by part."""
     clip_of: str | None = Field(default=None, pattern=JOB_ID_PATTERN)
     """The job that the clip came with first, if it was not sent with this one."""
+    imported: Imported | None = None
+    """Where the scene came from that this job takes in; None: it reconstructs a clip."""
     idempotency_key: str | None = None
     """SHA-256 of the caller's Idempotency-Key: a second submission under it yields this job."""
     created_at_s: float
@@ -156,6 +160,7 @@ class JobView(BaseModel):
     options: JobOptions
     input_bytes: int
     clip_of: str | None = Field(default=None, description="the job that the clip came with first, if not with this one")
+    imported: bool = Field(default=False, description="it takes in a scene that another installation made")
     created_at_s: float
     started_at_s: float | None = None
     finished_at_s: float | None = None
@@ -177,4 +182,5 @@ class JobView(BaseModel):
             | {"created_at_s", "started_at_s", "finished_at_s"}
         )
         progress |= {"position": forecast.position, "eta_s": forecast.eta_s} if forecast else {}
+        shared["imported"] = record.imported is not None
         return cls(id=record.job_id, links=links, **record.labels.model_dump(), **shared, **progress)

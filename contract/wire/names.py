@@ -6,6 +6,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
+JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
+"""Job ids are made by the service, never by a caller, so they are safe as file names and key parts."""
+
 PresetName = Literal[
     "instant", "fast", "quality", "small", "paper", "paper-released", "paper-wide", "pfs", "hexplane", "without_mapf"
 ]

@@ -27,6 +27,7 @@ class NoticeCode(StrEnum):
     DECODING = "decoding"
     DEPTH_UNIT = "depth_unit"
     FRAME_TIMES = "frame_times"
+    IMPORTED = "imported"
     INTRINSICS = "intrinsics"
     LAYOUT = "layout"
     MASKS = "masks"

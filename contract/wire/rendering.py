@@ -15,8 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.cameras import CamerasRequest
 from contract.wire.exports import ExportOptions
-from contract.wire.job import JOB_ID_PATTERN
-from contract.wire.names import Eye
+from contract.wire.names import JOB_ID_PATTERN, Eye
 from contract.wire.notices import Notice
 from contract.wire.pose import MatrixPose, OrbitPose
 

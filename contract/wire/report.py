@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
-from contract.wire.names import Eye, Eyes
+from contract.wire.names import JOB_ID_PATTERN, Eye, Eyes
 from contract.wire.notices import Notice, NoticeCode, Severity
 
 REPORT_VERSION = 2
 """Raised when a field changes its meaning; new fields do not raise it."""
+VersionText = Annotated[str, Field(pattern=r"^[0-9A-Za-z.+-]{1,40}$")]
+"""A version of intrasplat."""
 RESEARCH_USE = "Research use only. Not a medical device; it must not guide treatment."
 
 
@@ -143,6 +145,19 @@ class Recorded(BaseModel):
     size_bytes: int = Field(ge=0, description="what they take on the disk")
 
 
+class Imported(BaseModel):
+    """Where a scene came from that was made by another installation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    scene_id: str | None = Field(
+        default=None, pattern=JOB_ID_PATTERN, description="its id there; None: it was exported from a folder"
+    )
+    version: VersionText = Field(description="of the intrasplat that exported it")
+    exported_at_s: float = Field(ge=0, description="when it was exported, UNIX s, by the clock there")
+    imported_at_s: float = Field(ge=0, description="when it was imported, UNIX s")
+
+
 class Report(BaseModel):
     """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why; or
     while `scored` is False: a scene is finished before its scores are.
@@ -156,6 +171,7 @@ class Report(BaseModel):
 
     report_version: int = REPORT_VERSION
     notice: str = RESEARCH_USE
+    imported: Imported | None = Field(default=None, description="where the scene came from; None: it was made here")
     versions: dict[str, str] = Field(default={}, description="versions of intrasplat and of what it computes with")
 
     scored: bool = Field(

@@ -70,10 +70,11 @@ class Kept:
 
 
 class Deployment:
-    """One installation in its own folder and on its own port; a context manager."""
+    """One installation in its own folder and on its own port; a context manager. environment: of its processes, too."""
 
-    def __init__(self, folder: Path, port: int, workers: int = 1) -> None:
+    def __init__(self, folder: Path, port: int, workers: int = 1, **environment: str) -> None:
         folder.mkdir(parents=True)
+        self._more = environment
         self.data_dir = folder / "data"
         self.points = Points(folder / "points")
         self.server = EmbeddedServer(self.data_dir)
@@ -148,7 +149,7 @@ class Deployment:
 
     def _environment(self, changes: dict[str, str]) -> dict[str, str]:
         settings = self.settings.model_copy(update=changes)
-        return {**os.environ, **settings.to_environment(), FOLDER_VARIABLE: str(self.points.folder)}
+        return {**os.environ, **settings.to_environment(), FOLDER_VARIABLE: str(self.points.folder), **self._more}
 
     def _keep(self) -> None:
         while not self._end.wait(KEEP_PERIOD_S):

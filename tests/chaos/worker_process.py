@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -10,8 +11,12 @@ from contract.runtime.settings import Settings
 from tests.chaos.points import install_worker_points
 from worker.daemon.supervisor import run_supervisor
 
+REAL_CHILD = "INTRASPLAT_CHAOS_REAL_CHILD"
+"""Set: the device child is the real one, too."""
+
 if __name__ == "__main__":
     install_worker_points()
     end = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: end.set())
-    run_supervisor(Settings.from_environment(), end, child_command=[sys.executable, "-m", "tests.chaos.trainer"])
+    stand_in = [sys.executable, "-m", "tests.chaos.trainer"]
+    run_supervisor(Settings.from_environment(), end, None if REAL_CHILD in os.environ else stand_in)

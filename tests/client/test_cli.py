@@ -25,6 +25,7 @@ from contract.wire.names import MASKS, SUBMISSION
 from contract.wire.report import Masks
 from intrasplat_client import Client, JobState
 from intrasplat_client.errors import error_of_document
+from tests.archives import archived, small_scene
 from tests.client.local_service import LocalService, local_service
 from tests.reports import REPORT_OF_A_SCENE
 
@@ -289,3 +290,23 @@ def test_a_job_that_has_not_begun_is_shown_by_its_state(client: Client, clip: Pa
     job = client.reconstruct(clip)
     assert progress_of(job).stage == "queued"
     client.cancel(job.id)
+
+
+def test_import_sends_a_scene_of_another_installation(
+    service: LocalService, client: Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "scene.zip"
+    path.write_bytes(archived(tmp_path / "there", small_scene(50)))
+    arguments = ["--label", "demo", "--metadata", "study=7", "--retention-hours", "5", "--idempotency-key", "once"]
+    assert run_in(service, "import", str(path), *arguments) == ExitCode.OK
+    job = client.job(capsys.readouterr().out.strip())
+    assert (job.label, job.metadata, job.options.retention_hours, job.imported) == ("demo", {"study": "7"}, 5.0, True)
+    assert (service.store.spool_folder(job.id) / "scene.zip").read_bytes() == path.read_bytes()
+    assert (
+        client.import_scene(path, label="demo", metadata={"study": "7"}, retention_hours=5, idempotency_key="once")
+        == job
+    )
+    assert run_in(service, "import", str(tmp_path / "none.zip")) == ExitCode.BAD_INPUT
+    path.write_bytes(b"no zip")
+    assert run_in(service, "import", str(path)) == ExitCode.BAD_INPUT
+    assert "scene: scene.zip is not a readable zip" in capsys.readouterr().err

@@ -14,7 +14,8 @@ from contract.wire.notices import NoticeCode
 from service.problems import TITLES
 from tests.client.words import LANGUAGES, table
 from tests.test_codes import NOTICES
-from worker.daemon.consume import FETCHING, PUBLISHING
+from worker.daemon.consume import PUBLISHING
+from worker.daemon.orders import FETCHING
 from worker.machine.forecast import COMPILATION, USUAL_S
 from worker.report.judge import STAGE
 

@@ -48,7 +48,7 @@ OPERATIONS = {
         "export_scene",
         "purge_scene",
     ),
-    *("get_file", "get_thumbnail", "get_key"),
+    *("get_file", "get_thumbnail", "import_scene", "get_key"),
     *("healthz", "readyz", "info", "metrics"),
 }
 """What clients are generated from: renaming or removing one breaks them."""

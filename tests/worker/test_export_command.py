@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from contract.runtime.exits import ExitCode
+from contract.store.archive import read_archive
 from contract.wire.exports import EXPORT_FORMATS, ExportOptions
+from tests.archives import stored
 from tests.worker.scenes import random_scene
 from worker.__main__ import main
 from worker.export import export_parts
@@ -44,3 +46,11 @@ def test_what_cannot_be_written_is_told(
         arguments = ["--out", str(scene / arguments[1])]
     assert main(["export", str(scene), *arguments]) == ExitCode.BAD_INPUT
     assert words in capsys.readouterr().err
+
+
+def test_the_scene_itself_is_written_for_another_installation(tmp_path: Path) -> None:
+    stored(tmp_path / "scene", random_scene())
+    assert main(["export", str(tmp_path / "scene"), "--format", "scene"]) == 0
+    archive = read_archive(tmp_path / "scene.scene.zip", 1 << 24)
+    assert archive.head.scene_id is None
+    assert archive.report.gaussians == 11

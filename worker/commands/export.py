@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
 from contract.runtime.arguments import add_options
 from contract.runtime.exits import ExitCode, flag_of
+from contract.store.archive import archive_parts
 from contract.wire.errors import InputError
 from contract.wire.exports import EXPORT_FORMATS, ExportOptions, check_export
 from contract.wire.names import MANIFEST
@@ -36,17 +38,13 @@ def run_cli(options: argparse.Namespace) -> int:
         raise InputError(flag_of(error.field), error.problem, error.remedy) from error
     if not (options.scene / MANIFEST).is_file():
         raise InputError("SCENE", f"{options.scene} holds no scene.", "Name a folder that `reconstruct --out` wrote.")
-    from worker.export import export_parts
-    from worker.raster.backend import choose_device
-    from worker.scene.checkpoint import load_scene
-
-    scene = load_scene(options.scene)
+    parts = _parts(options, chosen)
     folder = options.scene.resolve()
     path = options.out or folder.with_name(folder.name + EXPORT_FORMATS[options.format].suffix)
     unfinished = path.with_name(f".{path.name}.part")
     try:
         with unfinished.open("wb") as file:
-            for part in export_parts(scene, options.format, chosen, choose_device(options.device)):
+            for part in parts:
                 file.write(part)
         unfinished.replace(path)
     except OSError as error:
@@ -55,3 +53,14 @@ def run_cli(options: argparse.Namespace) -> int:
         unfinished.unlink(missing_ok=True)
     print(path)
     return ExitCode.OK
+
+
+def _parts(options: argparse.Namespace, chosen: ExportOptions) -> Iterator[bytes]:
+    """The file in parts. A format of the stored files needs no torch."""
+    if EXPORT_FORMATS[options.format].is_stored:
+        return archive_parts(options.scene)
+    from worker.export import export_parts
+    from worker.raster.backend import choose_device
+    from worker.scene.checkpoint import load_scene
+
+    return export_parts(load_scene(options.scene), options.format, chosen, choose_device(options.device))

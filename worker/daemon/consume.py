@@ -28,7 +28,7 @@ from worker.daemon.hang import HangDetector
 from worker.daemon.heartbeat import Heartbeat
 from worker.daemon.held import HeldClaim
 from worker.daemon.job_errors import describe
-from worker.daemon.orders import Advanced, Failed, Finished, RunJob, StopJob, Stopped
+from worker.daemon.orders import FETCHING, Advanced, Failed, Finished, RunJob, StopJob, Stopped
 from worker.daemon.room import Room
 from worker.daemon.scores import AwaitedScores, LeftScores
 
@@ -40,9 +40,8 @@ UNREACHABLE_PAUSE_S = 1.0
 MAX_STORE_S = 60.0
 """The job fails when the store fails for so long. For room on the disk it waits as long as it takes."""
 
-FETCHING = "fetch"
 PUBLISHING = "publish"
-"""The first and the last stage a caller sees: the clip is fetched, the scene is published."""
+"""The last stage a caller sees: the scene is published."""
 
 DONE = "done"
 UNSETTLED = "the queue cannot be reached; the lease will run out"

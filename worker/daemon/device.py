@@ -22,13 +22,14 @@ from contract.store.disk_errors import StoreFullError
 from contract.store.results import without_scores
 from contract.store.store import Store, open_store
 from contract.wire.errors import Cancelled, InputError, ResumeMismatch, UnavailableError
-from contract.wire.job import JobRecord
+from contract.wire.job import JobProgress, JobRecord
 from contract.wire.names import REPORT
 from contract.wire.rendering import SceneRequest
-from contract.wire.report import Report
+from contract.wire.report import Imported, Report
 from worker.daemon.channel import Channel, Orders, Task
 from worker.daemon.job_errors import describe
 from worker.daemon.orders import (
+    FETCHING,
     Advanced,
     Failed,
     Finished,
@@ -52,6 +53,7 @@ from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lo
 from worker.raster.cpu import compile_kernels
 from worker.raster.cpu.threads import alone, cpu_time_s, thread_count
 from worker.scene.compact import compile_coder
+from worker.scene.imported import take_scene
 from worker.scene.resume_file import RESUME_FILE
 from worker.train.hooks import TrainingHooks
 from worker.train.request import ReconstructionRequest
@@ -142,6 +144,9 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
 def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, channel: Channel) -> None:
     """Do what was ordered, and report it."""
     order, limits = task.order, ClipLimits.of(settings)
+    if order.record.imported is not None:
+        take_in(order, order.record.imported, limits, settings.max_upload_bytes, channel)
+        return
     hooks = TrainingHooks(
         on_progress=_Reporter(channel).report,
         should_stop=task.stop.is_set,
@@ -161,6 +166,27 @@ def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, chann
         return
     channel.send(Finished())
     channel.send(scored(lambda: judge(made, hooks), made.report))
+
+
+def take_in(
+    order: RunJob | ScoreScene, imported: Imported, limits: ClipLimits, max_bytes: int, channel: Channel
+) -> None:
+    """Take in a scene that another installation made; it has its scores."""
+    if isinstance(order, ScoreScene):
+        report = order.scene / REPORT
+        channel.send(scored(lambda: Report.model_validate_json(report.read_bytes()), report))
+        return
+
+    def tell(fraction: float) -> None:
+        channel.send(Advanced(progress=JobProgress(stage=FETCHING, fraction=fraction)))
+
+    try:
+        taken = take_scene(order.spool / order.record.files.clip, order.out, imported, limits, max_bytes, tell)
+    except Exception as error:
+        channel.send(Failed(error=describe(error), fault=type(error).__name__))
+        return
+    channel.send(Finished())
+    channel.send(Scored(report=taken))
 
 
 def work_on(

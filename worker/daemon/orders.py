@@ -20,6 +20,9 @@ from contract.wire.job import JobError, JobProgress, JobRecord
 from contract.wire.report import Report
 from worker.machine.hooks import Progress
 
+FETCHING = "fetch"
+"""The first stage a caller sees: what was sent is fetched, and a scene that was sent whole is read."""
+
 
 class _Message(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")

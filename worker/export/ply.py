@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.store.zipped import zip_parts
 from worker.export.target import Target, splats_at
-from worker.export.zipped import zip_parts
 from worker.scene.scene import Scene
 
 

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.store.zipped import zip_parts
 from worker.export.npy import npy_head
 from worker.export.target import Target, as_bytes, splats_at
-from worker.export.zipped import zip_parts
 
 
 def tracks_parts(target: Target) -> Iterator[bytes]:

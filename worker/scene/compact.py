@@ -62,6 +62,17 @@ OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6
 """Orthonormal: brightness, red - blue, magenta - green."""
 
 
+TENSORS = {
+    "count": (torch.int64, 1),
+    "step": (torch.float32, 1),
+    "pattern": (torch.float32, 3),
+    "centre": (torch.float32, 1),
+    "width": (torch.float32, 1),
+    "shared": (torch.uint8, 1),
+}
+"""Type and dimensions of the tensors of a file, by name; PARTS codes are the others."""
+
+
 class DoesNotFitError(ValueError):
     """As many and as large whole numbers as a scene may have cannot hold it."""
 
@@ -196,17 +207,11 @@ def unpack(tensors: Mapping[str, Tensor]) -> Compact:
         ValueError: tensors are missing, do not fit together, or unpack to more than MAX_NUMBERS.
     """
     count, step, pattern, centre, width, shared = (
-        _checked(tensors, name, kind, dimensions)
-        for name, kind, dimensions in (
-            ("count", torch.int64, 1),
-            ("step", torch.float32, 1),
-            ("pattern", torch.float32, 3),
-            ("centre", torch.float32, 1),
-            ("width", torch.float32, 1),
-            ("shared", torch.uint8, 1),
-        )
+        _checked(tensors, name, kind, dimensions) for name, (kind, dimensions) in TENSORS.items()
     )
     codes = [_checked(tensors, f"code.{part}", torch.uint8, 1).numpy().tobytes() for part in range(PARTS)]
+    if len(tensors) > len(TENSORS) + PARTS:
+        raise ValueError("there are tensors that no compact scene has")
     channels, patterns, bases = pattern.shape
     at_rest = len(state_rows(channels))
     columns = at_rest + channels * patterns + PLAIN_COLUMNS

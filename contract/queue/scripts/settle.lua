@@ -4,6 +4,12 @@
 -- Keys   job:<id>, held, ended, jobs:<priority>, dead, durations, rests, events:<id>
 -- Answer 1: this claim has brought the job to that end; 0: the claim does not hold, or a cancel is in the way.
 
+-- Whether a job takes in a scene that was made elsewhere: how long that takes says nothing of other jobs.
+local function is_import(job)
+  local is_json, record = pcall(cjson.decode, job.document or '')
+  return is_json and type(record) == 'table' and type(record.imported) == 'table'
+end
+
 -- The seconds of training that a job's options ask for; nil if they name none.
 -- contract/queue/interface.py: asked_training_s says the same.
 local function asked_training_s(job)
@@ -18,7 +24,7 @@ if not is_of(job, ARGV[3], ARGV[4]) then return 0 end
 if job.state == target then return 1 end
 if job.state ~= 'running' or (target == 'cancelled') ~= (job.cancel ~= nil) then return 0 end
 if not change(job, target, {error = ARGV[6] ~= '' and ARGV[6]}) then return 0 end
-if target == 'done' then
+if target == 'done' and not is_import(job) then
   local took_s, asked_s = tonumber(job.finished) - tonumber(job.started), asked_training_s(job)
   redis.call('LPUSH', P .. 'durations', took_s)
   redis.call('LTRIM', P .. 'durations', 0, RULES.max_durations - 1)

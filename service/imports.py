@@ -1,0 +1,90 @@
+"""POST /scenes: a scene that another installation made becomes a scene of the caller's, by a job like any other.
+
+The service judges the archive without reading a number of it; the worker that takes the job reads the scene.
+"""
+
+from __future__ import annotations
+
+import time
+
+from fastapi import APIRouter, Request, Response
+from starlette.concurrency import run_in_threadpool
+
+from contract.access.audit import AuditAction
+from contract.access.keys import KeyScope
+from contract.store.archive import read_archive
+from contract.wire.errors import InputError
+from contract.wire.job import JobFiles, JobRecord, JobView
+from contract.wire.options import JobOptions, parse_options
+from contract.wire.report import Imported
+from service.access import Caller
+from service.bodies import SCENE_BODY
+from service.deps import AnyCaller, Deps, Services
+from service.problems import RETRY_AFTER_S
+from service.reconstruct import IdempotencyKey, check_scopes, enqueue, forecast_of, hash_of, receive_form
+from service.retention import check_retention
+from service.upload import SCENE_FORM, SCENE_PART, Received
+
+router = APIRouter(tags=["scenes"])
+
+OPTIONS = ("priority", "retention_hours")
+"""What may be chosen about an import: nothing is trained."""
+
+
+@router.post("/scenes", status_code=202, operation_id="import_scene", openapi_extra=SCENE_BODY)
+async def import_scene(
+    request: Request, response: Response, services: Services, caller: AnyCaller, idempotency_key: IdempotencyKey = None
+) -> JobView:
+    """Send a scene that another installation exported with format=scene. 202 means that it is safely on disk and
+    queued; Location is the job, which is done when a worker has read the scene, and whose id is the scene's here.
+    """
+    caller.require(KeyScope.RECONSTRUCT)
+    record = await receive_form(request, services, caller, hash_of(idempotency_key), _accept, SCENE_FORM)
+    response.headers["Location"] = f"/jobs/{record.job_id}"
+    response.headers["Retry-After"] = str(RETRY_AFTER_S)
+    return JobView.of(record, await run_in_threadpool(forecast_of, services, record))
+
+
+def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key: str | None) -> JobRecord:
+    """Spool first, then queue: a job exists only for an archive that is on disk and has passed the checks."""
+    options = _options(received.options)
+    check_retention(options, services.settings)
+    check_scopes(options, caller, services.settings)
+    if SCENE_PART not in received.names:
+        raise InputError(SCENE_PART, "there is no scene.", SCENE_FORM.remedy)
+    name, now_s = received.names[SCENE_PART], time.time()
+    archive = read_archive(services.store.incoming_folder(job_id) / name, services.settings.max_upload_bytes)
+    head = archive.head
+    record = JobRecord(
+        job_id=job_id,
+        tenant=caller.tenant,
+        files=JobFiles(clip=name),
+        options=options.model_copy(update={"preset": archive.manifest.preset}),
+        labels=received.labels,
+        input_bytes=received.total_bytes,
+        input_sha256=received.sha256(),
+        imported=Imported(
+            scene_id=head.scene_id, version=head.intrasplat, exported_at_s=head.exported_at_s, imported_at_s=now_s
+        ),
+        idempotency_key=key,
+        created_at_s=now_s,
+    )
+    services.audit.record(AuditAction.IMPORTED, caller, job_id)
+    with services.sweep.in_hand(job_id):
+        services.store.accept(record)
+        return enqueue(services, record)
+
+
+def _options(text: str) -> JobOptions:
+    """The options of an import.
+
+    Raises:
+        InputError: names an option that is about training, or cannot be used.
+    """
+    options = parse_options(JobOptions, text)
+    for name in sorted(options.model_fields_set - {*OPTIONS}):
+        raise InputError(f"options.{name}", "an imported scene is not trained.", f"Leave it out. {_TAKES}")
+    return options
+
+
+_TAKES = f"An import takes {' and '.join(OPTIONS)}."
