@@ -5,7 +5,8 @@ import { button, element } from "./element.js";
 import { figure, words } from "./messages.js";
 import { showProblem } from "./problem.js";
 
-/** The formats of docs/export.md, and what their files' names end in; those of one moment are of the one in view. */
+/** The formats of docs/export.md, and what their files' names end in; those of one moment are of the one in view.
+ * The scene itself is for keys that may download it. */
 const GROUPS = {
   moment: {
     "mesh-glb": "-mesh.glb",
@@ -23,6 +24,9 @@ const GROUPS = {
     "tracks": "-tracks.npz",
     "ply-zip": "-ply.zip",
     "tum": ".tum",
+  },
+  itself: {
+    "scene": ".scene.zip",
   },
 };
 const KEPT_MS = 10_000;
@@ -61,10 +65,11 @@ export class Downloads {
   /**
    * @param {HTMLDialogElement} dialog
    * @param {HTMLElement} message
+   * @param {import("./scopes.js").Scopes} scopes
    * @param {(id: string) => number} momentOf the moment in view of a scene, 0 of any other
    */
-  constructor(dialog, message, momentOf) {
-    Object.assign(this, { dialog, message, momentOf });
+  constructor(dialog, message, scopes, momentOf) {
+    Object.assign(this, { dialog, message, scopes, momentOf });
     dialog.addEventListener("click", (event) => {
       if (event.target === dialog) dialog.close(); // beside it
     });
@@ -79,13 +84,15 @@ export class Downloads {
       element("header", {}, element("h2", { text: words("download.title", { name }) }), close),
       ...this.#group("moment", id, t),
       ...this.#group("clip", id),
+      ...(this.scopes.has("download") ? this.#group("itself", id) : []),
       element("p", { class: "quiet", text: words("download.research") }),
     );
     this.dialog.showModal();
   }
 
   #group(group, id, t) {
-    const title = group === "moment" ? words(t > 0 ? "download.moment" : "download.first", { t: figure(t, 3) }) : words("download.clip");
+    const isMoment = group === "moment";
+    const title = isMoment ? words(t > 0 ? "download.moment" : "download.first", { t: figure(t, 3) }) : words(`download.${group}`);
     const buttons = Object.entries(GROUPS[group]).map(([format, suffix]) => {
       const text = `${words(`download.${format}`)} (.${suffix.split(".").at(-1)})`;
       const made = button(text, () => this.#save(id, format, suffix, t));

@@ -137,7 +137,7 @@ const list = new JobList(
 const jobs = new Jobs(showJobs, showConnection);
 const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
 const momentOf = (id) => (viewer.scene === id ? viewer.timeline.t : 0);
-const downloads = new Downloads(get("download"), get("jobs-message"), momentOf);
+const downloads = new Downloads(get("download"), get("jobs-message"), scopes, momentOf);
 
 const form = new ClipForm(
   {

@@ -209,6 +209,7 @@ export const DE = {
     "moment": "Der gezeigte Moment (t {t})",
     "first": "Der erste Moment",
     "clip": "Der ganze Clip",
+    "itself": "Die Szene selbst",
     "research": "Für die Forschung. Messen Sie damit keine Anatomie aus.",
     "mesh-glb": "Oberfläche mit Farben, in Metern",
     "mesh-ply": "Oberfläche mit Farben, in mm",
@@ -222,6 +223,7 @@ export const DE = {
     "depth": "Tiefe jedes Bildes, in mm, für NumPy",
     "tracks": "Wo jeder Punkt mit der Zeit ist, für NumPy",
     "ply-zip": "Splats jedes Bildes, in mm",
+    "scene": "Für den Import in einer anderen Installation",
     "tum": "Der Weg des Endoskops"
   },
   "report": {

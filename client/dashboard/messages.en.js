@@ -209,6 +209,7 @@ export const EN = {
     "moment": "The moment in view (t {t})",
     "first": "The first moment",
     "clip": "The whole clip",
+    "itself": "The scene itself",
     "research": "For research. Do not measure anatomy with it.",
     "mesh-glb": "Surface with colours, in metres",
     "mesh-ply": "Surface with colours, in mm",
@@ -222,6 +223,7 @@ export const EN = {
     "depth": "Depth of every frame, in mm, for NumPy",
     "tracks": "Where each point is over time, for NumPy",
     "ply-zip": "Splats of every frame, in mm",
+    "scene": "To be imported by another installation",
     "tum": "The endoscope's path"
   },
   "report": {

@@ -17,7 +17,7 @@ from contract.store.archive import AGAIN, FIELD, NESTED, read_archive
 from contract.store.durable import FOR_ALL, replace_file
 from contract.store.results import without_scores
 from contract.wire.errors import InputError, SceneError
-from contract.wire.names import REPORT, THUMBNAIL
+from contract.wire.names import RECORDED, REPORT, THUMBNAIL
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import Imported, Report
 from worker.scene.checkpoint import MISFITS, load_scene, save_scene
@@ -61,6 +61,8 @@ def take_scene(
     (folder / THUMBNAIL).unlink(missing_ok=True)  # it is rendered anew, so it shows the scene
     save_scene(folder, _known(scene, warnings))
     report = _from_elsewhere(read.report, imported)
+    if not (folder / RECORDED).exists():
+        report = report.model_copy(update={"recorded": None})
     replace_file(folder / REPORT, report.model_dump_json(indent=1).encode(), FOR_ALL)
     on_step(1.0)
     return report
