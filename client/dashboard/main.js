@@ -3,6 +3,7 @@
 import { getCurve, getReport } from "./api.js";
 import { stepBackWhileIdle } from "./awake.js";
 import { nameOf } from "./card.js";
+import { Compare } from "./compare.js";
 import { drawCurve, pointsOfCsv } from "./curve.js";
 import { Downloads } from "./downloads.js";
 import { Drawers } from "./drawers.js";
@@ -39,6 +40,17 @@ export const viewer = new Viewer({
   play: get("play"),
 });
 
+const compare = new Compare(viewer, {
+  stage: get("stage"),
+  box: get("compare-box"),
+  canvas: get("recorded"),
+  seam: get("seam"),
+  ofRecorded: get("of-recorded"),
+  ofModel: get("of-model"),
+  mode: get("compare"),
+  tools: get("compare-tools"),
+  message: get("compare-message"),
+});
 const drawers = new Drawers(get("tools"));
 
 /** @type {string | null} the job that opens by itself as soon as there is something to see of it */
@@ -56,6 +68,7 @@ function view(id, message) {
   awaited = null;
   reported = null;
   viewer.open(id, message);
+  compare.open(id);
   jobs.view(id);
   if (id !== null && drawers.isOpen !== "report-drawer") drawers.close();
   say(words("page.report_of"));
@@ -69,6 +82,7 @@ async function report(id) {
   try {
     const found = await getReport(id);
     if (!isStill()) return;
+    compare.know(id, found);
     showReport(get("report"), id, found, sendMasks);
     const csv = await getCurve(id).catch(() => "");
     if (!isStill()) return;

@@ -285,6 +285,24 @@ export const DE = {
     "no_connection": "keine Verbindung",
     "report_of": "Zur gezeigten Szene: wie gut sie ist, und was zu beachten ist."
   },
+  "compare": {
+    "title": "Mit der Aufnahme vergleichen",
+    "off": "kein Vergleich",
+    "wipe": "Aufnahme und Modell, mit Trennlinie",
+    "side": "Aufnahme neben dem Modell",
+    "instruments": "Instrumente in der Aufnahme",
+    "instruments_why": "Ohne sie ist schraffiert, was maskiert ist.",
+    "recorded": "Aufnahme, Bild {frame}",
+    "loading": "Bild der Aufnahme wird geladen",
+    "model": "Modell",
+    "seam": "Trennlinie zwischen Aufnahme und Modell",
+    "seam_at": "Aufnahme auf {percent} % der Breite",
+    "turned": "Der Vergleich ist beendet: Nur vom Ort des Endoskops aus zeigen Aufnahme und Modell dasselbe.",
+    "not_yet": "Die Aufnahme kann verglichen werden, wenn die Szene fertig ist.",
+    "none": "Zu dieser Szene gibt es keine Bilder der Aufnahme: Sie ist älter, oder die Bilder sollten nicht aufbewahrt werden.",
+    "no_eye": "Von diesem Auge sind keine Bilder der Aufnahme aufbewahrt.",
+    "failed": "Die Bilder der Aufnahme können nicht gezeigt werden. {why}"
+  },
   "curve": {
     "axes": "dB auf ungesehenen Bildern, je Schritt",
     "axes_both": "dB auf ungesehenen Bildern, dünn: rechtes Auge, je Schritt",

@@ -285,6 +285,24 @@ export const EN = {
     "no_connection": "no connection",
     "report_of": "Of the scene in view: how good it is, and what to be careful about."
   },
+  "compare": {
+    "title": "Compare with the recording",
+    "off": "no comparison",
+    "wipe": "recording and model, with a seam",
+    "side": "recording beside the model",
+    "instruments": "Instruments in the recording",
+    "instruments_why": "Without them, what is masked is hatched.",
+    "recorded": "recorded, frame {frame}",
+    "loading": "recorded frame is loading",
+    "model": "model",
+    "seam": "Seam between recording and model",
+    "seam_at": "recording on {percent} % of the width",
+    "turned": "The comparison has ended: only from the endoscope's own place do recording and model show the same.",
+    "not_yet": "The recording can be compared when the scene is finished.",
+    "none": "This scene keeps no recorded frames: it was made before they were kept, or they were not to be kept.",
+    "no_eye": "Of this eye no recorded frames are kept.",
+    "failed": "The recorded frames cannot be shown. {why}"
+  },
   "curve": {
     "axes": "dB on unseen frames, over iterations",
     "axes_both": "dB on unseen frames, thin: right eye, over iterations",

@@ -21,7 +21,7 @@ const NOT_YET = "Its first picture comes when training begins.";
 /** There is nothing to show, or not to this key; a picture that was there goes. */
 const NOTHING_TO_SHOW = [401, 403, 404, 409];
 
-/** Tells "shown" (a CustomEvent whose detail is Shown) of every picture that has come to the screen. */
+/** Tells "shown" (a CustomEvent whose detail is Shown) of every picture that has come to the screen, "gone" when it goes. */
 export class Viewer extends EventTarget {
   /** @param {Record<string, HTMLElement>} parts by what they are; index.html has them */
   constructor(parts) {
@@ -143,6 +143,7 @@ export class Viewer extends EventTarget {
     if (NOTHING_TO_SHOW.includes(error.status)) {
       this.shown = null;
       this.screen.clear(this.scene, error.message);
+      this.dispatchEvent(new Event("gone"));
     } else this.screen.fail(isNotYet ? NOT_YET : error.message);
   }
 
