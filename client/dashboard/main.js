@@ -1,5 +1,6 @@
 // The page: wires form, jobs, picture, curve and report together.
 
+import { Announcer } from "./announce.js";
 import { getCurve, getReport } from "./api.js";
 import { stepBackWhileIdle } from "./awake.js";
 import { nameOf } from "./card.js";
@@ -112,6 +113,8 @@ function offerMasks() {
 
 function showJobs() {
   scopes.refresh();
+  form.allow(scopes);
+  announcer.refresh(jobs.byId, viewer.scene);
   offerMasks();
   shelf.refresh();
   list.show(shelf.shown, viewer.scene);
@@ -153,6 +156,7 @@ const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message
 const momentOf = (id) => (viewer.scene === id ? viewer.timeline.t : 0);
 const downloads = new Downloads(get("download"), get("jobs-message"), scopes, momentOf);
 
+const announcer = new Announcer({ line: get("sent"), ask: get("notify") }, view);
 const form = new ClipForm(
   {
     form: get("upload"),
@@ -160,13 +164,20 @@ const form = new ClipForm(
     message: get("upload-message"),
     progress: get("upload-progress"),
     stop: get("upload-stop"),
+    refusal: get("upload-refusal"),
   },
-  (id) => {
-    awaited = id;
-    if (!viewer.scene) viewer.open(null, words("page.awaited"));
-    jobs.poll();
+  {
+    onJob: (id) => {
+      awaited = id;
+      announcer.await(id);
+      if (!viewer.scene) viewer.open(null, words("page.awaited"));
+      jobs.poll();
+    },
+    onShare: (share) => announcer.send(share),
+    onAsked: () => drawers.open("drawer", false),
   },
 );
+awaited = announcer.awaited; // of before a reload
 get("layer").addEventListener("change", offerMasks);
 get("better-masks").addEventListener("click", () => sendMasks(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
