@@ -1,4 +1,4 @@
-"""A network of one's own finds the instruments, if onnxruntime is there."""
+"""A network of one's own finds the instruments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from worker.machine.timing import Timings
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf
 from worker.stereo import ClipPaths, open_with_depth
 
-pytest.importorskip("onnxruntime")
 BLUE, BLUE_BIAS = (-20.0, -20.0, 40.0), -5.0
 
 
