@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from contract.runtime.arguments import add_options, given_options
 from contract.runtime.exits import ExitCode
@@ -12,6 +14,10 @@ from contract.runtime.progress_bar import ProgressBar
 from contract.wire.errors import InputError
 from contract.wire.notices import NoticeCode
 from contract.wire.options import ReconstructionOptions
+
+if TYPE_CHECKING:
+    from worker.input.clip import DepthClip
+    from worker.poses.rigid import Reals
 
 OPTIONS = (
     "layout",
@@ -35,8 +41,13 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--calibration", type=Path, metavar="F", help="as for reconstruct")
     parser.add_argument("--masks", type=Path, metavar="F", help="as for reconstruct")
+    parser.add_argument("--segmenter", type=Path, metavar="F", help="as for reconstruct")
     parser.add_argument(
-        "--against", type=Path, metavar="TUM", help="the true path: prints the absolute trajectory error against it"
+        "--against",
+        type=Path,
+        metavar="TUM",
+        help="the true path, with a pose for each frame or beginning with the clip: prints the absolute trajectory "
+        "error against it",
     )
     parser.add_argument("--out", type=Path, metavar="TUM", help="file to write the path to, in seconds and metres")
     add_options(parser, ReconstructionOptions, *OPTIONS)
@@ -54,33 +65,45 @@ def run_cli(options: argparse.Namespace) -> int:
     from worker.machine.hooks import Hooks
     from worker.machine.timing import Timings
     from worker.poses import with_poses
-    from worker.poses.trajectory import at_times, from_first, read_tum, trajectory_error, write_tum
+    from worker.poses.trajectory import from_first, read_tum, trajectory_error, write_tum
     from worker.stereo import ClipPaths, open_with_depth
 
-    true = read_tum(options.against) if options.against else None
+    out: Path | None = options.out
+    if out is not None and (out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK)):
+        raise InputError("--out", f"{out} cannot be written.", "Name a file in a folder that is there.")
+    known = read_tum(options.against) if options.against else None
     given, timings = given_options(options, ReconstructionOptions), Timings()
     keep_decoder_ready()
     with ProgressBar(sys.stderr) as bar:
         hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)))
         paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
-        clip = with_poses(open_with_depth(paths, given, hooks, timings), given, hooks, timings)
-    told = clip.poses
-    assert told is not None
+        clip = open_with_depth(paths, given, hooks, timings, segmenter=options.segmenter)
+        true = None if known is None else from_first(_of_frames(clip, *known))
+        clip = with_poses(clip, given, hooks, timings)
     for notice in clip.assumptions:
         if notice.code is NoticeCode.POSES:
             print(notice.text)
     for notice in clip.warnings:
         print(f"{notice.severity}: {notice.text}")
-    if options.out is not None:
-        write_tum(options.out, clip.frame_times_s, clip.world_from_camera)
+    if out is not None:
+        write_tum(out, clip.frame_times_s, clip.world_from_camera)
     if true is not None:
-        times_s, poses = true
-        if len(poses) != clip.frame_count:
-            first_s = clip.frame_times_s + times_s[0]
-            if first_s[-1] > times_s[-1] + 1:
-                problem = f"{options.against} ends before the clip does."
-                raise InputError("--against", problem, "Give the path of this clip.")
-            poses = at_times(times_s, poses, first_s)
-        error = trajectory_error(clip.world_from_camera, from_first(poses))
+        error = trajectory_error(clip.world_from_camera, true)
         print(f"absolute trajectory error: {error.mm:.2f} mm, {error.deg:.2f} degrees")
     return ExitCode.OK
+
+
+def _of_frames(clip: DepthClip, times_s: Reals, poses: Reals) -> Reals:
+    """The known poses [T, 4, 4] of the clip's frames: a line for each, or those at their times since the first line.
+
+    Raises:
+        InputError: the path is not this clip's.
+    """
+    from worker.poses.trajectory import at_times
+
+    if len(poses) == clip.frame_count:
+        return poses
+    if any(notice.code is NoticeCode.FRAME_TIMES for notice in clip.assumptions):
+        problem = f"the path has {len(poses)} poses, the clip {clip.frame_count} frames whose times nobody knows."
+        raise InputError("--against", problem, "Give a pose for each frame.")
+    return at_times(times_s - times_s[0], poses, clip.frame_times_s - clip.frame_times_s[0])

@@ -68,10 +68,10 @@ def inverse(motion: Reals) -> Reals:
     return back
 
 
-def between(frames: Sequence[int], poses: Reals, index: int) -> Reals:
+def between(frames: Sequence[int] | Reals, poses: Reals, index: float) -> Reals:
     """The pose [4, 4] at a frame if the camera moves evenly between those before and after it.
 
-    frames [K] rise; poses are [K, 4, 4].
+    frames [K] rise, or are times; poses are [K, 4, 4].
     """
     after = int(np.searchsorted(frames, index))
     if after in {0, len(frames)}:

@@ -8,6 +8,7 @@ Symbols: T frames.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +16,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from contract.wire.errors import InputError
-from worker.poses.rigid import Reals, inverse
+from worker.poses.rigid import Reals, between, inverse
 
 MM_PER_M = 1000.0
 ARM_MM = 60.0
 """How much a turn counts beside a place when two paths are laid on each other: as much as it moves what is so far away.
 Places alone do not fix the turn of a path that only turns, or that runs along a line."""
+LATE_S, MAX_GAP_S = 0.02, 0.25
+"""How far a frame may lie from the nearest pose of a path, unless it lies between two that are no farther apart."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +71,16 @@ def read_tum(path: Path) -> tuple[Reals, Reals]:
     """
     remedy = "Give lines `timestamp tx ty tz qx qy qz qw`, in seconds and metres."
     try:
-        lines = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
-        rows = np.array(lines, np.float64)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
         raise InputError("--against", f"{path} cannot be read as a TUM file ({error}).", remedy) from error
-    if rows.ndim != 2 or rows.shape[1] != 8 or not np.isfinite(rows).all():
-        raise InputError("--against", f"{path} does not hold 8 finite numbers a line.", remedy)
+    told = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    if not told:
+        raise InputError("--against", f"{path} holds no pose.", remedy)
+    for number, words in told:
+        if len(words) != 8 or not all(_is_number(word) for word in words):
+            raise InputError("--against", f"line {number} of {path} does not hold 8 finite numbers.", remedy)
+    rows = np.array([words for _, words in told], np.float64)
     lengths = np.linalg.norm(rows[:, 4:], axis=1)
     if not np.allclose(lengths, 1, atol=0.01):
         raise InputError("--against", f"{path} holds quaternions that are not of length 1.", remedy)
@@ -83,10 +90,28 @@ def read_tum(path: Path) -> tuple[Reals, Reals]:
     return rows[:, 0], poses
 
 
+def _is_number(word: str) -> bool:
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
+
+
 def at_times(times_s: Reals, poses: Reals, wanted_s: Reals) -> Reals:
-    """The poses [T, 4, 4] nearest in time to those wanted."""
-    nearest = np.abs(np.asarray(wanted_s)[:, None] - times_s).argmin(1)
-    return np.asarray(poses[nearest])
+    """The poses [T, 4, 4] of a path at the times wanted, which both count from one moment: evenly between its own.
+
+    Raises:
+        InputError: the path's times do not rise, or it has no poses about a time.
+    """
+    remedy = "Give a pose for each frame, or a path that begins with the clip and lasts as long, with 5 poses a second."
+    if not (np.diff(times_s) > 0).all():
+        raise InputError("--against", "the times of the path do not rise from line to line.", remedy)
+    gap_s = np.diff(times_s, prepend=-math.inf, append=math.inf)[np.searchsorted(times_s, wanted_s)]
+    nearest_s = np.abs(np.asarray(wanted_s)[:, None] - times_s).min(1)
+    if (unknown := (gap_s > MAX_GAP_S) & (nearest_s > LATE_S)).any():
+        about = f"{len(times_s)} poses from {times_s[0]:.2f} to {times_s[-1]:.2f} s"
+        raise InputError("--against", f"the path has {about}, and none about {wanted_s[unknown][0]:.2f} s.", remedy)
+    return np.stack([between(times_s, poses, wanted) for wanted in wanted_s])
 
 
 def from_first(poses: Reals) -> Reals:

@@ -43,11 +43,47 @@ def test_a_tum_file_keeps_the_path(tmp_path: Path) -> None:
     read_s, read = read_tum(tmp_path / "path.tum")
     assert_allclose(read_s, times_s)
     assert_allclose(read, path, atol=1e-5)
-    assert_allclose(at_times(read_s, read, times_s[5:7] + 0.001), path[5:7], atol=1e-5)
+    assert_allclose(at_times(read_s, read, times_s[5:7]), path[5:7], atol=1e-5)
     assert_allclose(from_first(read)[0], np.eye(4), atol=1e-6)
 
 
-@pytest.mark.parametrize("text", ["", "1 2 3\n", "0 0 0 0 0 0 0 2\n", "0 0 0 nan 0 0 0 1\n", "a b c d e f g h\n"])
+def test_between_its_poses_a_path_goes_on_evenly() -> None:
+    times_s = np.arange(20) / 25
+    even = np.tile(np.eye(4), (20, 1, 1))
+    even[:, 0, 3] = 3 * np.arange(20)
+    assert_allclose(at_times(times_s, even, np.array([0.1]))[0, :3, 3], [7.5, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("times_s", "about_s"),
+    [
+        (np.arange(10) / 25, "0.40"),
+        (np.arange(20) / 25 + 0.1, "0.00"),
+        (np.delete(np.arange(20) / 25, range(5, 13)), "0.20"),
+    ],
+)
+def test_a_path_without_poses_at_some_of_the_times_is_refused(times_s: Reals, about_s: str) -> None:
+    with pytest.raises(InputError, match=f"none about {about_s} s"):
+        at_times(times_s, a_path(len(times_s)), np.arange(20) / 25)
+
+
+def test_a_path_whose_times_do_not_rise_is_refused() -> None:
+    with pytest.raises(InputError, match="do not rise"):
+        at_times(np.array([0.0, 0.04, 0.04]), a_path(3), np.array([0.0]))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "# no pose\n",
+        "1 2 3\n",
+        "0 0 0 0 0 0 0 1\n0 0 0 0 0 0 1\n",
+        "0 0 0 0 0 0 0 2\n",
+        "0 0 0 nan 0 0 0 1\n",
+        "a b c d e f g h\n",
+    ],
+)
 def test_what_is_no_tum_file_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "bad.tum").write_text(text)
     with pytest.raises(InputError) as caught:
