@@ -43,8 +43,8 @@ def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, ti
     if clip.poses is not None:
         return clip
     if options.poses == "given" and not brought:
-        problem = "asks for poses that come with the clip, and stereo clips bring none."
-        raise InputError("options.poses", f"it {problem}", 'Say "auto" or "estimate", or give the EndoNeRF layout.')
+        problem = '"given" asks for poses that come with the clip, and stereo clips bring none.'
+        raise InputError("options.poses", problem, 'Say "auto" or "estimate", or give the EndoNeRF layout.')
     train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.left_out))
     with timings.measure("poses_s"):
         if options.poses == "given":
@@ -52,8 +52,11 @@ def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, ti
         if options.poses == "auto" and brought:
             return _steadied(clip, train, hooks)
         hooks.report_stage(STAGE, 0.0)
-        if options.poses == "fixed" or len(train) < MIN_FRAMES:
+        if len(train) < MIN_FRAMES:
             return _fixed(clip, "was taken as fixed")
+        if options.poses == "fixed":
+            moves = ", though most of the picture moves: all of that counts as the tissue's motion"
+            return _fixed(clip, f"was taken as fixed, as asked{'' if camera_rests(clip, train) else moves}")
         if options.poses == "auto" and camera_rests(clip, train):
             return _fixed(clip, "is fixed: most of the picture rests")
         from worker.poses.estimate import find_path

@@ -135,6 +135,15 @@ def test_frames_that_show_nothing_of_the_others_are_told() -> None:
     assert not path.confused
 
 
+@pytest.mark.parametrize("camera", [(), ("turn",)])
+def test_a_camera_that_must_be_fixed_is_told_if_the_picture_moves(camera: tuple[CameraPath, ...]) -> None:
+    clip, _ = clip_of("still", *camera)
+    fixed = posed(clip, "fixed")
+    assert fixed.world_from_camera is clip.world_from_camera
+    (notice,) = (each for each in fixed.assumptions if each.code is NoticeCode.POSES)
+    assert ("though most of the picture moves" in notice.text) is bool(camera)
+
+
 def test_poses_that_are_not_there_cannot_be_asked_for() -> None:
     clip, _ = clip_of("still")
     with pytest.raises(InputError) as caught:
