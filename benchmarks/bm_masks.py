@@ -17,7 +17,6 @@ INTRASPLAT_DATA set, its recordings come last, those of d4d with their (approxim
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import tempfile
 import time
@@ -31,6 +30,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.bm_poses import write
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import ReconstructionOptions
 from contract.wire.report import Report
@@ -256,14 +256,6 @@ def trained(clip: DepthClip, truths: Sequence[DepthClip], iterations: int) -> li
     with tempfile.TemporaryDirectory() as folder:
         made = make(ReconstructionRequest(clip, options, device="cpu"), Path(folder), TrainingHooks())
         return [judge(replace(made, clip=truth), TrainingHooks()) for truth in truths]
-
-
-def write(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write the rows measured so far."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python -m benchmarks.pages
 
 Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
-stability`), {post,two-eyes,stereo_truth,confidence,ablation,raster,service,memory,long,poses,keyframes}.csv,
+stability`), {post,two-eyes,stereo_truth,confidence,ablation,raster,service,memory,long,poses,keyframes,masks}.csv,
 off-axis.jpg, stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
 """
 
@@ -51,14 +51,6 @@ a grid of 2.86 pixels, medians in ms.
 _SCENE = """
 The model that `intrasplat reconstruct CLIP --iterations 600 --out s600` ends with on `d4d-a`:
 `python benchmarks/bm_raster.py --scene s600 --quick | tee docs/results/raster-scene.txt`
-"""
-_MASKS = """
-## Instruments found without masks
-
-`python benchmarks/bm_masks.py --size 320x256 --seeds 31 --iterations 300 --out docs/results/masks.csv`
-([masks.csv](masks.csv)): masks that are found against true ones, of every kind of instrument, and what a model loses by
-them. [Decision 048](../decisions/048-instruments-found.md) says what it means. The rows ran beside other programs, so
-their seconds are too many.
 """
 _STEREO = """
 ## Depth from stereo
@@ -128,7 +120,6 @@ def main() -> None:
         parts += [_SCENE, f"\n```\n{(RESULTS / 'raster-scene.txt').read_text().strip()}\n```\n"]
     parts += gpu_sections(RESULTS)
     parts += moving_sections(RESULTS)
-    parts += [_MASKS] if (RESULTS / "masks.csv").exists() else []
     if (RESULTS / "stereo.txt").exists():
         parts += [_STEREO, f"\n```\n{(RESULTS / 'stereo.txt').read_text().strip()}\n```\n"]
     parts += stereo_truth_sections(RESULTS)

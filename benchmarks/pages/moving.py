@@ -1,4 +1,4 @@
-"""What is measured of a camera that moves: its path, and the tissue that it shows."""
+"""What is measured of a camera that moves, its path and the tissue that it shows, and of clips without masks."""
 
 from __future__ import annotations
 
@@ -32,14 +32,23 @@ pixels of 640 on ([decision 051](../decisions/051-given-poses-that-jump.md)).
 _TISSUE = """
 ### Tissue that comes into view later
 
-`python -m benchmarks.bm_keyframes --motions breathing pull --seeds 1 --out docs/results/keyframes.csv`
-([keyframes.csv](keyframes.csv)):
-`fast` on stereo clips of 320x256, with the true poses and with those that `auto` finds. Held-out psnr_tissue in dB,
-left and right eye; the share of the tissue seen by any frame that the scene covers. Then what has left the view, from
-where the camera was a quarter of the clip before: the median error of its depth in mm, had it stayed as it was, and
-as shown; the mean confidence there, and of what is in view ([decision 050](../decisions/050-keyframes.md)).
+`python -m benchmarks.bm_keyframes --motions breathing pull --seeds 1 --out docs/results/keyframes.csv`, in parts that
+ran one after another ([keyframes.csv](keyframes.csv)): `fast` on stereo clips of 320x256, with the true poses and with
+those that `auto` finds. Held-out psnr_tissue in dB, left and right eye; the share of the tissue seen by any frame that
+the scene covers. Then what has left the view, from where the camera was a quarter of the clip before: the median error
+of its depth in mm, had it stayed as it was, and as shown; the mean confidence there, and of what is in view. The rows
+ran beside other programs ([decision 050](../decisions/050-keyframes.md)).
 """
+_MASKS = """
+## Instruments found without masks
 
+`python benchmarks/bm_masks.py --size 320x256 --seeds 31 --iterations 300 --out docs/results/masks.csv`
+([masks.csv](masks.csv)): masks that are found against true ones, of every kind of instrument, and held-out dB of
+`fast` with the true masks and with those found, over the tissue of the true ones: what is masked and never seen is a
+hole there, and counts. The masks of `d4d-a` and `d4d-a-stereo` are approximate, and `surgt_raw` has none. The rows ran
+beside other programs, so their seconds, of one core, are too many
+([decision 048](../decisions/048-instruments-found.md)).
+"""
 
 _PATH_COLUMNS = {
     "clip": "clip",
@@ -64,6 +73,21 @@ _NOISY_COLUMNS = {
     "share_mm": "share of the error, mm",
     "share_deg": "degrees",
 }
+_MASK_COLUMNS = {
+    "clip": "clip",
+    "frames": "frames",
+    "iou": "intersection over union",
+    "worst_iou": "in the worst frame",
+    "true_share": "true share",
+    "found_share": "found share",
+    "sure": "sure",
+    "told": "told",
+    "given_left_db": "left eye, true",
+    "found_left_db": "found",
+    "given_right_db": "right eye, true",
+    "found_right_db": "found",
+    "cost_s": "s",
+}
 
 
 def moving_sections(results: Path) -> list[str]:
@@ -77,6 +101,9 @@ def moving_sections(results: Path) -> list[str]:
         parts += [_NOISY, table([*_NOISY_COLUMNS.values(), "warned"], shown)]
     if rows := _rows(results / "keyframes.csv"):
         parts += [_TISSUE, _tissue_table(rows)]
+    if rows := _rows(results / "masks.csv"):
+        shown = [[row[name] or "–" for name in _MASK_COLUMNS] for row in rows]
+        parts += [_MASKS, table(list(_MASK_COLUMNS.values()), shown)]
     return parts
 
 
