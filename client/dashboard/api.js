@@ -87,6 +87,8 @@ export const getThumbnail = async (id) => (await request(`/scenes/${id}/thumbnai
 export const purgeScene = (id) => json(`/scenes/${id}`, { method: "DELETE" });
 /** @param {string} id @returns {Promise<Record<string, any>>} */
 export const getReport = (id) => json(`/scenes/${id}`);
+/** @param {string} id @returns {Promise<import("./wire.js").SceneCameras>} */
+export const getCameras = (id) => json(`/scenes/${id}/cameras`);
 /** @param {string} id @returns {Promise<string>} CSV */
 export const getCurve = async (id) => (await request(`/scenes/${id}/curve`)).text();
 /**
@@ -109,18 +111,6 @@ export async function trouble() {
     throw error;
   }
 }
-
-/**
- * Something that speaks against a clip; refused: POST /reconstruct would refuse it.
- * @typedef {{field: string, code: string, refused: boolean, problem: string, remedy: string}} Finding
- */
-/** @param {Record<string, unknown>} described a clip that is to be sent @returns {Promise<{findings: Finding[]}>} */
-export const checkClip = (described) =>
-  json("/reconstruct/check", {
-    method: "POST",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify(described),
-  });
 
 /**
  * Make finished uploads a job.

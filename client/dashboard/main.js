@@ -1,6 +1,6 @@
 // The page: wires form, jobs, picture, curve and report together.
 
-import { Announcer } from "./announce.js";
+import { Address } from "./address.js";
 import { getCurve, getReport } from "./api.js";
 import { stepBackWhileIdle } from "./awake.js";
 import { nameOf } from "./card.js";
@@ -10,14 +10,18 @@ import { Downloads } from "./downloads.js";
 import { Drawers } from "./drawers.js";
 import { baselinesOf } from "./figures.js";
 import { ClipForm } from "./form.js";
+import { prepareFullScreen, ScreenLight } from "./fullscreen.js";
+import { prepareHelp, toggleHelp } from "./help.js";
 import { JobList } from "./joblist.js";
 import { Jobs } from "./jobs.js";
 import { currentKey, keyEvents, showKeyForm } from "./key.js";
+import { listenToKeys, onKeys } from "./keys.js";
 import { languageEvents, showWords, words } from "./messages.js";
 import { pause } from "./pause.js";
 import { showReport } from "./report.js";
 import { Scopes } from "./scopes.js";
 import { Shelf } from "./shelf.js";
+import { steer } from "./steer.js";
 import { Viewer } from "./viewer.js";
 
 const get = (id) => document.getElementById(id);
@@ -37,9 +41,20 @@ export const viewer = new Viewer({
   layer: get("layer"),
   guess: get("guess"),
   highlights: get("highlights"),
-  home: get("home"),
   play: get("play"),
+  speed: get("speed"),
+  loop: get("loop"),
+  loopStart: get("loop-start"),
+  loopEnd: get("loop-end"),
+  loopAll: get("loop-all"),
 });
+/** What somebody asked for and cannot have; or, not isBad, has. */
+function tell(text, isBad = true) {
+  get("address-message").textContent = text;
+  get("address-message").classList.toggle("bad", isBad);
+}
+const handles = { home: get("home"), eye: get("eye"), stepBack: get("step-back"), stepOn: get("step-on") };
+steer(viewer, { stage: get("stage"), canvas: get("picture"), ...handles }, tell);
 
 const compare = new Compare(viewer, {
   stage: get("stage"),
@@ -68,8 +83,10 @@ function say(text) {
 function view(id, message) {
   awaited = null;
   reported = null;
+  tell("");
   viewer.open(id, message);
   compare.open(id);
+  address.note();
   jobs.view(id);
   if (id !== null && drawers.isOpen !== "report-drawer") drawers.close();
   say(words("page.report_of"));
@@ -113,14 +130,13 @@ function offerMasks() {
 
 function showJobs() {
   scopes.refresh();
-  form.allow(scopes);
-  announcer.refresh(jobs.byId, viewer.scene);
   offerMasks();
   shelf.refresh();
   list.show(shelf.shown, viewer.scene);
   const expected = jobs.byId.get(awaited);
   if (expected?.state === "running" || expected?.state === "done") view(expected.id);
   const viewed = jobs.byId.get(viewer.scene);
+  light.keep(viewer.timeline.isPlaying || viewed?.state === "running");
   get("scene-id").textContent = viewed ? nameOf(viewed) : "";
   if (viewed?.state === "done" && reported !== viewed.id) {
     viewer.refresh(); // what is shown may be of its training still
@@ -156,7 +172,17 @@ const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message
 const momentOf = (id) => (viewer.scene === id ? viewer.timeline.t : 0);
 const downloads = new Downloads(get("download"), get("jobs-message"), scopes, momentOf);
 
-const announcer = new Announcer({ line: get("sent"), ask: get("notify") }, view);
+const light = new ScreenLight();
+viewer.timeline.playEvents.addEventListener("changed", () => {
+  light.keep(viewer.timeline.isPlaying || jobs.byId.get(viewer.scene)?.state === "running");
+  address.note();
+});
+const goTo = (place) => {
+  if (place.scene !== viewer.scene) view(place.scene);
+  viewer.look(place);
+};
+const address = new Address(viewer, get("layer"), goTo, tell);
+
 const form = new ClipForm(
   {
     form: get("upload"),
@@ -164,20 +190,13 @@ const form = new ClipForm(
     message: get("upload-message"),
     progress: get("upload-progress"),
     stop: get("upload-stop"),
-    refusal: get("upload-refusal"),
   },
-  {
-    onJob: (id) => {
-      awaited = id;
-      announcer.await(id);
-      if (!viewer.scene) viewer.open(null, words("page.awaited"));
-      jobs.poll();
-    },
-    onShare: (share) => announcer.send(share),
-    onAsked: () => drawers.open("drawer", false),
+  (id) => {
+    awaited = id;
+    if (!viewer.scene) viewer.open(null, words("page.awaited"));
+    jobs.poll();
   },
 );
-awaited = announcer.awaited; // of before a reload
 get("layer").addEventListener("change", offerMasks);
 get("better-masks").addEventListener("click", () => sendMasks(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
@@ -187,6 +206,19 @@ languageEvents.addEventListener("changed", () => {
   showJobs();
 });
 showWords(document);
-keyEvents.addEventListener("changed", () => view(null, words(currentKey() ? "page.choose" : "page.key_forgotten")));
+keyEvents.addEventListener("changed", () => {
+  if (!currentKey() || !address.follow()) view(null, words(currentKey() ? "page.choose" : "page.key_forgotten"));
+});
 stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen === null);
-drawers.open("library", false);
+
+const showHelp = () => toggleHelp(get("help"));
+const toggleFullScreen = prepareFullScreen(get("full-screen"));
+prepareHelp(get("help"));
+get("show-help").addEventListener("click", showHelp);
+get("copy-link").addEventListener("click", () => address.copy());
+onKeys("full_screen", { f: [] }, toggleFullScreen);
+onKeys("copy_link", { l: [] }, () => address.copy());
+onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());
+onKeys("help", { "?": [] }, showHelp);
+listenToKeys();
+if (!address.follow()) drawers.open("library", false);

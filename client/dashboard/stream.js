@@ -5,7 +5,7 @@ import { connectionLost, errorWords, Problem } from "./problem.js";
 
 /**
  * What is asked for; the query of GET /render.
- * @typedef {{scene: string, t: number, pose?: string, layer: string, unseen: string, highlights: string,
+ * @typedef {{scene: string, t: number, pose?: string, eye?: "right", layer: string, unseen: string, highlights: string,
  *   format: string}} View
  */
 /**

@@ -1,7 +1,7 @@
 // The view of one scene: at most one picture is under way; the newest wish is asked for next, and now and then the same
 // again, which follows training, notices a purge, and keeps CURRENT true.
 
-import { listenToGestures } from "./gestures.js";
+import { Clip } from "./clip.js";
 import { Orbit } from "./orbit.js";
 import { Pace } from "./pace.js";
 import { pause } from "./pause.js";
@@ -13,15 +13,18 @@ const AGAIN_MS = 1500;
 const AFTER_TROUBLE_MS = 700;
 const NOT_YET = "Its first picture comes when training begins.";
 /**
- * What a view shows. t: as shown, within the clip; pose: as the service spells it, null for the endoscope's own;
+ * What a view shows. t: as shown, within the clip; pose: as the service spells it, null for the endoscope's own, of the eye;
  * camera: null where it is not known, as of recorded frames; way: how the picture came.
- * @typedef {{scene: string, t: number, pose: string | null, layer: string, unseen: "mark"|"guess",
+ * @typedef {{scene: string, t: number, pose: string | null, eye: "left"|"right", layer: string, unseen: "mark"|"guess",
  *   highlights: "on"|"off", state: "running"|"done", way: string, camera: import("./stream.js").Camera | null}} Shown
  */
 /** There is nothing to show, or not to this key; a picture that was there goes. */
 const NOTHING_TO_SHOW = [401, 403, 404, 409];
 
-/** Tells "shown" (a CustomEvent whose detail is Shown) of every picture that has come to the screen, "gone" when it goes. */
+/**
+ * Tells "shown" (a CustomEvent whose detail is Shown) of every picture that has come to the screen, "gone" when it goes, "known"
+ * when the scene's cameras are, and "refused" when nobody may stand where the viewer shall.
+ */
 export class Viewer extends EventTarget {
   /** @param {Record<string, HTMLElement>} parts by what they are; index.html has them */
   constructor(parts) {
@@ -34,11 +37,12 @@ export class Viewer extends EventTarget {
     this.isBusy = false;
     this.isWanted = false;
     this.askedAt = 0;
-    this.orbit = new Orbit();
+    this.orbit = new Orbit(() => this.timeline.t);
     this.pace = new Pace();
     this.pictures = new Pictures();
     this.screen = new Screen(parts);
     this.timeline = new Timeline(parts, () => this.refresh(), () => this.isBusy);
+    this.clip = new Clip((cameras) => this.#know(cameras));
     this.#listen();
     setInterval(() => this.#again(), AGAIN_MS / 3);
     document.addEventListener("visibilitychange", () => this.refresh());
@@ -56,6 +60,7 @@ export class Viewer extends EventTarget {
     this.shown = null;
     this.screen.clear(scene, words);
     this.parts.readout.textContent = "";
+    this.clip.open(scene);
     if (scene === null) this.timeline.play(false);
     this.refresh();
   }
@@ -66,7 +71,7 @@ export class Viewer extends EventTarget {
    */
   look({ t, pose, layer, unseen, highlights }) {
     const { parts } = this;
-    if (pose !== undefined) this.orbit.stand(pose);
+    if (pose !== undefined && !this.orbit.stand(pose)) this.dispatchEvent(new Event("refused"));
     if (layer !== undefined) parts.layer.value = layer;
     if (unseen !== undefined) parts.guess.checked = unseen === "guess";
     if (highlights !== undefined) parts.highlights.checked = highlights === "on";
@@ -78,6 +83,13 @@ export class Viewer extends EventTarget {
   refresh() {
     this.isWanted = true;
     if (!this.isBusy) this.#work();
+  }
+
+  #know(cameras) {
+    this.timeline.know(cameras);
+    if (!this.orbit.know(cameras)) this.dispatchEvent(new Event("refused"));
+    this.dispatchEvent(new Event("known"));
+    if (cameras) this.refresh();
   }
 
   #again() {
@@ -104,7 +116,7 @@ export class Viewer extends EventTarget {
       const picture = await this.pictures.ask(view);
       const bitmap = await createImageBitmap(picture.blob);
       if (visit !== this.visit) return; // another was opened meanwhile: never its neighbour's picture
-      this.screen.show(picture, bitmap, `${name}, t ${picture.t.toFixed(3)}`);
+      this.screen.show(picture, bitmap, `${name}, ${this.timeline.momentOf(picture.t)}`);
       this.pace.note();
       this.shown = shownOf(view, picture);
       this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
@@ -121,13 +133,14 @@ export class Viewer extends EventTarget {
     const { checked, disabled } = this.parts.highlights;
     const view = {
       scene,
-      t: Number(this.timeline.t.toFixed(4)),
+      t: Number(this.timeline.t.toFixed(6)),
       layer: this.parts.layer.value,
       unseen: this.parts.guess.checked ? "guess" : "mark",
       highlights: checked || disabled ? "on" : "off",
       format: "jpeg",
     };
     if (this.orbit.pose) view.pose = this.orbit.pose;
+    else if (this.orbit.eye === "right") view.eye = "right";
     return view;
   }
 
@@ -148,26 +161,13 @@ export class Viewer extends EventTarget {
   }
 
   #listen() {
-    const { stage, layer, guess, highlights, home } = this.parts;
-    const change = (work) => (...given) => {
-      if (!this.scene) return;
-      work(...given);
-      this.refresh();
-    };
-    const goHome = change(() => this.orbit.goHome());
-    listenToGestures(stage, {
-      turn: change((dx, dy) => this.orbit.turn(dx, dy)),
-      approach: change((factor) => this.orbit.approach(factor)),
-      home: goHome,
-      play: () => this.timeline.play(!this.timeline.isPlaying),
-    });
+    const { layer, guess, highlights } = this.parts;
     layer.addEventListener("change", () => (highlights.disabled = layer.value !== "rgb"));
     for (const choice of [layer, guess, highlights]) choice.addEventListener("change", () => this.refresh());
-    home.addEventListener("click", goHome);
   }
 }
 
 /** @param {import("./stream.js").View} view @param {import("./stream.js").Picture} picture @returns {Shown} */
-function shownOf({ scene, pose = null, layer, unseen, highlights }, { t, state, way, camera }) {
-  return { scene, t, pose, layer, unseen, highlights, state, way, camera };
+function shownOf({ scene, pose = null, eye = "left", layer, unseen, highlights }, { t, state, way, camera }) {
+  return { scene, t, pose, eye, layer, unseen, highlights, state, way, camera };
 }

@@ -22,7 +22,7 @@ OUT = Path(__file__).resolve().parents[2] / "docs" / "images" / "dashboard.png"
 PHANTOM = ("--motion", "pull", "--frames", "48", "--width", "320", "--height", "256", "--seed", "3")
 BUDGET_S = 15
 TRAINED_WITHIN_S = 100.0
-SHOWN_T = "0.4"
+SHOWN_FRAME = 19
 COLOURS = 256
 CURVE = "return document.querySelector('#curve polyline.score')?.points ?? []"
 
@@ -58,9 +58,9 @@ def draw(page: Page, clip: Path, out: Path, training: Path | None) -> None:
         save(page, training)
     wait.until(lambda _: "How far to trust it" in page.text("#report"))
     page.script(
-        f"const time = document.querySelector('#time');time.value = {SHOWN_T}; time.dispatchEvent(new Event('input'));"
+        "const frame = arguments[0]; import('/main.js').then(({ viewer }) => viewer.timeline.goTo(frame))", SHOWN_FRAME
     )
-    wait.until(lambda _: page.state == "live" and f"t {SHOWN_T}" in page.view)
+    wait.until(lambda _: page.state == "live" and f"frame {SHOWN_FRAME + 1} " in page.text("#time-value"))
     save(page, out)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import shutil
 import signal
 import socket
@@ -31,15 +32,17 @@ from contract.store.shelf import new_job_id
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest
 from contract.wire.job import JobFiles, JobProgress, JobRecord
-from contract.wire.names import CURVE, MANIFEST, REPORT
+from contract.wire.names import CURVE, MANIFEST, REPORT, Eye
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import OrbitPose
 from contract.wire.rendering import (
     MEDIA_TYPES,
     ExportRequest,
     Highlights,
+    ImageFormat,
     PictureCamera,
     RecordedRequest,
+    RenderRequest,
     SceneRequest,
     Unseen,
     WorkerAddress,
@@ -62,6 +65,7 @@ SNAPSHOT_ITERATION = 40
 CAMERA = PictureCamera(
     width=60, height=48, fx=80, fy=80, cx=30, cy=24, world_from_camera=(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0)
 )
+DEPTH_MM = 50.0
 RECORDED_SHADE = 8
 """Darker than any scene."""
 FAR_DEG = 25.0
@@ -100,6 +104,17 @@ def grey_of(job_id: str) -> int:
     return 16 + int(job_id[:2], 16) * 7 // 8
 
 
+def depth_of(request: RenderRequest) -> bytes:
+    """[H, W] float32 mm as NPY: DEPTH_MM everywhere; nothing right of the clip's middle."""
+    width, height, cx = request.camera.width or CAMERA.width, request.camera.height or CAMERA.height, request.camera.cx
+    middle = CAMERA.cx if cx is None else cx
+    columns = np.arange(width) + 0.5
+    depth_mm = np.where(columns <= middle, np.float32(DEPTH_MM), np.float32(0))
+    buffer = io.BytesIO()
+    np.save(buffer, np.tile(depth_mm, (height, 1)).astype(np.float32))
+    return buffer.getvalue()
+
+
 class Painter:
     """Paints each scene in a shade of its own, and warns of what lies far off, or beyond the picture's borders."""
 
@@ -109,6 +124,7 @@ class Painter:
         """Of every picture."""
         self.shown_unseen: Unseen | None = None
         self.shown_highlights: Highlights | None = None
+        self.eye: Eye = "left"
 
     def answer(self, request: SceneRequest) -> Reply:
         if isinstance(request, CamerasRequest):
@@ -119,7 +135,7 @@ class Painter:
             picture = cv2.imencode(".jpg", np.full((48, 60, 3), RECORDED_SHADE, np.uint8))[1].tobytes()
             return Reply(picture, "image/jpeg", request.t, iteration=0 if request.attempt is None else None)
         time.sleep(self.pause_s)
-        self.shown_unseen, self.shown_highlights = request.unseen, request.highlights
+        self.shown_unseen, self.shown_highlights, self.eye = request.unseen, request.highlights, request.eye
         picture = np.full((48, 60, 3), grey_of(request.scene_id), np.uint8)
         warnings = list(self.warnings)
         if isinstance(request.pose, OrbitPose) and abs(request.pose.yaw_deg) > FAR_DEG:
@@ -128,6 +144,8 @@ class Painter:
             warnings.append(a_warning(UNSEEN, NoticeCode.UNSEEN))
         if request.highlights is Highlights.OFF:
             warnings.append(Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
+        if request.format is ImageFormat.NPY:
+            return Reply(depth_of(request), MEDIA_TYPES[request.format], request.t, camera=CAMERA)
         image = cv2.imencode(f".{request.format.value}", picture)[1].tobytes()
         iteration = SNAPSHOT_ITERATION if request.attempt is None else None
         return Reply(

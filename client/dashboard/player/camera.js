@@ -40,6 +40,15 @@ export class Cameras {
     return this.frameTimesS[before] + (place - before) * (next - this.frameTimesS[before]);
   }
 
+  /** @param {number} seconds from the first frame @returns {number} model time, within the clip */
+  timeAt(seconds) {
+    const later = this.frameTimesS.findIndex((each) => each - this.frameTimesS[0] > seconds);
+    if (later < 0) return this.shownTime(1);
+    if (later === 0) return 0;
+    const [before, next] = [this.frameTimesS[later - 1], this.frameTimesS[later]];
+    return (later - 1 + (seconds + this.frameTimesS[0] - before) / (next - before)) / this.frameCount;
+  }
+
   /** @param {number} t @returns {Matrix} of the endoscope's left eye, between frames interpolated */
   endoscope(t) {
     const place = Math.min(Math.max(t * this.frameCount, 0), this.frameCount - 1);

@@ -1,0 +1,48 @@
+// The page's keys: one table, which handles them and of which the help tells.
+
+/**
+ * does: what the keys do, as the help's words name it. keys: what each gives to act, by KeyboardEvent.key.
+ * @typedef {{does: string, keys: Record<string, any[]>, act: (...given: any[]) => void, withShift: boolean}} KeyRow
+ */
+
+/** What is typed into takes all keys; what has keys of its own keeps them. */
+const TYPED = "textarea, select, dialog[open], input:not([type=range], [type=checkbox])";
+const OWN = { " ": "button, summary, a, [type=checkbox]", Enter: "button, summary, a, [type=checkbox]" };
+const OF_SLIDERS = /^(Arrow|Home)/;
+
+/** @type {KeyRow[]} */
+const rows = [];
+
+/**
+ * Let keys do something.
+ * @param {string} does words("help.DOES") says what
+ * @param {Record<string, any[]>} keys
+ * @param {(...given: any[]) => void} act
+ * @param {boolean} [withShift] of arrows, which mean something else without it
+ */
+export function onKeys(does, keys, act, withShift = false) {
+  rows.push({ does, keys, act, withShift });
+}
+
+/** @returns {readonly KeyRow[]} */
+export const keyRows = () => rows;
+
+/** @param {KeyboardEvent} event */
+function isForOthers({ key, target, ctrlKey, metaKey, altKey }) {
+  if (key === undefined || ctrlKey || metaKey || altKey || !(target instanceof Element)) return true; // autofill tells no key
+  if (target.closest(TYPED)) return true;
+  if (target.closest("[type=range], [role=slider]") && OF_SLIDERS.test(key)) return true;
+  return key in OWN && target.closest(OWN[key]) !== null;
+}
+
+/** Begin to listen. */
+export function listenToKeys() {
+  document.addEventListener("keydown", (event) => {
+    if (isForOthers(event)) return;
+    const isArrow = event.key.startsWith("Arrow");
+    const row = rows.find(({ keys, withShift }) => event.key in keys && (!isArrow || withShift === event.shiftKey));
+    if (!row) return;
+    event.preventDefault();
+    row.act(...row.keys[event.key]);
+  });
+}
