@@ -6,7 +6,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Header, Request, Response
 from starlette.concurrency import run_in_threadpool
@@ -14,6 +14,7 @@ from starlette.responses import FileResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
+from contract.store.results import listed_files
 from contract.wire.errors import SceneError
 from contract.wire.names import MANIFEST, SCENE
 from service.bodies import BINARY
@@ -91,8 +92,7 @@ def _file_of(folder: Path, name: str) -> StoredFile | None:
         content = manifest.read_bytes()
         if name == MANIFEST:
             return StoredFile(manifest, hashlib.sha256(content).hexdigest())
-        told = json.loads(content)
-        listed: dict[str, Any] = told["files"] | told.get("beside", {})
+        listed = listed_files(json.loads(content))
         if name not in listed or name != Path(name).name:
             return None
         return StoredFile(folder / name, str(listed[name]["sha256"]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 from contract.store.durable import FOR_ALL, replace_file
 from contract.wire.errors import SceneError
@@ -18,6 +19,16 @@ from contract.wire.report import Report
 
 RESULTS = (REPORT, CURVE, MANIFEST)
 """The files that change, in the order in which they do."""
+
+
+def listed_files(manifest: dict[str, Any]) -> dict[str, Any]:
+    """What a scene's manifest says of its files: of those that rendering reads and of those beside them.
+
+    Raises:
+        KeyError, TypeError: it is not the manifest of a scene.
+    """
+    files: dict[str, Any] = manifest["files"] | manifest.get("beside", {})
+    return files
 
 
 def add_scores(folder: Path, report: Report) -> None:

@@ -25,6 +25,7 @@ from typing import Any
 
 from contract.store.disk_errors import NO_ROOM, disk_errors
 from contract.store.local import LocalShelf, remove_tree
+from contract.store.results import listed_files
 from contract.store.shelf import (
     ABANDONED_AFTER_S,
     MARKERS,
@@ -317,8 +318,7 @@ def _check(folder: Path) -> None:
     if not (folder / MANIFEST).is_file():
         return
     try:
-        files = json.loads((folder / MANIFEST).read_bytes()).get("files", {})
-        for name, expected in files.items():
+        for name, expected in listed_files(json.loads((folder / MANIFEST).read_bytes())).items():
             if hashlib.sha256((folder / name).read_bytes()).hexdigest() != expected["sha256"]:
                 raise ValueError(name)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

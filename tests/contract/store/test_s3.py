@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import time
+import zipfile
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,11 @@ from typing import Any
 import pytest
 
 from contract.runtime.settings import Settings
+from contract.store.recorded import PICTURE, name_of, read_frame
 from contract.store.shelf import ABANDONED_AFTER_S, new_job_id
 from contract.store.store import Store, open_store
 from contract.wire.errors import SceneError, UnavailableError
-from contract.wire.names import CURVE, MANIFEST, REPORT, RESUME, SUBMISSION
+from contract.wire.names import CURVE, MANIFEST, RECORDED, REPORT, RESUME, SUBMISSION
 from tests.contract.stores import BUCKET_URL, accepted, lead_to, published, received
 from tests.reports import REPORT_OF_A_SCENE
 
@@ -162,6 +164,23 @@ def test_a_thumbnail_is_kept_in_the_bucket_and_goes_with_its_scene(tmp_path: Pat
     assert on(tmp_path, "another").thumbnail(job_id, 1) == b"jpeg"
     service.purge(job_id)
     service.keep_thumbnail(job_id, 1, b"late")
+    assert keys(bucket) == []
+
+
+def test_recorded_frames_are_read_on_any_machine_unless_they_were_altered(tmp_path: Path, bucket: Any) -> None:
+    worker, job_id = on(tmp_path, "worker"), new_job_id()
+    folder = worker.work_folder(job_id, 1)
+    with zipfile.ZipFile(folder / RECORDED, "w") as archive:
+        archive.writestr(name_of("left", 3, PICTURE), b"jpeg")
+    digest = sha256((folder / RECORDED).read_bytes()).hexdigest()
+    (folder / MANIFEST).write_text(json.dumps({"files": {}, "beside": {RECORDED: {"sha256": digest}}}))
+    worker.publish_scene(job_id, 1)
+    service = on(tmp_path, "service")
+    assert read_frame(service.scene_folder(job_id, 1) / RECORDED, 12, 0.2) == (3, b"jpeg")
+    bucket.put_object(Key=f"{PREFIX}scenes/{job_id}.1/{RECORDED}", Body=b"another patient's")
+    with pytest.raises(SceneError, match="damaged"):
+        on(tmp_path, "another").scene_folder(job_id, 1)
+    service.purge(job_id)
     assert keys(bucket) == []
 
 
