@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import httpx
@@ -23,11 +23,35 @@ LENGTH_BYTES = 4
 
 
 @dataclass(frozen=True)
+class PictureCamera:
+    """Where a picture was taken from and through which lens, in pixels of that picture.
+
+    world_from_camera: the upper three rows, row-major, translation in mm.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_from_camera: tuple[float, ...]
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, Any] | None) -> PictureCamera | None:
+        """As the service writes it; None: the service is too old to say."""
+        if document is None:
+            return None
+        known = {each.name: document[each.name] for each in fields(cls)}
+        return cls(**{**known, "world_from_camera": tuple(document["world_from_camera"])})
+
+
+@dataclass(frozen=True)
 class Image:
     """A rendered view: the encoded file, and what it shows.
 
     state is "running" for a view of a job that still trains; iteration is then the step that is shown. unseen is the
-    share of the view that no training frame saw; None: the service is too old to say.
+    share of the view that no training frame saw, and camera the picture's; None: the service is too old to say.
     """
 
     content: bytes
@@ -40,6 +64,7 @@ class Image:
     warning: str | None = None
     etag: str | None = None
     render_ms: float | None = None
+    camera: PictureCamera | None = None
 
     def array(self) -> NDArray[Any]:
         """The values of a view asked for with format="npy".
@@ -98,6 +123,7 @@ def _image_of(response: httpx.Response) -> Image:
         warning=about.get("warning"),
         etag=about.get("etag"),
         render_ms=_duration_ms(about.get("server-timing", ""), "render"),
+        camera=PictureCamera.of_document(json.loads(about.get("camera", "null"))),
     )
 
 
@@ -128,6 +154,7 @@ def image_of_message(message: bytes | str) -> tuple[object, Image | IntrasplatEr
             unseen=head.get("unseen"),
             warning="; ".join(each["text"] for each in head["warnings"]) or None,
             render_ms=head["render_ms"],
+            camera=PictureCamera.of_document(head.get("camera")),
         )
         return head["id"], image
     except (ValueError, KeyError, TypeError, AttributeError):

@@ -12,17 +12,17 @@ import math
 import threading
 import time
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from client.slicer import messages
-from client.slicer.clip import Clip, Surface
-from client.slicer.frames import Camera, Matrix, ras_from_ijk, turned
+from client.slicer.frames import Matrix, ras_from_ijk, turned, world_from_camera
 from client.slicer.link import Link
 from client.slicer.playback import Playback
 from client.slicer.status import Status
+from client.slicer.surface import Surface
 from contract.wire.errors import InputError, SceneError
 from contract.wire.pose import parse_pose
 from intrasplat_client import (
@@ -34,7 +34,7 @@ from intrasplat_client import (
     ServiceUnavailable,
     Unauthorized,
 )
-from intrasplat_client.views import Image
+from intrasplat_client.views import Image, PictureCamera
 
 SurfaceWhen = Literal["standing", "always", "never"]
 
@@ -55,11 +55,10 @@ AWAY = (ServiceUnavailable, ServiceFault)
 
 @dataclass(frozen=True)
 class Choice:
-    """What the user chose. width: of the picture in pixels; t: stand there instead of playing."""
+    """What the user chose. width: of the picture in pixels; None: the clip's."""
 
     scene: str
     width: int | None = None
-    t: float | None = None
     depth: bool = False
     surface: SurfaceWhen = "standing"
     pose_device: str = messages.POSE
@@ -67,32 +66,31 @@ class Choice:
 
 @dataclass(frozen=True)
 class _View:
-    """What is asked for: a frame, and world_from_camera; follows: the pose is a peer's."""
+    """What is asked for: a frame, and a pose as the API has it; None: the endoscope's own."""
 
     frame: int
-    pose: Matrix
-    follows: bool
+    pose: str | None
 
-    def is_like(self, other: _View | None) -> bool:
-        return other is not None and self.frame == other.frame and self.has_pose_of(other)
 
-    def has_pose_of(self, other: _View | None) -> bool:
-        return other is not None and self.follows == other.follows and np.array_equal(self.pose, other.pose)
+@dataclass(frozen=True)
+class _Shown:
+    """What peers have: a view, its picture and camera, and the depth in mm at which it is placed."""
+
+    view: _View
+    image: Image
+    camera: PictureCamera
+    plane_mm: float
 
 
 class Bridge:
     """One scene for all peers of `link`."""
 
-    def __init__(self, client: AsyncClient, clip: Clip, choice: Choice, status: Status) -> None:
+    def __init__(self, client: AsyncClient, choice: Choice, playback: Playback, status: Status) -> None:
         self.link = Link(self._hear, self._wake_up)
-        self._client, self._clip, self._choice, self._status = client, clip, choice, status
-        self._camera = clip.camera if choice.width is None else clip.camera.resized(choice.width)
-        self._playback = Playback(clip, choice.t)
-        self._given: Matrix | None = None
+        self._client, self._choice, self._playback, self._status = client, choice, playback, status
+        self._pose: str | None = None
         self._woken, self._moment = asyncio.Event(), asyncio.Event()
-        self._shown: _View | None = None
-        self._image: Image | None = None
-        self._plane_mm = 0.0
+        self._shown: _Shown | None = None
         self._looked_at_s = -math.inf
 
     async def run(self, end: threading.Event) -> None:
@@ -118,7 +116,7 @@ class Bridge:
         """A peer's pose or command."""
         if heard.device == self._choice.pose_device and heard.matrix is not None:
             try:
-                self._given = _checked(turned(heard.matrix))
+                self._pose = _checked(turned(heard.matrix))
                 self._status.refused = ""
             except InputError as error:
                 self._status.refused = f"The pose from {heard.device} is refused: {error.problem}"
@@ -135,7 +133,7 @@ class Bridge:
         elif words == "pause":
             self._playback.pause()
         elif words == "endoscope":
-            self._given = None
+            self._pose = None
         elif (t := _time_of(words)) is not None:
             self._playback.stand_at(t)
         else:
@@ -147,11 +145,6 @@ class Bridge:
 
     def _tell(self) -> None:
         self.link.send(messages.STATUS, messages.text(messages.STATUS, self._status.words()))
-
-    def _wanted(self) -> _View:
-        frame = self._playback.frame
-        follows = self._given is not None
-        return _View(frame, self._clip.path[frame] if self._given is None else self._given, follows)
 
     async def _show(self) -> None:
         """Pictures, one after the other."""
@@ -169,55 +162,58 @@ class Bridge:
         since_s = time.monotonic()
         while True:
             self._woken.clear()
-            wanted = self._wanted()
-            if self.link.has_peers and not wanted.is_like(self._shown):
+            wanted = _View(self._playback.frame, self._pose)
+            if self.link.has_peers and (self._shown is None or wanted != self._shown.view):
                 return wanted
             if self._shown is not None and time.monotonic() - since_s > CHECK_S:
-                return self._shown
+                return self._shown.view
             with contextlib.suppress(TimeoutError):
                 plays = self.link.has_peers and self._playback.plays
                 await asyncio.wait_for(self._woken.wait(), LOOK_S if plays else CHECK_S)
 
     async def _show_view(self, wanted: _View) -> None:
         """Render a view and send it with what belongs to it; nothing if it is the one that was sent."""
-        known = self._image if wanted.is_like(self._shown) else None
-        image = await self._render(wanted, "rgb", self._camera, known)
+        before = self._shown
+        known = before.image if before is not None and before.view == wanted else None
+        image = await self._render(wanted, "rgb", self._choice.width, known)
         if image is not known:
-            if not wanted.has_pose_of(self._shown) or time.monotonic() - self._looked_at_s > LOOK_AROUND_S:
-                await self._look_around(wanted)
-            place = ras_from_ijk(self._camera, wanted.pose, self._plane_mm)
-            depth = await self._render(wanted, "depth", self._camera) if self._choice.depth else None
+            camera = _camera_of(image)
+            plane_mm = await self._plane_mm(wanted, camera)
+            place = ras_from_ijk(camera, plane_mm)
+            depth = await self._render(wanted, "depth", self._choice.width) if self._choice.depth else None
             await self._send(messages.PICTURE, image.array(), place)
             if depth is not None:
                 await self._send(messages.DEPTH, depth.array(), place)
-            self.link.send(messages.CAMERA, messages.transform(messages.CAMERA, turned(wanted.pose)))
-            self._image, self._shown = image, wanted
-        self._status.show(image, wanted.frame, follows=wanted.follows, plays=self._playback.plays)
+            pose = turned(world_from_camera(camera))
+            self.link.send(messages.CAMERA, messages.transform(messages.CAMERA, pose))
+            self._shown = _Shown(wanted, image, camera, plane_mm)
+        self._status.show(image, wanted.frame, follows=wanted.pose is not None)
         self._tell()
         self._moment.set()
 
-    async def _look_around(self, view: _View) -> None:
-        """Measure where the picture is shown, the median depth of what is seen, and how far it can be trusted."""
-        camera = self._camera.resized(min(LOOK_AROUND_PX, self._camera.width))
-        depth_mm = (await self._render(view, "depth", camera)).array()
-        confidence = (await self._render(view, "confidence", camera)).array()
+    async def _plane_mm(self, view: _View, camera: PictureCamera) -> float:
+        """Where the picture is placed: the median depth of what is seen. Also measures the confidence."""
+        before = self._shown
+        is_new = before is None or before.camera.world_from_camera != camera.world_from_camera
+        if before is not None and not is_new and time.monotonic() - self._looked_at_s < LOOK_AROUND_S:
+            return before.plane_mm
+        width = min(LOOK_AROUND_PX, camera.width)
+        depth_mm = (await self._render(view, "depth", width)).array()
+        confidence = (await self._render(view, "confidence", width)).array()
         seen = depth_mm > 0
-        if seen.any():
-            self._plane_mm = float(np.median(depth_mm[seen]))
-        elif not self._plane_mm:
-            raise InputError("t", "nothing of the scene is seen from here.", "Choose another time with --t.")
-        self._status.confidence = float(confidence[seen].mean()) if seen.any() else None
         self._looked_at_s = time.monotonic()
+        self._status.confidence = float(confidence[seen].mean()) if seen.any() else None
+        if seen.any():
+            return float(np.median(depth_mm[seen]))
+        if before is None:
+            raise InputError("t", "nothing of the scene is seen at this moment.", "Choose another with --t.")
+        return before.plane_mm
 
-    async def _render(self, view: _View, layer: str, camera: Camera, known: Image | None = None) -> Image:
+    async def _render(self, view: _View, layer: str, width: int | None, known: Image | None = None) -> Image:
+        size: dict[str, Any] = {} if width is None else {"width": width}
+        t = self._playback.t_of(view.frame)
         return await self._client.render(
-            self._clip.t_of(view.frame),
-            scene=self._choice.scene,
-            pose=_text_of(view.pose),
-            layer=layer,
-            format="npy",
-            known=known,
-            **camera.model_dump(),
+            t, scene=self._choice.scene, pose=view.pose, layer=layer, format="npy", known=known, **size
         )
 
     async def _send(self, device: str, values: NDArray[np.generic], place: Matrix) -> None:
@@ -229,25 +225,25 @@ class Bridge:
         while self._choice.surface != "never":
             await self._moment.wait()
             self._moment.clear()
-            shown = self._shown
-            if shown is None or shown.frame == sent:
+            frame = None if self._shown is None else self._shown.view.frame
+            if frame is None or frame == sent:
                 continue
             if self._playback.plays and self._choice.surface == "standing" and sent is not None:
                 continue
             try:
-                await self._send_surface(shown.frame)
+                await self._send_surface(frame)
             except AWAY as error:
                 self._status.surface = f"There is no new surface yet: {error}"
                 self._tell()
                 await asyncio.sleep(RETRY_S)
             else:
-                sent = shown.frame
+                sent = frame
         await asyncio.Event().wait()
 
     async def _send_surface(self, frame: int) -> None:
         """Send a frame's surface, or say why there is none."""
         try:
-            content = await self._client.export(self._choice.scene, self._clip.t_of(frame), format="mesh-ply")
+            content = await self._client.export(self._choice.scene, self._playback.t_of(frame), format="mesh-ply")
             surface = await asyncio.to_thread(Surface.of_ply, content)
         except GONE:
             raise
@@ -262,28 +258,35 @@ class Bridge:
         """Tell peers why nothing more comes; the picture of a scene that they may not see any more turns black."""
         self._status.ended = "The bridge was ended." if error is None else str(error)
         if isinstance(error, GONE) and self._shown is not None:
-            place = ras_from_ijk(self._camera, self._shown.pose, self._plane_mm)
-            size = (self._camera.height, self._camera.width)
-            await self._send(messages.PICTURE, np.zeros((*size, 3), np.uint8), place)
+            camera = self._shown.camera
+            place = ras_from_ijk(camera, self._shown.plane_mm)
+            await self._send(messages.PICTURE, np.zeros((camera.height, camera.width, 3), np.uint8), place)
             if self._choice.depth:
-                await self._send(messages.DEPTH, np.zeros(size, np.float32), place)
+                await self._send(messages.DEPTH, np.zeros((camera.height, camera.width), np.float32), place)
         self._tell()
         await self.link.flush(FAREWELL_S)
 
 
-def _checked(pose: Matrix) -> Matrix:
-    """The pose, if the service accepts it.
+def _camera_of(image: Image) -> PictureCamera:
+    """The picture's camera.
+
+    Raises:
+        SceneError: an older service does not tell it.
+    """
+    if image.camera is None:
+        raise SceneError("The service does not tell the camera of its pictures; it is older than this program.")
+    return image.camera
+
+
+def _checked(pose: Matrix) -> str:
+    """The pose as the API has it: 12 numbers, row-major world_from_camera in mm.
 
     Raises:
         InputError: it is not rigid, not finite or too far away.
     """
-    parse_pose(_text_of(pose))
-    return pose
-
-
-def _text_of(pose: Matrix) -> str:
-    """As the API has it: 12 numbers, row-major world_from_camera in mm."""
-    return ",".join(repr(float(each)) for each in pose[:3].ravel())
+    text = ",".join(repr(float(each)) for each in pose[:3].ravel())
+    parse_pose(text)
+    return text
 
 
 def _time_of(words: str) -> float | None:

@@ -17,7 +17,6 @@ from contract.runtime.exits import ExitCode
 from contract.runtime.processes import heeding_signals
 from contract.runtime.settings import LOOPBACK_NAMES
 from contract.wire.errors import InputError, UnavailableError
-from contract.wire.names import MANIFEST
 from contract.wire.report import RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ def _slicer(options: argparse.Namespace) -> int:
     if not 0 < len(options.pose_device.encode()) <= MAX_DEVICE_CHARACTERS:
         problem = f"{options.pose_device!r} is not 1 to {MAX_DEVICE_CHARACTERS} characters long."
         raise InputError("--pose-device", problem, "Rename the transform in Slicer.")
-    choice = Choice(options.scene, options.width, options.t, options.depth, options.surface, options.pose_device)
+    choice = Choice(options.scene, options.width, options.depth, options.surface, options.pose_device)
     with heeding_signals() as end:
         try:
             asyncio.run(_run(options, choice, end))
@@ -84,13 +83,13 @@ def _slicer(options: argparse.Namespace) -> int:
 
 async def _run(options: argparse.Namespace, choice: Choice, end: threading.Event) -> None:
     from client.slicer.bridge import Bridge
-    from client.slicer.clip import Clip
+    from client.slicer.playback import Playback
     from client.slicer.status import Status
 
     async with intrasplat_client.AsyncClient(options.url, api_key=options.api_key, patience_s=PATIENCE_S) as client:
-        clip = Clip.of_manifest(await client.file(choice.scene, MANIFEST))
         report = await client.report(choice.scene, scores_within_s=0)
-        bridge = Bridge(client, clip, choice, Status(clip, report))
+        playback = Playback(report.frame_times_s, options.t)
+        bridge = Bridge(client, choice, playback, Status(playback, report))
         carrying = asyncio.create_task(_carry(bridge, options))
         showing = asyncio.create_task(bridge.run(end))
         done, _ = await asyncio.wait([carrying, showing], return_when=asyncio.FIRST_COMPLETED)

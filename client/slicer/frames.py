@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+
+from intrasplat_client.views import PictureCamera
 
 Matrix = NDArray[np.float64]
 
@@ -19,27 +20,6 @@ RAS_FROM_WORLD: Matrix = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 SLICE_MM = 1.0
 """Thickness of a picture, which is a volume of one slice."""
-
-
-class Camera(BaseModel):
-    """Intrinsics in pixels; pixel (i, j) is centred at (j + 0.5, i + 0.5)."""
-
-    model_config = ConfigDict(frozen=True)
-
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
-    cx: float
-    cy: float
-
-    def resized(self, width: int) -> Camera:
-        """The same view, `width` pixels wide."""
-        height = max(1, round(self.height * width / self.width))
-        across, down = width / self.width, height / self.height
-        return Camera(
-            width=width, height=height, fx=self.fx * across, fy=self.fy * down, cx=self.cx * across, cy=self.cy * down
-        )
 
 
 def turned(pose: Matrix) -> Matrix:
@@ -52,7 +32,12 @@ def points_in_ras(points_mm: NDArray[np.float32]) -> NDArray[np.float32]:
     return points_mm * RAS_FROM_WORLD.diagonal()[:3].astype(np.float32)
 
 
-def ras_from_ijk(camera: Camera, world_from_camera: Matrix, depth_mm: float) -> Matrix:
+def world_from_camera(camera: PictureCamera) -> Matrix:
+    """Where a picture was taken from, [4, 4]."""
+    return np.array([*camera.world_from_camera, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
+
+
+def ras_from_ijk(camera: PictureCamera, depth_mm: float) -> Matrix:
     """Where the pixels of a picture lie in RAS: on the plane z = D of its camera, each on the ray that it shows.
 
     [4, 4] takes (column j, row i, 0, 1), the centre of a pixel, to mm. Rows run down, as they do in the picture.
@@ -66,4 +51,4 @@ def ras_from_ijk(camera: Camera, world_from_camera: Matrix, depth_mm: float) -> 
             [0.0, 0.0, 0.0, 1.0],
         ]
     )
-    return np.asarray(RAS_FROM_WORLD @ world_from_camera @ camera_from_ijk, np.float64)
+    return np.asarray(RAS_FROM_WORLD @ world_from_camera(camera) @ camera_from_ijk, np.float64)

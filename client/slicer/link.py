@@ -140,8 +140,11 @@ class _Peer:
         self._offered.set()
 
     def hang_up(self) -> None:
-        """End the connection."""
-        self._writer.transport.abort()
+        """End the connection; what it has taken stays readable to the peer."""
+        if self.is_behind:
+            self._writer.transport.abort()
+        else:
+            self._writer.close()
 
     async def serve(self) -> str:
         """Talk to it until it goes; why it went."""

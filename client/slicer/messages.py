@@ -19,8 +19,8 @@ from pyigtl.messages import (
     TransformMessage,
 )
 
-from client.slicer.clip import Surface
 from client.slicer.frames import Matrix, points_in_ras
+from client.slicer.surface import Surface
 
 PICTURE, DEPTH, SURFACE = "IntrasplatPicture", "IntrasplatDepth", "IntrasplatSurface"
 CAMERA, STATUS = "IntrasplatCamera", "IntrasplatStatus"

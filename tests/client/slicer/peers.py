@@ -91,9 +91,12 @@ class Peer:
 
     def until_status(self, *parts: str) -> str:
         """The first status that holds all of these."""
-        return str(
-            until(lambda: (text := self.newest("IntrasplatStatus").string) and all(p in text for p in parts) and text)
-        )
+        end_s = time.monotonic() + WAIT_S
+        while True:
+            text: str = self.newest("IntrasplatStatus").string
+            if all(part in text for part in parts):
+                return text
+            assert time.monotonic() < end_s, text
 
     def until_picture(self, wanted: NDArray[np.generic]) -> None:
         """Wait until this picture comes."""
@@ -178,8 +181,11 @@ def publish(site: Site) -> str:
     site.queued_job()
     claim = site.claim()
     folder = site.store.work_folder(claim.job_id, claim.attempt)
-    save_scene(folder, tissue())
-    report = REPORT_OF_A_SCENE.model_copy(update={"warnings": (a_warning(DOUBT),)})
+    scene = tissue()
+    save_scene(folder, scene)
+    times_s = tuple(scene.frame_times_s.tolist())
+    about = {"warnings": (a_warning(DOUBT),), "frame_count": scene.frame_count, "frame_times_s": times_s}
+    report = REPORT_OF_A_SCENE.model_copy(update=about)
     (folder / REPORT).write_text(report.model_dump_json())
     site.store.publish_scene(claim.job_id, claim.attempt)
     assert site.queue.finish(claim)
