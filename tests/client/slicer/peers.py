@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import signal
@@ -201,12 +200,21 @@ def rendering_site(data_dir: Path) -> Iterator[Site]:
     endpoint = f"ipc://{short_socket_path(store.run_dir, 'worker-1.sock')}"
     pace = Pace()
     with RequestServer(endpoint, Views(store).answer, pace=pace):
-        site = Site(data_dir, endpoint, Painter(), pace)
+        site, ended = Site(data_dir, endpoint, Painter(), pace), threading.Event()
+        heart = threading.Thread(target=_beat, args=(site, ended))
+        heart.start()
         try:
             yield site
         finally:
-            with contextlib.suppress(RuntimeError):
-                site.stop()
+            ended.set()
+            heart.join()
+            site.stop()
+
+
+def _beat(site: Site, ended: threading.Event) -> None:
+    """Say again and again that the worker is there."""
+    while not ended.wait(1.0):
+        site.announce()
 
 
 def free_port() -> int:

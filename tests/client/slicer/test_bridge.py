@@ -68,6 +68,15 @@ def test_pictures_hold_the_renders_pixels_and_the_camera_is_the_endoscopes(
     assert "% on average" in status
 
 
+def test_a_view_tells_its_camera_over_http_and_over_the_stream(client: Client, scene: str) -> None:
+    camera = client.render(T, scene=scene, width=32).camera
+    with client.stream(scene) as viewer:
+        assert viewer.render(T, width=32).camera == camera
+    assert camera is not None
+    assert (camera.width, camera.height, camera.fx, camera.cy) == (32, 24, CAMERA.fx / 2, CAMERA.cy / 2)
+    assert camera.world_from_camera == tuple(SCENE.world_from_camera[FRAME, :3].ravel())
+
+
 def test_a_point_of_the_tissue_lies_behind_its_pixel_as_seen_from_the_camera_in_ras(
     standing: Peer, client: Client, scene: str
 ) -> None:
@@ -159,17 +168,15 @@ def test_a_peer_that_comes_back_has_everything_at_once_also_while_the_service_is
             peer.newest("IntrasplatSurface")
         until(lambda: "has gone" in running.said)
         site.stop()
-        try:
-            with peer_of(running) as peer:
+        with peer_of(running) as peer:
+            try:
                 assert np.array_equal(peer.picture(), wanted)
                 assert len(peer.newest("IntrasplatSurface").points) > 100
                 peer.send("t=0")
                 peer.until_status("STALE", "No service answers")
+            finally:
                 site.start()
-                peer.until_status("CURRENT", "frame 0 of")
-        finally:
-            if not site._thread.is_alive():
-                site.start()
+            peer.until_status("CURRENT", "frame 0 of")
 
 
 def test_a_deleted_scene_turns_black_and_ends_the_bridge(site: Site, client: Client) -> None:
