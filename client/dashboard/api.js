@@ -113,6 +113,18 @@ export async function trouble() {
 }
 
 /**
+ * Something that speaks against a clip; refused: POST /reconstruct would refuse it.
+ * @typedef {{field: string, code: string, refused: boolean, problem: string, remedy: string}} Finding
+ */
+/** @param {Record<string, unknown>} described a clip that is to be sent @returns {Promise<{findings: Finding[]}>} */
+export const checkClip = (described) =>
+  json("/reconstruct/check", {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify(described),
+  });
+
+/**
  * Make finished uploads a job.
  * @param {Record<string, unknown>} submission upload ids by part, and options
  * @param {string} idempotencyKey the same for every try

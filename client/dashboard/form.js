@@ -1,50 +1,16 @@
-// The form that sends a clip: files by picker or by drop, options, progress, and what was wrong with it.
+// The form that sends a clip: files by picker or by drop, what speaks against them, progress, and going on after a reload.
 
-import { reconstruct } from "./api.js";
-import { words } from "./messages.js";
-import { insist } from "./pause.js";
+import { findingsOf, showFindings } from "./checks.js";
+import { element } from "./element.js";
+import { keyEvents } from "./key.js";
+import { languageEvents, words } from "./messages.js";
+import { carriedFrom, limit, nameChoices, OPTIONS, optionsOf } from "./options.js";
 import { showProblem } from "./problem.js";
-import { Upload } from "./upload.js";
-import { LIMITS } from "./wire.js";
+import { interrupted, isSame, planOf, Sending } from "./sending.js";
 
 const PARTS = ["clip", "right", "calibration", "masks"];
-const OPTIONS = [
-  ...["preset", "budget_s", "layout", "eyes", "poses", "priority", "mask_source", "mask_polarity", "keep_recorded"],
-];
-const LABELS = {
-  preset: {
-    instant: "instant: a scene within seconds",
-    fast: "fast",
-    quality: "quality: sharper, takes longer",
-    small: "small: a small file",
-    paper: "paper: the method as published",
-    "paper-released": "paper, as its code was released",
-    "paper-wide": "paper, with more bases",
-    pfs: "baseline: pfs",
-    hexplane: "baseline: hexplane",
-    without_mapf: "baseline: without mapf",
-  },
-  mask_source: { given: "as given", auto: "as given, or found", none: "not at all" },
-  poses: {
-    auto: "may move: to be found out",
-    given: "moves as the clip's poses say",
-    fixed: "rests",
-    estimate: "moves: its path is estimated",
-  },
-  mask_polarity: { auto: "to be found out", tool: "the instrument", tissue: "the tissue" },
-  layout: {
-    auto: "to be found out",
-    sbs: "side by side",
-    tb: "top and bottom",
-    frames: "frames",
-    endonerf: "EndoNeRF",
-    stereomis: "StereoMIS",
-  },
-  eyes: { both: "both eyes", left: "the left eye; the right one judges" },
-  keep_recorded: { on: "kept, to compare the model with", off: "not kept" },
-  priority: { standard: "standard", high: "high: before all others" },
-};
 const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;
+const UNAUTHORISED = 401;
 
 /**
  * Which part of a clip each dropped file is, by its name; the user sees the guess in the pickers.
@@ -62,55 +28,44 @@ function partsOf(files) {
   return parts;
 }
 
-/** An id for one submission; not randomUUID, which browsers keep from pages without HTTPS. */
-const newKey = () => [...crypto.getRandomValues(new Uint32Array(4))].map((number) => number.toString(16)).join("-");
-
-/** @param {HTMLFormElement} form */
-function optionsOf(form) {
-  const given = new FormData(form);
-  const options = Object.fromEntries(OPTIONS.filter((name) => given.get(name)).map((name) => [name, given.get(name)]));
-  if (options.budget_s) options.budget_s = Number(options.budget_s);
-  return options;
-}
-
-/** Options that the form has no field for, as the job had them. @param {import("./api.js").Job | null} job */
-function carriedFrom(job) {
-  const options = Object.entries(job?.options ?? {});
-  return Object.fromEntries(options.filter(([name, value]) => value != null && !OPTIONS.includes(name)));
-}
-
-/** Give the form's fields the choices and limits of the service's options. @param {HTMLFormElement} form */
-function limit(form) {
-  for (const name of OPTIONS) {
-    const { choices, max, default: chosen } = LIMITS[name];
-    const field = form.elements[name];
-    if (max !== undefined) field.max = max;
-    for (const choice of choices ?? []) {
-      field.append(new Option(LABELS[name][choice] ?? choice, choice, choice === chosen, choice === chosen));
-    }
-  }
-}
-
 export class ClipForm {
   /**
    * @param {{form: HTMLFormElement, again: HTMLElement, message: HTMLElement, progress: HTMLElement,
-   *   stop: HTMLElement}} parts
-   * @param {(id: string) => void} onJob told of the job that was made
+   *   stop: HTMLElement, refusal: HTMLElement}} parts
+   * @param {{onJob: (id: string) => void, onShare: (share: number | null) => void, onAsked: () => void}} told of the job
+   *   that was made; of the share that is sent, null at the end; that something is asked of the user
    */
-  constructor(parts, onJob) {
-    Object.assign(this, parts);
-    this.onJob = onJob;
+  constructor(parts, told) {
+    Object.assign(this, parts, told);
     /** @type {import("./api.js").Job | null} the job whose clip is used again, in place of a file */
     this.earlier = null;
+    /** @type {{sending: Sending, missing: import("./sending.js").PlannedFile[]} | null} what a reload interrupted */
+    this.resumed = null;
+    this.isSending = false;
+    this.isAllowed = true;
+    this.looks = 0; // counts checks: only the newest is shown
     limit(this.form);
     this.submit = this.form.querySelector("[type=submit]");
     this.form.addEventListener("submit", (event) => {
       event.preventDefault();
       this.#send();
     });
+    this.form.addEventListener("change", () => this.#look());
     this.stop.addEventListener("click", () => this.controller?.abort());
-    this.again.querySelector("button").addEventListener("click", () => this.#startAnew());
+    this.again.querySelector("button").addEventListener("click", () => this.#giveUp());
+    languageEvents.addEventListener("changed", () => nameChoices(this.form));
+    keyEvents.addEventListener("changed", () => this.#resume());
     this.#takeDrops();
+    this.#resume();
+  }
+
+  /** Offer what the user's key may do. @param {import("./scopes.js").Scopes} scopes */
+  allow(scopes) {
+    this.isAllowed = scopes.known === null || scopes.has("reconstruct");
+    this.refusal.hidden = this.isAllowed;
+    this.#showSubmit();
+    const high = [...this.form.elements.priority.options].find((option) => option.value === "high");
+    high.disabled = scopes.known !== null && !scopes.has("priority");
   }
 
   /**
@@ -132,22 +87,43 @@ export class ClipForm {
   #startAnew() {
     this.form.reset();
     this.earlier = null;
+    this.resumed = null;
+    showFindings(this.form, []);
     this.#showSource();
     this.#say("");
   }
 
-  /** The pickers of clip and calibration, or whose are used again and, beside that, the masks' picker. */
+  /** Another clip in place of the earlier or the interrupted one. */
+  #giveUp() {
+    this.resumed?.sending.discard();
+    this.#startAnew();
+  }
+
+  /** The pickers of the parts that are asked for, and why it is not all of them. */
   #showSource() {
-    const isAgain = this.earlier !== null;
-    const { clip, right, calibration, masks, poses } = this.form.elements;
-    if (isAgain) this.again.after(masks.closest("label"));
-    else poses.closest("label").before(masks.closest("label"));
-    for (const picker of [clip, right, calibration]) picker.closest("label").hidden = isAgain;
-    clip.required = !isAgain;
-    this.again.hidden = !isAgain;
-    this.again.querySelector("p").textContent = isAgain
-      ? `The clip of ${this.earlier.id.slice(0, 8)} again, with its calibration.`
-      : "";
+    const { clip } = this.form.elements;
+    const asked = this.#askedFor();
+    for (const part of PARTS) {
+      const label = this.form.elements[part].closest("label");
+      label.hidden = !asked.includes(part);
+      const group = label.closest("details");
+      group?.classList.toggle("asked", !label.hidden);
+      if (group && this.resumed && !label.hidden) group.open = true;
+    }
+    this.form.classList.toggle("resumed", this.resumed !== null);
+    clip.required = asked.includes("clip");
+    this.again.hidden = this.earlier === null && this.resumed === null;
+    const [text, leave] = this.again.children;
+    leave.textContent = words(this.resumed ? "upload.give_up" : "upload.another");
+    if (this.resumed) {
+      const names = this.resumed.missing.map((planned) => planned.name).join(", ");
+      text.textContent = words("upload.choose_again", { names });
+    } else if (this.earlier) text.textContent = words("upload.clip_again", { id: this.earlier.label ?? this.earlier.id.slice(0, 8) });
+  }
+
+  #askedFor() {
+    if (this.resumed) return this.resumed.missing.map(({ part }) => pickerOf(part));
+    return this.earlier ? ["masks"] : PARTS;
   }
 
   #takeDrops() {
@@ -172,63 +148,128 @@ export class ClipForm {
       transfer.items.add(file);
       this.form.elements[part].files = transfer.files;
     }
+    this.#look();
+  }
+
+  /** @returns {Map<string, File>} the files that are chosen, by the part of the clip that they are */
+  #files() {
+    const chosen = PARTS.map((part) => [part, this.form.elements[part].files[0]]).filter(([, file]) => file);
+    const isPair = chosen.some(([part]) => part === "right");
+    return new Map(chosen.map(([part, file]) => [isPair && part === "clip" ? "left" : part, file]));
+  }
+
+  /** What is sent beside the files. */
+  #submission() {
+    const submission = { options: { ...carriedFrom(this.earlier), ...optionsOf(this.form) } };
+    if (this.earlier) submission.clip_of = this.earlier.id;
+    const label = this.form.elements.label.value.trim();
+    if (label) submission.label = label;
+    if (submission.options.budget_s) delete submission.options.iterations; // they exclude each other
+    return submission;
+  }
+
+  /** Show what speaks against what is chosen, or go on with what was interrupted. @returns {Promise<HTMLElement | null>} */
+  async #look() {
+    if (this.resumed) return this.#goOn();
+    const look = ++this.looks;
+    const files = this.#files();
+    const findings = files.size > 0 ? await findingsOf(files, this.#submission()) : [];
+    return look === this.looks ? showFindings(this.form, findings) : null;
   }
 
   async #send() {
+    if (this.isSending) return;
+    this.isSending = true;
+    this.#showSubmit();
+    const atFault = await this.#look();
+    this.isSending = false;
+    this.#showSubmit();
+    if (atFault) {
+      this.#say(words("upload.look"), "bad");
+      atFault.focus();
+      return;
+    }
+    const files = this.#files();
+    const sending = this.#begin(planOf(files, this.#submission()));
+    await this.#run(sending, files);
+  }
+
+  /** @param {import("./sending.js").Plan} plan */
+  #begin(plan) {
     this.controller = new AbortController();
-    const { signal } = this.controller;
-    const uploads = this.#uploads(signal);
+    return new Sending(plan, this.controller.signal, {
+      onShare: (share) => this.#showShare(share),
+      onTrouble: (problem) => showProblem(this.message, problem, words("upload.kept")),
+    });
+  }
+
+  /** @param {Sending} sending @param {Map<string, File>} files */
+  async #run(sending, files) {
     this.#show(true);
     try {
-      await this.#sendAll(uploads);
-      this.onJob(await this.#submitAll(uploads, signal));
+      this.onJob(await sending.run(files));
       this.#startAnew();
     } catch (error) {
-      if (signal.aborted) this.#say(words("upload.stopped"), "bad");
-      else showProblem(this.message, error);
-      for (const upload of uploads) upload.discard();
+      this.#tellEnd(sending, error);
     } finally {
       this.#show(false);
+      this.onShare(null);
     }
   }
 
-  #uploads(signal) {
-    const files = PARTS.map((part) => [part, this.form.elements[part].files[0]]).filter(([, file]) => file);
-    const isPair = files.some(([part]) => part === "right");
-    return files.map(([part, file]) => new Upload(isPair && part === "clip" ? "left" : part, file, signal));
+  /** It ended without a job. @param {Sending} sending @param {Error} error */
+  #tellEnd(sending, error) {
+    if (sending.signal.aborted) this.#say(words("upload.stopped"), "bad");
+    else showProblem(this.message, error);
+    if (error.status === UNAUTHORISED) return; // goes on with the right key
+    sending.discard();
+    this.resumed = null;
+    this.#showSource();
   }
 
-  async #sendAll(uploads) {
-    const total = uploads.reduce((sum, upload) => sum + upload.file.size, 0);
-    const showProgress = () => {
-      const share = uploads.reduce((sum, upload) => sum + upload.offset, 0) / total;
-      this.progress.value = share;
-      this.#say(words("upload.sending", { share: Math.round(share * 100) }));
-    };
-    showProgress();
-    for (const upload of uploads) await upload.send(showProgress, (problem) => this.#wait(problem));
+  /** Take up what a reload interrupted: what has not come of its files is asked for again. */
+  async #resume() {
+    const plan = interrupted();
+    if (plan === null || this.isSending) return;
+    const sending = this.#begin(plan);
+    this.#show(true);
+    try {
+      this.resumed = { sending, missing: await sending.missing() };
+    } catch (error) {
+      this.#tellEnd(sending, error);
+      return;
+    } finally {
+      this.#show(false);
+    }
+    if (this.resumed.missing.length === 0) {
+      await this.#run(sending, new Map());
+      return;
+    }
+    this.#showSource();
+    this.#say(words("upload.interrupted"), "bad");
+    this.onAsked();
   }
 
-  /** @returns {Promise<string>} the job's id */
-  async #submitAll(uploads, signal) {
-    const submission = { options: { ...carriedFrom(this.earlier), ...optionsOf(this.form) } };
-    if (this.earlier) submission.clip_of = this.earlier.id;
-    if (submission.options.budget_s) delete submission.options.iterations; // they exclude each other
-    for (const upload of uploads) submission[upload.part] = upload.id;
-    const key = newKey();
-    const submit = async () => {
-      try {
-        return (await reconstruct(submission, key, signal)).id;
-      } catch (error) {
-        if (error.status === 503 && error.document.job_id) return error.document.job_id; // safe, and queued later
-        throw error;
-      }
-    };
-    return insist(submit, (problem) => this.#wait(problem), signal);
+  /** Go on as soon as the files that were interrupted are chosen again. */
+  async #goOn() {
+    const { sending, missing } = this.resumed;
+    showFindings(this.form, []);
+    const files = new Map();
+    for (const planned of missing) {
+      const picker = this.form.elements[pickerOf(planned.part)];
+      const file = picker.files[0];
+      if (file && !isSame(planned, file)) {
+        picker.closest("label").after(element("div", { class: "finding bad", text: words("upload.other_file", { name: planned.name }) }));
+      } else if (file) files.set(planned.part, file);
+    }
+    if (files.size === missing.length && !this.isSending) await this.#run(sending, files);
+    return null;
   }
 
-  #wait(problem) {
-    showProblem(this.message, problem, words("upload.kept"));
+  #showShare(share) {
+    this.progress.value = share;
+    this.#say(words("upload.sending", { share: Math.round(share * 100) }));
+    this.onShare(share);
   }
 
   #say(text, kind = "") {
@@ -237,7 +278,15 @@ export class ClipForm {
   }
 
   #show(isSending) {
-    this.submit.disabled = isSending;
+    this.isSending = isSending;
     this.progress.hidden = this.stop.hidden = !isSending;
+    this.#showSubmit();
+  }
+
+  #showSubmit() {
+    this.submit.disabled = this.isSending || !this.isAllowed;
   }
 }
+
+/** @param {string} part of a clip @returns {string} the picker's name */
+const pickerOf = (part) => (part === "left" ? "clip" : part);

@@ -4,8 +4,9 @@ import { cancelJob, purgeScene, retryJob } from "./api.js";
 import { makeCard, nameOf, rename } from "./card.js";
 import { button, element } from "./element.js";
 import { TimesLeft } from "./left.js";
-import { figure, words } from "./messages.js";
+import { words } from "./messages.js";
 import { details, showProblem } from "./problem.js";
+import { progressOf } from "./progress.js";
 import { Thumbnails } from "./thumbnails.js";
 
 /** @typedef {import("./api.js").Job} Job */
@@ -84,25 +85,12 @@ export class JobList {
       row = made;
       this.rows.set(job.id, row);
     }
-    row.words.textContent = this.#describe(job);
+    row.words.textContent = progressOf(job, this.times);
     row.bar.value = job.fraction ?? 0;
     row.item.classList.toggle("chosen", job.id === chosen);
     if (job.id === chosen) row.item.setAttribute("aria-current", "true");
     else row.item.removeAttribute("aria-current");
     return row;
-  }
-
-  /** @param {Job} job @returns {string} what it is doing, in one line */
-  #describe(job) {
-    const left = this.times.of(job);
-    if (job.state === "queued") {
-      const before = job.position == null ? "" : words(job.position === 0 ? "job.next" : "job.before", { count: job.position });
-      return [words("state.queued"), before, left].filter(Boolean).join(" · ");
-    }
-    if (job.state !== "running") return words(`state.${job.state}`);
-    const stage = job.cancel_requested ? words("job.cancelling") : words(`stage.${job.stage ?? "start"}`);
-    const db = job.psnr_db != null && `${figure(job.psnr_db, 1)} dB`;
-    return [stage, db, left].filter(Boolean).join(" · ");
   }
 
   /** @param {Job} job @returns {("watch"|"view"|"save"|"rename"|"retry"|"cancel"|"delete")[]} what may be done, and would not be refused */

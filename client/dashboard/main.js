@@ -1,6 +1,7 @@
 // The page: wires form, jobs, picture, curve and report together.
 
 import { Address } from "./address.js";
+import { Announcer } from "./announce.js";
 import { getCurve, getReport } from "./api.js";
 import { stepBackWhileIdle } from "./awake.js";
 import { nameOf } from "./card.js";
@@ -130,6 +131,8 @@ function offerMasks() {
 
 function showJobs() {
   scopes.refresh();
+  form.allow(scopes);
+  announcer.refresh(jobs.byId, viewer.scene);
   offerMasks();
   shelf.refresh();
   list.show(shelf.shown, viewer.scene);
@@ -183,6 +186,7 @@ const goTo = (place) => {
 };
 const address = new Address(viewer, get("layer"), goTo, tell);
 
+const announcer = new Announcer({ line: get("sent"), ask: get("notify") }, view);
 const form = new ClipForm(
   {
     form: get("upload"),
@@ -190,13 +194,20 @@ const form = new ClipForm(
     message: get("upload-message"),
     progress: get("upload-progress"),
     stop: get("upload-stop"),
+    refusal: get("upload-refusal"),
   },
-  (id) => {
-    awaited = id;
-    if (!viewer.scene) viewer.open(null, words("page.awaited"));
-    jobs.poll();
+  {
+    onJob: (id) => {
+      awaited = id;
+      announcer.await(id);
+      if (!viewer.scene) viewer.open(null, words("page.awaited"));
+      jobs.poll();
+    },
+    onShare: (share) => announcer.send(share),
+    onAsked: () => drawers.open("drawer", false),
   },
 );
+awaited = announcer.awaited; // of before a reload
 get("layer").addEventListener("change", offerMasks);
 get("better-masks").addEventListener("click", () => sendMasks(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });

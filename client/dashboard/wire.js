@@ -41,6 +41,14 @@
  */
 /**
  * @typedef {{
+ *   scene_id?: string | null,
+ *   version: string,
+ *   exported_at_s: number,
+ *   imported_at_s: number,
+ * }} Imported
+ */
+/**
+ * @typedef {{
  *   code?: ErrorCode,
  *   problem: string,
  *   field?: string | null,
@@ -90,6 +98,7 @@
  *   options: JobOptions,
  *   input_bytes: number,
  *   clip_of?: string | null,
+ *   imported?: boolean,
  *   created_at_s: number,
  *   started_at_s?: number | null,
  *   finished_at_s?: number | null,
@@ -110,7 +119,7 @@
  *   text: string,
  * }} Notice
  */
-/** @typedef {"baseline"|"calibration"|"decoding"|"depth_unit"|"frame_times"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"poses"|"rectification"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"few_frames"|"field_of_view_unusual"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"masks_unsure"|"mask_gaps"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
+/** @typedef {"baseline"|"calibration"|"decoding"|"depth_unit"|"frame_times"|"imported"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"poses"|"rectification"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"few_frames"|"field_of_view_unusual"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"masks_unsure"|"mask_gaps"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
 /**
  * @typedef {{
  *   frames: number[],
@@ -125,6 +134,7 @@
  * @typedef {{
  *   report_version?: number,
  *   notice?: string,
+ *   imported?: Imported | null,
  *   versions?: Record<string, string>,
  *   scored?: boolean,
  *   psnr_tissue_db: number | null,

@@ -70,7 +70,9 @@ def check_calibration_text(text: str, field: str, label: str) -> None:
 
 
 def check_calibration_file(text: str, field: str, label: str) -> None:
-    """InputError for what check_calibration_text() refuses, and for a number that is none or not finite."""
+    """InputError for what is no text, what check_calibration_text() refuses, and numbers that are not finite."""
+    if "\0" in text:
+        raise InputError(field, f"{label} is not a text file.", _PLAIN_TEXT_REMEDY)
     check_calibration_text(text, field, label)
     _check_numbers(text, field, label)
 
@@ -89,12 +91,9 @@ def _text_of(path: Path, part: str) -> str:
         problem = f"{path.name} has {size} bytes; the limit is {MAX_CALIBRATION_BYTES}."
         raise LimitError(part, problem, _PLAIN_TEXT_REMEDY)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        text = "\0"
-    if "\0" in text:
-        raise InputError(part, f"{path.name} is not a text file.", _PLAIN_TEXT_REMEDY)
-    return text
+        return "\0"
 
 
 def check_head(head: bytes, suffix: str, part: str, label: str) -> None:

@@ -12,6 +12,7 @@ import pytest
 from client.generate_page import PAGE_TYPES, generate
 from client.up import DASHBOARD
 from contract.wire.options import JobOptions
+from tests.client.words import table
 
 SCRIPTS = sorted(DASHBOARD.rglob("*.js"))
 
@@ -93,10 +94,12 @@ def test_the_types_and_limits_are_what_contract_wire_generates() -> None:
     assert PAGE_TYPES.read_text(encoding="utf-8") == generate(), "run: python -m client.generate_page"
 
 
-def test_the_form_has_a_label_for_each_choice_and_a_field_for_options_alone() -> None:
-    page, script = (DASHBOARD / "index.html").read_text(), (DASHBOARD / "form.js").read_text()
+def test_the_form_has_words_for_each_choice_and_a_field_for_options_alone() -> None:
+    page, script = (DASHBOARD / "index.html").read_text(), (DASHBOARD / "options.js").read_text()
     (listed,) = re.findall(r"const OPTIONS = \[(.*)\]", script)
+    named = set()
     for name in re.findall(r'"(\w+)"', listed):
         assert f'name="{name}"' in page
         choices = get_args(JobOptions.model_fields[name].annotation)
-        assert [each for each in choices if isinstance(each, str) and not re.search(rf'\b{each}"?:', script)] == []
+        named |= {f"{name}_{each}" for each in choices if isinstance(each, str)}
+    assert set(table("en")["choice"]) == named

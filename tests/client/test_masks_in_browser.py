@@ -46,7 +46,7 @@ def test_recorded_frames_show_the_masks_while_a_job_trains_and_afterwards(site: 
 
 def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path: Path) -> None:
     page.choose("clip", CLIP)
-    page.click("#upload summary")
+    page.click("#upload > details > summary")
     Select(page.find("#upload [name=mask_source]")).select_by_value("auto")
     Select(page.find("#upload [name=poses]")).select_by_value("fixed")
     page.click("#upload [type=submit]")

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from client.up import DASHBOARD
+from contract.wire.checks import FindingCode
 from contract.wire.errors import ErrorCode
 from contract.wire.job import JobState
 from contract.wire.notices import NoticeCode
@@ -52,6 +53,7 @@ def test_every_code_of_the_contract_has_words(language: str) -> None:
     words = table(language)
     assert set(words["notice"]) == {code.value for code in NoticeCode}
     assert {code.value for code in ErrorCode} <= set(words["problem"])
+    assert set(words["check"]) == {code.value for code in FindingCode}
     assert set(words["state"]) == {state.value for state in JobState}
     assert set(words["stage"]) == {*USUAL_S, COMPILATION, STAGE, FETCHING, PUBLISHING}
     statuses = {STATUS_WITH_CODE.get(status, f"http_{status}") for status in TITLES}

@@ -74,14 +74,14 @@ def test_a_drawer_opens_beside_the_picture_and_gives_the_focus_back(site: Site, 
 def test_the_picture_fills_the_screen_and_a_refusal_is_seen_whatever_is_open(
     site: Site, page: Page, tmp_path: Path, width: int, height: int
 ) -> None:
-    notes = tmp_path / "notes.mp4"
-    notes.write_text("no film")
+    broken = tmp_path / "cut short.mp4"
+    broken.write_bytes(b"\0\0\0\x18ftypisom" + bytes(64))
     with screen_of(page, width, height):
         page.press(site.scene(), "View")
         page.until_state("live")
         left, top, right, bottom = box_of(page, "#stage")
         assert (right - left) * (bottom - top) > 0.85 * width * height
-        page.choose("clip", notes)
+        page.choose("clip", broken)
         page.script("document.querySelector('#upload details').open = true")
         page.click("#upload [type=submit]")
         page.until_text("#upload-message", say("problem.input:clip"))

@@ -15,12 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.intake.sniff import png_size
 from contract.store.recorded import MASK, PICTURE, name_of, nearest, read_frame
 from contract.wire.errors import InputError, SceneError
 from contract.wire.names import Eye as EyeName
 from contract.wire.rendering import RecordedMasks
 from contract.wire.report import Recorded
 from worker.input.clip import DepthClip, Eye
+from worker.input.clip.images import jpeg_size
 from worker.input.clip.split import spread
 from worker.machine.mapped import let_go
 
@@ -28,6 +30,8 @@ MAX_KEPT = 120
 """Moments of a clip."""
 MAX_WIDTH = 720
 """Px of a picture: a wider frame is made smaller by a whole factor, which takes a third of the time of any other."""
+MAX_HEIGHT = 4 * MAX_WIDTH
+"""Of a picture that is decoded; it may have come from another site."""
 QUALITY = 60
 MARK, MARK_SHARE = (0, 220, 255), 0.45
 """RGB that no tissue has, and how much of it the masked parts get; their outline gets all of it."""
@@ -109,9 +113,9 @@ def stored_frame(
         _, png = read_frame(path, frame_count, t, eye, MASK)
     except InputError:  # nothing is masked
         return index, jpeg
+    if jpeg_size(jpeg) != (size := png_size(png)) or size is None or size[0] > MAX_WIDTH or size[1] > MAX_HEIGHT:
+        raise SceneError("A recorded frame of this scene is damaged, too large, or does not fit its mask.")
     rgb, tool = _decoded(jpeg, cv2.IMREAD_COLOR)[..., ::-1], _decoded(png, cv2.IMREAD_GRAYSCALE) > 0
-    if rgb.shape[:2] != tool.shape:
-        raise SceneError("A recorded frame of this scene does not fit its mask.")
     return index, _jpeg(_marked(np.ascontiguousarray(rgb), tool))
 
 
@@ -155,7 +159,7 @@ def _decoded(content: bytes, flags: int) -> Picture:
     Raises:
         SceneError: it is none.
     """
-    picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if picture is None:
         raise SceneError("A recorded frame of this scene is damaged.")
     return np.asarray(picture, np.uint8)

@@ -55,13 +55,13 @@ def take_scene(
     on_step(0.6)
     _check_recording(scene, limits)
     _check_report(scene, read.report)
-    for name in NESTED:
-        if (folder / name).exists():
-            check_file(folder / name, FIELD, limits)
+    kept = [name for name in NESTED if (folder / name).exists()]
+    for name in kept:
+        check_file(folder / name, FIELD, limits)
     (folder / THUMBNAIL).unlink(missing_ok=True)  # it is rendered anew, so it shows the scene
-    save_scene(folder, _known(scene, warnings))
+    save_scene(folder, _known(scene, warnings), {name: (folder / name).read_bytes() for name in kept})
     report = _from_elsewhere(read.report, imported)
-    if not (folder / RECORDED).exists():
+    if RECORDED not in kept:
         report = report.model_copy(update={"recorded": None})
     replace_file(folder / REPORT, report.model_dump_json(indent=1).encode(), FOR_ALL)
     on_step(1.0)

@@ -43,6 +43,10 @@ def picture(jpeg: bytes) -> np.ndarray:
     return np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR))[..., ::-1].astype(int)
 
 
+HUGE = bytes.fromhex("ffd8ffc0000b08ffffffff01011100")
+"""The head of a JPEG of 65,535 x 65,535 pixels."""
+
+
 def two_eyes() -> DepthClip:
     """The right eye is 50 levels darker and has its masks on the right."""
     left = clip()
@@ -169,7 +173,7 @@ def test_a_damaged_file_is_told(tmp_path: Path, content: bytes) -> None:
         stored_frame(path, FRAMES, 0.0)
 
 
-@pytest.mark.parametrize(("jpeg", "png"), [(b"", b""), (b"JPEG", b""), (None, b"PNG"), (None, None)])
+@pytest.mark.parametrize(("jpeg", "png"), [(b"", b""), (b"JPEG", b""), (None, b"PNG"), (None, None), (HUGE, None)])
 def test_a_damaged_picture_or_a_mask_of_another_size_is_told(
     tmp_path: Path, jpeg: bytes | None, png: bytes | None
 ) -> None:

@@ -83,10 +83,12 @@ def test_an_import_of_an_import_names_the_last_place(tmp_path: Path) -> None:
 
 def test_found_masks_and_recorded_frames_come_along(tmp_path: Path) -> None:
     png = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (64).to_bytes(4, "big") + (48).to_bytes(4, "big") + b"\x08\x02\0\0\0"
-    pictures = {MASKS: zipped({"000000.png": png}), RECORDED: zipped({"000000.jpg": b"\xff\xd8\xff\xe0"})}
+    pictures = {MASKS: zipped({"000000.png": png}), RECORDED: zipped({"left/000000.jpg": b"\xff\xd8\xff\xe0"})}
     files = relisted({**files_of(archived(tmp_path / "there", small_scene())), **pictures})
     _, folder = taken(tmp_path, zipped(files))
     assert {name: (folder / name).read_bytes() for name in pictures} == pictures
+    beside = json.loads((folder / MANIFEST).read_bytes())["beside"]
+    assert {name: each["bytes"] for name, each in beside.items()} == {name: len(pictures[name]) for name in pictures}
 
 
 @pytest.mark.parametrize("name", HOSTILE)

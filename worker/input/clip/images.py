@@ -124,15 +124,15 @@ def _size_of(tree: FileTree, name: str) -> tuple[int, int]:
     header = tree.head(name, 32)
     size = png_size(header)
     if size is None and header.startswith(JPEG_MAGIC):
-        size = _jpeg_size(tree.head(name, 4 * _HEADER_BYTES))
+        size = jpeg_size(tree.head(name, 4 * _HEADER_BYTES))
     if size is None:
         problem = f"{name} is empty (0 bytes)." if not header else f"{name} is not a PNG or JPEG image."
         raise InputError(tree.field, problem, "Write the image again, as PNG.")
     return size
 
 
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Walks the marker segments up to the frame header (ITU T.81, B.2)."""
+def jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """(width, height) of a JPEG; walks the marker segments up to the frame header (ITU T.81, B.2)."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
