@@ -12,8 +12,11 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from contract.runtime.local import LOCAL_COMMANDS
+
+DASHBOARD_VARIABLE = "INTRASPLAT_DASHBOARD_DIR"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run_local(arguments: list[str]) -> int:
     """Replace this process by the worker's program, so that signals and exit status are the worker's."""
     command = [sys.executable, "-m", "worker", *arguments]
+    os.environ.setdefault(DASHBOARD_VARIABLE, str(Path(__file__).resolve().parent / "dashboard"))  # for export
     if os.name == "posix":
         os.execv(sys.executable, command)
     process = subprocess.Popen(command)  # without exec on Windows, where the caller would not wait

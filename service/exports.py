@@ -16,7 +16,7 @@ from starlette.responses import StreamingResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.store.archive import archive_parts
+from contract.store.stored_exports import stored_parts
 from contract.wire.errors import UnavailableError
 from contract.wire.exports import EXPORT_FORMATS, ExportOptions, check_export
 from contract.wire.rendering import ExportRequest
@@ -99,7 +99,7 @@ async def _stored(scene_id: str, name: str, services: Deps, caller: Caller) -> R
     caller.require(KeyScope.DOWNLOAD)
     record = await run_in_threadpool(finished_job, services, caller, scene_id)
     folder = await run_in_threadpool(services.store.scene_folder, scene_id, record.attempt)
-    parts = await run_in_threadpool(archive_parts, folder, scene_id)
+    parts = await run_in_threadpool(stored_parts, name, folder, scene_id, services.settings.dashboard_dir)
     await run_in_threadpool(services.audit.record, AuditAction.DOWNLOADED, caller, scene_id)
     headers = {"Content-Disposition": _disposition(scene_id, name), "Cache-Control": "no-store"}
     return StreamingResponse(parts, media_type=EXPORT_FORMATS[name].media_type, headers=headers)

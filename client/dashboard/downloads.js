@@ -26,6 +26,7 @@ const GROUPS = {
     "tum": ".tum",
   },
   itself: {
+    "html": ".html",
     "scene": ".scene.zip",
   },
 };

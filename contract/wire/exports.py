@@ -87,6 +87,9 @@ EXPORT_FORMATS = {
     "tracks": ExportFormat("-tracks.npz", "application/zip", ("every",), "where each Gaussian is over time, mm"),
     "webm": ExportFormat(".webm", "video/webm", _VIDEO, "a video without instruments (VP8)"),
     "mp4": ExportFormat(".mp4", "video/mp4", _VIDEO, "a video without instruments (VP9)"),
+    "html": ExportFormat(
+        ".html", "text/html", (), "a page with player and scene that opens from a disk", is_stored=True
+    ),
     "scene": ExportFormat(
         ".scene.zip", "application/zip", (), "the scene itself, to be imported elsewhere", is_stored=True
     ),

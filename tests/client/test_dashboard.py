@@ -15,18 +15,21 @@ from contract.wire.options import JobOptions
 from tests.client.words import table
 
 SCRIPTS = sorted(DASHBOARD.rglob("*.js"))
+INDEX, ALONE = DASHBOARD / "index.html", DASHBOARD / "file" / "alone.html"
+pages = pytest.mark.parametrize("path", [INDEX, ALONE], ids=lambda path: path.name)
+"""The page of a service, and the page of a file without one."""
 
 
 class Page(HTMLParser):
-    """Ids, references and inline code of the page."""
+    """Ids, references and inline code of a page."""
 
-    def __init__(self) -> None:
+    def __init__(self, path: Path) -> None:
         super().__init__()
         self.ids: list[str] = []
         self.references: list[str] = []
         self.inline: list[str] = []
         self._tag = ""
-        self.feed((DASHBOARD / "index.html").read_text())
+        self.feed(path.read_text())
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self._tag = tag
@@ -47,12 +50,14 @@ def imports_of(script: Path) -> list[str]:
     return re.findall(r'from "([^"]+)"', script.read_text())
 
 
-def test_the_page_refers_only_to_files_beside_it() -> None:
-    assert [each for each in Page().references if not (DASHBOARD / each).is_file()] == []
+@pages
+def test_the_page_refers_only_to_files_beside_it(path: Path) -> None:
+    assert [each for each in Page(path).references if not (path.parent / each).is_file()] == []
 
 
-def test_the_page_holds_no_inline_code_that_its_policy_would_stop() -> None:
-    assert Page().inline == []
+@pages
+def test_the_page_holds_no_inline_code_that_its_policy_would_stop(path: Path) -> None:
+    assert Page(path).inline == []
 
 
 def test_the_page_says_that_it_is_no_medical_device() -> None:
@@ -78,15 +83,16 @@ def test_the_player_knows_nothing_of_the_page() -> None:
         assert [each for each in workers if not (script.parent / each).is_file()] == []
 
 
-def test_every_element_that_a_script_asks_for_is_on_the_page() -> None:
-    page = Page()
-    asked = {each for script in SCRIPTS for each in re.findall(r'(?<!\.)\bget\("([^"]+)"\)', script.read_text())}
+@pages
+def test_every_element_that_a_script_asks_for_is_on_the_page(path: Path) -> None:
+    page, scripts = Page(path), [each for each in SCRIPTS if (each.parent == ALONE.parent) is (path == ALONE)]
+    asked = {each for script in scripts for each in re.findall(r'(?<!\.)\bget\("([^"]+)"\)', script.read_text())}
     assert asked <= set(page.ids)
     assert len(page.ids) == len(set(page.ids))
 
 
 def test_nothing_is_fetched_from_elsewhere() -> None:
-    for path in (*SCRIPTS, DASHBOARD / "style.css", DASHBOARD / "index.html"):
+    for path in (*SCRIPTS, DASHBOARD / "style.css", INDEX, ALONE):
         assert not re.search(r"(https?:)?//[a-z0-9.-]+\.[a-z]{2,}/", path.read_text()), path.name
 
 

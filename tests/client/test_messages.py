@@ -26,7 +26,7 @@ API_WORDS = re.compile(
 )
 """What programs and those who run a service read: routes, queries, headers, names of fields and settings, ids."""
 
-SCRIPTS = [script for script in sorted(DASHBOARD.glob("*.js")) if not re.match(r"messages\.\w\w\.js", script.name)]
+SCRIPTS = [script for script in sorted(DASHBOARD.rglob("*.js")) if not re.match(r"messages\.\w\w\.js", script.name)]
 STATUS_WITH_CODE = {413: "limit", 422: "input", 507: "store_full"}
 """As in problem.js."""
 
@@ -74,7 +74,7 @@ def test_scripts_and_page_ask_for_words_that_are_there_and_for_all_of_them() -> 
     known = {place for _, place, _ in places()}
     sections = "|".join(table("en"))
     source = "".join(script.read_text(encoding="utf-8") for script in SCRIPTS)
-    source += (DASHBOARD / "index.html").read_text(encoding="utf-8")
+    source += "".join(page.read_text(encoding="utf-8") for page in DASHBOARD.rglob("*.html"))
     asked = set(re.findall(rf'"((?:{sections})\.[a-z_0-9:]+)"', source))
     beginnings = tuple(set(re.findall(rf"`((?:{sections})\.[a-z_]*)\$\{{", source)))
     endings = re.findall(r'\["(\w+)", ', (DASHBOARD / "figures.js").read_text(encoding="utf-8"))

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from contract.runtime.arguments import add_options
 from contract.runtime.exits import ExitCode, flag_of
-from contract.store.archive import archive_parts
+from contract.runtime.settings import Settings
+from contract.store.stored_exports import stored_parts
 from contract.wire.errors import InputError
 from contract.wire.exports import EXPORT_FORMATS, ExportOptions, check_export
 from contract.wire.names import MANIFEST
@@ -58,7 +59,7 @@ def run_cli(options: argparse.Namespace) -> int:
 def _parts(options: argparse.Namespace, chosen: ExportOptions) -> Iterator[bytes]:
     """The file in parts. A format of the stored files needs no torch."""
     if EXPORT_FORMATS[options.format].is_stored:
-        return archive_parts(options.scene)
+        return stored_parts(options.format, options.scene, None, Settings.from_environment().dashboard_dir)
     from worker.export import export_parts
     from worker.raster.backend import choose_device
     from worker.scene.checkpoint import load_scene

@@ -1,0 +1,212 @@
+// A file that shows one scene without a service: the player of the page, with a few controls. The scene lies in the file.
+
+import { dateTime, element } from "../element.js";
+import { listenToGestures } from "../gestures.js";
+import { figure, noticeWords, showWords, words } from "../messages.js";
+import { Player } from "../player/player.js";
+import { graphics } from "../player/support.js";
+
+const DEGREES_A_PIXEL = 0.15;
+const KEY_PIXELS = 20;
+const MAX_DEGREES = 60;
+const [MIN_ZOOM, MAX_ZOOM] = [0.3, 4];
+const KEY_ZOOM = 1.1;
+/** A picture is drawn at most so much larger than the clip's. */
+const MAX_ENLARGED = 2;
+/** So long after the last movement the picture is drawn with exactly its own order. */
+const REST_MS = 200;
+const TURNS = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+const ZOOMS = { "+": KEY_ZOOM, "=": KEY_ZOOM, "-": 1 / KEY_ZOOM };
+
+const get = (id) => document.getElementById(id);
+const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
+
+/** What an element of the file holds; the element goes, with its memory. */
+function taken(id) {
+  const text = get(id).textContent;
+  get(id).remove();
+  return text;
+}
+
+/** @param {string} text in base64 @returns {ArrayBuffer} */
+function decoded(text) {
+  if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text).buffer;
+  return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer;
+}
+
+class View {
+  /** @param {Player} player */
+  constructor(player) {
+    this.player = player;
+    this.cameras = player.cameras;
+    this.last = (this.cameras.frameCount - 1) / this.cameras.frameCount;
+    this.durationS = this.cameras.seconds(this.last);
+    Object.assign(this, { t: 0, isPlaying: false, isWanted: false, isDrawing: false, rest: 0 });
+    this.goHome();
+  }
+
+  goHome() {
+    Object.assign(this, { isHome: true, yaw: 0, pitch: 0, zoom: 1 });
+  }
+
+  turn(dx, dy) {
+    this.isHome = false;
+    this.yaw = clamp(this.yaw - dx * DEGREES_A_PIXEL, -MAX_DEGREES, MAX_DEGREES);
+    this.pitch = clamp(this.pitch + dy * DEGREES_A_PIXEL, -MAX_DEGREES, MAX_DEGREES);
+  }
+
+  approach(factor) {
+    this.isHome = false;
+    this.zoom = clamp(this.zoom * factor, MIN_ZOOM, MAX_ZOOM);
+  }
+
+  /** Ask for a picture of what is wanted now; isMoving: another will follow. */
+  show(isMoving = false) {
+    clearTimeout(this.rest);
+    if (isMoving) this.rest = setTimeout(() => this.show(), REST_MS);
+    this.isMoving = isMoving;
+    this.isWanted = true;
+    get("time").value = String(this.t);
+    const shown = [this.cameras.seconds(this.t), this.durationS].map((seconds) => figure(seconds, 2));
+    get("seconds").textContent = words("file.seconds", { now: shown[0], all: shown[1] });
+    get("time").setAttribute("aria-valuetext", get("seconds").textContent);
+    if (!this.isDrawing) this.#draw();
+  }
+
+  async #draw() {
+    this.isDrawing = true;
+    try {
+      while (this.isWanted) {
+        this.isWanted = false;
+        const { yaw, pitch, zoom } = this;
+        const pose = this.isHome ? this.cameras.endoscope(this.t) : this.cameras.orbit(yaw, pitch, zoom);
+        const { warnings } = await this.player.draw({ t: this.t, pose, ...this.#size(), isMarked: get("marked").checked, isMoving: this.isMoving });
+        const told = [...new Set(warnings.map(noticeWords))].join(" ");
+        if (get("notices").textContent !== told) get("notices").textContent = told;
+      }
+    } catch (error) {
+      refuse(error);
+    } finally {
+      this.isDrawing = false;
+    }
+  }
+
+  /** The picture's size in pixels: what fits into the stage, in the clip's shape. */
+  #size() {
+    const { width, height } = this.cameras.intrinsics;
+    const { clientWidth, clientHeight } = get("stage");
+    const fitting = Math.min(clientWidth / width, clientHeight / height);
+    const canvas = this.player.canvas;
+    canvas.style.width = `${Math.max(1, Math.floor(width * fitting))}px`;
+    canvas.style.height = `${Math.max(1, Math.floor(height * fitting))}px`;
+    const scale = Math.min(fitting * devicePixelRatio, MAX_ENLARGED);
+    return { width: Math.max(1, Math.round(width * scale)), height: Math.max(1, Math.round(height * scale)) };
+  }
+
+  play(isPlaying) {
+    this.isPlaying = isPlaying;
+    get("play").textContent = words(isPlaying ? "file.pause" : "file.play");
+    get("play").setAttribute("aria-pressed", String(isPlaying));
+    let before = performance.now();
+    const step = (now) => {
+      if (!this.isPlaying) return;
+      if (!this.isDrawing) {
+        this.t = (this.t + (Math.max(0, now - before) / 1000 / Math.max(this.durationS, 0.1)) * this.last) % (this.last || 1);
+        before = now;
+        this.show(true);
+      }
+      requestAnimationFrame(step);
+    };
+    if (isPlaying) requestAnimationFrame(step);
+  }
+
+  /** The view that the address asks for, after #: t=0.5&orbit=10,0,1. Returns whether it asks for any. */
+  read(text) {
+    const asked = new URLSearchParams(text.slice(1));
+    const t = Number(asked.get("t") ?? NaN);
+    if (Number.isFinite(t)) this.t = clamp(t, 0, this.last);
+    const [yaw, pitch, zoom] = (asked.get("orbit") ?? "").split(",").map(Number);
+    if (![yaw, pitch, zoom].every(Number.isFinite)) return;
+    this.isHome = false;
+    [this.yaw, this.pitch] = [yaw, pitch].map((each) => clamp(each, -MAX_DEGREES, MAX_DEGREES));
+    this.zoom = clamp(zoom, MIN_ZOOM, MAX_ZOOM);
+  }
+}
+
+/** Say that the scene cannot be shown. */
+function refuse(error) {
+  document.body.dataset.state = "refused";
+  get("message").textContent = words("file.refused", { why: error.message });
+}
+
+function tell({ sceneId, version, exportedAtMs, sceneBytes, psnrDb, warnings }, manifest) {
+  const { width, height } = manifest.intrinsics;
+  const facts = {
+    scene: sceneId ?? "–",
+    exported: `${dateTime(exportedAtMs)} · intrasplat ${version}`,
+    preset: manifest.preset,
+    frames: words("file.frames", { frames: manifest.frame_times_s.length, seconds: figure(manifest.frame_times_s.at(-1), 2), width, height }),
+    gaussians: figure(manifest.gaussians),
+    size: words("file.megabytes", { size: figure(sceneBytes / 1e6, 2) }),
+    quality: psnrDb === null ? "–" : `${figure(psnrDb, 1)} dB`,
+  };
+  for (const [name, text] of Object.entries(facts)) {
+    get("facts").append(element("dt", { text: words(`file.fact_${name}`) }), element("dd", { text }));
+  }
+  const items = warnings.map((each) => element("li", { text: `${noticeWords(each)} ` }, element("small", { text: each.text })));
+  get("warnings").append(...items);
+}
+
+/** @param {View} view */
+function listen(view) {
+  const moved = (act) => (...given) => {
+    act(...given);
+    view.show(true);
+  };
+  const [turn, approach, home] = [(dx, dy) => view.turn(dx, dy), (by) => view.approach(by), () => view.goHome()].map(moved);
+  const play = () => view.play(!view.isPlaying);
+  const nothing = () => {};
+  listenToGestures(get("stage"), { turn, approach, home, play, pan: nothing, focus: nothing });
+  addEventListener("keydown", (event) => {
+    const isElsewhere = ["INPUT", "BUTTON", "SUMMARY"].includes(event.target.tagName);
+    if (event.defaultPrevented || isElsewhere || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (TURNS[event.key]) turn(...TURNS[event.key].map((each) => each * KEY_PIXELS));
+    else if (ZOOMS[event.key]) approach(ZOOMS[event.key]);
+    else if (event.key === "Home") home();
+    else if (event.key === " ") play();
+    else return;
+    event.preventDefault();
+  });
+  get("time").max = String(view.last);
+  get("time").addEventListener("input", () => {
+    view.play(false);
+    view.t = Number(get("time").value);
+    view.show(true);
+  });
+  get("play").addEventListener("click", play);
+  get("home").addEventListener("click", home);
+  get("marked").addEventListener("change", () => view.show());
+  addEventListener("hashchange", () => {
+    view.read(location.hash);
+    view.show();
+  });
+  new ResizeObserver(() => view.show()).observe(get("stage"));
+}
+
+async function start() {
+  showWords(document);
+  const manifest = JSON.parse(taken("manifest"));
+  tell(JSON.parse(taken("about")), manifest);
+  const support = graphics();
+  if (!support.isFast && support.name === "") throw new Error(words("file.no_webgl2"));
+  get("message").textContent = words(support.isFast ? "file.opening" : "file.slow");
+  const player = await Player.of({ manifest, scene: decoded(taken("scene")) }, get("picture"));
+  const view = new View(player);
+  view.read(location.hash);
+  listen(view);
+  view.show();
+  get("message").textContent = "";
+  document.body.dataset.state = "shown";
+}
+
+start().catch(refuse);
