@@ -69,8 +69,9 @@ export class Compare {
     this.parts.tools.closest("label").hidden = !this.report.recorded.masks;
     this.#moveSeam(MIDDLE);
     this.#draw();
-    const isRecorded = this.viewer.parts.layer.value === "recorded";
-    this.viewer.look({ pose: null, ...(isRecorded ? { layer: "rgb" } : {}) });
+    const { orbit, parts } = this.viewer;
+    const wish = parts.layer.value === "recorded" ? { layer: "rgb" } : {};
+    this.viewer.look(orbit.isHome ? wish : { ...wish, pose: null }); // at home either eye may stay
   }
 
   /** @param {string} why empty where the user knows */
@@ -86,7 +87,7 @@ export class Compare {
   }
 
   /** @param {import("./viewer.js").Shown} shown */
-  #follow({ scene, t, pose, layer, eye = "left" }) {
+  #follow({ scene, t, pose, layer, eye }) {
     if (this.mode === "off" || scene !== this.scene) return;
     const isHome = pose === null && layer !== "recorded";
     if (!isHome && this.isComing) return;

@@ -231,6 +231,38 @@ def test_side_by_side_each_has_half_of_the_stage(site: Site, page: Page, width: 
         assert not page.find("#seam").is_displayed()
 
 
+def test_the_right_eyes_frames_are_compared_with_what_the_right_eye_sees(site: Site, page: Page) -> None:
+    view(page, recorded_scene(site, ("left", "right")))
+    choose(page, "wipe")
+    until_frame(page, 0)
+    page.until(lambda: page.find("#eye").is_displayed())
+    for eye in ("right", "left"):
+        Select(page.find("#eye")).select_by_value(eye)
+        until_frame(page, 0, "right" if eye == "right" else "left")
+        assert site.painter.eye == eye
+    Select(page.find("#eye")).select_by_value("right")
+    until_frame(page, 0, "right")
+    choose(page, "side")  # stays with the eye
+    page.until(lambda: page.script("return document.querySelector('#stage').dataset.compare") == "side")
+    until_frame(page, 0, "right")
+    assert page.find("#eye").get_attribute("value") == "right"
+
+
+def test_an_eye_whose_frames_are_not_kept_is_told(site: Site, page: Page) -> None:
+    view(page, recorded_scene(site))
+    choose(page, "wipe")
+    until_frame(page, 0)
+    Select(page.find("#eye")).select_by_value("right")
+    page.until_text("#compare-message", say("compare.no_eye"))
+
+
+def test_a_key_goes_from_mode_to_mode(site: Site, page: Page) -> None:
+    view(page, recorded_scene(site))
+    for mode in ("wipe", "side", "off"):
+        page.find("#stage").send_keys("c")
+        assert page.find("#compare").get_attribute("value") == mode
+
+
 def test_scenes_without_recorded_frames_and_jobs_that_train_say_so(site: Site, page: Page) -> None:
     view(page, site.scene())
     choose(page, "wipe")
