@@ -1,4 +1,4 @@
-// What stands in front of the picture steps back while nobody uses it, and the screen does not go dark.
+// What stands in front of the picture steps back while nobody uses it.
 
 const IDLE_AFTER_MS = 5000;
 const SIGNS_OF_LIFE = ["pointermove", "pointerdown", "wheel", "keydown", "focusin"];
