@@ -19,6 +19,7 @@ from service import (
     exports,
     imports,
     jobs,
+    measure,
     reconstruct,
     recorded,
     renders,
@@ -80,7 +81,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     app.add_middleware(Measure, metrics=deps.metrics)
     install_handlers(app)
     install_refusal_handler(app, deps.audit)
-    scene_parts = (scenes, scene_files, recorded, thumbnails, exports, imports)
+    scene_parts = (scenes, scene_files, recorded, thumbnails, measure, exports, imports)
     for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, system):
         app.include_router(part.router)
     if settings.dashboard_dir is not None:

@@ -38,7 +38,7 @@ EXPOSED_HEADERS = (
         f"X-Intrasplat-{name}"
         for name in (
             *("Scene", "State", "Next", "T", "Iteration", "Unseen", "Camera"),
-            *("Depth-Unit", "Warning", "Warning-Codes"),
+            *("Depth-Unit", "Depth-Range-Mm", "Warning", "Warning-Codes"),
         )
     ),
 )

@@ -92,6 +92,15 @@ Centre = Annotated[
         description="where the optical axis is, in pixels from the left (cx) or upper (cy) edge; default: the clip's",
     ),
 ]
+PoseText = Annotated[
+    str | None,
+    Field(
+        max_length=1000,
+        description="12 or 16 numbers, row-major world_from_camera in mm, or orbit:yaw,pitch,zoom in degrees, or "
+        "orbit:yaw,pitch,zoom,x,y,z with the point looked at in mm; default: the endoscope's own pose at t",
+        examples=["orbit:10,0,1", "orbit:10,0,1.5,-4,2,60"],
+    ),
+]
 
 
 class RenderQuery(BaseModel):
@@ -101,13 +110,7 @@ class RenderQuery(BaseModel):
 
     scene: str | None = Field(default=None, description="may be left out only while there is exactly one scene")
     t: ModelTime = 0.0
-    pose: str | None = Field(
-        default=None,
-        max_length=1000,
-        description="12 or 16 numbers, row-major world_from_camera in mm, or orbit:yaw,pitch,zoom in degrees, or "
-        "orbit:yaw,pitch,zoom,x,y,z with the point looked at in mm; default: the endoscope's own pose at t",
-        examples=["orbit:10,0,1", "orbit:10,0,1.5,-4,2,60"],
-    )
+    pose: PoseText = None
     eye: Eye = Field(
         default="left",
         description="right: seen from the right eye of a stereo clip and through its lens, as recorded?eye=right is; "

@@ -1,4 +1,4 @@
-"""docs/codes.md lists every code of a notice and of an error, and no other; each class of error has a code."""
+"""docs/codes.md lists every code of a notice, an error and a refusal, and no other; each class of error has a code."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import contract.store.disk_errors  # noqa: F401
 import worker.daemon.serve  # noqa: F401
 from contract.wire.checks import FindingCode
 from contract.wire.errors import ErrorCode, IntrasplatError
+from contract.wire.measuring import RefusalCode
 from contract.wire.notices import NoticeCode
 from tests.test_repository import REPOSITORY
 
-PAGE, ERRORS = (REPOSITORY / "docs" / "codes.md").read_text(encoding="utf-8").split("## Errors")
+PAGE, ERRORS, REFUSALS = re.split(
+    "## (?:Errors|Refusals)", (REPOSITORY / "docs" / "codes.md").read_text(encoding="utf-8")
+)
 NOTICES, FINDINGS = PAGE.split("## Findings")
 SOURCES = [path for room in ("contract", "worker", "service") for path in (REPOSITORY / room).rglob("*.py")]
 
@@ -38,6 +41,10 @@ def test_every_code_of_an_error_is_explained_once_and_no_other() -> None:
 
 def test_every_code_of_a_finding_is_explained_once_and_no_other() -> None:
     assert sorted(listed(FINDINGS)) == sorted(FindingCode)
+
+
+def test_every_code_of_a_refusal_is_explained_once_and_no_other() -> None:
+    assert sorted(listed(REFUSALS)) == sorted(RefusalCode)
 
 
 def test_every_class_of_error_has_a_code_of_its_own() -> None:

@@ -20,7 +20,7 @@ from benchmarks.pages.moving import moving_sections
 from benchmarks.pages.post import post_sections
 from benchmarks.pages.right_eye import two_eyes_sections
 from benchmarks.pages.stability import stability_sections
-from benchmarks.pages.truth import confidence_sections, off_axis_sections, stereo_truth_sections
+from benchmarks.pages.truth import confidence_sections, measure_sections, off_axis_sections, stereo_truth_sections
 from worker.evaluate.stability import STABILITY
 
 RESULTS = Path(__file__).resolve().parent.parent.parent / "docs" / "results"
@@ -109,7 +109,7 @@ def main() -> None:
         *two_eyes_sections(RESULTS),
         *off_axis_sections(RESULTS),
     ]
-    parts += [*confidence_sections(RESULTS), *stability_sections(RESULTS)]
+    parts += [*confidence_sections(RESULTS), *measure_sections(RESULTS), *stability_sections(RESULTS)]
     if rows := _read(STABILITY):
         parts.append(origin(rows))
     if rows := _latest(_read("ablation.csv"), "change", "clip", "holdout", "seed"):

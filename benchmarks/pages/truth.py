@@ -11,6 +11,7 @@ from benchmarks.pages.markdown import number, origin, table
 from worker.evaluate.rows import Row, read_rows
 
 STEREO_TRUTH, CONFIDENCE, OFF_AXIS = "stereo_truth.csv", "confidence.csv", "off-axis.jpg"
+MEASURE = "measure.csv"
 _STEREO = """
 ### Against truth
 
@@ -28,6 +29,20 @@ confidence is a probability. [Decision 031](../decisions/031-confidence-is-a-pro
 
 ![Share of right pixels against confidence](confidence.png)
 """
+_MEASURE = """
+## Are measured distances true
+
+`python -m benchmarks.bm_measure --csv docs/results/measure.csv` ([measure.csv](measure.csv)): points of views of three
+times and three poses, and distances between them followed over all frames, against the truth of synthetic clips. Errors
+and standard uncertainties are medians in mm; 1 u and 2 u are the shares that lie within one and two uncertainties.
+Still and cut had a part in the calibration, the others had none ([what it means](../conventions.md#measuring)).
+"""
+_MEASURED = {
+    "clip": "clip", "points": "points", "refused": "refused", "depth_error_mm": "depth: error",
+    "depth_within_1": "1 u", "depth_within_2": "2 u", "distances": "distances", "distance_error_mm": "error",
+    "uncertainty_mm": "uncertainty", "within_1": "1 u", "within_2": "2 u",
+    "within_half_mm_or_1": "0.5 mm or 1 u", "within_half_mm_or_2": "0.5 mm or 2 u",
+}  # fmt: skip
 _OFF_AXIS = """
 ## Beside the endoscope
 
@@ -57,6 +72,13 @@ def confidence_sections(folder: Path) -> list[str]:
     """The reliability diagram of bm_confidence.py; nothing without it."""
     rows = read_rows(folder / CONFIDENCE)
     return [_CONFIDENCE, origin(rows)] if rows else []
+
+
+def measure_sections(folder: Path) -> list[str]:
+    """The table of bm_measure.py; nothing without rows."""
+    rows = read_rows(folder / MEASURE)
+    cells = [[row[name] for name in _MEASURED] for row in rows]
+    return [_MEASURE, table([*_MEASURED.values()], cells), origin(rows)] if rows else []
 
 
 def off_axis_sections(folder: Path) -> list[str]:

@@ -114,6 +114,40 @@
  */
 /**
  * @typedef {{
+ *   distance_mm: number,
+ *   uncertainty_mm: number,
+ *   t: number[],
+ *   time_s: number[],
+ *   distances_mm: number | null[],
+ *   uncertainties_mm: number | null[],
+ *   first_mm: number[][],
+ *   second_mm: number[][],
+ * }} MeasuredDistance
+ */
+/**
+ * @typedef {{
+ *   x: number,
+ *   y: number,
+ *   confidence: number,
+ *   depth_mm?: number | null,
+ *   uncertainty_mm?: number | null,
+ *   point_mm?: number[] | null,
+ *   mm_per_px?: number | null,
+ *   refusal?: Refusal | null,
+ * }} MeasuredPoint
+ */
+/**
+ * @typedef {{
+ *   t: number,
+ *   points: MeasuredPoint[],
+ *   distance?: MeasuredDistance | null,
+ *   depth_range_mm: number[],
+ *   warnings: Notice[],
+ *   notice?: string,
+ * }} Measurement
+ */
+/**
+ * @typedef {{
  *   code: NoticeCode,
  *   severity: Severity,
  *   text: string,
@@ -130,6 +164,15 @@
  *   size_bytes: number,
  * }} Recorded
  */
+/**
+ * @typedef {{
+ *   code: RefusalCode,
+ *   field: string,
+ *   problem: string,
+ *   remedy: string,
+ * }} Refusal
+ */
+/** @typedef {"low_confidence"|"unseen"} RefusalCode */
 /**
  * @typedef {{
  *   report_version?: number,

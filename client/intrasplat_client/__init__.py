@@ -29,7 +29,17 @@ from intrasplat_client.errors import (
     Unauthorized,
     Unreachable,
 )
-from intrasplat_client.models import ErrorCode, JobOptions, JobState, JobView, Notice, NoticeCode, Report, SceneCameras
+from intrasplat_client.models import (
+    ErrorCode,
+    JobOptions,
+    JobState,
+    JobView,
+    Measurement,
+    Notice,
+    NoticeCode,
+    Report,
+    SceneCameras,
+)
 from intrasplat_client.views import Image
 
 __all__ = [
@@ -47,6 +57,7 @@ __all__ = [
     "JobRejected",
     "JobState",
     "JobView",
+    "Measurement",
     "NotFound",
     "Notice",
     "NoticeCode",

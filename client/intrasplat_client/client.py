@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ from typing_extensions import Unpack
 
 from intrasplat_client.connection import DEFAULT_URL, BlockingConnection, http_settings, iterate, run
 from intrasplat_client.core import SCORES_WITHIN_S, Core
-from intrasplat_client.models import GivenOptions, JobState, JobView, Report, SceneCameras
+from intrasplat_client.models import GivenOptions, JobState, JobView, Measurement, Report, SceneCameras
 from intrasplat_client.session import DEFAULT_PATIENCE_S, OnWait
 from intrasplat_client.submission import OnUpload
 from intrasplat_client.viewer import StreamMessages, Viewer
@@ -282,6 +282,20 @@ class Client:
     def cameras(self, scene: str) -> SceneCameras:
         """Where the endoscope was, frame by frame, and its lens; also while the job trains."""
         return run(self._core.cameras(scene))
+
+    def measure(
+        self,
+        scene: str,
+        points: Sequence[tuple[float, float]],
+        t: float = 0.0,
+        pose: str | None = None,
+        **camera: float,
+    ) -> Measurement:
+        """Depth, place and uncertainty in mm under points (x, y) of a view; of two points their distance over time.
+
+        A point with a `refusal` was not measured. Arguments as Core.measure has them.
+        """
+        return run(self._core.measure(scene, points, t, pose, **camera))
 
     def export(self, scene: str, t: float | None = None, format: str = "ply", **options: float | str) -> bytes:
         """The scene as a file of a format; docs/export.md lists the formats and their options."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -15,7 +15,7 @@ from typing_extensions import Unpack
 from intrasplat_client import events, submission, views
 from intrasplat_client.connection import Call, Connection
 from intrasplat_client.errors import Unreachable
-from intrasplat_client.models import GivenOptions, JobState, JobView, Report, SceneCameras
+from intrasplat_client.models import GivenOptions, JobState, JobView, Measurement, Report, SceneCameras
 from intrasplat_client.session import OnWait, Session, parsed
 from intrasplat_client.submission import OnUpload
 from intrasplat_client.views import Image, view_query
@@ -262,6 +262,23 @@ class Core:
         """Where the endoscope was, frame by frame, and its lens; also while the job trains."""
         response = await self._get("scenes", scene, "cameras")
         return parsed(response, SceneCameras.model_validate_json, response.content)
+
+    async def measure(
+        self,
+        scene: str,
+        points: Sequence[tuple[float, float]],
+        t: float = 0.0,
+        pose: str | None = None,
+        **camera: float,
+    ) -> Measurement:
+        """Depth, place and uncertainty in mm under points (x, y) of a view; of two points their distance over time.
+
+        pose and camera (width, height, fx, fy, cx, cy) as render has them: the points are pixels of that picture. A
+        point with a `refusal` was not measured.
+        """
+        asked = ";".join(f"{float(x)!r},{float(y)!r}" for x, y in points)
+        response = await self._get("scenes", scene, "measure", points=asked, t=t, pose=pose, **camera)
+        return parsed(response, Measurement.model_validate_json, response.content)
 
     async def export(self, scene: str, t: float | None = None, format: str = "ply", **options: float | str) -> bytes:
         """The scene as a file of a format; docs/export.md lists the formats and their options."""

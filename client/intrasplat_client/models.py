@@ -130,6 +130,13 @@ class NoticeCode(StrEnum):
     UNCLASSIFIED = "unclassified"
 
 
+class RefusalCode(StrEnum):
+    """Why nothing is measured at a point; docs/codes.md explains each."""
+
+    LOW_CONFIDENCE = "low_confidence"
+    UNSEEN = "unseen"
+
+
 class Severity(StrEnum):
     """info: good to know; warning: a reason to distrust the result."""
 
@@ -306,6 +313,65 @@ class Masks(Model):
     """how clearly instruments were told from tissue, where masks were found; None: they were not"""
 
 
+class MeasuredDistance(Model):
+    """How far the two points are apart in space, at every frame; the tissue carries them along.
+
+    Null where a place is out of the endoscope's view for too long to be trusted. Lists have T entries.
+    """
+
+    distance_mm: float
+    """at the time asked for"""
+    uncertainty_mm: float
+    """standard uncertainty of distance_mm"""
+    t: tuple[float, ...]
+    """times of the frames"""
+    time_s: tuple[float, ...]
+    """seconds of the frames, from the first one"""
+    distances_mm: tuple[float | None, ...]
+    """at every frame"""
+    uncertainties_mm: tuple[float | None, ...]
+    """standard uncertainties of distances_mm"""
+    first_mm: tuple[tuple[float, ...], ...]
+    """where the first point is in the world at every frame"""
+    second_mm: tuple[tuple[float, ...], ...]
+    """where the second point is in the world at every frame"""
+
+
+class MeasuredPoint(Model):
+    """What is seen at a point of the picture. A point that is refused has no numbers but its confidence."""
+
+    x: float
+    """as asked for, in pixels of the picture"""
+    y: float
+    """as asked for, in pixels of the picture"""
+    confidence: float
+    """in [0, 1], as the layer confidence has it"""
+    depth_mm: float | None = None
+    """along the camera's z, as the layer depth has it"""
+    uncertainty_mm: float | None = None
+    """standard uncertainty of depth_mm"""
+    point_mm: tuple[float, ...] | None = None
+    """the place in the world"""
+    mm_per_px: float | None = None
+    """width of a pixel at this depth, across the view"""
+    refusal: Refusal | None = None
+
+
+class Measurement(Model):
+    """What was measured in one view of a finished scene."""
+
+    t: float
+    """the time that is shown"""
+    points: tuple[MeasuredPoint, ...]
+    distance: MeasuredDistance | None = None
+    """of two points; null of other numbers of points, and where one is refused"""
+    depth_range_mm: tuple[float, ...]
+    """depths of the brightest and the darkest false colour of layer=depth from this pose"""
+    warnings: tuple[Notice, ...]
+    """why the scene is in doubt; every view repeats them"""
+    notice: str = "Research use only. Not a medical device; it must not guide treatment."
+
+
 class Notice(Model):
     """One thing to know about a scene or a picture."""
 
@@ -329,6 +395,16 @@ class Recorded(Model):
     """whether masks are kept with them; False: every pixel counts as tissue"""
     size_bytes: int
     """what they take on the disk"""
+
+
+class Refusal(Model):
+    """Why nothing is measured at a point, and what to do."""
+
+    code: Annotated[RefusalCode | str, Field(union_mode="left_to_right")]
+    field: str
+    """the point, such as points[0]"""
+    problem: str
+    remedy: str
 
 
 class Report(Model):

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.cameras import CamerasRequest
 from contract.wire.exports import ExportOptions
+from contract.wire.measuring import MAX_POINTS, Point
 from contract.wire.names import JOB_ID_PATTERN, Eye
 from contract.wire.notices import Notice
 from contract.wire.pose import MatrixPose, OrbitPose
@@ -172,6 +173,21 @@ class RecordedRequest(BaseModel):
     masks: RecordedMasks = RecordedMasks.MARKED
 
 
+class MeasureRequest(BaseModel):
+    """The Measurement of some points of a view of a finished scene, as JSON. t, pose and camera as in RenderRequest."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["measure"] = "measure"
+    scene_id: str = Field(pattern=JOB_ID_PATTERN)
+    attempt: int
+    t: float = Field(ge=0, le=1e6)
+    pose: MatrixPose | OrbitPose | None = Field(default=None, discriminator="kind")
+    camera: IntrinsicsOverride = IntrinsicsOverride()
+    points: tuple[Point, ...] = Field(min_length=1, max_length=MAX_POINTS)
+    max_pixels: int = Field(default=4096 * 2160, gt=0)
+
+
 class CancelRequest(BaseModel):
     """Nobody waits any more for the answer to the request of the same id."""
 
@@ -180,7 +196,7 @@ class CancelRequest(BaseModel):
     kind: Literal["cancel"] = "cancel"
 
 
-SceneRequest: TypeAlias = RenderRequest | ExportRequest | RecordedRequest | CamerasRequest
+SceneRequest: TypeAlias = RenderRequest | ExportRequest | RecordedRequest | CamerasRequest | MeasureRequest
 """What is asked of a scene."""
 
 

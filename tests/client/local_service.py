@@ -27,6 +27,7 @@ from contract.wire.rendering import (
     MEDIA_TYPES,
     ExportRequest,
     Highlights,
+    MeasureRequest,
     RecordedRequest,
     SceneRequest,
     Unseen,
@@ -36,6 +37,7 @@ from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
 from tests.cameras import cameras_reply
+from tests.measurements import measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.serve import Reply, RequestServer
 
@@ -50,6 +52,8 @@ def paint(request: SceneRequest) -> Reply:
     """
     if isinstance(request, CamerasRequest):
         return cameras_reply(request)
+    if isinstance(request, MeasureRequest):
+        return measurement_reply(request)
     if isinstance(request, ExportRequest):
         return Reply(b"ply\n", "application/octet-stream", request.options.t or 0.0)
     if isinstance(request, RecordedRequest):

@@ -46,6 +46,7 @@ OPERATIONS = {
         "get_recorded",
         "get_cameras",
         "export_scene",
+        "measure",
         "purge_scene",
     ),
     *("get_file", "get_thumbnail", "import_scene", "get_key"),

@@ -24,6 +24,7 @@ from contract.wire.rendering import (
     ExportRequest,
     ImageFormat,
     Layer,
+    MeasureRequest,
     PictureCamera,
     RecordedRequest,
     SceneRequest,
@@ -33,6 +34,7 @@ from service.__main__ import KNOWN_WORKERS
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from tests.cameras import cameras_reply
+from tests.measurements import measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from tests.service.asgi import AsgiClient, serving
 from worker.daemon.serve import Reply, RequestServer
@@ -64,6 +66,8 @@ class Painter:
         self.requests.append(request)
         if isinstance(request, CamerasRequest):
             return cameras_reply(request)
+        if isinstance(request, MeasureRequest):
+            return measurement_reply(request)
         if isinstance(request, ExportRequest):
             return Reply(b"ply\n", "application/octet-stream", request.options.t or 0.0)
         if isinstance(request, RecordedRequest):

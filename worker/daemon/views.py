@@ -28,6 +28,7 @@ from contract.wire.rendering import (
     ImageFormat,
     IntrinsicsOverride,
     Layer,
+    MeasureRequest,
     PictureCamera,
     RecordedMasks,
     RecordedRequest,
@@ -45,6 +46,8 @@ from worker.raster.backend import CPU, Device
 from worker.render.camera import endoscope_pose, right_eye
 from worker.render.detail import LEVELS, thinned
 from worker.render.encode import FOR_EYES, encode_layer
+from worker.render.measure import WINDOW_PX
+from worker.render.measured import measured
 from worker.render.recorded import live_frame, stored_frame
 from worker.render.view import ROUNDING, Frame, no_pause, render_frame, renderer_of
 from worker.scene.checkpoint import load_scene
@@ -96,13 +99,15 @@ class Views:
             SceneError: the scene is missing or damaged.
             NotYetError: the running job has no snapshot here yet.
             LimitError: the image would exceed request.max_pixels.
-            InputError: the scene cannot be exported so, or has no such eye.
+            InputError: the scene cannot be exported so, has no such eye, or nothing can be measured there.
             UnavailableError: too many exports are under way.
         """
         if isinstance(request, RecordedRequest):
             return self._recorded(request)
         if isinstance(request, ExportRequest):
             return self._export(self._stored(request.scene_id, request.attempt), request)
+        if isinstance(request, MeasureRequest):
+            return self._measured(self._stored(request.scene_id, request.attempt), request)
         if request.attempt is not None:
             scene, snapshot = self._stored(request.scene_id, request.attempt), None
         else:
@@ -137,6 +142,8 @@ class Views:
             scene = snapshot.scene if snapshot is not None else None
         gaussians = len(scene.gaussians) if scene is not None else TYPICAL_GAUSSIANS
         size = (scene.intrinsics.width, scene.intrinsics.height) if scene is not None else TYPICAL_SIZE
+        if isinstance(request, MeasureRequest):
+            return len(request.points) * render_cost(WINDOW_PX**2, gaussians)
         if isinstance(request, ExportRequest):
             return render_cost(size[0] * size[1] if request.format in DRAWN else 0, gaussians)
         width, height = request.camera.size(*size)
@@ -234,6 +241,12 @@ class Views:
             problem = "the right eye's camera is not known: the clip has one eye, or came with its depth."
             raise InputError("eye", problem, "Ask for eye=left.")
         return right_eye(scene, shown_time(scene, request.t), told)
+
+    def _measured(self, scene: Scene, request: MeasureRequest) -> Reply:
+        """A Measurement as JSON. It tells nothing of the time of renders."""
+        camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
+        found = measured(scene, request.t, pose_of(scene, request.pose), camera, request.points, self._device)
+        return Reply(found.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, found.t, found.warnings, is_kept=True)
 
     def _export(self, scene: Scene, request: ExportRequest) -> Reply:
         """One part of an export. It tells nothing of the time of renders."""

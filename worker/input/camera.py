@@ -6,7 +6,7 @@ Symbols: M points.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -65,6 +65,10 @@ class Intrinsics:
         return Intrinsics(
             width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
+
+    def cut(self, left: int, top: int, width: int, height: int) -> Intrinsics:
+        """The camera of a part of the picture, whose first pixel is (top, left)."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
 
 def unproject(

@@ -172,14 +172,15 @@ class Phantom:
         """Pose [4, 4] of the endoscope's right eye, mm."""
         return right_eye(self.world_from_camera(frame), self.settings.baseline_mm)
 
-    def trajectories(self, stride_px: int = 8, shown_in: int = 0) -> Trajectories:
-        """Positions, in all frames, of the material points that every stride_px-th pixel of a frame shows."""
-        seen = rasterize_mesh(
-            self.surface.vertices_mm(shown_in),
-            self.surface.triangles,
-            self.world_from_camera(shown_in),
-            self.settings.intrinsics,
-        )
+    def trajectories(
+        self, stride_px: int = 8, shown_in: int = 0, world_from_camera: NDArray[np.float64] | None = None
+    ) -> Trajectories:
+        """Positions, in all frames, of the material points that every stride_px-th pixel of a frame shows, from a pose
+        [4, 4] mm (default: the left eye's).
+        """
+        pose = self.world_from_camera(shown_in) if world_from_camera is None else world_from_camera
+        vertices_mm = self.surface.vertices_mm(shown_in)
+        seen = rasterize_mesh(vertices_mm, self.surface.triangles, pose, self.settings.intrinsics)
         rows, columns = np.nonzero(seen.triangle >= 0)
         chosen = (rows % stride_px == stride_px // 2) & (columns % stride_px == stride_px // 2)
         rows, columns = rows[chosen], columns[chosen]

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from contract.wire.notices import Notice, NoticeCode
 from worker.input.camera import Intrinsics
+from worker.model.constants import SH_C0
+from worker.model.layout import COLOUR_ROW
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
 from worker.render.camera import endoscope_pose, view_camera
@@ -121,11 +123,7 @@ class SceneRenderer:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """R G B Z A [5, H, W], Z unnormalised in units, and blended_values as they are blended [H, W], as copies."""
         camera = view_camera(self.scene, t, world_from_camera, intrinsics, highlights=highlights)
-        values = self._values
-        if values is not None and self._out_of_view is not None:
-            times_s = self.scene.frame_times_s
-            time_s = float(np.interp(t * self.scene.frame_count, np.arange(len(times_s)), times_s))
-            values = self._out_of_view.faded(values, time_s)
+        values = self.values(t)
         with self._lock:
             shown = self._model.render(camera, t, values, pause)
             image = np.empty(shown.shape, np.float32)
@@ -133,6 +131,30 @@ class SceneRenderer:
                 image[:, rows] = shown[:, rows]
                 pause()
         return image[:5], None if values is None else image[5]
+
+    def values(self, t: float) -> NDArray[np.float32] | None:
+        """blended_values [N] at model time t: trust where positive. None: not known."""
+        if self._values is None or self._out_of_view is None:
+            return self._values
+        times_s = self.scene.frame_times_s
+        time_s = float(np.interp(t * self.scene.frame_count, np.arange(len(times_s)), times_s))
+        return self._out_of_view.faded(self._values, time_s)
+
+    def weights(
+        self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics, i: int, j: int
+    ) -> NDArray[np.float32]:
+        """[N] blending weights of the Gaussians at pixel (i, j)."""
+        camera = view_camera(self.scene, t, world_from_camera, intrinsics)
+        cotangents = np.zeros((5, intrinsics.height, intrinsics.width), np.float32)
+        cotangents[0, i, j] = 1  # the gradient of a pixel's red is how much red of each Gaussian it holds
+        with self._lock:
+            gradient = self._model.image_gradient(camera, t, cotangents)
+        return np.asarray(gradient[COLOUR_ROW] / np.float32(SH_C0), np.float32)
+
+    def means_mm(self, t: float) -> NDArray[np.float64]:
+        """[N, 3] centres of the Gaussians at model time t, in the world."""
+        with self._lock:
+            return self._model.deformed_mean(t).T.astype(np.float64) / self.scene.units_per_mm
 
 
 _renderers: weakref.WeakKeyDictionary[Scene, dict[Device, SceneRenderer]] = weakref.WeakKeyDictionary()
@@ -163,8 +185,7 @@ def render_frame(
     highlights: as the endoscope's eyes saw them, and away from both their mean; False: without.
     pause: called between the parts of the work (worker/raster/model.py).
     """
-    last = (scene.frame_count - 1) / scene.frame_count
-    shown = min(max(t, 0.0), last)
+    shown, outside = held_in_clip(scene, t)
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
     camera = (intrinsics or scene.intrinsics, pose)
     image, blended = renderer_of(scene, device).layers(shown, pose, camera[0], highlights=highlights, pause=pause)
@@ -182,15 +203,23 @@ def render_frame(
         pause()
     unseen = unseen_pixels(solid, blended)
     pause()
-    in_clip = 0.0 <= t <= last + ROUNDING
-    warnings = () if in_clip else (_warning_of_time(t, shown),)
-    warnings = (*warnings, *scene.pose_warnings, *_warnings_of_pose(_distance_from_trained(scene, pose), trust, unseen))
+    warnings = (*outside, *scene.pose_warnings, *_warnings_of_pose(_distance_from_trained(scene, pose), trust, unseen))
     if not highlights and scene.right_eye_mm is None:
         warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
     pause()
     own_view = partial(_endoscope_rgb, scene, shown, device, highlights)
     layer = partial(_confidence, scene, endoscope_pose(scene, shown), camera, (image[:3], depth_mm, trust), own_view)
     return Frame(rgb, depth_mm, unseen, warnings, layer)
+
+
+def held_in_clip(scene: Scene, t: float) -> tuple[float, tuple[Notice, ...]]:
+    """The model time that is shown for t, and the warning that says so if it is another."""
+    last = (scene.frame_count - 1) / scene.frame_count
+    shown = min(max(t, 0.0), last)
+    if 0.0 <= t <= last + ROUNDING:
+        return shown, ()
+    text = f"t = {t:g} lies outside the clip; t = {shown:.4g} is shown."
+    return shown, (Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, text),)
 
 
 def _parts(size: tuple[int, ...]) -> Iterator[slice]:
@@ -220,11 +249,6 @@ def _confidence(
         known_rgb = seen_from_endoscope(own_view(), depth_mm, camera, (scene.intrinsics, own_pose))
     likely = confidence(evidence(trust, rgb, known_rgb))
     return np.where(trust > 0, likely, 0).astype(np.float32)
-
-
-def _warning_of_time(t: float, shown: float) -> Notice:
-    text = f"t = {t:g} lies outside the clip; t = {shown:.4g} is shown."
-    return Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, text)
 
 
 def _warnings_of_pose(distance: float, trust: NDArray[np.float32], unseen: NDArray[np.bool_]) -> Iterator[Notice]:

@@ -1,0 +1,65 @@
+"""GET /scenes/{id}/measure: places in mm under points of a view, and the distance of two of them over time."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Response
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
+
+from contract.access.keys import KeyScope
+from contract.wire.measuring import MAX_POINTS, Measurement, parse_points
+from contract.wire.pose import parse_pose
+from contract.wire.rendering import IntrinsicsOverride, MeasureRequest
+from service.deps import AnyCaller, Services
+from service.renders import Centre, FocalLength, ModelTime, Pixels, PoseText, image_response
+from service.scenes import finished_job
+
+router = APIRouter(prefix="/scenes", tags=["scenes"])
+
+
+class MeasureQuery(BaseModel):
+    """The points that a caller asks about, and the view that shows them: as /render has it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    points: str = Field(
+        max_length=1000,
+        description=f"1 to {MAX_POINTS} points x,y;x,y in pixels from the picture's upper left; of two the distance "
+        "is told, too",
+        examples=["320,256", "300,200;360.5,240"],
+    )
+    t: ModelTime = 0.0
+    pose: PoseText = None
+    width: Pixels = None
+    height: Pixels = None
+    fx: FocalLength = None
+    fy: FocalLength = None
+    cx: Centre = None
+    cy: Centre = None
+
+
+@router.get("/{scene_id}/measure", operation_id="measure", response_model=Measurement)
+async def measure(
+    scene_id: str, services: Services, caller: AnyCaller, query: Annotated[MeasureQuery, Query()]
+) -> Response:
+    """Depth, place and uncertainty in mm of what the points of a view show; of two points the distance, which the
+    tissue carries along, at every frame. Where the confidence is low or no frame saw the tissue, nothing is measured,
+    and `refusal` says why. Research use only.
+    """
+    caller.require(KeyScope.VIEW)
+    record = await run_in_threadpool(finished_job, services, caller, scene_id)
+    await services.audit.viewed(caller, scene_id)
+    request = MeasureRequest(
+        scene_id=scene_id,
+        attempt=record.attempt,
+        t=query.t,
+        pose=None if query.pose is None else parse_pose(query.pose),
+        camera=IntrinsicsOverride(**query.model_dump(include=set(IntrinsicsOverride.model_fields))),
+        points=parse_points(query.points),
+        max_pixels=services.settings.max_render_pixels,
+    )
+    response = image_response(scene_id, await services.renderer.ask(request))
+    response.headers["Cache-Control"] = "no-store"
+    return response
