@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import sys
 import threading
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import intrasplat_client
 from client.connected import command_error
 from client.remote import add_service
+from client.slicer.say import say
 from contract.runtime.arguments import Commands, add_command, count, finite
 from contract.runtime.exits import ExitCode
 from contract.runtime.processes import heeding_signals
@@ -103,14 +103,10 @@ async def _run(options: argparse.Namespace, choice: Choice, end: threading.Event
 async def _carry(bridge: Bridge, options: argparse.Namespace) -> None:
     """Listen for peers, or reach the one that listens."""
     if options.connect:
-        _say(f"connecting to OpenIGTLink at {options.host}:{options.port}")
+        say(f"connecting to OpenIGTLink at {options.host}:{options.port}")
         await bridge.link.reach(options.host, options.port)
     if options.host not in LOOPBACK_NAMES:
-        _say("warning: OpenIGTLink has neither keys nor encryption; whoever reaches this port sees the scene")
+        say("warning: OpenIGTLink has neither keys nor encryption; whoever reaches this port sees the scene")
     await bridge.link.listen(
-        options.host, options.port, lambda port: _say(f"OpenIGTLink at {options.host}:{port}. {RESEARCH_USE}")
+        options.host, options.port, lambda port: say(f"OpenIGTLink at {options.host}:{port}. {RESEARCH_USE}")
     )
-
-
-def _say(words: str) -> None:
-    print(f"intrasplat: {words}", file=sys.stderr, flush=True)

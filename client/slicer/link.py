@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import sys
 from collections.abc import Callable
 
 from client.slicer.messages import HEADER_BYTES, HEARD, DamagedError, Heard, read, read_header
+from client.slicer.say import say
 from contract.wire.errors import UnavailableError
 
 MAX_PEERS = 8
@@ -94,22 +94,22 @@ class Link:
 
     async def _met(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve a peer until it goes."""
-        host, port = writer.get_extra_info("peername")[:2]
+        host, port = (writer.get_extra_info("peername") or ("somebody", 0))[:2]  # none if it has gone already
         name = f"{host}:{port}"
         if len(self._peers) >= MAX_PEERS:
             writer.close()
-            _say(f"{name} was turned away: {MAX_PEERS} peers are there")
+            say(f"{name} was turned away: {MAX_PEERS} peers are there")
             return
         peer = _Peer(reader, writer, self._newest, self._on_heard)
         self._peers.add(peer)
-        _say(f"{name} has come")
+        say(f"{name} has come")
         self._on_come()
         try:
             why = await peer.serve()
         finally:
             self._peers.discard(peer)
             writer.close()
-        _say(f"{name} has gone: {why}")
+        say(f"{name} has gone: {why}")
 
 
 class _Peer:
@@ -190,7 +190,3 @@ class _Peer:
     async def _skip(self, left: int) -> None:
         while left:
             left -= len(await self._reader.readexactly(min(left, PIECE_BYTES)))
-
-
-def _say(words: str) -> None:
-    print(f"intrasplat: {words}", file=sys.stderr, flush=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import struct
 
 import numpy as np
 
@@ -90,6 +91,20 @@ def test_what_a_peer_sends_is_heard_and_long_texts_of_other_kinds_are_passed_ove
         assert heard[1].matrix is not None
         np.testing.assert_array_equal(heard[1].matrix, pose)
         writer.close()
+        listening.cancel()
+
+    asyncio.run(asyncio.wait_for(use(), 60))
+
+
+def test_a_message_that_is_far_too_long_ends_the_connection_before_it_is_read() -> None:
+    async def use() -> None:
+        link = Link(lambda heard: None, lambda: None)
+        listening, port = await opened(link)
+        for kind, size in ((b"TRANSFORM", 1 << 20), (b"IMAGE", 1 << 40)):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(struct.pack(">H12s20sIIQQ", 1, kind, b"Pose", 0, 0, size, 0))
+            assert await reader.read(1) == b""
+            writer.close()
         listening.cancel()
 
     asyncio.run(asyncio.wait_for(use(), 60))
