@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
 import zipfile
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
 from contract.wire.errors import InputError, LimitError
 from contract.wire.exports import EXPORT_FORMATS, ExportOptions, check_export
@@ -153,10 +155,21 @@ def test_tracks_follow_every_gaussian_through_every_frame() -> None:
 
 def test_a_tum_file_has_every_frames_pose_in_metres(tmp_path: Path) -> None:
     scene = random_scene()
-    (tmp_path / "path.tum").write_bytes(exported(scene, "tum"))
-    times_s, poses = read_tum(tmp_path / "path.tum")
+    turned = scene.world_from_camera.copy()
+    turned[:, :3, :3] = Rotation.from_euler(
+        "xyz", [[5 * each, -3, 2 * each] for each in range(FRAMES)], True
+    ).as_matrix()
+    scene = dataclasses.replace(scene, world_from_camera=turned)
+    content = exported(scene, "tum")
+    rows = np.loadtxt(io.BytesIO(content))  # timestamp tx ty tz qx qy qz qw
+    assert rows.shape == (FRAMES, 8)
+    assert rows[:, 0] == pytest.approx(scene.frame_times_s, abs=1e-6)
+    assert rows[:, 1:4] == pytest.approx(turned[:, :3, 3] / 1000, abs=1e-7)
+    assert Rotation.from_quat(rows[:, 4:]).as_matrix() == pytest.approx(turned[:, :3, :3], abs=1e-6)
+    (tmp_path / "path.tum").write_bytes(content)
+    times_s, poses = read_tum(tmp_path / "path.tum")  # `intrasplat poses` reads it, too
     assert times_s == pytest.approx(scene.frame_times_s)
-    assert poses == pytest.approx(scene.world_from_camera, abs=1e-4)
+    assert poses == pytest.approx(turned, abs=1e-4)
 
 
 def test_after_the_clip_its_last_moment_is_shown() -> None:

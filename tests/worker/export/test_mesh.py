@@ -15,7 +15,10 @@ from scipy.ndimage import binary_dilation
 from contract.wire.errors import InputError
 from contract.wire.exports import ExportOptions
 from tests.worker.export.sheet import tissue
+from tests.worker.phantoms import prepared, trained
 from worker.export import export_parts, surface
+from worker.outcome import scene_of
+from worker.phantom import PhantomSettings, make_phantom
 from worker.render.camera import endoscope_pose
 from worker.render.view import render_frame
 from worker.scene.scene import Scene
@@ -52,6 +55,42 @@ def test_vertices_lie_where_the_endoscope_sees_the_tissue(scene: Scene) -> None:
     middle = (frame.depth_mm > 0)[6:-6, 6:-6]
     around = binary_dilation(covered, np.ones((3, 3)))  # a voxel is larger than a pixel
     assert around[6:-6, 6:-6][middle].mean() > 0.97
+
+
+def test_vertices_lie_on_the_surface_that_the_gaussians_cover(scene: Scene) -> None:
+    mesh = read(scene, "ply")
+    x, y, z = (scene.units_per_mm * mesh.vertices).T
+    start = tissue().gaussians.mean[:-1, 2] - 60
+    moved = scene.deformation.deform(scene.gaussians, T).mean[:-1, 2] - 60 - start  # all of it towards the camera
+    middle = (np.abs(x) < 25) & (np.abs(y) < 20)
+    error_mm = np.abs(z - 60 - 0.006 * (x * x + y * y) - float(moved.mean()))[middle] / scene.units_per_mm
+    pixel_mm = 60 / scene.units_per_mm / scene.intrinsics.fx
+    assert middle.sum() > 500
+    assert np.median(error_mm) < 0.5 * pixel_mm
+    assert np.percentile(error_mm, 95) < 1.0 * pixel_mm
+
+
+def test_the_mesh_of_a_trained_phantom_lies_as_near_its_true_surface_as_rendered_depth_does() -> None:
+    settings = PhantomSettings(width=160, height=128, frames=12, motion="breathing", tools=(), period_frames=12.0)
+    clip = make_phantom(settings).depth_clip()
+    trained_scene = scene_of(trained(prepared(clip, iterations=150)[0]))
+    k = trained_scene.intrinsics
+    for index in (0, 8):
+        t = index / clip.frame_count
+        data = b"".join(export_parts(trained_scene, "mesh-ply", ExportOptions(t=t)))
+        mesh = trimesh.load(io.BytesIO(data), file_type="ply", force="mesh", process=False)
+        pose = np.linalg.inv(endoscope_pose(trained_scene, t))
+        own = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        column = np.floor(k.fx * own[:, 0] / own[:, 2] + k.cx).astype(int)
+        row = np.floor(k.fy * own[:, 1] / own[:, 2] + k.cy).astype(int)
+        inside = (column >= 4) & (column < k.width - 4) & (row >= 4) & (row < k.height - 4)
+        true_mm = clip.depth_mm[index]
+        mesh_error_mm = np.abs(own[inside, 2] - true_mm[row[inside], column[inside]])
+        rendered_error_mm = np.abs(render_frame(trained_scene, t).depth_mm - true_mm)[4:-4, 4:-4]
+        pixel_mm = float(np.median(true_mm)) / k.fx
+        assert np.median(mesh_error_mm) < 2.0
+        assert np.median(mesh_error_mm) < np.median(rendered_error_mm) + 0.5 * pixel_mm
+        assert np.percentile(mesh_error_mm, 95) < np.percentile(rendered_error_mm, 95) + 0.5 * pixel_mm
 
 
 def test_a_mesh_shows_its_own_moment(scene: Scene) -> None:
