@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Response
@@ -18,26 +19,39 @@ from service.deps import AnyCaller, Deps, Services, owned_job
 from service.events import NOTHING_SEEN
 from service.listing import PAGED, JobQuery, find_page, tell_next
 from service.problems import RETRY_AFTER_S, Problem
+from service.renders import matches
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
 STREAM_HEADERS = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
 """The second keeps nginx from collecting events before it passes them on."""
 
+UNCHANGED: dict[int | str, dict[str, object]] = {304: {"description": "they are those that the caller has"}}
 STREAM_RESPONSES: dict[int | str, dict[str, object]] = {
     200: {"description": "server-sent events", "content": {EventSourceResponse.media_type: {}}},
     204: {"description": "the job has ended, and the caller knows all of it"},
 }
 
 
-@router.get("", operation_id="list_jobs", responses=PAGED)
-def list_jobs(services: Services, caller: AnyCaller, response: Response, search: JobQuery) -> list[JobView]:
+@router.get("", operation_id="list_jobs", response_model=list[JobView], responses=PAGED | UNCHANGED)
+def list_jobs(
+    services: Services,
+    caller: AnyCaller,
+    response: Response,
+    search: JobQuery,
+    if_none_match: Annotated[str | None, Header()] = None,
+) -> list[JobView] | Response:
     """The jobs, newest first, a page at a time. Positions in the queue are told of each by itself."""
     caller.require(KeyScope.VIEW)
     find = functools.partial(services.queue.records, caller.tenant)
     page = find_page(search, caller.tenant, find, search.state)
     tell_next(response, page, caller.tenant)
-    return [JobView.of(record) for record in page.records]
+    jobs = [JobView.of(record) for record in page.records]
+    content = "\n".join(each.model_dump_json() for each in jobs)
+    response.headers["ETag"] = f'"{hashlib.sha256(content.encode()).hexdigest()}"'
+    if matches(if_none_match, response.headers["ETag"]):
+        return Response(status_code=304, headers=response.headers)
+    return jobs
 
 
 @router.get("/{job_id}", operation_id="get_job")

@@ -20,6 +20,9 @@ import { connectionLost, errorWords, Problem, problemOf } from "./problem.js";
  * @typedef {{q?: string, cursor?: string, limit?: number, created_from_s?: number, created_until_s?: number}} Search
  */
 
+const NOT_MODIFIED = 304;
+const SILENCE_MS = 5000;
+
 /**
  * Ask the service, with the key if there is one.
  * @param {string} path
@@ -35,7 +38,7 @@ export async function request(path, options = {}) {
   } catch (error) {
     throw error.name === "AbortError" ? error : connectionLost();
   }
-  if (response.ok) return response;
+  if (response.ok || response.status === NOT_MODIFIED) return response;
   const problem = await problemOf(response);
   if (problem.status === 401 && sent === currentKey()) askForKey(sent ? errorWords("http_401", "wrong") : problem.message);
   throw problem;
@@ -57,14 +60,21 @@ const queryOf = (values) =>
 
 /** @returns {Promise<{tenant: string, scopes: string[], key_id: string | null}>} */
 export const getKey = () => json("/key");
+/** The last answer of listJobs(), which the service need not send again while nothing changes. */
+let listed = { path: "", key: null, tag: "", answer: { jobs: [], next: null } };
 /**
  * A page of the jobs, newest first.
  * @param {Search} search
  * @returns {Promise<{jobs: Job[], next: string | null}>} next: the cursor of the page after it
  */
 export async function listJobs(search) {
-  const response = await request(`/jobs?${queryOf(search)}`);
-  return { jobs: await bodyOf(response), next: response.headers.get("X-Intrasplat-Next") };
+  const path = `/jobs?${queryOf(search)}`;
+  const isKnown = listed.path === path && listed.key === currentKey();
+  const response = await request(path, { headers: isKnown ? { "If-None-Match": listed.tag } : {} });
+  if (response.status === NOT_MODIFIED) return { ...listed.answer };
+  const answer = { jobs: await bodyOf(response), next: response.headers.get("X-Intrasplat-Next") };
+  listed = { path, key: currentKey(), tag: response.headers.get("ETag"), answer };
+  return answer;
 }
 /** @param {Search} search @returns {Promise<SceneSummary[]>} */
 export const listScenes = (search) => json(`/scenes?${queryOf(search)}`);
@@ -100,6 +110,15 @@ export const exportScene = async (id, wanted) => (await request(`/scenes/${id}/e
 
 /** @param {string} id @returns {Promise<Blob>} a zip of the masks that were found */
 export const getMasks = async (id) => (await request(`/scenes/${id}/masks`)).blob();
+
+/**
+ * Return if a finished scene is still there for this key; throws as a picture of it would. It costs the service no picture.
+ * @param {string} id
+ */
+export const stillThere = async (id) => {
+  const signal = AbortSignal.timeout(SILENCE_MS);
+  await request(`/render?scene=${id}`, { headers: { "If-None-Match": "*" }, signal });
+};
 
 /** @returns {Promise<string>} why nothing would be trained now, in words; empty if it would */
 export async function trouble() {

@@ -96,7 +96,7 @@ export class JobEvents {
 }
 
 /** The next piece; an error if the line is silent, as a dead one is. */
-async function soon(reader) {
+export async function soon(reader) {
   let timer;
   const silence = new Promise((_, reject) => (timer = setTimeout(() => reject(connectionLost()), SILENCE_MS)));
   try {

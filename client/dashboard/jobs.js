@@ -9,6 +9,8 @@ import { words } from "./messages.js";
 /** @typedef {import("./api.js").Job} Job */
 
 const POLL_MS = 2000;
+/** While nobody looks at the list and nothing is under way, every so manieth time is enough. */
+const IDLE_POLLS = 4;
 /** Jobs in a page of the list. */
 export const PAGE_SIZE = 30;
 /** Browsers open six connections to a place, and uploads and pictures need some. */
@@ -40,8 +42,10 @@ export class Jobs {
   /**
    * @param {() => void} onChange after any change of the jobs
    * @param {(text: string, kind: "good"|"bad") => void} onConnection how the service is
+   * @param {() => boolean} isWatched whether somebody looks at the list, or waits for the service
    */
-  constructor(onChange, onConnection) {
+  constructor(onChange, onConnection, isWatched) {
+    this.isWatched = isWatched;
     this.onChange = onChange;
     this.onConnection = onConnection;
     /** @type {Map<string, Job>} */
@@ -61,8 +65,15 @@ export class Jobs {
     this.told = new Map(); // when the last event of a job came
     this.round = 0;
     keyEvents.addEventListener("changed", () => this.#startAnew());
-    setInterval(() => this.poll(), POLL_MS);
+    this.ticks = 0;
+    this.isWell = true;
+    setInterval(() => this.#tick(), POLL_MS);
     this.poll();
+  }
+
+  #tick() {
+    const isBusy = this.isWatched() || !this.isWell || [...this.byId.values()].some(isActive);
+    if (isBusy || ++this.ticks % IDLE_POLLS === 0) this.poll();
   }
 
   /** @param {string} id the points of its curve so far */
@@ -103,10 +114,16 @@ export class Jobs {
       this.#replace(jobs, askedAt);
       await this.#askForOne();
       const wrong = await trouble();
-      if (round === this.round) this.onConnection(wrong || words("page.ready"), wrong ? "bad" : "good");
+      if (round === this.round) this.#tellConnection(wrong);
     } catch (error) {
-      if (round === this.round) this.onConnection(error.status ? error.message : words("page.no_connection"), "bad");
+      if (round === this.round) this.#tellConnection(error.status ? error.message : words("page.no_connection"));
     }
+  }
+
+  /** @param {string} wrong what is, in words; empty: nothing */
+  #tellConnection(wrong) {
+    this.isWell = wrong === "";
+    this.onConnection(wrong || words("page.ready"), wrong ? "bad" : "good");
   }
 
   #startAnew() {

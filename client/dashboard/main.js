@@ -27,6 +27,7 @@ import { Viewer } from "./viewer.js";
 
 const get = (id) => document.getElementById(id);
 
+const scopes = new Scopes(() => showJobs());
 export const viewer = new Viewer({
   stage: get("stage"),
   canvas: get("picture"),
@@ -48,7 +49,8 @@ export const viewer = new Viewer({
   loopStart: get("loop-start"),
   loopEnd: get("loop-end"),
   loopAll: get("loop-all"),
-});
+  way: get("way"),
+}, () => scopes.has("download"));
 /** What somebody asked for and cannot have; or, not isBad, has. */
 function tell(text, isBad = true) {
   get("address-message").textContent = text;
@@ -142,7 +144,7 @@ function showJobs() {
   light.keep(viewer.timeline.isPlaying || viewed?.state === "running");
   get("scene-id").textContent = viewed ? nameOf(viewed) : "";
   if (viewed?.state === "done" && reported !== viewed.id) {
-    viewer.refresh(); // what is shown may be of its training still
+    if (viewer.shown?.state !== "done") viewer.refresh(); // what is shown may be of its training still
     report(viewed.id);
   }
   if (viewed && viewed.state !== "done") drawCurve(get("curve"), jobs.pointsOf(viewed.id), []);
@@ -153,7 +155,6 @@ function showConnection(text, kind) {
   get("connection").className = `pill ${kind}`;
 }
 
-const scopes = new Scopes(() => showJobs());
 const list = new JobList(
   { list: get("jobs"), nothing: get("no-jobs"), message: get("jobs-message"), confirm: get("confirm") },
   scopes,
@@ -170,7 +171,8 @@ const list = new JobList(
     },
   },
 );
-const jobs = new Jobs(showJobs, showConnection);
+const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !== "";
+const jobs = new Jobs(showJobs, showConnection, isWatched);
 const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
 const momentOf = (id) => (viewer.scene === id ? viewer.timeline.t : 0);
 const downloads = new Downloads(get("download"), get("jobs-message"), scopes, momentOf);

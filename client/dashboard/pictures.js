@@ -34,7 +34,7 @@ async function askOnce(path, signal) {
     codes: header("Warning-Codes")?.split(", ") ?? [],
     totalMs: total ? Number(total[1]) : NaN,
     camera: JSON.parse(header("Camera") ?? "null"),
-    way: "single pictures",
+    way: "single",
   };
 }
 
@@ -55,6 +55,14 @@ const warningOf = (codes, view) =>
     .map((code) => (code === "unseen" && view.unseen === "guess" ? words("picture.guessed") : noticeWords({ code, text: "" })))
     .filter(Boolean)
     .join(" ");
+
+/** Note of a picture of a view what its codes mean. @param {Picture} picture @param {View} view @returns {Picture} */
+export function judged(picture, view) {
+  picture.warning = warningOf(picture.codes, view);
+  picture.isRecorded = view.layer === RECORDED;
+  picture.isExtrapolated = picture.codes.some((code) => isGuess(code, view));
+  return picture;
+}
 
 /** @param {View} view */
 const pathOf = (view) =>
@@ -85,14 +93,16 @@ export class Pictures {
    */
   async ask(view) {
     this.#keepOpen();
-    const isRecorded = view.layer === RECORDED;
-    const isStreamed = this.stream.isOpen && !isRecorded;
+    const isStreamed = this.stream.isOpen && view.layer !== RECORDED;
     const picture = isStreamed ? await this.#fromStream(view) : await this.#fromPath(pathOf(view));
     if (picture.scene !== view.scene) throw new Error(words("page.other_scene"));
-    picture.warning = warningOf(picture.codes, view);
-    picture.isRecorded = isRecorded;
-    picture.isExtrapolated = picture.codes.some((code) => isGuess(code, view));
     return picture;
+  }
+
+  /** Have the stream back for the next picture. @returns {boolean} whether it would come another way than the last */
+  prepare(way) {
+    this.#keepOpen();
+    return way === "single" && this.stream.isOpen;
   }
 
   #keepOpen() {

@@ -1,11 +1,15 @@
-// The picture and what it is worth. A picture is live only while the service keeps confirming it: whatever goes wrong,
-// the badge says so by itself after STALE_AFTER_MS, because it depends on what comes, not on somebody noticing.
+// The picture and what it is worth. A picture is live only while the service keeps confirming it: whatever goes wrong, the
+// badge says so by itself after STALE_AFTER_MS, because it depends on what comes, not on somebody noticing. What this
+// browser draws from memory goes on without the service, and then says that nobody confirms it.
 
 import { clockTime } from "./element.js";
+import { words } from "./messages.js";
 
 /** @typedef {import("./stream.js").Picture} Picture */
 
 const STALE_AFTER_MS = 5000;
+/** A scene from memory is drawn here, so the service is asked less often. */
+const UNCONFIRMED_AFTER_MS = 10000;
 const LOOK_MS = 250;
 const FIRST_PICTURE = "first_picture";
 
@@ -16,7 +20,7 @@ export class Screen {
    */
   constructor(parts) {
     Object.assign(this, parts);
-    this.clear(null, "Choose a job.");
+    this.clear(null, words("page.choose"));
     setInterval(() => this.#look(), LOOK_MS);
     document.addEventListener("visibilitychange", () => this.#look()); // timers sleep in hidden tabs
   }
@@ -33,7 +37,7 @@ export class Screen {
   clear(scene, words) {
     this.scene = scene;
     this.shown = null;
-    this.shownAt = 0;
+    this.confirmedAt = 0;
     this.awaitedUntil = 0;
     this.trouble = "";
     this.words = words;
@@ -42,18 +46,28 @@ export class Screen {
     this.#look();
   }
 
-  /** @param {Picture} picture @param {ImageBitmap} bitmap of it, closed here @param {string} name what it shows */
-  show(picture, bitmap, name) {
+  /**
+   * @param {Picture} picture
+   * @param {ImageBitmap | HTMLCanvasElement} image of it; a bitmap is closed here
+   * @param {string} name what it shows
+   */
+  show(picture, image, name) {
     const { canvas } = this;
-    if (canvas.width !== bitmap.width) canvas.width = bitmap.width; // setting it clears and allocates anew
-    if (canvas.height !== bitmap.height) canvas.height = bitmap.height;
-    canvas.getContext("2d").drawImage(bitmap, 0, 0);
-    bitmap.close();
+    if (canvas.width !== image.width) canvas.width = image.width; // setting it clears and allocates anew
+    if (canvas.height !== image.height) canvas.height = image.height;
+    canvas.getContext("2d").drawImage(image, 0, 0);
+    image.close?.();
     canvas.setAttribute("aria-label", name);
     this.name = name;
     this.shown = picture;
-    this.shownAt = Date.now();
     this.awaitedUntil = 0;
+    if (picture.way === "memory") this.#look(); // that it could be drawn says nothing of whether it may
+    else this.confirm();
+  }
+
+  /** The service has just said that what is shown is there. */
+  confirm() {
+    this.confirmedAt = Date.now();
     this.trouble = "";
     this.#look();
   }
@@ -65,9 +79,9 @@ export class Screen {
     this.#look();
   }
 
-  /** @param {string} words why the picture, if there is one, is not live any more */
-  fail(words) {
-    this.trouble = this.words = words;
+  /** @param {string} reason why the picture, if there is one, is not confirmed any more */
+  fail(reason) {
+    this.trouble = this.words = reason;
     this.#look();
   }
 
@@ -77,7 +91,7 @@ export class Screen {
     this.canvas.hidden = this.shown === null;
     setText(this.badge, badge);
     this.badge.hidden = badge === "";
-    setText(this.statusText, this.shown && state !== "stale" ? this.name : "");
+    setText(this.statusText, this.#text(state));
     setText(this.message, message);
     this.message.hidden = message === "";
     setText(this.warning, state === "stale" ? "" : (this.shown?.warning ?? ""));
@@ -86,15 +100,24 @@ export class Screen {
   /** @returns {[string, string, string]} state, badge, message over the picture */
   #state() {
     if (this.scene === null) return ["none", "", this.words];
-    if (this.shown === null) return ["waiting", "NO PICTURE", this.words];
-    if (this.trouble || Date.now() > Math.max(this.shownAt + STALE_AFTER_MS, this.awaitedUntil)) {
-      const reason = this.trouble || "The service does not answer.";
-      return ["stale", "STALE", `Last picture ${clockTime(this.shownAt)}. ${reason} Reconnecting.`];
+    if (this.shown === null) return ["waiting", words("screen.nothing"), this.words];
+    const isOfMemory = this.shown.way === "memory";
+    const limit = this.confirmedAt + (isOfMemory ? UNCONFIRMED_AFTER_MS : STALE_AFTER_MS);
+    if (this.trouble || Date.now() > Math.max(limit, this.awaitedUntil)) {
+      if (isOfMemory) return ["unconfirmed", words("screen.unconfirmed"), ""];
+      const reason = this.trouble || words("screen.silent");
+      return ["stale", words("screen.stale"), words("screen.stale_why", { time: clockTime(this.confirmedAt), reason })];
     }
-    if (this.shown.isRecorded) return ["live", "RECORDED, what is coloured is masked", ""];
-    if (this.shown.codes?.includes(FIRST_PICTURE)) return ["training", "FIRST PICTURE, not yet a model", ""];
-    if (this.shown.state === "running") return ["training", `TRAINING, iteration ${this.shown.iteration}`, ""];
-    return this.shown.isExtrapolated ? ["extrapolated", "EXTRAPOLATED", ""] : ["live", "CURRENT", ""];
+    if (this.shown.isRecorded) return ["live", words("screen.recorded"), ""];
+    if (this.shown.codes?.includes(FIRST_PICTURE)) return ["training", words("screen.first_picture"), ""];
+    if (this.shown.state === "running") return ["training", words("screen.training", { iteration: this.shown.iteration }), ""];
+    return this.shown.isExtrapolated ? ["extrapolated", words("screen.extrapolated"), ""] : ["live", words("screen.current"), ""];
+  }
+
+  /** @param {string} state @returns {string} beside the badge */
+  #text(state) {
+    if (state === "unconfirmed") return words("screen.unconfirmed_why", { time: clockTime(this.confirmedAt) });
+    return this.shown && state !== "stale" ? this.name : "";
   }
 }
 

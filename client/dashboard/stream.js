@@ -9,10 +9,10 @@ import { connectionLost, errorWords, Problem } from "./problem.js";
  *   format: string}} View
  */
 /**
- * What came. isExtrapolated: it shows a guess, or a pose or time far from the clip's (set by Pictures.ask).
- * isRecorded: it is a frame of the clip, no render.
- * @typedef {{blob: Blob, scene: string, state: "running"|"done", t: number, iteration: number | null,
- *   unseen: number, warning: string, codes: string[], totalMs: number, way: string,
+ * What came: a file, or an image that this browser drew. way: how. isExtrapolated: it shows a guess, or a pose or time far
+ * from the clip's. isRecorded: it is a frame of the clip, no render. Both are set by judged() of pictures.js.
+ * @typedef {{blob?: Blob, image?: HTMLCanvasElement, scene: string, state: "running"|"done", t: number, iteration: number | null,
+ *   unseen: number, warning: string, codes: string[], totalMs: number, way: "stream"|"single"|"memory",
  *   camera: Camera | null, isExtrapolated?: boolean, isRecorded?: boolean}} Picture
  */
 /**

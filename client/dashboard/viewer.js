@@ -1,23 +1,35 @@
-// The view of one scene: at most one picture is under way; the newest wish is asked for next, and now and then the same
-// again, which follows training, notices a purge, and keeps CURRENT true.
+// The view of one scene: at most one picture is under way; the newest wish comes next. The service draws, or this browser
+// once it has the scene. Now and then the service is asked: for the newest picture of a job that trains, else only whether
+// the scene is still there, which notices a purge and keeps CURRENT true.
 
+import { stillThere } from "./api.js";
 import { Clip } from "./clip.js";
+import { Memory } from "./memory.js";
+import { figure, languageEvents, words } from "./messages.js";
 import { Orbit } from "./orbit.js";
 import { Pace } from "./pace.js";
 import { pause } from "./pause.js";
-import { Pictures } from "./pictures.js";
+import { judged, Pictures } from "./pictures.js";
 import { Screen } from "./screen.js";
 import { Timeline } from "./timeline.js";
+import { Way } from "./way.js";
 
 const AGAIN_MS = 1500;
+/** A finished scene does not change; that it is there costs the service some hundred bytes. */
+const CONFIRM_MS = 3000;
 const AFTER_TROUBLE_MS = 700;
-const NOT_YET = "Its first picture comes when training begins.";
+/** A view that changes again so soon moves; when it rests, it is drawn exactly. */
+const REST_MS = 150;
+const COARSE = "coarse";
 /**
  * What a view shows. t: as shown, within the clip; pose: as the service spells it, null for the endoscope's own, of the eye;
  * camera: null where it is not known, as of recorded frames; way: how the picture came.
  * @typedef {{scene: string, t: number, pose: string | null, eye: "left"|"right", layer: string, unseen: "mark"|"guess",
- *   highlights: "on"|"off", state: "running"|"done", way: string, camera: import("./stream.js").Camera | null}} Shown
+ *   highlights: "on"|"off", state: "running"|"done", way: "stream"|"single"|"memory",
+ *   camera: import("./stream.js").Camera | null}} Shown
  */
+/** Not a layer of the model, but what the endoscope saw. */
+const RECORDED = "recorded";
 /** There is nothing to show, or not to this key; a picture that was there goes. */
 const NOTHING_TO_SHOW = [401, 403, 404, 409];
 
@@ -26,8 +38,11 @@ const NOTHING_TO_SHOW = [401, 403, 404, 409];
  * when the scene's cameras are, and "refused" when nobody may stand where the viewer shall.
  */
 export class Viewer extends EventTarget {
-  /** @param {Record<string, HTMLElement>} parts by what they are; index.html has them */
-  constructor(parts) {
+  /**
+   * @param {Record<string, HTMLElement>} parts by what they are; index.html has them
+   * @param {() => boolean} mayDownload whether the key allows to load scenes into the browser
+   */
+  constructor(parts, mayDownload) {
     super();
     this.parts = parts;
     this.scene = null;
@@ -37,28 +52,39 @@ export class Viewer extends EventTarget {
     this.isBusy = false;
     this.isWanted = false;
     this.askedAt = 0;
+    this.isConfirming = false;
+    this.isMoving = false;
+    this.wishedAt = 0;
     this.orbit = new Orbit(() => this.timeline.t);
     this.pace = new Pace();
     this.pictures = new Pictures();
+    this.memory = new Memory(mayDownload);
+    this.way = new Way(parts.way, this.memory, () => this.refresh());
     this.screen = new Screen(parts);
     this.timeline = new Timeline(parts, () => this.refresh(), () => this.isBusy);
     this.clip = new Clip((cameras) => this.#know(cameras));
     this.#listen();
     setInterval(() => this.#again(), AGAIN_MS / 3);
     document.addEventListener("visibilitychange", () => this.refresh());
+    this.memory.addEventListener("changed", () => this.#tellWay());
+    this.memory.addEventListener("changed", () => this.memory.player && this.refresh());
+    languageEvents.addEventListener("changed", () => this.#tellWay());
+    new ResizeObserver(() => this.#isDrawnHere && this.refresh()).observe(parts.stage);
+    this.#tellWay();
   }
 
   /**
    * @param {string | null} scene
-   * @param {string} [words] to show until its picture is there
+   * @param {string} [message] to show until its picture is there
    */
-  open(scene, words = scene ? "Rendering." : "Choose a job.") {
+  open(scene, message = words(scene ? "screen.rendering" : "page.choose")) {
     this.scene = scene;
     this.visit += 1;
     this.pictures.giveUp(); // the other scene's
+    this.memory.open(scene);
     this.orbit.goHome();
     this.shown = null;
-    this.screen.clear(scene, words);
+    this.screen.clear(scene, message);
     this.parts.readout.textContent = "";
     this.clip.open(scene);
     if (scene === null) this.timeline.play(false);
@@ -81,6 +107,9 @@ export class Viewer extends EventTarget {
   }
 
   refresh() {
+    const now = performance.now();
+    this.isMoving = this.timeline.isPlaying || now - this.wishedAt < REST_MS;
+    this.wishedAt = now;
     this.isWanted = true;
     if (!this.isBusy) this.#work();
   }
@@ -92,8 +121,47 @@ export class Viewer extends EventTarget {
     if (cameras) this.refresh();
   }
 
+  /** Whether this browser draws what is wished for. */
+  get #isDrawnHere() {
+    return this.scene !== null && this.#whyNot() === null;
+  }
+
+  #whyNot() {
+    return this.memory.whyNot(this.#view(this.scene), this.shown?.state);
+  }
+
+  #tellWay() {
+    this.way.tell(this.#whyNot());
+  }
+
   #again() {
-    if (this.scene && !this.isBusy && performance.now() - this.askedAt > AGAIN_MS) this.refresh();
+    if (!this.scene) return;
+    const { shown, screen } = this;
+    if (shown?.state === "done") this.memory.want(this.#view(this.scene));
+    const now = performance.now();
+    const sinceConfirmedMs = Date.now() - screen.confirmedAt;
+    if (this.#isDrawnHere) {
+      if (sinceConfirmedMs > CONFIRM_MS) this.#confirm();
+    } else if (!this.isBusy && now - this.askedAt > AGAIN_MS) {
+      const isServed = shown?.state === "done" && shown.way !== "memory" && shown.layer !== RECORDED;
+      const isFinal = isServed && !screen.shown?.codes.includes(COARSE);
+      if (!isFinal || screen.trouble || this.pictures.prepare(shown.way)) this.refresh();
+      else if (sinceConfirmedMs > CONFIRM_MS) this.#confirm();
+    }
+  }
+
+  /** Ask whether what is shown is still there. */
+  async #confirm() {
+    if (this.isConfirming) return;
+    const { scene, visit } = this;
+    this.isConfirming = true;
+    try {
+      await stillThere(scene);
+      if (visit === this.visit) this.screen.confirm();
+    } catch (error) {
+      if (visit === this.visit) this.#fail(error);
+    }
+    this.isConfirming = false;
   }
 
   async #work() {
@@ -107,26 +175,44 @@ export class Viewer extends EventTarget {
 
   async #showOnce(scene, visit) {
     const began = (this.askedAt = performance.now());
-    const guesses = this.parts.guess.checked ? ", guesses shown" : "";
+    const guesses = this.parts.guess.checked ? `, ${words("picture.guesses")}` : "";
     const view = this.#view(scene);
-    const highlights = view.highlights === "off" ? ", without highlights" : "";
+    const highlights = view.highlights === "off" ? `, ${words("picture.no_highlights")}` : "";
     const layer = this.parts.layer.selectedOptions[0].text;
-    const name = view.layer === "recorded" ? layer : `${layer}, ${this.orbit.words}${guesses}${highlights}`;
+    const name = view.layer === RECORDED ? layer : `${layer}, ${this.orbit.words}${guesses}${highlights}`;
+    const isDrawnHere = this.#isDrawnHere;
     try {
-      const picture = await this.pictures.ask(view);
-      const bitmap = await createImageBitmap(picture.blob);
+      const picture = judged(await (isDrawnHere ? this.#draw(view) : this.pictures.ask(view)), view);
+      const image = picture.image ?? (await createImageBitmap(picture.blob));
       if (visit !== this.visit) return; // another was opened meanwhile: never its neighbour's picture
-      this.screen.show(picture, bitmap, `${name}, ${this.timeline.momentOf(picture.t)}`);
+      this.screen.show(picture, image, `${name}, ${this.timeline.momentOf(picture.t)}`);
       this.pace.note();
       this.shown = shownOf(view, picture);
       this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
       this.#tell(name, picture, performance.now() - began);
+      if (isDrawnHere) await this.memory.player?.settled();
+      else if (picture.state === "done") this.memory.want(view);
     } catch (error) {
       if (visit !== this.visit) return;
+      if (isDrawnHere) {
+        if (error.code !== "closed") this.memory.giveUp(error);
+        this.isWanted = true;
+        return;
+      }
       if (error.turnInS && this.screen.hasPicture) this.screen.waitFor(error.turnInS);
       else this.#fail(error);
       await pause(Math.max(AFTER_TROUBLE_MS, (error.turnInS ?? 0) * 1000));
     }
+  }
+
+  /** Draw a view here: at once while it moves, and once more, exactly, when it rests. */
+  async #draw(view) {
+    const { clientWidth, clientHeight } = this.parts.stage;
+    const room = { width: clientWidth * devicePixelRatio, height: clientHeight * devicePixelRatio };
+    const { isMoving } = this;
+    clearTimeout(this.resting);
+    if (isMoving && !this.timeline.isPlaying) this.resting = setTimeout(() => this.refresh(), 2 * REST_MS);
+    return this.memory.draw(view, room, { isMoving, isTimed: this.way.isOpen });
   }
 
   #view(scene) {
@@ -145,19 +231,24 @@ export class Viewer extends EventTarget {
   }
 
   #tell(name, picture, tookMs) {
-    const server = Number.isFinite(picture.totalMs) ? ` (service ${picture.totalMs.toFixed(0)} ms)` : "";
-    const rate = this.pace.rate >= 1 ? ` · ${this.pace.rate.toFixed(0)} pictures/s` : "";
-    const unseen = picture.unseen >= 0.005 ? ` · ${(picture.unseen * 100).toFixed(0)} % unseen` : "";
-    this.parts.readout.textContent = `${name}${unseen} · ${tookMs.toFixed(0)} ms${server}${rate} · ${picture.way}`;
+    const server = Number.isFinite(picture.totalMs) ? ` (${words("readout.service", { ms: figure(picture.totalMs) })})` : "";
+    const { rate } = this.pace;
+    const pace = rate >= 1 ? [words("readout.rate", { rate: figure(rate) })] : [];
+    const unseen = picture.unseen >= 0.005 ? [words("readout.unseen", { share: figure(100 * picture.unseen) })] : [];
+    const took = `${figure(tookMs)} ms${server}`;
+    this.parts.readout.textContent = [name, ...unseen, took, ...pace, words(`readout.${picture.way}`)].join(" · ");
+    this.#tellWay();
+    this.way.tellFigures({ rate, camera: picture.camera });
   }
 
   #fail(error) {
     const isNotYet = error.status === 503 && error.document.field === "scene" && !this.screen.hasPicture;
     if (NOTHING_TO_SHOW.includes(error.status)) {
       this.shown = null;
+      this.memory.open(this.scene);
       this.screen.clear(this.scene, error.message);
       this.dispatchEvent(new Event("gone"));
-    } else this.screen.fail(isNotYet ? NOT_YET : error.message);
+    } else this.screen.fail(isNotYet ? words("screen.not_yet") : error.message);
   }
 
   #listen() {

@@ -130,6 +130,8 @@ class Line:
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._open: list[socket.socket] = []
         self.connections = 0
+        self.bytes = 0
+        """Sent through it, both ways."""
         self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
 
@@ -157,18 +159,17 @@ class Line:
                 self._open += [near, far]
                 threading.Thread(target=self._put_through, args=(near, far), daemon=True).start()
 
-    @classmethod
-    def _put_through(cls, near: socket.socket, far: socket.socket) -> None:
+    def _put_through(self, near: socket.socket, far: socket.socket) -> None:
         with near, far:
-            back = threading.Thread(target=cls._forward, args=(far, near), daemon=True)
+            back = threading.Thread(target=self._forward, args=(far, near), daemon=True)
             back.start()
-            cls._forward(near, far)
+            self._forward(near, far)
             back.join()
 
-    @staticmethod
-    def _forward(source: socket.socket, target: socket.socket) -> None:
+    def _forward(self, source: socket.socket, target: socket.socket) -> None:
         with contextlib.suppress(OSError):
             while piece := source.recv(65536):
+                self.bytes += len(piece)
                 target.sendall(piece)
         for end in (source, target):
             with contextlib.suppress(OSError):

@@ -57,6 +57,8 @@ from tests.measurements import measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.pace import Pace
 from worker.daemon.serve import Reply, RequestServer
+from worker.scene.checkpoint import save_scene
+from worker.scene.scene import Scene
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 WAIT_S = 15.0
@@ -222,9 +224,13 @@ class Site:
             claim, progress.model_copy(update={"seconds_left": seconds_left, "psnr_right_db": psnr_right_db})
         )
 
-    def finish(self, claim: Claim, *, scored: bool = True) -> str:
+    def finish(self, claim: Claim, *, scored: bool = True, model: Scene | None = None) -> str:
+        """The job's scene; model: as it is stored, for those who read it."""
         folder = self.store.work_folder(claim.job_id, claim.attempt)
-        (folder / MANIFEST).write_text('{"files": {}}')
+        if model is None:
+            (folder / MANIFEST).write_text('{"files": {}}')
+        else:
+            save_scene(folder, model)
         report = REPORT_OF_THE_PAGE if scored else first_report_of_the_page()
         (folder / REPORT).write_text(report.model_dump_json())
         (folder / CURVE).write_text(CURVE_OF_THE_PAGE)
@@ -233,18 +239,19 @@ class Site:
         self.announce()
         return claim.job_id
 
-    def scene(self, mark: str = "") -> str:
+    def scene(self, mark: str = "", model: Scene | None = None) -> str:
         """A finished scene whose id begins with the mark."""
         self.queued_job(mark)
-        return self.finish(self.claim())
+        return self.finish(self.claim(), model=model)
 
 
 @contextmanager
-def site_at(data_dir: Path, **changes: Any) -> Iterator[Site]:
+def site_at(data_dir: Path, answer: Callable[[SceneRequest], Reply] | None = None, **changes: Any) -> Iterator[Site]:
+    """A site; answer: of its worker, the painter's if it is left out."""
     painter = Painter()
     endpoint = f"ipc://{short_socket_path(Store(data_dir).run_dir, 'worker-1.sock')}"
     pace = Pace()
-    with RequestServer(endpoint, painter.answer, pace=pace, max_wait_s=MAX_WAIT_S):
+    with RequestServer(endpoint, answer or painter.answer, pace=pace, max_wait_s=MAX_WAIT_S):
         site = Site(data_dir, endpoint, painter, pace, **changes)
         try:
             yield site

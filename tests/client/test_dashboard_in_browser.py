@@ -157,7 +157,7 @@ def test_the_view_turns_by_mouse_and_keys_and_goes_back_to_the_endoscope(site: S
     assert "endoscope's view" in page.view
 
 
-@pytest.mark.parametrize("way", ["stream", "single pictures"])
+@pytest.mark.parametrize("way", ["stream", "single"])
 def test_a_view_that_is_shown_is_told_with_its_camera_and_others_can_look_elsewhere(
     site: Site, page: Page, way: str
 ) -> None:

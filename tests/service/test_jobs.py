@@ -67,6 +67,16 @@ def test_jobs_are_listed_by_state_newest_first_and_no_more_than_asked_for(servic
     assert_problem(service.http.get("/jobs", params={"limit": 0}), 422, "limit")
 
 
+def test_a_list_that_has_not_changed_is_not_sent_again(service: ServiceUnderTest) -> None:
+    job_id = service.upload().json()["id"]
+    known = {"If-None-Match": service.http.get("/jobs").headers["etag"]}
+    same = service.http.get("/jobs", headers=known)
+    assert (same.status_code, same.content) == (304, b"")
+    service.claimed()
+    changed = service.http.get("/jobs", headers=known)
+    assert [job["state"] for job in changed.json() if job["id"] == job_id] == ["running"]
+
+
 def test_a_failed_job_is_tried_again_when_asked_and_no_other_is(service: ServiceUnderTest) -> None:
     job_id = service.upload().json()["id"]
     assert_problem(service.http.post(f"/jobs/{job_id}/retry"), 409, "job_id")

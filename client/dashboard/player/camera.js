@@ -88,6 +88,18 @@ export class Cameras {
   }
 
   /**
+   * @param {string | null} pose as the service spells it (contract/wire/pose.py); null is the endoscope's own
+   * @param {number} t the time that is shown
+   * @returns {Matrix}
+   */
+  standing(pose, t) {
+    if (pose === null) return this.endoscope(t);
+    const numbers = pose.replace("orbit:", "").split(/[,\s]+/).filter(Boolean).map(Number);
+    if (pose.startsWith("orbit:")) return this.orbit(...numbers);
+    return [...[0, 4, 8].map((i) => numbers.slice(i, i + 4)), [0, 0, 0, 1]];
+  }
+
+  /**
    * side and dim of worker/raster/__init__.py for a camera there.
    * @param {number} t
    * @param {Matrix} pose

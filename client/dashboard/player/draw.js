@@ -9,8 +9,14 @@ const SMOOTHED_SHARE = 1 / 128;
 const STRIPE_SHARE = 1 / 96;
 const TELL_EVERY_MS = 250;
 
-/** A GPU that cannot draw this scene; the message says why. */
-export class CannotDrawError extends Error {}
+/** This browser cannot draw the scene. */
+export class CannotDrawError extends Error {
+  /** @param {string} message @param {"kind"|"no_floats"|"too_large"|"no_worker"|"context_lost"|"closed"} code */
+  constructor(message, code) {
+    super(message);
+    this.code = code;
+  }
+}
 
 export class Drawing {
   /**
@@ -21,7 +27,7 @@ export class Drawing {
   constructor(canvas, table, packed) {
     const options = { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true };
     const gl = (this.gl = canvas.getContext("webgl2", options));
-    if (!gl?.getExtension("EXT_color_buffer_float")) throw new CannotDrawError("WebGL2 has no targets in floats.");
+    if (!gl?.getExtension("EXT_color_buffer_float")) throw new CannotDrawError("WebGL2 has no targets in floats.", "no_floats");
     // Without it blending in 32 bits is not allowed; 16 bits err by a level now and then.
     this.colourFormat = gl.getExtension("EXT_float_blend") ? gl.RGBA32F : gl.RGBA16F;
     Object.assign(this, { canvas, count: table.count, channels: table.channels, patterns: table.patterns });
@@ -58,7 +64,7 @@ export class Drawing {
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     const needed = Math.max(rows, numberRows, NUMBERS_ROW);
     if (needed > most) {
-      throw new CannotDrawError(`The scene needs textures of ${needed} texels; this GPU has ${most}.`);
+      throw new CannotDrawError(`The scene needs textures of ${needed} texels; this GPU has ${most}.`, "too_large");
     }
     this.rest = texture(gl, gl.RGBA32F, (ROW * STATE) / 4, rows, gl.RGBA, gl.FLOAT, padded(state, ROW * STATE * rows));
     const numbers = padded(coefficients, 4 * NUMBERS_ROW * Math.max(numberRows, 1));
@@ -188,6 +194,17 @@ export class Drawing {
     this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.FLOAT, new Float32Array(4));
   }
 
+  /** Kept when the GPU has drawn all of it; the page works on meanwhile. */
+  async settled() {
+    const { gl } = this;
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    while (fence && !gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) {
+      await new Promise((resolve) => setTimeout(resolve, 1));
+    }
+    gl.deleteSync(fence);
+  }
+
   /** The picture's pixels, from the top. @returns {Uint8Array} [height, width, 4] */
   pixels() {
     const { gl } = this;
@@ -250,7 +267,7 @@ function target(gl, textures) {
   });
   gl.drawBuffers(places);
   if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) {
-    throw new CannotDrawError("This GPU has no memory or no format for the picture.");
+    throw new CannotDrawError("This GPU has no memory or no format for the picture.", "too_large");
   }
   return made;
 }
@@ -273,7 +290,7 @@ function linked(gl, vertex, fragment) {
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
     const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
-    throw new CannotDrawError(`A program of the page does not compile here. ${logs.join(" ")}`);
+    throw new CannotDrawError(`A program of the page does not compile here. ${logs.join(" ")}`, "no_floats");
   }
   const places = new Map();
   const placeOf = (name) => {

@@ -27,24 +27,32 @@ export class Player {
    * @param {{manifest: Record<string, any>, scene: ArrayBuffer}} files
    * @param {HTMLCanvasElement | OffscreenCanvas} canvas to draw on, of this player alone
    * @param {(share: number) => void} [onProgress]
+   * @param {AbortSignal} [signal] ends it early, as an error
    * @returns {Promise<Player>}
    * @throws DamagedError, CannotDrawError
    */
-  static async of({ manifest, scene }, canvas, onProgress) {
+  static async of({ manifest, scene }, canvas, onProgress, signal) {
     if (manifest.coding !== "compact" || manifest.deformation !== "shared") {
-      throw new CannotDrawError(`Scenes of this kind (${manifest.deformation}) are drawn by the service.`);
+      throw new CannotDrawError(`Scenes of this kind (${manifest.deformation}) are drawn by the service.`, "kind");
     }
     await checkHash(scene, manifest.files[SCENE]);
     const began = performance.now();
-    const table = await readTable(scene, onProgress);
+    const table = await readTable(scene, onProgress, signal);
     const decoded = performance.now();
     const worker = new Worker(new URL("./order.worker.js", import.meta.url), { type: "module" });
-    const buffers = table.tables.map((each) => each.buffer);
-    const packed = await answered(worker, { table, manifest }, buffers);
-    const ready = performance.now();
-    const drawing = new Drawing(canvas, table, packed);
-    const times = { decodeMs: decoded - began, packMs: ready - decoded, uploadMs: performance.now() - ready };
-    return new Player(manifest, table, worker, drawing, times);
+    try {
+      const buffers = table.tables.map((each) => each.buffer);
+      const packed = await answered(worker, { table, manifest }, buffers);
+      signal?.throwIfAborted();
+      const ready = performance.now();
+      const drawing = new Drawing(canvas, table, packed);
+      const times = { decodeMs: decoded - began, packMs: ready - decoded, uploadMs: performance.now() - ready };
+      return new Player(manifest, table, worker, drawing, times);
+    } catch (error) {
+      worker.terminate();
+      canvas.getContext("webgl2")?.getExtension("WEBGL_lose_context")?.loseContext();
+      throw error;
+    }
   }
 
   /** Use Player.of(). */
@@ -54,6 +62,9 @@ export class Player {
     this.cameras = new Cameras(manifest);
     this.poseWarnings = manifest.settings?.pose_warnings ?? [];
     this.isClosed = false;
+    /** Broken when the scene is let go of: a worker that has ended answers nobody. */
+    this.closing = new Promise((_, reject) => (this.reject = reject));
+    this.closing.catch(() => {});
     this.deformedAt = null; // the time that the GPU's Gaussians are at
     this.sortedFor = ""; // the view that their order is of
     this.sorting = null; // a promise, while the worker sorts
@@ -76,7 +87,7 @@ export class Player {
         if (key !== this.sortedFor) await this.#sort(key, t, rows[2]);
       } else if (!this.sorting) this.#sort(key, t, rows[2]).catch(() => {}); // the next still picture tells of it
     }
-    if (this.isClosed) throw new CannotDrawError("The scene is closed.");
+    if (this.isClosed) throw new CannotDrawError("The scene is closed.", "closed");
     this.#deform(t, view.isTimed);
     const began = performance.now();
     const shine = this.cameras.gloss(t, view.pose, view.highlights !== false);
@@ -89,6 +100,11 @@ export class Player {
     return { t, unseen, warnings: this.#warnings(view, t, unseen, hardlySeen) };
   }
 
+  /** Kept when the GPU has drawn the last picture; to draw the next one sooner would only queue it. */
+  settled() {
+    return this.drawing.settled();
+  }
+
   /** The picture's pixels as they were drawn, from the top. @returns {Uint8Array} [height, width, 4] */
   pixels() {
     return this.drawing.pixels();
@@ -97,6 +113,7 @@ export class Player {
   /** Let the scene go. */
   close() {
     this.isClosed = true;
+    this.reject(new CannotDrawError("The scene is closed.", "closed"));
     this.worker.terminate();
     this.drawing.close();
   }
@@ -113,7 +130,7 @@ export class Player {
 
   async #sort(key, t, row) {
     const message = { id: ++this.id, patterns: patternsAt(this.table, t), row, seconds: this.cameras.seconds(t) };
-    this.sorting = answered(this.worker, message).finally(() => (this.sorting = null));
+    this.sorting = Promise.race([answered(this.worker, message), this.closing]).finally(() => (this.sorting = null));
     const { order, values, ms } = await this.sorting;
     if (this.isClosed) return;
     this.times.sortMs = ms;
@@ -152,7 +169,7 @@ export class Player {
 /** The worker's next answer. */
 function answered(worker, message, buffers = []) {
   return new Promise((resolve, reject) => {
-    worker.onerror = () => reject(new CannotDrawError("A worker of the page could not start."));
+    worker.onerror = () => reject(new CannotDrawError("A worker of the page could not start.", "no_worker"));
     worker.onmessage = ({ data }) => (data.error ? reject(new DamagedError(data.error)) : resolve(data));
     worker.postMessage(message, buffers);
   });

@@ -13,22 +13,31 @@ precision highp float;
 out vec4 made;
 void main() { made = vec4(exp(-fract(gl_FragCoord.x * 0.01)) * 0.01); }`;
 
-/** @typedef {{isFast: boolean, name: string, why: string}} Graphics why: in words, if it is not fast */
+/**
+ * canDraw: at all. isFast: at a display's rate. why: a code, if it is not fast.
+ * @typedef {{canDraw: boolean, isFast: boolean, name: string, why: "no_webgl"|"no_floats"|"software"|""}} Graphics
+ */
+
+/** @type {Graphics | null} */
+let found = null;
+
+/** What this browser draws with, found out once. @returns {Graphics} */
+export const graphics = () => (found ??= look());
 
 /** @returns {Graphics} */
-export function graphics() {
+function look() {
   const canvas = document.createElement("canvas");
   canvas.width = canvas.height = SIDE;
   const gl = canvas.getContext("webgl2", { antialias: false, depth: false });
-  if (!gl) return { isFast: false, name: "", why: "this browser has no WebGL2" };
+  if (!gl) return { canDraw: false, isFast: false, name: "", why: "no_webgl" };
   try {
     if (!gl.getExtension("EXT_color_buffer_float")) {
-      return { isFast: false, name: "", why: "WebGL2 has no targets in floats here" };
+      return { canDraw: false, isFast: false, name: "", why: "no_floats" };
     }
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     const name = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
     const isSoftware = SOFTWARE.test(name) || (!info && fillMs(gl) > SLOW_MS);
-    return { isFast: !isSoftware, name, why: isSoftware ? "this browser draws without a GPU" : "" };
+    return { canDraw: true, isFast: !isSoftware, name, why: isSoftware ? "software" : "" };
   } finally {
     gl.getExtension("WEBGL_lose_context")?.loseContext();
   }

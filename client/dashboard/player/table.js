@@ -1,6 +1,7 @@
 // The table of a scene, decoded by several workers at a time.
 
 import { DamagedError, groupsOf, partsOf, PARTS } from "./decode.js";
+import { CannotDrawError } from "./draw.js";
 import { tensorsOf } from "./safetensors.js";
 
 /** Channels that move: place, shape; with colour; with gloss. */
@@ -17,9 +18,10 @@ const MAX_NUMBERS = 7 * 2 ** 25;
 /**
  * @param {ArrayBuffer} file scene.safetensors, compact
  * @param {(share: number) => void} [onProgress]
+ * @param {AbortSignal} [signal] ends it early, as an error
  * @returns {Promise<Table>}
  */
-export async function readTable(file, onProgress = () => {}) {
+export async function readTable(file, onProgress = () => {}, signal = undefined) {
   const tensors = tensorsOf(file);
   const [channels, patterns, bases] = tensors.pattern.shape;
   const count = Number(tensors.count.data[0]);
@@ -49,7 +51,7 @@ export async function readTable(file, onProgress = () => {}) {
       onProgress(done / PARTS);
       return answer;
     }));
-    const all = await Promise.all(answers);
+    const all = await unlessAborted(Promise.all(answers), signal);
     return {
       count,
       atRest,
@@ -68,6 +70,17 @@ export async function readTable(file, onProgress = () => {}) {
   }
 }
 
+/** @template T @param {Promise<T>} work @param {AbortSignal} [signal] @returns {Promise<T>} */
+function unlessAborted(work, signal) {
+  if (!signal) return work;
+  return new Promise((resolve, reject) => {
+    const giveUp = () => reject(signal.reason);
+    if (signal.aborted) giveUp();
+    signal.addEventListener("abort", giveUp, { once: true });
+    work.then(resolve, reject).finally(() => signal.removeEventListener("abort", giveUp));
+  });
+}
+
 /**
  * @param {Worker} worker
  * @param {(message: any) => void} onMessage told of what comes before
@@ -75,7 +88,7 @@ export async function readTable(file, onProgress = () => {}) {
  */
 function answerOf(worker, onMessage) {
   return new Promise((resolve, reject) => {
-    worker.addEventListener("error", () => reject(new Error("A worker of the page could not start.")));
+    worker.addEventListener("error", () => reject(new CannotDrawError("A worker of the page could not start.", "no_worker")));
     worker.addEventListener("message", ({ data }) => {
       if (data.error) reject(new DamagedError(data.error));
       else if (data.table) resolve(data);

@@ -1,0 +1,69 @@
+// Who draws, why, and how fast: in words, with a choice and figures below.
+
+import { element } from "./element.js";
+import { CHOICES } from "./memory.js";
+import { figure, languageEvents, words } from "./messages.js";
+import { graphics } from "./player/support.js";
+
+export class Way {
+  /**
+   * @param {HTMLDetailsElement} target
+   * @param {import("./memory.js").Memory} memory
+   * @param {() => void} onOpen the figures are wanted
+   */
+  constructor(target, memory, onOpen) {
+    Object.assign(this, { target, memory });
+    this.summary = element("summary");
+    this.reason = element("p");
+    this.choice = element("select");
+    this.label = element("span");
+    this.figures = element("output", { class: "quiet" });
+    target.replaceChildren(
+      this.summary,
+      element("div", { class: "panel" }, this.reason, element("label", {}, this.label, this.choice), this.figures),
+    );
+    this.choice.addEventListener("change", () => memory.choose(this.choice.value));
+    target.addEventListener("toggle", () => target.open && onOpen());
+    languageEvents.addEventListener("changed", () => this.#word());
+    this.#word();
+  }
+
+  /** Whether somebody reads the figures. */
+  get isOpen() {
+    return this.target.open;
+  }
+
+  /** @param {string | null} why the service draws, a code; null: this browser does */
+  tell(why) {
+    const { step, share } = this.memory;
+    this.target.dataset.way = why === null ? "memory" : "service";
+    this.target.dataset.why = why ?? "";
+    const title = why === null ? "way.here" : "way.there";
+    setText(this.summary, step ? words(`way.${step}`, { share: figure(100 * share) }) : words(title));
+    setText(this.reason, why === null ? words("way.here_why") : words(`way.why_${why}`));
+    if (why !== null) setText(this.figures, "");
+  }
+
+  /** @param {{rate: number, camera: import("./stream.js").Camera}} drawn pictures a second, and the last one's camera */
+  tellFigures({ rate, camera }) {
+    const { player } = this.memory;
+    if (!player || !this.isOpen) return;
+    const ms = (value) => (value === undefined ? "–" : figure(value, value < 10 ? 1 : 0));
+    const { decodeMs, packMs, deformMs, sortMs, drawMs } = player.times;
+    const times = { decode: ms(decodeMs + packMs), deform: ms(deformMs), sort: ms(sortMs), draw: ms(drawMs) };
+    const size = { width: camera.width, height: camera.height, gpu: graphics().name };
+    setText(this.figures, words("way.figures", { rate: figure(rate), ...times, ...size }));
+  }
+
+  #word() {
+    setText(this.label, words("way.choice"));
+    const options = CHOICES.map((value) => new Option(words(`way.${value}`), value));
+    this.choice.replaceChildren(...options);
+    this.choice.value = this.memory.choice;
+  }
+}
+
+/** Only where it changes, so that screen readers are told once. */
+function setText(target, text) {
+  if (target.textContent !== text) target.textContent = text;
+}
