@@ -4,11 +4,13 @@
 import { figure, words } from "./messages.js";
 
 const WIDTH = 300;
-const HEIGHT = 120;
+const HEIGHT = 160;
 const LEFT = 30;
 const RIGHT = 6;
-const TOP = 8;
-const BOTTOM = 18;
+const TOP = 14;
+const BOTTOM = 36;
+/** Between the feet of two lines of text. */
+const LINE = 14;
 /** The axis spans at least so much, so that noise does not look like progress. */
 const MIN_SPAN_DB = 4;
 
@@ -40,6 +42,22 @@ function draw(svg, tag, attributes, text = "") {
 }
 
 /**
+ * Dashed lines with their names, from the top downwards; names that would overlap make room for each other.
+ * @param {SVGSVGElement} svg
+ * @param {{name: string, db: number}[]} baselines
+ * @param {(db: number) => number} y
+ */
+function drawBaselines(svg, baselines, y) {
+  const fromTop = [...baselines].sort((a, b) => b.db - a.db);
+  let foot = TOP - LINE; // of the name before
+  for (const { name, db } of fromTop) {
+    foot = Math.max(y(db) - 3, foot + LINE);
+    draw(svg, "line", { class: "baseline", x1: LEFT, x2: WIDTH - RIGHT, y1: y(db), y2: y(db) });
+    draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: foot }, `${name} ${figure(db, 1)}`);
+  }
+}
+
+/**
  * @param {SVGSVGElement} svg
  * @param {Point[]} points
  * @param {{name: string, db: number}[]} baselines
@@ -60,10 +78,6 @@ export function drawCurve(svg, points, baselines) {
     draw(svg, "line", { class: "grid", x1: LEFT, x2: WIDTH - RIGHT, y1: y(db), y2: y(db) });
     draw(svg, "text", { class: "tick right", x: LEFT - 4, y: y(db) + 3 }, String(db));
   }
-  for (const { name, db } of baselines) {
-    draw(svg, "line", { class: "baseline", x1: LEFT, x2: WIDTH - RIGHT, y1: y(db), y2: y(db) });
-    draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: y(db) - 3 }, `${name} ${figure(db, 1)}`);
-  }
   const line = (name, corners, radius) => {
     const places = corners.map(([iteration, db]) => [x(iteration).toFixed(1), y(db).toFixed(1)]);
     draw(svg, "polyline", { class: name, points: places.join(" ") });
@@ -71,9 +85,9 @@ export function drawCurve(svg, points, baselines) {
   };
   if (right.length > 0) line("beside", right.map((each) => [each.iteration, each.rightDb]), 1.8);
   line("score", points.map((each) => [each.iteration, each.db]), 2.5);
-  const what = words(right.length > 0 ? "curve.axes_both" : "curve.axes");
-  draw(svg, "text", { class: "tick", x: LEFT, y: HEIGHT - 4 }, what);
-  draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: HEIGHT - 4 }, String(last));
+  drawBaselines(svg, baselines, y); // over the lines, so that they can be read
+  draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: HEIGHT - 4 - LINE }, words("curve.steps", { count: figure(last) }));
+  draw(svg, "text", { class: "tick", x: LEFT, y: HEIGHT - 4 }, words(right.length > 0 ? "curve.axes_both" : "curve.axes"));
   const beside = right.length > 0 ? words("curve.beside", { db: figure(right.at(-1).rightDb, 1) }) : "";
   const score = `${figure(points.at(-1).db, 1)} dB${beside}`;
   svg.setAttribute("aria-label", words("curve.name", { score, last }));

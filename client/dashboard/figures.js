@@ -88,6 +88,29 @@ function list(title, notices) {
   return [element("dt", { text: words(title) }), element("dd", {}, element("ul", {}, ...notices.map(raw)))];
 }
 
+/**
+ * Every number and word of a report by its name in the API; lists by their length.
+ * @param {Record<string, any>} values
+ * @param {string} [within] the name of what holds them
+ * @returns {[string, string][]}
+ */
+function rawFigures(values, within = "") {
+  return Object.entries(values).flatMap(([name, value]) => {
+    if (value === null || value === undefined) return [];
+    if (Array.isArray(value)) return [[`${within}${name}`, `[${value.length}]`]];
+    return typeof value === "object" ? rawFigures(value, `${within}${name}.`) : [[`${within}${name}`, String(value)]];
+  });
+}
+
+/** @param {Report} report @returns {HTMLElement} for programs and those who write them */
+function everything(report) {
+  const lines = rawFigures(report).map(([name, value]) =>
+    element("tr", {}, element("th", { text: name }), element("td", { text: value })));
+  const table = element("table", { class: "everything" }, element("tbody", {}, ...lines));
+  table.lang = "en";
+  return element("details", {}, element("summary", { text: words("figure.everything") }), table);
+}
+
 /** @param {Report} report @returns {HTMLElement} closed until somebody opens it */
 export function figuresOf(report) {
   const lines = element("dl");
@@ -100,5 +123,5 @@ export function figuresOf(report) {
     ...list("figure.notes_title", of("info")),
     ...list("figure.assumed_title", report.assumptions),
   );
-  return element("details", { class: "figures" }, element("summary", { text: words("report.details") }), lines);
+  return element("details", { class: "figures" }, element("summary", { text: words("report.details") }), lines, everything(report));
 }

@@ -12,15 +12,31 @@ import { figure, words } from "./messages.js";
 /** @param {Report["masks"]} masks */
 const areFound = (masks) => masks?.source === "found" || masks?.source === "segmenter";
 
-/** What the clip showed, a sentence each. @param {Report} report */
-function seen({ frame_count: frames, frame_times_s: times, width, height, eyes, poses, masks, coverage }) {
+/** More reasons for care than these are under "details". */
+const MAX_REASONS = 3;
+
+/** What can be trusted, a sentence each, in mm, seconds and shares of the picture. @param {Report} report */
+function trusted(report) {
+  const { frame_count: frames, frame_times_s: times, eyes, poses, masks, coverage, depth_agreement_mm: depth_mm } = report;
   const seconds = figure((times.at(-1) ?? 0) - (times[0] ?? 0), 1);
-  const sentences = [words("report.clip", { frames: figure(frames), seconds, width, height })];
-  if (eyes) sentences.push(words(`report.eyes_${eyes}`));
-  if (poses) sentences.push(words(`report.camera_${poses.source}`, { path: figure(poses.path_mm ?? 0, 0) }));
-  if (masks) sentences.push(words(masks.source === "none" ? "report.no_masks" : "report.masks", { share: percent(masks.share) }));
+  const sentences = [words(`report.clip${eyes ? `_${eyes}` : ""}`, { frames: figure(frames), seconds })];
+  const isMeasured = Number.isFinite(depth_mm);
+  sentences.push(words(isMeasured ? "report.depth" : "report.no_depth", { mm: figure(depth_mm ?? 0, 1) }));
   if (Number.isFinite(coverage)) sentences.push(words("report.covered", { share: percent(coverage) }));
+  if (masks) sentences.push(words(masks.source === "none" ? "report.no_masks" : "report.masks", { share: percent(masks.share) }));
+  if (poses?.source === "estimated") sentences.push(words("report.camera_estimated", { mm: figure(poses.path_mm ?? 0) }));
+  else if (poses) sentences.push(words(`report.camera_${poses.source}`));
   return sentences;
+}
+
+/** Why to be careful, the worst first. @param {Report} report @param {import("./light.js").Trust} trust @returns {Node[]} */
+function careful(report, trust) {
+  const reasons = reasonsOf(trust);
+  const more = reasons.length - MAX_REASONS;
+  const shown = reasons.length > 0 ? [listOf(reasons.slice(0, MAX_REASONS), "reasons")] : [];
+  if (more > 0) shown.push(element("p", { class: "quiet", text: words("report.more_reasons", { count: more }) }));
+  const sides = Number.isFinite(report.psnr_right_db) ? "report.tested_beside" : "report.tested_here";
+  return [element("h3", { text: words("report.careful") }), ...shown, element("p", { class: "quiet", text: words(sides) })];
 }
 
 const listOf = (sentences, name) => element("ul", { class: name }, ...sentences.map((text) => element("li", { text })));
@@ -42,16 +58,15 @@ function correction(id, { masks }, message, onMasks) {
  */
 export function showReport(target, id, report, onMasks) {
   const trust = trustOf(report);
-  const reasons = reasonsOf(trust);
   const message = element("div", { class: "message bad" });
   const isOpen = target.querySelector("details.figures")?.open ?? false;
   const figures = figuresOf(report);
   figures.open = isOpen;
   target.replaceChildren(
     element("div", { class: "verdict" }, lightMark(trust.light), element("p", { text: words(`light.${trust.light}_why`) })),
-    ...(reasons.length > 0 ? [element("h3", { text: words("report.careful") }), listOf(reasons, "reasons")] : []),
-    element("h3", { text: words("report.seen") }),
-    listOf(seen(report), "seen"),
+    element("h3", { text: words("report.trusted") }),
+    listOf(trusted(report), "trusted"),
+    ...careful(report, trust),
     figures,
     ...correction(id, report, message, onMasks),
     message,

@@ -102,7 +102,7 @@ def test_the_types_and_limits_are_what_contract_wire_generates() -> None:
 
 def test_the_form_has_words_for_each_choice_and_a_field_for_options_alone() -> None:
     page, script = (DASHBOARD / "index.html").read_text(), (DASHBOARD / "options.js").read_text()
-    (listed,) = re.findall(r"const OPTIONS = \[(.*)\]", script)
+    (listed,) = re.findall(r"const OPTIONS = \[(.*?)\n\];", script, re.DOTALL)
     named = set()
     for name in re.findall(r'"(\w+)"', listed):
         assert f'name="{name}"' in page

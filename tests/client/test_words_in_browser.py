@@ -103,7 +103,7 @@ def test_a_german_browser_reads_german(site: Site, german: Page) -> None:
     site.queue.fail(site.claim(), JobError(code=ErrorCode.TRAINING_DIVERGED, problem="NaN."))
     scene = site.scene()
     german.press(scene, say("job.view", "de"))
-    german.until_text("#report", say("report.seen", "de"))
+    german.until_text("#report", say("report.trusted", "de"))
     german.until_text(f'[data-job="{failed}"]', say("problem.training_diverged", "de"))
     assert german.script("return document.documentElement.lang") == "de"
 
