@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from contract.runtime.exits import ExitCode
-from contract.wire.names import CURVE, REPORT, PresetName
+from contract.wire.names import CURVE, RECORDED, REPORT, PresetName
 from contract.wire.notices import NoticeCode
 from contract.wire.report import Report
 from worker.__main__ import main
@@ -177,10 +177,10 @@ def test_an_interrupted_run_goes_on_with_the_same_command(clip: Path, tmp_path: 
 def test_a_run_killed_while_it_wrote_a_state_or_its_results_starts_again_in_its_folder(
     clip: Path, tmp_path: Path
 ) -> None:
-    for name in (f".{RESUME_FILE}.new", REPORT, CURVE, ".manifest.json.new"):
+    for name in (f".{RESUME_FILE}.new", REPORT, CURVE, f".{RECORDED}.new", ".manifest.json.new"):
         (tmp_path / name).write_bytes(b"cut off")
     assert main(["reconstruct", str(clip), "--iterations", "5", "--out", str(tmp_path)]) == ExitCode.OK
-    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "scene.safetensors", REPORT, CURVE}
+    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "scene.safetensors", REPORT, CURVE, RECORDED}
 
 
 def test_a_finished_scene_is_not_replaced(clip: Path, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
