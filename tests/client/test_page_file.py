@@ -24,6 +24,8 @@ from contract.wire.errors import InputError, SceneError, UnavailableError
 from tests.archives import ORIGIN, small_scene, stored
 from tests.client.page import browser
 from tests.client.player import drawing_browser
+from tests.client.test_accessible_in_browser import RUN
+from tests.client.test_accessible_in_browser import axe as axe
 from tests.client.test_player import scattered
 from tests.client.words import table
 from tests.worker.scenes import random_scene
@@ -186,6 +188,15 @@ def test_without_webgl2_and_with_a_damaged_scene_it_says_so(driver: webdriver.Ch
         blind.execute_cdp_cmd("Emulation.setLocaleOverride", {"locale": "en-GB"})
         opened(blind, file, "refused")
         assert text(blind, "#message") == TABLE["refused"].format(why=TABLE["no_webgl2"])
+
+
+def test_axe_finds_nothing_on_it(driver: webdriver.Chrome, file: Path, axe: str) -> None:
+    driver.execute_cdp_cmd("Page.setBypassCSP", {"enabled": True})
+    opened(driver, file, "shown")
+    driver.find_element(By.CSS_SELECTOR, "summary").click()
+    found = driver.execute_async_script(RUN, axe)
+    assert found == []
+    driver.execute_cdp_cmd("Page.setBypassCSP", {"enabled": False})
 
 
 def test_the_command_line_writes_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
