@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from tests.client.page import Page, Site
+from tests.client.test_compare_in_browser import choose, recorded_scene
 from tests.client.test_theatre_in_browser import SIZES, screen_of
 from tests.client.words import LANGUAGES, say
 
@@ -70,7 +71,7 @@ def test_axe_finds_nothing_in_any_state_of_the_page(
     with screen_of(page, width, height):
         page.until_text("#connection", say("page.ready", language))
         found["empty"] = violations(page, axe)
-        scene = site.scene()
+        scene = recorded_scene(site)
         page.until(lambda: page.script("return document.querySelectorAll('#jobs .done').length") == 1)
         found["library"] = violations(page, axe)
         page.press(scene, say("job.view", language))
@@ -78,6 +79,10 @@ def test_axe_finds_nothing_in_any_state_of_the_page(
         page.until_text("#time-value", "40")
         page.script("document.querySelector('#loop-start').click()")
         found["scene"] = violations(page, axe)
+        page.until_text("#report", "dB")
+        for mode in ("wipe", "side", "off"):
+            choose(page, mode)
+            found[mode] = violations(page, axe)
         for drawer in ("drawer", "report-drawer"):
             page.show(drawer)
             page.until(lambda drawer=drawer: page.find(f"#{drawer}").is_displayed())  # type: ignore[misc]
@@ -125,9 +130,11 @@ def test_nothing_overlaps_or_lies_off_the_screen_and_all_can_be_touched(
     page.script("localStorage.setItem('intrasplat-language', arguments[0])", language)
     page.driver.refresh()
     with screen_of(page, width, height):
-        page.press(site.scene(), say("job.view", language))
+        page.press(recorded_scene(site), say("job.view", language))
         page.until_state("live")
         page.until_text("#time-value", "40")
+        page.until_text("#report", "dB")
+        choose(page, "wipe")
         page.script("for (const id of ['step-on', 'step-on', 'loop-start']) document.getElementById(id).click()")
         page.find("#stage")
         page.until(lambda: page.find("#loop-all").is_displayed())
