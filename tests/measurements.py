@@ -1,6 +1,6 @@
 """What is measured in a scene that is only painted: flat tissue 60 mm before an endoscope that rests.
 
-The right fifth of its picture is unsure, the lower fifth was never seen, and the rest stretches and shrinks by a tenth.
+The right fifth of its picture is unsure, the upper fifth was never seen, and the rest stretches and shrinks by a tenth.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from contract.wire.measuring import MeasuredDistance, MeasuredPoint, Measurement
 from contract.wire.rendering import MeasureRequest
 from tests.cameras import CAMERAS, FRAMES, RATE_HZ
 from worker.daemon.serve import Reply
+from worker.input.camera import Intrinsics
 
 DEPTH_MM, UNCERTAINTY_MM = 60.0, 0.4
 RANGE_MM = (45.0, 78.0)
@@ -19,8 +20,16 @@ RANGE_MM = (45.0, 78.0)
 def measured_flat(request: MeasureRequest) -> Measurement:
     """As a worker would measure it."""
     k = CAMERAS.intrinsics
-    width, height = request.camera.size(k.width, k.height)
-    points = tuple(_point(number, point, width, height) for number, point in enumerate(request.points))
+    asked, (width, height) = request.camera, request.camera.size(k.width, k.height)
+    camera = Intrinsics(
+        width=width,
+        height=height,
+        fx=asked.fx or k.fx * width / k.width,
+        fy=asked.fy or k.fy * height / k.height,
+        cx=asked.cx or k.cx * width / k.width,
+        cy=asked.cy or k.cy * height / k.height,
+    )
+    points = tuple(_point(number, point, camera) for number, point in enumerate(request.points))
     distance = None
     if len(points) == 2 and not any(each.refusal for each in points):
         distance = _distance(request.t, points)
@@ -37,14 +46,13 @@ def stretch(t: float) -> float:
     return 1 + 0.1 * math.sin(2 * math.pi * t)
 
 
-def _point(number: int, point: Point, width: int, height: int) -> MeasuredPoint:
-    (x, y), k = point, CAMERAS.intrinsics
-    if x > 0.8 * width or y > 0.8 * height:
-        code = RefusalCode.UNSEEN if y > 0.8 * height else RefusalCode.LOW_CONFIDENCE
+def _point(number: int, point: Point, k: Intrinsics) -> MeasuredPoint:
+    x, y = point
+    if x > 0.8 * k.width or y < 0.2 * k.height:
+        code = RefusalCode.UNSEEN if y < 0.2 * k.height else RefusalCode.LOW_CONFIDENCE
         refusal = Refusal(code=code, field=f"points[{number}]", problem="It is unsure.", remedy="Choose another.")
         return MeasuredPoint(x=x, y=y, confidence=0.2, refusal=refusal)
-    fx, fy = k.fx * width / k.width, k.fy * height / k.height
-    place = (DEPTH_MM * (x - k.cx * width / k.width) / fx, DEPTH_MM * (y - k.cy * height / k.height) / fy, DEPTH_MM)
+    place = (DEPTH_MM * (x - k.cx) / k.fx, DEPTH_MM * (y - k.cy) / k.fy, DEPTH_MM)
     return MeasuredPoint(
         x=x,
         y=y,
@@ -52,7 +60,7 @@ def _point(number: int, point: Point, width: int, height: int) -> MeasuredPoint:
         depth_mm=DEPTH_MM,
         uncertainty_mm=UNCERTAINTY_MM,
         point_mm=place,
-        mm_per_px=DEPTH_MM / fx,
+        mm_per_px=DEPTH_MM / k.fx,
     )
 
 

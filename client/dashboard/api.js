@@ -99,6 +99,12 @@ export const purgeScene = (id) => json(`/scenes/${id}`, { method: "DELETE" });
 export const getReport = (id) => json(`/scenes/${id}`);
 /** @param {string} id @returns {Promise<import("./wire.js").SceneCameras>} */
 export const getCameras = (id) => json(`/scenes/${id}/cameras`);
+/**
+ * @param {string} id
+ * @param {Record<string, string | number>} query of GET /scenes/{id}/measure
+ * @returns {Promise<import("./wire.js").Measurement>}
+ */
+export const getMeasurement = (id, query) => json(`/scenes/${id}/measure?${new URLSearchParams(query)}`);
 /** @param {string} id @returns {Promise<string>} CSV */
 export const getCurve = async (id) => (await request(`/scenes/${id}/curve`)).text();
 /**

@@ -17,9 +17,13 @@ import { JobList } from "./joblist.js";
 import { Jobs } from "./jobs.js";
 import { currentKey, keyEvents, showKeyForm } from "./key.js";
 import { listenToKeys, onKeys } from "./keys.js";
+import { Legend } from "./legend.js";
+import { Measure } from "./measure.js";
 import { languageEvents, showWords, words } from "./messages.js";
 import { pause } from "./pause.js";
+import { Probe } from "./probe.js";
 import { showReport } from "./report.js";
+import { Scale } from "./scale.js";
 import { Scopes } from "./scopes.js";
 import { Shelf } from "./shelf.js";
 import { steer } from "./steer.js";
@@ -70,6 +74,11 @@ const compare = new Compare(viewer, {
   tools: get("compare-tools"),
   message: get("compare-message"),
 });
+const over = { stage: get("stage"), canvas: get("picture"), over: get("over") };
+new Probe(viewer, over);
+new Scale(viewer, { canvas: get("picture"), box: get("scale") });
+new Legend(viewer, get("legend"));
+const measure = new Measure(viewer, { ...over, button: get("measure"), panel: get("measuring") });
 const drawers = new Drawers(get("tools"));
 
 /** @type {string | null} the job that opens by itself as soon as there is something to see of it */
@@ -232,6 +241,7 @@ get("copy-link").addEventListener("click", () => address.copy());
 onKeys("full_screen", { f: [] }, toggleFullScreen);
 onKeys("copy_link", { l: [] }, () => address.copy());
 onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());
+onKeys("measure", { m: [] }, () => viewer.scene && measure.toggle());
 onKeys("help", { "?": [] }, showHelp);
 listenToKeys();
 if (!address.follow()) drawers.open("library", false);

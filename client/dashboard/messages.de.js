@@ -389,6 +389,37 @@ export const DE = {
     "no_eye": "Von diesem Auge sind keine Bilder der Aufnahme aufbewahrt.",
     "failed": "Die Bilder der Aufnahme können nicht gezeigt werden. {why}"
   },
+  "measure": {
+    "title": "Messen",
+    "research": "Nur für die Forschung.",
+    "first": "Wählen Sie den ersten Punkt: anklicken, oder das Kreuz mit den Pfeiltasten bewegen und Enter drücken. Escape beendet.",
+    "second": "Erster Punkt: {reading}. Wählen Sie den zweiten Punkt.",
+    "asking": "Es wird gemessen.",
+    "done": "Zweiter Punkt: {reading}.",
+    "moved": "Die Ansicht hat sich geändert. Wählen Sie den ersten Punkt noch einmal.",
+    "not_here": "Nur fertige Szenen können gemessen werden, und nicht in aufgenommenen Bildern.",
+    "outside": "Das liegt außerhalb des Bildes.",
+    "refused_first": "Nicht gemessen: {why}. Wählen Sie einen anderen Punkt.",
+    "refused_second": "Nicht gemessen: {why}. Wählen Sie einen anderen zweiten Punkt.",
+    "failed": "Es konnte nicht gemessen werden. {why}",
+    "low_confidence": "hier zu unsicher",
+    "unseen": "hier nie gesehen",
+    "depth": "{depth} ± {sigma} mm entfernt, Vertrauen {trust} %",
+    "distance": "{mm} ± {sigma} mm",
+    "away": "In diesem Moment nicht bekannt: Ein Punkt ist außerhalb des Blickfelds des Endoskops.",
+    "scale": "{length} mm, bei {depth} mm: der Tiefe in der Bildmitte",
+    "axes": "Abstand in mm, über Sekunden",
+    "over_time": "Der Abstand über den Clip: von {low} bis {high} mm",
+    "again": "Neue Punkte",
+    "end": "Beenden"
+  },
+  "legend": {
+    "depth": "Tiefe",
+    "confidence": "Vertrauen in Tiefe und Farbe",
+    "mm": "{mm} mm",
+    "sure": "sicher",
+    "unsure": "unsicher"
+  },
   "curve": {
     "steps": "{count} Schritte",
     "axes": "dB auf ungesehenen Bildern",
@@ -540,6 +571,7 @@ export const DE = {
     "home": "Zurück zum Endoskop",
     "eye": "Linkes Auge, rechtes Auge",
     "compare": "Mit der Aufnahme vergleichen: mit Trennlinie, daneben, aus",
+    "measure": "Messen, oder damit aufhören",
     "full_screen": "Ganzer Bildschirm",
     "copy_link": "Link zu dieser Ansicht kopieren",
     "help": "Diese Hilfe zeigen oder schließen"

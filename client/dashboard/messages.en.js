@@ -389,6 +389,37 @@ export const EN = {
     "no_eye": "Of this eye no recorded frames are kept.",
     "failed": "The recorded frames cannot be shown. {why}"
   },
+  "measure": {
+    "title": "Measure",
+    "research": "For research only.",
+    "first": "Choose the first point: click it, or move the cross with the arrow keys and press Enter. Escape ends.",
+    "second": "First point: {reading}. Choose the second point.",
+    "asking": "Measuring.",
+    "done": "Second point: {reading}.",
+    "moved": "The view has changed. Choose the first point again.",
+    "not_here": "Only finished scenes can be measured, and not in recorded frames.",
+    "outside": "This lies outside the picture.",
+    "refused_first": "Not measured: {why}. Choose another point.",
+    "refused_second": "Not measured: {why}. Choose another second point.",
+    "failed": "Nothing could be measured. {why}",
+    "low_confidence": "too unsure here",
+    "unseen": "never seen here",
+    "depth": "{depth} ± {sigma} mm away, trust {trust} %",
+    "distance": "{mm} ± {sigma} mm",
+    "away": "Not known at this moment: a point is out of the endoscope's view.",
+    "scale": "{length} mm, at {depth} mm: the depth in the middle of the picture",
+    "axes": "distance in mm, over seconds",
+    "over_time": "The distance over the clip: from {low} to {high} mm",
+    "again": "New points",
+    "end": "End"
+  },
+  "legend": {
+    "depth": "Depth",
+    "confidence": "Trust in depth and colour",
+    "mm": "{mm} mm",
+    "sure": "sure",
+    "unsure": "unsure"
+  },
   "curve": {
     "steps": "{count} steps",
     "axes": "dB on unseen frames",
@@ -540,6 +571,7 @@ export const EN = {
     "home": "Back to the endoscope",
     "eye": "Left eye, right eye",
     "compare": "Compare with the recording: with a seam, beside it, off",
+    "measure": "Measure, or end it",
     "full_screen": "Full screen",
     "copy_link": "Copy the link to this view",
     "help": "Show or close this help"

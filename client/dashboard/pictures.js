@@ -34,6 +34,7 @@ async function askOnce(path, signal) {
     codes: header("Warning-Codes")?.split(", ") ?? [],
     totalMs: total ? Number(total[1]) : NaN,
     camera: JSON.parse(header("Camera") ?? "null"),
+    depthRangeMm: header("Depth-Range-Mm")?.split(" ").map(Number) ?? null,
     way: "single",
   };
 }

@@ -11,9 +11,10 @@ import { connectionLost, errorWords, Problem } from "./problem.js";
 /**
  * What came: a file, or an image that this browser drew. way: how. isExtrapolated: it shows a guess, or a pose or time far
  * from the clip's. isRecorded: it is a frame of the clip, no render. Both are set by judged() of pictures.js.
+ * depthRangeMm: of depth in false colours, of the brightest and of the darkest.
  * @typedef {{blob?: Blob, image?: HTMLCanvasElement, scene: string, state: "running"|"done", t: number, iteration: number | null,
  *   unseen: number, warning: string, codes: string[], totalMs: number, way: "stream"|"single"|"memory",
- *   camera: Camera | null, isExtrapolated?: boolean, isRecorded?: boolean}} Picture
+ *   camera: Camera | null, depthRangeMm?: [number, number] | null, isExtrapolated?: boolean, isRecorded?: boolean}} Picture
  */
 /**
  * Where a picture was taken from, and through which lens: pixels of the picture as it came, and world_from_camera as 12
@@ -90,9 +91,9 @@ export class Stream {
     if (head.id !== this.pending?.id) return; // of a view that nobody waits for any more
     const { resolve } = this.pending;
     this.pending = null;
-    const { scene, state, t, iteration, unseen, camera, warnings, total_ms: totalMs } = head;
+    const { scene, state, t, iteration, unseen, camera, depth_range_mm: depthRangeMm, warnings, total_ms: totalMs } = head;
     const codes = warnings.map(({ code }) => code);
-    resolve({ blob, scene, state, t, iteration, unseen, warning: "", codes, totalMs, camera, way: "stream" });
+    resolve({ blob, scene, state, t, iteration, unseen, warning: "", codes, totalMs, camera, depthRangeMm, way: "stream" });
   }
 
   #fail(problem) {

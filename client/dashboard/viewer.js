@@ -26,7 +26,7 @@ const COARSE = "coarse";
  * camera: null where it is not known, as of recorded frames; way: how the picture came.
  * @typedef {{scene: string, t: number, pose: string | null, eye: "left"|"right", layer: string, unseen: "mark"|"guess",
  *   highlights: "on"|"off", state: "running"|"done", way: "stream"|"single"|"memory",
- *   camera: import("./stream.js").Camera | null}} Shown
+ *   camera: import("./stream.js").Camera | null, depthRangeMm?: [number, number] | null}} Shown
  */
 /** Not a layer of the model, but what the endoscope saw. */
 const RECORDED = "recorded";
@@ -259,6 +259,6 @@ export class Viewer extends EventTarget {
 }
 
 /** @param {import("./stream.js").View} view @param {import("./stream.js").Picture} picture @returns {Shown} */
-function shownOf({ scene, pose = null, eye = "left", layer, unseen, highlights }, { t, state, way, camera }) {
-  return { scene, t, pose, eye, layer, unseen, highlights, state, way, camera };
+function shownOf({ scene, pose = null, eye = "left", layer, unseen, highlights }, { t, state, way, camera, depthRangeMm }) {
+  return { scene, t, pose, eye, layer, unseen, highlights, state, way, camera, depthRangeMm };
 }

@@ -40,6 +40,7 @@ from contract.wire.rendering import (
     ExportRequest,
     Highlights,
     ImageFormat,
+    Layer,
     MeasureRequest,
     PictureCamera,
     RecordedRequest,
@@ -53,7 +54,7 @@ from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
 from tests.cameras import cameras_reply
-from tests.measurements import measurement_reply
+from tests.measurements import RANGE_MM, measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.pace import Pace
 from worker.daemon.serve import Reply, RequestServer
@@ -162,6 +163,7 @@ class Painter:
             iteration,
             0.12 if NoticeCode.UNSEEN in [each.code for each in warnings] else 0.0,
             camera=CAMERA,
+            depth_range_mm=RANGE_MM if request.layer is Layer.DEPTH else None,
         )
 
 

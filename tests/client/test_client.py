@@ -58,10 +58,10 @@ def test_a_clip_becomes_a_scene_with_report_curve_export_and_renders(
         client.file(job.id)
     assert set(client.key()["scopes"]) == set(KeyScope)
     assert client.recorded(job.id, 0.5) == b"jpeg"
-    measured = client.measure(job.id, [(10, 12), (20.5, 12)], t=0.25, width=120)
+    measured = client.measure(job.id, [(10, 40), (20.5, 40)], t=0.25, width=120)
     assert measured.distance is not None
     assert measured.distance.distance_mm == pytest.approx(10.5 / 2)
-    (refused,) = client.measure(job.id, [(59, 2)]).points
+    (refused,) = client.measure(job.id, [(59, 20)]).points
     assert refused.refusal is not None
     assert refused.refusal.code == "low_confidence"
     assert client.cameras(job.id).model_dump() == CAMERAS.model_dump()

@@ -14,14 +14,14 @@ from tests.service.under_test import ServiceUnderTest, assert_problem, bearer
 
 def test_points_of_a_view_are_measured_by_the_worker(service: ServiceUnderTest) -> None:
     scene = service.finished_scene()
-    asked = {"points": "10,12;20.5,12", "t": 0.25, "pose": "orbit:5,0,1", "width": 120, "height": 96}
+    asked = {"points": "10,40;20.5,40", "t": 0.25, "pose": "orbit:5,0,1", "width": 120, "height": 96}
     answer = service.http.get(f"/scenes/{scene}/measure", params=asked)
     assert answer.status_code == 200
     assert answer.headers["cache-control"] == "no-store"
     (request,) = service.painter.requests
     assert isinstance(request, MeasureRequest)
     assert (request.scene_id, request.attempt, request.t) == (scene, 1, 0.25)
-    assert request.points == ((10, 12), (20.5, 12))
+    assert request.points == ((10, 40), (20.5, 40))
     assert request.pose == OrbitPose(yaw_deg=5, pitch_deg=0, zoom=1)
     assert request.camera == IntrinsicsOverride(width=120, height=96)
     found = Measurement.model_validate(answer.json())

@@ -15,8 +15,7 @@ import torch
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest, SceneCameras
-from contract.wire.errors import InputError, LimitError, SceneError
-from contract.wire.measuring import Measurement
+from contract.wire.errors import LimitError, SceneError
 from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose
 from contract.wire.rendering import (
@@ -24,7 +23,6 @@ from contract.wire.rendering import (
     ImageFormat,
     IntrinsicsOverride,
     Layer,
-    MeasureRequest,
     RenderRequest,
     Unseen,
 )
@@ -134,24 +132,6 @@ def test_a_render_tells_its_camera(store: Store, scene_id: str) -> None:
     own = Views(store).answer(request_of(scene_id, t=1.0)).camera
     assert own is not None
     assert own.world_from_camera == tuple(scene().world_from_camera[-1, :3].flatten())
-
-
-def test_points_of_a_stored_scene_are_measured_at_their_depth(store: Store, scene_id: str) -> None:
-    middle = (CLIP.width / 2, CLIP.height / 2)
-    asked = MeasureRequest(scene_id=scene_id, attempt=1, t=0.25, points=(middle, (middle[0] + 10, middle[1])))
-    views = Views(store)
-    reply = views.answer(asked)
-    assert (reply.media_type, reply.t, reply.is_kept) == ("application/json", 0.25, True)
-    found = Measurement.model_validate_json(reply.body)
-    assert [each.depth_mm for each in found.points] == pytest.approx([60 / UNITS_PER_MM] * 2, rel=0.05)
-    assert found.distance is not None
-    assert found.distance.distance_mm == pytest.approx(10 * 60 / UNITS_PER_MM / CLIP.fx, rel=0.1)
-    assert found.depth_range_mm[0] <= 60 / UNITS_PER_MM <= found.depth_range_mm[1]
-    assert views.cost(asked) > 0
-    with pytest.raises(InputError, match="outside the picture"):
-        views.answer(asked.model_copy(update={"points": ((-1.0, 0.0),)}))
-    with pytest.raises(SceneError):
-        views.answer(asked.model_copy(update={"scene_id": new_job_id()}))
 
 
 def test_a_time_after_the_clip_shows_its_last_frame_and_warns(store: Store, scene_id: str) -> None:

@@ -1,0 +1,192 @@
+"""Measuring in a real browser: under the pointer, between two points, over time, by mouse and by keyboard."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import Select
+
+from contract.wire.colours import COLOUR_TABLE
+from tests.client.page import CAMERA, Page, Site
+from tests.client.words import say
+from tests.measurements import DEPTH_MM, RANGE_MM, UNCERTAINTY_MM, stretch
+
+MM_A_PIXEL = DEPTH_MM / CAMERA.fx
+PLACES = """
+const { placeInPicture } = await import("/pointer.js");
+const { viewer } = await import("/main.js");
+const { u, v, scale } = placeInPicture(document.querySelector("#picture"), viewer.shown.camera, 0, 0);
+return [u, v, scale, viewer.shown.camera.width, viewer.shown.camera.height];
+"""
+
+
+def viewed(site: Site, page: Page) -> None:
+    page.press(site.scene(), "View")
+    page.until_state("live")
+
+
+def on_screen(page: Page, x: float, y: float) -> tuple[int, int]:
+    """Where a point of the picture, in shares of it, is on the screen."""
+    u, v, scale, width, height = page.script(f"return (async () => {{ {PLACES} }})()")
+    return round(scale * (x * width - u)), round(scale * (y * height - v))
+
+
+def point(page: Page, x: float, y: float) -> ActionChains:
+    """The mouse at a point of the picture, in shares of it."""
+    actions = ActionChains(page.driver, duration=0)
+    actions.w3c_actions.pointer_action.move_to_location(*on_screen(page, x, y))
+    return actions
+
+
+def click_at(page: Page, x: float, y: float) -> None:
+    point(page, x, y).click().perform()
+
+
+def start(site: Site, page: Page) -> None:
+    viewed(site, page)
+    page.click("#measure")
+    page.until_text("#measuring .told", say("measure.first"))
+
+
+def distance_of(page: Page) -> float:
+    """As the page says it, in mm."""
+    return float(page.text("#measuring .distance").split()[0])
+
+
+def test_the_pages_colours_are_the_workers(page: Page) -> None:
+    found = page.script("return (async () => [...(await import('/colours.js')).COLOURS])()")
+    assert bytes(found) == COLOUR_TABLE
+
+
+def test_depth_and_trust_are_told_where_the_pointer_rests_and_go_when_it_moves(site: Site, page: Page) -> None:
+    viewed(site, page)
+    point(page, 0.4, 0.4).perform()
+    page.until_text(".probe", say("measure.depth", depth=f"{DEPTH_MM:.1f}", sigma=f"{UNCERTAINTY_MM}", trust="90"))
+    point(page, 0.9, 0.4).perform()
+    page.until_text(".probe", say("measure.low_confidence"))
+    point(page, 0.4, 0.1).perform()
+    page.until_text(".probe", say("measure.unseen"))
+    page.script("document.querySelector('#stage').dispatchEvent(new PointerEvent('pointerleave'))")
+    assert page.text(".probe") == ""
+
+
+def test_two_clicks_measure_and_the_distance_follows_the_time(site: Site, page: Page) -> None:
+    start(site, page)
+    assert say("measure.research") in page.text("#measuring")
+    click_at(page, 0.25, 0.5)
+    page.until(lambda: "2" not in page.text("#measuring .distance") and "±" in page.text("#measuring .told"))
+    click_at(page, 0.5, 0.5)
+    page.until(lambda: page.text("#measuring .distance"))
+    began = distance_of(page)
+    assert began == pytest.approx(0.25 * CAMERA.width * MM_A_PIXEL, abs=0.4)
+    assert f"± {UNCERTAINTY_MM}" in page.text("#measuring .distance")
+    assert page.script("return document.querySelectorAll('.measured line').length") == 2
+    label = page.find("#measuring svg").get_attribute("aria-label") or ""
+    assert f"{began * 0.9:.1f}" in label
+    ends = "return ['x1', 'x2'].map((each) => +document.querySelector('.measured .line').getAttribute(each))"
+    left, right = page.script(ends)
+    page.script("import('/main.js').then(({ viewer }) => viewer.look({ t: 0.25 }))")
+    page.until(lambda: distance_of(page) == pytest.approx(began * stretch(0.25), abs=0.15))
+    wider = page.script(ends)
+    assert (wider[1] - wider[0]) / (right - left) == pytest.approx(stretch(0.25), rel=0.02)
+    page.script("import('/main.js').then(({ viewer }) => viewer.timeline.play(true))")
+    page.until(lambda: not math.isclose(distance_of(page), began * stretch(0.25), abs_tol=0.3))
+
+
+def test_a_distance_follows_the_tissue_when_the_view_turns(site: Site, page: Page) -> None:
+    start(site, page)
+    click_at(page, 0.25, 0.5)
+    page.until(lambda: "±" in page.text("#measuring .told"))
+    click_at(page, 0.5, 0.5)
+    page.until(lambda: page.text("#measuring .distance"))
+    before = page.text("#measuring .distance")
+    page.script("import('/main.js').then(({ viewer }) => viewer.look({ pose: 'orbit:5,0,1' }))")
+    page.until(lambda: "+5" in page.view)
+    assert page.text("#measuring .distance") == before
+
+
+def test_an_unsure_point_is_refused_in_plain_words_and_the_first_one_stays(site: Site, page: Page) -> None:
+    start(site, page)
+    click_at(page, 0.9, 0.5)
+    page.until_text("#measuring .told", say("measure.refused_first", why=say("measure.low_confidence")))
+    click_at(page, 0.25, 0.5)
+    page.until(lambda: "±" in page.text("#measuring .told"))
+    click_at(page, 0.25, 0.1)
+    page.until_text("#measuring .told", say("measure.refused_second", why=say("measure.unseen")))
+    assert page.text("#measuring .distance") == ""
+    click_at(page, 0.5, 0.5)
+    page.until(lambda: page.text("#measuring .distance"))
+
+
+def test_a_first_point_does_not_outlive_the_view_in_which_it_was_chosen(site: Site, page: Page) -> None:
+    start(site, page)
+    click_at(page, 0.25, 0.5)
+    page.until(lambda: "±" in page.text("#measuring .told"))
+    page.script("import('/main.js').then(({ viewer }) => viewer.look({ t: 0.5 }))")
+    page.until_text("#measuring .told", say("measure.moved"))
+
+
+def test_keys_alone_measure_and_escape_ends(site: Site, page: Page) -> None:
+    viewed(site, page)
+    stage = page.find("#stage")
+    stage.send_keys("m")
+    page.until_text("#measuring .told", say("measure.first"))
+    stage.send_keys(Keys.ARROW_LEFT, Keys.ENTER)
+    page.until(lambda: "±" in page.text("#measuring .told"))
+    assert "+" not in page.view  # arrows move the cross, and do not turn the view
+    stage.send_keys(Keys.ARROW_RIGHT, Keys.ENTER)
+    page.until(lambda: page.text("#measuring .distance"))
+    assert distance_of(page) == pytest.approx(10 * MM_A_PIXEL, abs=0.1)
+    stage.send_keys(Keys.ESCAPE)
+    assert not page.find("#measuring").is_displayed()
+    assert page.find("#measure").get_attribute("aria-pressed") == "false"
+    assert page.script("return document.querySelectorAll('.measured *').length") == 0
+
+
+def test_a_click_that_measures_turns_nothing_and_a_drag_still_turns(site: Site, page: Page) -> None:
+    start(site, page)
+    point(page, 0.3, 0.3).click_and_hold().move_by_offset(2, 1).release().perform()
+    page.until(lambda: "±" in page.text("#measuring .told"))
+    assert page.script("return import('/main.js').then(({ viewer }) => viewer.orbit.isHome)")
+    point(page, 0.3, 0.3).click_and_hold().move_by_offset(60, 0).move_by_offset(40, 0).release().perform()
+    page.until(lambda: not page.script("return import('/main.js').then(({ viewer }) => viewer.orbit.isHome)"))
+
+
+def test_a_job_that_trains_is_not_measured(site: Site, page: Page) -> None:
+    job_id = site.queued_job()
+    claim = site.claim()
+    site.train(claim, 40, 30.0)
+    page.press(job_id, "Watch")
+    page.until_state("training")
+    page.click("#measure")
+    page.until_text("#measuring .told", say("measure.not_here"))
+    assert not page.find("#scale").is_displayed()
+
+
+def test_the_scale_bar_says_at_which_depth_it_holds_and_is_as_long_as_it_says(site: Site, page: Page) -> None:
+    viewed(site, page)
+    page.until(lambda: page.find("#scale").is_displayed())
+    length = int(page.text("#scale .about").split()[0])
+    assert f"{DEPTH_MM:.0f} mm" in page.text("#scale .about")
+    scale = page.script(f"return (async () => {{ {PLACES} }})()")[2]
+    shown = page.script("return document.querySelector('#scale .bar').getBoundingClientRect().width")
+    assert shown == pytest.approx(length * scale / MM_A_PIXEL, rel=0.03)
+
+
+def test_depth_and_confidence_have_legends_and_colours_have_none(site: Site, page: Page) -> None:
+    viewed(site, page)
+    assert not page.find("#legend").is_displayed()
+    Select(page.find("#layer")).select_by_value("depth")
+    page.until_text("#legend", say("legend.depth"))
+    assert [page.text(f"#legend {part}") for part in (".low", ".high")] == [
+        say("legend.mm", mm=f"{each:.0f}") for each in RANGE_MM
+    ]
+    colours = page.script("return document.querySelector('#legend .colours').style.backgroundImage")
+    assert f"rgb({', '.join(map(str, COLOUR_TABLE[:3]))})" in colours
+    Select(page.find("#layer")).select_by_value("confidence")
+    page.until_text("#legend", say("legend.confidence"))
+    Select(page.find("#layer")).select_by_value("rgb")
+    page.until(lambda: not page.find("#legend").is_displayed())
