@@ -2,7 +2,8 @@
 
     python -m benchmarks.bm_player SCENE [SCENE ...] [--views 12] [--scale 1.0] [--load-only]
 
-For each scene's folder: the milliseconds of decoding, packing and filling textures in headless Chromium, then views at
+For each scene's folder: the CPU seconds of decoding in four workers, which as many cores share, and the milliseconds of
+decoding, packing and filling textures in headless Chromium, then views at
 the endoscope's eyes, on orbits up to 20 degrees away and at random times: PSNR against worker/render, the largest
 difference, how many pixels differ by more than 24 levels, and the milliseconds of deforming, sorting and drawing.
 Chromium draws on the processor here (SwiftShader); a GPU's milliseconds are on the page under details.
@@ -11,6 +12,7 @@ Chromium draws on the processor here (SwiftShader); a GPU's milliseconds are on 
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -47,17 +49,32 @@ def main() -> None:
     with drawing_browser() as driver:
         for folder in options.scenes:
             with player_page(driver, folder) as page:
-                _load(page, folder)
+                _load(page, folder, driver.service.process.pid)
                 if not options.load_only:
                     _draw(page, folder, options.views, options.scale)
 
 
-def _load(page: PlayerPage, folder: Path) -> None:
+def _load(page: PlayerPage, folder: Path, browser_pid: int) -> None:
     size = (folder / SCENE_FILE).stat().st_size
     print(f"{folder}: {size / 1e6:.2f} MB")
     for _ in range(LOADS):
-        times = page.load()
-        print("  " + ", ".join(f"{name} {times[name]:.0f}" for name in ("decodeMs", "packMs", "uploadMs")), flush=True)
+        before_s = _cpu_s(browser_pid)
+        page.decode()
+        cpu_s, times = _cpu_s(browser_pid) - before_s, page.load()
+        parts = ", ".join(f"{name} {times[name]:.0f}" for name in ("decodeMs", "packMs", "uploadMs"))
+        print(f"  decoding {cpu_s:.2f} CPU s; {parts}", flush=True)
+
+
+def _cpu_s(process_id: int) -> float:
+    """CPU seconds of a process and of all that descend from it (Linux)."""
+    try:
+        fields = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()
+        tasks = list(Path(f"/proc/{process_id}/task").iterdir())
+        children = [child for each in tasks for child in (each / "children").read_text().split()]
+    except OSError:  # it has ended
+        return 0.0
+    own_s = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return own_s + sum(_cpu_s(int(child)) for child in children)
 
 
 def _draw(page: PlayerPage, folder: Path, count: int, scale: float) -> None:

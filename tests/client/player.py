@@ -35,22 +35,22 @@ RUN = """
 const [done, given] = [arguments[arguments.length - 1], [...arguments].slice(0, -1)];
 (async () => { %s })().then(done, (error) => done({ error: String(error?.stack ?? error) }));
 """
-READ = """
+DECODE = """
 const { readTable } = await import("/player/table.js");
 const file = await (await fetch(given[0] + "scene.safetensors")).arrayBuffer();
-const began = performance.now();
-const { count, tables, partMs } = await readTable(file);
-const decodeMs = performance.now() - began;
+const { count, tables } = await readTable(file);
+"""
+READ = f"""{DECODE}
 const columns = tables.map((each) => each.length / count);
 const whole = new Int32Array(count * columns.reduce((a, b) => a + b));
-for (let n = 0, at = 0; n < count; n++) {
-  tables.forEach((each, part) => {
+for (let n = 0, at = 0; n < count; n++) {{
+  tables.forEach((each, part) => {{
     whole.set(each.subarray(n * columns[part], (n + 1) * columns[part]), at);
     at += columns[part];
-  });
-}
+  }});
+}}
 const digest = new Uint8Array(await crypto.subtle.digest("SHA-256", whole));
-return { sha256: [...digest].map((byte) => byte.toString(16).padStart(2, "0")).join(""), decodeMs, partMs };
+return {{ sha256: [...digest].map((byte) => byte.toString(16).padStart(2, "0")).join("") }};
 """
 LOAD = """
 const { Player } = await import("/player/player.js");
@@ -120,9 +120,13 @@ class PlayerPage:
         return answer
 
     def read(self) -> dict[str, Any]:
-        """The table as the player decodes it: its SHA-256 as int32 [N, K], and the milliseconds it took."""
+        """The table as the player decodes it: its SHA-256 as int32 [N, K]."""
         found: dict[str, Any] = self.run(READ, SCENES)
         return found
+
+    def decode(self) -> None:
+        """Download and decode the scene, no more."""
+        self.run(DECODE, SCENES)
 
     def load(self) -> dict[str, float]:
         """Load the scene into the player; milliseconds."""
