@@ -83,8 +83,6 @@ def _options(text: str) -> JobOptions:
     """
     options = parse_options(JobOptions, text)
     for name in sorted(options.model_fields_set - {*OPTIONS}):
-        raise InputError(f"options.{name}", "an imported scene is not trained.", f"Leave it out. {_TAKES}")
+        remedy = f"Leave it out. An import takes {' and '.join(OPTIONS)}."
+        raise InputError(f"options.{name}", "an imported scene is not trained.", remedy)
     return options
-
-
-_TAKES = f"An import takes {' and '.join(OPTIONS)}."

@@ -6,6 +6,7 @@ contract/store/archive.py has judged the archive before. Symbols: T frames.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -69,9 +70,9 @@ def take_scene(
 
 
 def _known(scene: Scene, warnings: tuple[Notice, ...]) -> Scene:
-    """The scene without settings that no program of ours reads."""
-    scene.settings["pose_warnings"] = [each.model_dump(mode="json") for each in warnings]
-    return scene
+    """The scene with no other settings than views need: how it was trained elsewhere is for its report to say."""
+    settings = {"pose_warnings": [each.model_dump(mode="json") for each in warnings]}
+    return replace(scene, settings=settings)
 
 
 def _check_recording(scene: Scene, limits: ClipLimits) -> None:

@@ -63,7 +63,9 @@ def test_what_no_reader_of_ours_knows_is_not_kept(tmp_path: Path) -> None:
     manifest = json.loads(files[MANIFEST]) | {"more": "<script>"}
     files = relisted({**files, MANIFEST: json.dumps(manifest).encode(), THUMBNAIL: b"of something else"})
     _, folder = taken(tmp_path, zipped(files))
-    assert "more" not in json.loads((folder / MANIFEST).read_text())
+    kept = json.loads((folder / MANIFEST).read_text())
+    assert "more" not in kept
+    assert kept["settings"] == {"pose_warnings": []}
     assert sorted(path.name for path in folder.iterdir()) == sorted([SCENE, MANIFEST, REPORT, CURVE])
 
 
