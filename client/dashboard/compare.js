@@ -10,6 +10,7 @@ import { RecordedFrames } from "./recordedframes.js";
 const STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2, PageDown: -10, PageUp: 10 };
 const ENDS = { Home: 0, End: 100 };
 const MIDDLE = 50;
+const TOLD_MS = 10_000;
 /** The hatch of what nobody saw (worker/render/unseen.py). */
 const GREYS = ["rgb(40 40 40)", "rgb(74 74 74)"];
 const STRIPES_A_PICTURE = 96;
@@ -27,10 +28,14 @@ export class Compare {
     this.hatch = document.createElement("canvas");
     /** @type {Mode} */
     this.mode = "off";
+    this.seam = MIDDLE;
     this.open(null);
     viewer.addEventListener("shown", ({ detail }) => this.#follow(detail));
     viewer.addEventListener("gone", () => this.#end(""));
-    languageEvents.addEventListener("changed", () => this.#label());
+    languageEvents.addEventListener("changed", () => {
+      this.#label();
+      this.#moveSeam(this.seam);
+    });
     parts.mode.addEventListener("change", () => this.choose(parts.mode.value));
     parts.tools.addEventListener("change", () => this.#draw());
     this.#listenToSeam();
@@ -63,7 +68,7 @@ export class Compare {
     if (!this.report.recorded) return this.#end(words("compare.none"));
     if (this.mode === "off") this.isComing = true; // until the view from home is there
     this.mode = this.parts.mode.value = mode;
-    this.parts.message.textContent = "";
+    this.#say("");
     this.parts.stage.dataset.compare = mode;
     this.parts.box.hidden = false;
     this.parts.tools.closest("label").hidden = !this.report.recorded.masks;
@@ -83,7 +88,14 @@ export class Compare {
     delete this.parts.stage.dataset.compare;
     this.parts.box.hidden = this.parts.tools.closest("label").hidden = true;
     this.parts.canvas.width = this.parts.canvas.height = 0; // its pixels are gone, not only hidden
-    this.parts.message.textContent = why;
+    this.#say(why);
+  }
+
+  /** @param {string} text for a while: it lies over the picture */
+  #say(text) {
+    clearTimeout(this.timer);
+    this.parts.message.textContent = text;
+    if (text) this.timer = setTimeout(() => this.#say(""), TOLD_MS);
   }
 
   /** @param {import("./viewer.js").Shown} shown */
