@@ -37,7 +37,7 @@ def report_with(*warnings: Notice) -> Report:
     return REPORT_OF_THE_PAGE.model_copy(update={"warnings": warnings})
 
 
-def test_no_word_of_the_api_reaches_the_first_layer(site: Site, page: Page) -> None:
+def test_row_6_no_word_of_the_api_reaches_the_first_layer(site: Site, page: Page) -> None:
     failed = site.queued_job()
     site.queue.fail(site.claim(), JobError(code=ErrorCode.INPUT, problem=API_TEXT, field="calibration"))
     scene = site.scene()
@@ -57,7 +57,7 @@ def test_no_word_of_the_api_reaches_the_first_layer(site: Site, page: Page) -> N
     assert API_TEXT in page.text("#report")
 
 
-def test_a_good_scene_is_told_without_an_alarm(site: Site, page: Page) -> None:
+def test_row_7_a_good_scene_is_told_without_an_alarm(site: Site, page: Page) -> None:
     scene = site.scene()
     copies = Notice.info(NoticeCode.COPYING_SCORES_MORE, "Copying neighbours scores more.")
     slow = report_with(copies).model_copy(update={"baseline_blend_db": 41.9})
@@ -108,7 +108,7 @@ def test_a_german_browser_reads_german(site: Site, german: Page) -> None:
     assert german.script("return document.documentElement.lang") == "de"
 
 
-def test_trying_again_is_offered_only_where_it_can_succeed(site: Site, page: Page) -> None:
+def test_row_10_trying_again_is_offered_only_where_it_can_succeed(site: Site, page: Page) -> None:
     offered = {}
     for code in (ErrorCode.INPUT, ErrorCode.TRAINING_DIVERGED, ErrorCode.OUT_OF_MEMORY, ErrorCode.UNAVAILABLE):
         offered[site.queued_job()] = code
@@ -122,7 +122,7 @@ def test_trying_again_is_offered_only_where_it_can_succeed(site: Site, page: Pag
         assert ("retry" in names) == (code is ErrorCode.UNAVAILABLE or code is ErrorCode.OUT_OF_MEMORY), code
 
 
-def test_a_time_left_is_told_roughly_and_a_broken_promise_is_admitted(site: Site, page: Page) -> None:
+def test_row_5_a_time_left_is_told_roughly_and_a_broken_promise_is_admitted(site: Site, page: Page) -> None:
     job_id = site.queued_job()
     claim = site.claim()
     site.train(claim, 20, 24.0)
