@@ -20,7 +20,7 @@ from tests.client.test_theatre_in_browser import is_on_screen, screen_of
 from tests.client.words import say
 from tests.service.test_check import RECTIFIED
 
-SLOW = {"latency": 0, "download_throughput": 10_000_000, "upload_throughput": 500_000}
+SLOW = {"latency": 0, "download_throughput": 10_000_000, "upload_throughput": 250_000}
 SHARE = "return document.querySelector('#upload-progress').value"
 FINDINGS = """
 return [...document.querySelectorAll("#upload .finding")].map((each) => {
@@ -188,7 +188,7 @@ def test_two_tabs_send_two_clips_and_know_nothing_of_each_other(site: Site, page
             assert page.text("#upload-message") == ""
             page.choose("clip", CLIP)
             page.click("#upload [type=submit]")
-            page.until(lambda: site.queue.records())
+            page.until(lambda: page.script("return sessionStorage.getItem('intrasplat-sent')"))
             driver.get("about:blank")
             driver.close()
         finally:
