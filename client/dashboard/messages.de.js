@@ -360,6 +360,13 @@ export const DE = {
     "gaussians": "{count} Gaußfunktionen"
   },
   "page": {
+    "key": "Schlüssel",
+    "key_note": "bleibt, bis dieser Tab geschlossen wird",
+    "use_key": "Verwenden",
+    "forget_key": "Schlüssel vergessen",
+    "notice": "Nur für die Forschung. Kein Medizinprodukt; keine Grundlage einer Behandlung.",
+    "connecting": "verbindet",
+    "keep": "Behalten",
     "details": "Einzelheiten",
     "close": "Schließen",
     "ready": "bereit",
@@ -508,6 +515,7 @@ export const DE = {
     "priority_high": "hoch: vor allen anderen"
   },
   "upload": {
+    "sent": "gesendet",
     "changed": "Eine Datei wurde geändert oder verschoben, seit sie gewählt wurde. Wählen Sie sie noch einmal.",
     "stop": "Senden anhalten",
     "look": "Vor dem Senden ist etwas zu berichtigen: siehe das Formular.",
@@ -532,7 +540,25 @@ export const DE = {
     "copied": "Der Link zu dieser Ansicht ist kopiert. Wer ihn öffnet, braucht einen eigenen Schlüssel.",
     "copy_by_hand": "Kopieren Sie diesen Link: {link}"
   },
+  "tool": {
+    "tools": "Werkzeuge",
+    "controls": "Zeit und Ansicht",
+    "scenes": "Szenen",
+    "new_clip": "Neuer Clip",
+    "report": "Bericht"
+  },
+  "layer": {
+    "title": "Bild der",
+    "rgb": "Farbe",
+    "depth": "Tiefe",
+    "confidence": "Verlässlichkeit",
+    "recorded": "Aufnahme, Masken markiert"
+  },
   "view": {
+    "guesses": "Vermutetes zeigen",
+    "guesses_why": "Was kein Bild des Clips sah, ist schraffiert, außer Sie wollen sehen, was das Modell dort vermutet.",
+    "highlights": "Glanz zeigen",
+    "highlights_why": "Die zwei Augen eines Stereoclips unterscheiden Glanz und Gewebe; Farben gibt es auch ohne Glanz.",
     "stage": "Das Gewebe. Das Fragezeichen zeigt alle Tasten.",
     "eye": "Auge des Endoskops",
     "left_eye": "linkes Auge",

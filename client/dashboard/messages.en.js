@@ -360,6 +360,13 @@ export const EN = {
     "gaussians": "{count} Gaussians"
   },
   "page": {
+    "key": "Key",
+    "key_note": "kept until this tab is closed",
+    "use_key": "Use it",
+    "forget_key": "Forget key",
+    "notice": "Research use only. Not a medical device; it must not guide treatment.",
+    "connecting": "connecting",
+    "keep": "Keep",
     "details": "Details",
     "close": "Close",
     "ready": "ready",
@@ -508,6 +515,7 @@ export const EN = {
     "priority_high": "high: before all others"
   },
   "upload": {
+    "sent": "sent",
     "changed": "A file was changed or moved since it was chosen. Choose it again.",
     "stop": "Stop sending",
     "look": "Something is to be put right before it can be sent: see the form.",
@@ -532,7 +540,25 @@ export const EN = {
     "copied": "The link to this view is copied. Whoever opens it needs a key of their own.",
     "copy_by_hand": "Copy this link: {link}"
   },
+  "tool": {
+    "tools": "Tools",
+    "controls": "Time and view",
+    "scenes": "Scenes",
+    "new_clip": "New clip",
+    "report": "Report"
+  },
+  "layer": {
+    "title": "Picture of",
+    "rgb": "colour",
+    "depth": "depth",
+    "confidence": "confidence",
+    "recorded": "recorded, masks marked"
+  },
   "view": {
+    "guesses": "Show guesses",
+    "guesses_why": "What no frame of the clip saw is hatched, unless you want to see what the model guesses there.",
+    "highlights": "Show highlights",
+    "highlights_why": "The two eyes of a stereo clip tell highlights from tissue; colours can be shown without them.",
     "stage": "The tissue. Question mark lists all keys.",
     "eye": "Eye of the endoscope",
     "left_eye": "left eye",

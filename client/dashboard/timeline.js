@@ -116,7 +116,7 @@ export class Timeline {
     const { play } = this.parts;
     const isNew = this.isPlaying !== isPlaying;
     this.isPlaying = isPlaying;
-    play.textContent = words(isPlaying ? "time.pause" : "time.play");
+    this.#show();
     play.setAttribute("aria-pressed", String(isPlaying));
     if (isPlaying) this.#run();
     if (isNew) this.playEvents.dispatchEvent(new Event("changed"));
@@ -148,7 +148,8 @@ export class Timeline {
   }
 
   #show() {
-    const { time, timeValue } = this.parts;
+    const { time, timeValue, play } = this.parts;
+    play.textContent = words(this.isPlaying ? "time.pause" : "time.play");
     time.value = String(this.frame);
     const text = this.#placeOf(this.t);
     timeValue.textContent = text;

@@ -24,6 +24,7 @@ BUDGET_S = 15
 TRAINED_WITHIN_S = 100.0
 SHOWN_FRAME = 19
 COLOURS = 256
+JUDGED = "return document.querySelector('#report .light:not(.pending)') !== null"
 CURVE = "return document.querySelector('#curve polyline.score')?.points ?? []"
 
 
@@ -56,7 +57,7 @@ def draw(page: Page, clip: Path, out: Path, training: Path | None) -> None:
     if training is not None:
         wait.until(lambda _: page.state == "training" and len(page.script(CURVE)) > 1)
         save(page, training)
-    wait.until(lambda _: "How far to trust it" in page.text("#report"))
+    wait.until(lambda _: page.script(JUDGED))
     page.script(
         "const frame = arguments[0]; import('/main.js').then(({ viewer }) => viewer.timeline.goTo(frame))", SHOWN_FRAME
     )
