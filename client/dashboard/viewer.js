@@ -66,6 +66,7 @@ export class Viewer extends EventTarget {
     this.#listen();
     setInterval(() => this.#again(), AGAIN_MS / 3);
     document.addEventListener("visibilitychange", () => this.refresh());
+    this.timeline.playEvents.addEventListener("changed", () => this.refresh()); // what rests is drawn exactly
     this.memory.addEventListener("changed", () => this.#tellWay());
     this.memory.addEventListener("changed", () => this.memory.player && this.refresh());
     languageEvents.addEventListener("changed", () => this.#tellWay());
