@@ -108,13 +108,20 @@ export class Announcer {
   }
 
   get #isWanted() {
-    return localStorage.getItem(WANTED_AS) === "on" && window.Notification?.permission === "granted";
+    try {
+      return localStorage.getItem(WANTED_AS) === "on" && window.Notification?.permission === "granted";
+    } catch {
+      return false; // the browser keeps nothing
+    }
   }
 
   async #wish() {
     const isWanted = !this.#isWanted && (await Notification.requestPermission()) === "granted";
-    localStorage.setItem(WANTED_AS, isWanted ? "on" : "off");
-    this.#showWish();
+    try {
+      localStorage.setItem(WANTED_AS, isWanted ? "on" : "off");
+    } finally {
+      this.#showWish();
+    }
   }
 
   #showWish() {
