@@ -1,7 +1,7 @@
 """`python -m worker COMMAND`: everything that happens on this machine, without a service, and the service's worker.
 
-`intrasplat reconstruct|render|export|poses|phantom|evaluate|stability|doctor` end here with the same arguments. Only
-the module of the chosen command is imported: --help and doctor answer at once, and doctor even without torch.
+`intrasplat reconstruct|render|export|measure|poses|phantom|evaluate|stability|doctor` end here with the same arguments.
+Only the module of the chosen command is imported: --help and doctor answer at once, and doctor even without torch.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ MODULES = {
     "reconstruct": "worker.commands.reconstruct",
     "render": "worker.commands.render",
     "export": "worker.commands.export",
+    "measure": "worker.commands.measure",
     "poses": "worker.commands.poses",
     "phantom": "worker.phantom.command",
     "evaluate": "worker.evaluate.command",

@@ -414,7 +414,7 @@ export const DE = {
     "depth": "{depth} ± {sigma} mm entfernt, Vertrauen {trust} %",
     "distance": "{mm} ± {sigma} mm",
     "away": "In diesem Moment nicht bekannt: Ein Punkt ist außerhalb des Blickfelds des Endoskops.",
-    "scale": "{length} mm, bei {depth} mm: der Tiefe in der Bildmitte",
+    "scale": "{length} mm in der Tiefe der Bildmitte ({depth} mm)",
     "axes": "Abstand in mm, über Sekunden",
     "over_time": "Der Abstand über den Clip: von {low} bis {high} mm",
     "again": "Neue Punkte",

@@ -414,7 +414,7 @@ export const EN = {
     "depth": "{depth} ± {sigma} mm away, trust {trust} %",
     "distance": "{mm} ± {sigma} mm",
     "away": "Not known at this moment: a point is out of the endoscope's view.",
-    "scale": "{length} mm, at {depth} mm: the depth in the middle of the picture",
+    "scale": "{length} mm at the depth of the middle ({depth} mm)",
     "axes": "distance in mm, over seconds",
     "over_time": "The distance over the clip: from {low} to {high} mm",
     "again": "New points",

@@ -6,6 +6,7 @@ LOCAL_COMMANDS = {
     "reconstruct": "train a scene from a clip, on this machine",
     "render": "render images of a scene that is on this machine",
     "export": "write a scene that is on this machine as a file for other programs",
+    "measure": "measure depths and distances in a scene that is on this machine, for research only",
     "phantom": "make a synthetic stereo clip of tissue, with its truth",
     "evaluate": "measure presets on clips, and draw speed against accuracy",
     "stability": "spoil synthetic clips in many ways, and draw where presets break and whether they say so",
