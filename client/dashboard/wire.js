@@ -256,7 +256,7 @@
 export const LIMITS = {
   layout: {"default": "auto", "choices": ["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]},
   mask_polarity: {"default": "auto", "choices": ["auto", "tool", "tissue"]},
-  mask_source: {"default": "given", "choices": ["given", "auto", "none"]},
+  mask_source: {"default": "auto", "choices": ["given", "auto", "none"]},
   pose_convention: {"default": "opengl", "choices": ["opengl", "llff"]},
   holdout: {"default": "every8"},
   preset: {"default": "fast", "choices": ["instant", "fast", "quality", "small", "paper", "paper-released", "paper-wide", "pfs", "hexplane", "without_mapf"]},

@@ -229,9 +229,9 @@ class JobOptions(Model):
     """how the clip's eyes, depths and masks are laid out"""
     mask_polarity: str = "auto"
     """what is bright in the masks"""
-    mask_source: str = "given"
-    """masks of instruments. given: the clip's, else the segmenter's if the installation has one; auto: else found
-    by colour and depth; none: every pixel is tissue
+    mask_source: str = "auto"
+    """masks of instruments. auto: the clip's, else the segmenter's if there is one, else found by colour and
+    depth; given: the clip's or the segmenter's; none: every pixel is tissue
     """
     pose_convention: str = "opengl"
     """axes of poses_bounds.npy"""
@@ -563,8 +563,8 @@ class GivenOptions(TypedDict, total=False):
     mask_polarity: Literal["auto", "tool", "tissue"]
     """what is bright in the masks"""
     mask_source: Literal["given", "auto", "none"]
-    """masks of instruments. given: the clip's, else the segmenter's if the installation has one; auto: else found
-    by colour and depth; none: every pixel is tissue
+    """masks of instruments. auto: the clip's, else the segmenter's if there is one, else found by colour and
+    depth; given: the clip's or the segmenter's; none: every pixel is tissue
     """
     pose_convention: Literal["opengl", "llff"]
     """axes of poses_bounds.npy"""

@@ -49,9 +49,9 @@ class ClipOptions(BaseModel):
     layout: Layout = Field(default="auto", description="how the clip's eyes, depths and masks are laid out")
     mask_polarity: MaskPolarity = Field(default="auto", description="what is bright in the masks")
     mask_source: MaskSource = Field(
-        default="given",
-        description="masks of instruments. given: the clip's, else the segmenter's if the installation has one; "
-        "auto: else found by colour and depth; none: every pixel is tissue",
+        default="auto",
+        description="masks of instruments. auto: the clip's, else the segmenter's if there is one, else found "
+        "by colour and depth; given: the clip's or the segmenter's; none: every pixel is tissue",
     )
     pose_convention: PoseConvention = Field(default="opengl", description="axes of poses_bounds.npy")
 
