@@ -100,6 +100,8 @@ def requests_of(data_dir: Path, job_id: str) -> list[tuple[str, str]]:
             path = route.path.format(job_id=job_id, scene_id=job_id, upload_id=job_id, name=MANIFEST)
             if route.path == "/render":
                 path += f"?scene={job_id}"
+            if route.path.endswith("/measure"):
+                path += "?points=1,1"
             asked += [(method, path) for method in sorted(route.methods or ())]
     return [(method, path) for method, path in asked if not {path, f"{method} {path}"} & OPEN_TO_ALL]
 
@@ -154,8 +156,9 @@ def test_another_tenants_job_is_answered_exactly_like_one_that_is_not_there(
     ]
     assert len(named) >= 8
     for method, path in named:
-        foreign = theirs.request(method, path)
-        absent = theirs.request(method, path.replace(job_id, missing))
+        body = {"json": {"label": "mine"}} if method == "PATCH" else {}
+        foreign = theirs.request(method, path, **body)
+        absent = theirs.request(method, path.replace(job_id, missing), **body)
         assert foreign.status_code == 404, f"{method} {path}: {foreign.status_code}"
         assert foreign.text == absent.text.replace(missing, job_id)
         assert {*foreign.headers} == {*absent.headers}
@@ -191,9 +194,8 @@ def test_a_key_does_what_its_scope_says_and_nothing_else(
     limited = ward(open_service, "ward-3", frozenset({scope}))
     needed = {"/metrics": KeyScope.OPERATE, "DELETE /scenes": KeyScope.PURGE}
     for method, path in requests_of(tmp_path / "other", job_id):
-        writes = (
-            "/uploads" in path or path == "/reconstruct" or (path.startswith("/jobs") and method in ("POST", "DELETE"))
-        )
+        is_sent = path in ("/reconstruct", "/reconstruct/check") or (method, path) == ("POST", "/scenes")
+        writes = "/uploads" in path or is_sent or (path.startswith("/jobs") and method in ("POST", "DELETE"))
         usual = KeyScope.RECONSTRUCT if writes else KeyScope.DOWNLOAD if "/files/" in path else KeyScope.VIEW
         wanted = needed.get(path) or needed.get(f"{method} {path.rpartition('/')[0]}") or usual
         response = limited.request(method, path, headers={"Tus-Resumable": "1.0.0"})
