@@ -28,7 +28,7 @@ export const EN = {
     "colours_unknown": "The colours of the two eyes could not be compared.",
     "colour_changes": "The colour of the tissue changes during the clip.",
     "depth_jumps": "The measured depth jumps from frame to frame.",
-    "depth_out_of_range": "Parts lie nearer or farther than depth was looked for.",
+    "depth_out_of_range": "Parts lie outside the range in which depth was looked for.",
     "depth_unusual": "The distance to the tissue is unusual for an endoscope; check the calibration.",
     "eyes_coloured_apart": "The two eyes differed in colour; that was corrected.",
     "eyes_disagree": "The two eyes do not fit together: something is wrong with recording or calibration.",
@@ -111,7 +111,7 @@ export const EN = {
     "http_401:wrong": "This key is not known.",
     "http_403": "Your key does not allow this.",
     "http_404": "It is not there any more.",
-    "http_404:scene": "There is no scene of this kind any more.",
+    "http_404:scene": "This scene is not there any more.",
     "http_405": "The service did not understand the page. Reload the page.",
     "http_408": "The connection was too slow. The page keeps trying.",
     "http_409": "This cannot be done at this moment.",
@@ -172,7 +172,7 @@ export const EN = {
     "extrapolated": "EXTRAPOLATED",
     "current": "CURRENT",
     "unconfirmed": "FROM MEMORY",
-    "unconfirmed_why": "the service has not answered since {time}; the scene may be deleted meanwhile"
+    "unconfirmed_why": "the service has not answered since {time}; the scene may have been deleted meanwhile"
   },
   "readout": {
     "service": "service {ms} ms",
@@ -299,11 +299,11 @@ export const EN = {
     "megabytes": "{size} MB",
     "fact_scene": "Scene",
     "fact_exported": "Exported",
-    "fact_preset": "Way of training",
+    "fact_preset": "Preset",
     "fact_frames": "Clip",
     "fact_gaussians": "Gaussians",
     "fact_size": "Size of the scene",
-    "fact_quality": "Score on frames that were held out"
+    "fact_quality": "Likeness on frames that were held out"
   },
   "report": {
     "trusted": "What can be trusted",
@@ -404,14 +404,14 @@ export const EN = {
     "asking": "Measuring.",
     "done": "Second point: {reading}.",
     "moved": "The view has changed. Choose the first point again.",
-    "not_here": "Only finished scenes can be measured, and not in recorded frames.",
+    "not_here": "Only finished scenes can be measured, not recorded frames.",
     "outside": "This lies outside the picture.",
     "refused_first": "Not measured: {why}. Choose another point.",
     "refused_second": "Not measured: {why}. Choose another second point.",
     "failed": "Nothing could be measured. {why}",
     "low_confidence": "too unsure here",
     "unseen": "never seen here",
-    "depth": "{depth} ± {sigma} mm away, trust {trust} %",
+    "depth": "{depth} ± {sigma} mm away, confidence {trust} %",
     "distance": "{mm} ± {sigma} mm",
     "away": "Not known at this moment: a point is out of the endoscope's view.",
     "scale": "{length} mm at the depth of the middle ({depth} mm)",
@@ -422,7 +422,7 @@ export const EN = {
   },
   "legend": {
     "depth": "Depth",
-    "confidence": "Trust in depth and colour",
+    "confidence": "Confidence in depth and colour",
     "mm": "{mm} mm",
     "sure": "sure",
     "unsure": "unsure"
@@ -519,7 +519,7 @@ export const EN = {
     "changed": "A file was changed or moved since it was chosen. Choose it again.",
     "stop": "Stop sending",
     "look": "Something is to be put right before it can be sent: see the form.",
-    "not_allowed": "Your key does not allow to send clips.",
+    "not_allowed": "Your key does not allow sending clips.",
     "interrupted": "A clip was being sent when the page was left. Choose the same files again, and it goes on where it was.",
     "choose_again": "Choose again: {names}",
     "other_file": "This is not the file that was being sent. Choose {name}, or give the clip up.",
@@ -534,8 +534,8 @@ export const EN = {
     "unknown": "This address names no scene. Choose one from the list.",
     "scene": "This address names a scene that cannot be: it may be cut off. Choose one from the list.",
     "t": "The time in this address cannot be read; the clip is shown from its beginning.",
-    "pose": "Nobody may stand where this address says; the view of the endoscope is shown.",
-    "layer": "This address names a kind of picture that there is not; the colours are shown.",
+    "pose": "This address names a view that cannot be shown; the view of the endoscope is shown.",
+    "layer": "This address names a kind of picture that does not exist; the colours are shown.",
     "copy": "Copy link",
     "copied": "The link to this view is copied. Whoever opens it needs a key of their own.",
     "copy_by_hand": "Copy this link: {link}"
