@@ -156,7 +156,7 @@ def read_archive(path: Path, max_bytes: int, into: Path | None = None) -> Archiv
         if head.files.keys() != by_name.keys() - {ARCHIVE}:
             raise InputError(FIELD, f"{ARCHIVE} does not list the files that are there.", AGAIN)
         report = _parsed(Report, texts[REPORT], REPORT)
-        _check_words(report)
+        check_words(REPORT, report.model_dump(mode="json"))
         _check_curve(texts[CURVE])
         manifest = _parsed(ManifestHead, texts[MANIFEST], MANIFEST)
         for name, listed in head.files.items():
@@ -201,9 +201,9 @@ def _parsed(model: type[Model], text: str, name: str) -> Model:
         raise InputError(FIELD, f"{name}: {place or 'it'}: {first['msg'][:200]}.", remedy) from error
 
 
-def _check_words(report: Report) -> None:
-    """Texts of a report are shown to people: none may be endless or hold control characters."""
-    waiting: list[JsonValue] = [TypeAdapter(JsonValue).validate_python(report.model_dump(mode="json"))]
+def check_words(name: str, content: object) -> None:
+    """InputError if a text of a file's JSON, which is shown to people, is endless or holds control characters."""
+    waiting: list[JsonValue] = [TypeAdapter(JsonValue).validate_python(content)]
     while waiting:
         each = waiting.pop()
         if isinstance(each, dict):
@@ -213,7 +213,7 @@ def _check_words(report: Report) -> None:
         elif isinstance(each, str) and (
             len(each) > MAX_CHARACTERS or re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", each)
         ):
-            problem = f"a text in {REPORT} is longer than {MAX_CHARACTERS} characters or holds control characters."
+            problem = f"a text in {name} is longer than {MAX_CHARACTERS} characters or holds control characters."
             raise InputError(FIELD, problem, AGAIN)
 
 

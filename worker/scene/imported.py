@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from contract.intake.limits import ClipLimits
 from contract.intake.sniff import check_file
-from contract.store.archive import AGAIN, FIELD, NESTED, read_archive
+from contract.store.archive import AGAIN, FIELD, NESTED, check_words, read_archive
 from contract.store.durable import FOR_ALL, replace_file
 from contract.store.results import without_scores
 from contract.wire.errors import InputError, SceneError
-from contract.wire.names import RECORDED, REPORT, THUMBNAIL
+from contract.wire.names import MANIFEST, RECORDED, REPORT, THUMBNAIL
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.report import Imported, Report
 from worker.scene.checkpoint import MISFITS, load_scene, save_scene
@@ -53,6 +53,7 @@ def take_scene(
         raise InputError(FIELD, words, AGAIN) from error
     except MISFITS as error:
         raise InputError(FIELD, f"The scene's settings cannot be read ({type(error).__name__}).", AGAIN) from error
+    check_words(MANIFEST, " ".join(each.text for each in warnings))  # every view repeats them in a header
     on_step(0.6)
     _check_recording(scene, limits)
     _check_report(scene, read.report)

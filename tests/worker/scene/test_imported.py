@@ -171,6 +171,10 @@ SPOILT: dict[str, tuple[Callable[[Files], Files], str]] = {
     "a scale of 0": (with_manifest(units_per_mm=0), "units_per_mm"),
     "a scale of infinity": (with_manifest(units_per_mm=float("inf")), "units_per_mm"),
     "warnings that are none": (with_manifest(settings={"pose_warnings": [{"code": "<b>"}]}), "settings"),
+    "warnings without end": (
+        with_manifest(settings={"pose_warnings": [{"code": "pose_jitter", "severity": "warning", "text": "x" * 5000}]}),
+        "manifest.json is longer than 4000 characters",
+    ),
     "settings that are none": (with_manifest(settings=[1]), "does not fit|settings"),
     "a number that is none": (with_tensors(lambda each: each["step"].fill_(float("nan"))), "NaN"),
     "a count beyond all memory": (with_tensors(lambda each: each["count"].fill_(2**40)), "does not fit"),
