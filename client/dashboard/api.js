@@ -45,10 +45,12 @@ export async function request(path, options = {}) {
 }
 
 const json = async (path, options) => bodyOf(await request(path, options));
+const blob = async (path, options) => bodyOf(await request(path, options), "blob");
 
-async function bodyOf(response) {
+/** The body of an answer, which may break off. @param {Response} response @param {"json"|"blob"|"text"} kind */
+export async function bodyOf(response, kind = "json") {
   try {
-    return await response.json();
+    return await response[kind]();
   } catch {
     throw connectionLost();
   }
@@ -92,7 +94,7 @@ export const labelJob = (id, label) =>
     body: JSON.stringify({ label: label || null }),
   });
 /** @param {string} id @returns {Promise<Blob>} a JPEG, from the browser's own store where it is still the same */
-export const getThumbnail = async (id) => (await request(`/scenes/${id}/thumbnail`, { cache: "no-cache" })).blob();
+export const getThumbnail = (id) => blob(`/scenes/${id}/thumbnail`, { cache: "no-cache" });
 /** @param {string} id @returns {Promise<Receipt>} */
 export const purgeScene = (id) => json(`/scenes/${id}`, { method: "DELETE" });
 /** @param {string} id @returns {Promise<Record<string, any>>} */
@@ -106,16 +108,16 @@ export const getCameras = (id) => json(`/scenes/${id}/cameras`);
  */
 export const getMeasurement = (id, query) => json(`/scenes/${id}/measure?${new URLSearchParams(query)}`);
 /** @param {string} id @returns {Promise<string>} CSV */
-export const getCurve = async (id) => (await request(`/scenes/${id}/curve`)).text();
+export const getCurve = async (id) => bodyOf(await request(`/scenes/${id}/curve`), "text");
 /**
  * @param {string} id
  * @param {{format: string, t?: number}} wanted docs/export.md lists the formats
  * @returns {Promise<Blob>}
  */
-export const exportScene = async (id, wanted) => (await request(`/scenes/${id}/export?${queryOf(wanted)}`)).blob();
+export const exportScene = (id, wanted) => blob(`/scenes/${id}/export?${queryOf(wanted)}`);
 
 /** @param {string} id @returns {Promise<Blob>} a zip of the masks that were found */
-export const getMasks = async (id) => (await request(`/scenes/${id}/masks`)).blob();
+export const getMasks = (id) => blob(`/scenes/${id}/masks`);
 
 /**
  * Return if a finished scene is still there for this key; throws as a picture of it would. It costs the service no picture.

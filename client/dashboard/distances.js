@@ -10,18 +10,19 @@ const TOP = 8;
 const BOTTOM = 18;
 /** The axis spans at least so much, so that noise does not look like movement. */
 const MIN_SPAN_MM = 1;
+const NOTHING = { time_s: [], distances_mm: [], uncertainties_mm: [] };
 
 /**
  * @param {SVGSVGElement} svg
- * @param {import("./wire.js").MeasuredDistance | null} found null: nothing is drawn
+ * @param {import("./wire.js").MeasuredDistance | null} found null, or known at no frame: nothing is drawn
  */
 export function drawDistances(svg, found) {
   svg.replaceChildren();
-  svg.toggleAttribute("hidden", found === null);
-  if (found === null) return;
-  svg.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
-  const { time_s: times, distances_mm: lengths, uncertainties_mm: sigmas } = found;
+  const { time_s: times, distances_mm: lengths, uncertainties_mm: sigmas } = found ?? NOTHING;
   const known = times.map((_, i) => i).filter((i) => lengths[i] !== null);
+  svg.toggleAttribute("hidden", known.length === 0);
+  if (known.length === 0) return;
+  svg.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
   const [low, high] = spanOf(known.flatMap((i) => [lengths[i] - sigmas[i], lengths[i] + sigmas[i]]));
   const last = times.at(-1) || 1;
   const x = (seconds) => LEFT + (seconds / last) * (WIDTH - LEFT - RIGHT);
@@ -57,11 +58,13 @@ export function drawDistances(svg, found) {
  * @param {number} t
  */
 export function markTime(svg, { time_s: times }, t) {
+  const line = svg.querySelector(".now");
+  if (!line) return; // nothing is drawn
   const place = Math.min(Math.max(t * times.length, 0), times.length - 1);
   const before = times[Math.floor(place)];
   const seconds = before + (place % 1) * (times[Math.ceil(place)] - before);
   const x = LEFT + (seconds / (times.at(-1) || 1)) * (WIDTH - LEFT - RIGHT);
-  for (const end of ["x1", "x2"]) svg.querySelector(".now").setAttribute(end, x.toFixed(1));
+  for (const end of ["x1", "x2"]) line.setAttribute(end, x.toFixed(1));
 }
 
 /** Least and greatest of the axis. */

@@ -2,7 +2,7 @@
 
 import { request } from "./api.js";
 import { pause } from "./pause.js";
-import { connectionLost } from "./problem.js";
+import { connectionLost, Problem } from "./problem.js";
 
 const NO_CONTENT = 204;
 const RETRY_MS = 2000;
@@ -64,6 +64,7 @@ export class JobEvents {
         await this.#readOnce();
       } catch (error) {
         if (error.status === 404 || error.status === 403) this.isOver = true;
+        if (!(error instanceof Problem || error.name === "AbortError")) console.error(error); // a fault of this page
       }
       if (!this.isOver) await pause(RETRY_MS, this.controller.signal).catch(() => {});
     }
@@ -78,12 +79,16 @@ export class JobEvents {
     }
     const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
     let text = "";
-    while (true) {
-      const { value, done } = await soon(reader);
-      if (done) return;
-      const [events, rest] = parseEvents(text + value);
-      text = rest;
-      for (const event of events) this.#take(event);
+    try {
+      while (true) {
+        const { value, done } = await soon(reader);
+        if (done) return;
+        const [events, rest] = parseEvents(text + value);
+        text = rest;
+        for (const event of events) this.#take(event);
+      }
+    } finally {
+      reader.cancel().catch(() => {}); // else the connection stays open beside the next one
     }
   }
 
@@ -95,7 +100,7 @@ export class JobEvents {
   }
 }
 
-/** The next piece; an error if the line is silent, as a dead one is. */
+/** The next piece; a Problem if the line is lost, or silent, as a dead one is. */
 export async function soon(reader) {
   let timer;
   const silence = new Promise((_, reject) => (timer = setTimeout(() => reject(connectionLost()), SILENCE_MS)));
@@ -103,7 +108,7 @@ export async function soon(reader) {
     return await Promise.race([reader.read(), silence]);
   } catch (error) {
     reader.cancel().catch(() => {});
-    throw error;
+    throw error instanceof Problem || error.name === "AbortError" ? error : connectionLost();
   } finally {
     clearTimeout(timer);
   }

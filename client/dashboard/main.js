@@ -229,7 +229,8 @@ languageEvents.addEventListener("changed", () => {
 });
 showWords(document);
 keyEvents.addEventListener("changed", () => {
-  if (!currentKey() || !address.follow()) view(null, words(currentKey() ? "page.choose" : "page.key_forgotten"));
+  view(null, words(currentKey() ? "page.choose" : "page.key_forgotten")); // another key may not see the same
+  if (currentKey()) address.follow();
 });
 stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen === null);
 

@@ -8,7 +8,7 @@ import { DamagedError } from "./player/decode.js";
 import { CannotDrawError } from "./player/draw.js";
 import { Player } from "./player/player.js";
 import { graphics } from "./player/support.js";
-import { connectionLost, Problem } from "./problem.js";
+import { Problem } from "./problem.js";
 
 const SCENE = "scene.safetensors";
 const PARTIAL = 206;
@@ -183,9 +183,7 @@ async function goOn(path, got, signal, onPart) {
   if (response.status !== PARTIAL) Object.assign(got, { length: 0, parts: [] });
   const reader = response.body.getReader();
   while (true) {
-    const { value, done } = await soon(reader).catch((error) => {
-      throw error.name === "AbortError" ? error : connectionLost();
-    });
+    const { value, done } = await soon(reader);
     if (done) return;
     got.parts.push(value);
     got.length += value.length;

@@ -1,9 +1,8 @@
 // Where pictures come from: the stream, and one by one from GET /render while there is no stream.
 
-import { request } from "./api.js";
+import { bodyOf, request } from "./api.js";
 import { keyEvents } from "./key.js";
 import { noticeWords, words } from "./messages.js";
-import { connectionLost } from "./problem.js";
 import { Stream } from "./stream.js";
 
 /** @typedef {import("./stream.js").View} View */
@@ -24,7 +23,7 @@ async function askOnce(path, signal) {
   const header = (name) => response.headers.get(`X-Intrasplat-${name}`);
   const total = /total;dur=([\d.]+)/.exec(response.headers.get("Server-Timing") ?? "");
   return {
-    blob: await response.blob().catch(() => Promise.reject(connectionLost())),
+    blob: await bodyOf(response, "blob"),
     scene: header("Scene"),
     state: header("State"),
     t: Number(header("T")),

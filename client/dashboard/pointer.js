@@ -29,16 +29,15 @@ export function placeInPicture(canvas, camera, x, y) {
  * where the browser draws the picture.
  * @param {Shown} shown
  * @param {number} u @param {number} v pixels of the picture
- * @param {AbortSignal} [signal]
  * @returns {Promise<number>} mm; NaN where nothing solid is, or no frame saw it
  */
-export async function depthAt({ scene, t, pose, eye, unseen, camera }, u, v, signal) {
+export async function depthAt({ scene, t, pose, eye, unseen, camera }, u, v) {
   const { fx, fy, cx, cy } = camera;
   const query = { scene, t, layer: "depth", format: "npy", unseen, width: SIDE, height: SIDE, fx, fy };
   const asked = new URLSearchParams({ ...query, cx: cx - u + SIDE / 2, cy: cy - v + SIDE / 2 });
   if (pose !== null) asked.set("pose", pose);
   if (eye === "right") asked.set("eye", eye);
-  const file = await (await request(`/render?${asked}`, { signal })).arrayBuffer();
+  const file = await (await request(`/render?${asked}`)).arrayBuffer();
   return middleOf(file) || NaN;
 }
 

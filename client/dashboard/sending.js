@@ -88,7 +88,7 @@ export class Sending {
 
   #tell() {
     const sum = (name) => this.uploads.reduce((total, upload) => total + upload[name], 0);
-    this.onShare(sum("offset") / sum("size"));
+    this.onShare(this.uploads.length > 0 ? sum("offset") / sum("size") : 1); // a clip that is used again may need no file
   }
 
   #note(planned, location) {

@@ -61,11 +61,6 @@ export class Shelf {
     this.#askForSummaries(shown);
   }
 
-  /** A scene was given another label, or is gone: what was found before stays as it was. */
-  forget(id) {
-    this.summaries.delete(id);
-  }
-
   get #isSearch() {
     return this.search.value.trim() !== "";
   }

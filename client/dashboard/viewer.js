@@ -86,6 +86,7 @@ export class Viewer extends EventTarget {
     this.orbit.goHome();
     this.shown = null;
     this.screen.clear(scene, message);
+    this.dispatchEvent(new Event("gone")); // what was measured or compared in it goes, too
     this.parts.readout.textContent = "";
     this.clip.open(scene);
     if (scene === null) this.timeline.play(false);

@@ -82,6 +82,7 @@ def test_an_address_waits_for_the_key_and_never_holds_it(tmp_path: Path, driver:
         page.find("#key-text").send_keys(key, Keys.ENTER)
         page.until_state("live")
         assert shown(page)["t"] == pytest.approx(0.5)
+        page.until_text("#time-value", "frame")  # the cameras, which were refused before, are asked for again
         page.find("#stage").send_keys("+")
         page.until(lambda: "pose=" in driver.current_url)
         assert key not in driver.current_url

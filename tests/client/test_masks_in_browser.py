@@ -88,6 +88,18 @@ def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path
     page.until_text("#jobs-message", f"clip_kept_by {record.job_id}")
 
 
+def test_a_clip_is_sent_again_without_any_file(site: Site, page: Page) -> None:
+    page.choose("clip", CLIP)
+    page.click("#upload [type=submit]")
+    page.until_text("#jobs", "waiting")
+    scene = site.finish(site.claim())
+    report = REPORT_OF_THE_PAGE.model_copy(update={"masks": Masks(source="none")})
+    site.store.add_scores("worker-1", scene, 1, report)
+    page.click(f'#report button[aria-label="{say("report.send_masks")}"]')
+    page.click("#upload [type=submit]")
+    page.until(lambda: [each.clip_of for each in site.queue.records() if each.job_id != scene] == [scene])
+
+
 @pytest.mark.parametrize(
     ("masks", "words"),
     [

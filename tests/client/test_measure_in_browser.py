@@ -176,6 +176,19 @@ def test_the_scale_bar_says_at_which_depth_it_holds_and_is_as_long_as_it_says(si
     assert shown == pytest.approx(length * scale / MM_A_PIXEL, rel=0.03)
 
 
+def test_nothing_of_a_scene_that_leaves_the_screen_stays_on_it(site: Site, page: Page) -> None:
+    start(site, page)
+    click_at(page, 0.3, 0.4)
+    page.until(lambda: "±" in page.text("#measuring .told"))
+    click_at(page, 0.6, 0.4)
+    page.until(lambda: page.text("#measuring .distance") and page.find("#scale").is_displayed())
+    page.script("return import('/main.js').then(({ viewer }) => viewer.open(null))")
+    assert page.shade == -1
+    assert not page.find("#measuring").is_displayed()
+    assert not page.find("#scale").is_displayed()
+    assert page.script("return document.querySelectorAll('.measured *').length") == 0
+
+
 def test_depth_and_confidence_have_legends_and_colours_have_none(site: Site, page: Page) -> None:
     viewed(site, page)
     assert not page.find("#legend").is_displayed()

@@ -108,8 +108,9 @@ class View {
     get("play").textContent = words(isPlaying ? "file.pause" : "file.play");
     get("play").setAttribute("aria-pressed", String(isPlaying));
     let before = performance.now();
+    const run = (this.run = {}); // a second start ends the first
     const step = (now) => {
-      if (!this.isPlaying) return;
+      if (!this.isPlaying || this.run !== run) return;
       if (!this.isDrawing) {
         this.t = (this.t + (Math.max(0, now - before) / 1000 / Math.max(this.durationS, 0.1)) * this.last) % (this.last || 1);
         before = now;
