@@ -108,7 +108,7 @@ export class Shelf {
     this.isAsking = true;
     try {
       const times = wanted.map((job) => job.created_at_s);
-      const window = { created_from_s: Math.min(...times), created_until_s: Math.max(...times) };
+      const window = { created_from_s: Math.min(...times), created_until_s: Math.max(...times), q: this.search.value.trim() };
       const scenes = new Map((await listScenes({ ...window, limit: 2 * MAX_ASKED })).map((scene) => [scene.id, scene]));
       for (const { id } of wanted) this.summaries.set(id, scenes.get(id) ?? null);
       this.onChange();

@@ -40,14 +40,14 @@ def labelled(site: Site, job_id: str, label: str) -> str:
     return job_id
 
 
-def many_done(site: Site, count: int) -> None:
-    """Jobs that are done, with names, without scenes of their own."""
+def many_done(site: Site, count: int, began_s: float = -10_000) -> None:
+    """Jobs that are done, with names, without scenes of their own; began_s: of the first, from now."""
     for index in range(count):
         record = JobRecord(
             job_id=f"{index:032x}",
             files=JobFiles(clip="clip.mp4"),
             labels=Labels(label=f"case {index}"),
-            created_at_s=time.time() - 10_000 + index,
+            created_at_s=time.time() + began_s + index,
         )
         site.queue.submit(record)
         assert site.queue.finish(site.claim())
@@ -119,6 +119,16 @@ def test_a_thousand_scenes_are_listed_page_by_page_and_only_those_in_sight_have_
     lists = [each for each in asked if re.search(r"/jobs\?", each)]
     assert all("limit=30" in each for each in lists)
     assert len({each for each in asked if "thumbnail" in each}) < 40
+
+
+def test_a_scene_that_is_found_has_its_light_however_many_are_newer(site: Site, page: Page) -> None:
+    old = labelled(site, site.scene(), "liver old")
+    many_done(site, 120, 1)
+    labelled(site, f"{119:032x}", "liver new")
+    page.open()
+    page.find("#search").send_keys("liver")
+    page.until(lambda: page.script(NAMES) == ["liver new", "liver old"])
+    page.until(lambda: page.text(card(old, ".trust")))
 
 
 def test_pictures_out_of_sight_are_let_go_of(site: Site, page: Page) -> None:
