@@ -69,7 +69,7 @@ export class Measure {
     this.chosen = []; // points of the picture of this.view
     this.view = null; // in which they were chosen
     this.found = null; // the distance of both
-    this.cross = null; // of the keys, a point of the picture
+    this.cross = null; // of the keys, in shares of the picture, whose size may change
     this.asked = {}; // replaced by each question: earlier answers are for nobody
     this.#say();
   }
@@ -167,7 +167,7 @@ export class Measure {
     if (now) this.overlay.line(shown.camera, now.places, `${figure(now.mm, 1)} mm`);
     else if (!this.found && shown?.camera && sameView(shown, this.view)) this.overlay.points(shown.camera, this.chosen);
     else this.overlay.clear();
-    if (shown?.camera) this.overlay.cross(shown.camera, this.cross);
+    if (shown?.camera && this.cross) this.overlay.cross(shown.camera, this.#crossIn(shown.camera));
   }
 
   /** Clicks choose; what moves farther goes on to whoever turns the view. */
@@ -210,13 +210,15 @@ export class Measure {
   }
 
   #crossIn({ width, height }) {
-    return (this.cross ??= [width / 2, height / 2]);
+    const [x, y] = (this.cross ??= [0.5, 0.5]);
+    return [x * width, y * height];
   }
 
   #moveCross(camera, [right, down], step) {
     const [x, y] = this.#crossIn(camera);
     const held = (value, size) => Math.min(Math.max(value, 0.5), size - 0.5);
-    this.cross = [held(x + right * step, camera.width), held(y + down * step, camera.height)];
+    const moved = [held(x + right * step, camera.width), held(y + down * step, camera.height)];
+    this.cross = [moved[0] / camera.width, moved[1] / camera.height];
     this.#draw();
   }
 }

@@ -34,9 +34,9 @@ export class Overlay {
     this.#add("text", { x, y }).textContent = text;
   }
 
-  /** @param {import("./stream.js").Camera} camera @param {number[] | null} point of the picture, besides what is there */
+  /** @param {import("./stream.js").Camera} camera @param {number[]} point of the picture, besides what is there */
   cross(camera, point) {
-    if (point) this.#mark("cross", this.#at(camera, point));
+    this.#mark("cross", this.#at(camera, point));
   }
 
   #at(camera, point) {

@@ -9,6 +9,9 @@ const EVERY_MS = 1000;
 const MAX_SHARE = 0.25;
 const LENGTHS_MM = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200];
 
+/** Whether two views are of the same scene from the same place; the times may differ. */
+const isSamePlace = (a, b) => a.scene === b.scene && a.pose === b.pose && a.eye === b.eye;
+
 export class Scale {
   /**
    * @param {import("./viewer.js").Viewer} viewer
@@ -37,7 +40,7 @@ export class Scale {
   #follow(shown) {
     if (!isMeasurable(shown)) return this.#forget();
     const { known } = this;
-    if (known && (known.shown.scene !== shown.scene || known.shown.pose !== shown.pose)) this.known = null;
+    if (known && !isSamePlace(known.shown, shown)) this.known = null;
     this.#draw();
     if (this.wanted || sameView(shown, this.known?.shown ?? null)) return;
     this.wanted = setTimeout(() => this.#ask(), Math.max(0, this.askedAt + EVERY_MS - performance.now()));
@@ -51,7 +54,7 @@ export class Scale {
       const { width, height } = shown.camera;
       const { points } = await getMeasurement(shown.scene, queryOf(shown, [[width / 2, height / 2]]));
       const now = this.viewer.shown;
-      if (now?.scene === shown.scene && now.pose === shown.pose) this.known = { shown, point: points[0] };
+      if (now && isSamePlace(now, shown)) this.known = { shown, point: points[0] };
     } catch {
       this.known = null; // the picture's own state says what is wrong
     } finally {
