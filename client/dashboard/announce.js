@@ -2,7 +2,7 @@
 // user wants it, by a notification of the browser when it is ready.
 
 import { nameOf } from "./card.js";
-import { button, element } from "./element.js";
+import { button, element, setText } from "./element.js";
 import { keep, kept } from "./kept.js";
 import { words } from "./messages.js";
 import { errorWords } from "./problem.js";
@@ -93,7 +93,7 @@ export class Announcer {
     if (!this.line.firstChild) this.line.append(element("p"), ...this.#buttons(told));
     const what = told.state === "failed" ? errorWords(told.error?.code ?? "unclassified", told.error?.field) : progressOf(told, this.times);
     const text = `${nameOf(told)}: ${what}`;
-    if (this.line.firstChild.textContent !== text) this.line.firstChild.textContent = text;
+    setText(this.line.firstChild, text);
     this.line.classList.toggle("bad", told.state === "failed");
   }
 

@@ -1,6 +1,7 @@
 // The recorded frame beside or over the model's picture of the same moment. Both show the same only from the
 // endoscope's own pose: choosing it goes there, and turning away ends it.
 
+import { setText } from "./element.js";
 import { languageEvents, words } from "./messages.js";
 import { RecordedFrames } from "./recordedframes.js";
 
@@ -160,7 +161,7 @@ export class Compare {
     const isLate = this.drawn === null || this.drawn !== wanted;
     canvas.hidden = this.drawn === null;
     const text = this.drawn === null ? words("compare.loading") : words("compare.recorded", { frame: this.drawn + 1 });
-    if (ofRecorded.textContent !== text) ofRecorded.textContent = text;
+    setText(ofRecorded, text);
     ofRecorded.toggleAttribute("data-late", isLate);
     ofModel.textContent = words("compare.model");
     canvas.setAttribute("aria-label", text);

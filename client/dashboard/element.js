@@ -31,6 +31,11 @@ export function button(text, onClick, name = text) {
   return made;
 }
 
+/** Only where it changes, so that screen readers are told once. @param {Element} target @param {string} text */
+export function setText(target, text) {
+  if (target.textContent !== text) target.textContent = text;
+}
+
 const LOCALES = { en: "en-GB", de: "de-DE" };
 
 /** @param {number} ms since 1970 */

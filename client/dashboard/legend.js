@@ -1,6 +1,7 @@
 // What the false colours of the layers depth and confidence mean.
 
 import { gradient } from "./colours.js";
+import { setText } from "./element.js";
 import { figure, languageEvents, words } from "./messages.js";
 
 export class Legend {
@@ -32,7 +33,6 @@ export class Legend {
   }
 
   #say(part, text) {
-    const found = this.box.querySelector(part);
-    if (found.textContent !== text) found.textContent = text;
+    setText(this.box.querySelector(part), text);
   }
 }

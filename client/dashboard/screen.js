@@ -2,7 +2,7 @@
 // badge says so by itself after STALE_AFTER_MS, because it depends on what comes, not on somebody noticing. What this
 // browser draws from memory goes on without the service, and then says that nobody confirms it.
 
-import { clockTime } from "./element.js";
+import { clockTime, setText } from "./element.js";
 import { words } from "./messages.js";
 
 /** @typedef {import("./stream.js").Picture} Picture */
@@ -119,9 +119,4 @@ export class Screen {
     if (state === "unconfirmed") return words("screen.unconfirmed_why", { time: clockTime(this.confirmedAt) });
     return this.shown && state !== "stale" ? this.name : "";
   }
-}
-
-/** Only where it changes, so that screen readers are told once. */
-function setText(target, text) {
-  if (target.textContent !== text) target.textContent = text;
 }

@@ -1,6 +1,6 @@
 // Who draws, why, and how fast: in words, with a choice and figures below.
 
-import { element } from "./element.js";
+import { element, setText } from "./element.js";
 import { CHOICES } from "./memory.js";
 import { figure, languageEvents, words } from "./messages.js";
 import { graphics } from "./player/support.js";
@@ -61,9 +61,4 @@ export class Way {
     this.choice.replaceChildren(...options);
     this.choice.value = this.memory.choice;
   }
-}
-
-/** Only where it changes, so that screen readers are told once. */
-function setText(target, text) {
-  if (target.textContent !== text) target.textContent = text;
 }

@@ -13,7 +13,7 @@ from typing import Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from contract.wire.cameras import CamerasRequest
+from contract.wire.cameras import CamerasRequest, ClipCamera
 from contract.wire.exports import ExportOptions
 from contract.wire.measuring import MAX_POINTS, Point
 from contract.wire.names import JOB_ID_PATTERN, Eye
@@ -94,17 +94,9 @@ class IntrinsicsOverride(BaseModel):
         return width, height
 
 
-class PictureCamera(BaseModel):
+class PictureCamera(ClipCamera):
     """Where a picture was taken from and through which lens, in pixels of that picture (docs/conventions.md)."""
 
-    model_config = ConfigDict(frozen=True)
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
     world_from_camera: tuple[float, ...] = Field(min_length=12, max_length=12)
     """The upper three rows, row-major, translation in mm."""
 

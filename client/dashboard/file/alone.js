@@ -1,6 +1,6 @@
 // A file that shows one scene without a service: the player of the page, with a few controls. The scene lies in the file.
 
-import { dateTime, element } from "../element.js";
+import { dateTime, element, setText } from "../element.js";
 import { listenToGestures } from "../gestures.js";
 import { figure, noticeWords, showWords, words } from "../messages.js";
 import { Player } from "../player/player.js";
@@ -81,8 +81,7 @@ class View {
         const { yaw, pitch, zoom } = this;
         const pose = this.isHome ? this.cameras.endoscope(this.t) : this.cameras.orbit(yaw, pitch, zoom);
         const { warnings } = await this.player.draw({ t: this.t, pose, ...this.#size(), isMarked: get("marked").checked, isMoving: this.isMoving });
-        const told = [...new Set(warnings.map(noticeWords))].join(" ");
-        if (get("notices").textContent !== told) get("notices").textContent = told;
+        setText(get("notices"), [...new Set(warnings.map(noticeWords))].join(" "));
       }
     } catch (error) {
       refuse(error);
