@@ -93,8 +93,8 @@ export const labelJob = (id, label) =>
     headers: { "Content-Type": "application/json" },
     body: JSON.stringify({ label: label || null }),
   });
-/** @param {string} id @returns {Promise<Blob>} a JPEG, from the browser's own store where it is still the same */
-export const getThumbnail = (id) => blob(`/scenes/${id}/thumbnail`, { cache: "no-cache" });
+/** @param {string} id @returns {Promise<Blob>} a JPEG; the browser keeps none, for it would outlive a purge */
+export const getThumbnail = (id) => blob(`/scenes/${id}/thumbnail`, { cache: "no-store" });
 /** @param {string} id @returns {Promise<Receipt>} */
 export const purgeScene = (id) => json(`/scenes/${id}`, { method: "DELETE" });
 /** @param {string} id @returns {Promise<Record<string, any>>} */

@@ -248,6 +248,7 @@ export class ClipForm {
     this.#showSource();
     this.#say(words("upload.interrupted"), "bad");
     this.onAsked();
+    await this.#goOn(); // after another key was asked for, the files are chosen still
   }
 
   /** Go on as soon as the files that were interrupted are chosen again. */

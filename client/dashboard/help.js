@@ -3,7 +3,7 @@
 import { element } from "./element.js";
 import { GESTURES } from "./gestures.js";
 import { keyRows } from "./keys.js";
-import { hasWords, words } from "./messages.js";
+import { hasWords, language, languageEvents, setLanguage, words } from "./messages.js";
 
 /** @param {string} key of KeyboardEvent */
 const nameOf = (key) => (hasWords(`key.${key}`) ? words(`key.${key}`) : key);
@@ -19,21 +19,29 @@ function table(title, rows) {
   return element("table", {}, caption, element("tbody", {}, ...rows));
 }
 
+function fill(dialog) {
+  const keys = keyRows().map(({ keys: by, does, withShift }) =>
+    row([...(withShift ? [words("key.Shift")] : []), ...Object.keys(by).map(nameOf)], does, "kbd"));
+  const gestures = Object.entries(GESTURES).map(([name, does]) => row([words(`gesture.${name}`)], does, "span"));
+  dialog.querySelector(".help-tables").replaceChildren(table("help.keys", keys), table("help.gestures", gestures));
+}
+
 /**
  * Open or close the help.
  * @param {HTMLDialogElement} dialog
  */
 export function toggleHelp(dialog) {
   if (dialog.open) return dialog.close();
-  const keys = keyRows().map(({ keys: by, does, withShift }) =>
-    row([...(withShift ? [words("key.Shift")] : []), ...Object.keys(by).map(nameOf)], does, "kbd"));
-  const gestures = Object.entries(GESTURES).map(([name, does]) => row([words(`gesture.${name}`)], does, "span"));
-  dialog.querySelector(".help-tables").replaceChildren(table("help.keys", keys), table("help.gestures", gestures));
+  fill(dialog);
   dialog.showModal();
 }
 
-/** Wire the help's dialog. @param {HTMLDialogElement} dialog with a [data-close] and a place for .help-tables */
+/** Wire the help's dialog. @param {HTMLDialogElement} dialog with a [data-close], a choice of language and a place for .help-tables */
 export function prepareHelp(dialog) {
+  const choice = dialog.querySelector("#language");
+  choice.value = language();
+  choice.addEventListener("change", () => setLanguage(choice.value));
+  languageEvents.addEventListener("changed", () => fill(dialog));
   dialog.querySelector("[data-close]").addEventListener("click", () => dialog.close());
   dialog.addEventListener("keydown", (event) => event.key === "?" && dialog.close());
   dialog.addEventListener("click", (event) => event.target === dialog && dialog.close()); // beside it

@@ -578,6 +578,7 @@ export const DE = {
     "place": "{seconds} s von {duration} s, Bild {frame} von {frames}"
   },
   "help": {
+    "language": "Sprache",
     "title": "Tasten und Gesten",
     "open": "Hilfe",
     "keys": "Tasten",

@@ -578,6 +578,7 @@ export const EN = {
     "place": "{seconds} s of {duration} s, frame {frame} of {frames}"
   },
   "help": {
+    "language": "Language",
     "title": "Keys and gestures",
     "open": "Help",
     "keys": "Keys",

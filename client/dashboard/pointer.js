@@ -26,7 +26,7 @@ export function placeInPicture(canvas, camera, x, y) {
 
 /**
  * Depth of what is shown at a place of the picture, along the camera's z. The service draws a few pixels for it, also
- * where the browser draws the picture.
+ * where the browser draws the picture. /measure tells more, and only of finished scenes.
  * @param {Shown} shown
  * @param {number} u @param {number} v pixels of the picture
  * @returns {Promise<number>} mm; NaN where nothing solid is, or no frame saw it

@@ -90,6 +90,7 @@ export class Viewer extends EventTarget {
     this.parts.readout.textContent = "";
     this.clip.open(scene);
     if (scene === null) this.timeline.play(false);
+    this.parts.play.disabled = scene === null;
     this.refresh();
   }
 

@@ -133,3 +133,23 @@ def test_row_5_a_time_left_is_told_roughly_and_a_broken_promise_is_admitted(site
     page.script("window.later = 20000")
     site.train(claim, 91, 25.0, seconds_left=1.0)
     page.until_text(f'[data-job="{job_id}"]', say("left.overdue"))
+
+
+def test_another_language_is_chosen_in_the_help_and_kept(site: Site, page: Page) -> None:
+    page.click("#show-help")
+    page.script(
+        "const choice = document.querySelector('#language'); choice.value = 'de';"
+        "choice.dispatchEvent(new Event('change'))"
+    )
+    page.until_text("#help caption", say("help.keys", "de"))
+    page.until_text("#help-title", say("help.title", "de"))
+    page.open()
+    page.until_text("#tools", say("tool.scenes", "de"))
+    page.script("localStorage.clear()")
+
+
+def test_nothing_plays_without_a_scene(site: Site, page: Page) -> None:
+    assert not page.find("#play").is_enabled()
+    page.press(site.scene(), "View")
+    page.until_state("live")
+    assert page.find("#play").is_enabled()
