@@ -15,6 +15,10 @@ CAMERAS = SceneCameras(
     units_per_mm=1.0,
     right_eye_mm=(4.0, 0.0, 0.0),
 )
+FIRST_CAMERAS = CAMERAS.model_copy(
+    update={"frame_times_s": (0.0,), "world_from_camera": (STILL,), "trained_t": (0.0,), "right_eye_mm": None}
+)
+"""Of a first picture: one moment, one eye."""
 
 
 def cameras_reply(request: CamerasRequest, cameras: SceneCameras = CAMERAS) -> Reply:

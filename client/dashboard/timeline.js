@@ -33,9 +33,11 @@ export class Timeline {
 
   /** @param {Cameras | null} cameras of the scene, which know its times; null while they are not known */
   know(cameras) {
+    const { count } = this;
     this.cameras = cameras;
     this.parts.time.max = String(this.count - 1);
-    this.loopAll();
+    if (cameras && this.count === count) this.#show(); // told once more: the loop stays
+    else this.loopAll();
   }
 
   /** Frames; while they are not known, places. */

@@ -191,6 +191,7 @@ export class Viewer extends EventTarget {
       this.screen.show(picture, image, `${name}, ${this.timeline.momentOf(picture.t)}`);
       this.pace.note();
       this.shown = shownOf(view, picture);
+      if (!picture.isRecorded) this.clip.follow(picture);
       this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
       this.#tell(name, picture, performance.now() - began);
       if (isDrawnHere) await this.memory.player?.settled();

@@ -53,7 +53,7 @@ from contract.wire.report import Report
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
-from tests.cameras import cameras_reply
+from tests.cameras import CAMERAS, cameras_reply
 from tests.measurements import RANGE_MM, measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.pace import Pace
@@ -130,10 +130,11 @@ class Painter:
         self.shown_unseen: Unseen | None = None
         self.shown_highlights: Highlights | None = None
         self.eye: Eye = "left"
+        self.cameras = CAMERAS
 
     def answer(self, request: SceneRequest) -> Reply:
         if isinstance(request, CamerasRequest):
-            return cameras_reply(request)
+            return cameras_reply(request, self.cameras)
         if isinstance(request, MeasureRequest):
             return measurement_reply(request)
         if isinstance(request, ExportRequest):

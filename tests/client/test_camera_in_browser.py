@@ -8,12 +8,21 @@ import pytest
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
+from contract.wire.notices import Notice, NoticeCode
 from contract.wire.pose import OrbitPose, parse_pose
-from tests.cameras import CAMERAS, FRAMES
+from tests.cameras import CAMERAS, FIRST_CAMERAS, FRAMES
 from tests.client.page import CAMERA, DEPTH_MM, Page, Site
 from tests.client.words import say
 
 SHOWN = "const done = arguments[0]; import('/main.js').then(({ viewer }) => done(viewer.shown));"
+SHORTER_FRAMES = 30
+SHORTER_CAMERAS = CAMERAS.model_copy(
+    update={
+        "frame_times_s": CAMERAS.frame_times_s[:SHORTER_FRAMES],
+        "world_from_camera": CAMERAS.world_from_camera[:SHORTER_FRAMES],
+        "trained_t": (0.0,),
+    }
+)
 MEDIAN_MM = 60 / CAMERAS.units_per_mm
 
 
@@ -56,6 +65,32 @@ def test_time_is_told_in_seconds_and_frames_and_stepped_frame_by_frame(page: Pag
     assert page.find("#time").get_attribute("aria-valuetext") == "1.95 s of 1.95 s, frame 40 of 40"
     stage.send_keys(".")  # there is none after the last
     page.until(lambda: shown(page)["t"] == pytest.approx((FRAMES - 1) / FRAMES))
+
+
+def test_a_scene_that_is_watched_from_its_first_picture_on_is_played_as_soon_as_it_trains(
+    site: Site, page: Page
+) -> None:
+    site.painter.warnings = [Notice.warning(NoticeCode.FIRST_PICTURE, "One moment.")]
+    site.painter.cameras = FIRST_CAMERAS
+    scene = site.queued_job()
+    claim = site.claim()
+    site.train(claim, 0, 20.0)
+    page.press(scene, "Watch")
+    page.until_text("#badge", say("screen.first_picture"))
+    page.until_text("#time-value", "frame 1 of 1")
+    page.driver.execute_async_script(
+        "const [t, done] = arguments; import('/main.js').then(({ viewer }) => done(viewer.look({ t })))", 0.5
+    )
+    site.painter.cameras = CAMERAS
+    site.painter.warnings = []
+    page.until_text("#badge", "TRAINING")
+    page.until_text("#time-value", f"1.00 s of 1.95 s, frame 21 of {FRAMES}")  # t is kept
+    assert page.find("#eye").is_displayed()
+    page.click("#step-on")
+    page.until_text("#time-value", "frame 22 of 40")
+    site.painter.cameras = SHORTER_CAMERAS
+    site.finish(claim)
+    page.until_text("#time-value", f"of {SHORTER_FRAMES}")
 
 
 PLAYED = """
