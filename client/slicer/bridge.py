@@ -45,8 +45,8 @@ FAREWELL_S = 3.0
 LOOK_S = 0.02
 """How often a clip that plays is looked at for its next frame."""
 LOOK_AROUND_S = 1.0
-LOOK_AROUND_PX = 64
-"""The median depth and the confidence are measured on a view so wide, when the pose changes and at most so often."""
+"""The median depth and the confidence are measured at the clip's own size, in which confidence is calibrated, when the
+pose changes and at most so often."""
 GONE = (NotFound, Unauthorized, Forbidden)
 """What no waiting mends: the scene is deleted, or the key may not see it."""
 AWAY = (ServiceUnavailable, ServiceFault)
@@ -197,9 +197,8 @@ class Bridge:
         is_new = before is None or before.camera.world_from_camera != camera.world_from_camera
         if before is not None and not is_new and time.monotonic() - self._looked_at_s < LOOK_AROUND_S:
             return before.plane_mm
-        width = min(LOOK_AROUND_PX, camera.width)
-        depth_mm = (await self._render(view, "depth", width)).array()
-        confidence = (await self._render(view, "confidence", width)).array()
+        depth_mm = (await self._render(view, "depth", None)).array()
+        confidence = (await self._render(view, "confidence", None)).array()
         seen = depth_mm > 0
         self._looked_at_s = time.monotonic()
         self._status.confidence = float(confidence[seen].mean()) if seen.any() else None

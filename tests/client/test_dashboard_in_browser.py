@@ -96,7 +96,7 @@ def test_a_stereo_clip_may_be_trained_on_its_left_eye_alone(site: Site, page: Pa
     page.click("#upload [type=submit]")
     page.until(lambda: site.queue.records())
     options = site.queue.records()[0].options
-    assert (options.eyes, options.poses, options.mask_source) == ("left", "fixed", "given")
+    assert (options.eyes, options.poses, options.mask_source) == ("left", "fixed", "auto")
 
 
 def test_a_clip_that_cannot_be_used_is_refused_in_words(page: Page, tmp_path: Path) -> None:
@@ -179,6 +179,7 @@ def test_a_view_that_is_shown_is_told_with_its_camera_and_others_can_look_elsewh
         "state": "done",
         "way": way,
         "camera": CAMERA.model_dump(mode="json"),
+        "depthRangeMm": [45, 78],
     }
     page.find("#stage").send_keys("+")  # a turn or an approach goes on from the endoscope
     page.until(lambda: "1.10×" in page.view)

@@ -92,10 +92,23 @@ def places_at(
     if not bool(scene.seen.any()):
         problem = "Nothing is known of how far to trust this scene, so nothing can be measured in it."
         raise InputError("scene", problem, "Measure in a scene whose training has ended.")
+    for number, (x, y) in enumerate(points):
+        if not (0 <= x < camera.width and 0 <= y < camera.height):
+            problem = f"({x:g}, {y:g}) lies outside the picture of {camera.width} x {camera.height} pixels."
+            raise InputError(f"points[{number}]", problem, "Give x and y in pixels from the picture's upper left.")
     own_pose = endoscope_pose(scene, t)
     pose = own_pose if world_from_camera is None else world_from_camera
-    view = _View(scene, t, pose, camera, own_pose, device)
-    return [view.place(number, *point) for number, point in enumerate(points)]
+    sampled = _as_recorded(camera, scene.intrinsics)
+    across, down = sampled.width / camera.width, sampled.height / camera.height
+    view = _View(scene, t, pose, sampled, own_pose, device)
+    return [view.place(x * across, y * down) for x, y in points]
+
+
+def _as_recorded(camera: Intrinsics, own: Intrinsics) -> Intrinsics:
+    """The same view in pixels as fine as the recording's, in which confidence is calibrated: what is measured does not
+    depend on how large the picture is."""
+    scale = own.fx / camera.fx
+    return camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,12 +120,9 @@ class _View:
     own_pose: NDArray[np.float64]
     device: Device
 
-    def place(self, number: int, x: float, y: float) -> Place:
+    def place(self, x: float, y: float) -> Place:
         """What the pixel shows that covers (x, y)."""
         camera, scene = self.camera, self.scene
-        if not (0 <= x < camera.width and 0 <= y < camera.height):
-            problem = f"({x:g}, {y:g}) lies outside the picture of {camera.width} x {camera.height} pixels."
-            raise InputError(f"points[{number}]", problem, "Give x and y in pixels from the picture's upper left.")
         window, i, j = _window(camera, x, y)
         image, blended = renderer_of(scene, self.device).layers(self.t, self.pose, window)
         assert blended is not None  # the scene's `seen` is known
