@@ -334,7 +334,7 @@ export const DE = {
     "warping": "verschoben",
     "likeness_title": "Ähnlichkeit",
     "right_eye_title": "Ähnlichkeit vom rechten Auge aus",
-    "depth_title": "Tiefe gegen Stereo, mittlere Abweichung",
+    "depth_title": "Tiefe gegen Stereo, Median der Abweichung",
     "covered_title": "Abgedecktes Gewebe",
     "instruments_title": "Instrumente",
     "frames_title": "Bilder",

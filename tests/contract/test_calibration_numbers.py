@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from contract.intake.calibration.text import read_calibration
 from contract.intake.limits import ClipLimits
 from contract.intake.sniff import check_file
 from contract.wire.errors import InputError
@@ -47,3 +48,10 @@ def test_words_and_comments_are_no_numbers(tmp_path: Path, name: str, text: str)
     path = tmp_path / name
     path.write_text(text)
     check_file(path, "calibration", ClipLimits())
+
+
+@pytest.mark.parametrize(("text", "given"), [("{}", "None"), ('{"model": "fisheye"}', "fisheye")])
+def test_a_calibration_of_no_known_model_is_refused_in_plain_words(text: str, given: str) -> None:
+    with pytest.raises(InputError) as refused:
+        read_calibration(text)
+    assert refused.value.problem == f"model is {given}, not rectified or raw."

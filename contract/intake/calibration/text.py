@@ -37,6 +37,9 @@ def checked_calibration(value: dict[str, Any]) -> StereoCalibration:
         calibration = parse_calibration(value)
     except ValidationError as error:
         first = error.errors()[0]
+        if first["type"] in ("union_tag_not_found", "union_tag_invalid"):
+            problem = f"model is {str(value.get('model'))[:80]}, not rectified or raw."
+            raise InputError(FIELD, problem, FORMATS_REMEDY) from None
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         raise InputError(
             FIELD, f"{where}: {first['msg']} (given {str(first['input'])[:80]}).", FORMATS_REMEDY
