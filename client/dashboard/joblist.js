@@ -5,6 +5,7 @@ import { makeCard, nameOf, rename } from "./card.js";
 import { button, element } from "./element.js";
 import { TimesLeft } from "./left.js";
 import { words } from "./messages.js";
+import { hush } from "./news.js";
 import { details, showProblem } from "./problem.js";
 import { progressOf } from "./progress.js";
 import { Thumbnails } from "./thumbnails.js";
@@ -129,6 +130,7 @@ export class JobList {
   }
 
   #rename(job) {
+    hush(this.message);
     this.renamed = job.id;
     rename(this.rows.get(job.id).item, job, (labelled) => {
       const row = this.rows.get(job.id);
@@ -160,8 +162,7 @@ export class JobList {
   }
 
   async #do(work) {
-    this.message.className = "message";
-    this.message.replaceChildren();
+    hush(this.message);
     try {
       await work();
     } catch (error) {

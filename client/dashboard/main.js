@@ -20,6 +20,7 @@ import { listenToKeys, onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
 import { Measure } from "./measure.js";
 import { languageEvents, showWords, words } from "./messages.js";
+import { hush, prepareNews } from "./news.js";
 import { pause } from "./pause.js";
 import { Probe } from "./probe.js";
 import { showReport } from "./report.js";
@@ -96,6 +97,7 @@ function view(id, message) {
   awaited = null;
   reported = null;
   tell("");
+  hush(get("jobs-message"));
   viewer.open(id, message);
   compare.open(id);
   address.note();
@@ -232,6 +234,8 @@ keyEvents.addEventListener("changed", () => {
   view(null, words(currentKey() ? "page.choose" : "page.key_forgotten")); // another key may not see the same
   if (currentKey()) address.follow();
 });
+prepareNews(get("news"));
+get("upload").addEventListener("submit", () => hush(get("jobs-message")));
 stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen === null);
 
 const showHelp = () => toggleHelp(get("help"));

@@ -103,3 +103,20 @@ def test_controls_step_back_while_idle_and_return(site: Site, page: Page) -> Non
         page.script("document.querySelector('#theatre').toggleAttribute('data-idle', true)")
         page.script("document.body.dispatchEvent(new Event(arguments[0], { bubbles: true }))", sign)
         assert not page.script(idle), sign
+
+
+@pytest.mark.parametrize("close", ["#jobs-message + [data-close]", '[data-job] button[aria-label^="View"]'])
+def test_the_news_of_a_deletion_leaves_by_its_button_and_with_the_next_scene(
+    site: Site, page: Page, close: str
+) -> None:
+    site.scene()
+    gone = site.scene()
+    assert not page.find("#jobs-message + [data-close]").is_displayed()
+    page.press(gone, "Delete")
+    page.until(lambda: page.find("#confirm").is_displayed())
+    page.click("#confirm [value=yes]")
+    page.until_text("#jobs-message", "are deleted for good")
+    assert page.find("#jobs-message + [data-close]").is_displayed()
+    page.click(close)
+    page.until(lambda: page.text("#jobs-message") == "")
+    assert not page.find("#jobs-message + [data-close]").is_displayed()
