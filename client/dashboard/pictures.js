@@ -16,6 +16,8 @@ const MAX_RETRY_MS = 15000;
 const RECORDED = "recorded";
 
 const GUESSES = ["pose_far", "time_outside_clip"];
+/** What a view itself says; all other notices are of its scene. */
+const OF_VIEW = [...GUESSES, "unseen", "hardly_seen"];
 
 /** @param {string} path @param {AbortSignal} signal @returns {Promise<Picture>} */
 async function askOnce(path, signal) {
@@ -49,9 +51,11 @@ function isGuess(code, view) {
   return GUESSES.includes(code);
 }
 
-/** What to know of a picture, in the page's words. @param {string[]} codes @param {View} view */
+const withViewFirst = (codes) => [true, false].flatMap((isOfView) => codes.filter((code) => OF_VIEW.includes(code) === isOfView));
+
+/** What to know of a picture, in the page's words, and of this view first. @param {string[]} codes @param {View} view */
 const warningOf = (codes, view) =>
-  codes
+  withViewFirst(codes)
     .map((code) => (code === "unseen" && view.unseen === "guess" ? words("picture.guessed") : noticeWords({ code, text: "" })))
     .filter(Boolean)
     .join(" ");

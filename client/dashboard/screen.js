@@ -95,6 +95,7 @@ export class Screen {
     setText(this.message, message);
     this.message.hidden = message === "";
     setText(this.warning, state === "stale" ? "" : (this.shown?.warning ?? ""));
+    this.warning.title = this.warning.textContent;
   }
 
   /** @returns {[string, string, string]} state, badge, message over the picture */

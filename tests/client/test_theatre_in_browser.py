@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 from selenium.webdriver.common.keys import Keys
 
+from contract.wire.notices import NoticeCode
 from tests.client.page import Page, Site
 from tests.client.words import say
+from tests.reports import a_warning
 
 SIZES = [(1280, 800), (1920, 1080), (820, 1180), (390, 844)]
 """A laptop, the screen of an operating room, a tablet held upright, a phone."""
@@ -120,3 +122,27 @@ def test_the_news_of_a_deletion_leaves_by_its_button_and_with_the_next_scene(
     page.click(close)
     page.until(lambda: page.text("#jobs-message") == "")
     assert not page.find("#jobs-message + [data-close]").is_displayed()
+
+
+def test_the_warning_of_this_view_is_read_before_those_of_its_scene_and_all_are_behind_it(
+    site: Site, page: Page
+) -> None:
+    of_scene = [NoticeCode.POSES_UNSURE, NoticeCode.MASKS_UNSURE, NoticeCode.POSE_JITTER]
+    site.painter.warnings = [a_warning("Of the scene.", code) for code in of_scene]
+    with screen_of(page, 1280, 800):
+        page.press(site.scene(), "View")
+        page.until_text("#picture-warning", say("notice.poses_unsure"))
+        page.driver.execute_async_script(
+            "const [pose, done] = arguments; import('/main.js').then(({ viewer }) => done(viewer.look({ pose })))",
+            "orbit:30,0,1",
+        )
+        page.until_text("#picture-warning", say("notice.pose_far"))
+        whole = " ".join(say(f"notice.{code}") for code in (NoticeCode.POSE_FAR, *of_scene))
+        assert page.script("return document.querySelector('#picture-warning').textContent") == whole
+        assert page.find("#picture-warning").get_attribute("title") == whole
+        hidden = "const { scrollHeight, clientHeight } = document.querySelector('#picture-warning'); "
+        hidden += "return scrollHeight - clientHeight"
+        assert page.script(hidden) > 0
+        page.click(".picture-warning summary")
+        assert page.script(hidden) == 0
+        assert is_on_screen(page, "#picture-warning")
