@@ -5,7 +5,7 @@ import { nameOf } from "./card.js";
 import { button, element, setText } from "./element.js";
 import { keep, kept } from "./kept.js";
 import { words } from "./messages.js";
-import { errorWords } from "./problem.js";
+import { failureOf } from "./problem.js";
 import { progressOf } from "./progress.js";
 import { TimesLeft } from "./left.js";
 
@@ -91,7 +91,7 @@ export class Announcer {
     this.line.dataset.of = key ?? "";
     if (!told) return;
     if (!this.line.firstChild) this.line.append(element("p"), ...this.#buttons(told));
-    const what = told.state === "failed" ? errorWords(told.error?.code ?? "unclassified", told.error?.field) : progressOf(told, this.times);
+    const what = failureOf(told) || progressOf(told, this.times);
     const text = `${nameOf(told)}: ${what}`;
     setText(this.line.firstChild, text);
     this.line.classList.toggle("bad", told.state === "failed");

@@ -9,6 +9,7 @@ import { Compare } from "./compare.js";
 import { drawCurve, pointsOfCsv } from "./curve.js";
 import { Downloads } from "./downloads.js";
 import { Drawers } from "./drawers.js";
+import { setText } from "./element.js";
 import { baselinesOf } from "./figures.js";
 import { ClipForm } from "./form.js";
 import { prepareFullScreen, ScreenLight } from "./fullscreen.js";
@@ -22,6 +23,7 @@ import { Measure } from "./measure.js";
 import { languageEvents, showWords, words } from "./messages.js";
 import { hush, prepareNews } from "./news.js";
 import { pause } from "./pause.js";
+import { failureOf } from "./problem.js";
 import { Probe } from "./probe.js";
 import { showReport } from "./report.js";
 import { Scale } from "./scale.js";
@@ -55,7 +57,7 @@ export const viewer = new Viewer({
   loopEnd: get("loop-end"),
   loopAll: get("loop-all"),
   way: get("way"),
-}, () => scopes.has("download"));
+}, () => scopes.has("download"), (id) => failureOf(jobs.byId.get(id)));
 /** What somebody asked for and cannot have; or, not isBad, has. */
 function tell(text, isBad = true) {
   get("address-message").textContent = text;
@@ -149,6 +151,7 @@ function showJobs() {
   offerMasks();
   shelf.refresh();
   list.show(shelf.shown, viewer.scene);
+  setText(get("no-jobs"), shelf.nothing);
   const expected = jobs.byId.get(awaited);
   if (expected?.state === "running" || expected?.state === "done") view(expected.id);
   const viewed = jobs.byId.get(viewer.scene);

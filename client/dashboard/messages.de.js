@@ -253,6 +253,7 @@ export const DE = {
     "leave": "Lassen, wie es war",
     "search": "Nach Namen suchen",
     "none": "Noch keine.",
+    "none_found": "Unter diesem Namen wurde nichts gefunden.",
     "more": "Mehr zeigen"
   },
   "download": {

@@ -253,6 +253,7 @@ export const EN = {
     "leave": "Leave it as it was",
     "search": "Search by name",
     "none": "None yet.",
+    "none_found": "Nothing of this name was found.",
     "more": "Show more"
   },
   "download": {

@@ -27,6 +27,12 @@ export function errorWords(code, field) {
   return words(`problem.${found ?? "http_other"}`);
 }
 
+/** @param {import("./api.js").Job} [job] @returns {string} why nothing comes of it; empty where something does, or may */
+export function failureOf(job) {
+  if (job?.state === "cancelled") return errorWords("cancelled");
+  return job?.state === "failed" ? errorWords(job.error?.code ?? "unclassified", job.error?.field) : "";
+}
+
 /** What the service itself says of an error, for whoever runs it. @param {Record<string, any>} error */
 export const apiWords = ({ field, detail, problem, remedy }) =>
   [field && `${field}:`, detail ?? problem, remedy].filter(Boolean).join(" ");

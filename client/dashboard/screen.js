@@ -50,15 +50,17 @@ export class Screen {
    * @param {Picture} picture
    * @param {ImageBitmap | HTMLCanvasElement} image of it; a bitmap is closed here
    * @param {string} name what it shows
+   * @param {string} moment of the clip
    */
-  show(picture, image, name) {
+  show(picture, image, name, moment) {
     const { canvas } = this;
     if (canvas.width !== image.width) canvas.width = image.width; // setting it clears and allocates anew
     if (canvas.height !== image.height) canvas.height = image.height;
     canvas.getContext("2d").drawImage(image, 0, 0);
     image.close?.();
-    canvas.setAttribute("aria-label", name);
-    this.name = name;
+    const label = `${name}, ${moment}`;
+    canvas.setAttribute("aria-label", label);
+    this.about = picture.isRecorded ? moment : label; // the badge says what recorded frames are
     this.shown = picture;
     this.awaitedUntil = 0;
     if (picture.way === "memory") this.#look(); // that it could be drawn says nothing of whether it may
@@ -118,6 +120,6 @@ export class Screen {
   /** @param {string} state @returns {string} beside the badge */
   #text(state) {
     if (state === "unconfirmed") return words("screen.unconfirmed_why", { time: clockTime(this.confirmedAt) });
-    return this.shown && state !== "stale" ? this.name : "";
+    return this.shown && state !== "stale" ? this.about : "";
   }
 }

@@ -4,6 +4,7 @@
 import { listJobs, listScenes } from "./api.js";
 import { keyEvents } from "./key.js";
 import { PAGE_SIZE } from "./jobs.js";
+import { words } from "./messages.js";
 import { showProblem } from "./problem.js";
 
 const TYPING_MS = 300;
@@ -45,6 +46,12 @@ export class Shelf {
   get shown() {
     const ids = new Set(this.#isSearch ? this.found : [...this.jobs.newest, ...this.found]);
     return [...ids].map((id) => this.jobs.byId.get(id)).filter(Boolean);
+  }
+
+  /** @returns {string} what to say where no job is shown; empty while it is not known yet */
+  get nothing() {
+    if (!this.#isSearch) return words("label.none");
+    return this.next === undefined ? "" : words("label.none_found");
   }
 
   /** @param {string} id @returns {SceneSummary | null} of a finished scene, once it is known */

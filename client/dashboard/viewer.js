@@ -41,9 +41,11 @@ export class Viewer extends EventTarget {
   /**
    * @param {Record<string, HTMLElement>} parts by what they are; index.html has them
    * @param {() => boolean} mayDownload whether the key allows to load scenes into the browser
+   * @param {(scene: string) => string} whyNothing why nothing will come of a scene's job; empty where that is not known
    */
-  constructor(parts, mayDownload) {
+  constructor(parts, mayDownload, whyNothing) {
     super();
+    this.whyNothing = whyNothing;
     this.parts = parts;
     this.scene = null;
     /** @type {Shown | null} what is on the screen */
@@ -188,7 +190,7 @@ export class Viewer extends EventTarget {
       const picture = judged(await (isDrawnHere ? this.#draw(view) : this.pictures.ask(view)), view);
       const image = picture.image ?? (await createImageBitmap(picture.blob));
       if (visit !== this.visit) return; // another was opened meanwhile: never its neighbour's picture
-      this.screen.show(picture, image, `${name}, ${this.timeline.momentOf(picture.t)}`);
+      this.screen.show(picture, image, name, this.timeline.momentOf(picture.t));
       this.pace.note();
       this.shown = shownOf(view, picture);
       if (!picture.isRecorded) this.clip.follow(picture);
@@ -250,7 +252,7 @@ export class Viewer extends EventTarget {
     if (NOTHING_TO_SHOW.includes(error.status)) {
       this.shown = null;
       this.memory.open(this.scene);
-      this.screen.clear(this.scene, error.message);
+      this.screen.clear(this.scene, this.whyNothing(this.scene) || error.message);
       this.dispatchEvent(new Event("gone"));
     } else this.screen.fail(isNotYet ? words("screen.not_yet") : error.message);
   }

@@ -86,7 +86,7 @@ def test_a_scene_is_renamed_in_place_and_found_by_its_name(site: Site, page: Pag
     page.until(lambda: page.script(NAMES) == ["liver, left lobe"])
     page.find("#search").send_keys("x")
     page.until(lambda: page.script(NAMES) == [])
-    assert page.find("#no-jobs").is_displayed()
+    page.until_text("#no-jobs", say("label.none_found"))
     page.find("#search").send_keys(*[Keys.BACKSPACE] * 5)
     page.until(lambda: len(page.script(NAMES)) == 2)
     assert page.script("return document.querySelector('#jobs li').dataset.job") == second

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from selenium.webdriver.common.keys import Keys
 
+from contract.wire.errors import ErrorCode
+from contract.wire.job import JobError
 from contract.wire.notices import NoticeCode
 from tests.client.page import Page, Site
 from tests.client.words import say
@@ -146,3 +148,25 @@ def test_the_warning_of_this_view_is_read_before_those_of_its_scene_and_all_are_
         page.click(".picture-warning summary")
         assert page.script(hidden) == 0
         assert is_on_screen(page, "#picture-warning")
+
+
+def test_the_stage_says_why_nothing_comes_of_a_job_that_failed(site: Site, page: Page) -> None:
+    site.queued_job()
+    claim = site.claim()
+    site.train(claim, 10, 21.0)
+    page.press(claim.job_id, "Watch")
+    page.until_state("training")
+    diverged = JobError(code=ErrorCode.TRAINING_DIVERGED, problem="It diverged.", remedy="Send another clip.")
+    assert site.queue.fail(claim, diverged)
+    page.until_text("#stage-message", say("problem.training_diverged"))
+
+
+def test_the_status_of_recorded_frames_says_once_what_they_are(site: Site, page: Page) -> None:
+    page.press(site.scene(), "View")
+    page.until_state("live")
+    page.script(
+        "const layer = document.querySelector('#layer'); layer.value = 'recorded';"
+        "layer.dispatchEvent(new Event('change'))"
+    )
+    page.until_text("#badge", say("screen.recorded"))
+    page.until(lambda: page.text("#status-text") == "0.00 s")
