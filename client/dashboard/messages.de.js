@@ -546,7 +546,8 @@ export const DE = {
     "controls": "Zeit und Ansicht",
     "scenes": "Szenen",
     "new_clip": "Neuer Clip",
-    "report": "Bericht"
+    "report": "Bericht",
+    "more": "Mehr"
   },
   "layer": {
     "title": "Bild der",

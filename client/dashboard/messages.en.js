@@ -546,7 +546,8 @@ export const EN = {
     "controls": "Time and view",
     "scenes": "Scenes",
     "new_clip": "New clip",
-    "report": "Report"
+    "report": "Report",
+    "more": "More"
   },
   "layer": {
     "title": "Picture of",

@@ -65,6 +65,7 @@ def view(page: Page, scene: str) -> None:
 
 
 def choose(page: Page, mode: str) -> None:
+    page.script("document.querySelector('#more').open = true")  # on narrow screens it is under "More"
     Select(page.find("#compare")).select_by_value(mode)
 
 
@@ -224,6 +225,7 @@ def test_side_by_side_each_has_half_of_the_stage(site: Site, page: Page, width: 
             middle = (left + right) / 2
             assert np.allclose(recorded, (left, top, middle, bottom), atol=3)
             assert np.allclose(model, (middle, top, right, bottom), atol=3)
+            assert box_of(page, "#tools")[0] >= right
         else:
             middle = (top + bottom) / 2
             assert np.allclose(recorded, (left, top, right, middle), atol=3)

@@ -13,7 +13,7 @@ from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError
 from contract.wire.notices import NoticeCode
 from tests.client.page import Page, Site
-from tests.client.words import say
+from tests.client.words import LANGUAGES, say
 from tests.reports import a_warning
 
 SIZES = [(1280, 800), (1920, 1080), (820, 1180), (390, 844)]
@@ -96,12 +96,53 @@ def test_the_picture_fills_the_screen_and_a_refusal_is_seen_whatever_is_open(
         assert page.script("return document.documentElement.scrollWidth") <= width
 
 
+@pytest.mark.parametrize("language", LANGUAGES)
+@pytest.mark.parametrize(("width", "height"), [size for size in SIZES if size[0] < size[1]])
+def test_held_upright_the_picture_keeps_its_share_and_the_status_its_words(
+    site: Site, page: Page, width: int, height: int, language: str
+) -> None:
+    page.script("localStorage.setItem('intrasplat-language', arguments[0])", language)
+    page.driver.refresh()
+    with screen_of(page, width, height):
+        page.press(site.scene(), say("job.view", language))
+        page.until_state("live")
+        page.until_text("#time-value", "40")
+        page.find("#controls")
+        assert box_of(page, ".scales")[1] - box_of(page, "#tools")[3] > 0.4 * height
+        cut = "const line = document.querySelector('.status-line'); return line.scrollWidth > line.clientWidth"
+        assert not page.script(cut)
+        assert not page.find("#layer").is_displayed()
+        page.find("#more summary").click()
+        assert page.find("#layer").is_displayed()
+        assert is_on_screen(page, "#layer")
+    page.script("localStorage.clear()")
+
+
+def test_on_a_phone_an_open_drawer_has_the_screen_also_below_a_message(site: Site, page: Page, tmp_path: Path) -> None:
+    broken = tmp_path / "cut short.mp4"
+    broken.write_bytes(b"\0\0\0\x18ftypisom" + bytes(64))
+    width, height = SIZES[-1]
+    with screen_of(page, width, height):
+        page.press(site.scene(), "View")
+        page.until_state("live")
+        page.choose("clip", broken)
+        page.click("#upload [type=submit]")
+        page.until_text("#upload-message", say("problem.input:clip"))
+        _, top, _, bottom = box_of(page, "#drawer")
+        assert bottom - top >= 0.6 * height
+        assert not page.find("#controls").is_displayed()
+        page.find("#drawer [data-close]").send_keys(Keys.ENTER)
+        assert page.script("return document.activeElement.dataset.drawer") == "drawer"
+        assert page.find("#controls").is_displayed()
+
+
 def test_controls_step_back_while_idle_and_return(site: Site, page: Page) -> None:
     page.press(site.scene(), "View")
     page.until_state("live")
     idle = "return document.querySelector('#theatre').hasAttribute('data-idle')"
     page.until(lambda: page.script(idle))
     page.until(lambda: page.script("return getComputedStyle(document.querySelector('#tools')).opacity") == "0")
+    assert box_of(page, ".scales")[3] == box_of(page, "#theatre")[3]  # not where the controls were
     assert is_on_screen(page, "#badge")
     for sign in ("pointermove", "pointerdown", "keydown"):
         page.script("document.querySelector('#theatre').toggleAttribute('data-idle', true)")
