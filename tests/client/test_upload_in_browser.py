@@ -253,7 +253,7 @@ def test_the_browser_tells_when_a_scene_is_ready_if_the_user_has_clicked_for_it(
             page.until(lambda: page.text("#sent") or page.state != "none")
             site.finish(site.claim())
             page.until_state("live")
-            assert page.script("return told") == told
+            page.until(lambda told=told: page.script("return told") == told)
     finally:
         page.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
         page.script("localStorage.clear()")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -57,7 +58,9 @@ def python_client(document: Path, tmp_path_factory: pytest.TempPathFactory) -> I
     name = "generated_intrasplat"
     command = [sys.executable, "-m", "openapi_python_client", "generate", "--path", str(document), "--meta", "none"]
     command += ["--config", str(CONFIG), "--output-path", str(folder / name), "--fail-on-warning"]
-    made = subprocess.run(command, capture_output=True, text=True, timeout=MADE_S, check=False)
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])  # the generator asks ruff to format
+    environment = {**os.environ, "PATH": path}
+    made = subprocess.run(command, capture_output=True, text=True, timeout=MADE_S, check=False, env=environment)
     assert made.returncode == 0, made.stdout + made.stderr
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)

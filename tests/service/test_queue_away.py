@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from contract.queue.interface import MAX_LISTED
+from contract.queue.interface import MAX_LISTED, Place
 from contract.queue.memory import MemoryQueue
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord
@@ -25,9 +25,11 @@ class LeavingQueue(MemoryQueue):
         self._stay()
         return super().get(job_id)
 
-    def records(self, tenant: str | None = None, limit: int | None = MAX_LISTED) -> list[JobRecord]:
+    def records(
+        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: Place | None = None
+    ) -> list[JobRecord]:
         self._stay()
-        return super().records(tenant, limit)
+        return super().records(tenant, limit, before)
 
     def workers(self) -> list[WorkerAddress]:
         self._stay()
