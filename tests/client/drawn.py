@@ -12,13 +12,13 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 from selenium import webdriver
-from selenium.webdriver.common.by import By
-from selenium.webdriver.support.select import Select
 
 from tests.client.page import Page, Site
 from tests.client.player import TIE_LEVELS
 from tests.client.test_player import LEAST_DB, scattered
 
+MAX_TIED = 1e-3
+"""Share of values that two Gaussians at one depth, blended the other way round, may change at a time that nobody chose."""
 PIXELS = """
 const { width, height } = document.querySelector("#picture");
 const pixels = document.querySelector("#picture").getContext("2d").getImageData(0, 0, width, height).data;
@@ -44,8 +44,12 @@ class Drawn(Page):
         self.until(lambda: self.way == way)
 
     def choose_way(self, choice: str) -> None:
-        self.script("document.querySelector('#way').open = true")
-        Select(self.driver.find_element(By.CSS_SELECTOR, "#way select")).select_by_value(choice)
+        self.script("for (const each of ['more', 'way']) document.getElementById(each).open = true")
+        self.script(
+            "const choice = document.querySelector('#way select'); choice.value = arguments[0];"
+            "choice.dispatchEvent(new Event('change', { bubbles: true }))",
+            choice,
+        )
 
     def look(self, **wish: object) -> None:
         self.driver.execute_async_script(LOOK, wish)
@@ -104,5 +108,5 @@ def same_as_the_service(site: Site, page: Drawn) -> NDArray[np.uint8]:
     assert drawn.shape == rendered.shape
     levels = np.abs(drawn.astype(np.int64) - rendered)
     assert 10 * np.log10(255**2 / max((levels**2).mean(), 1e-9)) >= LEAST_DB, page.shown
-    assert levels.max() <= TIE_LEVELS, page.shown
+    assert (levels > TIE_LEVELS).mean() <= MAX_TIED, page.shown
     return drawn
