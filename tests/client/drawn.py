@@ -18,7 +18,7 @@ from tests.client.player import TIE_LEVELS
 from tests.client.test_player import LEAST_DB, scattered
 
 MAX_TIED = 1e-3
-"""Share of values that two Gaussians at one depth, blended the other way round, may change at a time that nobody chose."""
+"""Share of values that may differ: two Gaussians at one depth, blended the other way round at some odd time."""
 PIXELS = """
 const { width, height } = document.querySelector("#picture");
 const pixels = document.querySelector("#picture").getContext("2d").getImageData(0, 0, width, height).data;
