@@ -34,7 +34,7 @@ export class JobList {
     Object.assign(this, parts, told);
     this.scopes = scopes;
     this.times = new TimesLeft();
-    this.thumbnails = new Thumbnails();
+    this.thumbnails = new Thumbnails(this.list.closest(".drawer"));
     /** @type {Map<string, {item: HTMLElement, bar: HTMLProgressElement, words: HTMLElement, key: string}>} */
     this.rows = new Map();
     /** @type {string | null} the job whose name is being changed: its row stays as it is */

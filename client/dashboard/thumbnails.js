@@ -12,11 +12,12 @@ const AFTER_TROUBLE_MS = 3000;
 const MAX_TRIES = 5;
 
 export class Thumbnails {
-  constructor() {
+  /** @param {Element} root scrolls: a margin counts only around what is named as the root */
+  constructor(root) {
     /** @type {Set<HTMLImageElement>} in view and not loaded yet */
     this.waiting = new Set();
     this.loading = 0;
-    this.observer = new IntersectionObserver((entries) => this.#see(entries), { rootMargin: MARGIN });
+    this.observer = new IntersectionObserver((entries) => this.#see(entries), { root, rootMargin: MARGIN });
   }
 
   /** @param {string} id of a scene @returns {HTMLImageElement} that loads itself while it can be seen */
