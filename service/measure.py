@@ -5,24 +5,23 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from contract.access.keys import KeyScope
 from contract.wire.measuring import MAX_POINTS, Measurement, parse_points
-from contract.wire.pose import parse_pose
-from contract.wire.rendering import IntrinsicsOverride, MeasureRequest
+from contract.wire.rendering import MeasureRequest
 from service.deps import AnyCaller, Services
-from service.renders import Centre, FocalLength, ModelTime, Pixels, PoseText, image_response
+from service.renders import ViewQuery, image_response
 from service.scenes import finished_job
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
 
-class MeasureQuery(BaseModel):
+class MeasureQuery(ViewQuery):
     """The points that a caller asks about, and the view that shows them: as /render has it."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(extra="forbid")
 
     points: str = Field(
         max_length=1000,
@@ -30,14 +29,6 @@ class MeasureQuery(BaseModel):
         "is told, too",
         examples=["320,256", "300,200;360.5,240"],
     )
-    t: ModelTime = 0.0
-    pose: PoseText = None
-    width: Pixels = None
-    height: Pixels = None
-    fx: FocalLength = None
-    fy: FocalLength = None
-    cx: Centre = None
-    cy: Centre = None
 
 
 @router.get("/{scene_id}/measure", operation_id="measure", response_model=Measurement)
@@ -55,8 +46,8 @@ async def measure(
         scene_id=scene_id,
         attempt=record.attempt,
         t=query.t,
-        pose=None if query.pose is None else parse_pose(query.pose),
-        camera=IntrinsicsOverride(**query.model_dump(include=set(IntrinsicsOverride.model_fields))),
+        pose=query.asked_pose,
+        camera=query.camera,
         points=parse_points(query.points),
         max_pixels=services.settings.max_render_pixels,
     )

@@ -19,7 +19,7 @@ from contract.runtime.version import version
 from contract.wire.job import JobState
 from contract.wire.names import Eye
 from contract.wire.notices import NoticeCode
-from contract.wire.pose import parse_pose
+from contract.wire.pose import Pose, parse_pose
 from contract.wire.rendering import (
     MEDIA_TYPES,
     Highlights,
@@ -103,25 +103,40 @@ PoseText = Annotated[
 ]
 
 
-class RenderQuery(BaseModel):
-    """A view as a caller asks for it: the query of /render, and with an id the messages of /stream."""
+class ViewQuery(BaseModel):
+    """When, where from and through which lens a caller looks."""
 
     model_config = ConfigDict(frozen=True)
 
-    scene: str | None = Field(default=None, description="may be left out only while there is exactly one scene")
     t: ModelTime = 0.0
     pose: PoseText = None
-    eye: Eye = Field(
-        default="left",
-        description="right: seen from the right eye of a stereo clip and through its lens, as recorded?eye=right is; "
-        "not with pose",
-    )
     width: Pixels = None
     height: Pixels = None
     fx: FocalLength = None
     fy: FocalLength = None
     cx: Centre = None
     cy: Centre = None
+
+    @property
+    def asked_pose(self) -> Pose | None:
+        """None: the endoscope's own. Raises InputError: the text is no pose."""
+        return None if self.pose is None else parse_pose(self.pose)
+
+    @property
+    def camera(self) -> IntrinsicsOverride:
+        """What of the clip's camera is to be another."""
+        return IntrinsicsOverride(**self.model_dump(include=set(IntrinsicsOverride.model_fields)))
+
+
+class RenderQuery(ViewQuery):
+    """A view as a caller asks for it: the query of /render, and with an id the messages of /stream."""
+
+    scene: str | None = Field(default=None, description="may be left out only while there is exactly one scene")
+    eye: Eye = Field(
+        default="left",
+        description="right: seen from the right eye of a stereo clip and through its lens, as recorded?eye=right is; "
+        "not with pose",
+    )
     layer: Layer = Field(default=Layer.RGB, description="depth is along the camera's z; confidence is in [0, 1]")
     format: ImageFormat = Field(
         default=ImageFormat.PNG,
@@ -273,9 +288,9 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
         scene_id=shown.scene_id,
         attempt=shown.attempt,
         t=query.t,
-        pose=None if query.pose is None else parse_pose(query.pose),
+        pose=query.asked_pose,
         eye=query.eye,
-        camera=IntrinsicsOverride(**query.model_dump(include=set(IntrinsicsOverride.model_fields))),
+        camera=query.camera,
         layer=query.layer,
         format=query.format,
         quality=query.quality,

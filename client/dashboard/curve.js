@@ -1,6 +1,7 @@
 // The curve: likeness to frames that training never sees, over iterations; the right eye's is thinner. Dashed is what
 // copying neighbours reaches.
 
+import { draw } from "./element.js";
 import { figure, words } from "./messages.js";
 
 const WIDTH = 300;
@@ -31,14 +32,6 @@ export function pointsOfCsv(csv) {
     rightDb: Number.parseFloat(row[rightDb]), // empty where there is no right eye
   }));
   return points.filter((point) => Number.isFinite(point.iteration) && Number.isFinite(point.db));
-}
-
-/** Draw one thing. */
-function draw(svg, tag, attributes, text = "") {
-  const made = document.createElementNS(svg.namespaceURI, tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, String(value));
-  made.textContent = text;
-  svg.append(made);
 }
 
 /**

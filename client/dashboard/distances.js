@@ -1,5 +1,6 @@
 // The curve of a distance over the clip, with its uncertainty as a band.
 
+import { draw } from "./element.js";
 import { figure, words } from "./messages.js";
 
 const WIDTH = 300;
@@ -27,25 +28,20 @@ export function drawDistances(svg, found) {
   const last = times.at(-1) || 1;
   const x = (seconds) => LEFT + (seconds / last) * (WIDTH - LEFT - RIGHT);
   const y = (mm) => TOP + ((high - mm) / (high - low)) * (HEIGHT - TOP - BOTTOM);
-  const add = (tag, attributes, text = "") => {
-    const made = svg.appendChild(document.createElementNS(svg.namespaceURI, tag));
-    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, String(value));
-    made.textContent = text;
-  };
   for (const mm of [low, high]) {
-    add("line", { class: "grid", x1: LEFT, x2: WIDTH - RIGHT, y1: y(mm), y2: y(mm) });
-    add("text", { class: "tick right", x: LEFT - 4, y: y(mm) + 4 }, figure(mm, 1));
+    draw(svg, "line", { class: "grid", x1: LEFT, x2: WIDTH - RIGHT, y1: y(mm), y2: y(mm) });
+    draw(svg, "text", { class: "tick right", x: LEFT - 4, y: y(mm) + 4 }, figure(mm, 1));
   }
   for (const run of runsOf(known)) {
     const upper = run.map((i) => `${x(times[i]).toFixed(1)},${y(lengths[i] + sigmas[i]).toFixed(1)}`);
     const lower = run.map((i) => `${x(times[i]).toFixed(1)},${y(lengths[i] - sigmas[i]).toFixed(1)}`);
-    add("polygon", { class: "band", points: [...upper, ...lower.reverse()].join(" ") });
+    draw(svg, "polygon", { class: "band", points: [...upper, ...lower.reverse()].join(" ") });
     const middle = run.map((i) => `${x(times[i]).toFixed(1)},${y(lengths[i]).toFixed(1)}`);
-    add("polyline", { class: "score", points: middle.join(" ") });
+    draw(svg, "polyline", { class: "score", points: middle.join(" ") });
   }
-  add("line", { class: "now", x1: x(0), x2: x(0), y1: TOP, y2: HEIGHT - BOTTOM });
-  add("text", { class: "tick", x: LEFT, y: HEIGHT - 4 }, words("measure.axes"));
-  add("text", { class: "tick right", x: WIDTH - RIGHT, y: HEIGHT - 4 }, `${figure(last, 1)} s`);
+  draw(svg, "line", { class: "now", x1: x(0), x2: x(0), y1: TOP, y2: HEIGHT - BOTTOM });
+  draw(svg, "text", { class: "tick", x: LEFT, y: HEIGHT - 4 }, words("measure.axes"));
+  draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: HEIGHT - 4 }, `${figure(last, 1)} s`);
   const told = known.map((i) => lengths[i]);
   const range = { low: figure(Math.min(...told), 1), high: figure(Math.max(...told), 1) };
   svg.setAttribute("aria-label", words("measure.over_time", range));

@@ -31,6 +31,20 @@ export function button(text, onClick, name = text) {
   return made;
 }
 
+/**
+ * Draw one thing into a picture of lines.
+ * @param {SVGSVGElement} svg
+ * @param {string} tag
+ * @param {Record<string, string | number>} attributes
+ * @param {string} [text]
+ */
+export function draw(svg, tag, attributes, text = "") {
+  const made = document.createElementNS(svg.namespaceURI, tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, String(value));
+  made.textContent = text;
+  svg.append(made);
+}
+
 /** Only where it changes, so that screen readers are told once. @param {Element} target @param {string} text */
 export function setText(target, text) {
   if (target.textContent !== text) target.textContent = text;

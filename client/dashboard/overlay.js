@@ -1,5 +1,6 @@
 // Points, line and cross over the picture, at places of the tissue or points of the picture.
 
+import { draw } from "./element.js";
 import { project, toScreen } from "./places.js";
 
 const ARM_PX = 9;
@@ -28,10 +29,10 @@ export class Overlay {
     const ends = places.map((place) => project(camera, place)).map((each) => each && this.#at(camera, each));
     if (ends.includes(null)) return;
     const [[x1, y1], [x2, y2]] = ends;
-    for (const name of ["under", "line"]) this.#add("line", { class: name, x1, y1, x2, y2 });
+    for (const name of ["under", "line"]) draw(this.svg, "line", { class: name, x1, y1, x2, y2 });
     for (const end of ends) this.#mark("point", end);
     const [x, y] = [(x1 + x2) / 2, (y1 + y2) / 2 - ARM_PX];
-    this.#add("text", { x, y }).textContent = text;
+    draw(this.svg, "text", { x, y }, text);
   }
 
   /** @param {import("./stream.js").Camera} camera @param {number[]} point of the picture, besides what is there */
@@ -47,12 +48,6 @@ export class Overlay {
 
   #mark(name, [x, y]) {
     const arms = `M${x - ARM_PX} ${y}H${x + ARM_PX}M${x} ${y - ARM_PX}V${y + ARM_PX}`;
-    for (const each of ["under", name]) this.#add("path", { class: each, d: arms });
-  }
-
-  #add(tag, attributes) {
-    const made = this.svg.appendChild(document.createElementNS(this.svg.namespaceURI, tag));
-    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, String(value));
-    return made;
+    for (const each of ["under", name]) draw(this.svg, "path", { class: each, d: arms });
   }
 }
