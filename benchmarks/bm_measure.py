@@ -4,8 +4,8 @@
 
 Trains `fast` for a fixed number of iterations on small stereo clips of synthetic tissue. Measures depths of points in
 views of several times and poses, and distances between them over all frames, and compares them with the truth: how many
-lie within one and two stated standard uncertainties, and within 0.5 mm or these. Prints a row a clip; with --csv it
-writes them.
+lie within one and two standard uncertainties (two are stated), and within 0.5 mm or these. Prints a row a clip; with
+--csv it writes them.
 
 --fit finds DISPARITY_PX of worker/render/measure.py, and the factor of the spread (taken as 1), anew on the clips
 FITTED_ON. The others confirm them. --scenes keeps the trained scenes in a folder, and uses those that are there.

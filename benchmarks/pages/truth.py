@@ -34,7 +34,8 @@ _MEASURE = """
 
 `python -m benchmarks.bm_measure --csv docs/results/measure.csv` ([measure.csv](measure.csv)): points of views of three
 times and three poses, and distances between them followed over all frames, against the truth of synthetic clips. Errors
-and standard uncertainties are medians in mm; 1 u and 2 u are the shares that lie within one and two uncertainties.
+and standard uncertainties are medians in mm; 1 u and 2 u are the shares that lie within one and two of them.
+API and page state 2 u.
 Still and cut had a part in the calibration, the others had none ([what it means](../conventions.md#measuring)).
 """
 _MEASURED = {

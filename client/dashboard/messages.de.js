@@ -399,7 +399,7 @@ export const DE = {
   },
   "measure": {
     "title": "Messen",
-    "research": "Nur für die Forschung.",
+    "research": "Nur für die Forschung. 95 von 100 wahren Werten liegen innerhalb von ±.",
     "first": "Wählen Sie den ersten Punkt: anklicken, oder das Kreuz mit den Pfeiltasten bewegen und Enter drücken. Escape beendet.",
     "second": "Erster Punkt: {reading}. Wählen Sie den zweiten Punkt.",
     "asking": "Es wird gemessen.",

@@ -322,7 +322,7 @@ class MeasuredDistance(Model):
     distance_mm: float
     """at the time asked for"""
     uncertainty_mm: float
-    """standard uncertainty of distance_mm"""
+    """about 95 % of the true distances lie within it"""
     t: tuple[float, ...]
     """times of the frames"""
     time_s: tuple[float, ...]
@@ -330,7 +330,7 @@ class MeasuredDistance(Model):
     distances_mm: tuple[float | None, ...]
     """at every frame"""
     uncertainties_mm: tuple[float | None, ...]
-    """standard uncertainties of distances_mm"""
+    """of distances_mm"""
     first_mm: tuple[tuple[float, ...], ...]
     """where the first point is in the world at every frame"""
     second_mm: tuple[tuple[float, ...], ...]
@@ -349,7 +349,7 @@ class MeasuredPoint(Model):
     depth_mm: float | None = None
     """along the camera's z, as the layer depth has it"""
     uncertainty_mm: float | None = None
-    """standard uncertainty of depth_mm"""
+    """about 95 % of the true depths lie within it"""
     point_mm: tuple[float, ...] | None = None
     """the place in the world"""
     mm_per_px: float | None = None

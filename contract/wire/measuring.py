@@ -1,7 +1,7 @@
 """Places in mm under pixels of a view, and the distance of two of them over time; how far each may be off.
 
-Symbols: T frames. Uncertainties are standard uncertainties: of the true values two thirds or more lie within one, and
-about 95 % within two (docs/conventions.md, "Measuring").
+Symbols: T frames. Uncertainties are expanded uncertainties of factor 2: about 95 % of the true values lie within them
+(docs/conventions.md, "Measuring").
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class MeasuredPoint(BaseModel):
     y: float = Field(description="as asked for, in pixels of the picture")
     confidence: float = Field(description="in [0, 1], as the layer confidence has it")
     depth_mm: float | None = Field(default=None, description="along the camera's z, as the layer depth has it")
-    uncertainty_mm: float | None = Field(default=None, description="standard uncertainty of depth_mm")
+    uncertainty_mm: float | None = Field(default=None, description="about 95 % of the true depths lie within it")
     point_mm: Place | None = Field(default=None, description="the place in the world")
     mm_per_px: float | None = Field(default=None, description="width of a pixel at this depth, across the view")
     refusal: Refusal | None = None
@@ -66,11 +66,11 @@ class MeasuredDistance(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     distance_mm: float = Field(description="at the time asked for")
-    uncertainty_mm: float = Field(description="standard uncertainty of distance_mm")
+    uncertainty_mm: float = Field(description="about 95 % of the true distances lie within it")
     t: tuple[float, ...] = Field(description="times of the frames")
     time_s: tuple[float, ...] = Field(description="seconds of the frames, from the first one")
     distances_mm: tuple[float | None, ...] = Field(description="at every frame")
-    uncertainties_mm: tuple[float | None, ...] = Field(description="standard uncertainties of distances_mm")
+    uncertainties_mm: tuple[float | None, ...] = Field(description="of distances_mm")
     first_mm: tuple[Place, ...] = Field(description="where the first point is in the world at every frame")
     second_mm: tuple[Place, ...] = Field(description="where the second point is in the world at every frame")
 

@@ -1,4 +1,4 @@
-"""Places under pixels of a view, in mm, with their uncertainty; and how far two of them are apart at every frame.
+"""Places under pixels of a view, in mm, with their standard uncertainty; how far two of them are apart at every frame.
 
 Symbols: N Gaussians, M of them that make a pixel, T frames, w blending weights of the Gaussians at a pixel.
 
@@ -202,8 +202,8 @@ def _window(camera: Intrinsics, x: float, y: float) -> tuple[Intrinsics, int, in
 class Distances:
     """How far two places are apart.
 
-    now_mm, now_uncertainty_mm      at the moment at which they were chosen
-    distances_mm, uncertainties_mm  [T] at every frame
+    now_mm, now_uncertainty_mm      at the moment at which they were chosen, with the standard uncertainty
+    distances_mm, uncertainties_mm  [T] at every frame, likewise
     known                           [T] whether both are trusted then
     paths_mm                        [2, T, 3] where they are in the world
     """

@@ -21,6 +21,8 @@ from worker.render.view import held_in_clip, renderer_of
 from worker.scene.scene import Scene
 
 OTHER_PLACE = "Choose another place or another moment."
+EXPANDED = 2.0
+"""Told uncertainties over standard ones: about 95 % of the true values lie within what is told."""
 DIGITS = 4
 """After the point, of lengths: a tenth of a micrometre."""
 
@@ -61,7 +63,7 @@ def _point(number: int, point: Point, place: Place, camera: Intrinsics) -> Measu
         y=point[1],
         confidence=likely,
         depth_mm=round(place.depth_mm, DIGITS),
-        uncertainty_mm=round(place.uncertainty_mm, DIGITS),
+        uncertainty_mm=round(EXPANDED * place.uncertainty_mm, DIGITS),
         point_mm=_rounded(place.point_mm),
         mm_per_px=round(place.depth_mm / camera.fx, 2 * DIGITS),
     )
@@ -85,11 +87,11 @@ def _distance(scene: Scene, found: Distances) -> MeasuredDistance:
 
     return MeasuredDistance(
         distance_mm=round(found.now_mm, DIGITS),
-        uncertainty_mm=round(found.now_uncertainty_mm, DIGITS),
+        uncertainty_mm=round(EXPANDED * found.now_uncertainty_mm, DIGITS),
         t=tuple(frame / scene.frame_count for frame in range(scene.frame_count)),
         time_s=tuple(scene.frame_times_s.tolist()),
         distances_mm=told(found.distances_mm),
-        uncertainties_mm=told(found.uncertainties_mm),
+        uncertainties_mm=told(EXPANDED * found.uncertainties_mm),
         first_mm=tuple(_rounded(each) for each in found.paths_mm[0]),
         second_mm=tuple(_rounded(each) for each in found.paths_mm[1]),
     )
