@@ -16,8 +16,9 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.access.keys import KeyScope
 from contract.intake.calibration.fit import fitted
-from contract.intake.calibration.text import read_calibration
+from contract.intake.calibration.opencv import look_at_calibration
 from contract.intake.calibration.types import StereoCalibration
+from contract.intake.fit import STEREO_VIDEOS, calibration_missing
 from contract.intake.limits import ClipLimits
 from contract.intake.sniff import ZIP_SUFFIX, check_calibration_file, check_head
 from contract.wire.checks import DescribedClip, DescribedFile, Finding, FindingCode
@@ -122,21 +123,16 @@ def _of_calibration(described: DescribedClip) -> Iterator[Finding]:
     file, clip = described.calibration, described.clip or described.left
     if file is None:
         if clip is not None and described.clip_of is None and clip.suffix.lower() != ZIP_SUFFIX:
-            remedy = "Add the calibration of this endoscope."
-            problem = "a video of two eyes needs a calibration."
-            yield _finding("calibration", FindingCode.CALIBRATION_MISSING, problem, remedy, refused=False)
+            is_stereo = described.left is not None or described.options.get("layout") in STEREO_VIDEOS
+            yield _of_error(FindingCode.CALIBRATION_MISSING, calibration_missing(), refused=is_stereo)
         return
     if file.text is None:
         return
     try:
         check_calibration_file(file.text, "calibration", "it")
+        calibration = look_at_calibration(file.text)
     except InputError as error:
         yield _of_error(FindingCode.CALIBRATION_UNREADABLE, error)
-        return
-    try:
-        calibration = read_calibration(file.text)
-    except InputError as error:
-        yield _of_error(FindingCode.CALIBRATION_UNREADABLE, error, refused=False)
         return
     if calibration is not None:
         yield from _of_fit(calibration, described)

@@ -16,6 +16,8 @@ from contract.wire.options import ReconstructionOptions
 
 _OF_MANY_FILES = ("endonerf", "stereomis", "frames")
 """Layouts whose clip is a zip."""
+STEREO_VIDEOS = ("sbs", "tb")
+"""Layouts whose clip shows both eyes: a video of these, unlike a zip, can bring no calibration."""
 
 
 def check_fit(options: ReconstructionOptions, files: Mapping[str, Path], sent: Collection[str]) -> None:
@@ -26,15 +28,19 @@ def check_fit(options: ReconstructionOptions, files: Mapping[str, Path], sent: C
         sent: the parts that came with the options; the others are those of an earlier job's clip.
 
     Raises:
-        InputError: names the option, or the clip if it lacks a file of the layout that was asked for.
+        InputError: names the option, the clip if it lacks a file of the layout that was asked for, or the calibration
+            if a video is sure to be of two eyes and came without one.
     """
     layout, clip = options.layout, files.get("clip")
     if clip is None and layout != "auto":
         raise InputError("options.layout", f'layout "{layout}" does not go with two files.', "Leave it out.")
-    is_zip = clip is not None and clip.suffix.lower() == ZIP_SUFFIX
+    is_zip = clip is not None and _is_zip(clip)
     if clip is not None and layout in _OF_MANY_FILES and not is_zip:
         problem = f'layout "{layout}" needs a zip, {clip.name} is none.'
         raise InputError("options.layout", problem, "Leave it out, or send the files in a zip.")
+    shows_two_eyes = clip is None or layout in STEREO_VIDEOS
+    if shows_two_eyes and "calibration" not in files and not _is_zip(clip or files["left"]):
+        raise calibration_missing()
     has_poses = clip is not None and is_zip and _holds(clip, POSES_FILE)
     if layout == "endonerf" and not has_poses:
         raise InputError("clip", f"the zip has no {POSES_FILE}.", "Put it beside images/, or leave the layout out.")
@@ -44,6 +50,17 @@ def check_fit(options: ReconstructionOptions, files: Mapping[str, Path], sent: C
     if options.mask_source == "none" and "masks" in sent:
         problem = '"none" uses no masks, and masks came with it.'
         raise InputError("options.mask_source", problem, "Leave out either of them.")
+
+
+def calibration_missing() -> InputError:
+    """What is said of a video of two eyes that came without a calibration."""
+    return InputError(
+        "calibration", "a video of two eyes needs a calibration.", "Add the calibration of this endoscope."
+    )
+
+
+def _is_zip(path: Path) -> bool:
+    return path.suffix.lower() == ZIP_SUFFIX
 
 
 def _holds(path: Path, name: str) -> bool:

@@ -9,6 +9,7 @@ import re
 import zipfile
 from pathlib import Path, PurePosixPath
 
+from contract.intake.calibration.opencv import look_at_calibration
 from contract.intake.limits import MAX_CALIBRATION_BYTES, ClipLimits
 from contract.intake.nesting import nesting
 from contract.intake.video_header import EBML, check_is_video, check_video, is_video
@@ -41,7 +42,9 @@ def check_file(path: Path, part: str, limits: ClipLimits) -> None:
     if path.stat().st_size == 0:
         raise InputError(part, f"{path.name} is empty (0 bytes).", "Send the file again.")
     if part == "calibration":
-        check_calibration_file(_text_of(path, part), part, path.name)
+        text = _text_of(path, part)
+        check_calibration_file(text, part, path.name)
+        look_at_calibration(text)
     elif path.suffix.lower() == ZIP_SUFFIX:
         _check_zip(path, part, limits)
     else:

@@ -36,6 +36,7 @@ from intrasplat_client import (
 from tests.cameras import CAMERAS
 from tests.client.local_service import SNAPSHOT_ITERATION, LocalService, line_to, local_service
 from tests.reports import REPORT_OF_A_SCENE
+from tests.worker.input.clip.hostile import CALIBRATION
 
 WAIT_S = 10.0
 
@@ -257,7 +258,7 @@ def test_two_eyes_calibration_and_masks_arrive_as_what_they_are(
     service: LocalService, client: Client, clip: Path, tmp_path: Path
 ) -> None:
     calibration = tmp_path / "calibration.json"
-    calibration.write_text("{}")
+    calibration.write_bytes(CALIBRATION)
     for in_pieces in (False, True):
         job = client.reconstruct(clip, clip, calibration=calibration, masks=clip, in_pieces=in_pieces)
         spooled = {path.name for path in service.store.spool_folder(job.id).iterdir()}

@@ -77,6 +77,7 @@ def test_wrong_files_are_told_beside_their_fields_before_anything_is_sent(
     )  # the browser read the clip's size
     page.choose("calibration", calibration_at(tmp_path / "metres.json", baseline_mm=0.0045))
     page.until(lambda: page.script(FINDINGS) == [["calibration", "calibration_unreadable"]])
+    assert page.find(".finding").get_attribute("class") == "finding bad"  # it would be refused
     page.choose("masks", notes)
     page.until(lambda: ["masks", "kind"] in page.script(FINDINGS))
     names = page.script("return performance.getEntriesByType('resource').map((entry) => new URL(entry.name).pathname)")

@@ -8,7 +8,7 @@ import pytest
 
 from contract.intake.calibration.text import read_calibration
 from contract.intake.limits import ClipLimits
-from contract.intake.sniff import check_file
+from contract.intake.sniff import check_calibration_file, check_file
 from contract.wire.errors import InputError
 
 YAML = "%YAML:1.0\nM1: !!opencv-matrix\n   rows: 1\n   data: [ 570., {}, 1. ]\n"
@@ -44,10 +44,8 @@ def test_a_calibration_with_what_is_no_number_is_refused_at_upload(tmp_path: Pat
         ("c.yaml", YAML.format("0.") + "nan_count: 0\ninf: 1\n"),
     ],
 )
-def test_words_and_comments_are_no_numbers(tmp_path: Path, name: str, text: str) -> None:
-    path = tmp_path / name
-    path.write_text(text)
-    check_file(path, "calibration", ClipLimits())
+def test_words_and_comments_are_no_numbers(name: str, text: str) -> None:
+    check_calibration_file(text, "calibration", name)
 
 
 @pytest.mark.parametrize(("text", "given"), [("{}", "None"), ('{"model": "fisheye"}', "fisheye")])

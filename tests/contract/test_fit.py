@@ -12,7 +12,7 @@ from contract.intake.fit import check_fit
 from contract.wire.errors import InputError
 from contract.wire.options import JobOptions, parse_options
 
-PAIR = ("left.mp4", "right.mp4")
+PAIR = ("left.mp4", "right.mp4", "calibration.json")
 
 
 def files_in(folder: Path, *names: str) -> dict[str, Path]:
@@ -41,6 +41,9 @@ def files_in(folder: Path, *names: str) -> dict[str, Path]:
         ({"poses": "given"}, ("clip.zip",), ("clip",), "options.poses"),
         ({"poses": "given", "layout": "frames"}, ("poses.zip",), ("clip",), "options.poses"),
         ({"mask_source": "none"}, ("clip.mp4", "masks.zip"), ("masks",), "options.mask_source"),
+        ({}, ("left.mp4", "right.mp4"), ("left", "right"), "calibration"),
+        ({"layout": "sbs"}, ("clip.mp4",), ("clip",), "calibration"),
+        ({"layout": "tb"}, ("clip.webm", "masks.zip"), ("clip", "masks"), "calibration"),
     ],
 )
 def test_what_cannot_go_together_names_the_field_and_a_remedy(
@@ -56,7 +59,10 @@ def test_what_cannot_go_together_names_the_field_and_a_remedy(
     [
         ({}, PAIR, PAIR),
         ({"poses": "estimate"}, PAIR, PAIR),
-        ({"layout": "tb", "poses": "fixed"}, ("clip.mp4",), ("clip",)),
+        ({"layout": "tb", "poses": "fixed"}, ("clip.mp4", "calibration.json"), ("clip",)),
+        ({"layout": "sbs"}, ("clip.zip",), ("clip",)),
+        ({}, ("left.zip", "right.mp4"), ("left", "right")),
+        ({}, ("clip.mp4",), ("clip",)),
         ({"layout": "frames"}, ("clip.zip",), ("clip",)),
         ({"poses": "given"}, ("poses.zip",), ("clip",)),
         ({"poses": "given", "layout": "endonerf"}, ("poses.zip",), ("clip",)),

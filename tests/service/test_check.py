@@ -93,10 +93,11 @@ def test_nothing_speaks_against_a_clip_with_the_calibration_of_its_eyes(service:
         ("calibration", {"size_bytes": 2_000_000, "text": None}, "too_large", True),
         ("calibration", {"text": "<!DOCTYPE x>"}, "calibration_unreadable", True),
         ("calibration", {"text": '{"fx_px": NaN}'}, "calibration_unreadable", True),
-        ("calibration", {"text": "{"}, "calibration_unreadable", False),
-        ("calibration", {"text": json.dumps(RECTIFIED | {"baseline_mm": 0.0045})}, "calibration_unreadable", False),
+        ("calibration", {"text": "{"}, "calibration_unreadable", True),
+        ("calibration", {"text": json.dumps(RECTIFIED | {"baseline_mm": 0.0045})}, "calibration_unreadable", True),
         ("calibration", {"text": json.dumps(RECTIFIED | {"width": 600})}, "calibration_size", False),
-        ("calibration", {"text": INI.replace("T_2=0", "")}, "calibration_unreadable", False),
+        ("calibration", {"text": INI.replace("T_2=0", "")}, "calibration_unreadable", True),
+        ("calibration", {"suffix": ".yaml", "text": "%YAML:1.0\n---\nK: 1\n"}, "calibration_unreadable", True),
     ],
 )
 def test_a_wrong_file_is_told_with_its_field(
@@ -114,9 +115,10 @@ def test_a_calibration_of_one_eye_does_not_fit_a_layout_that_was_chosen(service:
 
 
 def test_a_video_without_calibration_is_told_and_a_zip_or_an_earlier_clip_is_not(service: ServiceUnderTest) -> None:
-    missing = [("calibration", "calibration_missing", False)]
-    assert findings(service, clip=video()) == missing
-    assert findings(service, left=video(), right=video()) == missing
+    missing, refused = ([("calibration", "calibration_missing", refused)] for refused in (False, True))
+    assert findings(service, clip=video()) == missing  # a layout of the worker's own may need none
+    assert findings(service, clip=video(), options={"layout": "sbs"}) == refused
+    assert findings(service, left=video(), right=video()) == refused
     assert findings(service, clip=video(suffix=".zip", head=b"PK\3\4".hex())) == []
     assert findings(service, masks=video(), clip_of="0" * 32) == []
 
@@ -142,6 +144,9 @@ def test_what_is_told_as_refused_is_refused(service: ServiceUnderTest) -> None:
     files = {"clip": ("clip.mp4", b"no film at all")}
     assert findings(service, clip=video(head=b"no film at all".hex()), calibration=calibration())[0][2]
     assert_problem(service.http.post("/reconstruct", files=files), 422, "clip")
+    assert_problem(service.upload(options='{"layout": "tb"}'), 422, "calibration")
+    broken = {"clip": ("a.mp4", CLIP.read_bytes()), "calibration": ("c.json", b"{")}
+    assert_problem(service.http.post("/reconstruct", files=broken), 422, "calibration")
 
 
 def test_a_description_that_is_none_is_refused(service: ServiceUnderTest) -> None:
@@ -153,5 +158,5 @@ def test_a_description_that_is_none_is_refused(service: ServiceUnderTest) -> Non
 def test_many_blanks_in_an_ini_are_read_at_once(service: ServiceUnderTest) -> None:
     text = INI + "a" + " " * 500_000 + "b\n"
     assert findings(service, clip=video(), calibration=calibration(text, ".ini")) == [
-        ("calibration", "calibration_unreadable", False)
+        ("calibration", "calibration_unreadable", True)
     ]

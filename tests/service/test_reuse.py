@@ -20,6 +20,7 @@ from tests.service.under_test import (
     bearer,
     running_service,
 )
+from tests.worker.input.clip.hostile import CALIBRATION, OPENCV
 
 OTHER_ZIP = EMPTY_ZIP[:-2] + b"\x03\x00abc"
 """With a comment."""
@@ -50,10 +51,10 @@ def contents(service: ServiceUnderTest, record: JobRecord) -> dict[str, bytes]:
 
 
 def test_a_clip_is_used_again_with_better_masks_and_is_as_if_it_were_sent_again(service: ServiceUnderTest) -> None:
-    eyes = {"left": ("l.mov", LEFT), "right": ("r.mov", RIGHT), "calibration": ("k.yaml", b"K: 1")}
+    eyes = {"left": ("l.mov", LEFT), "right": ("r.mov", RIGHT), "calibration": ("k.json", CALIBRATION)}
     first = record_of(service, service.upload(parts={**eyes, "masks": ("m.zip", EMPTY_ZIP)}))
     second = record_of(service, again(service, first.job_id, {"masks": ("m.zip", OTHER_ZIP)}))
-    files = {"left.mov": LEFT, "right.mov": RIGHT, "calibration.yaml": b"K: 1", "masks.zip": OTHER_ZIP}
+    files = {"left.mov": LEFT, "right.mov": RIGHT, "calibration.json": CALIBRATION, "masks.zip": OTHER_ZIP}
     assert contents(service, second) == files
     assert (second.clip_of, second.options.seed) == (first.job_id, 3)
     whole = record_of(service, service.upload(parts={**eyes, "masks": ("m.zip", OTHER_ZIP)}))
@@ -66,11 +67,11 @@ def test_what_is_not_sent_is_the_earlier_jobs_and_the_format_may_be_another(serv
     first = record_of(
         service,
         service.upload(
-            parts={"clip": ("a.mp4", CLIP), "calibration": ("k.yaml", b"K: 1"), "masks": ("m.zip", EMPTY_ZIP)}
+            parts={"clip": ("a.mp4", CLIP), "calibration": ("k.json", CALIBRATION), "masks": ("m.zip", EMPTY_ZIP)}
         ),
     )
-    second = record_of(service, again(service, first.job_id, {"calibration": ("k.json", b"{}")}))
-    assert contents(service, second) == {"clip.mp4": CLIP, "calibration.json": b"{}", "masks.zip": EMPTY_ZIP}
+    second = record_of(service, again(service, first.job_id, {"calibration": ("k.yaml", OPENCV)}))
+    assert contents(service, second) == {"clip.mp4": CLIP, "calibration.yaml": OPENCV, "masks.zip": EMPTY_ZIP}
 
 
 def test_each_of_the_two_is_removed_by_itself_and_the_receipt_names_who_keeps_the_clip(

@@ -15,6 +15,7 @@ from contract.store.shelf import is_job_id
 from contract.store.store import Store
 from service.partial import promised_bytes
 from tests.service.under_test import CLIP, EMPTY_ZIP, ServiceUnderTest, another_clip, assert_problem, running_service
+from tests.worker.input.clip.hostile import CALIBRATION
 
 TUS = {"Tus-Resumable": "1.0.0"}
 BYTES = {**TUS, "Content-Type": "application/offset+octet-stream"}
@@ -195,18 +196,29 @@ def test_two_eyes_and_a_calibration_come_as_three_uploads(service: ServiceUnderT
     ids = {
         "left": uploaded(service, CLIP, "left", ".mov"),
         "right": uploaded(service, CLIP, "right", ".mov"),
-        "calibration": uploaded(service, b"K: 1", "calibration", ".yaml"),
+        "calibration": uploaded(service, CALIBRATION, "calibration", ".json"),
     }
     job = service.http.post("/reconstruct", json=ids)
     assert job.status_code == 202
     folder = service.store.spool_folder(job.json()["id"])
-    assert {path.name for path in folder.iterdir()} >= {"left.mov", "right.mov", "calibration.yaml"}
+    assert {path.name for path in folder.iterdir()} >= {"left.mov", "right.mov", "calibration.json"}
+
+
+@pytest.mark.parametrize("content", [b"K: 1", CALIBRATION[:-9]])
+def test_a_calibration_that_cannot_be_read_makes_no_job(service: ServiceUnderTest, content: bytes) -> None:
+    ids = {"clip": uploaded(service, CLIP), "calibration": uploaded(service, content, "calibration", ".json")}
+    assert_problem(service.http.post("/reconstruct", json=ids), 422, "calibration")
+    assert service.queue.records() == []
+    better = ids | {"calibration": uploaded(service, CALIBRATION, "calibration", ".json")}
+    assert service.http.post("/reconstruct", json=better).status_code == 202  # the clip need not come again
 
 
 def test_the_same_clip_has_the_same_digest_whichever_way_it_came(service: ServiceUnderTest) -> None:
-    parts = {"left": ("l.mp4", CLIP), "right": ("r.mp4", another_clip(b"right"))}
+    files = {"right": another_clip(b"right"), "left": CLIP, "calibration": CALIBRATION}
+    suffixes = {"calibration": ".json"}
+    parts = {part: (f"x{suffixes.get(part, '.mp4')}", files[part]) for part in sorted(files)}
     whole = service.queue.get(service.upload(parts=parts).json()["id"])
-    ids = {eye: uploaded(service, content, eye) for eye, content in (("right", another_clip(b"right")), ("left", CLIP))}
+    ids = {part: uploaded(service, files[part], part, suffixes.get(part, ".mp4")) for part in files}
     pieces = service.queue.get(service.http.post("/reconstruct", json=ids).json()["id"])
     assert whole is not None
     assert pieces is not None

@@ -22,6 +22,7 @@ from service.problems import Problem, install_handlers
 from service.upload import UploadLimits, receive_upload
 from tests.service.asgi import serving
 from tests.service.under_test import CLIP, EMPTY_ZIP, ServiceUnderTest, assert_problem, running_service
+from tests.worker.input.clip.hostile import CALIBRATION
 
 PATIENCE_S = 10.0
 UPLOAD_HEADERS = {
@@ -49,13 +50,15 @@ def test_an_accepted_clip_is_on_disk_and_queued_before_the_answer(service: Servi
 
 def test_two_eyes_calibration_and_masks_are_kept_under_our_names(service: ServiceUnderTest) -> None:
     eyes = {"left": ("Smith_L.MOV", CLIP), "right": ("Smith_R.mov", CLIP)}
-    response = service.upload(parts={**eyes, "calibration": ("stereo.yaml", b"K: 1"), "masks": ("m.zip", EMPTY_ZIP)})
+    response = service.upload(
+        parts={**eyes, "calibration": ("stereo.json", CALIBRATION), "masks": ("m.zip", EMPTY_ZIP)}
+    )
     record = service.queue.get(response.json()["id"])
     assert record is not None
     assert record.files.model_dump() == {
         "clip": "left.mov",
         "right": "right.mov",
-        "calibration": "calibration.yaml",
+        "calibration": "calibration.json",
         "masks": "masks.zip",
     }
     assert "Smith" not in "".join(path.read_text() for path in service.store.data_dir.rglob("*.json"))

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from contract.intake.calibration.opencv import look_at_calibration
 from contract.intake.calibration.types import (
     RawCalibration,
     RectifiedCalibration,
@@ -66,7 +67,9 @@ def raw_calibration(**changes: Any) -> RawCalibration:
 
 
 def load(path: Path, width: int = WIDTH, height: int = HEIGHT) -> StereoCalibration:
-    return load_calibration(path, eye_width=width, eye_height=height)
+    read = load_calibration(path, eye_width=width, eye_height=height)
+    look_at_calibration(path.read_text())  # what can be read is not refused on arrival
+    return read
 
 
 def write(path: Path, text: str) -> Path:

@@ -15,26 +15,12 @@ from numpy.typing import NDArray
 
 from contract.intake.calibration.check import FIELD
 from contract.intake.calibration.fit import check_centred, fitted
+from contract.intake.calibration.opencv import check_opencv_names, name_of
 from contract.intake.calibration.text import FORMATS_REMEDY, checked_calibration, parse_text
 from contract.intake.calibration.types import StereoCalibration
 from contract.intake.limits import MAX_CALIBRATION_BYTES
 from contract.intake.sniff import check_calibration_text
 from contract.wire.errors import InputError
-
-OPENCV_KEYS = {
-    "left_k": "m1 k1 kl kleft cameramatrix1 cameramatrixleft cameramatrixl leftcameramatrix",
-    "right_k": "m2 k2 kr kright cameramatrix2 cameramatrixright cameramatrixr rightcameramatrix",
-    "left_d": "d1 dl dleft distcoeffs1 distcoeff1 distcoeffsleft distcoeffleft distcoeffsl leftdistcoeffs "
-    "distortion1 distortionleft distortioncoefficients1 distortioncoefficientsleft",
-    "right_d": "d2 dr dright distcoeffs2 distcoeff2 distcoeffsright distcoeffright distcoeffsr rightdistcoeffs "
-    "distortion2 distortionright distortioncoefficients2 distortioncoefficientsright",
-    "rotation": "r rotation rotationmatrix rmat stereorotation",
-    "translation": "t translation translationvector tvec stereotranslation",
-    "size": "imagesize size",
-    "width": "imagewidth width camerawidth",
-    "height": "imageheight height cameraheight",
-}
-"""Spellings met in files; compared without case, underscores, dots and dashes."""
 
 
 def load_calibration(path: Path | str, *, eye_width: int, eye_height: int) -> StereoCalibration:
@@ -77,10 +63,7 @@ def _read_text(path: Path) -> str:
 def _parse_opencv(text: str, eye_width: int, eye_height: int) -> tuple[dict[str, Any], bool]:
     """A FileStorage file; both eyes' matrices, R and T are required, distortion and image size are not."""
     values = _opencv_values(text)
-    missing = [name for name in ("left_k", "right_k", "rotation", "translation") if name not in values]
-    if missing:
-        spellings = ", ".join(OPENCV_KEYS[name].split()[0].upper() for name in missing)
-        raise InputError(FIELD, f"found no {spellings} in the OpenCV file.", FORMATS_REMEDY)
+    check_opencv_names(values)
     rotation = values["rotation"]
     if rotation.size == 3:  # a rotation vector
         rotation = cv2.Rodrigues(rotation.reshape(3, 1))[0]
@@ -110,8 +93,7 @@ def _opencv_values(text: str) -> dict[str, NDArray[np.float64]]:
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         for key in list(storage.root().keys()):
-            spelling = key.lower().translate(str.maketrans("", "", "_.-"))
-            name = next((name for name, spellings in OPENCV_KEYS.items() if spelling in spellings.split()), None)
+            name = name_of(key)
             if name is not None:
                 values[name] = _node_values(storage.getNode(key))
         storage.release()

@@ -23,6 +23,21 @@ CALIBRATION = (
     b'{"model": "rectified", "width": 96, "height": 80, "fx_px": 90, "fy_px": 90, "cx_px": 48, "cy_px": 40, '
     b'"baseline_mm": 4}'
 )
+OPENCV = b"""%YAML:1.0
+---
+M1: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 90., 0., 48., 0., 90., 40., 0., 0., 1. ]
+M2: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 90., 0., 48., 0., 90., 40., 0., 0., 1. ]
+R: [ 0., 0., 0. ]
+T: [ -4., 0., 0. ]
+"""
 FRAME = "left/000000.png"
 
 
@@ -145,6 +160,7 @@ def recorded(path: Path, codec: str, frames: int) -> bytes:
     return data
 
 
+_CUT_XML = b'<?xml version="1.0"?>\n<opencv_storage>\n<M1>1</M1>\n<M2>1</M2>\n<R>1</R>\n<T>1</T>\n'
 _ENTITIES = (
     b'<?xml version="1.0"?><!DOCTYPE o [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;"><!ENTITY c "&b;&b;&b;&b;">]>'
     b"<opencv_storage><M1>&c;</M1></opencv_storage>"
@@ -207,6 +223,13 @@ CORPUS: dict[str, Hostile] = {
     ),
     "bytes": Hostile("calibration.yaml", fixed(bytes(range(256)) * 9), "not a text", part="calibration"),
     "deep": Hostile("calibration.json", fixed(b'{"a":' + b"[" * 99_999), "nested 100000 levels", part="calibration"),
+    "broken JSON": Hostile("calibration.json", fixed(CALIBRATION[:-9]), "not valid JSON", part="calibration"),
+    "no camera": Hostile(
+        "calibration.yaml", fixed(b"%YAML:1.0\n---\nK: 1\n"), "found no M1, M2, R, T", part="calibration"
+    ),
+    "cut YAML": Hostile("calibration.yml", fixed(OPENCV[:-3]), "cut short|neither JSON", part="calibration"),
+    "cut XML": Hostile("calibration.xml", fixed(_CUT_XML), "cut short|neither JSON", part="calibration"),
+    "half an ini": Hostile("calibration.ini", fixed(b"[StereoLeft]\nres_x=96\n"), "the ini lacks", part="calibration"),
     "large": Hostile("calibration.json", fixed(b"{" + b" " * 2_000_000 + b"}"), "2000002", part="calibration"),
     "masks of another size": Hostile(
         "masks.zip", fixed(zipped(*((f"{i}.png", png(16, 9000)) for i in range(12)))), "pixels", "decoding", "masks"
