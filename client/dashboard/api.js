@@ -165,3 +165,14 @@ export const reconstruct = (submission, idempotencyKey, signal) =>
     body: JSON.stringify(submission),
     signal,
   });
+
+/**
+ * Send a scene that another installation saved.
+ * @param {File} file docs/export.md, "scene"
+ * @returns {Promise<Job>} done once the scene is found sound
+ */
+export function importScene(file) {
+  const body = new FormData();
+  body.append("scene", file, "scene.zip"); // the file's own name may name somebody
+  return json("/scenes", { method: "POST", body });
+}

@@ -14,6 +14,7 @@ import { baselinesOf } from "./figures.js";
 import { ClipForm } from "./form.js";
 import { prepareFullScreen, ScreenLight } from "./fullscreen.js";
 import { prepareHelp, toggleHelp } from "./help.js";
+import { SceneImport } from "./importing.js";
 import { JobList } from "./joblist.js";
 import { Jobs } from "./jobs.js";
 import { currentKey, keyEvents, showKeyForm } from "./key.js";
@@ -131,6 +132,14 @@ async function report(id) {
   }
 }
 
+/** A job that was sent just now. */
+function expect(id) {
+  awaited = id;
+  announcer.await(id);
+  if (!viewer.scene) viewer.open(null, words("page.awaited"));
+  jobs.poll();
+}
+
 function sendMasks(id) {
   const job = jobs.byId.get(id);
   if (!job) return;
@@ -147,6 +156,7 @@ function offerMasks() {
 function showJobs() {
   scopes.refresh();
   form.allow(scopes);
+  sceneImport.allow(scopes);
   announcer.refresh(jobs.byId, viewer.scene);
   offerMasks();
   shelf.refresh();
@@ -213,16 +223,12 @@ const form = new ClipForm(
     refusal: get("upload-refusal"),
   },
   {
-    onJob: (id) => {
-      awaited = id;
-      announcer.await(id);
-      if (!viewer.scene) viewer.open(null, words("page.awaited"));
-      jobs.poll();
-    },
+    onJob: expect,
     onShare: (share) => announcer.send(share),
     onAsked: () => drawers.open("drawer", false),
   },
 );
+const sceneImport = new SceneImport({ ask: get("import"), file: get("import-file"), message: get("jobs-message") }, expect);
 awaited = announcer.awaited; // of before a reload
 get("layer").addEventListener("change", offerMasks);
 get("better-masks").addEventListener("click", () => sendMasks(viewer.scene));

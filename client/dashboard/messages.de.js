@@ -92,6 +92,7 @@ export const DE = {
     "input:right": "Der Clip des rechten Auges kann nicht verwendet werden, oder er passt nicht zum linken.",
     "input:calibration": "Diese Kalibrierung kann mit diesem Clip nicht verwendet werden.",
     "input:masks": "Diese Masken können mit diesem Clip nicht verwendet werden.",
+    "input:scene": "Diese Datei ist keine Szene von intrasplat, oder sie ist beschädigt.",
     "input:options": "Diese Einstellungen passen nicht zu diesem Clip.",
     "limit": "Es ist größer, als dieser Dienst annimmt.",
     "limit:clip": "Der Clip ist größer oder länger, als dieser Dienst annimmt.",
@@ -255,6 +256,10 @@ export const DE = {
     "none": "Noch keine.",
     "none_found": "Unter diesem Namen wurde nichts gefunden.",
     "more": "Mehr zeigen"
+  },
+  "import": {
+    "choose": "Szene aus einer Datei öffnen",
+    "sending": "Die Szene wird gesendet."
   },
   "download": {
     "title": "{name} als Datei speichern",

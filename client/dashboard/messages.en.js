@@ -92,6 +92,7 @@ export const EN = {
     "input:right": "The right eye's clip cannot be used, or does not match the left one.",
     "input:calibration": "This calibration cannot be used with this clip.",
     "input:masks": "These masks cannot be used with this clip.",
+    "input:scene": "This file is no scene of intrasplat, or it is damaged.",
     "input:options": "These settings do not go with this clip.",
     "limit": "It is larger than this service accepts.",
     "limit:clip": "The clip is larger or longer than this service accepts.",
@@ -255,6 +256,10 @@ export const EN = {
     "none": "None yet.",
     "none_found": "Nothing of this name was found.",
     "more": "Show more"
+  },
+  "import": {
+    "choose": "Open a scene from a file",
+    "sending": "The scene is being sent."
   },
   "download": {
     "title": "Save {name} as a file",
