@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from client.audit import add_audit
 from client.keys import add_keys
 from client.remote import add_remote
 from client.slicer.command import add_slicer
@@ -61,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     add_remote(commands)
     add_slicer(commands)
     add_keys(commands)
+    add_audit(commands)
     return parser
 
 

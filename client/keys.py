@@ -9,13 +9,11 @@ from __future__ import annotations
 import argparse
 import sys
 from datetime import UTC, datetime
-from pathlib import Path
 
 from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now
 from contract.access.keys import DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope
-from contract.runtime.arguments import Commands, add_command
+from contract.runtime.arguments import Commands, add_command, add_data_dir, settings_of
 from contract.runtime.exits import ExitCode
-from contract.runtime.settings import Settings
 from contract.wire.errors import InputError
 
 
@@ -35,11 +33,11 @@ def add_keys(commands: Commands) -> None:
     revoke = add_command(own, "revoke", "refuse a key from now on", _revoke)
     revoke.add_argument("key_id", metavar="ID", help="as `intrasplat keys list` shows it")
     for command in (create, add_command(own, "list", "show all keys, without their secrets", _list), revoke):
-        command.add_argument("--data-dir", type=Path, metavar="DIR", help="of the service (default: its settings')")
+        add_data_dir(command)
 
 
 def _create(options: argparse.Namespace) -> int:
-    keys = KeyFile(_data_dir(options))
+    keys = KeyFile(settings_of(options).data_dir)
     key, text = keys.create(options.tenant, _scopes(options.scopes), options.label)
     try:
         _record(options, AuditAction.KEY_CREATED, key)
@@ -52,13 +50,13 @@ def _create(options: argparse.Namespace) -> int:
 
 
 def _list(options: argparse.Namespace) -> int:
-    for key in KeyFile(_data_dir(options)).list():
+    for key in KeyFile(settings_of(options).data_dir).list():
         print(_line(key))
     return ExitCode.OK
 
 
 def _revoke(options: argparse.Namespace) -> int:
-    key = KeyFile(_data_dir(options)).revoke(options.key_id)
+    key = KeyFile(settings_of(options).data_dir).revoke(options.key_id)
     if key is None:
         raise InputError("ID", f"there is no key {options.key_id!r}.", "See `intrasplat keys list`.")
     print(f"revoked {_line(key)}", file=sys.stderr)
@@ -68,7 +66,7 @@ def _revoke(options: argparse.Namespace) -> int:
 
 def _record(options: argparse.Namespace, action: AuditAction, key: ApiKey) -> None:
     entry = AuditEntry(time=utc_now(), action=action, tenant=key.tenant, key_id=key.key_id)
-    AuditLog(_data_dir(options)).append(entry)
+    AuditLog(settings_of(options).data_dir).append(entry)
 
 
 def _scopes(text: str) -> frozenset[KeyScope]:
@@ -81,8 +79,3 @@ def _scopes(text: str) -> frozenset[KeyScope]:
 def _line(key: ApiKey) -> str:
     created = datetime.fromtimestamp(key.created_at_s, UTC).strftime("%Y-%m-%d")
     return f"{key.key_id}  {key.tenant}  {','.join(sorted(key.scopes))}  {created}  {key.label or ''}".rstrip()
-
-
-def _data_dir(options: argparse.Namespace) -> Path:
-    chosen: Path | None = options.data_dir
-    return Settings.from_environment().data_dir if chosen is None else chosen

@@ -19,7 +19,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from contract.runtime.locks import FolderLock
+from contract.runtime.locks import held
 from contract.runtime.settings import LOOPBACK_NAMES, Settings
 from contract.store.durable import replace_file
 from contract.wire.errors import InputError, UnavailableError
@@ -29,8 +29,6 @@ KEYS_FILE = "keys.json"
 KEY_PREFIX = "isp"
 SECRET_BYTES = 32
 MAX_LABEL_CHARACTERS = 60
-LOCK_TIMEOUT_S = 5.0
-"""A process holds the lock for milliseconds only."""
 
 
 class KeyScope(StrEnum):
@@ -173,16 +171,8 @@ class KeyFile:
     def _changing(self) -> Iterator[tuple[ApiKey, ...]]:
         """The present keys, while this process holds the lock."""
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        lock = FolderLock(self._path.with_name("keys.lock"))
-        deadline_s = time.monotonic() + LOCK_TIMEOUT_S
-        while not lock.take():
-            if time.monotonic() > deadline_s:
-                raise UnavailableError("Another process is changing the keys.", "Try again.")
-            time.sleep(0.02)
-        try:
+        with held(self._path.with_name("keys.lock"), "the keys"):
             yield self.list()
-        finally:
-            lock.release()
 
     def _write(self, keys: tuple[ApiKey, ...]) -> None:
         replace_file(self._path, _Stored(keys=keys).model_dump_json(indent=1).encode())

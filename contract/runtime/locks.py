@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from contract.wire.errors import UnavailableError
+
+HELD_TIMEOUT_S = 5.0
+"""Whoever holds a lock by held() does so for milliseconds only."""
+TRY_PERIOD_S = 0.005
 
 
 class FolderLock:
@@ -32,3 +41,26 @@ class FolderLock:
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
+
+
+@contextmanager
+def held(path: Path, what: str) -> Iterator[None]:
+    """The time in which nobody else, no other thread either, holds the lock of this file.
+
+    Args:
+        what: is changed meanwhile, for people.
+
+    Raises:
+        UnavailableError: somebody else holds it for longer than HELD_TIMEOUT_S.
+        OSError: the file cannot be opened.
+    """
+    lock = FolderLock(path)
+    deadline_s = time.monotonic() + HELD_TIMEOUT_S
+    while not lock.take():
+        if time.monotonic() > deadline_s:
+            raise UnavailableError(f"Another process is changing {what}.", "Try again.")
+        time.sleep(TRY_PERIOD_S)
+    try:
+        yield
+    finally:
+        lock.release()

@@ -1,0 +1,119 @@
+"""The chain of an audit's lines: each line names all that stands before it by SHA-256, so that no change goes unseen.
+
+A chained line begins {"chain":"<hash>",... The hash is of the bytes from the start of the chained line before it up to
+its own start, without the newline between them: as a rule, of the line before. Lines without a chain, which a crash has
+cut off or version 0.2 wrote, are hashed together with that line, or from the start of the file if there is none.
+
+The hash that the next line will name is the head. The first line of a file names the head of the file before it, START
+if there is none. Nothing is secret: whoever may write the file can make a whole new chain. That, and lines removed at
+the end, show only against a head that was kept elsewhere.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import os
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from contract.wire.errors import InputError
+
+START = "0" * 64
+HEAD_PATTERN = r"[0-9a-f]{64}"
+CHAINED = re.compile(rb'\{"chain":"([0-9a-f]{64})",')
+TAIL_BYTES = 4096
+"""The last line is looked for in so many bytes first; a line has about 350."""
+
+
+def head_of(descriptor: int) -> str | None:
+    """The head of an open file; None if it is empty. Reads TAIL_BYTES, and more only where lines have no chain."""
+    size, window = os.fstat(descriptor).st_size, TAIL_BYTES
+    while size:
+        start = max(0, size - window)
+        tail = os.pread(descriptor, size - start, start).removesuffix(b"\n")
+        at = _last_chained(tail, is_whole=start == 0)
+        if at is not None or start == 0:
+            return hashlib.sha256(tail[at or 0 :]).hexdigest()
+        window *= 8
+    return None
+
+
+def _last_chained(tail: bytes, *, is_whole: bool) -> int | None:
+    """Where the last chained line of the tail begins. is_whole: the tail begins with a line."""
+    at = tail.rfind(b'{"chain":"')
+    while at >= 0:
+        if (tail[at - 1 : at] == b"\n" or (at == 0 and is_whole)) and CHAINED.match(tail, at):
+            return at
+        at = tail.rfind(b'{"chain":"', 0, at)
+    return None
+
+
+def audit_lines(path: Path) -> Iterator[bytes]:
+    """The lines of an audit file, of a compressed one (.gz) too, without their newlines.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            for line in file:
+                yield line.removesuffix(b"\n")
+    except (OSError, EOFError) as error:
+        problem = f"{path} cannot be read ({type(error).__name__})."
+        raise InputError("FILE", problem, "Name the files of one service's audit, as the user that runs it.") from error
+
+
+@dataclass
+class CheckedFile:
+    """What one file's chain says."""
+
+    path: Path
+    lines: int = 0
+    begins: str | None = None
+    """The head that its first line names; None: that line has no chain."""
+    head: str = START
+    """What the next line would name."""
+    broken_at: int | None = None
+    """The first line, counted from 1, that does not name what stands before it."""
+    unchained: list[int] = field(default_factory=list)
+    found_at: int | None = None
+    """After this line the head was the one that is looked for; 0: before the first."""
+
+
+def check_file(path: Path, wanted: str | None = None) -> CheckedFile:
+    """Follow the chain of one file. wanted: a head to look for. Raises as audit_lines()."""
+    checked, since = CheckedFile(path), hashlib.sha256()
+    for number, line in enumerate(audit_lines(path), 1):
+        chained = CHAINED.match(line)
+        if chained is None:
+            checked.unchained.append(number)
+            since.update(line if number == 1 else b"\n" + line)
+        else:
+            named = chained[1].decode()
+            if number == 1:
+                checked.begins = named
+                checked.found_at = 0 if named == wanted else None
+            elif named != checked.head and checked.broken_at is None:
+                checked.broken_at = number
+            since = hashlib.sha256(line)
+        checked.lines, checked.head = number, since.hexdigest()
+        if checked.head == wanted:
+            checked.found_at = number
+    return checked
+
+
+def in_order(files: Sequence[CheckedFile]) -> list[CheckedFile]:
+    """The files, none of them empty, so that each begins where the one before it ends, as far as that can be."""
+    heads = {each.head for each in files}
+    firsts = [each for each in files if each.begins is None or each.begins not in heads]
+    firsts.sort(key=lambda each: each.begins not in (None, START))
+    following = {each.begins: each for each in files if each not in firsts}
+    ordered: list[CheckedFile] = []
+    for first in firsts:
+        ordered.append(first)
+        while (after := following.pop(ordered[-1].head, None)) is not None:
+            ordered.append(after)
+    return ordered + list(following.values())

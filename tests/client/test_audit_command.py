@@ -1,0 +1,88 @@
+"""`intrasplat audit verify`: what an operator reads, and the status that a script goes by."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from client.cli import main
+from contract.access.audit import AUDIT_FILE, AuditAction, AuditEntry, AuditLog, utc_now
+from contract.access.chain import check_file
+from contract.runtime.exits import ExitCode
+
+
+def write(folder: Path, count: int) -> Path:
+    for _ in range(count):
+        AuditLog(folder).append(AuditEntry(time=utc_now(), action=AuditAction.VIEWED, tenant="ward-3"))
+    return folder / AUDIT_FILE
+
+
+def verified(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, list[str]]:
+    status = main(["audit", "verify", *map(str, arguments)])
+    return status, capsys.readouterr().out.splitlines()
+
+
+def test_an_audit_that_nobody_touched_is_intact_and_its_head_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path, 3)
+    status, lines = verified(capsys, "--data-dir", tmp_path)
+    assert status == ExitCode.OK
+    assert lines == [f"{path}: 3 lines, begins the audit", "intact", f"head {check_file(path).head}"]
+
+
+def test_rotated_files_are_one_audit_in_whatever_order_they_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("audit.2", "audit.1"):
+        write(tmp_path, 2).rename(tmp_path / name)
+    newest = write(tmp_path, 1)
+    status, lines = verified(capsys, newest, tmp_path / "audit.1", tmp_path / "audit.2")
+    assert (status, lines[-2:]) == (ExitCode.OK, ["intact", f"head {check_file(newest).head}"])
+    (tmp_path / "empty").touch()
+    status, lines = verified(capsys, newest, tmp_path / "audit.1", tmp_path / "audit.2", tmp_path / "empty")
+    assert (status, lines[0]) == (ExitCode.OK, f"{tmp_path / 'empty'}: no line")
+    status, lines = verified(capsys, newest, tmp_path / "audit.2")
+    assert status == ExitCode.FAILED
+    assert f"{newest}, line 1: it does not follow the last line of {tmp_path / 'audit.2'}" in lines[2]
+
+
+def test_a_changed_line_is_named_and_the_status_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(tmp_path, 5)
+    lines = path.read_text().splitlines()
+    lines[2] = lines[2].replace("ward-3", "ward-4")
+    path.write_text("\n".join(lines) + "\n")
+    status, told = verified(capsys, path)
+    assert (status, told[2]) == (ExitCode.FAILED, "CHANGED")
+    assert told[1].startswith(f"{path}, line 4: it does not follow line 3, which was changed")
+
+
+def test_lines_that_are_gone_at_the_end_show_against_a_head_that_was_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path, 5)
+    head = verified(capsys, path)[1][-1].removeprefix("head ")
+    write(tmp_path, 2)
+    assert verified(capsys, path, "--head", head)[0] == ExitCode.OK
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:4]))
+    assert verified(capsys, path)[0] == ExitCode.OK
+    status, told = verified(capsys, path, "--head", head)
+    assert status == ExitCode.FAILED
+    assert any(line.startswith(f"--head {head}: no line has this hash") for line in told)
+
+
+def test_old_lines_are_told_and_not_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / AUDIT_FILE).write_text('{"time":"1"}\n{"time":"2"}\n')
+    status, told = verified(capsys, write(tmp_path, 1))
+    assert status == ExitCode.OK
+    assert "begins before there was a chain" in told[0]
+    assert told[0].endswith("cut off by a crash: 1-2")
+
+
+@pytest.mark.parametrize("arguments", [["absent"], ["--head", "12"]])
+def test_what_cannot_be_verified_is_refused_in_a_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str]
+) -> None:
+    assert main(["audit", "verify", *arguments, "--data-dir", str(tmp_path)]) == ExitCode.BAD_INPUT
+    assert capsys.readouterr().err.startswith("intrasplat: ")
