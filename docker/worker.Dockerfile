@@ -1,20 +1,23 @@
 # The worker: claims jobs, trains, serves renders. CPU by default; for NVIDIA GPUs (docker/compose.gpu.yml does this)
 #   docker build --build-arg TORCH_INDEX=https://download.pytorch.org/whl/cu128 \
-#                --build-arg SYSTEM_PACKAGES="gcc libc6-dev" --build-arg EXTRAS=s3,gpu …
+#                --build-arg SYSTEM_PACKAGES="gcc libc6-dev" --build-arg EXTRAS=s3,mesh,onnx,gpu …
 ARG BASE=python:3.12.13-slim-trixie
 
 FROM ${BASE} AS build
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
-ARG EXTRAS=s3
+ARG EXTRAS=s3,mesh,onnx
 WORKDIR /app
 RUN python -m venv /venv
-COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY constraints.txt ./
 # torch first and alone: it is most of the download, and its layer outlives every change of ours.
 # Its index has of everything else the versions it likes; those of constraints.txt come with the next step.
 RUN grep -E '^(torch|triton)[<>=]' constraints.txt >torch.txt \
     && /venv/bin/pip install --no-cache-dir --constraint torch.txt --index-url "$TORCH_INDEX" torch
+COPY pyproject.toml README.md LICENSE ./
 COPY contract contract
 COPY worker worker
+# the command `intrasplat`, which runs the worker's programs too
+COPY client client
 RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt ".[$EXTRAS]"
 
 FROM ${BASE}

@@ -36,6 +36,9 @@ COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "compose.yml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 PINNED = re.compile(r"[a-z/-]+:\d+\.\d+\.\d+[a-z0-9.-]*(@sha256:[0-9a-f]{64})?$")
 START_TIMEOUT_S = 20.0
+PROXY_VARIABLES = frozenset({"INTRASPLAT_HOSTS", "FORWARDED_ALLOW_IPS"})
+NOT_IN_IMAGES = frozenset({"dev", "gpu", "slicer"})
+"""Extras that no container of a CPU needs: of tests, of GPUs, and of a bridge that runs beside Slicer."""
 
 each_service = pytest.mark.parametrize("name", SERVICES)
 each_dockerfile = pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.name)
@@ -97,8 +100,22 @@ def test_images_have_full_versions(name: str) -> None:
 @each_service
 def test_no_secret_stands_in_the_environment(name: str) -> None:
     for variable, value in SERVICES[name].get("environment", {}).items():
-        assert variable.endswith("_FILE")
-        assert value.removeprefix("/run/secrets/") in SERVICES[name]["secrets"]
+        if variable not in PROXY_VARIABLES:
+            assert variable.endswith("_FILE")
+            assert value.removeprefix("/run/secrets/") in SERVICES[name]["secrets"]
+
+
+def test_a_proxy_is_named_from_outside_the_file() -> None:
+    environment = SERVICES["service"]["environment"]
+    assert {name: environment[name] for name in PROXY_VARIABLES} == {
+        "INTRASPLAT_HOSTS": "${INTRASPLAT_HOSTS:-}",
+        "FORWARDED_ALLOW_IPS": "${FORWARDED_ALLOW_IPS:-127.0.0.1}",
+    }
+
+
+@each_service
+def test_logs_go_to_a_driver_that_docker_and_podman_have(name: str) -> None:
+    assert SERVICES[name]["logging"]["driver"] == "json-file"
 
 
 def test_only_the_service_is_published_and_only_to_its_own_machine() -> None:
@@ -148,6 +165,20 @@ def test_the_service_image_has_every_package_that_the_service_imports() -> None:
     foreign = modules - sys.stdlib_module_names - own - {"pydantic_core"}  # a part of pydantic, which brings it
     names = {module: {each.lower().replace("_", "-") for each in providers[module]} for module in foreign}
     assert [module for module in sorted(foreign) if not names[module] & installed] == []
+
+
+def test_the_worker_image_has_every_extra_that_a_worker_can_use() -> None:
+    extras = set(project()["optional-dependencies"]) - NOT_IN_IMAGES
+    (default,) = (text for kind, text in instructions(DOCKER / "worker.Dockerfile") if text.startswith("EXTRAS="))
+    assert set(default.removeprefix("EXTRAS=").split(",")) == extras
+    gpu = yaml.safe_load((DOCKER / "compose.gpu.yml").read_text())["services"]["worker"]["build"]["args"]["EXTRAS"]
+    assert set(gpu.split(",")) == extras | {"gpu"}
+
+
+@each_dockerfile
+def test_the_command_line_is_in_every_image(path: Path) -> None:
+    copied = {source for kind, text in instructions(path) if kind == "COPY" for source in text.split()[:-1]}
+    assert {"client", "contract"} <= copied  # `intrasplat` is client.cli:main
 
 
 def test_docker_itself_finds_no_fault_with_the_files() -> None:

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import re
-from typing import get_args
-
-import yaml  # type: ignore[import-untyped]
 
 from contract.queue import redis_queue as queue_redis
 from contract.queue.interface import LEASE_S, MAX_ATTEMPTS
-from contract.queue.redis_queue import PREFIX
 from contract.runtime.settings import ENVIRONMENT_PREFIX, Settings, default_data_dir
 from contract.store.s3 import SEEN_FOR_S
-from contract.wire.options import Priority
 from tests.test_repository import REPOSITORY
 from worker.daemon.supervisor import TIDY_PERIOD_S
 
@@ -48,11 +43,10 @@ def test_every_variable_that_is_named_exists() -> None:
     assert [name for name in sorted(named) if not any(f'"{name}"' in each for each in sources)] == []
 
 
-def test_keda_watches_the_queues_own_streams() -> None:
-    watched = [trigger["metadata"] for trigger in yaml.safe_load(block("yaml"))["spec"]["triggers"]]
-    assert {each["stream"] for each in watched} == {f"{PREFIX}jobs:{name}" for name in get_args(Priority)}
-    scripts = (REPOSITORY / "contract" / "queue" / "scripts" / "common.lua").read_text(encoding="utf-8")
-    assert all(f"'{each['consumerGroup']}'" in scripts for each in watched)
+def test_nginx_hands_on_the_port_and_needs_no_new_release() -> None:
+    server = block("nginx")
+    assert "proxy_set_header Host $http_host;" in server  # a browser's WebSocket names its port as its origin
+    assert "listen 443 ssl http2;" in server  # `http2 on` exists from 1.25.1 on
 
 
 def test_the_access_list_is_that_of_the_containers() -> None:

@@ -17,7 +17,7 @@ import pytest
 from worker.machine.gpu import MAX_TRITON, MIN_TRITON, triton_range
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("docker/*.md")])
+PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("docker/**/*.md")])
 TARGETS = (
     "help", "setup", "demo", "test", "check", "bench", "gpu-check", "evaluate", "capacity", "chaos", "sbom", "clean",
 )  # fmt: skip

@@ -310,3 +310,11 @@ def test_import_sends_a_scene_of_another_installation(
     path.write_bytes(b"no zip")
     assert run_in(service, "import", str(path)) == ExitCode.BAD_INPUT
     assert "scene: scene.zip is not a readable zip" in capsys.readouterr().err
+
+
+def test_work_on_this_machine_without_the_workers_packages_says_where_to_do_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "worker", None)  # as in the service's container
+    assert main(["doctor"]) == ExitCode.UNAVAILABLE
+    assert "the worker's container" in capsys.readouterr().err
