@@ -89,6 +89,7 @@ def test_two_eyes_that_differ_are_told_and_doubts_do_not_stop_a_clip(site: Site,
     page.choose("clip", CLIP)
     page.choose("right", CLIP.parent / "stereo_sbs_trimmed.mp4")
     page.until(lambda: ["right", "eyes_differ"] in page.script(FINDINGS))
+    page.choose("calibration", calibration_at(tmp_path / "eyes.json", width=192, height=80))
     page.find("#upload [name=label]").send_keys("liver, left lobe")
     page.click("#upload [type=submit]")
     page.until(lambda: site.queue.records())
