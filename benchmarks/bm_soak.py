@@ -22,6 +22,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from statistics import linear_regression, median
@@ -31,8 +32,7 @@ from urllib.parse import urlsplit
 from bm_service import PhantomClip, make_clip
 
 from client.demo import started_service
-from contract.wire.errors import IntrasplatError
-from intrasplat_client import Client, Conflict
+from intrasplat_client import Client, Conflict, IntrasplatError
 from intrasplat_client.models import JobState
 from worker.evaluate.rows import commit, machine
 
@@ -70,22 +70,21 @@ def _soak(url: str, clip: PhantomClip, data_dir: Path, minutes: float) -> tuple[
     end = threading.Event()
     shown: list[str] = []  # the scene that is looked at now, if any
     counts: Counter[str] = Counter()
-    threads = [threading.Thread(target=_look, args=(url, shown, end, counts)) for _ in range(2)]
-    threads.append(threading.Thread(target=_look_through_socket, args=(url, shown, end, counts)))
     rows: list[Row] = []
-    threads.append(threading.Thread(target=_sample, args=(data_dir, end, rows)))
-    for thread in threads:
-        thread.start()
     rounds = 0
     deadline_s = time.monotonic() + 60 * minutes
-    try:
-        while time.monotonic() < deadline_s:
-            _round(url, clip, rounds, shown)
-            rounds += 1
-    finally:
-        end.set()
-        for thread in threads:
-            thread.join()
+    with ThreadPoolExecutor() as threads:
+        beside = [threads.submit(_look, url, shown, end, counts) for _ in range(2)]
+        beside.append(threads.submit(_look_through_socket, url, shown, end, counts))
+        beside.append(threads.submit(_sample, data_dir, end, rows))
+        try:
+            while time.monotonic() < deadline_s and not any(each.done() for each in beside):
+                _round(url, clip, rounds, shown)
+                rounds += 1
+        finally:
+            end.set()
+    for each in beside:
+        each.result()  # raises what ended it too early
     return rows, rounds, counts
 
 
