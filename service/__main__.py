@@ -34,11 +34,11 @@ def main() -> int:
     if settings.redis_url is None:
         return end_by(UnavailableError("REDIS_URL is not set.", "`intrasplat up` starts a queue of its own."))
     configure(settings, "service")
-    queue = RedisQueue(settings.redis_url, patience_s=QUEUE_PATIENCE_S)
     try:
+        queue = RedisQueue(settings.redis_url, patience_s=QUEUE_PATIENCE_S)
         _ask(queue)
         store = open_store(settings)
-    except UnavailableError as error:
+    except IntrasplatError as error:
         return end_by(error)
     known = store.run_dir / KNOWN_WORKERS
     renderer = ZmqRenderer(queue, settings.render_timeout_s, settings.render_secret, known)

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
+from contract.runtime.queue_url import parse_queue_url
 from contract.wire.errors import InputError
 from contract.wire.names import DeviceName
 
@@ -143,6 +144,8 @@ class Settings(BaseModel):
         values = {name: _value(source, variable) for name, variable in variables.items()}
         values["redis_url"] = _value(source, "REDIS_URL") or values["redis_url"]
         values = {name: value for name, value in values.items() if value}
+        if "redis_url" in values:
+            parse_queue_url(values["redis_url"])
         try:
             return cls.model_validate(values)
         except ValidationError as error:

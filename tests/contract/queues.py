@@ -96,6 +96,10 @@ class RunningServer:
         """The server neither ends nor answers; by SIGCONT it goes on."""
         self._process.send_signal(by)
 
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait(20.0)
+
     def stop(self) -> None:
         self._process.terminate()
         self._process.wait(20.0)
