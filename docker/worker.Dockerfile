@@ -1,11 +1,11 @@
 # The worker: claims jobs, trains, serves renders. CPU by default; for NVIDIA GPUs (docker/compose.gpu.yml does this)
 #   docker build --build-arg TORCH_INDEX=https://download.pytorch.org/whl/cu128 \
-#                --build-arg SYSTEM_PACKAGES="gcc libc6-dev" --build-arg EXTRAS=s3,mesh,onnx,gpu …
+#                --build-arg SYSTEM_PACKAGES="gcc libc6-dev" --build-arg EXTRAS=s3,mesh,onnx,otel,gpu …
 ARG BASE=python:3.12.13-slim-trixie
 
 FROM ${BASE} AS build
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
-ARG EXTRAS=s3,mesh,onnx
+ARG EXTRAS=s3,mesh,onnx,otel
 WORKDIR /app
 RUN python -m venv /venv
 COPY constraints.txt ./

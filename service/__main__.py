@@ -8,6 +8,7 @@ import sys
 
 from contract.access.keys import check_keys
 from contract.queue.redis_queue import RedisQueue
+from contract.runtime import traces
 from contract.runtime.exits import ExitCode, end_by
 from contract.runtime.logs import configure
 from contract.runtime.settings import Settings
@@ -34,6 +35,7 @@ def main() -> int:
     if settings.redis_url is None:
         return end_by(UnavailableError("REDIS_URL is not set.", "`intrasplat up` starts a queue of its own."))
     configure(settings, "service")
+    traces.configure("service")
     try:
         queue = RedisQueue(settings.redis_url, patience_s=QUEUE_PATIENCE_S)
         _ask(queue)

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from zmq.utils.monitor import parse_monitor_message
 
 from contract.access.render_keys import service_keys, worker_keys
+from contract.runtime import traces
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import CancelRequest, SceneRequest, WorkerReply, WorkerRequest
 
@@ -92,7 +93,8 @@ class Connection:
             WorkerGoneError: there will be none.
             UnavailableError: it is not one that this version can read.
         """
-        document = WorkerRequest(request=request).model_dump_json().encode()
+        trace = traces.current().traceparent
+        document = WorkerRequest(request=request, trace=trace).model_dump_json().encode()
         await self.reach(patiently=patiently)
         request_id = next(self._ids).to_bytes(8, "big")
         future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()

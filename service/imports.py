@@ -21,7 +21,7 @@ from service.access import Caller
 from service.bodies import SCENE_BODY
 from service.deps import AnyCaller, Deps, Services
 from service.problems import RETRY_AFTER_S
-from service.reconstruct import IdempotencyKey, check_scopes, enqueue, forecast_of, hash_of, receive_form
+from service.reconstruct import IdempotencyKey, check_scopes, forecast_of, hash_of, receive_form, spool_and_queue
 from service.retention import check_retention
 from service.upload import SCENE_FORM, SCENE_PART, Received
 
@@ -70,9 +70,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         created_at_s=now_s,
     )
     services.audit.record(AuditAction.IMPORTED, caller, job_id)
-    with services.sweep.in_hand(job_id):
-        services.store.accept(record)
-        return enqueue(services, record)
+    return spool_and_queue(services, record)
 
 
 def _options(text: str) -> JobOptions:

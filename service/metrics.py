@@ -14,6 +14,7 @@ from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from contract.queue.interface import Queue
+from contract.runtime import traces
 from contract.runtime.version import version
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
@@ -143,6 +144,8 @@ class _QueueCollector(Collector):
         except UnavailableError:
             free_bytes = 0
         yield GaugeMetricFamily("intrasplat_free_bytes", "Left on the data directory's disk.", free_bytes)
+        if (dropped := traces.dropped()) is not None:
+            yield CounterMetricFamily("intrasplat_spans_dropped", "Spans that the collector did not get.", dropped)
 
     def _of_queue(self) -> list[Metric]:
         figures, workers = self._queue.figures(), self._queue.workers()

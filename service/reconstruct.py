@@ -22,6 +22,7 @@ from contract.intake.fit import check_fit
 from contract.intake.limits import MAX_MEMORY_BYTES, ClipLimits
 from contract.intake.sniff import check_file
 from contract.queue.interface import Admission, QueueFullError
+from contract.runtime import traces
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.wire.errors import InputError, LimitError, UnavailableError
@@ -120,7 +121,9 @@ async def receive_form(
             room_bytes = services.intake.room_bytes() + place.kept_bytes
             limits = UploadLimits(settings.max_upload_bytes, room_bytes, settings.min_free_bytes)
             content_type = request.headers.get("content-type", "")
-            received = await receive_upload(content_type, services.intake.body(request, place), folder, limits, form)
+            with traces.span("receive"):
+                body = services.intake.body(request, place)
+                received = await receive_upload(content_type, body, folder, limits, form)
             return await run_in_threadpool(accept, services, caller, job_id, received, key)
         except ClientDisconnect:
             detail = "The connection was closed before the upload was complete."
@@ -265,12 +268,11 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         idempotency_key=key,
         created_at_s=time.time(),
     )
-    _look_at(services, record, received.names, sent)
+    with traces.span("judge"):
+        _look_at(services, record, received.names, sent)
     outcome = "ok" if clip_of is None else f"ok (clip of {clip_of})"
     services.audit.record(AuditAction.ACCEPTED, caller, job_id, outcome)
-    with services.sweep.in_hand(job_id):
-        services.store.accept(record)
-        return enqueue(services, record)
+    return spool_and_queue(services, record)
 
 
 def check_scopes(options: JobOptions, caller: Caller, settings: Settings) -> None:
@@ -294,6 +296,18 @@ def _look_at(services: Deps, record: JobRecord, names: Mapping[str, str], sent: 
     for part, path in files.items():
         check_file(path, part, limits)
     check_fit(record.options, files, sent)
+
+
+def spool_and_queue(services: Deps, record: JobRecord) -> JobRecord:
+    """Put what was received into the spool and then into the queue; the record that stands there. As enqueue()."""
+    request = traces.current()
+    request.set(job_id=record.job_id, input_bytes=record.input_bytes)
+    record = record.model_copy(update={"trace": request.traceparent})
+    with services.sweep.in_hand(record.job_id):
+        with traces.span("spool"):
+            services.store.accept(record)
+        with traces.span("enqueue"):
+            return enqueue(services, record)
 
 
 def enqueue(services: Deps, record: JobRecord) -> JobRecord:

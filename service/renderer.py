@@ -18,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from contract.queue.interface import WORKER_TTL_S, Queue
+from contract.runtime import traces
 from contract.store.durable import replace_file
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ReplyError, SceneRequest, WorkerAddress, WorkerReply
@@ -110,7 +111,8 @@ class ZmqRenderer:
 
     async def _ask(self, address: WorkerAddress, request: SceneRequest, *, patiently: bool = True) -> Answer:
         connection = await self._connection(address)
-        answer = await connection.ask(request, patiently=patiently)
+        with traces.span("ask worker", kind=traces.Kind.CLIENT, worker=address.name):
+            answer = await connection.ask(request, patiently=patiently)
         return dataclasses.replace(answer, worker=address.endpoint)
 
     async def reachable(self, workers: Sequence[WorkerAddress], timeout_s: float) -> list[WorkerAddress]:

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from contract.access.keys import KeyScope
+from contract.runtime import traces
 from contract.runtime.settings import Settings
 from contract.runtime.version import version
 from contract.wire.job import JobState
@@ -213,7 +214,9 @@ async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown
             503: it had, and waits for another worker.
     """
     caller.require(KeyScope.VIEW)
-    shown = await run_in_threadpool(_find, services, caller, scene)
+    with traces.span("find"):
+        shown = await run_in_threadpool(_find, services, caller, scene)
+    traces.current().set(job_id=shown.scene_id)
     await services.audit.viewed(caller, shown.scene_id)
     return shown
 

@@ -1,6 +1,6 @@
-"""Middleware around all routes: request ids, a line in the log for each request, and the answer to a fault.
+"""Middleware around all routes: request ids, a line in the log and a span for each request, the answer to a fault.
 
-The line tells the route's template, not the path, and nothing of query, headers or body: callers put anything there.
+Both tell the route's template, not the path, and nothing of query, headers or body: callers put anything there.
 """
 
 from __future__ import annotations
@@ -9,13 +9,18 @@ import logging
 import re
 import time
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from contract.runtime import traces
 from contract.runtime.logs import answering
+from contract.store.shelf import is_job_id
+from service.metrics import METHODS
 from service.problems import Problem, fault
 
 REQUEST_ID = "X-Request-Id"
@@ -28,6 +33,9 @@ QUIET_ROUTES = frozenset({"/healthz", "/readyz", "/metrics"})
 MAX_OPEN = 512
 """Requests, streams of events and WebSockets at a time. Each of them may hold a connection for long."""
 
+NO_ROUTE = "-"
+OTHER_METHOD = "_OTHER"
+"""In spans, of a method that a caller has made up; so OpenTelemetry calls it."""
 GONE = 499
 """In the log alone: the caller left before it was answered."""
 SWITCHED = 101
@@ -54,15 +62,17 @@ class RequestLog:
             await self._app(scope, receive, send)
             return
         given = Headers(scope=scope).get(REQUEST_ID, "")
-        request_id = given if KEPT_REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         answered, began_s = _Answered(), time.perf_counter()
         self._open += 1
-        with answering(request_id):
-            try:
-                await self._answer(scope, receive, _marking(scope, send, request_id, answered), answered)
-            finally:
-                self._open -= 1
-                _log(scope, answered.status or GONE, time.perf_counter() - began_s)
+        with _span_of(scope) as span:
+            request_id = given if KEPT_REQUEST_ID.fullmatch(given) else span.trace_id or uuid.uuid4().hex
+            with answering(request_id):
+                try:
+                    await self._answer(scope, receive, _marking(scope, send, request_id, answered), answered)
+                finally:
+                    self._open -= 1
+                    _log(scope, answered.status or GONE, time.perf_counter() - began_s)
+                    _describe(span, scope, request_id, answered.status or GONE)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, answered: _Answered) -> None:
         if self._open > MAX_OPEN:
@@ -106,8 +116,36 @@ async def _nothing() -> Message:
     return {"type": "websocket.disconnect"}
 
 
+@contextmanager
+def _span_of(scope: Scope) -> Iterator[traces.Span]:
+    """The span of a request, in the trace that its caller named. Each view of a WebSocket has one of its own."""
+    if scope["type"] == "websocket" or scope["path"] in QUIET_ROUTES:
+        yield traces.NOT_RECORDED
+        return
+    parent = Headers(scope=scope).get(traces.TRACEPARENT, traces.NEW)
+    with traces.span(_method_of(scope), parent, kind=traces.Kind.SERVER) as span:
+        yield span
+
+
+def _describe(span: traces.Span, scope: Scope, request_id: str, status: int) -> None:
+    if span.traceparent is None:
+        return
+    method, route = _method_of(scope), getattr(scope.get("route"), "path", NO_ROUTE)
+    span.rename(f"{method} {route}")
+    span.set(request_id=request_id, method=method, route=route, status=status)
+    for job_id in scope.get("path_params", {}).values():
+        if is_job_id(str(job_id)):
+            span.set(job_id=str(job_id))
+    if status >= 500:
+        span.end(failed=str(status))
+
+
+def _method_of(scope: Scope) -> str:
+    return scope["method"] if scope["method"] in METHODS else OTHER_METHOD
+
+
 def _log(scope: Scope, status: int, seconds: float) -> None:
-    route = getattr(scope.get("route"), "path", "-")
+    route = getattr(scope.get("route"), "path", NO_ROUTE)
     level = logging.DEBUG if route in QUIET_ROUTES and status < 400 else logging.INFO
     fields = {
         "method": scope.get("method", "WEBSOCKET"),

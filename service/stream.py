@@ -26,6 +26,7 @@ from pydantic_core import from_json
 from starlette.types import Message
 
 from contract.access.keys import KeyScope
+from contract.runtime import traces
 from contract.wire.job import JobState
 from contract.wire.notices import Notice
 from contract.wire.rendering import PictureCamera
@@ -179,11 +180,12 @@ class _Viewer:
         message = message_of(document)
         caller = self._known_caller()
         self._services.limiter.admit(caller.key_id or caller.address)
-        shown = await find_shown(self._services, caller, message.scene)
-        request = request_of(message, shown, self._services.settings)
-        shown, answer = await answer_to(self._services, caller, request, shown)
-        if answer.head.error is not None:
-            raise problem_of_reply(answer.head.error)
+        with traces.span("view of /stream", traces.NEW, kind=traces.Kind.SERVER):
+            shown = await find_shown(self._services, caller, message.scene)
+            request = request_of(message, shown, self._services.settings)
+            shown, answer = await answer_to(self._services, caller, request, shown)
+            if answer.head.error is not None:
+                raise problem_of_reply(answer.head.error)
         return packed(message, shown, answer, (time.perf_counter() - start) * 1e3)
 
     async def _tell(self, error: Exception, message_id: object) -> None:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import NoReturn
 
+from contract.runtime import traces
 from contract.runtime.arguments import add_command
 from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, end_by
 from contract.runtime.local import LOCAL_COMMANDS, WORKER_SUMMARY
@@ -85,6 +86,7 @@ def _doctor(options: argparse.Namespace) -> int:
 def _consume(options: argparse.Namespace) -> int:
     settings = Settings.from_environment()
     configure(settings, "worker")
+    traces.configure("worker", settings.worker_name)
     if settings.redis_url is None:
         raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
     from worker.daemon.supervisor import run_supervisor
@@ -96,6 +98,7 @@ def _consume(options: argparse.Namespace) -> int:
 def _device(options: argparse.Namespace) -> int:
     settings = Settings.from_environment()
     configure(settings, "device")
+    traces.configure("device", settings.worker_name)
     from worker.daemon.device import run_device
 
     run_device(settings)

@@ -47,6 +47,8 @@ OPTIONAL_PACKAGES = {
     "fsspec": "only needed for a store in a bucket",
     "s3fs": "only needed for a store in a bucket",
     "onnxruntime": "only needed for a segmenter of your own",
+    "opentelemetry-sdk": "only needed for traces",
+    "opentelemetry-exporter-otlp-proto-http": "only needed for traces",
 }
 INSTALL_REMEDY = "in a checkout, run `make setup`, or `pip install .`"
 

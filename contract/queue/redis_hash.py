@@ -30,6 +30,7 @@ def new_record(record: JobRecord) -> tuple[str, str, str, str]:
         "released": str(record.released),
         "tenant": record.tenant,
         "priority": record.options.priority,
+        "trace": record.trace,
         "owner": record.owner,
         "cancel": "1" if record.cancel_requested else None,
         "progress": record.progress and record.progress.model_dump_json(),
@@ -78,6 +79,7 @@ def _changed(fields: Mapping[str, str]) -> dict[str, object]:
         "error": _parsed(JobError, fields.get("error")),
         "started_at_s": float(fields["started"]) if "started" in fields else None,
         "finished_at_s": float(fields["finished"]) if "finished" in fields else None,
+        "trace": fields.get("trace"),
     }
 
 

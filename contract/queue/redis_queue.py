@@ -12,6 +12,7 @@ Keys (the braces put all of them in one cluster slot, so that a script may touch
         started, finished, queued       UNIX s by the server's clock; queued: since when it waits
         label, metadata                 of its labels; metadata as JSON. They stand in neither document nor events
         tenant, priority                of the document, for the scripts
+        trace                           as in JobRecord
         entry, sequence                 its stream entry, and its place among the jobs of its priority
         restored                        token of the call that put it back
     {intrasplat}:events:<id>            stream; each entry is what a change left of the hash (EVENT_FIELDS)

@@ -127,6 +127,8 @@ class JobRecord(BaseModel):
     cancel_requested: bool = False
     progress: JobProgress | None = None
     error: JobError | None = None
+    trace: str | None = Field(default=None, exclude=True)
+    """The W3C traceparent of the request that submitted it. It stands in no JSON, so that older versions read that."""
 
 
 class Forecast(BaseModel):

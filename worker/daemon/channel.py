@@ -16,7 +16,11 @@ from typing import BinaryIO
 
 from pydantic import ValidationError
 
+from contract.runtime import traces
 from worker.daemon.orders import DeviceReport, RunJob, ScoreScene, line_of, read_order
+
+TRACES_PATIENCE_S = 1.0
+"""How long the end of the process waits for a collector: less than a supervisor waits for the process."""
 
 logger = logging.getLogger("intrasplat.worker")
 
@@ -91,4 +95,5 @@ class Orders:
                 self._tasks.put(task)
             elif task is not None:
                 task.stop.set()
+        traces.flush(TRACES_PATIENCE_S)
         os._exit(0)  # all that must be kept is on disk already

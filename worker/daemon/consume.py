@@ -28,6 +28,7 @@ from worker.daemon.hang import HangDetector
 from worker.daemon.heartbeat import Heartbeat
 from worker.daemon.held import HeldClaim
 from worker.daemon.job_errors import describe
+from worker.daemon.job_spans import StageSpans, attempt_span
 from worker.daemon.orders import FETCHING, Advanced, Failed, Finished, RunJob, StopJob, Stopped
 from worker.daemon.room import Room
 from worker.daemon.scores import AwaitedScores, LeftScores
@@ -128,11 +129,10 @@ def run_job(
     """
     assert record.owner is not None
     claim = Claim(record.job_id, record.attempt, record.owner)
-    log = _log_of(claim)
-    log.info("an attempt starts")
-    started_s = time.monotonic()
+    log, started_s = _log_of(claim), time.monotonic()
     room.begins()
-    with Heartbeat(queue, claim) as heart:
+    with attempt_span(record, name) as span, Heartbeat(queue, claim) as heart:
+        log.info("an attempt starts")
         job = _Job(queue, store, claim, heart, name, end, room)
         try:
             outcome = job.settle(job.work(child, record))
@@ -141,10 +141,11 @@ def run_job(
         except Exception as error:
             child.kill()
             outcome = job.settle(Failed(error=describe(error), fault=type(error).__name__))
-    log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
+        span.set(outcome=outcome)
+        log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
     if not job.is_scoring:
         return None
-    scores = AwaitedScores(store, name, claim.job_id, claim.attempt)
+    scores = AwaitedScores(store, name, record)
     if outcome == DONE:
         return scores
     if outcome != UNSETTLED:  # if unsettled, the queue may have accepted the end
@@ -180,12 +181,13 @@ class _Job:
         self._name = name
         self._end = end
         self._log = _log_of(claim)
+        self._stages = StageSpans()
         self.is_scoring = False
 
     def work(self, child: DeviceChild, record: JobRecord) -> Finished | Stopped | Failed | Died:
         """Let the child reconstruct; stop it when the queue or `end` says so, kill it when it hangs."""
         job_id, attempt = self._claim.job_id, self._claim.attempt
-        self._heart.report(JobProgress(stage=FETCHING, fraction=0.0))
+        self._report(JobProgress(stage=FETCHING, fraction=0.0))
         spool = self._retry_store(lambda: self._store.fetch_clip(job_id))
         kept = self._retry_store(lambda: self._store.kept_folder(job_id, attempt))
         out = self._retry_store(lambda: self._store.work_folder(job_id, attempt))
@@ -202,7 +204,7 @@ class _Job:
                 return Died(report.cause, excused=asked_s is not None)
             if isinstance(report, Advanced):
                 detector.observe(report.progress)
-                self._heart.report(report.progress)
+                self._report(report.progress)
             if asked_s is None and self._is_to_stop():
                 child.send(StopJob())
                 asked_s = time.monotonic()
@@ -212,6 +214,10 @@ class _Job:
             if detector.is_hung():
                 child.kill()
                 return Died(f"hung in stage {detector.stage!r} and was killed", excused=asked_s is not None)
+
+    def _report(self, progress: JobProgress) -> None:
+        self._heart.report(progress)
+        self._stages.reached(progress.stage)
 
     def _is_to_stop(self) -> bool:
         return self._heart.order is not Order.GO_ON or self._end.is_set()
@@ -228,6 +234,14 @@ class _Job:
         Retry until the queue answers or `end` is set. After that touch nothing: whether the claim still stands is
         unknown.
         """
+        if isinstance(result, Failed | Died):
+            self._stages.end(result.fault if isinstance(result, Failed) else "died")
+        try:
+            return self._settle(result)
+        finally:
+            self._stages.end()
+
+    def _settle(self, result: Finished | Stopped | Failed | Died) -> str:
         if self._heart.order in (Order.CANCEL, Order.LOST):
             return self._withdraw()
         result = self._excuse(result)
@@ -268,7 +282,7 @@ class _Job:
 
     def _publish(self) -> bool | None:
         """Publish the scene, then finish the record, so that whoever sees the job done finds its scene."""
-        self._heart.report(JobProgress(stage=PUBLISHING, fraction=1.0, seconds_left=0.0))
+        self._report(JobProgress(stage=PUBLISHING, fraction=1.0, seconds_left=0.0))
         order = self._retry_queue(self._heart.beat)
         if order is None or order in (Order.CANCEL, Order.LOST):
             return None if order is None else False

@@ -12,10 +12,11 @@ import time
 from collections.abc import Callable
 
 from contract.queue.interface import Queue
+from contract.runtime import traces
 from contract.store.results import without_scores
 from contract.store.store import Store
 from contract.wire.errors import SceneError, UnavailableError
-from contract.wire.job import JobState
+from contract.wire.job import JobRecord, JobState
 from contract.wire.report import Report
 from worker.daemon.child import LOOK_PERIOD_S, MAX_STOP_S, DeviceChild, Ended
 from worker.daemon.hang import HangDetector
@@ -33,10 +34,11 @@ logger = logging.getLogger("intrasplat.worker")
 class AwaitedScores:
     """Waits for the scores of a finished scene and adds them to it. name: the worker's."""
 
-    def __init__(self, store: Store, name: str, job_id: str, attempt: int) -> None:
+    def __init__(self, store: Store, name: str, record: JobRecord) -> None:
         self._store = store
-        self._scene = name, job_id, attempt
-        self._log = logging.LoggerAdapter(logger, _named(job_id, attempt))
+        self._scene = name, record.job_id, record.attempt
+        self._trace = record.trace or traces.NEW
+        self._log = logging.LoggerAdapter(logger, _named(record.job_id, record.attempt))
 
     def take(self, child: DeviceChild, stop: Callable[[], bool], *, gives_up: bool = False) -> bool:
         """Wait until the child has scored the scene, is stopped, hangs or dies.
@@ -46,6 +48,11 @@ class AwaitedScores:
         Returns:
             Whether the scene is settled: its scores are added, or no longer expected.
         """
+        name, job_id, attempt = self._scene
+        with traces.span("score", self._trace, job_id=job_id, attempt=attempt, worker=name):
+            return self._take(child, stop, gives_up=gives_up)
+
+    def _take(self, child: DeviceChild, stop: Callable[[], bool], *, gives_up: bool) -> bool:
         detector, asked_s = HangDetector(), None
         while not isinstance(report := child.next_report(LOOK_PERIOD_S), Scored | Stopped | Ended):
             if isinstance(report, Advanced):
@@ -108,7 +115,7 @@ class LeftScores:
             if order is not None:
                 logger.info("the scores of an earlier attempt are made up for", extra=_named(job_id, attempt))
                 child.send(order)
-                scores = AwaitedScores(self._store, self._name, job_id, attempt)
+                scores = AwaitedScores(self._store, self._name, order.record)
                 if not scores.take(child, stop=self._is_to_stop(), gives_up=True):
                     self._tried_s[job_id] = time.monotonic()
                 return

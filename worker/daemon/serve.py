@@ -35,6 +35,7 @@ from contract.wire.rendering import (
     WorkerRequest,
 )
 from worker.daemon.pace import Pace
+from worker.daemon.turn_spans import answer_span, shared_span
 from worker.daemon.turns import COARSEST, Turn, Turns
 from worker.render.encode import FOR_EYES
 
@@ -238,11 +239,12 @@ class RequestServer:
 
     def _take_in(self, caller: bytes, request_id: bytes, document: bytes) -> None:
         try:
-            request = WorkerRequest.model_validate_json(document).request
+            envelope = WorkerRequest.model_validate_json(document)
         except ValidationError as error:
             problem = f"The request does not fit: {error.errors()[0]['msg']}."
             self._send(caller, request_id, WorkerReply(error=ReplyError(kind="internal", problem=problem)))
             return
+        request = envelope.request
         if isinstance(request, CancelRequest):
             self._turns.give_up(caller, request_id)
             for begun in self._begun:
@@ -250,7 +252,8 @@ class RequestServer:
             return
         cost = self._cost(request)
         seconds, least_s = self._turns.seconds(cost), self._turns.seconds(cost, self._coarsest(request))
-        turn = Turn(caller, request_id, request, cost, seconds, least_s, time.monotonic())
+        arrived_s = time.monotonic()
+        turn = Turn(caller, request_id, request, cost, seconds, least_s, arrived_s, trace=envelope.trace)
         if (wait_s := self._wait_s(turn)) > self._max_wait_s:
             self._send(caller, request_id, WorkerReply(error=_busy(wait_s)))
         else:
@@ -273,7 +276,8 @@ class RequestServer:
         self._begun.append(turn)
         self._charged_s = self._spent_s()
         try:
-            head, body, is_new = self._reply(turn.request)
+            with answer_span(turn):
+                head, body, is_new = self._reply(turn.request)
         except GivenUpError:
             return
         finally:
@@ -285,6 +289,8 @@ class RequestServer:
         self._pace.charge(max(0.0, len(answered) * MIN_CHARGE_S - turn.spent_s))
         for each in answered:
             self._send(each.caller, each.request_id, head, body)
+        for each in answered[1:]:
+            shared_span(each)
 
     def _charge(self) -> float:
         """Count the CPU seconds since this was last done for the answer that is being made; how many they are."""

@@ -27,6 +27,7 @@ class Turn:
     seconds    CPU seconds that all of it will take, as far as known; spent_s: that it has taken
     least_s    the same at the coarsest level of detail that the caller accepts
     level      of detail at which it is answered
+    trace      traceparent of the asker; None: it has none
     arrived_s  monotonic
     """
 
@@ -40,6 +41,7 @@ class Turn:
     spent_s: float = 0.0
     is_given_up: bool = False
     level: int = 0
+    trace: str | None = None
 
     @property
     def due_s(self) -> float:

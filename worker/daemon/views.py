@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from contract.runtime import traces
 from contract.runtime.settings import GIB
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest, SceneCameras
@@ -197,7 +198,8 @@ class Views:
             self._forget(key)
             raise
         if key not in self._scenes:
-            self._scenes[key] = load_scene(folder)
+            with traces.span("load"):
+                self._scenes[key] = load_scene(folder)
         self._scenes.move_to_end(key)
         while len(self._scenes) > MAX_HELD_SCENES or (len(self._scenes) > 1 and self._byte_count() > self._hot_bytes):
             self._forget(next(iter(self._scenes)))
@@ -215,7 +217,9 @@ class Views:
         detail = LEVELS[level]
         camera = camera.resized(-(-camera.width // detail.pixels), -(-camera.height // detail.pixels))
         drawn = thinned(scene, detail.gaussians)
-        frame = render_frame(drawn, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
+        told = traces.Attributes(width=size[0], height=size[1], level=level, gaussians=len(drawn.gaussians))
+        with traces.span("draw", **told):
+            frame = render_frame(drawn, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
         range_mm = None
         if request.layer is Layer.DEPTH and request.format in FOR_EYES:
             range_mm = renderer_of(drawn, self._device).depth_range.before(pose)
@@ -280,9 +284,10 @@ def _reply(
 ) -> Reply:
     """A frame as it is sent."""
     iteration = None if snapshot is None else snapshot.iteration
-    body = encode_layer(
-        frame, request.layer, request.format, request.quality, request.unseen, depth_range_mm=depth_range_mm
-    )
+    with traces.span("encode", layer=request.layer.value, format=request.format.value):
+        body = encode_layer(
+            frame, request.layer, request.format, request.quality, request.unseen, depth_range_mm=depth_range_mm
+        )
     warnings = frame.warnings
     if snapshot is not None:
         # What the clip shows of each place is counted when training has ended: until then nothing is vouched for.

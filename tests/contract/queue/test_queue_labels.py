@@ -1,4 +1,4 @@
-"""Labels in the queue, and its records page by page."""
+"""What stands beside a record in the queue, its labels and its trace, and records page by page."""
 
 from __future__ import annotations
 
@@ -31,3 +31,12 @@ def test_a_page_of_records_begins_after_a_place_and_ties_are_ordered(queue: Queu
     assert queue.records("ward-1", 3, place_of(every[1])) == every[2:5]
     assert queue.records(None, None, place_of(every[2])) == every[3:]
     assert queue.records("ward-1", 3, place_of(every[-1])) == []
+
+
+def test_whoever_claims_a_job_gets_the_trace_of_the_request_that_submitted_it(queue: Queue) -> None:
+    trace = "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01"
+    queue.submit(job().model_copy(update={"trace": trace}))
+    record, claim = claimed(queue)
+    assert record.trace == trace
+    assert queue.release(claim)
+    assert claimed(queue)[0].trace == trace

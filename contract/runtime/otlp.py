@@ -1,0 +1,158 @@
+"""Spans of contract/runtime/traces.py by OpenTelemetry's SDK, sent to a collector by OTLP over HTTP (extra `otel`)."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import queue
+import threading
+import time
+from collections.abc import Sequence
+
+from opentelemetry import trace
+from opentelemetry.context import Context
+from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+from opentelemetry.sdk.resources import Resource
+from opentelemetry.sdk.trace import ReadableSpan, SpanProcessor, TracerProvider
+from opentelemetry.sdk.trace.export import SpanExporter, SpanExportResult
+from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+from contract.runtime.traces import TRACEPARENT, Attributes, Kind, Span, flush
+from contract.runtime.version import version
+
+NAMES = {"method": "http.request.method", "route": "http.route", "status": "http.response.status_code"}
+"""Attributes that OpenTelemetry has names for; all others have ours."""
+MAX_CHARACTERS = 200
+FLUSH_LOOK_S = 0.01
+
+logger = logging.getLogger("intrasplat.traces")
+
+
+class OtlpRecorder:
+    """Makes spans and sends them; the standard OTEL_ variables say where to, how often, and which share of them."""
+
+    def __init__(self, process: str, instance: str | None = None, exporter: SpanExporter | None = None) -> None:
+        told = {"service.name": os.environ.get("OTEL_SERVICE_NAME") or f"intrasplat-{process}"}
+        told |= {"service.version": version()} | ({"service.instance.id": instance} if instance else {})
+        self._sender = Sender(exporter or OTLPSpanExporter())
+        provider = TracerProvider(resource=Resource.create(told), shutdown_on_exit=False)
+        provider.add_span_processor(self._sender)
+        self._tracer = provider.get_tracer("intrasplat", version())
+        self._propagator = TraceContextTextMapPropagator()
+        logging.getLogger("opentelemetry").setLevel(logging.CRITICAL)  # the sender says it once
+        atexit.register(flush)
+
+    @property
+    def dropped(self) -> int:
+        return self._sender.dropped
+
+    def begin(self, name: str, parent: str, kind: Kind, since_s: float | None, attributes: Attributes) -> Span:
+        context = self._propagator.extract({TRACEPARENT: parent}, Context())
+        start_ns = None if since_s is None else round(since_s * 1e9)
+        begun = _OtelSpan(self._tracer.start_span(name, context, trace.SpanKind[kind], start_time=start_ns))
+        begun.set(**attributes)
+        return begun
+
+    def flush(self, timeout_s: float) -> None:
+        self._sender.force_flush(round(timeout_s * 1000))
+
+
+class _OtelSpan(Span):
+    """A span of the SDK."""
+
+    def __init__(self, span: trace.Span) -> None:
+        known = span.get_span_context()
+        self._span = span
+        self.trace_id = trace.format_trace_id(known.trace_id)
+        self.traceparent = f"00-{self.trace_id}-{trace.format_span_id(known.span_id)}-{known.trace_flags:02x}"
+
+    def set(self, **attributes: object) -> None:
+        for name, value in attributes.items():
+            known = value if isinstance(value, int | float) else str(value)[:MAX_CHARACTERS]
+            self._span.set_attribute(NAMES.get(name, f"intrasplat.{name}"), known)
+
+    def rename(self, name: str) -> None:
+        self._span.update_name(name)
+
+    def end(self, failed: str | None = None) -> None:
+        if not self._span.is_recording():
+            return
+        if failed is not None:
+            self._span.set_attribute("error.type", failed[:MAX_CHARACTERS])
+            self._span.set_status(trace.StatusCode.ERROR)
+        self._span.end()
+
+
+class Sender(SpanProcessor):
+    """Sends ended spans in batches, in a thread of its own. Nobody waits for it: what finds no room is dropped.
+
+    The SDK's own processor counts no losses, and starts a thread in every forked child.
+    """
+
+    def __init__(self, exporter: SpanExporter) -> None:
+        self._exporter = exporter
+        self._waiting: queue.Queue[ReadableSpan] = queue.Queue(_number("OTEL_BSP_MAX_QUEUE_SIZE", 2048))
+        self._max_batch = _number("OTEL_BSP_MAX_EXPORT_BATCH_SIZE", 512)
+        self._period_s = _number("OTEL_BSP_SCHEDULE_DELAY", 5000) / 1000
+        self._lock = threading.Lock()
+        self._hurry = threading.Event()
+        self._away = False
+        self.dropped = 0
+        threading.Thread(target=self._run, name="traces", daemon=True).start()
+
+    def on_end(self, span: ReadableSpan) -> None:
+        if span.context is None or not span.context.trace_flags.sampled:
+            return
+        try:
+            self._waiting.put_nowait(span)
+        except queue.Full:
+            with self._lock:
+                self.dropped += 1
+        if self._waiting.qsize() >= self._max_batch:
+            self._hurry.set()
+
+    def force_flush(self, timeout_millis: int = 30000) -> bool:
+        """Send what waits now; False if that is not done in time."""
+        until_s = time.monotonic() + timeout_millis / 1000
+        while self._waiting.unfinished_tasks and time.monotonic() < until_s and not self._away:
+            self._hurry.set()
+            time.sleep(FLUSH_LOOK_S)
+        return not self._waiting.unfinished_tasks
+
+    def _run(self) -> None:
+        while True:
+            self._hurry.wait(self._period_s)
+            self._hurry.clear()
+            while batch := self._batch():
+                self._send(batch)
+                for _ in batch:
+                    self._waiting.task_done()
+
+    def _batch(self) -> list[ReadableSpan]:
+        """What waits, as much of it as may be sent at once."""
+        batch: list[ReadableSpan] = []
+        while len(batch) < self._max_batch and not self._waiting.empty():
+            batch.append(self._waiting.get_nowait())
+        return batch
+
+    def _send(self, batch: Sequence[ReadableSpan]) -> None:
+        try:
+            is_sent = self._exporter.export(batch) is SpanExportResult.SUCCESS
+        except Exception:  # whatever the collector answers, this thread goes on
+            is_sent = False
+        if not is_sent:
+            with self._lock:
+                self.dropped += len(batch)
+        if is_sent is self._away:
+            self._away = not is_sent
+            if self._away:
+                logger.warning("the collector does not take spans; they are dropped until it does")
+            else:
+                logger.warning("the collector takes spans again; %d were dropped so far", self.dropped)
+
+
+def _number(variable: str, default: int) -> int:
+    """A whole number above 0 from a variable; the default if it holds something else."""
+    text = os.environ.get(variable, "")
+    return int(text) if text.isdecimal() and int(text) > 0 else default

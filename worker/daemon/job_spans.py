@@ -1,0 +1,42 @@
+"""The spans of a job in a worker: its wait, each attempt, and its stages (contract/runtime/traces.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from contract.runtime import traces
+from contract.wire.job import JobRecord
+
+
+@contextmanager
+def attempt_span(record: JobRecord, worker: str) -> Iterator[traces.Span]:
+    """The span of one attempt at a job, in the trace of the request that submitted it.
+
+    Before the first attempt there is one of the time that the job waited.
+    """
+    parent = record.trace or traces.NEW
+    if record.attempt == 1:
+        traces.begin("wait in queue", parent, since_s=record.created_at_s, job_id=record.job_id).end()
+    told = traces.Attributes(job_id=record.job_id, attempt=record.attempt, worker=worker)
+    with traces.span("attempt", parent, kind=traces.Kind.CONSUMER, **told) as span:
+        yield span
+
+
+class StageSpans:
+    """A span for each stage: it lasts until the next stage is reached, or the end."""
+
+    def __init__(self) -> None:
+        self._stage = ""
+        self._span = traces.NOT_RECORDED
+
+    def reached(self, stage: str) -> None:
+        """Say at which stage the job is."""
+        if stage != self._stage:
+            self.end()
+            self._stage, self._span = stage, traces.begin(stage)
+
+    def end(self, failed: str | None = None) -> None:
+        """No stage follows. failed: the type of the error that ended the last one."""
+        self._span.end(failed)
+        self._stage, self._span = "", traces.NOT_RECORDED
