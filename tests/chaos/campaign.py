@@ -8,6 +8,7 @@ import struct
 import threading
 import time
 import uuid
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,10 +53,14 @@ class Outcome:
 
 
 class ChaosClient:
-    """A client that sends one clip until it is accepted, always under the same idempotency key."""
+    """A client that sends one clip until it is accepted, always under the same idempotency key.
 
-    def __init__(self, url: str) -> None:
+    headers: of its requests, such as a key.
+    """
+
+    def __init__(self, url: str, headers: Mapping[str, str] | None = None) -> None:
         self._url = url
+        self._headers = headers or {}
         self._key = uuid.uuid4().hex
         self._body, self._type = _form(_clip_of_its_own(self._key))
         self.job_id: str | None = None
@@ -83,7 +88,7 @@ class ChaosClient:
 
     def _send_until_accepted(self) -> None:
         deadline_s = time.monotonic() + ACCEPTED_WITHIN_S
-        headers = {"Content-Type": self._type, "Idempotency-Key": self._key}
+        headers = {**self._headers, "Content-Type": self._type, "Idempotency-Key": self._key}
         while time.monotonic() < deadline_s:
             with suppress(httpx.HTTPError, json.JSONDecodeError):
                 answer = httpx.post(f"{self._url}/reconstruct", content=self._body, headers=headers, timeout=30)

@@ -11,9 +11,11 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import httpx
 
@@ -70,19 +72,28 @@ class Kept:
 
 
 class Deployment:
-    """One installation in its own folder and on its own port; a context manager. environment: of its processes, too."""
+    """One installation in its own folder and on its own port; a context manager.
 
-    def __init__(self, folder: Path, port: int, workers: int = 1, **environment: str) -> None:
+    more_ports: of further services. environment: of its processes, too.
+    """
+
+    def __init__(
+        self, folder: Path, port: int, workers: int = 1, more_ports: Sequence[int] = (), **environment: str
+    ) -> None:
         folder.mkdir(parents=True)
         self._more = environment
         self.data_dir = folder / "data"
         self.points = Points(folder / "points")
         self.server = EmbeddedServer(self.data_dir)
-        self.url = f"http://127.0.0.1:{port}"
+        self.urls = [f"http://127.0.0.1:{each}" for each in (port, *more_ports)]
+        self.url = self.urls[0]
         self.store = Store(self.data_dir)
         self.settings = Settings(data_dir=self.data_dir, port=port, redis_url=self.server.url, min_free_bytes=0)
         self._folder = folder
-        self.service = Kept("tests.chaos.service_process", self._environment({}), folder / "service.log")
+        self.services = [
+            Kept("tests.chaos.service_process", self._environment({"port": each}), folder / f"service-{each}.log")
+            for each in (port, *more_ports)
+        ]
         self.workers: list[Kept] = []
         self.add_workers(workers)
         self._end = threading.Event()
@@ -98,7 +109,7 @@ class Deployment:
     def __exit__(self, *exception: object) -> None:
         self._end.set()
         self._keeper.join()
-        for kept in (self.service, *self.workers):
+        for kept in (*self.services, *self.workers):
             kept.end()
         self.queue.close()
         self.server.stop()
@@ -116,7 +127,7 @@ class Deployment:
             self.workers.append(Kept("tests.chaos.worker_process", environment, log))
 
     def wait_until_ready(self, timeout_s: float = START_TIMEOUT_S) -> None:
-        """Wait until service, queue and all workers answer.
+        """Wait until services, queue and all workers answer.
 
         Raises:
             TimeoutError: they do not.
@@ -125,29 +136,30 @@ class Deployment:
         while time.monotonic() < deadline_s:
             with suppress(Exception):
                 # A stand-in for a worker answers no views, so /readyz would wait for it for ever.
-                lives = httpx.get(f"{self.url}/healthz", timeout=2.0).status_code == 200
-                if lives and len(self.queue.workers()) >= len(self.workers):
+                lives = [httpx.get(f"{url}/healthz", timeout=2.0).status_code == 200 for url in self.urls]
+                if all(lives) and len(self.queue.workers()) >= len(self.workers):
                     return
             time.sleep(0.05)
         raise TimeoutError(f"{self.data_dir} is not ready after {timeout_s:g} s; its logs lie beside it")
 
     def kill(self, target: Victim) -> None:
         """kill -9 the victim."""
+        services = [kept.process_id for kept in self.services]
         supervisors = [kept.process_id for kept in self.workers]
         children = [child for supervisor in supervisors if supervisor for child in children_of(supervisor)]
         victims = {
-            Victim.SERVICE: [self.service.process_id],
+            Victim.SERVICE: services,
             Victim.SUPERVISOR: supervisors,
             Victim.CHILD: children,
             Victim.VALKEY: [self.server.process_id],
-            Victim.ALL: [self.service.process_id, *supervisors, *children, self.server.process_id],
+            Victim.ALL: [*services, *supervisors, *children, self.server.process_id],
         }[target]
         for victim in victims:
             if victim is not None:
                 with suppress(ProcessLookupError):
                     os.kill(victim, signal.SIGKILL)
 
-    def _environment(self, changes: dict[str, str]) -> dict[str, str]:
+    def _environment(self, changes: dict[str, Any]) -> dict[str, str]:
         settings = self.settings.model_copy(update=changes)
         return {**os.environ, **settings.to_environment(), FOLDER_VARIABLE: str(self.points.folder), **self._more}
 
@@ -155,7 +167,7 @@ class Deployment:
         while not self._end.wait(KEEP_PERIOD_S):
             with suppress(Exception):  # it is tried again
                 self.server.ensure_running()
-                for kept in (self.service, *self.workers):
+                for kept in (*self.services, *self.workers):
                     kept.keep()
 
 
