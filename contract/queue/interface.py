@@ -18,12 +18,14 @@ from enum import StrEnum
 from statistics import median
 from typing import Protocol
 
+from contract.queue.deliveries import Deliveries
 from contract.wire.errors import ErrorCode, UnavailableError
 from contract.wire.job import Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.labels import LabelChange
 from contract.wire.names import BUDGETS_S
 from contract.wire.options import ReconstructionOptions
 from contract.wire.rendering import WorkerAddress
+from contract.wire.webhooks import DeliveryStatus
 
 MAX_ATTEMPTS = 3
 """A job whose worker has died this often fails: the job is assumed to be the cause."""
@@ -106,12 +108,13 @@ class Place:
 
 @dataclass(frozen=True)
 class QueueFigures:
-    """For metrics. ended: jobs that came to each terminal state since the queue was made."""
+    """For metrics. ended: jobs that came to each terminal state since the queue was made; webhooks: likewise."""
 
     queued: int
     running: int
     oldest_queued_s: float
     ended: dict[JobState, int]
+    webhooks: dict[DeliveryStatus, int]
 
 
 class QueueFullError(UnavailableError):
@@ -124,7 +127,7 @@ class QueueFullError(UnavailableError):
         self.tenant = tenant
 
 
-class Queue(Protocol):
+class Queue(Deliveries, Protocol):
     """Every method is atomic, and may be repeated when its answer was lost.
 
     All raise UnavailableError when the queue cannot be reached or its memory is full.
@@ -215,7 +218,7 @@ class Queue(Protocol):
         ...
 
     def forget(self, job_id: str) -> bool:
-        """Remove record, events and idempotency key of an ended job; False if it is missing or live."""
+        """Remove record, events, deliveries and idempotency key of an ended job; False if it is missing or live."""
         ...
 
     def rewrite_log(self) -> bool:

@@ -18,7 +18,10 @@ from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError, JobState, sources_of
 from contract.wire.names import BUDGETS_S
 
-NAMES = ("submit", "restore", "claim", "beat", "settle", "release", "cancel", "retry", "relabel", "forget", "announce")
+NAMES = (
+    *("submit", "restore", "claim", "beat", "settle", "release", "cancel", "retry", "relabel", "forget"),
+    *("lend", "note", "announce"),
+)
 
 UNREADABLE = JobError(
     code=ErrorCode.RECORD_UNREADABLE,

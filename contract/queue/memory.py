@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter, deque
 
+from contract.queue.deliveries import Loan
 from contract.queue.interface import (
     IDEMPOTENCY_S,
     LEASE_S,
@@ -33,9 +34,11 @@ from contract.queue.interface import (
     trainers,
     worker_died,
 )
+from contract.queue.memory_deliveries import MemoryDeliveries
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.labels import LabelChange
 from contract.wire.rendering import WorkerAddress
+from contract.wire.webhooks import Delivery, DeliveryStatus
 
 LEASE_CHECK_S = 0.05
 """How often a waiting claim looks for leases that have run out."""
@@ -66,6 +69,7 @@ class MemoryQueue:
         self._served: Counter[str] = Counter()
         """By tenant: the number of the last claim that gave it a new job."""
         self._workers: dict[str, tuple[WorkerAddress, float]] = {}
+        self._deliveries = MemoryDeliveries()
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
         with self._changed:
@@ -87,7 +91,7 @@ class MemoryQueue:
             if record.job_id in self._records:
                 return False
             self._remember(record, record.created_at_s + IDEMPOTENCY_S - time.time())
-            self._write(record)
+            self._deliveries.owe(self._write(record))
             return True
 
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
@@ -201,9 +205,26 @@ class MemoryQueue:
                 return False
             del self._records[job_id]
             del self._events[job_id]
+            self._deliveries.forget(job_id)
             self._places.pop(job_id, None)
             self._idempotent = {key: held for key, held in self._idempotent.items() if held[0] != job_id}
             return True
+
+    def lend_delivery(self, token: str) -> Loan | None:
+        with self._changed:
+            if (lent := self._deliveries.lend(token)) is None:
+                return None
+            delivery, mark = lent
+            record = self._records[delivery.job_id]
+            return Loan(delivery, record.callback_url or "", record.tenant, mark)
+
+    def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
+        with self._changed:
+            return self._deliveries.note(loan, delivery, wait_s)
+
+    def deliveries(self, job_id: str) -> list[Delivery]:
+        with self._changed:
+            return self._deliveries.of(job_id)
 
     def rewrite_log(self) -> bool:
         return True
@@ -228,7 +249,8 @@ class MemoryQueue:
             ages_s = [now_s - self._queued_at_s[record.job_id] for record in waiting]
             ended = {state: self._ended[state] for state in TERMINAL_STATES}
             running = len(self._in(JobState.RUNNING))
-            return QueueFigures(len(waiting), running, max([0.0, *ages_s]), ended)
+            webhooks = {**self._deliveries.ended, DeliveryStatus.OWED: self._deliveries.owed}
+            return QueueFigures(len(waiting), running, max([0.0, *ages_s]), ended, webhooks)
 
     def ping(self) -> None:
         return None
@@ -356,7 +378,10 @@ class MemoryQueue:
             asked_s = asked_training_s(record.options)
             if asked_s is not None:
                 self._rests_s.append(now_s - record.started_at_s - asked_s)
-        return self._write(self._moved(record, target, **update))
+        changed = self._write(self._moved(record, target, **update))
+        if target in TERMINAL_STATES:
+            self._deliveries.owe(changed)
+        return changed
 
     def _write(self, record: JobRecord) -> JobRecord:
         """Store a changed record, add its event, and wake the claims that wait for a job."""

@@ -16,6 +16,12 @@ EVENT_FIELDS = ("state", "attempt", "released", "owner", "cancel", "progress", "
 LABEL_FIELDS = (LABEL_FIELD, METADATA_FIELD)
 """They change too, and no event has them: whoever removes a text finds it in no earlier event."""
 
+CALLBACK_FIELD = "callback"
+"""Never changes. It stands beside the document for the scripts, and for readers of an earlier version."""
+
+BESIDE_EVENTS = ("document", CALLBACK_FIELD, *LABEL_FIELDS)
+"""What the record of an event is made of, besides the event."""
+
 Model = TypeVar("Model", JobProgress, JobError)
 
 logger = logging.getLogger("intrasplat.queue")
@@ -24,13 +30,14 @@ logger = logging.getLogger("intrasplat.queue")
 def new_record(record: JobRecord) -> tuple[str, str, str, str]:
     """ARGV 2 to 5 of submit.lua and restore.lua: id, hash as JSON, time of submission, idempotency hash."""
     fields = {
-        "document": record.model_dump_json(exclude={"labels"}),
+        "document": record.model_dump_json(exclude={"labels", "callback_url"}),
         "state": record.state.value,
         "attempt": str(record.attempt),
         "released": str(record.released),
         "tenant": record.tenant,
         "priority": record.options.priority,
         "trace": record.trace,
+        CALLBACK_FIELD: record.callback_url,
         "owner": record.owner,
         "cancel": "1" if record.cancel_requested else None,
         "progress": record.progress and record.progress.model_dump_json(),
@@ -70,6 +77,7 @@ def _changed(fields: Mapping[str, str]) -> dict[str, object]:
     """The values of a record that have changed since it was submitted."""
     return {
         "state": JobState(fields["state"]),
+        "callback_url": fields.get(CALLBACK_FIELD),
         "labels": Labels(label=fields.get(LABEL_FIELD), metadata=json.loads(fields.get(METADATA_FIELD) or "{}")),
         "attempt": int(fields["attempt"]),
         "released": int(fields["released"]),

@@ -11,11 +11,13 @@ Keys (the braces put all of them in one cluster slot, so that a script may touch
         progress, error                 JSON of JobProgress, JobError
         started, finished, queued       UNIX s by the server's clock; queued: since when it waits
         label, metadata                 of its labels; metadata as JSON. They stand in neither document nor events
+        callback                        where the webhook goes when the job has ended; absent: nowhere
         tenant, priority                of the document, for the scripts
         trace                           as in JobRecord
         entry, sequence                 its stream entry, and its place among the jobs of its priority
         restored                        token of the call that put it back
     {intrasplat}:events:<id>            stream; each entry is what a change left of the hash (EVENT_FIELDS)
+    {intrasplat}:deliveries:<id>        hash, JSON of Delivery by event: the webhooks of the job's ends
 Indexes, written by the same scripts as the hashes:
     {intrasplat}:index                  sorted set of job ids by time of submission; and tenant:<tenant>:index
     {intrasplat}:waiting:high|standard  sorted set of queued jobs by sequence: the order in which they will be claimed
@@ -24,6 +26,8 @@ Indexes, written by the same scripts as the hashes:
     {intrasplat}:dead                   sorted set of dead letters, by time of failure
     {intrasplat}:ended                  hash, jobs that ever came to each terminal state
     {intrasplat}:durations              list, seconds that the last done jobs ran
+    {intrasplat}:owed                   sorted set of the events whose webhook is owed, by when it is due
+    {intrasplat}:delivered              hash, webhooks that ever came to each DeliveryStatus but owed
     {intrasplat}:sequence               counter
     {intrasplat}:workers                set of names that may have a {intrasplat}:worker:<name>
 These expire:
@@ -31,6 +35,7 @@ These expire:
     {intrasplat}:idempotency:<tenant>:<hash>  id of the job submitted under that key
     {intrasplat}:yield:<id>             owner that was told to make way for that job
     {intrasplat}:forgotten:<id>         token of the call that removed it
+    {intrasplat}:lent:<token>           event that was lent to that call
 
 A user who may do this and nothing else:
     ACL SETUSER intrasplat on >PASSWORD ~{intrasplat}:* resetchannels +@all -@dangerous +bgrewriteaof
@@ -52,6 +57,7 @@ from typing import Any
 
 import redis
 
+from contract.queue.deliveries import LOAN_S, Loan
 from contract.queue.interface import (
     IDEMPOTENCY_S,
     LEASE_S,
@@ -74,11 +80,12 @@ from contract.queue.interface import (
 )
 from contract.queue.lua import UNREADABLE, Scripts
 from contract.queue.redis_client import PATIENCE_S, connect, reachable
-from contract.queue.redis_hash import LABEL_FIELDS, label_fields, new_record, record_of, table_of
+from contract.queue.redis_hash import BESIDE_EVENTS, label_fields, new_record, record_of, table_of
 from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES, Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.labels import LabelChange
 from contract.wire.rendering import WorkerAddress
+from contract.wire.webhooks import Delivery, DeliveryStatus
 
 PREFIX = "{intrasplat}:"
 INDEX = PREFIX + "index"
@@ -86,6 +93,7 @@ HIGH, STANDARD = PREFIX + "jobs:high", PREFIX + "jobs:standard"
 HELD = PREFIX + "held"
 QUEUED = PREFIX + "queued"
 WORKERS = PREFIX + "workers"
+OWED = PREFIX + "owed"
 
 BLOCK_S = 2.0
 """How long one read may block. The client notices a cut connection within this and the socket's timeout."""
@@ -214,10 +222,10 @@ class RedisQueue:
     def events(self, job_id: str, after: str = "0") -> list[Event]:
         milliseconds, count = event_order(after)
         with reachable(), self._client.pipeline(transaction=True) as batch:
-            batch.hmget(_job_key(job_id), "document", *LABEL_FIELDS)
+            batch.hmget(_job_key(job_id), *BESIDE_EVENTS)
             batch.xrange(f"{PREFIX}events:{job_id}", min=f"({milliseconds}-{count}")
             of_all, entries = batch.execute()
-        shared = {name: text for name, text in zip(("document", *LABEL_FIELDS), of_all, strict=True) if text}
+        shared = {name: text for name, text in zip(BESIDE_EVENTS, of_all, strict=True) if text}
         found = ((number, record_of(job_id, {**fields, **shared})) for number, fields in entries)
         return [Event(number, record) for number, record in found if record is not None]
 
@@ -226,6 +234,22 @@ class RedisQueue:
         terminal = json.dumps(dict.fromkeys(sorted(TERMINAL_STATES), True))
         idempotency_key = (record and record.idempotency_key) or ""
         return bool(self._scripts.run("forget", job_id, terminal, idempotency_key, uuid.uuid4().hex))
+
+    def lend_delivery(self, token: str) -> Loan | None:
+        answer = self._scripts.run("lend", token, round(LOAN_S * 1000))
+        return Loan(Delivery.model_validate_json(answer[0]), *answer[1:]) if answer else None
+
+    def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
+        wait_ms = "" if wait_s is None else round(wait_s * 1000)
+        document = delivery.model_dump_json(exclude={"next_try_at_s"})
+        return bool(self._scripts.run("note", delivery.event_id, loan.mark, document, delivery.status.value, wait_ms))
+
+    def deliveries(self, job_id: str) -> list[Delivery]:
+        with reachable():
+            found = [Delivery.model_validate_json(each) for each in self._client.hvals(_deliveries_key(job_id))]
+            due = self._client.zmscore(OWED, [each.event_id for each in found]) if found else []
+        told = [each.model_copy(update={"next_try_at_s": at_s}) for each, at_s in zip(found, due, strict=True)]
+        return sorted(told, key=lambda each: each.ended_at_s)
 
     def rewrite_log(self) -> bool:
         try:
@@ -255,11 +279,15 @@ class RedisQueue:
             batch.zrange(QUEUED, 0, 0, withscores=True)
             batch.hlen(HELD)
             batch.hgetall(f"{PREFIX}ended")
+            batch.zcard(OWED)
+            batch.hgetall(f"{PREFIX}delivered")
             batch.time()
-            queued, oldest, running, ended, (seconds, microseconds) = batch.execute()
+            queued, oldest, running, ended, owed, delivered, (seconds, microseconds) = batch.execute()
         since_s = oldest[0][1] if oldest else float("inf")
         counts = {state: int(ended.get(state, 0)) for state in TERMINAL_STATES}
-        return QueueFigures(queued, running, max(0.0, seconds + microseconds / 1e6 - since_s), counts)
+        webhooks = {DeliveryStatus(status): int(count) for status, count in delivered.items()}
+        oldest_s = max(0.0, seconds + microseconds / 1e6 - since_s)
+        return QueueFigures(queued, running, oldest_s, counts, webhooks | {DeliveryStatus.OWED: owed})
 
     def ping(self) -> None:
         with reachable():
@@ -332,6 +360,10 @@ def _address(name: str, document: str) -> WorkerAddress | None:
 
 def _job_key(job_id: str) -> str:
     return f"{PREFIX}job:{job_id}"
+
+
+def _deliveries_key(job_id: str) -> str:
+    return f"{PREFIX}deliveries:{job_id}"
 
 
 def _worker_key(name: str) -> str:

@@ -104,7 +104,9 @@ class Store:
         """
         folder, clip = self.incoming_folder(record.job_id), ShelfEntry(Area.SPOOL, record.job_id)
         with disk_errors():
-            (folder / SUBMISSION).write_text(record.model_dump_json(indent=1, exclude={"labels"}))
+            # A reader of an earlier version refuses fields that it does not know.
+            absent = {"labels"} if record.callback_url else {"labels", "callback_url"}
+            (folder / SUBMISSION).write_text(record.model_dump_json(indent=1, exclude=absent))
             if record.labels != Labels():
                 (folder / LABELS).write_text(record.labels.model_dump_json())
         self._shelf.put(folder, clip)

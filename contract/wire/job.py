@@ -115,6 +115,8 @@ class JobRecord(BaseModel):
     """Where the scene came from that this job takes in; None: it reconstructs a clip."""
     idempotency_key: str | None = None
     """SHA-256 of the caller's Idempotency-Key: a second submission under it yields this job."""
+    callback_url: str | None = None
+    """Where the service sends a webhook whenever the job has ended."""
     created_at_s: float
     started_at_s: float | None = None
     finished_at_s: float | None = None
@@ -176,6 +178,8 @@ class JobView(BaseModel):
             links["retry"] = f"/jobs/{record.job_id}/retry"
         if record.state in (JobState.RUNNING, JobState.DONE):
             links["render"] = f"/render?scene={record.job_id}"
+        if record.callback_url is not None:
+            links["deliveries"] = f"/jobs/{record.job_id}/deliveries"
         if record.state is JobState.DONE:
             links["scene"] = f"/scenes/{record.job_id}"
         progress = record.progress.model_dump() if record.progress else {}

@@ -29,6 +29,7 @@ def job(
     priority: Priority = "standard",
     tenant: str = "ward-1",
     idempotency_key: str | None = None,
+    callback_url: str | None = None,
 ) -> JobRecord:
     return JobRecord(
         job_id=new_job_id(),
@@ -36,6 +37,7 @@ def job(
         options=JobOptions(seed=3, priority=priority),
         tenant=tenant,
         idempotency_key=idempotency_key,
+        callback_url=callback_url,
         created_at_s=created_at_s,
     )
 

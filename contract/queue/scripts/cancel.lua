@@ -1,7 +1,7 @@
 #!lua flags=allow-oom
 -- CANCEL: end a queued job; ask the worker of a running one to stop.
 -- ARGV   2 id
--- Keys   job:<id>, the indexes of queued jobs, ended, jobs:<priority>, events:<id>
+-- Keys   job:<id>, the indexes of queued jobs, ended, jobs:<priority>, events:<id>, owed, deliveries:<id>
 -- Answer the job's hash afterwards.
 
 local job = read(ARGV[2])

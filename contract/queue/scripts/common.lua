@@ -8,16 +8,24 @@ local PRIORITIES = {'high', 'standard'}
 local GROUP, CONSUMER = 'workers', 'worker'
 -- A released entry counts as idle for longer than any lease, so that anybody may claim it at once.
 local LONG_MS = 86400000
+-- The deliveries that are owed, by when they are due; a job's own are in deliveries:<id>, by event.
+local OWED = P .. 'owed'
 
 local function now()
   local clock = redis.call('TIME')
   return clock[1] .. '.' .. string.format('%06d', clock[2])
 end
 
+-- The time so many ms from now.
+local function later(ms) return string.format('%.6f', tonumber(now()) + tonumber(ms) / 1000) end
+
 local function stream(priority) return P .. 'jobs:' .. priority end
 local function waiting(priority) return P .. 'waiting:' .. priority end
 local function waiting_of(tenant) return P .. 'tenant:' .. tenant .. ':waiting' end
 local function document(id) return P .. 'job:' .. id end
+local function deliveries(id) return P .. 'deliveries:' .. id end
+-- The job of an event (contract/wire/webhooks.py: event_id).
+local function job_of(event) return string.match(event, '^[^.]*') end
 
 local function table_of(flat)
   local found = {}
@@ -68,6 +76,17 @@ local function leave(job)
   end
 end
 
+-- A job has ended: if it has a callback, the delivery is due at once.
+local function owe(job)
+  if not job.callback then return end
+  local is_json, fault = pcall(cjson.decode, job.error or '')
+  local delivery = {event_id = job.id .. '.' .. job.attempt .. '.' .. job.state, state = job.state, ended_at_s = job.finished}
+  if is_json and type(fault) == 'table' then delivery.error_code = fault.code end
+  if redis.call('HSETNX', deliveries(job.id), delivery.event_id, cjson.encode(delivery)) == 1 then
+    redis.call('ZADD', OWED, now(), delivery.event_id)
+  end
+end
+
 local function enter(job)
   if job.state == 'queued' then
     redis.call('ZADD', waiting(job.priority), job.sequence, job.id)
@@ -80,6 +99,7 @@ local function enter(job)
     redis.call('HINCRBY', P .. 'ended', job.state, 1)
     drop(job.priority, job.entry)
     if job.state == 'failed' then redis.call('ZADD', P .. 'dead', job.finished, job.id) end
+    owe(job)
   end
 end
 

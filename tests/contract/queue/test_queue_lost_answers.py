@@ -12,6 +12,7 @@ from contract.queue.interface import Admission, Claim, Order, Queue
 from contract.queue.redis_queue import PREFIX, RedisQueue
 from contract.wire.job import JobRecord, JobState
 from contract.wire.labels import LabelChange
+from contract.wire.webhooks import DeliveryStatus, DeliveryTry
 from tests.contract.queues import ERROR, TRAINING, LossyProxy, RunningServer, claimed, job, known, state_of
 
 Act = Callable[[Queue], object]
@@ -74,6 +75,28 @@ def _restore(queue: Queue) -> tuple[Act, str]:
     return lambda lossy: lossy.restore(record), record.job_id
 
 
+def _lend(queue: Queue) -> tuple[Act, str]:
+    """Of two deliveries that are due, a repeated call is lent one."""
+    records = [queue.submit(job(callback_url="https://his.example/done")) for _ in range(2)]
+    for record in records:
+        queue.cancel(record.job_id)
+
+    def lend(lossy: Queue) -> object:
+        first, second = lossy.lend_delivery("a" * 32), queue.lend_delivery("b" * 32)
+        return sorted(loan.delivery.job_id for loan in (first, second) if loan) == sorted(r.job_id for r in records)
+
+    return lend, records[0].job_id
+
+
+def _note(queue: Queue) -> tuple[Act, str]:
+    record = queue.submit(job(callback_url="https://his.example/done"))
+    queue.cancel(record.job_id)
+    loan = queue.lend_delivery("a" * 32)
+    assert loan is not None
+    noted = loan.delivery.model_copy(update={"status": DeliveryStatus.DELIVERED, "tries": (DeliveryTry(at_s=1.0),)})
+    return lambda lossy: lossy.note_try(loan, noted, None), record.job_id
+
+
 def _forget(queue: Queue) -> tuple[Act, str]:
     record = queue.submit(job())
     queue.cancel(record.job_id)
@@ -95,6 +118,8 @@ LOST_ANSWERS: dict[str, tuple[Lost, object, int]] = {
     "retry": (_retry, JobRecord, 4),
     "relabel": (_relabel, JobRecord, 2),
     "restore": (_restore, True, 1),
+    "lend": (_lend, True, 2),
+    "note": (_note, True, 2),
     "forget": (_forget, True, 0),
 }
 

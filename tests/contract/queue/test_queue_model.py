@@ -6,6 +6,7 @@ lets them).
 
 from __future__ import annotations
 
+import uuid
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -15,11 +16,14 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
+from contract.queue.deliveries import Loan
 from contract.queue.interface import Admission, Claim, Event, QueueFullError, place_of
 from contract.queue.memory import MemoryQueue
 from contract.queue.redis_queue import HELD, PREFIX, QUEUED, RedisQueue
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, JobRecord, JobState
 from contract.wire.labels import LabelChange
+from contract.wire.options import Priority
+from contract.wire.webhooks import Delivery, DeliveryStatus, DeliveryTry, TryFailure
 from tests.contract.conftest import emptied
 from tests.contract.queues import ERROR, TRAINING, job
 
@@ -33,6 +37,11 @@ def timeless(answer: object) -> object:
     """The answer without what depends on clocks; whether a time is there stays."""
     if isinstance(answer, JobRecord):
         return answer.model_copy(update={name: 1.0 for name in TIMES if getattr(answer, name) is not None})
+    if isinstance(answer, Delivery):
+        is_due = None if answer.next_try_at_s is None else 1.0
+        return answer.model_copy(update={"ended_at_s": 1.0, "next_try_at_s": is_due})
+    if isinstance(answer, Loan):
+        return timeless(answer.delivery), answer.url, answer.tenant
     if isinstance(answer, Event):
         return timeless(answer.record)
     if isinstance(answer, list):
@@ -76,10 +85,12 @@ class BothQueues(RuleBasedStateMachine):
         tenant=st.sampled_from(["ward-1", "ward-2"]),
         key=st.sampled_from([None, None, "a" * 64, "b" * 64]),
         limited=st.booleans(),
+        callback=st.sampled_from([None, "https://his.example/done"]),
     )
-    def submit(self, urgent: bool, tenant: str, key: str | None, limited: bool) -> None:
+    def submit(self, urgent: bool, tenant: str, key: str | None, limited: bool, callback: str | None) -> None:
         created_at_s = 1000.0 + len(self.submitted) // 2
-        record = job(created_at_s, priority="high" if urgent else "standard", tenant=tenant, idempotency_key=key)
+        priority: Priority = "high" if urgent else "standard"
+        record = job(created_at_s, priority=priority, tenant=tenant, idempotency_key=key, callback_url=callback)
         self.submitted.append(record)
         self.both("submit", record, ADMISSION if limited else None)
 
@@ -132,10 +143,23 @@ class BothQueues(RuleBasedStateMachine):
             ended = {"state": state, "attempt": 1, "finished_at_s": 2000.0, "error": ERROR}
             self.both("restore", record.model_copy(update=ended))
 
+    @rule(failure=st.sampled_from([None, TryFailure.TIMEOUT]), wait_s=st.sampled_from([0.0, 60.0]))
+    def deliver(self, failure: TryFailure | None, wait_s: float) -> None:
+        loans = {queue: queue.lend_delivery(uuid.uuid4().hex) for queue in (self.memory, self.server)}
+        lent = [timeless(loan) for loan in loans.values()]
+        assert lent[0] == lent[1]
+        for queue, loan in loans.items():
+            if loan is not None:
+                tries = (*loan.delivery.tries, DeliveryTry(at_s=1.0, failure=failure))
+                status = DeliveryStatus.OWED if failure else DeliveryStatus.DELIVERED
+                noted = loan.delivery.model_copy(update={"tries": tries, "status": status})
+                assert queue.note_try(loan, noted, wait_s if failure else None)
+
     @rule(pick=PICK)
     def look(self, pick: int) -> None:
         job_id = self.some_job(pick)
         self.both("get", job_id)
+        self.both("deliveries", job_id)
         positions = {queue.forecast(job_id).position for queue in (self.memory, self.server)}
         assert len(positions) == 1
 
@@ -145,6 +169,7 @@ class BothQueues(RuleBasedStateMachine):
         self.both("records", "ward-1")
         figures = [queue.figures() for queue in (self.memory, self.server)]
         assert len({(each.queued, each.running, tuple(sorted(each.ended.items()))) for each in figures}) == 1
+        assert figures[0].webhooks == figures[1].webhooks
         for record in self.submitted[-3:]:
             self.both("events", record.job_id)
 

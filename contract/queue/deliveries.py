@@ -1,0 +1,48 @@
+"""The part of the queue that remembers which webhooks are owed (`Deliveries`, a Protocol).
+
+A job's end and the delivery that it owes are one step, so neither a killed worker nor a killed service loses one.
+Services lend deliveries that are due. A loan is a lease: if nothing is noted before it runs out, another service is
+lent the delivery. So each is made at least once, and twice only if a service died, or lost the queue, in between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from contract.wire.webhooks import Delivery
+
+LOAN_S = 30.0
+"""Longer than a try takes (service/webhooks.py)."""
+
+
+@dataclass(frozen=True)
+class Loan:
+    """A delivery that a service is to try now; `mark` tells this loan from earlier and later ones."""
+
+    delivery: Delivery
+    url: str
+    tenant: str
+    mark: str
+
+
+class Deliveries(Protocol):
+    """Every method is atomic, and may be repeated when its answer was lost; all raise UnavailableError."""
+
+    def lend_delivery(self, token: str) -> Loan | None:
+        """The delivery that has been due for longest, which is lent to nobody else for LOAN_S; None if none is due.
+
+        token: of this call; the same token gets the same delivery again.
+        """
+        ...
+
+    def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
+        """Keep what became of a loan: the delivery with one more try. False if the loan no longer holds.
+
+        wait_s: until it is due again; None: it is owed no more.
+        """
+        ...
+
+    def deliveries(self, job_id: str) -> list[Delivery]:
+        """What a job's ends owe and owed, the first end first; nothing if the job has no callback."""
+        ...

@@ -1,0 +1,75 @@
+"""Deliveries inside one process; the queue in memory calls each method under its lock."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+
+from contract.queue.deliveries import LOAN_S, Loan
+from contract.wire.job import JobRecord
+from contract.wire.webhooks import Delivery, DeliveryStatus, event_id
+
+
+class MemoryDeliveries:
+    """Which webhooks are owed, and what became of the others."""
+
+    def __init__(self) -> None:
+        self.ended: Counter[DeliveryStatus] = Counter()
+        self._all: dict[str, Delivery] = {}
+        """By event."""
+        self._due_at_s: dict[str, float] = {}
+        self._lent: dict[str, str] = {}
+        """Event by token."""
+
+    @property
+    def owed(self) -> int:
+        """How many are owed."""
+        return len(self._due_at_s)
+
+    def owe(self, record: JobRecord) -> None:
+        """The delivery of a job that has just ended, if it has a callback."""
+        event = event_id(record.job_id, record.attempt, record.state)
+        if record.callback_url is None or event in self._all:
+            return
+        error_code = record.error.code.value if record.error else None
+        ended_at_s = record.finished_at_s or time.time()
+        self._all[event] = Delivery(event_id=event, state=record.state, error_code=error_code, ended_at_s=ended_at_s)
+        self._due_at_s[event] = time.time()
+
+    def lend(self, token: str) -> tuple[Delivery, str] | None:
+        """The delivery and the mark of its loan."""
+        event = self._lent.get(token)
+        if event not in self._due_at_s:
+            now_s = time.time()
+            due = [each for each, due_at_s in self._due_at_s.items() if due_at_s <= now_s]
+            if not due:
+                return None
+            event = self._lent[token] = min(due, key=self._due_at_s.__getitem__)
+            self._due_at_s[event] = now_s + LOAN_S
+        return self._all[event], repr(self._due_at_s[event])
+
+    def note(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
+        """As Deliveries.note_try has it."""
+        event = delivery.event_id
+        if self._all.get(event) == delivery:
+            return True
+        if event not in self._due_at_s or repr(self._due_at_s[event]) != loan.mark:
+            return False
+        self._all[event] = delivery
+        if wait_s is None:
+            del self._due_at_s[event]
+            self.ended[delivery.status] += 1
+        else:
+            self._due_at_s[event] = time.time() + wait_s
+        return True
+
+    def of(self, job_id: str) -> list[Delivery]:
+        """The deliveries of a job, with when they are tried next."""
+        found = [each for each in self._all.values() if each.job_id == job_id]
+        return [each.model_copy(update={"next_try_at_s": self._due_at_s.get(each.event_id)}) for each in found]
+
+    def forget(self, job_id: str) -> None:
+        """Owe nothing of a job that is removed, and remember nothing of it."""
+        for delivery in self.of(job_id):
+            del self._all[delivery.event_id]
+            self._due_at_s.pop(delivery.event_id, None)

@@ -1,0 +1,101 @@
+"""Webhooks: what a caller is told when its job has ended, and the log of how that went.
+
+The body and its headers follow Standard Webhooks (standardwebhooks.com). It names the job and nothing of its content:
+whoever receives it asks for the rest with a key.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from enum import StrEnum
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from contract.wire.job import JobState
+from contract.wire.names import JOB_ID_PATTERN
+
+CALLBACK_PART = "callback_url"
+MAX_CALLBACK_CHARACTERS = 1000
+CALLBACK_ABOUT = "where a webhook goes when the job has ended: a URL at a host that the service's operator has allowed"
+
+
+class DeliveryStatus(StrEnum):
+    """Where the delivery of a webhook stands."""
+
+    OWED = "owed"
+    DELIVERED = "delivered"
+    FAILED = "failed"
+    """Given up: after the last try, or because the receiver wants no more (410)."""
+
+
+class TryFailure(StrEnum):
+    """Why one try to deliver a webhook failed; docs/codes.md explains each."""
+
+    ADDRESS_REFUSED = "address_refused"
+    CERTIFICATE = "certificate"
+    HOST_REFUSED = "host_refused"
+    STATUS = "status"
+    TIMEOUT = "timeout"
+    UNREACHABLE = "unreachable"
+
+
+class DeliveryTry(BaseModel):
+    """One try to deliver a webhook."""
+
+    model_config = ConfigDict(frozen=True)
+
+    at_s: float = Field(description="when it began, UNIX s")
+    status_code: int | None = Field(default=None, description="the receiver's answer; None if there was none")
+    failure: TryFailure | None = Field(default=None, description="why it failed; None: the webhook was delivered")
+
+
+class Delivery(BaseModel):
+    """A webhook about one end of a job, and all tries to deliver it so far."""
+
+    model_config = ConfigDict(frozen=True)
+
+    event_id: str = Field(description="the header webhook-id, the same at every try")
+    state: JobState = Field(description="the state in which the job ended")
+    error_code: str | None = Field(default=None, description="the code of a failed job's error")
+    ended_at_s: float = Field(description="when the job ended, UNIX s")
+    status: DeliveryStatus = DeliveryStatus.OWED
+    tries: tuple[DeliveryTry, ...] = ()
+    next_try_at_s: float | None = Field(default=None, description="when it is tried next, UNIX s; None: never again")
+
+    @property
+    def job_id(self) -> str:
+        """The job."""
+        return self.event_id.partition(".")[0]
+
+
+class EndedJob(BaseModel):
+    """The job that a webhook is about."""
+
+    model_config = ConfigDict(frozen=True)
+
+    job_id: str = Field(pattern=JOB_ID_PATTERN)
+    state: JobState = Field(description="done, failed or cancelled")
+    error_code: str | None = Field(default=None, description="the code of a failed job's error (docs/codes.md)")
+
+
+class JobEnded(BaseModel):
+    """The body of a webhook: a job has ended."""
+
+    model_config = ConfigDict(frozen=True)
+
+    id: str = Field(description="the event's id, as in the header webhook-id")
+    type: str = Field(description="job.done, job.failed or job.cancelled")
+    timestamp: str = Field(description="when the job ended, ISO 8601, UTC")
+    data: EndedJob
+
+    @classmethod
+    def of(cls, delivery: Delivery) -> JobEnded:
+        """What a delivery tells."""
+        ended = datetime.fromtimestamp(delivery.ended_at_s, UTC).isoformat(timespec="milliseconds")
+        job = EndedJob(job_id=delivery.job_id, state=delivery.state, error_code=delivery.error_code)
+        return cls(id=delivery.event_id, type=f"job.{delivery.state}", timestamp=ended, data=job)
+
+
+def event_id(job_id: str, attempt: int, state: JobState) -> str:
+    """The id of a job's end: a job that failed and was retried ends once more, with another attempt or state."""
+    return f"{job_id}.{attempt}.{state}"

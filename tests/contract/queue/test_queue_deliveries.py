@@ -1,0 +1,160 @@
+"""Webhooks that are owed: from the very step in which a job ends, to one service at a time, until it is noted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+
+import pytest
+
+from contract.queue import memory_deliveries, redis_queue
+from contract.queue.deliveries import Loan
+from contract.queue.interface import MAX_ATTEMPTS, Claim, Queue
+from contract.wire.job import JobState
+from contract.wire.webhooks import DeliveryStatus, DeliveryTry, TryFailure
+from tests.contract.queues import ERROR, claimed, job
+
+CALLBACK = "https://his.example/done"
+TOKENS = (f"{number:032x}" for number in count())
+
+
+def lent(queue: Queue) -> Loan | None:
+    return queue.lend_delivery(next(TOKENS))
+
+
+def tried(queue: Queue, loan: Loan, failure: TryFailure | None, wait_s: float | None) -> bool:
+    status = (
+        DeliveryStatus.OWED if wait_s is not None else DeliveryStatus.FAILED if failure else DeliveryStatus.DELIVERED
+    )
+    tries = (*loan.delivery.tries, DeliveryTry(at_s=1.0, failure=failure))
+    return queue.note_try(loan, loan.delivery.model_copy(update={"tries": tries, "status": status}), wait_s)
+
+
+@pytest.fixture
+def lending_for_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (memory_deliveries, redis_queue):
+        monkeypatch.setattr(module, "LOAN_S", 0.001)
+
+
+def die(queue: Queue, claim: Claim) -> None:
+    queue.release(claim, died=True)
+    for _ in range(MAX_ATTEMPTS - 1):
+        queue.release(claimed(queue)[1], died=True)
+
+
+def cancel(queue: Queue, claim: Claim) -> None:
+    queue.cancel(claim.job_id)
+    queue.confirm_cancel(claim)
+
+
+ENDS: dict[str, tuple[Callable[[Queue, Claim], object], JobState, str | None]] = {
+    "done": (lambda queue, claim: queue.finish(claim), JobState.DONE, None),
+    "failed": (lambda queue, claim: queue.fail(claim, ERROR), JobState.FAILED, "unclassified"),
+    "failed by deaths": (die, JobState.FAILED, "attempts_exhausted"),
+    "cancelled": (cancel, JobState.CANCELLED, None),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_job_with_a_callback_owes_a_webhook_as_soon_as_it_has_ended_and_not_before(queue: Queue, end: str) -> None:
+    act, state, code = ENDS[end]
+    submitted = queue.submit(job(callback_url=CALLBACK))
+    record, claim = claimed(queue)
+    assert record.callback_url == submitted.callback_url == CALLBACK
+    assert lent(queue) is None
+    assert queue.deliveries(record.job_id) == []
+    act(queue, claim)
+    loan = lent(queue)
+    assert loan is not None
+    assert (loan.url, loan.tenant, loan.delivery.job_id) == (CALLBACK, "ward-1", record.job_id)
+    assert (loan.delivery.state, loan.delivery.error_code) == (state, code)
+    assert lent(queue) is None
+
+
+def test_a_queued_job_that_is_cancelled_owes_one_and_a_job_without_a_callback_owes_none(queue: Queue) -> None:
+    first, second = queue.submit(job(callback_url=CALLBACK)), queue.submit(job())
+    for record in (second, first):
+        queue.cancel(record.job_id)
+    loan = lent(queue)
+    assert loan is not None
+    assert loan.delivery.job_id == first.job_id
+    assert lent(queue) is None
+    assert queue.deliveries(second.job_id) == []
+
+
+def test_a_failed_delivery_is_lent_again_when_it_is_due_and_a_delivered_one_never(queue: Queue) -> None:
+    job_id = queue.submit(job(callback_url=CALLBACK)).job_id
+    queue.cancel(job_id)
+    first = lent(queue)
+    assert first is not None
+    assert tried(queue, first, TryFailure.TIMEOUT, 0.0)
+    second = lent(queue)
+    assert second is not None
+    assert second.delivery.event_id == first.delivery.event_id
+    assert [each.failure for each in second.delivery.tries] == [TryFailure.TIMEOUT]
+    assert tried(queue, second, TryFailure.STATUS, 60.0)
+    assert lent(queue) is None
+    (delivery,) = queue.deliveries(job_id)
+    assert len(delivery.tries) == 2
+    assert delivery.next_try_at_s is not None
+    assert queue.figures().webhooks == {DeliveryStatus.OWED: 1}
+
+
+def test_a_delivered_and_a_given_up_webhook_are_counted_and_stay_in_the_log(queue: Queue) -> None:
+    for failure in (None, TryFailure.STATUS):
+        job_id = queue.submit(job(callback_url=CALLBACK)).job_id
+        queue.cancel(job_id)
+        loan = lent(queue)
+        assert loan is not None
+        assert tried(queue, loan, failure, None)
+        (delivery,) = queue.deliveries(job_id)
+        assert delivery.next_try_at_s is None
+    assert lent(queue) is None
+    counted = {DeliveryStatus.OWED: 0, DeliveryStatus.DELIVERED: 1, DeliveryStatus.FAILED: 1}
+    assert queue.figures().webhooks == counted
+
+
+@pytest.mark.usefixtures("lending_for_no_time")
+def test_a_loan_that_has_run_out_is_lent_to_another_and_what_the_first_notes_does_not_count(queue: Queue) -> None:
+    job_id = queue.submit(job(callback_url=CALLBACK)).job_id
+    queue.cancel(job_id)
+    first = second = lent(queue)
+    while second is None or second == first:
+        second = lent(queue)
+    assert first is not None
+    assert first.delivery == second.delivery
+    assert not tried(queue, first, TryFailure.TIMEOUT, 60.0)
+    assert tried(queue, second, None, None)
+    assert [each.status for each in queue.deliveries(job_id)] == [DeliveryStatus.DELIVERED]
+
+
+def test_a_job_that_fails_is_retried_and_is_done_owes_two_webhooks(queue: Queue) -> None:
+    job_id = queue.submit(job(callback_url=CALLBACK)).job_id
+    queue.fail(claimed(queue)[1], ERROR)
+    queue.retry(job_id)
+    queue.finish(claimed(queue)[1])
+    states = [loan.delivery.state for loan in (lent(queue), lent(queue)) if loan]
+    assert states == [JobState.FAILED, JobState.DONE]
+    assert [each.state for each in queue.deliveries(job_id)] == states
+
+
+def test_a_job_that_is_forgotten_owes_nothing(queue: Queue) -> None:
+    job_id = queue.submit(job(callback_url=CALLBACK)).job_id
+    queue.cancel(job_id)
+    loan = lent(queue)
+    assert loan is not None
+    queue.forget(job_id)
+    assert not tried(queue, loan, TryFailure.TIMEOUT, 0.0)
+    assert lent(queue) is None
+    assert queue.deliveries(job_id) == []
+    assert queue.figures().webhooks == {DeliveryStatus.OWED: 0}
+
+
+def test_a_job_that_the_queue_had_lost_owes_its_webhook_again(queue: Queue) -> None:
+    ended = {"state": JobState.DONE, "attempt": 2, "finished_at_s": 2000.0}
+    record = job(callback_url=CALLBACK).model_copy(update=ended)
+    assert queue.restore(record)
+    loan = lent(queue)
+    assert loan is not None
+    assert loan.delivery.event_id == f"{record.job_id}.2.done"
+    assert loan.delivery.ended_at_s == 2000.0
