@@ -1,4 +1,5 @@
-"""`intrasplat keys`: make, list and revoke the API keys of an installation, in its data directory.
+"""`intrasplat keys`: make, list and revoke the API keys of an installation, in its data directory; and tell the secret
+with which a tenant's receivers verify webhooks.
 
 The commands edit the file that the services read (contract/access/keys.py). Run them as the user that runs the service:
 that user can read the clips anyway.
@@ -7,14 +8,18 @@ that user can read the clips anyway.
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from datetime import UTC, datetime
 
 from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now
 from contract.access.keys import DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope
+from contract.access.webhook_secrets import tenant_secret
 from contract.runtime.arguments import Commands, add_command, add_data_dir, settings_of
 from contract.runtime.exits import ExitCode
+from contract.runtime.settings import Settings
 from contract.wire.errors import InputError
+from contract.wire.job import TENANT_PATTERN
 
 
 def add_keys(commands: Commands) -> None:
@@ -30,6 +35,8 @@ def add_keys(commands: Commands) -> None:
         help=f"of {', '.join(KeyScope)} (default: %(default)s)",
     )
     create.add_argument("--label", help="what the list shows, at most 60 characters; name no patient")
+    webhooks = add_command(own, "webhook-secret", "print what a tenant verifies webhooks with", _webhook_secret)
+    webhooks.add_argument("--tenant", required=True, help="whose jobs the webhooks are about")
     revoke = add_command(own, "revoke", "refuse a key from now on", _revoke)
     revoke.add_argument("key_id", metavar="ID", help="as `intrasplat keys list` shows it")
     for command in (create, add_command(own, "list", "show all keys, without their secrets", _list), revoke):
@@ -61,6 +68,17 @@ def _revoke(options: argparse.Namespace) -> int:
         raise InputError("ID", f"there is no key {options.key_id!r}.", "See `intrasplat keys list`.")
     print(f"revoked {_line(key)}", file=sys.stderr)
     _record(options, AuditAction.KEY_REVOKED, key)
+    return ExitCode.OK
+
+
+def _webhook_secret(options: argparse.Namespace) -> int:
+    secret = Settings.from_environment().webhook_secret
+    if secret is None:
+        remedy = "Set it as for the service; `openssl rand -hex 32` makes one."
+        raise InputError("INTRASPLAT_WEBHOOK_SECRET", "it is not set.", remedy)
+    if not re.fullmatch(TENANT_PATTERN, options.tenant):
+        raise InputError("--tenant", f"{options.tenant!r} is no tenant.", "See `intrasplat keys list`.")
+    print(tenant_secret(secret, options.tenant))
     return ExitCode.OK
 
 

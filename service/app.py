@@ -56,7 +56,8 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(_kept_up(run)) for run in (deps.sweep.run, deps.retention.run, renderer.run)]
+        background = (deps.sweep.run, deps.retention.run, deps.webhooks.run, renderer.run)
+        tasks = [asyncio.create_task(_kept_up(run)) for run in background]
         yield
         deps.feeds.end()
         for task in tasks:

@@ -9,6 +9,7 @@ from pydantic.json_schema import models_json_schema
 from contract.wire.checks import DescribedClip
 from contract.wire.labels import Labels
 from contract.wire.names import JOB_ID_PATTERN
+from contract.wire.webhooks import CALLBACK_ABOUT, CALLBACK_PART, MAX_CALLBACK_CHARACTERS
 from service.upload import CLIP_OF, PARTS, SUFFIXES
 
 EXAMPLE_ID = "0123456789abcdef0123456789abcdef"
@@ -28,6 +29,12 @@ CLIP_OF_ID = {
     "pattern": JOB_ID_PATTERN,
     "description": "a job whose clip is used again, with its calibration and masks unless others are sent",
 }
+CALLBACK_URL = {
+    "type": "string",
+    "format": "uri",
+    "maxLength": MAX_CALLBACK_CHARACTERS,
+    "description": CALLBACK_ABOUT,
+}
 OPTIONS = {"$ref": "#/components/schemas/JobOptions"}
 
 
@@ -44,7 +51,7 @@ def _body(title: str, about: str, parts: dict[str, Any]) -> dict[str, Any]:
     labels = Labels.model_json_schema()["properties"]
     text = next(each for each in labels["label"]["anyOf"] if each["type"] == "string")  # a form has no null
     labels["label"] = {**text, "description": labels["label"]["description"]}
-    properties = {**parts, CLIP_OF: CLIP_OF_ID, **labels, "options": OPTIONS}
+    properties = {**parts, CLIP_OF: CLIP_OF_ID, **labels, CALLBACK_PART: CALLBACK_URL, "options": OPTIONS}
     description = f"{about}: {ONE_CLIP}, and what else is known."
     return {
         "title": title,

@@ -35,6 +35,7 @@ from service.render_limits import RenderLimits
 from service.renderer import Renderer
 from service.retention import Retention
 from service.sweep import Sweep
+from service.webhooks import Webhooks
 
 UNIX_SOCKET = "unix"
 NO_ADDRESS = "unknown"
@@ -54,10 +55,11 @@ class Deps:
         self.render_limits = RenderLimits(settings)
         self.audit = Audit(AuditLog(settings.data_dir))
         self.metrics = Metrics(queue, store)
-        # how a clip comes in, how callers follow its job, and how all of it is removed
+        # how a clip comes in, how callers follow its job and hear of its end, and how all of it is removed
         self.intake = Intake(settings, store)
         self.sweep = Sweep(queue, store)
         self.feeds = Feeds(queue)
+        self.webhooks = Webhooks(settings, queue)
         self.questions = Questions()
         self.done = DoneJobs(queue, store, self.questions)
         self.purger = Purger(queue, store, self.audit, self.done)

@@ -19,6 +19,7 @@ from contract.wire.options import JobOptions, parse_options
 from contract.wire.report import Imported
 from service.access import Caller
 from service.bodies import SCENE_BODY
+from service.callbacks import check_callback
 from service.deps import AnyCaller, Deps, Services
 from service.problems import RETRY_AFTER_S
 from service.reconstruct import IdempotencyKey, check_scopes, forecast_of, hash_of, receive_form, spool_and_queue
@@ -50,6 +51,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
     options = _options(received.options)
     check_retention(options, services.settings)
     check_scopes(options, caller, services.settings)
+    check_callback(received.callback_url, services.settings)
     if SCENE_PART not in received.names:
         raise InputError(SCENE_PART, "there is no scene.", SCENE_FORM.remedy)
     name, now_s = received.names[SCENE_PART], time.time()
@@ -61,6 +63,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         files=JobFiles(clip=name),
         options=options.model_copy(update={"preset": archive.manifest.preset}),
         labels=received.labels,
+        callback_url=received.callback_url,
         input_bytes=received.total_bytes,
         input_sha256=received.sha256(),
         imported=Imported(

@@ -15,6 +15,7 @@ from contract.access.keys import KeyScope
 from contract.queue.interface import event_order
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState, JobView
 from contract.wire.labels import LabelChange
+from contract.wire.webhooks import Delivery
 from service.deps import AnyCaller, Deps, Services, owned_job
 from service.events import NOTHING_SEEN
 from service.listing import PAGED, JobQuery, find_page, tell_next
@@ -59,6 +60,13 @@ def get_job(job_id: str, response: Response, services: Services, caller: AnyCall
     """State, position, stage, progress, held-out dB so far, seconds left, and the error if it failed."""
     caller.require(KeyScope.VIEW)
     return _view(services, owned_job(services, caller, job_id), response)
+
+
+@router.get("/{job_id}/deliveries", operation_id="list_deliveries")
+def list_deliveries(job_id: str, services: Services, caller: AnyCaller) -> list[Delivery]:
+    """The webhooks about this job's ends, and every try to deliver them; none of a job without a callback_url."""
+    caller.require(KeyScope.VIEW)
+    return services.queue.deliveries(owned_job(services, caller, job_id).job_id)
 
 
 @router.patch("/{job_id}", operation_id="label_job")

@@ -18,6 +18,7 @@ from contract.runtime import traces
 from contract.runtime.version import version
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
+from contract.wire.webhooks import DeliveryStatus
 
 NO_ROUTE = "none"
 """The page's files, and all that does not exist: paths are a caller's to choose, so they are no label."""
@@ -156,6 +157,9 @@ class _QueueCollector(Collector):
         kinds = collections.Counter((worker.device, "no" if worker.renders_only else "yes") for worker in workers)
         for kind, count in sorted(kinds.items()):
             live.add_metric(kind, count)
+        webhooks = CounterMetricFamily("intrasplat_webhooks", "Webhooks delivered and given up.", labels=("status",))
+        for status in (DeliveryStatus.DELIVERED, DeliveryStatus.FAILED):
+            webhooks.add_metric((status.value,), figures.webhooks.get(status, 0))
         return [
             GaugeMetricFamily("intrasplat_jobs_queued", "Jobs that wait.", figures.queued),
             GaugeMetricFamily("intrasplat_jobs_running", "Jobs that a worker holds.", figures.running),
@@ -164,4 +168,8 @@ class _QueueCollector(Collector):
             ),
             ended,
             live,
+            webhooks,
+            GaugeMetricFamily(
+                "intrasplat_webhooks_owed", "Webhooks still to deliver.", figures.webhooks[DeliveryStatus.OWED]
+            ),
         ]

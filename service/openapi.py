@@ -7,7 +7,9 @@ from typing import Any
 
 from fastapi import FastAPI
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic.json_schema import models_json_schema
 
+from contract.wire.webhooks import JobEnded
 from service.bodies import BODIES, EXAMPLE_ID
 from service.problems import MEDIA_TYPE
 
@@ -35,6 +37,33 @@ EXAMPLES: dict[str, dict[str, Any]] = {
         "remedy": "Send .mp4, .mov, .mkv, .webm, .zip.",
     },
 }
+REFERENCE = "#/components/schemas/{model}"
+WEBHOOK_HEADERS = {
+    "webhook-id": "the event's id, the same at every try: whoever knows it already has this webhook",
+    "webhook-timestamp": "when this try was sent, UNIX s",
+    "webhook-signature": "v1, and HMAC-SHA256 of `id.timestamp.body` under the tenant's secret, in base64",
+}
+WEBHOOKS = {
+    "jobEnded": {
+        "post": {
+            "operationId": "job_ended",
+            "summary": "A job has ended",
+            "description": "Sent to a job's callback_url whenever the job has ended, until it is answered with 2xx or "
+            "410. Headers and signature are those of Standard Webhooks.",
+            "parameters": [
+                {"name": name, "in": "header", "required": True, "schema": {"type": "string"}, "description": about}
+                for name, about in WEBHOOK_HEADERS.items()
+            ],
+            "requestBody": {
+                "required": True,
+                "content": {"application/json": {"schema": {"$ref": REFERENCE.format(model=JobEnded.__name__)}}},
+            },
+            "responses": {"2XX": {"description": "the webhook has come"}},
+            "security": [],
+        }
+    }
+}
+"""What the service sends of its own accord."""
 KEY_SCHEME = {
     "type": "http",
     "scheme": "bearer",
@@ -73,6 +102,8 @@ def _completed(document: dict[str, Any]) -> dict[str, Any]:
         schemas.pop(name, None)
     schemas["Problem"] = ProblemDocument.model_json_schema()
     schemas |= BODIES
+    schemas |= models_json_schema([(JobEnded, "serialization")], ref_template=REFERENCE)[1]["$defs"]
+    document["webhooks"] = WEBHOOKS
     for name, example in EXAMPLES.items():
         if name in schemas:
             schemas[name]["examples"] = [example]

@@ -31,6 +31,7 @@ from contract.wire.labels import parse_labels
 from contract.wire.options import JobOptions, parse_options
 from service.access import Caller
 from service.bodies import REQUEST_BODY
+from service.callbacks import check_callback
 from service.deps import AnyCaller, Deps, Services
 from service.intake import declared_length
 from service.partial import Partial, find_partial
@@ -41,6 +42,8 @@ from service.upload import CLIP_FORM, LIMIT_REMEDY, PARTS, Form, Received, Uploa
 
 router = APIRouter(tags=["jobs"])
 
+SAME_UNDER_A_KEY = ("input_sha256", "options", "callback_url")
+"""What a second submission under an idempotency key repeats; a callback that differed would never be told."""
 STEPS_PER_S = 10.0
 """By which `iterations` are taken for seconds of training; of a plain machine with `paper`."""
 MAX_SUBMISSION_BYTES = 128 * 1024
@@ -72,6 +75,7 @@ class Submission(BaseModel):
     clip_of: str | None = None
     label: str | None = None
     metadata: dict[str, object] | None = None
+    callback_url: str | None = None
     options: dict[str, object] = Field(default={})
 
     def uploads(self) -> dict[str, str]:
@@ -164,6 +168,7 @@ def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key:
         return _taken_before(services, job_ids, submission, options)
     labels = parse_labels(submission.label, submission.metadata)
     received = Received(options=options.model_dump_json(), clip_of=submission.clip_of, labels=labels)
+    received.callback_url = submission.callback_url
     received.names = {part: partial.path.name for part, partial in partials.items()}
     received.check_clip()  # before anything is read
     with contextlib.ExitStack() as held:
@@ -232,7 +237,9 @@ def _taken_before(services: Deps, job_ids: set[str | None], submission: Submissi
     known = services.queue.get(job_id)
     record = known or services.store.labelled_submission(job_id)
     clip_of = submission.clip_of and first_job(services.store, submission.clip_of)
-    if len(job_ids) > 1 or record is None or (record.options, record.clip_of) != (options, clip_of):
+    asked = (options, clip_of, submission.callback_url)
+    asked_before = record and (record.options, record.clip_of, record.callback_url)
+    if len(job_ids) > 1 or record is None or asked_before != asked:
         detail = f"An upload was used for the job {job_id} already."
         raise Problem(409, detail, remedy="Upload it again.", extensions={"job_id": job_id})
     # A clip that was accepted is never refused for want of room in a queue that has lost its record.
@@ -249,6 +256,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
     options = parse_options(JobOptions, received.options)
     check_retention(options, services.settings)
     check_scopes(options, caller, services.settings)
+    check_callback(received.callback_url, services.settings)
     received.check_clip()
     sent = set(received.names)
     clip_of = None
@@ -262,6 +270,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         files=received.files(),
         options=options,
         labels=received.labels,
+        callback_url=received.callback_url,
         input_bytes=received.total_bytes,
         input_sha256=received.sha256(),
         clip_of=clip_of,
@@ -316,7 +325,8 @@ def enqueue(services: Deps, record: JobRecord) -> JobRecord:
     Raises:
         QueueFullError: there is no room in the queue; the clip is removed.
         Problem: 503: the queue is away. The clip stays, and is queued as soon as the queue is back.
-        InputError: the idempotency key was used for another clip or other options; the clip is removed.
+        InputError: the idempotency key was used for another clip, other options or another callback; the clip is
+            removed.
     """
     settings = services.settings
     try:
@@ -332,7 +342,7 @@ def enqueue(services: Deps, record: JobRecord) -> JobRecord:
     if standing.job_id == record.job_id:
         return standing
     services.store.purge(record.job_id)
-    if (standing.input_sha256, standing.options) != (record.input_sha256, record.options):
-        problem = f"it was used for the job {standing.job_id} with another clip or other options."
+    if any(getattr(standing, name) != getattr(record, name) for name in SAME_UNDER_A_KEY):
+        problem = f"it was used for the job {standing.job_id} with another clip, other options or another callback_url."
         raise InputError("Idempotency-Key", problem, "Use a new key for every new job.")
     return standing

@@ -18,6 +18,7 @@ from contract.intake.limits import MAX_CALIBRATION_BYTES
 from contract.wire.errors import InputError, LimitError
 from contract.wire.job import JobFiles
 from contract.wire.labels import LABEL_FIELD, METADATA_FIELD, Labels, parse_labels
+from contract.wire.webhooks import CALLBACK_PART
 from service.problems import Problem, no_room_for
 
 CLIP_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".zip")
@@ -36,13 +37,14 @@ SCENE_SUFFIXES = {SCENE_PART: (".zip",)}
 
 OPTIONS = "options"
 CLIP_OF = "clip_of"
-TEXTS = (OPTIONS, CLIP_OF, LABEL_FIELD, METADATA_FIELD)
+TEXTS = (OPTIONS, CLIP_OF, LABEL_FIELD, METADATA_FIELD, CALLBACK_PART)
 """Parts that are text."""
 MAX_OPTIONS_BYTES = 64 * 1024
 MAX_BYTES = {
     OPTIONS: MAX_OPTIONS_BYTES,
     CLIP_OF: 256,
     LABEL_FIELD: 4096,
+    CALLBACK_PART: 4096,
     METADATA_FIELD: MAX_OPTIONS_BYTES,
     "calibration": MAX_CALIBRATION_BYTES,
 }
@@ -51,7 +53,7 @@ LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
 MAX_HEADER_BYTES = 8 * 1024
 FORM_REMEDY = (
     "Send multipart/form-data with clip, or left and right, or clip_of, and optionally calibration, masks, options, "
-    "label and metadata; "
+    "label, metadata and callback_url; "
     'options is JSON, such as {"budget_s": 20}, and clip_of the id of a job whose clip is used again.'
 )
 
@@ -73,8 +75,9 @@ class Form:
 CLIP_FORM = Form(SUFFIXES, TEXTS, FORM_REMEDY)
 SCENE_FORM = Form(
     SCENE_SUFFIXES,
-    (OPTIONS, LABEL_FIELD, METADATA_FIELD),
-    "Send multipart/form-data with scene, a file of format=scene, and optionally options, label and metadata.",
+    (OPTIONS, LABEL_FIELD, METADATA_FIELD, CALLBACK_PART),
+    "Send multipart/form-data with scene, a file of format=scene, and optionally options, label, metadata and "
+    "callback_url.",
 )
 
 
@@ -89,12 +92,14 @@ class UploadLimits:
 
 @dataclass
 class Received:
-    """What arrived: stored names by part, digests by part, options as text, labels, whose clip is used again."""
+    """What arrived: stored names by part, digests by part, options as text, labels, whose clip is used again, and
+    where a webhook goes at the end."""
 
     names: dict[str, str] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     options: str = "{}"
     clip_of: str | None = None
+    callback_url: str | None = None
     labels: Labels = field(default_factory=Labels)
     total_bytes: int = 0
 
@@ -227,6 +232,7 @@ class _Receiver:
         texts = {name: self._text(name) for name in self._texts}
         self._received.options = texts.get(OPTIONS, self._received.options)
         self._received.clip_of = texts.get(CLIP_OF)
+        self._received.callback_url = texts.get(CALLBACK_PART)
         self._received.labels = parse_labels(texts.get(LABEL_FIELD), texts.get(METADATA_FIELD))
         return self._received
 

@@ -12,10 +12,11 @@ from contract.wire.checks import FindingCode
 from contract.wire.errors import ErrorCode, IntrasplatError
 from contract.wire.measuring import RefusalCode
 from contract.wire.notices import NoticeCode
+from contract.wire.webhooks import TryFailure
 from tests.test_repository import REPOSITORY
 
-PAGE, ERRORS, REFUSALS = re.split(
-    "## (?:Errors|Refusals)", (REPOSITORY / "docs" / "codes.md").read_text(encoding="utf-8")
+PAGE, ERRORS, REFUSALS, TRIES = re.split(
+    "## (?:Errors|Refusals|Tries of a webhook)", (REPOSITORY / "docs" / "codes.md").read_text(encoding="utf-8")
 )
 NOTICES, FINDINGS = PAGE.split("## Findings")
 SOURCES = [path for room in ("contract", "worker", "service") for path in (REPOSITORY / room).rglob("*.py")]
@@ -45,6 +46,10 @@ def test_every_code_of_a_finding_is_explained_once_and_no_other() -> None:
 
 def test_every_code_of_a_refusal_is_explained_once_and_no_other() -> None:
     assert sorted(listed(REFUSALS)) == sorted(RefusalCode)
+
+
+def test_every_code_of_a_failed_try_of_a_webhook_is_explained_once_and_no_other() -> None:
+    assert sorted(listed(TRIES)) == sorted(TryFailure)
 
 
 def test_every_class_of_error_has_a_code_of_its_own() -> None:

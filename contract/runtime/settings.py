@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
+from pydantic_core.core_schema import ValidationInfo
 
 from contract.runtime.queue_url import parse_queue_url
 from contract.wire.errors import InputError
@@ -20,6 +22,7 @@ OTHER_VARIABLES = frozenset({"API_KEY", "CACHE", "CHAOS_FOLDER", "DATA", "LAST_W
 """Of commands, tests and processes among themselves."""
 MISSPELT = 0.75
 """How alike a name and a setting's are, from 0 to 1, if the one is taken for the other."""
+WEBHOOK_HOST_PATTERN = r"(https?://)?([A-Za-z0-9.-]+|\[[0-9A-Fa-f:]+\])(:[0-9]{1,5})?"
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 """Only this machine can reach a service at one of these."""
 
@@ -116,6 +119,14 @@ class Settings(BaseModel):
     """For jobs that name no retention themselves; None keeps them until they are deleted."""
     max_retention_hours: float | None = Field(default=None, gt=0)
 
+    # webhooks
+    webhook_secret: str | None = Field(default=None, min_length=32)
+    """The secrets that tenants verify webhooks with are made from it."""
+    webhook_hosts: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
+    """Where webhooks may go: HOST or HOST:PORT for https, http://HOST:PORT without encryption; nowhere by default."""
+    webhook_private: Literal["no", "yes"] = "no"
+    """yes: those hosts may have private addresses, and those of this machine."""
+
     # renders
     max_render_pixels: int = Field(default=4096 * 2160, gt=0)
     render_timeout_s: float = Field(default=20.0, gt=0)
@@ -129,6 +140,16 @@ class Settings(BaseModel):
     # many machines
     store_url: str | None = Field(default=None, pattern=r"^s3://[^\s]+$")
     """The bucket that keeps clips and scenes for all machines; None: data_dir keeps them."""
+
+    @field_validator("webhook_hosts")
+    @classmethod
+    def _origins(cls, hosts: tuple[str, ...], given: ValidationInfo) -> tuple[str, ...]:
+        for host in hosts:
+            if not re.fullmatch(WEBHOOK_HOST_PATTERN, host, re.ASCII):
+                raise ValueError(f"{host!r} is not HOST, HOST:PORT or http://HOST:PORT")
+        if hosts and not given.data.get("webhook_secret"):
+            raise ValueError(f"webhooks are signed; set {ENVIRONMENT_PREFIX}WEBHOOK_SECRET (openssl rand -hex 32), too")
+        return hosts
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] | None = None) -> Settings:

@@ -7,9 +7,16 @@ from pathlib import Path
 
 import pytest
 
+from tests.receiver import Receiver
 from tests.service.under_test import ServiceUnderTest, running_service
 
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[ServiceUnderTest]:
     yield from running_service(tmp_path)
+
+
+@pytest.fixture
+def receiver() -> Iterator[Receiver]:
+    with Receiver() as receiver:
+        yield receiver

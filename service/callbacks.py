@@ -1,0 +1,95 @@
+"""Where webhooks may go: to hosts that the operator has named, at addresses that the operator has not ruled out.
+
+A caller chooses the URL, and the service connects to it from inside the hospital's network. So the URL is judged when
+it is given and again at every try, and the address that was judged is the one that is connected to: a name that means
+another machine a moment later changes nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import socket
+from ipaddress import IPv4Address, IPv6Address, IPv6Network, ip_address
+
+import httpx
+
+from contract.runtime.settings import Settings
+from contract.wire.errors import InputError
+from contract.wire.webhooks import CALLBACK_PART, MAX_CALLBACK_CHARACTERS
+
+DEFAULT_PORTS = {"https": 443, "http": 80}
+URL_TEXT = re.compile(r"[!-~]+", re.ASCII)
+"""Visible ASCII."""
+NAT64 = IPv6Network("64:ff9b::/96")
+METADATA = frozenset({ip_address("fd00:ec2::254")})
+"""Where clouds tell their machines secrets; others lie among the link-local addresses."""
+URL_REMEDY = "Give a URL such as https://his.example.org/intrasplat, without a user, a password or a fragment."
+HOSTS_REMEDY = "Whoever runs the service names hosts in INTRASPLAT_WEBHOOK_HOSTS."
+
+
+def check_callback(url: str | None, settings: Settings) -> None:
+    """Return if webhooks may go there, as far as can be told without looking up its name.
+
+    Raises:
+        InputError: it is no URL, or its host is not allowed.
+    """
+    if url is None:
+        return
+    if len(url) > MAX_CALLBACK_CHARACTERS:
+        problem = f"it has {len(url)} characters, more than {MAX_CALLBACK_CHARACTERS}."
+        raise InputError(CALLBACK_PART, problem, URL_REMEDY)
+    origin = _origin(url)
+    if origin is None:
+        raise InputError(CALLBACK_PART, f"{url[:80]!r} is not a URL that a webhook can be sent to.", URL_REMEDY)
+    if not settings.webhook_hosts:
+        raise InputError(CALLBACK_PART, "this service sends no webhooks.", HOSTS_REMEDY)
+    if not is_allowed(url, settings):
+        raise InputError(CALLBACK_PART, f"webhooks may not go to {origin[:80]}.", HOSTS_REMEDY)
+
+
+def is_allowed(url: str, settings: Settings) -> bool:
+    """Whether the operator has named the URL's scheme, host and port."""
+    named = (host if "://" in host else f"https://{host}" for host in settings.webhook_hosts)
+    return _origin(url) in {_origin(each) for each in named}
+
+
+async def permitted_addresses(host: str, settings: Settings) -> list[str]:
+    """The addresses of a host that may be connected to, in the resolver's order.
+
+    Raises:
+        OSError, UnicodeError: the name means nothing.
+    """
+    found = await asyncio.get_running_loop().getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    addresses = dict.fromkeys(str(each[4][0]) for each in found)
+    return [address for address in addresses if _is_permitted(address, settings.webhook_private == "yes")]
+
+
+def _origin(url: str) -> str | None:
+    """Scheme, host and port in one form; None if it is no URL, or one with a user or a fragment."""
+    if not URL_TEXT.fullmatch(url):
+        return None
+    try:
+        parts = httpx.URL(url)
+    except httpx.InvalidURL:
+        return None
+    host = parts.raw_host.decode()
+    if parts.scheme not in DEFAULT_PORTS or not host or parts.userinfo or parts.fragment:
+        return None
+    return f"{parts.scheme}://{host}:{parts.port or DEFAULT_PORTS[parts.scheme]}"
+
+
+def _is_permitted(text: str, private: bool) -> bool:
+    address = _meant(ip_address(text.partition("%")[0]))
+    if address.is_link_local or address.is_multicast or address.is_unspecified or address in METADATA:
+        return False
+    return address.is_global or (private and (address.is_private or address.is_loopback))
+
+
+def _meant(address: IPv4Address | IPv6Address) -> IPv4Address | IPv6Address:
+    """The IPv4 address inside an IPv6 one that stands for it; others themselves."""
+    if isinstance(address, IPv4Address):
+        return address
+    if address in NAT64:
+        return IPv4Address(int(address) & 0xFFFFFFFF)
+    return address.ipv4_mapped or address.sixtofour or address

@@ -1,0 +1,214 @@
+"""Webhooks: tells callers' systems that a job has ended, signed, as often as it takes.
+
+The queue remembers what is owed (contract/queue/deliveries.py); each service lends from it and tries. Nothing is kept
+here, so a service may die at any time, and one that starts goes on with what is owed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+import ssl
+import time
+import uuid
+from dataclasses import dataclass
+
+import httpx
+from starlette.concurrency import run_in_threadpool
+
+from contract.access.webhook_secrets import signature, tenant_secret
+from contract.queue.deliveries import Loan
+from contract.queue.interface import Queue
+from contract.runtime.settings import Settings
+from contract.runtime.version import version
+from contract.wire.errors import UnavailableError
+from contract.wire.webhooks import Delivery, DeliveryStatus, DeliveryTry, JobEnded, TryFailure
+from service.callbacks import is_allowed, permitted_addresses
+
+LOOK_PERIOD_S = 0.5
+MAX_AT_ONCE = 16
+"""Tries under way at a time: a receiver that does not answer holds one for TRY_S."""
+TRY_S = 10.0
+"""How long one try may take, from looking up the name to the head of the answer."""
+CONNECT_S = 4.0
+"""The same for the connection to one address: a host may have another one that answers."""
+MAX_TRIES = 11
+FIRST_WAIT_S, WAIT_GROWS, MAX_WAIT_S, JITTER = 5.0, 4.0, 6 * 3600.0, 0.2
+"""5 s after the first try, 20 s after the second, ... 6 h after the last but one: 26 h in all."""
+
+logger = logging.getLogger("intrasplat.service")
+
+
+class TryFailed(Exception):
+    """A try failed; status_code: of the receiver's answer, if there was one."""
+
+    def __init__(self, failure: TryFailure, status_code: int | None = None) -> None:
+        super().__init__(failure)
+        self.failure = failure
+        self.status_code = status_code
+
+
+class Webhooks:
+    """Delivers what the queue says is owed."""
+
+    def __init__(self, settings: Settings, queue: Queue) -> None:
+        self._settings = settings
+        self._queue = queue
+        self._is_away = False
+
+    async def run(self) -> None:
+        """Deliver whatever is due, until cancelled."""
+        places = asyncio.Semaphore(MAX_AT_ONCE)
+        tls = await run_in_threadpool(ssl.create_default_context)
+        timeout = httpx.Timeout(TRY_S, connect=CONNECT_S)
+        limits = httpx.Limits(max_keepalive_connections=0)  # a connection belongs to the name it was made for
+        # trust_env: no proxy of the environment comes between the address that was judged and the one connected to
+        async with (
+            httpx.AsyncClient(verify=tls, trust_env=False, limits=limits, timeout=timeout) as http,
+            asyncio.TaskGroup() as tries,
+        ):
+            while True:
+                await places.acquire()
+                loan = await run_in_threadpool(self._lent)
+                if loan is None:
+                    places.release()
+                    await asyncio.sleep(LOOK_PERIOD_S)
+                else:
+                    tries.create_task(self._deliver(http, loan)).add_done_callback(lambda _: places.release())
+
+    def _lent(self) -> Loan | None:
+        """A delivery that is due; None also while the queue is away."""
+        try:
+            loan = self._queue.lend_delivery(uuid.uuid4().hex)
+        except UnavailableError as error:
+            if not self._is_away:
+                logger.warning("webhooks wait for the queue: %s", error.problem)
+            self._is_away = True
+            return None
+        self._is_away = False
+        return loan
+
+    async def _deliver(self, http: httpx.AsyncClient, loan: Loan) -> None:
+        began_s, status_code, failure = time.time(), None, None
+        try:
+            async with asyncio.timeout(TRY_S):
+                status_code = await self._post(http, loan)
+        except TimeoutError:
+            failure = TryFailure.TIMEOUT
+        except TryFailed as error:
+            failure, status_code = error.failure, error.status_code
+        delivery = _after(loan.delivery, DeliveryTry(at_s=began_s, status_code=status_code, failure=failure))
+        _log(delivery)
+        wait_s = wait_after(len(delivery.tries)) if delivery.status is DeliveryStatus.OWED else None
+        try:
+            await run_in_threadpool(self._queue.note_try, loan, delivery, wait_s)
+        except UnavailableError as error:  # the loan runs out, and the webhook is sent once more
+            logger.warning("what became of a webhook is not noted: %s", error.problem, extra=_about(delivery))
+
+    async def _post(self, http: httpx.AsyncClient, loan: Loan) -> int:
+        """The status of the receiver's answer, which is one of success.
+
+        Raises:
+            TryFailed: there was none.
+        """
+        secret = self._settings.webhook_secret
+        if secret is None or not is_allowed(loan.url, self._settings):
+            raise TryFailed(TryFailure.HOST_REFUSED)
+        url = httpx.URL(loan.url)
+        try:
+            addresses = await permitted_addresses(_host_of(url), self._settings)
+        except (OSError, UnicodeError):
+            raise TryFailed(TryFailure.UNREACHABLE) from None
+        if not addresses:
+            raise TryFailed(TryFailure.ADDRESS_REFUSED)
+        request = _request(loan, tenant_secret(secret, loan.tenant))
+        failed = TryFailed(TryFailure.UNREACHABLE)
+        for address in addresses:
+            try:
+                return await _send(http, url, address, request)
+            except httpx.ConnectError as error:  # the next address may answer
+                failed = TryFailed(TryFailure.CERTIFICATE if _is_of_tls(error) else TryFailure.UNREACHABLE)
+            except httpx.TimeoutException:
+                failed = TryFailed(TryFailure.TIMEOUT)
+            except httpx.HTTPError:
+                failed = TryFailed(TryFailure.UNREACHABLE)
+        raise failed
+
+
+def wait_after(tries: int) -> float:
+    """Seconds from so many failed tries to the next, about: many that failed together do not come back together."""
+    wait_s = min(FIRST_WAIT_S * WAIT_GROWS ** (tries - 1), MAX_WAIT_S)
+    return wait_s * random.uniform(1 - JITTER, 1 + JITTER)
+
+
+def _after(delivery: Delivery, tried: DeliveryTry) -> Delivery:
+    """The delivery with one more try."""
+    tries = (*delivery.tries, tried)
+    status = DeliveryStatus.OWED
+    if tried.failure is None:
+        status = DeliveryStatus.DELIVERED
+    elif tried.status_code == httpx.codes.GONE or len(tries) >= MAX_TRIES:
+        status = DeliveryStatus.FAILED
+    return delivery.model_copy(update={"tries": tries, "status": status})
+
+
+def _log(delivery: Delivery) -> None:
+    failure = delivery.tries[-1].failure
+    if delivery.status is DeliveryStatus.FAILED:
+        logger.error("a webhook was given up after %d tries: %s", len(delivery.tries), failure, extra=_about(delivery))
+    elif failure is not None:
+        logger.warning("a webhook was not delivered and is tried again: %s", failure, extra=_about(delivery))
+    else:
+        logger.info("a webhook was delivered", extra=_about(delivery))
+
+
+def _about(delivery: Delivery) -> dict[str, object]:
+    code = delivery.tries[-1].status_code
+    return {"job_id": delivery.job_id} | ({} if code is None else {"status": code})
+
+
+@dataclass(frozen=True)
+class _Request:
+    body: bytes
+    headers: dict[str, str]
+
+
+def _request(loan: Loan, secret: str) -> _Request:
+    body, now_s, event = JobEnded.of(loan.delivery).model_dump_json().encode(), int(time.time()), loan.delivery.event_id
+    headers = {
+        "Content-Type": "application/json",
+        "User-Agent": f"intrasplat/{version()}",
+        "webhook-id": event,
+        "webhook-timestamp": str(now_s),
+        "webhook-signature": signature(secret, event, now_s, body),
+    }
+    return _Request(body, headers)
+
+
+async def _send(http: httpx.AsyncClient, url: httpx.URL, address: str, request: _Request) -> int:
+    """The status of an answer of success from that address, whose certificate must be for the URL's host.
+
+    Only the head of the answer is read, and no redirect is followed.
+    """
+    headers = {"Host": url.netloc.decode(), **request.headers}
+    extensions = {"sni_hostname": _host_of(url)}
+    at = url.copy_with(host=address)
+    async with http.stream("POST", at, content=request.body, headers=headers, extensions=extensions) as answer:
+        if not answer.is_success:
+            raise TryFailed(TryFailure.STATUS, answer.status_code)
+        return answer.status_code
+
+
+def _host_of(url: httpx.URL) -> str:
+    """The host as it is looked up and as certificates have it: ASCII."""
+    return url.raw_host.decode()
+
+
+def _is_of_tls(error: BaseException | None) -> bool:
+    """Whether TLS is the cause: the certificate is not trusted, or for another name."""
+    while error is not None:
+        if isinstance(error, ssl.SSLError):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
