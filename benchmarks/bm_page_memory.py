@@ -5,7 +5,8 @@
 A service with the scene of this folder, and its page in headless Chromium, which plays in a loop and turns now and
 then. Every so many seconds a row: the JavaScript heap after a collection, nodes and listeners of the document, and
 pictures shown so far. `--way always` lets the browser draw (on the processor here, so few pictures a second), `never`
-leaves it to the service. The last line is the slope of the second half in kB of heap a minute.
+leaves it to the service. The first line says who draws where
+nobody has chosen, and how soon that was settled. The last line is the slope of the second half in kB of heap a minute.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ from worker.daemon.views import Views
 from worker.scene.checkpoint import load_scene
 
 COUNT = VIEWER % 'window.drawn = 0; viewer.addEventListener("shown", () => (window.drawn += 1)); done()'
+LOOK_AT_GRAPHICS = """
+const done = arguments[0];
+import("/player/support.js").then(({ graphics }) => done(graphics().tookMs));
+"""
 TURN = VIEWER % "viewer.look({ pose: arguments[0] }); done()"
 SWING_DEG = 10.0
 FIELDS = ("minute", "heap_kb", "nodes", "listeners", "pictures")
@@ -50,6 +55,10 @@ def main() -> None:
         driver.set_window_size(640, 480)
         page = stack.enter_context(opened(site.url, driver))
         page.press(site.scene(model=load_scene(options.scene)), "View")
+        page.until_state("live")
+        choice, took_ms = page.way, driver.execute_async_script(LOOK_AT_GRAPHICS)
+        print(f"by itself: {' '.join(choice)}, {page.decided_ms:.1f} ms after the scene was chosen", end="; ")
+        print(f"looking at the graphics took {took_ms:.1f} ms when the page was opened")
         page.choose_way(options.way)
         page.until_way(*(("memory", "") if options.way == "always" else ("service", "never")))
         rows = []

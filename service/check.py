@@ -72,12 +72,13 @@ async def check_clip(request: Request, services: Services, caller: AnyCaller) ->
 def _findings(services: Deps, caller: Caller, described: DescribedClip) -> Iterator[Finding]:
     files = described.files()
     total_bytes = sum(file.size_bytes for file in files.values())
-    for part, file in files.items():
-        yield from _of_file(part, file)
+    of_files = [finding for part, file in files.items() for finding in _of_file(part, file)]
+    yield from of_files
     if total_bytes:
         yield from _found(FindingCode.NO_ROOM, lambda: services.intake.check(caller.tenant, total_bytes))
     yield from _of_sizes(ClipLimits.of(services.settings), files)
-    yield from _of_calibration(described)
+    if ("calibration", FindingCode.ENDING) not in {(finding.field, finding.code) for finding in of_files}:
+        yield from _of_calibration(described)
     yield from _of_options(services, caller, described)
 
 
@@ -85,7 +86,9 @@ def _of_file(part: str, file: DescribedFile) -> Iterator[Finding]:
     if file.size_bytes == 0:
         yield _finding(part, FindingCode.EMPTY, "the file is empty.", "Send a file with content.")
         return
-    yield from _found(FindingCode.ENDING, lambda: checked_suffix(part, file.suffix))
+    if wrong := list(_found(FindingCode.ENDING, lambda: checked_suffix(part, file.suffix))):
+        yield from wrong  # what it holds is judged once it is a file of a kind that may hold it
+        return
     yield from _found(FindingCode.TOO_LARGE, lambda: check_part_size(part, file.size_bytes))
     head = bytes.fromhex(file.head)
     if part == "calibration" or not head:

@@ -52,8 +52,9 @@ export class Announcer {
     this.#showTitle(null);
   }
 
-  /** @param {Map<string, Job>} byId @param {string | null} viewed */
-  refresh(byId, viewed) {
+  /** @param {Map<string, Job>} byId @param {Set<string>} gone ids of jobs that are no more @param {string | null} viewed */
+  refresh(byId, gone, viewed) {
+    if (this.pending.some((id) => gone.has(id))) this.#keep(this.pending.filter((id) => !gone.has(id)));
     for (const id of this.pending) {
       const job = byId.get(id);
       if (job && isOver(job)) this.#end(job);

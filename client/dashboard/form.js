@@ -63,6 +63,7 @@ export class ClipForm {
   allow(scopes) {
     this.isAllowed = scopes.known === null || scopes.has("reconstruct");
     this.refusal.hidden = this.isAllowed;
+    this.form.classList.toggle("refused", !this.isAllowed);
     this.#showSubmit();
     const high = [...this.form.elements.priority.options].find((option) => option.value === "high");
     high.disabled = scopes.known !== null && !scopes.has("priority");
@@ -135,7 +136,7 @@ export class ClipForm {
     document.addEventListener("dragleave", (event) => hold(event, false));
     document.addEventListener("drop", (event) => {
       hold(event, false);
-      if (this.form.contains(event.target)) this.take([...event.dataTransfer.files]);
+      if (this.isAllowed && this.form.contains(event.target)) this.take([...event.dataTransfer.files]);
     });
   }
 

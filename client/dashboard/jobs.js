@@ -56,6 +56,10 @@ export class Jobs {
     this.next = null;
     /** @type {Set<string>} ids of jobs that stay known though they are not among the newest */
     this.kept = new Set();
+    /** @type {string[]} ids of jobs that somebody waits for, whatever the list holds */
+    this.awaited = [];
+    /** @type {Set<string>} ids of jobs that are no more, or not this key's */
+    this.gone = new Set();
     /** @type {string | null} the job in view */
     this.viewed = null;
     /** @type {Map<string, Scores>} */
@@ -95,6 +99,7 @@ export class Jobs {
 
   /** @param {string} id of a job that was purged */
   forget(id) {
+    this.gone.add(id);
     this.byId.delete(id);
     this.kept.delete(id);
     this.newest = this.newest.filter((each) => each !== id);
@@ -131,6 +136,7 @@ export class Jobs {
     this.followed.clear();
     this.byId.clear();
     this.kept.clear();
+    this.gone.clear();
     this.newest = [];
     this.next = null;
     this.scores.clear();
@@ -142,6 +148,7 @@ export class Jobs {
   #replace(jobs, askedAt) {
     this.newest = jobs.map((job) => job.id);
     for (const job of jobs) {
+      this.gone.delete(job.id);
       const known = this.byId.get(job.id);
       const isOlder = known && (this.told.get(job.id) ?? 0) > askedAt;
       if (!isOlder) this.byId.set(job.id, { ...job, ...positionIn(known, job) });
@@ -152,9 +159,9 @@ export class Jobs {
     this.onChange();
   }
 
-  /** Forget what is neither among the newest, nor kept, nor in view. */
+  /** Forget what is neither among the newest, nor kept, nor awaited, nor in view. */
   #prune() {
-    const wanted = new Set([...this.newest, ...this.kept, this.viewed]);
+    const wanted = new Set([...this.newest, ...this.kept, ...this.awaited, this.viewed]);
     for (const known of [this.byId, this.scores, this.told]) {
       for (const id of known.keys()) if (!wanted.has(id)) known.delete(id);
     }
@@ -184,21 +191,23 @@ export class Jobs {
   }
 
   /**
-   * One job a round is asked for by itself: the one in view if nothing is known of it, or one of those that neither events
-   * nor the list tell of. (The list tells no positions.)
+   * One job a round is asked for by itself: the one in view or one that is awaited if nothing is known of it, or one of
+   * those that neither events nor the list tell of. (The list tells no positions.)
    */
   async #askForOne() {
     const isUntold = (job) => job.state === "queued" || (job.state === "running" && !this.newest.includes(job.id));
     const untold = [...this.byId.values()].filter((job) => isUntold(job) && !this.followed.has(job.id)).map((job) => job.id);
-    if (this.viewed !== null && !this.byId.has(this.viewed)) untold.unshift(this.viewed);
+    const isUnknown = (id) => id !== null && !this.byId.has(id) && !this.gone.has(id);
+    untold.unshift(...new Set([this.viewed, ...this.awaited].filter(isUnknown)));
     if (untold.length === 0) return;
     const id = untold[this.round % untold.length];
     try {
       const job = await getJob(id);
-      if (this.byId.has(id) || id === this.viewed) this.byId.set(id, job);
+      if (this.byId.has(id) || id === this.viewed || this.awaited.includes(id)) this.byId.set(id, job);
     } catch (error) {
       if (error.status !== 404) throw error;
       this.byId.delete(id);
+      this.gone.add(id);
     }
     this.onChange();
   }

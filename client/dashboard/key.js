@@ -8,19 +8,32 @@ export const keyEvents = new EventTarget();
 /** @returns {string | null} */
 export const currentKey = () => sessionStorage.getItem(NAME);
 
+let isMissing = false;
+
+/** @returns {boolean} whether the service wants a key, or another one than the page has */
+export const isKeyMissing = () => isMissing;
+
+function tellChange() {
+  isMissing = false;
+  keyEvents.dispatchEvent(new Event("changed"));
+}
+
 /** @param {string} text */
 function keepKey(text) {
   sessionStorage.setItem(NAME, text);
-  keyEvents.dispatchEvent(new Event("changed"));
+  tellChange();
 }
 
 function forgetKey() {
   sessionStorage.removeItem(NAME);
-  keyEvents.dispatchEvent(new Event("changed"));
+  tellChange();
 }
 
 /** @param {string} words why it is asked for */
-export const askForKey = (words) => keyEvents.dispatchEvent(new CustomEvent("missing", { detail: words }));
+export function askForKey(words) {
+  isMissing = true;
+  keyEvents.dispatchEvent(new CustomEvent("missing", { detail: words }));
+}
 
 /** @returns {Record<string, string>} */
 export function keyHeaders() {

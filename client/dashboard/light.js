@@ -48,10 +48,14 @@ export function trustOf({ scored, psnr_tissue_db: db, warnings }) {
   return { light: some.length > 0 ? "care" : "good", reasons };
 }
 
-/** @param {Trust} trust @returns {string[]} why, in plain words */
-export function reasonsOf({ light, reasons }) {
+/**
+ * @param {Trust} trust
+ * @param {(notice: import("./wire.js").Notice) => string} wordsOf a reason
+ * @returns {string[]} why, in plain words
+ */
+export function reasonsOf({ light, reasons }, wordsOf = noticeWords) {
   if (light === "bad" && reasons.length === 0) return [words("light.not_measured")];
-  return [...new Set(reasons.map(noticeWords))];
+  return [...new Set(reasons.map(wordsOf))];
 }
 
 /** @param {Light} light @returns {HTMLElement} shape and word */

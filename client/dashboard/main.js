@@ -157,7 +157,12 @@ function showJobs() {
   scopes.refresh();
   form.allow(scopes);
   sceneImport.allow(scopes);
-  announcer.refresh(jobs.byId, viewer.scene);
+  jobs.awaited = announcer.pending;
+  announcer.refresh(jobs.byId, jobs.gone, viewer.scene);
+  if (jobs.gone.has(awaited)) {
+    awaited = null;
+    if (!viewer.scene) viewer.open(null, words("page.deleted"));
+  }
   offerMasks();
   shelf.refresh();
   list.show(shelf.shown, viewer.scene);

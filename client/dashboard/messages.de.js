@@ -209,7 +209,7 @@ export const DE = {
     "automatic": "wo es schnell geht",
     "always": "wo immer es geht",
     "never": "nie",
-    "figures": "{rate} Bilder/s von {width} × {height}; Millisekunden: Entpacken {decode}, Bewegung {deform}, Sortieren {sort}, Zeichnen {draw}. {gpu}"
+    "figures": "{width} × {height}; Millisekunden: Entpacken {decode}, Bewegung {deform}, Sortieren {sort}, Zeichnen {draw}. {gpu}"
   },
   "light": {
     "good": "Gut",
@@ -254,6 +254,7 @@ export const DE = {
     "leave": "Lassen, wie es war",
     "search": "Nach Namen suchen",
     "none": "Noch keine.",
+    "no_key": "Für die Szenen wird ein Schlüssel gebraucht. Geben Sie ihn oben ein.",
     "none_found": "Unter diesem Namen wurde nichts gefunden.",
     "more": "Mehr zeigen"
   },
@@ -322,8 +323,10 @@ export const DE = {
     "masks": "Instrumente bedeckten {share} des Bildes und sind weggelassen.",
     "no_masks": "Instrumente sind nicht markiert und gelten als Gewebe.",
     "camera_fixed": "Das Endoskop ruhte.",
+    "camera_fixed_or_tissue": "Das Endoskop wurde als ruhend angenommen; vielleicht bewegte es sich anstelle des Gewebes.",
     "camera_given": "Das Endoskop bewegte sich, wie der Clip sagt.",
     "camera_estimated": "Das Endoskop bewegte sich insgesamt um etwa {mm} mm.",
+    "camera_estimated_or_tissue": "Das Endoskop bewegte sich wohl um etwa {mm} mm; ein Teil davon ist vielleicht Bewegung des Gewebes.",
     "more_reasons": "{count} weitere unter den Einzelheiten.",
     "tested_here": "Geprüft wurde es von dort, wo das Endoskop war. Ansichten von daneben wurden nicht geprüft. Messen Sie damit keine Anatomie aus.",
     "tested_beside": "Geprüft wurde es von beiden Augen des Endoskops. Ansichten von weiter daneben wurden nicht geprüft. Messen Sie damit keine Anatomie aus.",

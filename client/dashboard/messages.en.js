@@ -209,7 +209,7 @@ export const EN = {
     "automatic": "where it is fast",
     "always": "wherever it can",
     "never": "never",
-    "figures": "{rate} pictures/s of {width} × {height}; milliseconds: decoding {decode}, motion {deform}, sorting {sort}, drawing {draw}. {gpu}"
+    "figures": "{width} × {height}; milliseconds: decoding {decode}, motion {deform}, sorting {sort}, drawing {draw}. {gpu}"
   },
   "light": {
     "good": "Good",
@@ -254,6 +254,7 @@ export const EN = {
     "leave": "Leave it as it was",
     "search": "Search by name",
     "none": "None yet.",
+    "no_key": "A key is needed to see the scenes. Enter it above.",
     "none_found": "Nothing of this name was found.",
     "more": "Show more"
   },
@@ -322,8 +323,10 @@ export const EN = {
     "masks": "Instruments covered {share} of the picture and are left out.",
     "no_masks": "Instruments are not marked, and count as tissue.",
     "camera_fixed": "The endoscope rested.",
+    "camera_fixed_or_tissue": "The endoscope was taken to rest; it may have moved instead of the tissue.",
     "camera_given": "The endoscope moved as the clip says.",
     "camera_estimated": "The endoscope moved by about {mm} mm in all.",
+    "camera_estimated_or_tissue": "The endoscope seems to have moved by about {mm} mm in all; some of it may be the tissue's movement.",
     "more_reasons": "{count} more under the details.",
     "tested_here": "It was tested from where the endoscope was. Views from beside it were not tested. Do not measure anatomy with it.",
     "tested_beside": "It was tested from both eyes of the endoscope. Views from farther beside were not tested. Do not measure anatomy with it.",

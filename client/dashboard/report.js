@@ -5,7 +5,7 @@ import { download } from "./downloads.js";
 import { button, element } from "./element.js";
 import { figuresOf, percent } from "./figures.js";
 import { lightMark, reasonsOf, trustOf } from "./light.js";
-import { figure, words } from "./messages.js";
+import { figure, noticeWords, words } from "./messages.js";
 
 /** @typedef {import("./wire.js").Report} Report */
 
@@ -14,6 +14,14 @@ const areFound = (masks) => masks?.source === "found" || masks?.source === "segm
 
 /** More reasons for care than these are under "details". */
 const MAX_REASONS = 3;
+
+/** Whether a notice doubts what the report says of the endoscope's movement. @param {Report} report */
+const doubtsCamera = ({ poses }) => ({ code }) =>
+  (code === "camera_or_tissue" && poses?.source !== "given") || (code === "poses_unsure" && poses?.source === "fixed");
+
+/** Whether and how far the endoscope moved. @param {NonNullable<Report["poses"]>} poses @param {boolean} isDoubted */
+const cameraWords = ({ source, path_mm: mm }, isDoubted) =>
+  words(`report.camera_${source}${isDoubted ? "_or_tissue" : ""}`, { mm: figure(mm ?? 0) });
 
 /** What can be trusted, a sentence each, in mm, seconds and shares of the picture. @param {Report} report */
 function trusted(report) {
@@ -24,14 +32,14 @@ function trusted(report) {
   sentences.push(words(isMeasured ? "report.depth" : "report.no_depth", { mm: figure(depth_mm ?? 0, 1) }));
   if (Number.isFinite(coverage)) sentences.push(words("report.covered", { share: percent(coverage) }));
   if (masks) sentences.push(words(masks.source === "none" ? "report.no_masks" : "report.masks", { share: percent(masks.share) }));
-  if (poses?.source === "estimated") sentences.push(words("report.camera_estimated", { mm: figure(poses.path_mm ?? 0) }));
-  else if (poses) sentences.push(words(`report.camera_${poses.source}`));
+  if (poses && !report.warnings.some(doubtsCamera(report))) sentences.push(cameraWords(poses, false));
   return sentences;
 }
 
 /** Why to be careful, the worst first. @param {Report} report @param {import("./light.js").Trust} trust @returns {Node[]} */
 function careful(report, trust) {
-  const reasons = reasonsOf(trust);
+  const isDoubt = doubtsCamera(report);
+  const reasons = reasonsOf(trust, (notice) => (report.poses && isDoubt(notice) ? cameraWords(report.poses, true) : noticeWords(notice)));
   const more = reasons.length - MAX_REASONS;
   const shown = reasons.length > 0 ? [listOf(reasons.slice(0, MAX_REASONS), "reasons")] : [];
   if (more > 0) shown.push(element("p", { class: "quiet", text: words("report.more_reasons", { count: more }) }));

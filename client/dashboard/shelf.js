@@ -2,7 +2,7 @@
 // what its report says in short.
 
 import { listJobs, listScenes } from "./api.js";
-import { keyEvents } from "./key.js";
+import { isKeyMissing, keyEvents } from "./key.js";
 import { PAGE_SIZE } from "./jobs.js";
 import { words } from "./messages.js";
 import { showProblem } from "./problem.js";
@@ -35,6 +35,7 @@ export class Shelf {
       this.timer = setTimeout(() => this.#startAnew(), TYPING_MS);
     });
     more.addEventListener("click", () => this.#addPage());
+    keyEvents.addEventListener("missing", onChange);
     keyEvents.addEventListener("changed", () => {
       search.value = "";
       this.summaries.clear();
@@ -50,6 +51,7 @@ export class Shelf {
 
   /** @returns {string} what to say where no job is shown; empty while it is not known yet */
   get nothing() {
+    if (isKeyMissing()) return words("label.no_key");
     if (!this.#isSearch) return words("label.none");
     return this.next === undefined ? "" : words("label.none_found");
   }

@@ -87,14 +87,22 @@ export class Timeline {
     speed.selectedIndex = Math.min(SPEEDS.length - 1, Math.max(0, speed.selectedIndex + steps));
   }
 
-  /** Let the loop begin here. */
+  /** Let the loop begin here; end here, if it is to end before. After a loop that ends before, a new one begins. */
   startLoop() {
-    this.#loop(this.frame, this.last > this.frame ? this.last : this.count - 1);
+    const { frame, first, last } = this;
+    if (frame === last) return; // a loop of one frame is none
+    if (frame < last) this.#loop(frame, last);
+    else if (first === 0) this.#loop(last, frame);
+    else this.#loop(frame, this.count - 1);
   }
 
-  /** Let the loop end here. */
+  /** Let the loop end here; begin here, if it is to begin later. Before a loop that begins later, a new one ends. */
   endLoop() {
-    this.#loop(this.first < this.frame ? this.first : 0, this.frame);
+    const { frame, first, last } = this;
+    if (frame === first) return;
+    if (frame > first) this.#loop(first, frame);
+    else if (last === this.count - 1) this.#loop(frame, first);
+    else this.#loop(0, frame);
   }
 
   /** Let the loop be the whole clip. */

@@ -83,6 +83,7 @@ export class Viewer extends EventTarget {
   open(scene, message = words(scene ? "screen.rendering" : "page.choose")) {
     this.scene = scene;
     this.visit += 1;
+    this.way.begin();
     this.pictures.giveUp(); // the other scene's
     this.memory.open(scene);
     this.orbit.goHome();
@@ -239,12 +240,12 @@ export class Viewer extends EventTarget {
   #tell(name, picture, tookMs) {
     const server = Number.isFinite(picture.totalMs) ? ` (${words("readout.service", { ms: figure(picture.totalMs) })})` : "";
     const { rate } = this.pace;
-    const pace = rate >= 1 ? [words("readout.rate", { rate: figure(rate) })] : [];
+    const pace = rate >= 1 && this.timeline.isPlaying ? [words("readout.rate", { rate: figure(rate) })] : [];
     const unseen = picture.unseen >= 0.005 ? [words("readout.unseen", { share: figure(100 * picture.unseen) })] : [];
     const took = `${figure(tookMs)} ms${server}`;
     this.parts.readout.textContent = [name, ...unseen, took, ...pace, words(`readout.${picture.way}`)].join(" · ");
     this.#tellWay();
-    this.way.tellFigures({ rate, camera: picture.camera });
+    this.way.tellFigures(pace, picture.camera);
   }
 
   #fail(error) {

@@ -13,6 +13,7 @@ export class Way {
    */
   constructor(target, memory, onOpen) {
     Object.assign(this, { target, memory });
+    this.begin();
     this.summary = element("summary");
     this.reason = element("p");
     this.choice = element("select");
@@ -33,9 +34,18 @@ export class Way {
     return this.target.open;
   }
 
+  /** Another scene was chosen: who draws it is decided anew, and how soon is kept beside the answer (data-decided-ms). */
+  begin() {
+    this.begunAt = performance.now();
+    delete this.target.dataset.decidedMs;
+  }
+
   /** @param {string | null} why the service draws, a code; null: this browser does */
   tell(why) {
     const { step, share } = this.memory;
+    const { dataset } = this.target;
+    const isNew = dataset.decidedMs === undefined || dataset.why !== (why ?? "");
+    if (isNew) dataset.decidedMs = (performance.now() - this.begunAt).toFixed(1);
     this.target.dataset.way = why === null ? "memory" : "service";
     this.target.dataset.why = why ?? "";
     const title = why === null ? "way.here" : "way.there";
@@ -44,15 +54,15 @@ export class Way {
     if (why !== null) setText(this.figures, "");
   }
 
-  /** @param {{rate: number, camera: import("./stream.js").Camera}} drawn pictures a second, and the last one's camera */
-  tellFigures({ rate, camera }) {
+  /** @param {string[]} pace how fast pictures come, while they do @param {import("./stream.js").Camera} camera of the last */
+  tellFigures(pace, camera) {
     const { player } = this.memory;
     if (!player || !this.isOpen) return;
     const ms = (value) => (value === undefined ? "–" : figure(value, value < 10 ? 1 : 0));
     const { decodeMs, packMs, deformMs, sortMs, drawMs } = player.times;
     const times = { decode: ms(decodeMs + packMs), deform: ms(deformMs), sort: ms(sortMs), draw: ms(drawMs) };
     const size = { width: camera.width, height: camera.height, gpu: graphics().name };
-    setText(this.figures, words("way.figures", { rate: figure(rate), ...times, ...size }));
+    setText(this.figures, [...pace, words("way.figures", { ...times, ...size })].join("; "));
   }
 
   #word() {

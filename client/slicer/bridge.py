@@ -136,6 +136,7 @@ class Bridge:
             self._pose = None
         elif (t := _time_of(words)) is not None:
             self._playback.stand_at(t)
+            self._status.refused = self._playback.note_on(t)
         else:
             self._status.refused = f"{words[:40]!r} is no command. Send play, pause, t=0.4 or endoscope."
         self._tell()

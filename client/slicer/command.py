@@ -89,6 +89,8 @@ async def _run(options: argparse.Namespace, choice: Choice, end: threading.Event
     async with intrasplat_client.AsyncClient(options.url, api_key=options.api_key, patience_s=PATIENCE_S) as client:
         report = await client.report(choice.scene, scores_within_s=0)
         playback = Playback(report.frame_times_s, options.t)
+        if options.t is not None and (note := playback.note_on(options.t)):
+            say(f"warning: {note}")
         bridge = Bridge(client, choice, playback, Status(playback, report))
         carrying = asyncio.create_task(_carry(bridge, options))
         showing = asyncio.create_task(bridge.run(end))

@@ -61,3 +61,11 @@ class Playback:
     def stand_at(self, t: float) -> None:
         """Show the frame nearest to a model time and stay there."""
         self._standing = min(max(round(t * self.frame_count), 0), self.frame_count - 1)
+
+    def note_on(self, t: float) -> str:
+        """What to say of a model time that is asked for; empty where the clip has it."""
+        if 0 <= t <= 1:
+            return ""
+        return (
+            f"t={t:g} is outside the clip, which lasts from 0 to 1: its {'first' if t < 0 else 'last'} frame is shown."
+        )

@@ -38,6 +38,11 @@ class Drawn(Page):
         found = self.script("const { way, why } = document.querySelector('#way').dataset; return [way, why]")
         return found[0], found[1]
 
+    @property
+    def decided_ms(self) -> float:
+        """How soon after the scene was chosen it was settled who draws."""
+        return float(self.script("return document.querySelector('#way').dataset.decidedMs"))
+
     def until_way(self, *way: str) -> None:
         self.until(lambda: self.way == way)
 

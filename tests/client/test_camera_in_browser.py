@@ -161,6 +161,42 @@ def test_speed_is_chosen_by_keys_and_a_part_is_repeated_and_seen_on_the_slider(p
     assert not page.find("#loop").is_displayed()
 
 
+LOOP = """
+const track = document.querySelector("#loop").style;
+return ["--first", "--last"].map((name) => Math.round(39 * Number(track.getPropertyValue(name))));
+"""
+
+
+@pytest.mark.parametrize(
+    ("marks", "part"),
+    [
+        ([(20, "a"), (10, "b")], [10, 20]),
+        ([(10, "b"), (20, "a")], [10, 20]),
+        ([(10, "a"), (20, "b"), (30, "a")], [30, 39]),
+        ([(10, "a"), (20, "b"), (5, "b")], [0, 5]),
+        ([(10, "a"), (10, "b")], [10, 39]),
+    ],
+)
+def test_marks_set_the_other_way_round_are_swapped_and_beyond_a_part_a_new_one_begins(
+    page: Page, scene: str, marks: list[tuple[int, str]], part: list[int]
+) -> None:
+    for frame, key in marks:
+        page.script(
+            "const time = document.querySelector('#time');"
+            "time.value = arguments[0]; time.dispatchEvent(new Event('input'))",
+            frame,
+        )
+        page.find("#stage").send_keys(key)
+    assert page.script(LOOP) == part
+
+
+def test_a_page_that_rests_names_no_pictures_a_second(page: Page, scene: str) -> None:
+    page.click("#play")
+    page.until_text("#readout", "pictures/s")
+    page.click("#play")
+    page.until(lambda: "pictures/s" not in page.text("#readout"))
+
+
 def test_turning_takes_more_and_more_beyond_what_the_clip_taught_and_ends_at_60_degrees(page: Page, scene: str) -> None:
     stage = page.find("#stage")
     stage.send_keys(*[Keys.ARROW_LEFT] * 6)  # 3 degrees each

@@ -101,6 +101,7 @@ def test_without_a_graphics_processor_the_service_draws_and_the_page_says_so(sit
     assert say("way.there") in page.text("#way")
     assert say("way.why_software") in page.text("#way")
     page.until_text("#readout", say("readout.stream"))
+    assert page.decided_ms > 0.0
 
 
 def test_a_browser_without_webgl_leaves_drawing_to_the_service(site: Site) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 
 from contract.wire.notices import Notice, NoticeCode
@@ -52,6 +54,19 @@ def test_the_first_layer_says_in_mm_and_seconds_what_can_be_trusted(site: Site, 
     assert page.script(LINES, "reasons") == []
     assert say("report.tested_beside") in page.text("#report")
     assert "dB" not in page.text("#report")
+
+
+@pytest.mark.parametrize(
+    ("source", "code"),
+    [("fixed", "camera_or_tissue"), ("fixed", "poses_unsure"), ("estimated", "camera_or_tissue")],
+)
+def test_a_doubt_about_the_endoscopes_movement_and_what_was_taken_for_it_are_one_sentence(
+    site: Site, page: Page, source: Literal["fixed", "estimated"], code: str
+) -> None:
+    poses, warning = CameraPoses(source=source, path_mm=12.3), Notice.warning(NoticeCode(code), "GET /x")
+    show(site, page, GOOD.model_copy(update={"poses": poses, "warnings": (warning,)}))
+    assert page.script(LINES, "reasons") == [say(f"report.camera_{source}_or_tissue", mm="12")]
+    assert say(f"report.camera_{source}", mm="12") not in page.script(LINES, "trusted")
 
 
 def test_only_the_worst_reasons_are_in_the_first_layer_and_all_are_in_the_second(site: Site, page: Page) -> None:

@@ -213,6 +213,19 @@ def test_a_job_that_was_watched_is_found_again_after_a_reload(site: Site, page: 
     page.until(lambda: page.script("return document.title") == "intrasplat")
 
 
+def test_a_job_that_somebody_else_deletes_is_forgotten(site: Site, page: Page) -> None:
+    page.choose("clip", CLIP)
+    page.click("#upload [type=submit]")
+    page.until(lambda: page.script("return sessionStorage.getItem('intrasplat-sent')"))
+    site.queue.fail(site.claim(), JobError(code=ErrorCode.FAULT, problem="It broke."))
+    (record,) = site.queue.records()
+    page.driver.get("about:blank")
+    site.queue.forget(record.job_id)
+    page.open()
+    page.until(lambda: page.script("return sessionStorage.getItem('intrasplat-sent')") is None)
+    page.until_text("#stage-message", say("page.deleted"))
+
+
 def test_progress_and_failure_are_in_view_while_another_scene_is_looked_at(site: Site, page: Page) -> None:
     scene = site.scene()
     page.choose("clip", CLIP)
@@ -271,10 +284,11 @@ def test_a_key_that_may_not_send_is_told_so_and_asks_for_nothing_that_is_refused
         page = Page(driver, site.url)
         page.open()
         page.until(lambda: page.find("#key-text").is_displayed())
+        page.until(lambda: page.text("#no-jobs") == say("label.no_key"))
         page.find("#key-text").send_keys(viewing, Keys.ENTER)
+        page.until(lambda: page.text("#no-jobs") == say("label.none"))
         page.show("drawer")
-        page.until_text("#upload", say("upload.not_allowed"))
-        assert not page.find("#upload [type=submit]").is_enabled()
+        page.until(lambda: page.text("#upload") == say("upload.not_allowed"))  # nothing else is offered
         page.show("library")
         page.click("#forget-key")
         page.until(lambda: page.find("#key-text").is_displayed())

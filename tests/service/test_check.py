@@ -82,6 +82,8 @@ def test_nothing_speaks_against_a_clip_with_the_calibration_of_its_eyes(service:
     ("part", "changes", "code", "refused"),
     [
         ("clip", {"suffix": ".avi"}, "ending", True),
+        ("clip", {"suffix": ".avi", "head": b"RIFF film".hex()}, "ending", True),
+        ("calibration", {"suffix": ".pdf", "text": "\0"}, "ending", True),
         ("clip", {"size_bytes": 0}, "empty", True),
         ("clip", {"size_bytes": 10**15}, "too_large", True),
         ("clip", {"head": b"no film at all".hex()}, "kind", True),

@@ -18,11 +18,14 @@ void main() { made = vec4(exp(-fract(gl_FragCoord.x * 0.01)) * 0.01); }`;
  * @typedef {{canDraw: boolean, isFast: boolean, name: string, why: "no_webgl"|"no_floats"|"software"|""}} Graphics
  */
 
-/** @type {Graphics | null} */
+/** @type {Graphics & {tookMs: number} | null} */
 let found = null;
 
-/** What this browser draws with, found out once. @returns {Graphics} */
-export const graphics = () => (found ??= look());
+/** What this browser draws with, found out once, and how long that took. @returns {Graphics & {tookMs: number}} */
+export function graphics() {
+  const began = performance.now();
+  return (found ??= { ...look(), tookMs: performance.now() - began });
+}
 
 /** @returns {Graphics} */
 function look() {

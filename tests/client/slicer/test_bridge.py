@@ -142,6 +142,11 @@ def test_commands_play_pause_and_choose_a_moment(standing: Peer) -> None:
     standing.until_status("standing")
     standing.send("t = 0.5")
     standing.until_status(f"frame {FRAME}", "standing")
+    for beyond, frame in ((1.5, FRAMES - 1), (-0.5, 0)):
+        standing.send(f"t={beyond}")
+        standing.until_status(f"t={beyond:g} is outside the clip", f"frame {frame} of", "standing")
+    standing.send("t=1")
+    assert "outside" not in standing.until_status(f"frame {FRAMES - 1} of")
     standing.send("faster")
     standing.until_status("'faster' is no command")
 
@@ -239,4 +244,10 @@ def test_a_bridge_that_cannot_start_says_why(site: Site, scene: str, case: str, 
 def test_a_port_for_other_machines_comes_with_a_warning(site: Site, scene: str) -> None:
     with bridge(scene, "--url", site.url, "--port", "0", "--host", "0.0.0.0") as running:
         until(lambda: "neither keys nor encryption" in running.said)
+        assert running.end() == 0
+
+
+def test_a_moment_outside_the_clip_is_told_where_it_was_asked_for(site: Site, scene: str) -> None:
+    with bridge(scene, "--url", site.url, "--port", "0", "--t", "1.5") as running:
+        until(lambda: "t=1.5 is outside the clip" in running.said)
         assert running.end() == 0
