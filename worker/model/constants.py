@@ -11,7 +11,7 @@ import math
 NEAR = 0.2
 """Units of depth; the projection of anything nearer is unbounded."""
 EPS2D = 0.3
-"""Pixels^2 added to both variances on the image: no Gaussian is thinner than about a pixel."""
+"""Pixels^2 of the recording added to both variances on the image: no Gaussian is thinner than about a pixel."""
 IMAGE_MARGIN = 0.15
 """Share of the image's size by which a centre may lie outside before J is taken at the margin instead: far outside,
 the linear projection would smear the Gaussian over the whole image."""

@@ -19,7 +19,9 @@ COLOUR_CHANNELS = GLOSS_ROW  # of a motion that moves the colour, too
 ROWS = OPACITY_ROW
 VALUES = OPACITY_ROW + 1
 
-# A camera vector [CAMERA]: intrinsics in pixels, the image's size, what it sees of the gloss
-# (worker/raster/__init__.py), camera_from_world [3, 4] row-major
-FX, FY, CX, CY, WIDTH, HEIGHT, SIDE, DIM, POSE = range(9)
+# A camera vector [CAMERA]: intrinsics in pixels, the image's size, what it sees of the gloss, what it enlarges along x
+# and y, the recording's depth [4] (worker/raster/__init__.py), camera_from_world [3, 4] row-major
+FX, FY, CX, CY, WIDTH, HEIGHT, SIDE, DIM, ENLARGED = range(9)
+RECORDED = ENLARGED + 2
+POSE = RECORDED + 4
 CAMERA = POSE + 12

@@ -15,7 +15,8 @@ Projection. (x, y, z) = camera_from_world mean; R, S rotation and scale; W the r
     J      = [[fx / z, 0, -fx u / z], [0, fy / z, -fy v / z]]
              u = x / z clamped to [-(cx + margin) / fx, (W - cx + margin) / fx], margin = IMAGE_MARGIN W
              v = y / z clamped likewise, with H, fy, cy
-    cov2d  = J W Sigma W^T J^T + 0.3 I (EPS2D, pixels^2);  conic = cov2d^-1
+    cov2d  = J W Sigma W^T J^T + 0.3 diag(m_x^2, m_y^2) (EPS2D, pixels^2);  conic = cov2d^-1
+    m_x    = max(1, e_x z_r / z), e = Camera.enlarged, z_r = Camera.recorded_depth (mean, 1); m_y likewise
 
 Cull. A Gaussian draws nothing where z <= NEAR or opacity < 1/255, or where no pixel centre of the image can reach
 alpha >= 1/255: a bound that only saves work and never changes a pixel.
@@ -29,8 +30,8 @@ Blend. d = pixel centre - mean2d, front to back from T = 1 at every pixel:
     rgb = sum w colour;  depth = sum w z;  alpha = sum w          no background: what nothing covers is black
 
 Gradients reach mean, quaternion, scale, opacity, colour and camera_from_world (if it is a tensor that asks), depth's
-also z. They are 0 through a clamped u or v (the rest of J keeps its own), through alpha at MAX_ALPHA, and through the
-cuts and the order; a culled Gaussian gets 0, and so does the last row of camera_from_world.
+also z. They are 0 through a clamped u or v (the rest of J keeps its own), through m_x and m_y, through alpha at
+MAX_ALPHA, and through the cuts and the order; a culled Gaussian gets 0, and so does the last row of camera_from_world.
 
 N = 0 and a scene without a visible Gaussian render black, with zero gradients. Inputs must be finite.
 No backend may hold an array of N x H x W.
@@ -55,6 +56,8 @@ class Camera:
     camera_from_world is [4, 4] float64, rigid, translation in optimiser units; a tensor where its gradient is wanted.
     side and dim say what it sees of the gloss g of a Gaussian (worker/model/gaussians.py): the colour gains side g and
     loses dim |g|. The left eye has side -1/2, the right eye 1/2. The rasteriser gets colours that have it already.
+    enlarged and recorded_depth say how large a pixel of the recording is (docs/rasterizer.md): by how much the focal
+    lengths exceed the recording's, and the third row of the recording's camera_from_world. By default it is a pixel.
     """
 
     fx: float
@@ -66,6 +69,8 @@ class Camera:
     camera_from_world: NDArray[np.float64] | Tensor
     side: float = 0.0
     dim: float = 0.0
+    enlarged: tuple[float, float] = (0.0, 0.0)
+    recorded_depth: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1 or min(self.fx, self.fy) <= 0:

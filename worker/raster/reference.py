@@ -95,13 +95,22 @@ def project(mean: Tensor, quaternion: Tensor, scale: Tensor, opacity: Tensor, ca
     half = pose[:3, :3] @ rotation(quaternion) * scale[:, None, :]  # W R S: [N, 3, 3]
     on_image = projection_jacobian(x / z, y / z, z, camera) @ half  # [N, 2, 3]
     covariance = on_image @ on_image.transpose(1, 2)
-    xx, xy, yy = covariance[:, 0, 0] + EPS2D, covariance[:, 0, 1], covariance[:, 1, 1] + EPS2D
+    low_x, low_y = _low_pass(mean.detach(), z.detach(), camera)
+    xx, xy, yy = covariance[:, 0, 0] + low_x, covariance[:, 0, 1], covariance[:, 1, 1] + low_y
     determinant = xx * yy - xy * xy
     conic = torch.stack([yy, -xy, xx], dim=-1) / determinant[:, None]
 
     half_extent = _half_extent(xx.detach(), yy.detach(), opacity.detach())
     visible = in_front & (opacity >= MIN_ALPHA) & _meets_image(mean2d.detach(), half_extent, camera)
     return Projected(mean2d, conic, depth, opacity, half_extent, visible)
+
+
+def _low_pass(mean: Tensor, z: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """What is added to the variances along x and y, [N] each."""
+    row = mean.new_tensor(camera.recorded_depth)
+    nearer = (mean @ row[:3] + row[3]) / z
+    x, y = (EPS2D * torch.clamp(enlarged * nearer, min=1.0) ** 2 for enlarged in camera.enlarged)
+    return x, y
 
 
 def rotation(quaternion: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ def camera_vector(camera: Camera) -> NDArray[np.float64]:
     matrix = given.detach().double().cpu().numpy() if isinstance(given, torch.Tensor) else given
     pose = np.asarray(matrix, np.float64)[:3].ravel()
     intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
-    return np.concatenate([intrinsics, [camera.side, camera.dim], pose])
+    return np.concatenate([intrinsics, [camera.side, camera.dim], camera.enlarged, camera.recorded_depth, pose])
 
 
 def image_size(camera: NDArray[np.float64]) -> tuple[int, int]:

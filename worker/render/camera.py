@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from contract.wire.report import RightEye
 from worker.input.camera import Intrinsics
+from worker.raster import Camera
 from worker.raster.step import camera_vector
 from worker.scene.scene import Scene
 from worker.train.targets import camera_in_units
@@ -53,7 +54,30 @@ def view_camera(
 ) -> NDArray[np.float64]:
     """The camera vector (worker/raster/step.py) of a view [4, 4] mm at model time t."""
     side, dim = gloss_seen(scene, t, world_from_camera[:3, 3], highlights=highlights)
-    return camera_vector(camera_in_units(intrinsics, world_from_camera, scene.units_per_mm, side, dim))
+    camera = camera_in_units(intrinsics, world_from_camera, scene.units_per_mm, side, dim)
+    return camera_vector(_as_enlarged(camera, scene, t, world_from_camera, intrinsics))
+
+
+def _as_enlarged(
+    camera: Camera, scene: Scene, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
+) -> Camera:
+    """The camera, told by how much it enlarges the recording (docs/rasterizer.md, "Pixels of the recording")."""
+    own, recorder = scene.intrinsics, nearest_recorder(scene, t, world_from_camera[:3, 3])
+    enlarged = intrinsics.fx / own.fx, intrinsics.fy / own.fy
+    if np.array_equal(recorder[:3, 2:], world_from_camera[:3, 2:]) and max(enlarged) <= 1:
+        return camera  # to the last bit what training saw
+    x, y, z = recorder[:3, 2].tolist()
+    origin = -float(recorder[:3, 2] @ recorder[:3, 3]) * scene.units_per_mm
+    return dataclasses.replace(camera, enlarged=enlarged, recorded_depth=(x, y, z, origin))
+
+
+def nearest_recorder(scene: Scene, t: float, centre_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """world_from_camera [4, 4] (mm) of the endoscope, at model time t or at a trained frame, where it was nearest to a
+    place [3]."""
+    own, trained = endoscope_pose(scene, t), scene.world_from_camera[scene.trained_frames]
+    apart_mm = np.linalg.norm(trained[:, :3, 3] - centre_mm, axis=1)
+    nearest = int(apart_mm.argmin())
+    return own if np.linalg.norm(own[:3, 3] - centre_mm) <= apart_mm[nearest] else np.array(trained[nearest])
 
 
 def gloss_seen(

@@ -35,7 +35,7 @@ class DepthRange:
 
     @classmethod
     def of(cls, scene: Scene, model: Model) -> Self:
-        frames = spread([round(t * scene.frame_count) for t in scene.trained_t], SAMPLED_FRAMES)
+        frames = spread(scene.trained_frames, SAMPLED_FRAMES)
         counts = scene.seen.numpy() > 0 if bool(scene.seen.any()) else np.ones(len(scene.gaussians), np.bool_)
         seen = (seen_by_endoscope(scene, model, frame) for frame in frames)
         depths_mm = np.concatenate([z_mm[in_view & counts] for z_mm, in_view in seen])

@@ -45,7 +45,7 @@ class OutOfView:
         """None if the camera never moves."""
         if (scene.world_from_camera == scene.world_from_camera[0]).all():
             return None
-        frames = spread([round(t * scene.frame_count) for t in scene.trained_t], SAMPLED_FRAMES)
+        frames = spread(scene.trained_frames, SAMPLED_FRAMES)
         seen_s = np.array([scene.frame_times_s[frame] for frame in frames], np.float32)
         in_view = np.stack([seen_by_endoscope(scene, model, frame)[1] for frame in frames])
         nothing = np.full((1, in_view.shape[1]), np.inf, np.float32)

@@ -264,7 +264,6 @@ def _warnings_of_pose(distance: float, trust: NDArray[np.float32], unseen: NDArr
 
 def _distance_from_trained(scene: Scene, pose: NDArray[np.float64]) -> float:
     """Distance of the camera's centre from the nearest trained one, in median depths of the clip."""
-    frames = [round(t * scene.frame_count) for t in scene.trained_t]
-    centres = scene.world_from_camera[frames][:, :3, 3]
+    centres = scene.world_from_camera[scene.trained_frames][:, :3, 3]
     nearest_mm = float(np.linalg.norm(centres - pose[:3, 3], axis=1).min())
     return nearest_mm * scene.units_per_mm / MEDIAN_DEPTH_UNITS

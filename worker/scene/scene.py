@@ -67,6 +67,11 @@ class Scene:
         return int(self.world_from_camera.shape[0])
 
     @cached_property
+    def trained_frames(self) -> list[int]:
+        """The training frames."""
+        return [round(t * self.frame_count) for t in self.trained_t]
+
+    @cached_property
     def pose_warnings(self) -> tuple[Notice, ...]:
         """Why the endoscope's poses are in doubt: the clip's warnings of POSE_DOUBTS. Empty: nothing is known of it."""
         return tuple(Notice.model_validate(each) for each in self.settings.get("pose_warnings", ()))

@@ -8,6 +8,11 @@ const FADING = 1.0;
 
 /** @typedef {number[][]} Matrix */
 /** @typedef {{width: number, height: number, fx: number, fy: number, cx: number, cy: number}} Intrinsics pixels */
+/**
+ * enlarged: by how much the focal lengths exceed the recording's. recorded: its camera_from_world's third row, in units.
+ * Zeros: nothing is enlarged.
+ * @typedef {{enlarged: [number, number], recorded: number[]}} Enlargement
+ */
 /** @typedef {{poses: Matrix[], frameTimesS: number[], trainedFrames: number[]}} Recording */
 
 const dot = (a, b) => a.reduce((sum, each, i) => sum + each * b[i], 0);
@@ -116,6 +121,28 @@ export class Cameras {
     const along = Math.min(Math.max(dot(fromLeft, baseline) / length ** 2, 0), 1);
     const away = Math.hypot(...fromLeft.map((each, i) => each - along * baseline[i])) / length;
     return [Math.exp(-0.5 * (away / FADING) ** 2) * (along - 0.5), 0];
+  }
+
+  /**
+   * By how much a view enlarges the recording (docs/rasterizer.md, "Pixels of the recording").
+   * @param {number} t
+   * @param {Matrix} pose
+   * @param {Intrinsics} lens
+   * @returns {Enlargement}
+   */
+  enlargement(t, pose, lens) {
+    const recorder = this.#nearestRecorder(t, centreOf(pose));
+    const enlarged = [lens.fx / this.intrinsics.fx, lens.fy / this.intrinsics.fy];
+    const isOwn = [0, 1, 2].every((i) => recorder[i][2] === pose[i][2] && recorder[i][3] === pose[i][3]);
+    if (isOwn && Math.max(...enlarged) <= 1) return { enlarged: [0, 0], recorded: [0, 0, 0, 0] };
+    return { enlarged, recorded: this.cameraFromWorld(recorder)[2] };
+  }
+
+  /** The endoscope, at t or at a trained frame, where it was nearest to a place. */
+  #nearestRecorder(t, centre) {
+    const far = (pose) => Math.hypot(...centreOf(pose).map((each, i) => each - centre[i]));
+    const own = this.endoscope(t);
+    return this.trainedFrames.map((frame) => this.poses[frame]).reduce((a, b) => (far(b) < far(a) ? b : a), own);
   }
 
   /** @param {Matrix} pose @returns {Matrix} three rows that turn places in units into the camera's axes */

@@ -117,9 +117,10 @@ export class Drawing {
    * @param {number[][]} cameraFromWorld three rows, units
    * @param {import("./camera.js").Intrinsics} lens of the picture's size
    * @param {[number, number]} shine side and dim
+   * @param {import("./camera.js").Enlargement} enlargement
    * @param {boolean} isMarked whether what no frame saw is hatched
    */
-  draw(cameraFromWorld, lens, shine, isMarked) {
+  draw(cameraFromWorld, lens, shine, enlargement, isMarked) {
     const { gl } = this;
     this.#resize(lens.width, lens.height);
     const columns = [0, 1, 2, 3].flatMap((j) => [...cameraFromWorld.map((row) => row[j]), j === 3 ? 1 : 0]);
@@ -129,6 +130,8 @@ export class Drawing {
       lens: ["4f", lens.fx, lens.fy, lens.cx, lens.cy],
       picture: ["2f", lens.width, lens.height],
       shine: ["2f", ...shine],
+      enlarged: ["2f", ...enlargement.enlarged],
+      recorded: ["4f", ...enlargement.recorded],
     });
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.blendTarget);
     gl.viewport(0, 0, lens.width, lens.height);

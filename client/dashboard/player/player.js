@@ -91,7 +91,9 @@ export class Player {
     this.#deform(t, view.isTimed);
     const began = performance.now();
     const shine = this.cameras.gloss(t, view.pose, view.highlights !== false);
-    this.drawing.draw(rows, this.cameras.resized(view.width, view.height), shine, view.isMarked !== false);
+    const lens = this.cameras.resized(view.width, view.height);
+    const enlargement = this.cameras.enlargement(t, view.pose, lens);
+    this.drawing.draw(rows, lens, shine, enlargement, view.isMarked !== false);
     if (view.isTimed) {
       this.drawing.finish();
       this.times.drawMs = performance.now() - began;

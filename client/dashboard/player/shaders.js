@@ -64,6 +64,8 @@ uniform mat4 cameraFromWorld;
 uniform vec4 lens;       // fx, fy, cx, cy
 uniform vec2 picture;    // width, height
 uniform vec2 shine;      // side, dim
+uniform vec2 enlarged;   // by how much the focal lengths exceed the recording's; 0: nothing is enlarged
+uniform vec4 recorded;   // the third row of the recording's camera_from_world
 in uint gaussian;
 flat out vec2 centre;
 flat out vec4 conic;     // a, b, c, opacity
@@ -90,16 +92,17 @@ void main() {
   mat3 axes = mat3(cameraFromWorld) * rotation;
   vec2 low = (-lens.zw - MARGIN * picture) / lens.xy, high = (picture - lens.zw + MARGIN * picture) / lens.xy;
   vec2 ratio = clamp(m.xy / m.z, low, high), slope = lens.xy / m.z;
-  // k0 and k1 are the rows of J W R S; cov2d is their products, plus EPS2D.
+  // k0 and k1 are the rows of J W R S; cov2d is their products, plus the low-pass of the recording's pixels.
   vec3 third = vec3(axes[0].z, axes[1].z, axes[2].z);
   vec3 k0 = slope.x * (vec3(axes[0].x, axes[1].x, axes[2].x) - ratio.x * third) * s.xyz;
   vec3 k1 = slope.y * (vec3(axes[0].y, axes[1].y, axes[2].y) - ratio.y * third) * s.xyz;
   float xx = dot(k0, k0), yy = dot(k1, k1), xy = dot(k0, k1);
   vec3 area = cross(k0, k1);
+  vec2 grown = max(vec2(1.0), enlarged * dot(recorded, vec4(p.xyz, 1.0)) / m.z), low_pass = EPS2D * grown * grown;
   // Sums of squares: the difference xx yy - xy xy loses its digits where a Gaussian is long and thin.
-  float det = dot(area, area) + EPS2D * (xx + yy) + EPS2D * EPS2D;
-  xx += EPS2D;
-  yy += EPS2D;
+  float det = dot(area, area) + low_pass.y * xx + low_pass.x * yy + low_pass.x * low_pass.y;
+  xx += low_pass.x;
+  yy += low_pass.y;
   centre = slope * m.xy + lens.zw;
   conic = vec4(yy / det, -xy / det, xx / det, p.w);
   float gloss = shine.x * c.w - shine.y * abs(c.w);

@@ -144,6 +144,12 @@ def random_scene(
     )
 
 
+def enlarged(scene: SplatScene) -> SplatScene:
+    """The scene, recorded by another camera beside this one: it enlarges most of it, more across than down."""
+    row = (0.1, -0.05, 0.9, 4.0)
+    return dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, enlarged=(2.0, 1.1), recorded_depth=row))
+
+
 def opaque_wall() -> SplatScene:
     """Every pixel is full long before its last Gaussian: most are hidden everywhere."""
     return random_scene(400, width=37, height=35, seed=40, pixels=9.0, opacities=(0.9,))

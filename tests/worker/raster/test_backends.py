@@ -22,12 +22,13 @@ from tests.worker.raster.scenes import (
     Rasterize,
     SplatScene,
     affordable,
+    enlarged,
     opacities_at_both_ends,
     opaque_wall,
     pixels_near_a_cut,
     random_scene,
 )
-from worker.model.constants import MIN_TRANSMITTANCE
+from worker.model.constants import EPS2D, MIN_TRANSMITTANCE
 from worker.raster import Rendered, reference
 
 MAX_LEFT_OUT = 0.05
@@ -44,6 +45,7 @@ SCENES: dict[str, Callable[[], SplatScene]] = {
     "opaque": opaque_wall,
     "opacity 0 and 1": opacities_at_both_ends,
     "thinner than a pixel": lambda: random_scene(600, width=56, height=40, seed=8, pixels=0.15),
+    "enlarged": lambda: enlarged(random_scene(300, width=45, height=38, seed=10, pixels=0.5)),
     "a small frame": lambda: random_scene(1500, width=96, height=80, seed=9),
 }
 SMALL_SCENES: dict[str, Callable[[], SplatScene]] = {
@@ -54,6 +56,7 @@ SMALL_SCENES: dict[str, Callable[[], SplatScene]] = {
     "past a tile": lambda: random_scene(60, width=17, height=9, seed=6),
     "wide": lambda: random_scene(40, width=10, height=12, seed=7, pixels=7.0),
     "opaque": lambda: random_scene(120, width=9, height=8, seed=40, pixels=9.0, opacities=(0.9,)),
+    "enlarged": lambda: enlarged(random_scene(60, width=14, height=10, seed=10, pixels=0.5)),
     "thinner than a pixel": lambda: random_scene(120, width=14, height=10, seed=8, pixels=0.15),
 }
 """The same, as small as an interpreted kernel needs them."""
@@ -97,6 +100,18 @@ def test_values_and_gradients_are_the_references(
         assert_close(getattr(got, layer), getattr(wanted, layer), where=~left_out, name=layer)
     for leaf, gradient in wanted_gradients.items():
         assert_close(got_gradients[leaf], gradient, name=f"gradient of {leaf}")
+
+
+def test_an_enlarged_picture_holds_the_recordings_pixels_and_no_needles() -> None:
+    thin = random_scene(300, width=45, height=38, seed=10, pixels=0.1)
+    needles, smooth = (reference.project(*each.tensors()[:4], each.camera) for each in (thin, enlarged(thin)))
+    recorded = 4.0 + thin.mean @ torch.tensor([0.1, -0.05, 0.9], dtype=torch.float64)
+    a, b, c = smooth.conic.T
+    least = torch.stack([c, a]) / (a * c - b * b)  # the variances along x and y
+    for variance, by in zip(least, (2.0, 1.1), strict=True):
+        wanted = EPS2D * torch.clamp(by * recorded / smooth.depth, min=1.0) ** 2
+        assert bool((variance[smooth.visible] >= wanted[smooth.visible]).all())
+    assert float((smooth.half_extent > needles.half_extent).double().mean()) > 0.6
 
 
 def test_an_opacity_of_one_gets_its_gradient(rasterize: Rasterize) -> None:

@@ -1,4 +1,5 @@
-"""What a view shows of the gloss: each eye its own highlights, far from both the tissue without them."""
+"""What a view shows of the gloss: each eye its own highlights, far from both the tissue without them.
+And by how much a view enlarges the recording."""
 
 from __future__ import annotations
 
@@ -12,9 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from contract.wire.notices import NoticeCode
 from tests.worker.scenes import random_scene
-from worker.render.camera import FADING, endoscope_pose, gloss_seen
+from worker.model.layout import ENLARGED, POSE, RECORDED
+from worker.raster.step import camera_vector
+from worker.render.camera import FADING, endoscope_pose, gloss_seen, nearest_recorder, view_camera
 from worker.render.view import render_frame
 from worker.scene.scene import Scene
+from worker.train.targets import camera_in_units
 
 RIGHT_EYE_MM = (3.0, 0.0, 4.0)
 BASELINE_MM = 5.0
@@ -86,3 +90,41 @@ def test_far_from_both_eyes_a_view_shows_what_it_would_without_gloss(scene: Scen
     one_eyed = dataclasses.replace(scene, right_eye_mm=None)
     np.testing.assert_array_equal(render_frame(scene, T, far).rgb, render_frame(one_eyed, T, far).rgb)
     assert (render_frame(scene, T, far).rgb > render_frame(scene, T, far, highlights=False).rgb).any()
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0])
+@pytest.mark.parametrize("t", [0.0, 0.21, 0.5, 0.83])
+def test_the_endoscopes_own_view_is_to_the_bit_what_training_saw(t: float, scale: float) -> None:
+    scene = random_scene()  # whose camera moves
+    pose = endoscope_pose(scene, t)
+    lens = scene.intrinsics.resized(round(64 * scale), round(48 * scale))
+    trained_on = camera_vector(camera_in_units(lens, pose, scene.units_per_mm))
+    np.testing.assert_array_equal(view_camera(scene, t, pose, lens), trained_on)
+
+
+def test_a_longer_lens_and_a_nearer_place_enlarge_alike(scene: Scene) -> None:
+    middle = np.array([0.0, 0.0, 60 / scene.units_per_mm, 1.0])
+
+    def enlarged(pose: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
+        lens = scene.intrinsics.resized(scale * scene.intrinsics.width, scale * scene.intrinsics.height)
+        camera = view_camera(scene, T, pose, lens)
+        in_units = middle * [*[scene.units_per_mm] * 3, 1]
+        depth = camera[POSE + 8 :] @ in_units
+        return np.asarray(camera[ENLARGED : ENLARGED + 2] * (camera[RECORDED : RECORDED + 4] @ in_units) / depth)
+
+    own = endoscope_pose(scene, T)
+    nearer = own.copy()
+    nearer[2, 3] += middle[2] / 2
+    np.testing.assert_allclose(enlarged(own, 2), [2, 2], rtol=1e-9)
+    np.testing.assert_allclose(enlarged(nearer, 1), [2, 2], rtol=1e-9)
+    np.testing.assert_allclose(enlarged(nearer, 3), [6, 6], rtol=1e-9)
+
+
+def test_of_all_places_of_the_endoscope_the_nearest_to_a_view_recorded_it() -> None:
+    made = random_scene()
+    poses = made.world_from_camera.copy()
+    poses[:, 2, 3] = 10.0 * np.arange(6)
+    scene = dataclasses.replace(made, world_from_camera=poses)  # it stands at 30 mm; frames 0 and 2 are trained on
+    places_mm = (0.0, 21.0, 28.0, 41.0)
+    found = [nearest_recorder(scene, 0.5, np.array([0.0, 0.0, each]))[2, 3] for each in places_mm]
+    assert found == [0.0, 20.0, 30.0, 30.0]

@@ -94,6 +94,20 @@ def test_every_layer_has_the_asked_size(scene: Scene, size: tuple[int, int]) -> 
     assert not frame.confidence[~solid].any()
 
 
+@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize("orbit", [None, (10, -5)])
+def test_a_larger_picture_is_the_recordings_one_between_its_pixels_too(
+    scene: Scene, orbit: tuple[float, float] | None, scale: int
+) -> None:
+    pose = None if orbit is None else orbit_pose(*orbit)
+    own = render_frame(scene, 0.5, pose)
+    large = render_frame(scene, 0.5, pose, scene.intrinsics.resized(scale * WIDTH, scale * HEIGHT))
+    averaged = large.rgb.reshape(HEIGHT, scale, WIDTH, scale, 3).mean((1, 3))
+    assert 10 * np.log10(255**2 / np.square(averaged - own.rgb).mean()) > 42  # 33 dB where needles come out
+    assert abs(averaged.mean() - own.rgb.mean()) < 0.5
+    assert large.unseen_share == pytest.approx(own.unseen_share, abs=0.005)
+
+
 def test_another_camera_looks_at_the_same_tissue(scene: Scene) -> None:
     camera = scene.intrinsics
     right_half = Intrinsics(

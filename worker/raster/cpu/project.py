@@ -19,7 +19,20 @@ import numpy as np
 
 from worker.machine.cache import kernel
 from worker.model.constants import EPS2D, IMAGE_MARGIN, LN2, LOG2E, MAX_DETERMINANT, MAX_LOG2_EXP, MIN_ALPHA, NEAR
-from worker.model.layout import CX, CY, FX, FY, HEIGHT, LOG_SCALE_ROW, MEAN_ROW, POSE, QUATERNION_ROW, WIDTH
+from worker.model.layout import (
+    CX,
+    CY,
+    ENLARGED,
+    FX,
+    FY,
+    HEIGHT,
+    LOG_SCALE_ROW,
+    MEAN_ROW,
+    POSE,
+    QUATERNION_ROW,
+    RECORDED,
+    WIDTH,
+)
 from worker.raster.cpu.bins import EXTENT, GRADIENT
 from worker.raster.cpu.simd import (
     exp2,
@@ -145,6 +158,16 @@ def _limits(camera):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _low_pass(camera, mean, inverse_z):  # type: ignore[no-untyped-def]
+    """What is added to the variances along x and y."""
+    row = (camera[RECORDED], camera[RECORDED + 1], camera[RECORDED + 2])
+    nearer = (_dot(row, mean) + camera[RECORDED + 3]) * inverse_z
+    one = widen(splat(np.float32(1.0)))
+    m_x, m_y = maximum(camera[ENLARGED] * nearer, one), maximum(camera[ENLARGED + 1] * nearer, one)
+    return EPS2D * m_x * m_x, EPS2D * m_y * m_y
+
+
+@kernel
 def _held(ratio, low, high):  # type: ignore[no-untyped-def]
     """ratio within [low, high]."""
     return minimum(maximum(ratio, low), high)
@@ -217,13 +240,14 @@ def project(  # type: ignore[no-untyped-def]
         r = _rotation(q)
         s0, s1, s2 = _rows_of(state, LOG_SCALE_ROW, i)
         scale = (_exp(s0), _exp(s1), _exp(s2))
-        # A = J W (2 x 3), then K = A R S (2 x 3), cov2d = K K^T + EPS2D I.
+        # A = J W (2 x 3), then K = A R S (2 x 3), cov2d = K K^T + the low-pass.
         inverse_z = 1.0 / z
         u, v = _held(x * inverse_z, low_u, high_u), _held(y * inverse_z, low_v, high_v)
         j0, j1 = fx * inverse_z, fy * inverse_z
         k0 = _each(_through(_sum(j0, w[0], zero - j0 * u, w[2]), r), scale)
         k1 = _each(_through(_sum(j1, w[1], zero - j1 * v, w[2]), r), scale)
-        cxx, cxy, cyy = _dot(k0, k0) + EPS2D, _dot(k0, k1), _dot(k1, k1) + EPS2D
+        low_x, low_y = _low_pass(camera, mean, inverse_z)
+        cxx, cxy, cyy = _dot(k0, k0) + low_x, _dot(k0, k1), _dot(k1, k1) + low_y
         log2_opacity = zero - log2(1.0 + _exp(zero - widen(load(opacity_logit, i))))
         extent2 = 2.0 * LN2 * (log2_opacity - np.log2(MIN_ALPHA))
         det = cxx * cyy - cxy * cxy
@@ -302,7 +326,8 @@ def project_backward(  # type: ignore[no-untyped-def]
         # times 1 - opacity, exact also where opacity rounds to 1
         _put(v_opacity_logit, i, narrow(widen(load_strided(totals, 4, GRADIENT)) * odds / (1.0 + odds)), adds)
 
-        # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + EPS2D I.
+        # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + the
+        # low-pass.
         mean = _rows_of(state, MEAN_ROW, i)
         x, y, z = _dot(w[0], mean) + shift[0], _dot(w[1], mean) + shift[1], _dot(w[2], mean) + shift[2]
         inverse_z = 1.0 / z
@@ -317,7 +342,8 @@ def project_backward(  # type: ignore[no-untyped-def]
         a0, a1 = _sum(j0, w[0], zero - j0 * u, w[2]), _sum(j1, w[1], zero - j1 * v, w[2])
         b0, b1 = _through(a0, r), _through(a1, r)
         t0, t1 = _each(b0, variance), _each(b1, variance)
-        cxx, cxy, cyy = _dot(t0, b0) + EPS2D, _dot(t0, b1), _dot(t1, b1) + EPS2D
+        low_x, low_y = _low_pass(camera, mean, inverse_z)
+        cxx, cxy, cyy = _dot(t0, b0) + low_x, _dot(t0, b1), _dot(t1, b1) + low_y
         inverse_det = 1.0 / (cxx * cyy - cxy * cxy)
         ka, kb, kc = cyy * inverse_det, zero - cxy * inverse_det, cxx * inverse_det
 

@@ -1,8 +1,8 @@
 """What project.py and project_backward.py both compute of a Gaussian and its camera; device functions.
 
-N Gaussians; state: one frame's rows of N floats, as in project.py; camera: its 18 numbers. Arithmetic is float64 as on
-the CPU; exponentials have float32's precision and end at 2**20, so no log-scale or logit, however far out, leaves the
-numbers.
+N Gaussians; state: one frame's rows of N floats, as in project.py; camera: its CAMERA numbers. Arithmetic is float64 as
+on the CPU; exponentials have float32's precision and end at 2**20, so no log-scale or logit, however far out, leaves
+the numbers.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from worker.model.constants import IMAGE_MARGIN, LN2, LOG2E, MAX_LOG2_EXP
-from worker.model.layout import CX, FX, LOG_SCALE_ROW, MEAN_ROW, POSE, QUATERNION_ROW, WIDTH
+from worker.model.constants import EPS2D, IMAGE_MARGIN, LN2, LOG2E, MAX_LOG2_EXP
+from worker.model.layout import CX, ENLARGED, FX, LOG_SCALE_ROW, MEAN_ROW, POSE, QUATERNION_ROW, RECORDED, WIDTH
 
 _MARGIN, _LOG2E = tl.constexpr(IMAGE_MARGIN), tl.constexpr(LOG2E)
 _MIN_EXPONENT, _MAX_EXPONENT = tl.constexpr(-200.0), tl.constexpr(MAX_LOG2_EXP * LN2)  # below: 0 as a float32
 _X, _Q, _S = tl.constexpr(MEAN_ROW), tl.constexpr(QUATERNION_ROW), tl.constexpr(LOG_SCALE_ROW)
 _FOCAL, _CENTRE, _SIZE, _POSE = tl.constexpr(FX), tl.constexpr(CX), tl.constexpr(WIDTH), tl.constexpr(POSE)
+_EPS2D, _ENLARGED, _RECORDED = tl.constexpr(EPS2D), tl.constexpr(ENLARGED), tl.constexpr(RECORDED)
 
 
 @triton.jit
@@ -73,6 +74,20 @@ def seen(camera, a, b, c):  # type: ignore[no-untyped-def]
     y = dot(tl.load(row + 4), tl.load(row + 5), tl.load(row + 6), a, b, c) + tl.load(row + 7)
     z = dot(tl.load(row + 8), tl.load(row + 9), tl.load(row + 10), a, b, c) + tl.load(row + 11)
     return x, y, z
+
+
+@triton.jit
+def nearness(camera, a, b, c, inverse_z):  # type: ignore[no-untyped-def]
+    """How often the depth before the camera goes into that before the recording's, of world points."""
+    row = camera + _RECORDED
+    return (dot(tl.load(row), tl.load(row + 1), tl.load(row + 2), a, b, c) + tl.load(row + 3)) * inverse_z
+
+
+@triton.jit
+def low_pass(camera, first: tl.constexpr, nearer):  # type: ignore[no-untyped-def]
+    """What is added to the variance along x (first 0) or y (first 1)."""
+    m = tl.maximum(tl.load(camera + _ENLARGED + first) * nearer, 1.0)
+    return _EPS2D * m * m
 
 
 @triton.jit

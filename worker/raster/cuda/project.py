@@ -19,17 +19,27 @@ import math
 import triton
 import triton.language as tl
 
-from worker.model.constants import EPS2D, LN2, LOG2E, MAX_DETERMINANT, MIN_ALPHA, NEAR
+from worker.model.constants import LN2, LOG2E, MAX_DETERMINANT, MIN_ALPHA, NEAR
 from worker.model.layout import CAMERA, CX, CY
 from worker.raster.cuda.bins import DEPTH_BITS, EXTENT, count_tiles
-from worker.raster.cuda.geometry import dot, exp, image_row, mean_of, rotation_of, seen, variances_of
+from worker.raster.cuda.geometry import (
+    dot,
+    exp,
+    image_row,
+    low_pass,
+    mean_of,
+    nearness,
+    rotation_of,
+    seen,
+    variances_of,
+)
 
 RECORD = 12
 """Floats in a splat record: 48 bytes, three loads of 16."""
 PROJECT_BLOCK = 128
 
 _RECORD, _EXTENT = tl.constexpr(RECORD), tl.constexpr(EXTENT)
-_NEAR, _EPS2D = tl.constexpr(NEAR), tl.constexpr(EPS2D)
+_NEAR = tl.constexpr(NEAR)
 _LOG2E, _LN2 = tl.constexpr(LOG2E), tl.constexpr(LN2)
 _LOG2_MIN_ALPHA = tl.constexpr(math.log2(MIN_ALPHA))
 _CAMERA, _CX, _CY = tl.constexpr(CAMERA), tl.constexpr(CX), tl.constexpr(CY)
@@ -69,17 +79,18 @@ def project(  # type: ignore[no-untyped-def]
     x, y, z = seen(camera, a, b, c)
     in_front = there & (z > _NEAR)
     inverse_z = 1.0 / tl.where(in_front, z, 1.0)
+    nearer = nearness(camera, a, b, c, inverse_z)
     _, _, _, _, _, r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_of(state, n, there, N)
     v0, v1, v2 = variances_of(state, n, there, N)
     j0, _, a00, a01, a02 = image_row(camera, 0, x * inverse_z, inverse_z)
     j1, _, a10, a11, a12 = image_row(camera, 1, y * inverse_z, inverse_z)
-    # B = A R, cov2d = B S^2 B^T + EPS2D I
+    # B = A R, cov2d = B S^2 B^T + the low-pass
     b00, b01 = dot(a00, a01, a02, r00, r10, r20), dot(a00, a01, a02, r01, r11, r21)
     b02, b10 = dot(a00, a01, a02, r02, r12, r22), dot(a10, a11, a12, r00, r10, r20)
     b11, b12 = dot(a10, a11, a12, r01, r11, r21), dot(a10, a11, a12, r02, r12, r22)
-    cxx = dot(b00 * b00, b01 * b01, b02 * b02, v0, v1, v2) + _EPS2D
+    cxx = dot(b00 * b00, b01 * b01, b02 * b02, v0, v1, v2) + low_pass(camera, 0, nearer)
     cxy = dot(b00 * b10, b01 * b11, b02 * b12, v0, v1, v2)
-    cyy = dot(b10 * b10, b11 * b11, b12 * b12, v0, v1, v2) + _EPS2D
+    cyy = dot(b10 * b10, b11 * b11, b12 * b12, v0, v1, v2) + low_pass(camera, 1, nearer)
     det = cxx * cyy - cxy * cxy
     logit = tl.load(opacity_logit + n, mask=there, other=0.0)
     log2_opacity = -tl.log2(1.0 + exp(-logit))

@@ -9,10 +9,20 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from worker.model.constants import EPS2D
 from worker.model.layout import CAMERA, CHANNELS, HEIGHT, LOG_SCALE_ROW, POSE, QUATERNION_ROW, WIDTH
 from worker.raster.cuda.bins import SLOT
-from worker.raster.cuda.geometry import dot, exp, image_row, limits, mean_of, rotation_of, seen, variances_of
+from worker.raster.cuda.geometry import (
+    dot,
+    exp,
+    image_row,
+    limits,
+    low_pass,
+    mean_of,
+    nearness,
+    rotation_of,
+    seen,
+    variances_of,
+)
 
 SUMS = 10
 """What a splat's slots add up to: the moments 1, x, y, xx, xy, yy of dL/dpower about mean2d, dL/d(r, g, b, z)."""
@@ -22,7 +32,7 @@ with hundreds keeps only its own program waiting."""
 BACKWARD_BLOCK = 128
 POSE_SHARE = 12
 
-_SLOT, _SHARE, _EPS2D = tl.constexpr(SLOT), tl.constexpr(POSE_SHARE), tl.constexpr(EPS2D)
+_SLOT, _SHARE = tl.constexpr(SLOT), tl.constexpr(POSE_SHARE)
 _CAMERA, _POSE = tl.constexpr(CAMERA), tl.constexpr(POSE)
 _WIDTH, _HEIGHT = tl.constexpr(WIDTH), tl.constexpr(HEIGHT)
 _ROWS, _Q, _S = tl.constexpr(CHANNELS), tl.constexpr(QUATERNION_ROW), tl.constexpr(LOG_SCALE_ROW)
@@ -159,10 +169,11 @@ def project_backward(  # type: ignore[no-untyped-def]
     v_logit = tl.load(sums, mask=drawn, other=0.0) * odds / (1.0 + odds)
     _store(v_opacity_logit + splat, v_logit, drawn, there)
 
-    # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + EPS2D I.
+    # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + the low-pass.
     a, b, c = mean_of(state, n, there, N)
     x, y, z = seen(camera, a, b, c)
     inverse_z = 1.0 / tl.where(drawn, z, 1.0)
+    nearer = nearness(camera, a, b, c, inverse_z)
     ratio_x, ratio_y = x * inverse_z, y * inverse_z
     qw, qx, qy, qz, length, r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_of(state, n, there, N)
     v0, v1, v2 = variances_of(state, n, there, N)
@@ -173,9 +184,9 @@ def project_backward(  # type: ignore[no-untyped-def]
     b11, b12 = dot(a10, a11, a12, r01, r11, r21), dot(a10, a11, a12, r02, r12, r22)
     t00, t01, t02 = b00 * v0, b01 * v1, b02 * v2
     t10, t11, t12 = b10 * v0, b11 * v1, b12 * v2
-    cxx = dot(t00, t01, t02, b00, b01, b02) + _EPS2D
+    cxx = dot(t00, t01, t02, b00, b01, b02) + low_pass(camera, 0, nearer)
     cxy = dot(t00, t01, t02, b10, b11, b12)
-    cyy = dot(t10, t11, t12, b10, b11, b12) + _EPS2D
+    cyy = dot(t10, t11, t12, b10, b11, b12) + low_pass(camera, 1, nearer)
     inverse_det = 1.0 / (cxx * cyy - cxy * cxy)
     ka, kb, kc = cyy * inverse_det, -cxy * inverse_det, cxx * inverse_det
 
