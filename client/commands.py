@@ -11,6 +11,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from client.audit import add_audit
+from client.backup import add_backup
 from client.keys import add_keys
 from client.remote import add_remote
 from client.slicer.command import add_slicer
@@ -63,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     add_slicer(commands)
     add_keys(commands)
     add_audit(commands)
+    add_backup(commands)
     return parser
 
 

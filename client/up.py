@@ -24,6 +24,7 @@ from pathlib import Path
 from client.up_room import RoomWatch
 from contract.access.keys import check_keys
 from contract.queue.embedded import EmbeddedServer
+from contract.queue.installed import UP_LOCK
 from contract.runtime.locks import FolderLock
 from contract.runtime.processes import told_to_end
 from contract.runtime.settings import Settings
@@ -53,7 +54,7 @@ class Installation:
     def __init__(self, settings: Settings, worker_count: int = 1) -> None:
         Store(settings.data_dir)  # makes the folders, readable by their owner only
         data_dir = settings.data_dir.expanduser().resolve()
-        self._lock = FolderLock(data_dir / "run" / "up.lock")
+        self._lock = FolderLock(data_dir / "run" / UP_LOCK)
         self._queue = EmbeddedServer(data_dir) if settings.redis_url is None else None
         self._queue_at_s = 0.0
         self.room = RoomWatch(Disk(data_dir), settings.min_free_bytes, say)

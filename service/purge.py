@@ -19,7 +19,7 @@ from contract.queue.interface import Queue
 from contract.store.disk_errors import StoreFullError, disk_errors
 from contract.store.durable import flush
 from contract.store.shelf import Removed, is_job_id
-from contract.store.store import Store
+from contract.store.store import PURGING, Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES
 from service.access import Caller
@@ -28,7 +28,6 @@ from service.done import DoneJobs
 from service.partial import partials_of
 from service.problems import Problem
 
-NOTES = "purging"
 NOTE_IS_OLD_S = 60.0
 """A younger note may be of a removal that is under way."""
 LOG_CLEARED_AFTER_S = 90.0
@@ -56,7 +55,7 @@ class Purger:
         self._store = store
         self._audit = audit
         self._done = done
-        self._notes = store.data_dir / NOTES
+        self._notes = store.data_dir / PURGING
         self._log_stale_since_s: float | None = None
 
     def purge(self, job_id: str, caller: Caller | None, reason: str = "request") -> Receipt:

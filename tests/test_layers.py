@@ -27,7 +27,7 @@ MAY_IMPORT = {
 FOLDERS = {"intrasplat_client": REPOSITORY / "client" / "intrasplat_client"}
 """Of packages that do not lie in the repository's root."""
 ROOMS = {
-    "contract": ("wire", "runtime", "intake", "store", "queue", "access"),
+    "contract": ("wire", "runtime", "intake", "store", "queue", "access", "backup"),
     "worker": (
         "machine",
         "input",

@@ -52,6 +52,10 @@ class AuditAction(StrEnum):
     """A missing or wrong key, a missing scope, another tenant's job. The outcome is the HTTP status."""
     KEY_CREATED = "key-created"
     KEY_REVOKED = "key-revoked"
+    BACKED_UP = "backed-up"
+    """All of it was copied."""
+    RESTORED = "restored"
+    """The lines before are of the backup; its time is the outcome."""
 
 
 class AuditEntry(BaseModel):

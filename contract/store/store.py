@@ -46,15 +46,22 @@ from contract.wire.names import KEPT, LABELS, REPORT, SUBMISSION, THUMBNAIL
 from contract.wire.report import Report
 
 UNSCORED = "unscored"
+PURGING = "purging"
+"""Of notes, each named by a job whose removal has begun and not ended (service/purge.py)."""
+RESTORING = "restoring"
+"""A file that is there while a data directory is filled from a backup: it is not whole yet."""
 
 
 def open_store(settings: Settings) -> Store:
     """The store that the settings name.
 
     Raises:
-        UnavailableError: the data directory cannot be made, the bucket does not answer, or the package for buckets is
-            not installed.
+        UnavailableError: the data directory cannot be made or was not restored to its end, the bucket does not answer,
+            or the package for buckets is not installed.
     """
+    if (settings.data_dir.expanduser() / RESTORING).exists():
+        problem = f"A restore into {settings.data_dir} was cut off, or goes on."
+        raise UnavailableError(problem, "Wait for it; if it was cut off, empty the folder and restore again.")
     return Store(settings.data_dir, settings.store_url)
 
 

@@ -1,10 +1,11 @@
-"""Every test that asks for `queue` or `queues` runs on each implementation, and on each kind of server."""
+"""Every test that asks for `queue` or `queues` runs on each implementation, and on each kind of server; a bucket."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import redis
@@ -13,6 +14,7 @@ from contract.queue.interface import LEASE_S, Queue
 from contract.queue.memory import MemoryQueue
 from contract.queue.redis_queue import PREFIX, RedisQueue
 from tests.contract.queues import RunningServer, redis_binary, valkey_binary
+from tests.contract.stores import lead_to
 
 MakeQueue = Callable[..., Queue]
 """A client of the one queue of the test, with a lease of so many seconds."""
@@ -114,3 +116,27 @@ def own(binary: Path, tmp_path: Path) -> Iterator[RunningServer]:
     server = RunningServer(binary, tmp_path)
     yield server
     server.stop()
+
+
+@pytest.fixture(scope="session")
+def s3_server() -> Iterator[str]:
+    """The address of an S3 server."""
+    pytest.importorskip("s3fs")
+    moto_server: Any = pytest.importorskip("moto.server")
+    server = moto_server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture
+def bucket(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The empty bucket of BUCKET_URL, as boto3 sees it; the environment leads our store to it."""
+    boto3: Any = pytest.importorskip("boto3")
+    lead_to(monkeypatch, s3_server)
+    bucket = boto3.resource("s3").Bucket("clips")
+    bucket.create()
+    yield bucket
+    bucket.object_versions.delete()
+    bucket.delete()

@@ -20,14 +20,14 @@ from contract.queue.interface import Claim
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
-from contract.store.store import Store
+from contract.store.store import PURGING, Store
 from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobError, JobFiles, JobRecord
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.options import JobOptions
 from service.audit import Audit
 from service.done import DoneJobs
-from service.purge import LOG_CLEARED_AFTER_S, NOTES, Purger
+from service.purge import LOG_CLEARED_AFTER_S, Purger
 from service.questions import Questions
 from service.retention import HOUR_S, Retention, check_retention, kept_hours
 from tests.service.test_tus import uploaded
@@ -116,7 +116,7 @@ def test_a_live_job_is_not_purged(service: ServiceUnderTest) -> None:
     service.claimed()
     assert_problem(service.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
     assert service.spooled() != []
-    assert not (service.store.data_dir / NOTES).exists()
+    assert not (service.store.data_dir / PURGING).exists()
 
 
 @pytest.mark.parametrize("cut_at", ["store.purge", "queue.forget"])
@@ -139,7 +139,7 @@ def test_a_purge_that_was_cut_off_is_finished(
         _, retention = parts(service)
         retention.purge_due(time.time())
         assert service.queue.get(scene_id) is not None  # so young a note may be of a purge that is under way
-        note = service.store.data_dir / NOTES / scene_id
+        note = service.store.data_dir / PURGING / scene_id
         os.utime(note, (1.0, 1.0))
         retention.purge_due(time.time())
         assert not note.exists()
@@ -159,7 +159,7 @@ def test_a_job_that_is_retried_during_its_purge_is_not_reported_as_purged(
 
     monkeypatch.setattr(service.store, "purge", purge_while_somebody_retries)
     assert_problem(service.http.delete(f"/scenes/{job_id}"), 409, "scene_id")
-    assert (service.store.data_dir / NOTES / job_id).exists()
+    assert (service.store.data_dir / PURGING / job_id).exists()
 
 
 def test_several_services_may_purge_the_same_job_at_once(service: ServiceUnderTest) -> None:

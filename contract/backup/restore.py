@@ -1,0 +1,246 @@
+"""Fill an empty data directory and an empty queue from a backup.
+
+Files come first, each compared with its hash, then the records. While a file `restoring` lies in the data directory,
+neither service nor worker starts on it. What was purged since, as the given audits tell, does not come back; nor do
+keys that were revoked since.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from contract.access.audit import AUDIT_FILE, AuditAction, AuditEntry, AuditLog, utc_now
+from contract.access.chain import audit_lines
+from contract.access.keys import KeyFile
+from contract.backup.copier import place_for, write_hashed
+from contract.backup.manifest import (
+    ANOTHER,
+    FIELD,
+    JOBS_FILE,
+    MANIFEST_FILE,
+    PIECE_BYTES,
+    Manifest,
+    digest_of,
+    finished_backups,
+    job_of,
+    read_jobs,
+    read_manifest,
+)
+from contract.queue.interface import IDEMPOTENCY_S, Queue
+from contract.runtime.settings import Settings
+from contract.store.disk import Disk
+from contract.store.disk_errors import NO_ROOM
+from contract.store.durable import flush
+from contract.store.local import remove_tree
+from contract.store.store import RESTORING, Store
+from contract.wire.errors import InputError, UnavailableError
+from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
+
+NO_CONTENT = frozenset({"lost+found"})
+"""What may lie in an empty folder: the root of a disk has it."""
+
+
+@dataclass
+class Restored:
+    """What came back. purged: jobs that did not, because they were purged. lost: jobs with neither clip nor scene."""
+
+    backup: Path
+    created_at: str
+    jobs: Counter[JobState] = field(default_factory=Counter)
+    purged: list[str] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+    revoked_keys: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Since:
+    """What audits tell of the time after a backup, and before."""
+
+    purged: frozenset[str]
+    revoked_keys: frozenset[str]
+
+
+def restore_backup(
+    settings: Settings, open_queue: AbstractContextManager[Queue], source: Path, audits: Sequence[Path] = ()
+) -> Restored:
+    """Restore a backup: `source` itself, or the newest in it. All of it is on disk and in the queue when this returns.
+
+    Args:
+        open_queue: entered once the data directory is known to be empty.
+        audits: of the time after the backup.
+
+    Raises:
+        InputError: there is no whole backup, it does not fit the settings, or an audit cannot be read.
+        UnavailableError: the data directory or the queue is not empty, cannot be written, or is full.
+
+    After an error the data directory is empty again, unless it was not empty before.
+    """
+    backup = _backup_in(source.expanduser().resolve())
+    manifest = read_manifest(backup)
+    _check_store(manifest, settings)
+    since = _since([backup / AUDIT_FILE] * (AUDIT_FILE in manifest.files) + list(audits))
+    data_dir = settings.data_dir.expanduser().resolve()
+    with _writing(data_dir):
+        data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _check_empty(data_dir)
+        data_dir.chmod(0o700)
+        try:
+            (data_dir / RESTORING).touch(mode=0o600)
+            with open_queue as queue:
+                if queue.records(limit=1):
+                    problem = "The queue is not empty: it holds jobs of another installation."
+                    raise UnavailableError(problem, "Give the restored service a queue of its own (REDIS_URL).")
+                _copy_files(backup, manifest, data_dir, since.purged)
+                restored = Restored(backup, manifest.created_at)
+                restored.revoked_keys = _revoke(data_dir, since.revoked_keys)
+                _fill_queue(queue, Store(data_dir, settings.store_url), read_jobs(backup), since.purged, restored)
+            outcome = f"backup of {manifest.created_at}"
+            AuditLog(data_dir).append(AuditEntry(time=utc_now(), action=AuditAction.RESTORED, outcome=outcome))
+            (data_dir / RESTORING).unlink()
+            flush(data_dir)
+        except BaseException:
+            with suppress(OSError):
+                _empty(data_dir)
+            raise
+    return restored
+
+
+def _backup_in(source: Path) -> Path:
+    """The backup that is meant."""
+    if (source / MANIFEST_FILE).is_file():
+        return source
+    if found := finished_backups(source):
+        return found[0]
+    remedy = "Name the folder that was given to `intrasplat backup`, or one backup in it."
+    raise InputError(FIELD, f"{source} holds no finished backup.", remedy)
+
+
+def _check_store(manifest: Manifest, settings: Settings) -> None:
+    if manifest.store_url is not None and settings.store_url is None:
+        problem = f"The clips and scenes of this backup are in the bucket {manifest.store_url}."
+        raise InputError("INTRASPLAT_STORE_URL", problem, "Set it to that bucket, or to a copy of it.")
+    if manifest.store_url is None and settings.store_url is not None:
+        problem = "The clips and scenes of this backup come from a data directory, not from a bucket."
+        raise InputError("INTRASPLAT_STORE_URL", problem, "Unset it.")
+
+
+def _since(audits: Sequence[Path]) -> _Since:
+    """What these audits say was purged, or was begun to be, and which keys were revoked."""
+    told: dict[str, set[str]] = {AuditAction.PURGED: set(), AuditAction.KEY_REVOKED: set()}
+    for path in audits:
+        for line in audit_lines(path):
+            with suppress(ValueError):  # a line that was cut off by a crash
+                entry: dict[str, str] = json.loads(line)
+                about = entry.get("job_id") or entry.get("key_id")
+                if (action := entry.get("action")) in told and about is not None:
+                    told[action].add(about)
+    return _Since(frozenset(told[AuditAction.PURGED]), frozenset(told[AuditAction.KEY_REVOKED]))
+
+
+def _check_empty(data_dir: Path) -> None:
+    found = sorted(each.name for each in data_dir.iterdir() if each.name not in NO_CONTENT)
+    if found:
+        cut_off = ", left by a restore that was cut off" if RESTORING in found else ""
+        problem = f"{data_dir} is not empty: it holds {', '.join(found[:5])}{cut_off}."
+        raise UnavailableError(problem, "Restore into an empty data directory; move away or remove what is there.")
+
+
+def _copy_files(backup: Path, manifest: Manifest, data_dir: Path, purged: frozenset[str]) -> None:
+    """Copy all files but those of purged jobs, whose hashes are compared all the same."""
+    folders: set[Path] = set()
+    for name, file in manifest.files.items():
+        target = None
+        try:
+            if name == JOBS_FILE or job_of(name) in purged:
+                found = (backup / name).stat().st_size, digest_of(backup / name)
+            else:
+                with (backup / name).open("rb") as original:
+                    target = place_for(data_dir, name)
+                    found = write_hashed(target, iter(lambda: original.read(PIECE_BYTES), b""))
+                os.utime(target, ns=(time.time_ns(), file.changed_ns))
+        except FileNotFoundError as error:
+            raise InputError(FIELD, f"{name} is missing in {backup}.", ANOTHER) from error
+        if found != (file.bytes, file.sha256):
+            raise InputError(FIELD, f"{name} in {backup} is not what was backed up: its hash differs.", ANOTHER)
+        if target is not None:
+            flush(target)
+            folders |= {each for each in target.parents if each.is_relative_to(data_dir)}
+    for folder in folders:
+        flush(folder)
+
+
+def _revoke(data_dir: Path, key_ids: frozenset[str]) -> list[str]:
+    keys = KeyFile(data_dir)
+    return [key.key_id for key in keys.list() if key.key_id in key_ids and keys.revoke(key.key_id)]
+
+
+def _fill_queue(
+    queue: Queue, store: Store, records: Iterator[JobRecord], purged: frozenset[str], restored: Restored
+) -> None:
+    """Give the queue the jobs, in their order. A bucket may hold what was purged since: that is removed from it."""
+    scenes: Mapping[str, list[int]] = store.finished_scenes()
+    clips = set(store.spooled_ids())
+    for job_id in sorted(purged & (scenes.keys() | clips)):
+        store.purge(job_id)
+    for record in records:
+        if record.job_id in purged:
+            restored.purged.append(record.job_id)
+        elif (found := _as_found(record, scenes.get(record.job_id, []), record.job_id in clips)) is None:
+            restored.lost.append(record.job_id)
+        else:
+            restored.jobs[_put(queue, found)] += 1
+
+
+def _as_found(record: JobRecord, attempts: Sequence[int], has_clip: bool) -> JobRecord | None:
+    """The record as its files allow: done if its scene is there, else to be run; None without clip and scene."""
+    if record.state in TERMINAL_STATES and record.state is not JobState.DONE:
+        return record
+    if record.state is JobState.DONE and record.attempt in attempts:
+        return record
+    if attempts:
+        ended = {"state": JobState.DONE, "attempt": max(attempts), "finished_at_s": record.finished_at_s or time.time()}
+        return record.model_copy(update=ended)
+    if not has_clip:
+        return None
+    waits = {"state": JobState.QUEUED, "released": record.attempt, "owner": None, "progress": None}
+    waits |= {"started_at_s": None, "finished_at_s": None}
+    if record.created_at_s + IDEMPOTENCY_S < time.time():
+        waits["idempotency_key"] = None  # it stands for no job any more, and another may have had it since
+    return record.model_copy(update=waits)
+
+
+def _put(queue: Queue, record: JobRecord) -> JobState:
+    """Enter a job into the queue; its state there."""
+    if record.state in TERMINAL_STATES:
+        queue.restore(record)
+        return record.state
+    asked = record.cancel_requested
+    queue.submit(record.model_copy(update={"cancel_requested": False}))
+    cancelled = queue.cancel(record.job_id) if asked else None
+    return cancelled.state if cancelled else record.state
+
+
+def _empty(data_dir: Path) -> None:
+    for path in data_dir.iterdir():
+        if path.name not in NO_CONTENT:
+            remove_tree(path)
+
+
+@contextmanager
+def _writing(data_dir: Path) -> Iterator[None]:
+    """Raise an OSError of the body as an UnavailableError that names the file, or the disk that is full."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in NO_ROOM:
+            problem = f"There is no room left on {Disk(data_dir).name}; nothing was restored."
+            raise UnavailableError(problem, "Use a larger disk.") from error
+        problem = f"{error.filename or data_dir} cannot be read or written ({os.strerror(error.errno or 0)})."
+        raise UnavailableError(problem, "Run the command as the user of the service.") from error
