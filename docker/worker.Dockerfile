@@ -13,12 +13,15 @@ COPY constraints.txt ./
 # Its index has of everything else the versions it likes; those of constraints.txt come with the next step.
 RUN grep -E '^(torch|triton)[<>=]' constraints.txt >torch.txt \
     && /venv/bin/pip install --no-cache-dir --constraint torch.txt --index-url "$TORCH_INDEX" torch
-COPY pyproject.toml README.md LICENSE ./
+# Then what pyproject.toml asks for, which a change of the code does not install anew.
+COPY pyproject.toml docker/requirements.py README.md LICENSE ./
+RUN python requirements.py "$EXTRAS" >requirements.txt \
+    && /venv/bin/pip install --no-cache-dir --constraint constraints.txt --requirement requirements.txt
 COPY contract contract
 COPY worker worker
 # the command `intrasplat`, which runs the worker's programs too
 COPY client client
-RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt ".[$EXTRAS]"
+RUN /venv/bin/pip install --no-cache-dir --no-deps .
 
 FROM ${BASE}
 # Triton, on a GPU, compiles its launchers with a C compiler; the CPU needs none.
