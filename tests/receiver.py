@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
+from contract.access.webhook_secrets import tenant_secret
+from tests.test_operations import block
+
 ARRIVES_WITHIN_S = 60.0
 
 
@@ -29,6 +32,13 @@ class Webhook:
         document: dict[str, Any] = json.loads(self.body)
         return document
 
+    def is_genuine(self, webhook_secret: str, tenant: str) -> bool:
+        """What the documented sample says, given the secret that the tenant has."""
+        names: dict[str, Any] = {}
+        exec(block("python"), names)
+        genuine: bool = names["is_genuine"](tenant_secret(webhook_secret, tenant), self.headers, self.body)
+        return genuine
+
 
 class Receiver:
     """Keeps what comes and answers with `answers`, one after the other, then with 204; a context manager.
@@ -43,6 +53,7 @@ class Receiver:
         self._floods = floods
         self._end = threading.Event()
         self.came: queue.Queue[Webhook] = queue.Queue()
+        self.all: list[Webhook] = []
         self.flooded_bytes: queue.Queue[int] = queue.Queue()
         receiver = self
 
@@ -78,7 +89,9 @@ class Receiver:
     def _take(self, request: BaseHTTPRequestHandler) -> None:
         body = request.rfile.read(int(request.headers["content-length"]))
         headers = {name.lower(): value for name, value in request.headers.items()}
-        self.came.put(Webhook(request.path, headers, body))
+        webhook = Webhook(request.path, headers, body)
+        self.all.append(webhook)
+        self.came.put(webhook)
         if self._hangs:
             self._end.wait()
             return

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from contract.queue.interface import BEAT_PERIOD_S, LEASE_S
 from tests.chaos.campaign import CELLS, NO_MATTER, Outcome, run_kill
-from tests.chaos.deployment import Deployment, Victim
+from tests.chaos.deployment import TENANTS, Deployment, Victim
 from tests.chaos.history import RERUN_WITHIN_S, ClipHistory, orphans
 from tests.chaos.points import Point
 from tests.chaos.scenarios import ScenarioResult, bad_wire, zombie
@@ -44,15 +44,15 @@ def main(argv: list[str] | None = None) -> int:
     plan = _plan(options.kills, options.seed)
     started_s = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="intrasplat-chaos-") as folder:
-        outcomes, left = _run_deployments(plan, Path(folder), options.deployments, options.first_port)
+        outcomes, left, told = _run_deployments(plan, Path(folder), options.deployments, options.first_port)
         seconds = time.monotonic() - started_s
         findings = _run_scenarios(Path(folder), options.first_port)
-    table = _table(outcomes, left, seconds, options) + _scenario_lines(findings)
+    table = _table(outcomes, left, told, seconds, options) + _scenario_lines(findings)
     print(table)
     if options.out is not None:
         options.out.write_text(table)
     broken = any(result.violations for result in (*outcomes, *findings))
-    return 1 if left or broken else 0
+    return 1 if left or broken or _strange(outcomes, told) else 0
 
 
 def _plan(kills: int, seed: int) -> list[tuple[Victim, Point, bool]]:
@@ -68,9 +68,11 @@ def _plan(kills: int, seed: int) -> list[tuple[Victim, Point, bool]]:
 
 def _run_deployments(
     plan: list[tuple[Victim, Point, bool]], folder: Path, deployments: int, first_port: int
-) -> tuple[list[Outcome], list[Path]]:
+) -> tuple[list[Outcome], list[Path], list[str]]:
+    """What became of each clip; folders that belong to none; the jobs of all webhooks that came."""
     outcomes: list[Outcome] = []
     left: list[Path] = []
+    told: list[str] = []
     remaining: Iterator[tuple[Victim, Point, bool]] = iter(plan)
     lock = threading.Lock()
 
@@ -90,11 +92,17 @@ def _run_deployments(
                     _report(outcome, len(outcomes), len(plan))
             with lock:
                 left.extend(orphans(deployment.store, known))
+                told.extend(webhook.document["data"]["job_id"] for webhook in deployment.receiver.all)
 
     with ThreadPoolExecutor(deployments) as threads:
         for life in [threads.submit(live_in, number) for number in range(deployments)]:
             life.result()  # raises what a deployment that does not start raises
-    return outcomes, left
+    return outcomes, left, told
+
+
+def _strange(outcomes: list[Outcome], told: list[str]) -> set[str]:
+    """The jobs of webhooks that are none of the campaign's."""
+    return set(told) - {outcome.history.job_id for outcome in outcomes if outcome.history.job_id is not None}
 
 
 def _run_scenarios(folder: Path, port: int) -> list[ScenarioResult]:
@@ -127,7 +135,9 @@ def _report(outcome: Outcome, done: int, total: int) -> None:
         print(f"{done} of {total}", file=sys.stderr, flush=True)
 
 
-def _table(outcomes: list[Outcome], left: list[Path], seconds: float, options: argparse.Namespace) -> str:
+def _table(
+    outcomes: list[Outcome], left: list[Path], told: list[str], seconds: float, options: argparse.Namespace
+) -> str:
     by_cell: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for outcome in outcomes:
         by_cell[outcome.history.cell].append(outcome)
@@ -144,6 +154,8 @@ def _table(outcomes: list[Outcome], left: list[Path], seconds: float, options: a
         "The trainer is a stand-in that takes half a second; service, queue, supervisor and store are the real ones.",
         "",
         f"- kills: {len(outcomes)}; clips that got 202: {len(accepted)}; cancels that were confirmed: {len(cancelled)}",
+        f"- tenants: {len(TENANTS)}; webhooks that came: {len(told)}, about {len(set(told))} jobs; "
+        f"about jobs that are not the campaign's: {len(_strange(outcomes, told))}",
         f"- broken laws: {len(broken)}; folders that belong to no job: {len(left)}",
         f"- the law for running again: within {RERUN_WITHIN_S:g} s (lease {LEASE_S:g} + beat {BEAT_PERIOD_S:g} + 2), "
         "plus the restart where Valkey or all died",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import socket
 import struct
@@ -16,11 +17,13 @@ from urllib.parse import urlsplit
 
 import httpx
 
+from contract.queue.deliveries import LOAN_S
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
-from tests.chaos.deployment import Deployment, Victim
+from tests.chaos.deployment import TENANTS, Deployment, Victim
 from tests.chaos.history import ClipHistory, violations
 from tests.chaos.points import Point
+from tests.receiver import Receiver, Webhook
 
 CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
 PADDING_BYTES = 200_000
@@ -28,6 +31,8 @@ ACCEPTED_WITHIN_S = 60.0
 ENDED_WITHIN_S = 90.0
 POINT_WITHIN_S = 40.0
 SCORED_WITHIN_S = 30.0
+TOLD_WITHIN_S = LOAN_S + 30.0
+"""How soon a webhook comes: the service that was to send it may be killed, and be killed again for another clip."""
 SECOND_ENDING_S = 0.3
 """How long to wait before looking again at a job that has ended."""
 TIDIED_WITHIN_S = 5.0
@@ -37,9 +42,12 @@ RETRY_PAUSE_S = 0.2
 NO_MATTER = frozenset(
     (target, point)
     for target in (Victim.SUPERVISOR, Victim.CHILD)
-    for point in (Point.UPLOAD, Point.SPOOLED)
+    for point in (Point.UPLOAD, Point.SPOOLED, Point.TELLING, Point.TOLD)
 )  # fmt: skip
-"""Cells without meaning: before the clip is queued, the worker has no part in it."""
+"""Cells without meaning: the worker has no part in a clip before it is queued, nor in the webhook at its end."""
+
+TURNS = itertools.cycle(TENANTS)
+"""Whose clip is next."""
 
 CELLS = [(target, point) for target in Victim for point in Point if (target, point) not in NO_MATTER]
 
@@ -55,14 +63,15 @@ class Outcome:
 class ChaosClient:
     """A client that sends one clip until it is accepted, always under the same idempotency key.
 
-    headers: of its requests, such as a key.
+    headers: of its requests, such as a key. callback_url: where it wants to be told of the job's end.
     """
 
-    def __init__(self, url: str, headers: Mapping[str, str] | None = None) -> None:
+    def __init__(self, url: str, headers: Mapping[str, str] | None = None, callback_url: str | None = None) -> None:
         self._url = url
-        self._headers = headers or {}
+        self.headers = headers or {}
+        self._texts = {} if callback_url is None else {"callback_url": callback_url}
         self._key = uuid.uuid4().hex
-        self._body, self._type = _form(_clip_of_its_own(self._key))
+        self._body, self._type = _form(_clip_of_its_own(self._key), self._texts)
         self.job_id: str | None = None
         self._thread = threading.Thread(target=self._send_until_accepted, name="caller", daemon=True)
 
@@ -79,8 +88,9 @@ class ChaosClient:
         address = urlsplit(self._url)
         assert address.hostname is not None
         connection = socket.create_connection((address.hostname, address.port), timeout=10)
+        own = "".join(f"{name}: {value}\r\n" for name, value in self.headers.items())
         head = (
-            f"POST /reconstruct HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Type: {self._type}\r\n"
+            f"POST /reconstruct HTTP/1.1\r\nHost: {address.netloc}\r\n{own}Content-Type: {self._type}\r\n"
             f"Idempotency-Key: {self._key}\r\nContent-Length: {len(self._body)}\r\n\r\n"
         )
         connection.sendall(head.encode() + self._body[: len(self._body) // 2])
@@ -88,7 +98,7 @@ class ChaosClient:
 
     def _send_until_accepted(self) -> None:
         deadline_s = time.monotonic() + ACCEPTED_WITHIN_S
-        headers = {**self._headers, "Content-Type": self._type, "Idempotency-Key": self._key}
+        headers = {**self.headers, "Content-Type": self._type, "Idempotency-Key": self._key}
         while time.monotonic() < deadline_s:
             with suppress(httpx.HTTPError, json.JSONDecodeError):
                 answer = httpx.post(f"{self._url}/reconstruct", content=self._body, headers=headers, timeout=30)
@@ -101,8 +111,8 @@ class ChaosClient:
 def run_kill(deployment: Deployment, target: Victim, point: Point, cancels: bool) -> Outcome:
     """Kill `target` while a clip is at `point`; with `cancels`, after asking to cancel it."""
     deployment.points.reset()
-    history = ClipHistory((target.value, point.value))
-    caller = ChaosClient(deployment.url)
+    history = ClipHistory((target.value, point.value), told=[])
+    caller = new_caller(deployment)
     half: socket.socket | None = None
     if point is Point.UPLOAD:
         half = caller.send_half()
@@ -113,7 +123,7 @@ def run_kill(deployment: Deployment, target: Victim, point: Point, cancels: bool
         deployment.points.wait_for(point, POINT_WITHIN_S)
     if cancels:
         caller.wait()
-        history.cancel_heard = _cancel(deployment, caller.job_id)
+        history.cancel_heard = _cancel(deployment, caller)
     history.killed_at_s = time.time()
     deployment.kill(target)
     deployment.points.let_go()
@@ -128,11 +138,17 @@ def run_kill(deployment: Deployment, target: Victim, point: Point, cancels: bool
     return Outcome(history, violations(history, deployment.store))
 
 
-def _cancel(deployment: Deployment, job_id: str | None) -> bool:
-    if job_id is None:
+def new_caller(deployment: Deployment) -> ChaosClient:
+    """A caller of one of several tenants, who wants a webhook; its path names the tenant."""
+    tenant = next(TURNS)
+    return ChaosClient(deployment.url, deployment.keys[tenant], f"{deployment.receiver.origin}/{tenant}")
+
+
+def _cancel(deployment: Deployment, caller: ChaosClient) -> bool:
+    if caller.job_id is None:
         return False
     with suppress(httpx.HTTPError):
-        answer = httpx.delete(f"{deployment.url}/jobs/{job_id}", timeout=10)
+        answer = httpx.delete(f"{deployment.url}/jobs/{caller.job_id}", headers=caller.headers, timeout=10)
         return answer.status_code == 200 and (
             answer.json()["cancel_requested"] or answer.json()["state"] == "cancelled"
         )
@@ -148,6 +164,18 @@ def watch(deployment: Deployment, history: ClipHistory) -> None:
         history.scored = _wait_until_scored(deployment, record)
     time.sleep(SECOND_ENDING_S if record is not None and record.state is JobState.DONE else TIDIED_WITHIN_S)
     history.events = deployment.queue.events(history.job_id)
+    if history.told is not None:
+        history.told = _wait_until_told(deployment.receiver, history.job_id)
+
+
+def _wait_until_told(receiver: Receiver, job_id: str) -> list[Webhook]:
+    """The webhooks about a job that came within TOLD_WITHIN_S, once there is any."""
+    deadline_s = time.monotonic() + TOLD_WITHIN_S
+    while True:
+        told = [each for each in list(receiver.all) if each.document["data"]["job_id"] == job_id]
+        if told or time.monotonic() > deadline_s:
+            return told
+        time.sleep(0.05)
 
 
 def _wait_until_scored(deployment: Deployment, record: JobRecord) -> bool:
@@ -180,7 +208,11 @@ def _clip_of_its_own(name: str) -> bytes:
     return CLIP.read_bytes() + struct.pack(">I4s", 8 + len(padding), b"free") + padding
 
 
-def _form(clip: bytes) -> tuple[bytes, str]:
+def _form(clip: bytes, texts: Mapping[str, str]) -> tuple[bytes, str]:
     boundary = uuid.uuid4().hex
-    head = f'--{boundary}\r\nContent-Disposition: form-data; name="clip"; filename="clip.mp4"\r\n\r\n'
+    parts = [
+        f'--{boundary}\r\nContent-Disposition: form-data; name="{each}"\r\n\r\n{texts[each]}\r\n' for each in texts
+    ]
+    parts += [f'--{boundary}\r\nContent-Disposition: form-data; name="clip"; filename="clip.mp4"\r\n\r\n']
+    head = "".join(parts)
     return head.encode() + clip + f"\r\n--{boundary}--\r\n".encode(), f"multipart/form-data; boundary={boundary}"

@@ -19,15 +19,19 @@ from typing import Any
 
 import httpx
 
+from contract.access.keys import DEFAULT_SCOPES, KeyFile
 from contract.queue.embedded import EmbeddedServer
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import Settings
 from contract.store.store import Store
 from tests.chaos.points import FOLDER_VARIABLE, Points
+from tests.receiver import Receiver
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 KEEP_PERIOD_S = 0.05
 START_TIMEOUT_S = 60.0
+TENANTS = ("theatre-1", "theatre-2", "theatre-3")
+WEBHOOK_SECRET = "chaos" * 8
 
 
 class Victim(StrEnum):
@@ -74,6 +78,7 @@ class Kept:
 class Deployment:
     """One installation in its own folder and on its own port; a context manager.
 
+    keys: headers with the key of each of several tenants. receiver: of the webhooks that they ask for.
     more_ports: of further services. environment: of its processes, too.
     """
 
@@ -88,7 +93,16 @@ class Deployment:
         self.urls = [f"http://127.0.0.1:{each}" for each in (port, *more_ports)]
         self.url = self.urls[0]
         self.store = Store(self.data_dir)
-        self.settings = Settings(data_dir=self.data_dir, port=port, redis_url=self.server.url, min_free_bytes=0)
+        self.receiver = Receiver()
+        self.settings = Settings(
+            data_dir=self.data_dir,
+            port=port,
+            redis_url=self.server.url,
+            min_free_bytes=0,
+            webhook_secret=WEBHOOK_SECRET,
+            webhook_hosts=(self.receiver.origin,),
+            webhook_private="yes",
+        )
         self._folder = folder
         self.services = [
             Kept("tests.chaos.service_process", self._environment({"port": each}), folder / f"service-{each}.log")
@@ -101,6 +115,8 @@ class Deployment:
 
     def __enter__(self) -> Deployment:
         self.server.start()
+        self.receiver.__enter__()
+        self.keys = {tenant: {"Authorization": f"Bearer {self._new_key(tenant)}"} for tenant in TENANTS}
         self.queue = RedisQueue(self.server.url)
         self._keeper.start()
         self.wait_until_ready()
@@ -113,6 +129,7 @@ class Deployment:
             kept.end()
         self.queue.close()
         self.server.stop()
+        self.receiver.__exit__()
 
     @property
     def socket(self) -> Path:
@@ -158,6 +175,9 @@ class Deployment:
             if victim is not None:
                 with suppress(ProcessLookupError):
                     os.kill(victim, signal.SIGKILL)
+
+    def _new_key(self, tenant: str) -> str:
+        return KeyFile(self.data_dir).create(tenant, DEFAULT_SCOPES)[1]
 
     def _environment(self, changes: dict[str, Any]) -> dict[str, str]:
         settings = self.settings.model_copy(update=changes)

@@ -10,7 +10,9 @@ from contract.queue.interface import BEAT_PERIOD_S, LEASE_S, Event
 from contract.store.store import Store
 from contract.wire.job import TERMINAL_STATES, JobState
 from contract.wire.names import MANIFEST
+from tests.chaos.deployment import WEBHOOK_SECRET
 from tests.chaos.trainer import STEPS, STEPS_MADE
+from tests.receiver import Webhook
 
 RERUN_SLACK_S = 2.0
 RERUN_WITHIN_S = LEASE_S + BEAT_PERIOD_S + RERUN_SLACK_S
@@ -24,6 +26,7 @@ class ClipHistory:
     job_id         of the 202; None if the caller never got one
     cancel_heard   the service confirmed that a cancel was asked for
     killed_at_s    UNIX time of the kill; None where nothing is killed
+    told           the webhooks that came about it; None: nobody asked for any
     scored         the scores of a job that is done were added
     restart_s      until everything that was killed answered again; counted where Valkey or all were killed
     """
@@ -34,6 +37,7 @@ class ClipHistory:
     killed_at_s: float | None = None
     restart_s: float = 0.0
     scored: bool = False
+    told: list[Webhook] | None = None
     events: list[Event] = field(default_factory=list)
 
     @property
@@ -82,8 +86,23 @@ def violations(history: ClipHistory, store: Store) -> list[str]:
         made = json.loads(manifest.read_bytes())[STEPS_MADE]
         if sorted(set(made)) != list(range(STEPS)) or len(made) > STEPS:
             broken.append(f"the scene was made by the steps {made}")
+    if history.told is not None:
+        broken += _broken_webhooks(history.told, history.final)
     if history.rerun_s is not None and history.rerun_s > RERUN_WITHIN_S + history.restart_s:
         broken.append(f"it ran again only after {history.rerun_s:.1f} s")
+    return broken
+
+
+def _broken_webhooks(told: list[Webhook], final: JobState | None) -> list[str]:
+    """A job that has ended is told of at least once, as it ended, under its tenant's signature; no other job is."""
+    if final not in TERMINAL_STATES:
+        return ["it has not ended, and a webhook says that it has"] if told else []
+    broken = [] if told else ["it ended, and no webhook came"]
+    for webhook in told:
+        if not webhook.is_genuine(WEBHOOK_SECRET, webhook.path.removeprefix("/")):
+            broken.append("the signature of its webhook is wrong")
+        if webhook.document["data"]["state"] != final:
+            broken.append(f"it ended as {final}, and its webhook says {webhook.document['data']['state']}")
     return broken
 
 

@@ -33,6 +33,8 @@ class Point(StrEnum):
     PUBLISHING = "publishing"
     PUBLISHED = "after publish, before ack"
     SCORING = "done, before its scores"
+    TELLING = "before its webhook is sent"
+    TOLD = "after its webhook, before that is noted"
 
 
 class Points:
@@ -93,12 +95,14 @@ def reach(point: Point) -> None:
 
 
 def install_service_points() -> None:
-    """SPOOLED lies after the store's accept, ENQUEUED after the queue's submit."""
+    """SPOOLED lies after the store's accept, ENQUEUED after the queue's submit; TELLING and TOLD around a webhook."""
     from contract.queue.redis_queue import RedisQueue
     from contract.store.store import Store
 
     _reach_after(Store, "accept", Point.SPOOLED)
     _reach_after(RedisQueue, "submit", Point.ENQUEUED)
+    _reach_after(RedisQueue, "lend_delivery", Point.TELLING, if_any=True)
+    _reach_before(RedisQueue, "note_try", Point.TOLD)
 
 
 def install_worker_points() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from contract.queue.interface import LEASE_S
 from contract.wire.job import TERMINAL_STATES, JobState
-from tests.chaos.campaign import ChaosClient, wait_until_ended, watch
+from tests.chaos.campaign import ChaosClient, new_caller, wait_until_ended, watch
 from tests.chaos.deployment import Deployment, children_of
 from tests.chaos.history import ClipHistory, orphans, violations
 from tests.chaos.points import Point
@@ -44,7 +44,7 @@ class ScenarioResult:
 def zombie(folder: Path, port: int, point: Point) -> ScenarioResult:
     """SIGSTOP the worker that holds a job at `point` past its lease, let the other finish, SIGCONT the first."""
     with Deployment(folder, port, workers=2) as deployment:
-        caller = ChaosClient(deployment.url)
+        caller = new_caller(deployment)
         deployment.points.arm(point)
         caller.start()
         held = deployment.points.wait_for(point, 40.0)
@@ -64,7 +64,7 @@ def zombie(folder: Path, port: int, point: Point) -> ScenarioResult:
             with suppress(ProcessLookupError):
                 os.kill(process_id, signal.SIGCONT)
         time.sleep(3.0)  # the zombie tries to publish
-        history = ClipHistory(("zombie", point.value), caller.job_id, killed_at_s=stopped_s)
+        history = ClipHistory(("zombie", point.value), caller.job_id, killed_at_s=stopped_s, told=[])
         watch(deployment, history)
         broken = violations(history, deployment.store)
         if history.events[-1].record.attempt != 2:
@@ -78,11 +78,11 @@ def bad_wire(folder: Path, port: int, seed: int) -> ScenarioResult:
     with Deployment(folder, port, workers=0) as deployment, ChaosProxy(deployment.socket, seed) as proxy:
         deployment.add_workers(2, redis_url=f"redis://127.0.0.1:{proxy.port}/0")
         deployment.wait_until_ready()
-        callers = []
+        callers: list[ChaosClient] = []
         for fault, seconds in WIRE_FAULTS:
             proxy.set(fault)
             for _ in range(WIRE_JOBS // len(WIRE_FAULTS)):
-                callers.append(ChaosClient(deployment.url))
+                callers.append(new_caller(deployment))
                 callers[-1].start()
                 time.sleep(seconds * len(WIRE_FAULTS) / WIRE_JOBS)
             proxy.set(Fault.NONE)
@@ -90,7 +90,7 @@ def bad_wire(folder: Path, port: int, seed: int) -> ScenarioResult:
         broken, attempts = [], 0
         for caller in callers:
             caller.wait()
-            history = ClipHistory(("wire", ""), caller.job_id)
+            history = ClipHistory(("wire", ""), caller.job_id, told=[])
             watch(deployment, history)
             broken += violations(history, deployment.store)
             attempts += history.events[-1].record.attempt if history.events else 0
